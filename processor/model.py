@@ -1,0 +1,272 @@
+"""The records that travel between the parts of the project.
+
+Every record is frozen. Arrays are float64 or int64, checked for their shape and set read-only when the record is
+made; an absent array is an empty one. Lists of things are kept as columns: ``centres (k, 3)`` beside ``radii (k,)``.
+Lengths are in mm, angles in rad. ``T_a_b`` is a 4x4 matrix that maps coordinates in frame b to frame a.
+
+The records are also the HDF5 schema: :mod:`processor.store` walks their fields, so a new record needs no I/O code.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
+
+KEY_POINTS = ("P1", "P2", "P3", "P4", "P5", "P6", "P7", "P8")
+ENDS = ("start", "end")
+KINDS = ("arch-bridge", "space-frame", "structure")
+
+
+class RecordError(ValueError):
+    """A record was given a value that does not fit its field."""
+
+
+class InputError(Exception):
+    """Input that cannot be used. The message names the file, what was expected, what came and what to do."""
+
+
+class UsageError(Exception):
+    """A command, recipe or parameter that the program does not understand; the message says what it would take."""
+
+
+def column(*shape: int | str, dtype: type = np.float64) -> Any:
+    """Declare an array field.
+
+    ``shape`` holds a number for a fixed axis and a name for a free one; axes of one name have one length within the
+    record. Without a value the array is empty.
+    """
+    return dataclasses.field(
+        default_factory=lambda: np.empty([0 if isinstance(n, str) else n for n in shape] if shape else 0, dtype),
+        metadata={"shape": shape, "dtype": dtype},
+    )
+
+
+def optional(*shape: int, dtype: type = np.float64) -> Any:
+    """Declare an array field of fixed shape that may be absent (then it has size 0)."""
+    return dataclasses.field(
+        default_factory=lambda: np.empty(0, dtype), metadata={"shape": shape, "dtype": dtype, "optional": True}
+    )
+
+
+def names(axis: str) -> Any:
+    """Declare a tuple of strings, as long as the axis of that name in the record's arrays."""
+    return dataclasses.field(default=(), metadata={"axis": axis})
+
+
+class Checked:
+    """Checks the declared fields of a frozen dataclass when it is made; holds no data and no behaviour."""
+
+    def __post_init__(self) -> None:
+        lengths: dict[str, tuple[int, str]] = {}
+        for field in dataclasses.fields(self):  # type: ignore[arg-type]
+            value = getattr(self, field.name)
+            where = f"{type(self).__name__}.{field.name}"
+            if "axis" in field.metadata:
+                value = tuple(str(item) for item in value)
+                _same_length(lengths, field.metadata["axis"], len(value), where)
+                object.__setattr__(self, field.name, value)
+            elif "shape" in field.metadata:
+                array = _checked_array(value, field.metadata, where, lengths)
+                object.__setattr__(self, field.name, array)
+
+
+def _checked_array(
+    value: Any, metadata: Any, where: str, lengths: dict[str, tuple[int, str]]
+) -> npt.NDArray[np.generic]:
+    shape = metadata["shape"]
+    array: npt.NDArray[np.generic] = np.ascontiguousarray(value, dtype=metadata["dtype"])
+    absent = array.size == 0
+    if absent and metadata.get("optional"):
+        array = np.empty(0, metadata["dtype"])
+    else:
+        if absent:
+            array = array.reshape([0 if isinstance(n, str) else n for n in shape])
+        fits = array.ndim == len(shape) and all(
+            isinstance(want, str) or got == want for got, want in zip(array.shape, shape, strict=True)
+        )
+        if not fits:
+            raise RecordError(f"{where}: expected an array of shape {shape}, got {array.shape}")
+        if not absent:
+            for got, want in zip(array.shape, shape, strict=True):
+                if isinstance(want, str):
+                    _same_length(lengths, want, got, where)
+    array = array.view()
+    array.flags.writeable = False
+    return array
+
+
+def _same_length(lengths: dict[str, tuple[int, str]], axis: str, length: int, where: str) -> None:
+    known, first = lengths.setdefault(axis, (length, where))
+    if known != length:
+        raise RecordError(f"{where}: length {length} along '{axis}', but {first} has {known}")
+
+
+# --- the scene: all that a step may read --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Scan(Checked):
+    """One scan, or one merged cloud.
+
+    The scan's frame is the one its file uses, in mm. ``points`` are relative to ``origin``: the coordinate in the
+    scan's frame is ``origin + points``, so a georeferenced cloud keeps its precision.
+    """
+
+    name: str
+    points: Floats = column("n", 3)
+    origin: Floats = dataclasses.field(
+        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
+    )
+    intensity: Floats = column("n")
+    point_station: Ints = column("n", dtype=np.int64)  # row of Scene.stations a point was seen from, -1 = unknown
+    component: str = ""  # arch bridge: the part this is a scan of
+    station: str = ""
+    position: Floats = optional(3)  # of the scanner, in the scan's frame
+    T_project_scan: Floats = optional(
+        4, 4
+    )  # absent: the scan is in the project's frame already, or its pose is unknown
+    sigma_mm: float = float("nan")  # range noise, one standard deviation; NaN = unknown
+
+
+@dataclass(frozen=True)
+class Stations(Checked):
+    """Scanner positions in the project's frame."""
+
+    ids: tuple[str, ...] = names("k")
+    positions: Floats = column("k", 3)
+
+
+@dataclass(frozen=True)
+class DesignPart(Checked):
+    """The nominal geometry of one component, in the bridge's frame (mm)."""
+
+    name: str
+    vertices: Floats = column("v", 3)
+    faces: Ints = column("f", 3, dtype=np.int64)
+    bottom_edge_left: Floats = column("l", 3)  # from the start to the end of the component; left = +Y
+    bottom_edge_right: Floats = column("r", 3)
+
+
+@dataclass(frozen=True)
+class ArchDesign(Checked):
+    """A bridge of components in assembly order. Bridge frame: X along the span, Z up, mm.
+
+    ``joint_points`` are P1..P8 of each joint: the outer corners bottom-left, bottom-right, top-right, top-left
+    (left = +Y), then the middles of the outer bottom, right, top and left edges.
+    """
+
+    parts: tuple[DesignPart, ...] = ()  # in assembly order
+    joint_names: tuple[str, ...] = names("j")
+    joint_left: tuple[str, ...] = names("j")
+    joint_right: tuple[str, ...] = names("j")
+    joint_points: Floats = column("j", 8, 3)
+
+
+@dataclass(frozen=True)
+class FrameDesign(Checked):
+    """A space frame: nodes and the members between them, mm."""
+
+    ids: Ints = column("k", dtype=np.int64)
+    centres: Floats = column("k", 3)
+    radii: Floats = column("k")
+    member_a: Ints = column("m", dtype=np.int64)  # ids of the two nodes
+    member_b: Ints = column("m", dtype=np.int64)
+    tube_diameters: Floats = column("m")
+
+
+@dataclass(frozen=True)
+class Scene(Checked):
+    """What was scanned, and what it was meant to be. Steps read this and nothing else."""
+
+    name: str
+    kind: str  # one of KINDS
+    scans: tuple[Scan, ...] = ()
+    arch: ArchDesign | None = None
+    frame: FrameDesign | None = None
+    stations: Stations | None = None
+    temperature_C: float = float("nan")  # of the steel while it was scanned
+    units: str = "mm"  # of the input's coordinates, and why they were read so
+    units_reason: str = ""
+
+
+# --- the truth: evaluation alone reads it --------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class PointLabels(Checked):
+    """What each point of a scan really is: ``part`` a row of ``part_names``, ``source`` a row of SOURCES."""
+
+    scan: str
+    part_names: tuple[str, ...] = ()
+    part: Ints = column("n", dtype=np.int64)  # -1 = none
+    source: Ints = column("n", dtype=np.int64)
+
+
+SOURCES = ("surface", "mixed", "outlier")
+
+
+@dataclass(frozen=True)
+class ArchTruth(Checked):
+    """The true pose and key points of each component. Axis of length 2: start, end; NaN where an end has none."""
+
+    names: tuple[str, ...] = names("c")
+    T_bridge_scan: Floats = column("c", 4, 4)
+    key_points_scan: Floats = column("c", 2, 8, 3)
+    key_points_bridge: Floats = column("c", 2, 8, 3)
+
+
+@dataclass(frozen=True)
+class FrameTruth(Checked):
+    """The true balls, in the frame of the scan: as built, not as designed."""
+
+    ids: Ints = column("k", dtype=np.int64)
+    centres: Floats = column("k", 3)
+    radii: Floats = column("k")
+    lowest: Floats = column("k", 3)
+
+
+@dataclass(frozen=True)
+class Truth(Checked):
+    """What the generator knows and no step may see."""
+
+    labels: tuple[PointLabels, ...] = ()
+    arch: ArchTruth | None = None
+    frame: FrameTruth | None = None
+    spacing_mm: float = float("nan")
+    sigma_mm: float = float("nan")
+
+
+# --- checks ---------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Metric:
+    """One figure held against the truth. Without a limit (NaN) it informs and always passes."""
+
+    step: str
+    name: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value keeps within the limit; a value that is not a number never does."""
+        return bool(np.isnan(self.limit) or self.value <= self.limit)
+
+
+@dataclass(frozen=True)
+class StepRun:
+    """One step as it was run: the parameters as JSON text, and the step's own Result record."""
+
+    step: str
+    method: str
+    params: str
+    result: Any
