@@ -1,0 +1,96 @@
+"""Iterative closest point, to points and to planes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.geometry import rigid
+from processor.model import Floats
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """What an alignment reached: the pose, the rms of the pairs' distances in mm and the share of points paired."""
+
+    T_target_source: Floats
+    rms: float
+    paired_share: float
+    iterations: int
+
+
+def point_to_point(
+    source: Floats,
+    target: Floats,
+    start: Floats,
+    *,
+    max_distance_mm: float = np.inf,
+    max_iterations: int = 100,
+    tolerance: float = 1e-6,
+) -> Alignment:
+    """Align source (n, 3) to target (m, 3) from a start (4, 4): Besl and McKay, as in paper 000 eq. 5.
+
+    Pairs farther apart than ``max_distance_mm`` are left out. Stops after ``max_iterations`` or when the rms changes
+    by less than ``tolerance`` of itself.
+    """
+    tree = cKDTree(target)
+    T, last, iteration = start, np.inf, 0
+    rms, share = np.inf, 0.0
+    for iteration in range(1, max_iterations + 1):
+        moved = rigid.apply(T, source)
+        distance, index = tree.query(moved, distance_upper_bound=max_distance_mm)
+        paired = np.isfinite(distance)
+        share = float(paired.mean())
+        if paired.sum() < 3:
+            return Alignment(T, np.inf, share, iteration)
+        rms = float(np.sqrt(np.mean(distance[paired] ** 2)))
+        if abs(last - rms) <= tolerance * max(rms, 1e-9):
+            break
+        last = rms
+        T = rigid.fit(source[paired], target[index[paired]])
+    return Alignment(T, rms, share, iteration)
+
+
+def point_to_plane(
+    source: Floats,
+    target: Floats,
+    normals: Floats,
+    start: Floats,
+    *,
+    gates_mm: tuple[float, ...],
+    iterations: int = 15,
+) -> Alignment:
+    """Align source (n, 3) to a surface given by samples target (m, 3) with unit normals (m, 3).
+
+    Gauss-Newton on the distances along the normals, Huber-weighted by their median; pairs beyond the gate are left
+    out, gates in turn from wide to narrow. The rms is over the last gate's pairs.
+    """
+    tree = cKDTree(target)
+    T, rms, share, done = start, np.inf, 0.0, 0
+    for gate in gates_mm:
+        for _ in range(iterations):
+            done += 1
+            moved = rigid.apply(T, source)
+            distance, index = tree.query(moved)
+            index = np.minimum(index, len(target) - 1)
+            residual = np.einsum("ni,ni->n", moved - target[index], normals[index])
+            # The nearest sample is up to a sample's spacing away along the surface; the gate is on the normal part.
+            keep = (np.abs(residual) <= gate) & (distance <= 3.0 * gate)
+            share = float(keep.mean())
+            if keep.sum() < 6:
+                return Alignment(T, np.inf, share, done)
+            r, n, p = residual[keep], normals[index[keep]], moved[keep]
+            rms = float(np.sqrt(np.mean(r**2)))
+            scale = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
+            weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(r), 1e-12))
+            centre = p.mean(axis=0)
+            J = np.hstack([np.cross(p - centre, n), n])
+            step = np.linalg.lstsq(J.T @ (weight[:, None] * J), -J.T @ (weight * r), rcond=None)[0]
+            R = rigid.rotation_from_vector(step[:3])
+            T = rigid.transform(R, centre + step[3:] - R @ centre) @ T
+            reach = float(np.linalg.norm(p - centre, axis=1).max())
+            if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-4 * gate:
+                break
+    return Alignment(T, rms, share, done)

@@ -1,0 +1,106 @@
+"""Straight lines and polylines in space."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.model import Floats
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line through ``point`` (3,) along the unit vector ``direction`` (3,)."""
+
+    point: Floats
+    direction: Floats
+
+    def distances(self, points: Floats) -> Floats:
+        """Distances of points (n, 3), mm (paper 000, eq. 2)."""
+        distances: Floats = np.linalg.norm(np.cross(points - self.point, self.direction), axis=1)
+        return distances
+
+
+def fit_line(points: Floats) -> Line:
+    """Least-squares line through points (n, 3), n >= 2: their mean and first principal direction."""
+    centre = points.mean(axis=0)
+    _, _, Vt = np.linalg.svd(points - centre, full_matrices=False)
+    return Line(centre, Vt[0])
+
+
+def ransac_line(
+    points: Floats, threshold_mm: float, probability: float, max_iterations: int, rng: np.random.Generator
+) -> Line | None:
+    """Line with the most points within the threshold, then fitted to them by least squares.
+
+    The number of two-point samples adapts to the best share of inliers found so far. None when no two points differ.
+    """
+    best: np.ndarray | None = None
+    needed, tried = float(max_iterations), 0
+    while tried < min(needed, max_iterations):
+        tried += 1
+        a, b = points[rng.choice(len(points), 2, replace=False)]
+        length = float(np.linalg.norm(b - a))
+        if length == 0.0:
+            continue
+        inliers = Line(a, (b - a) / length).distances(points) <= threshold_mm
+        if best is None or inliers.sum() > best.sum():
+            best = inliers
+            share = min(float(inliers.mean()), 1.0 - 1e-12)
+            needed = math.log(1.0 - probability) / math.log(1.0 - share**2)
+    return None if best is None else fit_line(points[best])
+
+
+def crossing(a: Line, b: Line) -> Floats:
+    """Middle (3,) of the shortest segment between two lines; NaN where they are parallel."""
+    normal = np.cross(a.direction, b.direction)
+    square = float(normal @ normal)
+    if square < 1e-12:
+        return np.full(3, np.nan)
+    offset = b.point - a.point
+    on_a = a.point + (np.cross(offset, b.direction) @ normal / square) * a.direction
+    on_b = b.point + (np.cross(offset, a.direction) @ normal / square) * b.direction
+    return 0.5 * (on_a + on_b)
+
+
+@dataclass(frozen=True)
+class Polyline:
+    """A polyline through vertices (m, 3), m >= 2, with the arc length (m,) at each."""
+
+    vertices: Floats
+    arc: Floats
+
+    @classmethod
+    def through(cls, vertices: Floats) -> Polyline:
+        """Make a polyline; its arc length starts at 0."""
+        steps = np.linalg.norm(np.diff(vertices, axis=0), axis=1)
+        return cls(vertices, np.concatenate([[0.0], np.cumsum(steps)]))
+
+    @property
+    def length(self) -> float:
+        """Length in mm."""
+        return float(self.arc[-1])
+
+    def at(self, s: Floats) -> Floats:
+        """Points (k, 3) at arc lengths s (k,)."""
+        return np.stack([np.interp(s, self.arc, self.vertices[:, i]) for i in range(3)], axis=1)
+
+    def nearest(self, points: Floats) -> tuple[Floats, Floats]:
+        """Arc lengths (n,) of, and vectors (n, 3) from, the nearest point of the polyline to each of points (n, 3)."""
+        start, along = self.vertices[:-1], np.diff(self.vertices, axis=0)
+        squared = np.einsum("mi,mi->m", along, along)
+        best = np.full(len(points), np.inf)
+        s, offset = np.zeros(len(points)), np.zeros((len(points), 3))
+        for i in range(len(along)):
+            if squared[i] == 0.0:
+                continue
+            t = np.clip((points - start[i]) @ along[i] / squared[i], 0.0, 1.0)
+            vector = points - start[i] - t[:, None] * along[i]
+            distance = np.einsum("ni,ni->n", vector, vector)
+            closer = distance < best
+            best[closer] = distance[closer]
+            offset[closer] = vector[closer]
+            s[closer] = self.arc[i] + t[closer] * math.sqrt(squared[i])
+        return s, offset

@@ -1,0 +1,106 @@
+"""Point feature histograms and the coarse alignment that rests on them (paper 000, section 2.6)."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.geometry import rigid
+from processor.model import Floats, Ints
+
+
+def normals(points: Floats, radius_mm: float) -> Floats:
+    """Estimate unit normals (n, 3) of points (n, 3): least principal direction of the neighbours, away from the cloud's centre.
+
+    Along a straight line of points the normal is not defined; what comes out there is one of many, as in the paper.
+    """
+    tree = cKDTree(points)
+    outward = points - points.mean(axis=0)
+    result = np.zeros_like(points)
+    for i, neighbours in enumerate(tree.query_ball_point(points, radius_mm)):
+        local = points[neighbours] - points[neighbours].mean(axis=0)
+        normal = np.linalg.eigh(local.T @ local)[1][:, 0]
+        result[i] = normal if normal @ outward[i] >= 0.0 else -normal
+    return result
+
+
+def pair_features(points: Floats, point_normals: Floats, i: Ints, j: Ints) -> Floats:
+    """Angles alpha, beta (as cosines) and theta (rad) of point pairs (i, j), (k, 3); paper 000 eq. 3 and 4.
+
+    The source of a pair is the point whose normal makes the smaller angle with the line to the other (Rusu), so that
+    the result does not depend on the order of the points. NaN for coincident points.
+    """
+    line = points[j] - points[i]
+    distance = np.linalg.norm(line, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        unit = line / distance[:, None]
+    swap = np.abs(np.einsum("ki,ki->k", point_normals[i], unit)) < np.abs(np.einsum("ki,ki->k", point_normals[j], unit))
+    unit = np.where(swap[:, None], -unit, unit)
+    U = np.where(swap[:, None], point_normals[j], point_normals[i])
+    N = np.where(swap[:, None], point_normals[i], point_normals[j])
+    V = np.cross(U, unit)
+    length = np.linalg.norm(V, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        V = V / length[:, None]
+    W = np.cross(U, V)
+    return np.stack(
+        [
+            np.einsum("ki,ki->k", V, N),
+            np.einsum("ki,ki->k", U, unit),
+            np.arctan2(np.einsum("ki,ki->k", W, N), np.einsum("ki,ki->k", U, N)),
+        ],
+        axis=1,
+    )
+
+
+def histograms(points: Floats, point_normals: Floats, radius_mm: float, bins: int = 5) -> Floats:
+    """PFH (n, bins^3) of points (n, 3): for each, the shares of all pairs in its neighbourhood (itself included).
+
+    Each angle's range is cut into ``bins`` equal parts; alpha varies fastest. Pairs without a frame (coincident, or a
+    line along the normal) are left out; a point without pairs has a histogram of zeros.
+    """
+    tree = cKDTree(points)
+    result = np.zeros((len(points), bins**3))
+    low, span = np.array([-1.0, -1.0, -np.pi]), np.array([2.0, 2.0, 2.0 * np.pi])
+    for query, found in enumerate(tree.query_ball_point(points, radius_mm)):
+        neighbours = np.array(sorted(found))
+        first, second = np.triu_indices(len(neighbours), 1)
+        features = pair_features(points, point_normals, neighbours[first], neighbours[second])
+        features = features[np.isfinite(features).all(axis=1)]
+        if len(features) == 0:
+            continue
+        cell = np.clip(np.floor((features - low) / span * bins).astype(np.int64), 0, bins - 1)
+        flat = cell @ np.array([1, bins, bins * bins])
+        result[query] = np.bincount(flat, minlength=bins**3) / len(features)
+    return result
+
+
+def coarse_alignment(
+    source: Floats,
+    target: Floats,
+    source_histograms: Floats,
+    target_histograms: Floats,
+    *,
+    tolerance_mm: float,
+    iterations: int,
+    rng: np.random.Generator,
+) -> Floats:
+    """T_target_source (4, 4) from the nearest histograms: three pairs at a time, the pose with most pairs wins.
+
+    A sample whose sides differ by more than the tolerance between the clouds is passed over. The winner is not
+    necessarily right: the share of pairs it explains says nothing about it on repeated or straight shapes.
+    """
+    match = cKDTree(target_histograms).query(source_histograms)[1]
+    paired = target[match]
+    best, best_count = np.eye(4), -1
+    for _ in range(iterations):
+        pick = rng.choice(len(source), 3, replace=False)
+        a, b = source[pick], paired[pick]
+        sides = np.linalg.norm(a - np.roll(a, 1, axis=0), axis=1) - np.linalg.norm(b - np.roll(b, 1, axis=0), axis=1)
+        if np.abs(sides).max() > tolerance_mm:
+            continue
+        T = rigid.fit(a, b)
+        count = int((np.linalg.norm(rigid.apply(T, source) - paired, axis=1) <= tolerance_mm).sum())
+        if count > best_count:
+            best, best_count = T, count
+    return best

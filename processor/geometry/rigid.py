@@ -1,0 +1,56 @@
+"""Rigid motions as 4x4 matrices: ``T_a_b`` maps coordinates in frame b to frame a."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.model import Floats
+
+
+def transform(rotation: Floats, translation: Floats) -> Floats:
+    """Build T (4, 4) from a rotation (3, 3) and a translation (3,)."""
+    T = np.eye(4)
+    T[:3, :3] = rotation
+    T[:3, 3] = translation
+    return T
+
+
+def apply(T: Floats, points: Floats) -> Floats:
+    """Map points (..., 3) by T (4, 4)."""
+    mapped: Floats = points @ T[:3, :3].T + T[:3, 3]
+    return mapped
+
+
+def invert(T: Floats) -> Floats:
+    """Invert a rigid T (4, 4) without loss: the rotation is transposed."""
+    R = T[:3, :3]
+    return transform(R.T, -R.T @ T[:3, 3])
+
+
+def rotation_angle(R: Floats) -> float:
+    """Angle of a rotation (3, 3) in rad, accurate near 0 and near pi."""
+    sine = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    return float(np.arctan2(sine, 0.5 * (np.trace(R) - 1.0)))
+
+
+def rotation_from_vector(w: Floats) -> Floats:
+    """Rotation (3, 3) about the axis w by |w| rad (Rodrigues)."""
+    angle = float(np.linalg.norm(w))
+    if angle == 0.0:
+        return np.eye(3)
+    x, y, z = np.asarray(w) / angle
+    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    R: Floats = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
+    return R
+
+
+def fit(source: Floats, target: Floats) -> Floats:
+    """Rigid T_target_source that minimises the squared distances of paired points (n, 3), n >= 3.
+
+    Never a reflection. Source: Besl and McKay's objective (paper 000 eq. 5), solved by the SVD of the covariance.
+    """
+    centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
+    U, _, Vt = np.linalg.svd((source - centre_source).T @ (target - centre_target))
+    proper = np.diag([1.0, 1.0, np.sign(np.linalg.det(Vt.T @ U.T))])
+    R = Vt.T @ proper @ U.T
+    return transform(R, centre_target - R @ centre_source)

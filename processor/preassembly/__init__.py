@@ -1,0 +1,1 @@
+"""The parts of virtual preassembly: attitude, features, matching, errors."""

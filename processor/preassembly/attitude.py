@@ -1,0 +1,159 @@
+"""The attitude of a part: principal axes laid on the design's, and which of the possible ways is right.
+
+Principal axes leave four proper rotations, eight where the section is nearly square. The source paper (000, section
+2.2) resolves them by levelling the parts by hand; here every one is tried against the design's surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.geometry import icp, principal, rigid
+from processor.geometry.neighbors import voxel_means
+from processor.model import DesignPart, Floats
+
+GATES_MM = (400.0, 150.0, 50.0, 25.0, 12.0)
+SEED_POINTS = 3000
+SAME_POSE_MM = 5.0  # poses that move no corner of the part by more are one and the same
+TELLING_MM = 10.0  # design surface this far from the rival's design can tell two poses apart
+LEAST_EVIDENCE = 10  # points on telling surface
+RIVAL_RATIO = 1.5  # a pose whose misfit is within this factor of the best is a rival
+
+
+@dataclass(frozen=True)
+class Attitude:
+    """The pose of a part by its principal axes and by its surface (``T_bridge_scan``, 4x4 each), and how sure it is."""
+
+    T_principal: Floats
+    T_surface: Floats
+    status: str  # ok | ambiguous | failed
+    message: str
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Samples (n, 3) of a design part's surface in the bridge's frame with unit normals (n, 3)."""
+
+    points: Floats
+    normals: Floats
+    corners: Floats  # of the bounding box (8, 3)
+
+
+def sample_surface(part: DesignPart, count: int = 40_000) -> Surface:
+    """Spread about ``count`` samples over the part's triangles, on a fixed low-discrepancy pattern."""
+    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
+    cross = np.cross(b - a, c - a)
+    double_area = np.linalg.norm(cross, axis=1)
+    used = double_area > 0.0
+    a, b, c, cross, double_area = a[used], b[used], c[used], cross[used], double_area[used]
+    cumulative = np.cumsum(double_area)
+    i = np.arange(count)
+    triangle = np.searchsorted(cumulative, (i + 0.5) / count * cumulative[-1])
+    # The R2 sequence (plastic number), folded from the square onto the triangle.
+    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
+    at = a[triangle]
+    points = at + u[:, None] * (b[triangle] - at) + v[:, None] * (c[triangle] - at)
+    low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
+    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    return Surface(points, (cross / double_area[:, None])[triangle], corners)
+
+
+def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
+    """T_bridge_scan that lay the scan's principal axes on the design's: eight proper rotations about the long axis."""
+    scan = principal.of_points(points)
+    design = principal.of_mesh(part.vertices, part.faces)
+    quarter_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    rotations = [
+        design.axes @ np.diag(signs) @ turn @ scan.axes.T
+        for turn in (np.eye(3), quarter_turn)
+        for signs in principal.proper_sign_choices()
+    ]
+    return [rigid.transform(R, design.centre - R @ scan.centre) for R in rotations]
+
+
+def find(points: Floats, part: DesignPart) -> Attitude:
+    """Attitude of the part scanned as points (n, 3), against its design.
+
+    Symmetric parts are told apart by what the designs in the two poses do not share (a pad, a taper); where there is
+    nothing of the kind, or the scan does not show it, the answer is ``ambiguous``.
+    """
+    surface = sample_surface(part)
+    size = float(np.linalg.norm(surface.corners[7] - surface.corners[0]))
+    seeds = voxel_means(points, size / 150.0, least=2)
+    if len(seeds) < 50:
+        seeds = points
+    seeds = seeds[:: max(1, len(seeds) // SEED_POINTS)]
+    candidates = []
+    for T in principal_hypotheses(points, part):
+        fitted = icp.point_to_plane(seeds, surface.points, surface.normals, T, gates_mm=GATES_MM)
+        candidates.append((_misfit(seeds, surface, fitted.T_target_source), fitted.T_target_source, T))
+    candidates.sort(key=lambda item: item[0])
+    misfit, best, start = candidates[0]
+    # Half the points farther from the design than a thick plate: no pose explains the scan.
+    if not misfit < GATES_MM[-2]:
+        return Attitude(start, best, "failed", f"no attitude fits the design (typical distance {misfit:.0f} mm)")
+    message = ""
+    for rival_misfit, rival, rival_start in candidates[1:]:
+        if rival_misfit > RIVAL_RATIO * misfit + 0.5:
+            break
+        if _largest_move(best, rival, points) < SAME_POSE_MM:
+            continue
+        ours, theirs = _evidence(points, surface, best, rival)
+        more, fewer = max(ours, theirs), min(ours, theirs)
+        if more < LEAST_EVIDENCE or more < 3 * fewer:
+            turn = np.degrees(rigid.rotation_angle(best[:3, :3] @ rival[:3, :3].T))
+            message = f"the part fits its design as well when turned by {turn:.0f} deg; a mark on it would tell"
+        elif theirs > ours:
+            best, start, message = rival, rival_start, ""
+    return Attitude(start, best, "ambiguous" if message else "ok", message)
+
+
+def _misfit(points: Floats, surface: Surface, T: Floats) -> float:
+    """Median distance in mm of the points to the nearest design sample's plane."""
+    moved = rigid.apply(T, points)
+    distance, index = cKDTree(surface.points).query(moved)
+    normal_part = np.abs(np.einsum("ni,ni->n", moved - surface.points[index], surface.normals[index]))
+    # Beyond the surface's edge a point lies in the plane of its nearest sample and is far all the same.
+    spacing = 3.0 * float(np.median(distance))
+    return float(np.median(np.where(distance > 100.0 + spacing, distance, normal_part)))
+
+
+def _largest_move(T: Floats, other: Floats, points: Floats) -> float:
+    low, high = points.min(axis=0), points.max(axis=0)
+    box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
+    return float(np.linalg.norm(rigid.apply(T, box) - rigid.apply(other, box), axis=1).max())
+
+
+def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> tuple[int, int]:
+    """Count the scan points on design surface that only one of the poses has, for the best and for the rival."""
+    return (
+        _points_on(points, best, _only_in(surface, best, rival)),
+        _points_on(points, rival, _only_in(surface, rival, best)),
+    )
+
+
+def _only_in(surface: Surface, T: Floats, other: Floats) -> Floats:
+    """Give the samples of the design that, taken to the scan by T, are far from the design as ``other`` would place it."""
+    there = rigid.apply(other, rigid.apply(rigid.invert(T), surface.points))
+    # Near an edge the nearest sample can be on the other face: the least of several planes is the distance.
+    index = cKDTree(surface.points).query(there, k=8)[1]
+    planes = np.abs(np.einsum("nki,nki->nk", there[:, None] - surface.points[index], surface.normals[index]))
+    telling: Floats = surface.points[planes.min(axis=1) > TELLING_MM]
+    return telling
+
+
+def _points_on(points: Floats, T: Floats, samples: Floats) -> int:
+    """Count the points that lie, taken by T, within TELLING_MM of a sample."""
+    if len(samples) == 0:
+        return 0
+    moved = rigid.apply(T, points)
+    near = ((moved > samples.min(axis=0) - 50.0) & (moved < samples.max(axis=0) + 50.0)).all(axis=1)
+    if not near.any():
+        return 0
+    distance = cKDTree(samples).query(moved[near], distance_upper_bound=TELLING_MM)[0]
+    return int(np.isfinite(distance).sum())
