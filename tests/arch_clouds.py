@@ -23,9 +23,9 @@ def position(s, u, v):
 
 
 def widening(s, part):
-    """How much wider the feet get towards their base: 1 at the joint, 1.4 at the base."""
+    """How much wider the feet get towards their base: 1 up to 0.4 of their length, 1.4 at the base."""
     t = {0: 1.0 - s / (CUTS[1] * ARC), 4: (s / ARC - CUTS[4]) / (1.0 - CUTS[4])}.get(part, 0.0 * s)
-    return 1.0 + 0.4 * np.clip(t, 0.0, 1.0)
+    return 1.0 + 0.4 * np.clip((t - 0.4) / 0.6, 0.0, 1.0)
 
 
 def faces(part):

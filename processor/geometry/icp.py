@@ -60,28 +60,32 @@ def point_to_plane(
     start: Floats,
     *,
     gates_mm: tuple[float, ...],
-    iterations: int = 15,
+    tree: cKDTree | None = None,
+    max_iterations: int = 15,
 ) -> Alignment:
     """Align source (n, 3) to a surface given by samples target (m, 3) with unit normals (m, 3).
 
     Gauss-Newton on the distances along the normals, Huber-weighted by their median; pairs beyond the gate are left
-    out, gates in turn from wide to narrow. The rms is over the last gate's pairs.
+    out, gates in turn from wide to narrow. The rms is over the last gate's pairs. ``tree`` is of the target, if there
+    is one already.
     """
-    tree = cKDTree(target)
+    tree = cKDTree(target) if tree is None else tree
     T, rms, share, done = start, np.inf, 0.0, 0
     for gate in gates_mm:
-        for _ in range(iterations):
+        for _ in range(max_iterations):
             done += 1
             moved = rigid.apply(T, source)
-            distance, index = tree.query(moved)
-            index = np.minimum(index, len(target) - 1)
-            residual = np.einsum("ni,ni->n", moved - target[index], normals[index])
             # The nearest sample is up to a sample's spacing away along the surface; the gate is on the normal part.
-            keep = (np.abs(residual) <= gate) & (distance <= 3.0 * gate)
-            share = float(keep.mean())
-            if keep.sum() < 6:
+            distance, index = tree.query(moved, distance_upper_bound=3.0 * gate)
+            near = np.isfinite(distance)
+            p, at = moved[near], index[near]
+            n = normals[at]
+            r = np.einsum("ni,ni->n", p - target[at], n)
+            keep = np.abs(r) <= gate
+            p, n, r = p[keep], n[keep], r[keep]
+            share = len(r) / len(source)
+            if len(r) < 6:
                 return Alignment(T, np.inf, share, done)
-            r, n, p = residual[keep], normals[index[keep]], moved[keep]
             rms = float(np.sqrt(np.mean(r**2)))
             scale = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
             weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(r), 1e-12))
@@ -91,6 +95,6 @@ def point_to_plane(
             R = rigid.rotation_from_vector(step[:3])
             T = rigid.transform(R, centre + step[3:] - R @ centre) @ T
             reach = float(np.linalg.norm(p - centre, axis=1).max())
-            if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-4 * gate:
+            if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-3 * gate:
                 break
     return Alignment(T, rms, share, done)

@@ -15,11 +15,14 @@ from processor.geometry import icp, principal, rigid
 from processor.geometry.neighbors import voxel_means
 from processor.model import DesignPart, Floats
 
-GATES_MM = (400.0, 150.0, 50.0, 25.0, 12.0)
-SEED_POINTS = 3000
+COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
+FINE_GATES_MM = (50.0, 25.0, 12.0)  # for those that can still win
+COARSE_POINTS, FINE_POINTS = 600, 4000
+PROMISING = 4.0  # a hypothesis this many times worse than the best after the coarse gates is dropped
+NO_FIT_MM = 25.0  # typical distance to the design, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses that move no corner of the part by more are one and the same
 TELLING_MM = 10.0  # design surface this far from the rival's design can tell two poses apart
-LEAST_EVIDENCE = 10  # points on telling surface
+LEAST_EVIDENCE = 10  # samples of telling surface that the scan shows
 RIVAL_RATIO = 1.5  # a pose whose misfit is within this factor of the best is a rival
 
 
@@ -39,7 +42,8 @@ class Surface:
 
     points: Floats
     normals: Floats
-    corners: Floats  # of the bounding box (8, 3)
+    tree: cKDTree
+    size: float  # diagonal of the bounding box
 
 
 def sample_surface(part: DesignPart, count: int = 40_000) -> Surface:
@@ -58,9 +62,8 @@ def sample_surface(part: DesignPart, count: int = 40_000) -> Surface:
     u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
     at = a[triangle]
     points = at + u[:, None] * (b[triangle] - at) + v[:, None] * (c[triangle] - at)
-    low, high = part.vertices.min(axis=0), part.vertices.max(axis=0)
-    corners = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    return Surface(points, (cross / double_area[:, None])[triangle], corners)
+    size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
+    return Surface(points, (cross / double_area[:, None])[triangle], cKDTree(points), size)
 
 
 def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
@@ -83,19 +86,22 @@ def find(points: Floats, part: DesignPart) -> Attitude:
     nothing of the kind, or the scan does not show it, the answer is ``ambiguous``.
     """
     surface = sample_surface(part)
-    size = float(np.linalg.norm(surface.corners[7] - surface.corners[0]))
-    seeds = voxel_means(points, size / 150.0, least=2)
+    seeds = voxel_means(points, surface.size / 150.0, least=2)
     if len(seeds) < 50:
         seeds = points
-    seeds = seeds[:: max(1, len(seeds) // SEED_POINTS)]
-    candidates = []
+    coarse = []
     for T in principal_hypotheses(points, part):
-        fitted = icp.point_to_plane(seeds, surface.points, surface.normals, T, gates_mm=GATES_MM)
-        candidates.append((_misfit(seeds, surface, fitted.T_target_source), fitted.T_target_source, T))
+        fitted = _aligned(_thinned(seeds, COARSE_POINTS), surface, T, COARSE_GATES_MM)
+        coarse.append((_misfit(_thinned(seeds, COARSE_POINTS), surface, fitted), fitted, T))
+    promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + 1.0]
+    seeds = _thinned(seeds, FINE_POINTS)
+    candidates = []
+    for _, T_coarse, T in promising:
+        fitted = _aligned(seeds, surface, T_coarse, FINE_GATES_MM)
+        candidates.append((_misfit(seeds, surface, fitted), fitted, T))
     candidates.sort(key=lambda item: item[0])
     misfit, best, start = candidates[0]
-    # Half the points farther from the design than a thick plate: no pose explains the scan.
-    if not misfit < GATES_MM[-2]:
+    if misfit > NO_FIT_MM:
         return Attitude(start, best, "failed", f"no attitude fits the design (typical distance {misfit:.0f} mm)")
     message = ""
     for rival_misfit, rival, rival_start in candidates[1:]:
@@ -105,7 +111,7 @@ def find(points: Floats, part: DesignPart) -> Attitude:
             continue
         ours, theirs = _evidence(points, surface, best, rival)
         more, fewer = max(ours, theirs), min(ours, theirs)
-        if more < LEAST_EVIDENCE or more < 3 * fewer:
+        if more < LEAST_EVIDENCE or more < 2 * fewer:
             turn = np.degrees(rigid.rotation_angle(best[:3, :3] @ rival[:3, :3].T))
             message = f"the part fits its design as well when turned by {turn:.0f} deg; a mark on it would tell"
         elif theirs > ours:
@@ -113,10 +119,19 @@ def find(points: Floats, part: DesignPart) -> Attitude:
     return Attitude(start, best, "ambiguous" if message else "ok", message)
 
 
+def _thinned(points: Floats, count: int) -> Floats:
+    return points[:: max(1, len(points) // count)]
+
+
+def _aligned(points: Floats, surface: Surface, T: Floats, gates_mm: tuple[float, ...]) -> Floats:
+    found = icp.point_to_plane(points, surface.points, surface.normals, T, gates_mm=gates_mm, tree=surface.tree)
+    return found.T_target_source
+
+
 def _misfit(points: Floats, surface: Surface, T: Floats) -> float:
     """Median distance in mm of the points to the nearest design sample's plane."""
     moved = rigid.apply(T, points)
-    distance, index = cKDTree(surface.points).query(moved)
+    distance, index = surface.tree.query(moved)
     normal_part = np.abs(np.einsum("ni,ni->n", moved - surface.points[index], surface.normals[index]))
     # Beyond the surface's edge a point lies in the plane of its nearest sample and is far all the same.
     spacing = 3.0 * float(np.median(distance))
@@ -130,30 +145,30 @@ def _largest_move(T: Floats, other: Floats, points: Floats) -> float:
 
 
 def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> tuple[int, int]:
-    """Count the scan points on design surface that only one of the poses has, for the best and for the rival."""
+    """Count the shown samples of surface that only one of the poses has, for the best and for the rival."""
     return (
-        _points_on(points, best, _only_in(surface, best, rival)),
-        _points_on(points, rival, _only_in(surface, rival, best)),
+        _shown(points, best, _only_in(surface, best, rival)),
+        _shown(points, rival, _only_in(surface, rival, best)),
     )
 
 
 def _only_in(surface: Surface, T: Floats, other: Floats) -> Floats:
-    """Give the samples of the design that, taken to the scan by T, are far from the design as ``other`` would place it."""
+    """Give the samples of the design that, placed in the scan by T, are far from the design as ``other`` places it."""
     there = rigid.apply(other, rigid.apply(rigid.invert(T), surface.points))
     # Near an edge the nearest sample can be on the other face: the least of several planes is the distance.
-    index = cKDTree(surface.points).query(there, k=8)[1]
+    index = surface.tree.query(there, k=8)[1]
     planes = np.abs(np.einsum("nki,nki->nk", there[:, None] - surface.points[index], surface.normals[index]))
     telling: Floats = surface.points[planes.min(axis=1) > TELLING_MM]
     return telling
 
 
-def _points_on(points: Floats, T: Floats, samples: Floats) -> int:
-    """Count the points that lie, taken by T, within TELLING_MM of a sample."""
+def _shown(points: Floats, T: Floats, samples: Floats) -> int:
+    """Count the samples that have a point within TELLING_MM, the points taken by T."""
     if len(samples) == 0:
         return 0
     moved = rigid.apply(T, points)
-    near = ((moved > samples.min(axis=0) - 50.0) & (moved < samples.max(axis=0) + 50.0)).all(axis=1)
+    near = ((moved > samples.min(axis=0) - TELLING_MM) & (moved < samples.max(axis=0) + TELLING_MM)).all(axis=1)
     if not near.any():
         return 0
-    distance = cKDTree(samples).query(moved[near], distance_upper_bound=TELLING_MM)[0]
+    distance = cKDTree(moved[near]).query(samples, distance_upper_bound=TELLING_MM)[0]
     return int(np.isfinite(distance).sum())
