@@ -1,4 +1,4 @@
-"""A small arch bridge made with numpy alone: a circular soffit, box sections, five parts, for tests of the processor."""
+"""A small arch bridge made with numpy alone: circular soffit, box sections, five parts; for tests of the processor."""
 
 from __future__ import annotations
 

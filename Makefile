@@ -1,0 +1,47 @@
+# Everything runs in .venv; nothing is installed outside it but system libraries, and those only where they are missing.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+OUT ?= out
+
+.PHONY: demo test lint bench nightly clean system
+
+demo: $(VENV)/.demo
+	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
+
+test: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/python -m pytest -n 2 -m "not slow" --cov --cov-report=term --cov-fail-under=85
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+	$(BIN)/mypy
+
+bench: $(VENV)/.test
+	$(BIN)/python -m tests.bench.paper_comparison --output $(OUT)/bench.json
+
+nightly: $(VENV)/.test
+	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m tests.bench.paper_comparison --seeds 5 --sets D1,D2,D3 --output $(OUT)/nightly.json
+
+system:
+	@sh .ci/system-libraries
+
+$(BIN)/python:
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: pyproject.toml .ci/system-libraries | $(BIN)/python
+	@sh .ci/system-libraries
+	$(BIN)/python -m pip install --quiet --editable ".[designgen]"
+	@touch $@
+
+$(VENV)/.test: pyproject.toml .ci/system-libraries | $(BIN)/python
+	@sh .ci/system-libraries
+	$(BIN)/python -m pip install --quiet --editable ".[designgen,test]"
+	@touch $@ $(VENV)/.demo
+
+clean:
+	rm -rf $(VENV) $(OUT) build *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache
