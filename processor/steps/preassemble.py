@@ -50,6 +50,7 @@ class Params:
 
     method: str = METHODS[0]
     seed: int = 0
+    end_limit_mm: float = 100.0  # a joint end found farther than this from its place in the design is not used
     boxes: BoxParams = field(default_factory=BoxParams)
     slices: SliceParams = field(default_factory=SliceParams)
     match: MatchParams = field(default_factory=MatchParams)
@@ -142,35 +143,46 @@ def _extract(scan: Scan, index: int, design: ArchDesign, params: Params) -> _Par
     found = attitude.find(points, part)
     spacing = surface_spacing(points)
     ends: list[features.JointEdges | None] = []
+    trouble: list[str] = []
     for outward, joint in ((-1.0, index - 1), (1.0, index)):
         if not 0 <= joint < len(design.joint_names):
             ends.append(None)
             continue
-        corners = design.joint_points[joint]
-        T_joint_scan = rigid.invert(features.joint_frame(corners)) @ found.T_principal
-        size = np.array([np.linalg.norm(corners[0] - corners[1]), np.linalg.norm(corners[3] - corners[0])])
-        cut = features.cut_joint_end(points, T_joint_scan, outward, size, params.boxes)
-        rng = _generator(params, f"{part.name} {joint}")
-        edges = features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
-        T_scan_joint = rigid.invert(T_joint_scan)
-        ends.append(
-            None
-            if edges is None
-            else features.JointEdges(
-                rigid.apply(T_scan_joint, edges.points), rigid.apply(T_scan_joint, edges.key_points)
-            )
-        )
+        edges, said = _joint_end(points, found, design.joint_points[joint], outward, spacing, params, part.name)
+        ends.append(edges)
+        trouble += [f"{design.joint_names[joint]}: {said}"] if said else []
     left, right = features.slice_edges(points, found.T_principal, spacing, params.slices)
     bottom = errors.BottomEdges(
         left, right, Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
     )
-    wanted = (index > 0, index < len(design.joint_names))
-    trouble = ", ".join(
-        f"no joint edges found at the {which}"
-        for which, want, end in zip(("start", "end"), wanted, ends, strict=True)
-        if want and end is None
-    )
-    return _Part(part.name, scan, found, (ends[0], ends[1]), bottom, trouble)
+    return _Part(part.name, scan, found, (ends[0], ends[1]), bottom, "; ".join(trouble))
+
+
+def _joint_end(
+    points: Floats,
+    found: attitude.Attitude,
+    design_points: Floats,
+    outward: float,
+    spacing: float,
+    params: Params,
+    purpose: str,
+) -> tuple[features.JointEdges | None, str]:
+    """Edges of one joint end in the scan's frame, or None and the reason why there are none."""
+    T_joint_scan = rigid.invert(features.joint_frame(design_points)) @ found.T_principal
+    corners = design_points[:4]
+    size = np.array([np.linalg.norm(corners[0] - corners[1]), np.linalg.norm(corners[3] - corners[0])])
+    cut = features.cut_joint_end(points, T_joint_scan, outward, size, params.boxes)
+    rng = _generator(params, f"{purpose} {outward}")
+    edges = features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
+    if edges is None:
+        return None, "no joint edges found"
+    T_scan_joint = rigid.invert(T_joint_scan)
+    edges = features.JointEdges(rigid.apply(T_scan_joint, edges.points), rigid.apply(T_scan_joint, edges.key_points))
+    off = rigid.apply(found.T_surface, edges.key_points[:4]).mean(axis=0) - corners.mean(axis=0)
+    distance = float(np.linalg.norm(off))
+    if not distance <= params.end_limit_mm:
+        return None, f"what was taken for the joint's end lies {distance:.0f} mm from where the design has it"
+    return edges, ""
 
 
 def _assemble(parts: list[_Part], design: ArchDesign, params: Params) -> tuple[list[Floats], list[str]]:
