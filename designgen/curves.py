@@ -1,0 +1,120 @@
+"""Arch curves in closed form, by arc length.
+
+A curve lies in the XZ plane of the bridge, X = 0 at its start and Z = 0 at both ends; ``s`` is the arc length from
+the start in mm. The tangent looks along +X, the normal upward.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import brentq
+
+from processor.model import Floats, UsageError
+
+NAMES = ("parabola", "catenary", "circle")
+
+
+@dataclass(frozen=True)
+class Curve:
+    """A symmetric arch curve. Its functions take the arc length off the crown."""
+
+    span: float
+    rise: float
+    length: float
+    _place: Callable[[Floats], tuple[Floats, Floats]]  # x off the midspan, z below the crown
+    _angle: Callable[[Floats], Floats]  # slope, rad
+    _curvature: Callable[[Floats], Floats]  # 1/mm, positive
+
+    def frame(self, s: Floats) -> tuple[Floats, Floats, Floats]:
+        """Point, tangent and upward normal (n, 3 each) at arc lengths s (n,)."""
+        off = np.asarray(s, dtype=np.float64) - 0.5 * self.length
+        x, drop = self._place(off)
+        angle = self._angle(off)
+        zero, cos, sin = np.zeros_like(x), np.cos(angle), np.sin(angle)
+        point = np.stack([x + 0.5 * self.span, zero, self.rise - drop], axis=-1)
+        return point, np.stack([cos, zero, sin], axis=-1), np.stack([-sin, zero, cos], axis=-1)
+
+    def point(self, s: Floats, u: Floats, v: Floats) -> Floats:
+        """Points (n, 3) at arc lengths s, u to the left (+Y) and v along the upward normal."""
+        r, _, normal = self.frame(s)
+        found: Floats = r + np.asarray(v)[..., None] * normal
+        found[..., 1] += u
+        return found
+
+    def curvature(self, s: Floats) -> Floats:
+        """Curvature (n,) in 1/mm; the centre lies below."""
+        return self._curvature(np.asarray(s, dtype=np.float64) - 0.5 * self.length)
+
+
+def make(name: str, span: float, rise: float) -> Curve:
+    """Make one of NAMES with the span and rise in mm."""
+    if name == "parabola":
+        return _parabola(span, rise)
+    if name == "catenary":
+        return _catenary(span, rise)
+    if name == "circle":
+        return _circle(span, rise)
+    raise UsageError(f"bridge.curve: expected one of {', '.join(NAMES)}, got {name!r}")
+
+
+def _parabola(span: float, rise: float) -> Curve:
+    k = 4.0 * rise / span**2  # z below the crown = k x^2
+
+    def arc(x: Floats) -> Floats:
+        t = 2.0 * k * x
+        result: Floats = (t * np.sqrt(1.0 + t * t) + np.arcsinh(t)) / (4.0 * k)
+        return result
+
+    def x_of(s: Floats) -> Floats:
+        x = np.array(s)
+        for _ in range(50):  # Newton: the arc length is convex on either side, so this converges from outside
+            step = (arc(x) - s) / np.sqrt(1.0 + (2.0 * k * x) ** 2)
+            x = x - step
+            if np.max(np.abs(step), initial=0.0) < 1e-10 * span:
+                break
+        return x
+
+    def place(s: Floats) -> tuple[Floats, Floats]:
+        x = x_of(s)
+        return x, k * x * x
+
+    return Curve(
+        span,
+        rise,
+        2.0 * float(arc(np.array(0.5 * span))),
+        place,
+        lambda s: np.arctan(-2.0 * k * x_of(s)),
+        lambda s: 2.0 * k / (1.0 + (2.0 * k * x_of(s)) ** 2) ** 1.5,
+    )
+
+
+def _catenary(span: float, rise: float) -> Curve:
+    half = 0.5 * span
+    # a (cosh(half / a) - 1) = rise; with q = half / a the left side grows with q from 0
+    q = brentq(lambda q: half * (math.cosh(q) - 1.0) / q - rise, 1e-9, 50.0, xtol=1e-15, rtol=1e-15)
+    a = half / q
+    return Curve(
+        span,
+        rise,
+        2.0 * a * math.sinh(q),
+        lambda s: (a * np.arcsinh(s / a), np.sqrt(a * a + s * s) - a),
+        lambda s: np.arctan(-s / a),
+        lambda s: a / (a * a + s * s),
+    )
+
+
+def _circle(span: float, rise: float) -> Curve:
+    R = (0.25 * span**2 + rise**2) / (2.0 * rise)
+    # Above a half circle the curve would overhang; the recipe's checks keep the rise below half the span.
+    return Curve(
+        span,
+        rise,
+        2.0 * R * math.asin(0.5 * span / R),
+        lambda s: (R * np.sin(s / R), R * (1.0 - np.cos(s / R))),
+        lambda s: -s / R,
+        lambda s: np.full_like(s, 1.0 / R),
+    )

@@ -1,0 +1,77 @@
+"""Arch bridge of five parts: foot1, rib1, rib2, rib3, foot2."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+from designgen import curves
+from designgen.designs import arch_foot, arch_rib
+from designgen.designs.arch_part import ArchPart, Plates
+from processor.model import UsageError
+
+ABOUT = "arch bridge: two feet and three ribs along a parabola, catenary or circle"
+NAMES = ("foot1", "rib1", "rib2", "rib3", "foot2")
+
+
+@dataclass(frozen=True)
+class Params:
+    """Size of the bridge in mm; ``joints`` are fractions of the soffit's arc length."""
+
+    curve: str = "parabola"
+    span_mm: float = 24_000.0
+    rise_mm: float = 6_000.0
+    width_mm: float = 900.0
+    height_mm: float = 1_100.0
+    plate_bottom_mm: float = 24.0
+    plate_top_mm: float = 24.0
+    plate_web_mm: float = 20.0
+    base_width_mm: float = 1_300.0
+    base_height_mm: float = 1_600.0
+    joints: tuple[float, ...] = (0.19, 0.40, 0.60, 0.81)
+    taper: float = 0.6
+
+    def __post_init__(self) -> None:
+        for key in ("span_mm", "rise_mm", "width_mm", "height_mm", "plate_bottom_mm", "plate_top_mm", "plate_web_mm"):
+            _expect(getattr(self, key) > 0.0, key, getattr(self, key), "a length above 0")
+        _expect(self.curve in curves.NAMES, "curve", self.curve, f"one of {', '.join(curves.NAMES)}")
+        _expect(self.rise_mm < 0.5 * self.span_mm, "rise_mm", self.rise_mm, "less than half of span_mm")
+        _expect(
+            self.plate_web_mm < 0.5 * self.width_mm, "plate_web_mm", self.plate_web_mm, "less than half of width_mm"
+        )
+        plates = self.plate_bottom_mm + self.plate_top_mm
+        _expect(plates < self.height_mm, "plate_bottom_mm + plate_top_mm", plates, "less than height_mm")
+        _expect(self.base_width_mm >= self.width_mm, "base_width_mm", self.base_width_mm, "at least width_mm")
+        _expect(self.base_height_mm >= self.height_mm, "base_height_mm", self.base_height_mm, "at least height_mm")
+        _expect(0.0 < self.taper < 1.0, "taper", self.taper, "between 0 and 1")
+        cuts = (0.0, *self.joints, 1.0)
+        rising = len(self.joints) == 4 and all(a < z for a, z in pairwise(cuts))
+        _expect(rising, "joints", list(self.joints), "four rising fractions between 0 and 1")
+
+
+def _expect(fits: bool, key: str, came: object, expected: str) -> None:
+    if not fits:
+        raise UsageError(f"bridge.{key}: expected {expected}, got {came}")
+
+
+def build(params: Params) -> tuple[ArchPart, ...]:
+    """Build the five parts, in order."""
+    curve = curves.make(params.curve, params.span_mm, params.rise_mm)
+    plates = Plates(params.plate_bottom_mm, params.plate_top_mm, params.plate_web_mm)
+    cuts = [curve.length * c for c in (0.0, *params.joints, 1.0)]
+    parts = []
+    for i, name in enumerate(NAMES):
+        section = {"s0_mm": cuts[i], "s1_mm": cuts[i + 1], "width_mm": params.width_mm, "height_mm": params.height_mm}
+        if name.startswith("rib"):
+            parts.append(arch_rib.build(name, curve, arch_rib.Params(**section, plates=plates)))
+            continue
+        foot = arch_foot.Params(
+            **section,
+            base_width_mm=params.base_width_mm,
+            base_height_mm=params.base_height_mm,
+            taper=params.taper,
+            plates=plates,
+            base_at="start" if i == 0 else "end",
+        )
+        parts.append(arch_foot.build(name, curve, foot))
+    return tuple(parts)

@@ -1,0 +1,31 @@
+"""Arch rib: a hollow box of four plates along the curve, open at both ends."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from designgen.curves import Curve
+from designgen.designs.arch_part import ArchPart, Plates
+
+ABOUT = "arch rib: hollow box section of four plates, open at both ends"
+
+
+@dataclass(frozen=True)
+class Params:
+    """A rib between arc lengths s0 and s1 (mm)."""
+
+    s0_mm: float
+    s1_mm: float
+    width_mm: float
+    height_mm: float
+    plates: Plates
+
+
+def build(name: str, curve: Curve, params: Params) -> ArchPart:
+    """Build the rib on a curve."""
+    b, h = 0.5 * params.width_mm, params.height_mm
+    return ArchPart(
+        name, curve, params.plates, np.array([params.s0_mm, params.s1_mm]), np.array([b, b]), np.array([h, h])
+    )

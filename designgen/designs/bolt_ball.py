@@ -1,0 +1,125 @@
+"""Bolt ball: a sphere with a milled flat and a threaded hole a member, and a process hole at its lowest point.
+
+Sizes follow the pattern of catalogues and are plausible, not those of a standard.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from processor.model import Floats, UsageError
+
+if TYPE_CHECKING:
+    import cadquery as cq
+
+ABOUT = "bolt ball: sphere with milled flats, threaded holes and a process hole"
+PROCESS_HOLE_RADIUS_MM, PROCESS_HOLE_DEPTH_MM = 10.0, 35.0
+
+
+@dataclass(frozen=True)
+class Connection:
+    """How a tube is joined to a ball (mm): bolt, hexagonal sleeve and cone."""
+
+    tube_diameter: float
+    bolt: float
+    across_flats: float
+    sleeve_length: float
+    cone_length: float
+
+    @property
+    def sleeve_corner_radius(self) -> float:
+        """Radius of the sleeve's corners."""
+        return self.across_flats / math.sqrt(3.0)
+
+    @property
+    def flat_radius(self) -> float:
+        """Radius of the flat milled for the sleeve."""
+        return self.sleeve_corner_radius + 1.0
+
+
+CONNECTIONS = (
+    Connection(60.0, 20.0, 34.0, 35.0, 50.0),
+    Connection(75.5, 24.0, 41.0, 40.0, 60.0),
+    Connection(88.5, 27.0, 46.0, 45.0, 70.0),
+    Connection(114.0, 33.0, 55.0, 50.0, 80.0),
+    Connection(140.0, 39.0, 65.0, 60.0, 100.0),
+)
+
+
+def connection(tube_diameter: float) -> Connection:
+    """Return the connection for a tube; UsageError names the tubes there are."""
+    for found in CONNECTIONS:
+        if found.tube_diameter == tube_diameter:
+            return found
+    known = ", ".join(f"{c.tube_diameter:g}" for c in CONNECTIONS)
+    raise UsageError(f"frame.tube_diameter_mm: expected one of {known}, got {tube_diameter:g}")
+
+
+@dataclass(frozen=True)
+class Params:
+    """A ball of radius ``radius_mm`` and the unit directions (m, 3) of its members."""
+
+    radius_mm: float
+    directions: Floats
+    connection: Connection
+    process_hole: bool = True
+
+    def __post_init__(self) -> None:
+        if not self.radius_mm > self.connection.flat_radius:
+            raise UsageError(
+                f"frame.radii_mm: expected more than the flat's radius {self.connection.flat_radius:.1f}, "
+                f"got {self.radius_mm:g}"
+            )
+        least = least_radius(self.directions, self.connection)
+        if self.radius_mm < least:
+            raise UsageError(
+                f"frame.radii_mm: expected at least {least:.1f} so that sleeves do not meet, got {self.radius_mm:g}"
+            )
+
+    @property
+    def flat_distance(self) -> float:
+        """Distance of a flat from the centre."""
+        return math.sqrt(self.radius_mm**2 - self.connection.flat_radius**2)
+
+
+def least_radius(directions: Floats, joined: Connection) -> float:
+    """Smallest ball on which sleeves along unit directions (m, 3) do not meet: rc / sin(least angle / 2)."""
+    if len(directions) < 2:
+        return 0.0
+    cosines = directions @ directions.T - 2.0 * np.eye(len(directions))
+    angle = math.acos(min(1.0, max(-1.0, float(cosines.max()))))
+    return joined.sleeve_corner_radius / math.sin(0.5 * angle)
+
+
+def build(params: Params) -> cq.Shape:
+    """Build the CadQuery solid, centred at the origin."""
+    import cadquery as cq
+
+    R, joined = params.radius_mm, params.connection
+    ball: cq.Shape = cq.Solid.makeSphere(R, cq.Vector(0, 0, 0), cq.Vector(0, 0, 1), -90, 90, 360)
+    for direction in params.directions:
+        out = cq.Vector(*direction)
+        flat = cq.Solid.makeCylinder(2.0 * R, R, out * params.flat_distance, out)
+        bore = cq.Solid.makeCylinder(0.5 * joined.bolt, 0.8 * R, out * (0.3 * R), out)
+        ball = ball.cut(flat).cut(bore)
+    if params.process_hole:
+        hole = cq.Solid.makeCylinder(
+            PROCESS_HOLE_RADIUS_MM, PROCESS_HOLE_DEPTH_MM, cq.Vector(0, 0, -R), cq.Vector(0, 0, 1)
+        )
+        ball = ball.cut(hole)
+    return ball
+
+
+def exposed(params: Params, directions: Floats) -> np.ndarray:
+    """Mark the unit directions (n, 3) in which the sphere's own surface is left by the flats and the process hole."""
+    kept = np.ones(len(directions), bool)
+    for flat in params.directions:
+        kept &= params.radius_mm * (directions @ flat) < params.flat_distance
+    if params.process_hole:
+        off_axis = params.radius_mm * np.hypot(directions[:, 0], directions[:, 1])
+        kept &= (off_axis > PROCESS_HOLE_RADIUS_MM) | (directions[:, 2] > 0.0)
+    return kept

@@ -1,0 +1,158 @@
+"""Scans as point clouds. Mode ``surface``: random points on the exact surface with isotropic noise, as papers do.
+
+A mode that casts rays from stations belongs beside it; :func:`designgen.scene.make` dispatches on ``scan.mode``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from designgen.designs import arch_part, bolt_ball, space_frame
+from designgen.designs.arch_part import Face
+from processor.model import SOURCES, Floats, Ints, UsageError
+
+MODES = ("surface",)
+OUTLIER = SOURCES.index("outlier")
+
+
+@dataclass(frozen=True)
+class Params:
+    """How a scene is scanned (mm). ``spacing_mm`` d means one point in d^2 on average."""
+
+    mode: str = "surface"
+    spacing_mm: float = 10.0
+    sigma_mm: float = 1.0  # of each coordinate
+    outlier_share: float = 0.0  # of all points, anywhere in the part's box and a tenth around it
+    inner_depth_mm: float = 1000.0  # how far into an open end the inner faces are seen
+    member_reach_mm: float = 0.0  # frames: members are sampled this far from each ball; 0 = all along
+
+    def __post_init__(self) -> None:
+        _expect(self.mode in MODES, "mode", self.mode, f"one of {', '.join(MODES)}")
+        _expect(0.05 <= self.spacing_mm <= 1000.0, "spacing_mm", self.spacing_mm, "0.05 to 1000")
+        _expect(0.0 <= self.sigma_mm <= 1000.0, "sigma_mm", self.sigma_mm, "0 to 1000")
+        _expect(0.0 <= self.outlier_share < 1.0, "outlier_share", self.outlier_share, "0 to less than 1")
+        _expect(self.inner_depth_mm > 0.0, "inner_depth_mm", self.inner_depth_mm, "a length above 0")
+        _expect(self.member_reach_mm >= 0.0, "member_reach_mm", self.member_reach_mm, "0 or a length")
+
+
+def _expect(fits: bool, key: str, came: object, expected: str) -> None:
+    if not fits:
+        raise UsageError(f"scan.{key}: expected {expected}, got {came}")
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """Points (n, 3), the part each belongs to (-1 = none) and its source (a row of SOURCES)."""
+
+    points: Floats
+    part: Ints
+    source: Ints
+
+
+def scan_part(part: arch_part.ArchPart, number: int, params: Params, rng: np.random.Generator) -> Cloud:
+    """Scan one arch part in the bridge's frame; its points are labelled with its number."""
+    faces = arch_part.faces(part, params.inner_depth_mm)
+    points = np.vstack([_on_face(face, params.spacing_mm, rng) for face in faces])
+    return _with_errors(points, np.full(len(points), number), params, rng)
+
+
+def scan_frame(frame: space_frame.Frame, params: Params, rng: np.random.Generator) -> Cloud:
+    """Scan a whole frame; points of a ball are labelled with its node, those of members with -1."""
+    clouds, labels = [], []
+    for node, centre in enumerate(frame.centres):
+        ball = frame.ball(node)
+        count = rng.poisson(4.0 * np.pi * ball.radius_mm**2 / params.spacing_mm**2)
+        unit = _unit_vectors(count, rng)
+        unit = unit[bolt_ball.exposed(ball, unit)]
+        clouds.append(centre + ball.radius_mm * unit)
+        labels.append(np.full(len(unit), node))
+    for i, j in frame.members:
+        members = _member(frame, int(i), int(j), params, rng)
+        clouds.append(members)
+        labels.append(np.full(len(members), -1))
+    return _with_errors(np.vstack(clouds), np.concatenate(labels), params, rng)
+
+
+def _on_face(face: Face, spacing_mm: float, rng: np.random.Generator) -> Floats:
+    """Points (n, 3) on a face, uniform by area: proposals in (p, q), kept in proportion to the area element."""
+    p, q = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 5), indexing="ij"))
+    highest = 1.001 * float(face.element(p, q).max())
+    count = rng.poisson(highest / spacing_mm**2)
+    p, q = rng.uniform(size=count), rng.uniform(size=count)
+    kept = rng.uniform(size=count) * highest < face.element(p, q)
+    return face.at(p[kept], q[kept])
+
+
+def _unit_vectors(count: int, rng: np.random.Generator) -> Floats:
+    z = rng.uniform(-1.0, 1.0, count)
+    angle = rng.uniform(0.0, 2.0 * np.pi, count)
+    rho = np.sqrt(1.0 - z * z)
+    return np.stack([rho * np.cos(angle), rho * np.sin(angle), z], axis=1)
+
+
+def _member(frame: space_frame.Frame, i: int, j: int, params: Params, rng: np.random.Generator) -> Floats:
+    """Sleeves, cones and tube between two nodes, as surfaces of revolution (the sleeve hexagonal) about the axis."""
+    joined, a, b = frame.connection, frame.centres[i], frame.centres[j]
+    length = float(np.linalg.norm(b - a))
+    unit = (b - a) / length
+    side = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
+    side /= np.linalg.norm(side)
+    basis = np.stack([side, np.cross(unit, side), unit])
+    reach = params.member_reach_mm or length
+    tube = 0.5 * joined.tube_diameter
+    found = []
+    starts = []
+    for node, origin, sign in ((i, a, 1.0), (j, b, -1.0)):
+        flat = frame.ball(node).flat_distance
+        tip = flat + joined.sleeve_length
+        end = tip + joined.cone_length
+        axial = basis * np.array([[1.0], [1.0], [sign]])
+        sleeve = _prism(joined.sleeve_corner_radius, flat, tip, params.spacing_mm, rng)
+        cone = _cone(joined.sleeve_corner_radius + 3.0, tube, tip, end, params.spacing_mm, rng)
+        near = [sleeve, cone]
+        if end < reach < 0.5 * length:
+            near.append(_cone(tube, tube, end, reach, params.spacing_mm, rng))
+        found += [origin + cloud @ axial for cloud in near]
+        starts.append(end)
+    if reach >= 0.5 * length:
+        found.append(a + _cone(tube, tube, starts[0], length - starts[1], params.spacing_mm, rng) @ basis)
+    return np.vstack(found)
+
+
+def _cone(r0: float, r1: float, z0: float, z1: float, spacing_mm: float, rng: np.random.Generator) -> Floats:
+    """Points on a cone or cylinder about z, uniform by area."""
+    slant = np.hypot(z1 - z0, r1 - r0)
+    count = rng.poisson(np.pi * (r0 + r1) * slant / spacing_mm**2)
+    t = rng.uniform(size=count)
+    if r0 != r1:  # the share of the area up to t is that of r^2
+        t = (np.sqrt(r0 * r0 + t * (r1 * r1 - r0 * r0)) - r0) / (r1 - r0)
+    r, angle = r0 + t * (r1 - r0), rng.uniform(0.0, 2.0 * np.pi, count)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z0 + t * (z1 - z0)], axis=1)
+
+
+def _prism(corner_radius: float, z0: float, z1: float, spacing_mm: float, rng: np.random.Generator) -> Floats:
+    """Points on the six sides of a hexagonal prism about z (a hexagon's side is its corner radius)."""
+    count = rng.poisson(6.0 * corner_radius * (z1 - z0) / spacing_mm**2)
+    side, q = rng.integers(0, 6, count), rng.uniform(-0.5, 0.5, count) * corner_radius
+    apothem = corner_radius * np.sqrt(0.75)
+    angle = (side + 0.5) * np.pi / 3.0
+    x = apothem * np.cos(angle) - q * np.sin(angle)
+    y = apothem * np.sin(angle) + q * np.cos(angle)
+    return np.stack([x, y, rng.uniform(z0, z1, count)], axis=1)
+
+
+def _with_errors(points: Floats, part: Ints, params: Params, rng: np.random.Generator) -> Cloud:
+    """Add noise to every coordinate, and outliers after the points."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    if params.sigma_mm > 0.0:
+        points = points + params.sigma_mm * rng.standard_normal(points.shape)
+    source = np.zeros(len(points), np.int64)
+    if params.outlier_share > 0.0:
+        count = round(len(points) * params.outlier_share / (1.0 - params.outlier_share))
+        margin = 0.1 * (high - low)
+        points = np.vstack([points, rng.uniform(low - margin, high + margin, (count, 3))])
+        part = np.concatenate([part, np.full(count, -1)])
+        source = np.concatenate([source, np.full(count, OUTLIER)])
+    return Cloud(points, part.astype(np.int64), source)
