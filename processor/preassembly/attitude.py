@@ -15,6 +15,7 @@ from processor.geometry import icp, principal, rigid
 from processor.geometry.neighbors import voxel_means
 from processor.model import DesignPart, Floats
 
+SAMPLE_SPACING_MM = 30.0  # of the design's surface: a mark of 0.1 m shows in ten samples
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for those that can still win
 COARSE_POINTS, FINE_POINTS = 600, 4000
@@ -46,14 +47,15 @@ class Surface:
     size: float  # diagonal of the bounding box
 
 
-def sample_surface(part: DesignPart, count: int = 40_000) -> Surface:
-    """Spread about ``count`` samples over the part's triangles, on a fixed low-discrepancy pattern."""
+def sample_surface(part: DesignPart) -> Surface:
+    """Spread samples over the part's triangles, on a fixed low-discrepancy pattern."""
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     cross = np.cross(b - a, c - a)
     double_area = np.linalg.norm(cross, axis=1)
     used = double_area > 0.0
     a, b, c, cross, double_area = a[used], b[used], c[used], cross[used], double_area[used]
     cumulative = np.cumsum(double_area)
+    count = int(np.clip(0.5 * cumulative[-1] / SAMPLE_SPACING_MM**2, 2_000, 400_000))
     i = np.arange(count)
     triangle = np.searchsorted(cumulative, (i + 0.5) / count * cumulative[-1])
     # The R2 sequence (plastic number), folded from the square onto the triangle.

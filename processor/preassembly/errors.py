@@ -33,20 +33,23 @@ class LinearError:
 
     @property
     def mean(self) -> float:
-        """Mean over all stations of both edges; NaN without any."""
-        return float(np.mean(self.deviation)) if len(self.deviation) else float("nan")
+        """Mean over all stations of both edges that have points; NaN without any."""
+        known = self.deviation[np.isfinite(self.deviation)]
+        return float(np.mean(known)) if len(known) else float("nan")
 
     @property
     def max(self) -> float:
-        """Largest over all stations of both edges; NaN without any."""
-        return float(np.max(self.deviation)) if len(self.deviation) else float("nan")
+        """Largest over all stations of both edges that have points; NaN without any."""
+        known = self.deviation[np.isfinite(self.deviation)]
+        return float(np.max(known)) if len(known) else float("nan")
 
 
 def linear_error(parts: list[BottomEdges], poses: list[Floats]) -> LinearError:
     """Linear error of parts at poses T_bridge_scan, a station every 200 mm of both edges.
 
-    At a station it is the length of the mean vector from the design's edge to the scanned points of the 200 mm
-    around: single distances would all be positive and never fall below the noise.
+    The stations are those of the design, NaN where no scanned point is near. The deviation at a station is the length
+    of the mean vector from the design's edge to the scanned points of the 200 mm around: single distances would all be
+    positive and never fall below the noise.
     """
     stations: list[float] = []
     edges: list[str] = []
@@ -56,15 +59,17 @@ def linear_error(parts: list[BottomEdges], poses: list[Floats]) -> LinearError:
         for part, pose in zip(parts, poses, strict=True):
             design: Polyline = getattr(part, f"design_{edge}")
             points: Floats = getattr(part, edge)
+            count = int(np.ceil(design.length / STATION_MM))
+            vectors = np.full((count, 3), np.nan)
             if len(points) and np.isfinite(pose).all():
                 s, offset = design.nearest(rigid.apply(pose, points))
                 inner = (s > 0.0) & (s < design.length)  # beyond the ends the vector is not square to the edge
                 cell = np.floor(s[inner] / STATION_MM).astype(np.int64)
                 for c in np.unique(cell):
-                    vector = offset[inner][cell == c].mean(axis=0)
-                    stations.append(before + (c + 0.5) * STATION_MM)
-                    edges.append(edge)
-                    deviations.append(float(np.linalg.norm(vector)))
+                    vectors[c] = offset[inner][cell == c].mean(axis=0)
+            stations += [before + (c + 0.5) * STATION_MM for c in range(count)]
+            edges += [edge] * count
+            deviations += np.linalg.norm(vectors, axis=1).tolist()
             before += design.length
     return LinearError(np.array(stations), tuple(edges), np.array(deviations))
 

@@ -43,10 +43,11 @@ class SliceParams:
     """Parameters of the slices; the paper's values where it gives them."""
 
     thickness: float = 0.5  # of a slice, in spacings
+    check_thickness: float = 4.0  # the same for the edges that the linear error is taken from
     search_offset_mm: float = 200.0  # of the lines l1, l2 beyond the part's box
-    filter_radius: float = 4.0  # of the radius filter, in spacings
+    filter_radius: float = 4.0  # of the radius filter, in spacings or slices, whichever is longer
     filter_neighbours: int = 3
-    direction_radius: float = 20.0  # neighbourhood of the direction filter, in spacings
+    direction_radius: float = 20.0  # neighbourhood of the direction filter, likewise
     direction_limit_deg: float = 30.0  # from the part's main direction
 
 
@@ -131,11 +132,14 @@ def reduced_boxes(
     return JointEdges(np.vstack(edges), np.array(corners + middles))
 
 
-def slice_edges(points: Floats, T_bridge_scan: Floats, spacing_mm: float, params: SliceParams) -> tuple[Floats, Floats]:
+def slice_edges(
+    points: Floats, T_bridge_scan: Floats, spacing_mm: float, thickness: float, params: SliceParams
+) -> tuple[Floats, Floats]:
     """Bottom edges, left (k, 3) and right (m, 3), of a part in its scan's frame (paper 000, section 2.4, figure 9).
 
     The part is levelled by its principal axes, X along it and Z up as ``T_bridge_scan`` has them. In each slice and
     half the point nearest to l1 or l2 is taken; lone points and points that run across the part are filtered out.
+    ``thickness`` is that of a slice in spacings: the thicker, the more points to choose from, the nearer to the edge.
     """
     axes = principal.of_points(points).axes
     up = T_bridge_scan[:3, :3].T @ np.array([0.0, 0.0, 1.0])
@@ -147,7 +151,7 @@ def slice_edges(points: Floats, T_bridge_scan: Floats, spacing_mm: float, params
     level = points @ R.T
     low, high = level.min(axis=0), level.max(axis=0)
     middle = 0.5 * (low[1] + high[1])
-    in_slice = np.floor((level[:, 0] - low[0]) / (params.thickness * spacing_mm)).astype(np.int64)
+    in_slice = np.floor((level[:, 0] - low[0]) / (thickness * spacing_mm)).astype(np.int64)
     sides = []
     for left in (True, False):
         side = np.flatnonzero((level[:, 1] >= middle) == left)
@@ -157,20 +161,21 @@ def slice_edges(points: Floats, T_bridge_scan: Floats, spacing_mm: float, params
         nearest = np.full(in_slice.max() + 1, np.inf)
         np.minimum.at(nearest, in_slice[side], distance)
         picked = side[distance == nearest[in_slice[side]]]
-        sides.append(points[picked[_runs_along(level[picked], spacing_mm, params)]])
+        radius, reach = (k * max(1.0, thickness) * spacing_mm for k in (params.filter_radius, params.direction_radius))
+        sides.append(points[picked[_runs_along(level[picked], radius, reach, params)]])
     return sides[0], sides[1]
 
 
-def _runs_along(level: Floats, spacing_mm: float, params: SliceParams) -> np.ndarray:
+def _runs_along(level: Floats, radius_mm: float, reach_mm: float, params: SliceParams) -> np.ndarray:
     """Mark points (n,) with neighbours enough whose local direction is near the part's (its X axis)."""
     tree = cKDTree(level)
-    counts = tree.query_ball_point(level, params.filter_radius * spacing_mm, return_length=True) - 1
+    counts = tree.query_ball_point(level, radius_mm, return_length=True) - 1
     keep = counts >= params.filter_neighbours
     limit = np.cos(np.radians(params.direction_limit_deg))
     near = cKDTree(level[keep]) if keep.any() else tree
     kept = level[keep]
     for i, point in zip(np.flatnonzero(keep), kept, strict=True):
-        neighbours = kept[near.query_ball_point(point, params.direction_radius * spacing_mm)]
+        neighbours = kept[near.query_ball_point(point, reach_mm)]
         local = neighbours - neighbours.mean(axis=0)
         keep[i] = abs(np.linalg.eigh(local.T @ local)[1][0, 2]) >= limit
     return np.asarray(keep, bool)

@@ -93,14 +93,15 @@ class Result(Checked):
 
 
 @dataclass(frozen=True)
-class _Part:
+class Part:
     """What was taken from one scan: its attitude, joint ends (None where none was found) and bottom edges."""
 
     name: str
     scan: Scan
     attitude: attitude.Attitude
     ends: tuple[features.JointEdges | None, features.JointEdges | None]  # start, end; scan's frame, origin taken off
-    edges: errors.BottomEdges
+    lines: Floats  # (n, 3) along both bottom edges, for matching; scan's frame
+    edges: errors.BottomEdges  # the same from thicker slices, for the linear error
     trouble: str
 
 
@@ -114,7 +115,16 @@ def run(scene: Scene, params: Params) -> Result:
     design = scene.arch
     if design is None or len(design.parts) < 2:
         raise InputError(f"{scene.name}: preassembly needs an arch-bridge design of at least two parts (design.json)")
-    parts = [_extract(scan, index, design, params) for index, scan in enumerate(_scans_in_order(scene, design))]
+    return assemble(extract(scene, design, params), design, params)
+
+
+def extract(scene: Scene, design: ArchDesign, params: Params) -> list[Part]:
+    """Take from every scan what any of the methods needs, in assembly order; errors as of run."""
+    return [_extract(scan, index, design, params) for index, scan in enumerate(_scans_in_order(scene, design))]
+
+
+def assemble(parts: list[Part], design: ArchDesign, params: Params) -> Result:
+    """Assemble extracted parts by the method of the parameters."""
     poses, messages = _assemble(parts, design, params)
     return _result(parts, poses, messages, design, params)
 
@@ -137,7 +147,7 @@ def _generator(params: Params, purpose: str) -> np.random.Generator:
     return np.random.default_rng([params.seed, zlib.crc32(purpose.encode())])
 
 
-def _extract(scan: Scan, index: int, design: ArchDesign, params: Params) -> _Part:
+def _extract(scan: Scan, index: int, design: ArchDesign, params: Params) -> Part:
     part = design.parts[index]
     points = scan.points
     found = attitude.find(points, part)
@@ -151,11 +161,15 @@ def _extract(scan: Scan, index: int, design: ArchDesign, params: Params) -> _Par
         edges, said = _joint_end(points, found, design.joint_points[joint], outward, spacing, params, part.name)
         ends.append(edges)
         trouble += [f"{design.joint_names[joint]}: {said}"] if said else []
-    left, right = features.slice_edges(points, found.T_principal, spacing, params.slices)
-    bottom = errors.BottomEdges(
-        left, right, Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
+    slices = params.slices
+    lines, checked = (
+        features.slice_edges(points, found.T_principal, spacing, thickness, slices)
+        for thickness in (slices.thickness, slices.check_thickness)
     )
-    return _Part(part.name, scan, found, (ends[0], ends[1]), bottom, "; ".join(trouble))
+    bottom = errors.BottomEdges(
+        *checked, Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
+    )
+    return Part(part.name, scan, found, (ends[0], ends[1]), np.vstack(lines), bottom, "; ".join(trouble))
 
 
 def _joint_end(
@@ -185,7 +199,7 @@ def _joint_end(
     return edges, ""
 
 
-def _assemble(parts: list[_Part], design: ArchDesign, params: Params) -> tuple[list[Floats], list[str]]:
+def _assemble(parts: list[Part], design: ArchDesign, params: Params) -> tuple[list[Floats], list[str]]:
     """Chain the parts from the first: T_bridge_scan of each (NaN where the chain is broken) and a message each."""
     poses = [_place_first(parts[0], design, params)]
     messages = [""]
@@ -199,7 +213,7 @@ def _assemble(parts: list[_Part], design: ArchDesign, params: Params) -> tuple[l
 NOWHERE = np.full((4, 4), np.nan)
 
 
-def _place_first(part: _Part, design: ArchDesign, params: Params) -> Floats:
+def _place_first(part: Part, design: ArchDesign, params: Params) -> Floats:
     end = part.ends[1]
     if end is None:
         return NOWHERE
@@ -208,12 +222,12 @@ def _place_first(part: _Part, design: ArchDesign, params: Params) -> Floats:
     T = _shifted(T, corners.mean(axis=0) - rigid.apply(T, end.key_points[:4]).mean(axis=0))
     if params.method != "design-aided":
         return T
-    source = np.vstack([end.points, part.edges.left, part.edges.right])
+    source = np.vstack([end.points, part.lines])
     target = np.vstack([_outline(corners, 5.0), _design_lines(part, 5.0)])
     return matching.by_lines(source, target, T, params.match, _generator(params, "match " + part.name)).T_bridge_scan
 
 
-def _place_next(before: _Part, T_before: Floats, part: _Part, params: Params) -> matching.Placement:
+def _place_next(before: Part, T_before: Floats, part: Part, params: Params) -> matching.Placement:
     theirs, ours = before.ends[1], part.ends[0]
     if theirs is None or ours is None or not np.isfinite(T_before).all():
         return matching.Placement(NOWHERE, "not placed: the chain is broken before it")
@@ -226,7 +240,7 @@ def _place_next(before: _Part, T_before: Floats, part: _Part, params: Params) ->
     )
     source, target = ours.points, rigid.apply(T_before, theirs.points)
     if params.method == "design-aided":
-        source = np.vstack([source, part.edges.left, part.edges.right])
+        source = np.vstack([source, part.lines])
         target = np.vstack([target, _design_lines(part, 5.0)])
     return matching.by_lines(source, target, start, params.match, _generator(params, "match " + part.name))
 
@@ -241,13 +255,13 @@ def _outline(corners: Floats, spacing_mm: float) -> Floats:
     return ring.at(np.arange(0.0, ring.length, spacing_mm))
 
 
-def _design_lines(part: _Part, spacing_mm: float) -> Floats:
+def _design_lines(part: Part, spacing_mm: float) -> Floats:
     """Points (k, 3) along both bottom edges of the design."""
     lines = (part.edges.design_left, part.edges.design_right)
     return np.vstack([line.at(np.arange(0.0, line.length, spacing_mm)) for line in lines])
 
 
-def _result(parts: list[_Part], poses: list[Floats], messages: list[str], design: ArchDesign, params: Params) -> Result:
+def _result(parts: list[Part], poses: list[Floats], messages: list[str], design: ArchDesign, params: Params) -> Result:
     pairs = list(pairwise(range(len(parts))))
     joint_gaps = np.full((len(pairs), 8, 3), np.nan)
     for j, (left, right) in enumerate(pairs):
@@ -300,7 +314,7 @@ def _inverse(T: Floats) -> Floats:
     return rigid.invert(T) if np.isfinite(T).all() else NOWHERE
 
 
-def _status(part: _Part, pose: Floats) -> str:
+def _status(part: Part, pose: Floats) -> str:
     if part.trouble or part.attitude.status == "failed" or not np.isfinite(pose).all():
         return "failed"
     return part.attitude.status
@@ -311,7 +325,7 @@ def _with_origin(T: Floats, origin: Floats) -> Floats:
     return rigid.transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ origin)
 
 
-def _key_points(part: _Part, end: features.JointEdges | None) -> Floats:
+def _key_points(part: Part, end: features.JointEdges | None) -> Floats:
     return np.full((8, 3), np.nan) if end is None else end.key_points + part.scan.origin
 
 

@@ -54,7 +54,7 @@ def test_a_scan_of_something_else_fits_no_attitude():
 
 def test_surface_samples_lie_on_the_mesh_and_cover_it_evenly():
     part = arch_clouds.design().parts[1]
-    surface = attitude.sample_surface(part, 4000)
+    surface = attitude.sample_surface(part)
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
     np.testing.assert_allclose(surface.points.mean(axis=0), (area @ (a + b + c)) / 3.0 / area.sum(), atol=30.0)
@@ -115,7 +115,7 @@ def test_slices_follow_the_bottom_edges():
     rng = np.random.default_rng(3)
     points = arch_clouds.scan_points(2, 8.0, 0.5, rng)
     part = arch_clouds.design().parts[2]
-    left, right = features.slice_edges(points, np.eye(4), 8.0, features.SliceParams())
+    left, right = features.slice_edges(points, np.eye(4), 8.0, 0.5, features.SliceParams())
     for found, design in ((left, part.bottom_edge_left), (right, part.bottom_edge_right)):
         offset = np.linalg.norm(Polyline.through(design).nearest(found)[1], axis=1)
         assert len(found) > 500
