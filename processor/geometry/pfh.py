@@ -10,7 +10,7 @@ from processor.model import Floats, Ints
 
 
 def normals(points: Floats, radius_mm: float) -> Floats:
-    """Estimate unit normals (n, 3) of points (n, 3): least principal direction of the neighbours, away from the cloud's centre.
+    """Estimate unit normals (n, 3) of points (n, 3): least principal direction of the neighbours, away from the middle.
 
     Along a straight line of points the normal is not defined; what comes out there is one of many, as in the paper.
     """

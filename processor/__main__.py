@@ -1,0 +1,35 @@
+"""Entry point of ``processor``: runs the command line and turns errors into one line and an exit code."""
+
+from __future__ import annotations
+
+import sys
+
+import click
+
+from processor.cli import commands
+from processor.model import InputError, UsageError
+
+WRONG_USAGE, BAD_INPUT = 2, 3
+
+
+def main() -> None:
+    """Run the command line; the exit codes are those of processor --help."""
+    try:
+        commands(standalone_mode=False)
+    except click.exceptions.Exit as end:
+        sys.exit(end.exit_code)
+    except click.exceptions.Abort:
+        sys.exit(130)
+    except click.ClickException as error:
+        error.show()
+        sys.exit(WRONG_USAGE)
+    except UsageError as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(WRONG_USAGE)
+    except (InputError, OSError) as error:
+        click.echo(f"error: {error}", err=True)
+        sys.exit(BAD_INPUT)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""Command line of ``processor``. What is heavy is imported where it is used, so that help comes at once."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from processor import __version__
+from processor.model import InputError, Metric
+
+DONE, IN_PART, LIMIT_MISSED = 0, 1, 4
+UNITS = ("m", "mm", "cm", "inch", "ft")
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="processor")
+def commands() -> None:
+    """Check steel structures from laser scans.
+
+    Exit codes: 0 done, 1 done in part, 2 wrong usage, 3 bad input, 4 an accuracy limit was missed.
+    """
+
+
+def _named(_: click.Context, __: click.Parameter, value: str | None) -> tuple[str, ...]:
+    return tuple(name.strip() for name in value.split(",") if name.strip()) if value else ()
+
+
+@commands.command()
+@click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of the results")
+@click.option("--steps", callback=_named, metavar="A,B", help="instead of those of the input's kind")
+@click.option("--method", "methods", callback=_named, metavar="NAME[,NAME]", help="further ones are run for comparison")
+@click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
+@click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
+@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
+@click.pass_context
+def run(
+    context: click.Context,
+    input_: Path,
+    output: Path,
+    steps: tuple[str, ...],
+    methods: tuple[str, ...],
+    params: Path | None,
+    units: str | None,
+    seed: int,
+    as_json: bool,
+) -> None:
+    """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
+    from processor import pipeline
+    from processor.evaluate import evaluate
+    from processor.report import tables, writing
+
+    if not input_.exists():
+        raise InputError(f"{input_}: there is no such file or folder")
+    writing.check_output(output)
+    parameters = pipeline.read_params(params)
+    if steps:
+        pipeline.plan("", steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
+    scene = pipeline.read(input_, units)
+    jobs = pipeline.plan(scene.kind, steps, methods, parameters, seed)
+    click.echo(f"{input_.name}: read as {scene.units} ({scene.units_reason})", err=True)
+    execution = pipeline.execute(input_, scene, jobs, log=lambda line: click.echo(line, err=True))
+    report = evaluate(input_, execution)
+    writing.write(output, execution, report)
+    if as_json:
+        click.echo((output / writing.RESULTS).read_text("utf-8"), nl=False)
+    else:
+        for table in tables.all_of(execution, report):
+            if table.file != "linear":
+                click.echo(tables.plain_text(table) + "\n")
+        click.echo(f"report: {output / 'report.html'}")
+    complete = all(one.result.status == "ok" for one, _ in tables.grouped(execution.runs))
+    context.exit(LIMIT_MISSED if not report.passed else DONE if complete else IN_PART)
+
+
+@commands.command()
+@click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object instead of a table")
+@click.pass_context
+def check(context: click.Context, output: Path, as_json: bool) -> None:
+    """Print the checks of the run in OUT again; exits 4 when a limit was missed."""
+    from processor.evaluate import ErrorReport
+    from processor.report import tables
+
+    found = _read_results(output)
+    metrics = tuple(
+        Metric(c["step"], c["name"], _number(c["value"]), _number(c["limit"]), c["unit"]) for c in found["checks"]
+    )
+    report = ErrorReport(metrics)
+    if as_json:
+        click.echo(json.dumps({"passed": report.passed, "checks": found["checks"]}, ensure_ascii=False))
+    elif metrics:
+        click.echo(tables.plain_text(tables.of_checks(report), most=len(metrics)))
+    else:
+        click.echo("no checks: the input held no truth")
+    context.exit(DONE if report.passed else LIMIT_MISSED)
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _read_results(output: Path) -> dict[str, Any]:
+    path = output / "results.json"
+    try:
+        found: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise InputError(f"{path}: no readable results ({error}); run processor run again") from error
+    if found.get("format") != "processor-results" or not isinstance(found.get("checks"), list):
+        raise InputError(f"{path}: expected results of processor, found something else")
+    return found

@@ -1,0 +1,223 @@
+"""Records to HDF5 groups and back, by walking the fields of their dataclasses.
+
+A field is a dataset of its name (arrays, numbers, text, lists of text) or a group (a record; a tuple of records with
+members 0000, 0001, ...). A field that is None is left out. Text is of fixed length in UTF-8, so nothing in a file
+refers to a heap, and its size is known before it is read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import types
+import typing
+from collections.abc import Callable, Collection, Mapping
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+
+from processor.model import RecordError
+
+CHUNK_ROWS = 65_536
+PLAIN_ITEMS = 1_024  # arrays up to this size are stored plainly
+GZIP_LEVEL = 1
+
+Record = TypeVar("Record")
+Hook = Callable[..., Any]
+
+
+class DecodeError(ValueError):
+    """A group that does not hold the record it should; ``problems`` says all that is wrong with it."""
+
+    def __init__(self, problems: list[str]) -> None:
+        super().__init__("; ".join(problems))
+        self.problems = problems
+
+
+def write_array(group: Any, name: str, array: np.typing.NDArray[np.generic]) -> None:
+    """Write an array; a large one in chunks of rows, shuffled and compressed."""
+    if array.size <= PLAIN_ITEMS:
+        group.create_dataset(name, data=array)
+        return
+    rows = min(len(array), max(1, CHUNK_ROWS // max(1, math.prod(array.shape[1:]) // 3)))
+    group.create_dataset(
+        name,
+        data=array,
+        chunks=(rows, *array.shape[1:]),
+        compression="gzip",
+        compression_opts=GZIP_LEVEL,
+        shuffle=True,
+    )
+
+
+def write_text(group: Any, name: str, text: str) -> None:
+    """Write one text."""
+    data = _encoded(text)
+    group.create_dataset(name, data=np.array(data, _text_type(len(data))))
+
+
+def _encoded(text: str) -> bytes:
+    if "\0" in text:
+        raise RecordError(f"text with a zero character cannot be stored: {text[:40]!r}")
+    return text.encode("utf-8", "replace")
+
+
+def _text_type(length: int) -> Any:
+    return h5py.string_dtype("utf-8", max(1, length))
+
+
+def write_record(
+    group: Any, record: Any, skip: Collection[str] = (), hooks: Mapping[type, Hook] = types.MappingProxyType({})
+) -> None:
+    """Write the fields of a record into a group, except those of ``skip``.
+
+    ``hooks`` names another writer for records of a type. Raises TypeError for a field of a kind that has no form here.
+    """
+    for field in dataclasses.fields(record):
+        if field.name not in skip:
+            _write(group, field.name, getattr(record, field.name), field.metadata, hooks)
+
+
+def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type, Hook]) -> None:
+    if value is None:
+        return
+    if "shape" in metadata:
+        write_array(group, name, value)
+    elif isinstance(value, str):
+        write_text(group, name, value)
+    elif isinstance(value, bool):
+        group.create_dataset(name, data=np.uint8(value))
+    elif isinstance(value, int):
+        group.create_dataset(name, data=np.int64(value))
+    elif isinstance(value, float):
+        group.create_dataset(name, data=np.float64(value))
+    elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+        members = group.create_group(name)
+        for i, item in enumerate(value):
+            _write(members, f"{i:04d}", item, {}, hooks)
+    elif isinstance(value, tuple) and all(isinstance(item, str) for item in value):
+        data = [_encoded(item) for item in value]
+        group.create_dataset(name, data=np.array(data, _text_type(max([1, *map(len, data)]))))
+    elif dataclasses.is_dataclass(value):
+        hook = hooks.get(type(value))
+        member = group.create_group(name)
+        if hook:
+            hook(member, value)
+        else:
+            write_record(member, value, hooks=hooks)
+    else:
+        raise TypeError(f"{group.name}/{name}: no form for a {type(value).__name__} in a file")
+
+
+def read_record(
+    group: Any,
+    cls: type[Record],
+    hooks: Mapping[type, Hook] = types.MappingProxyType({}),
+    given: Mapping[str, Any] = types.MappingProxyType({}),
+) -> Record:
+    """Read a record of type ``cls`` from a group; fields in ``given`` are not read but taken from there.
+
+    Raises DecodeError with every member that is missing, unknown, or not of its field's type and shape.
+    """
+    problems: list[str] = []
+    values = dict(given)
+    hints = typing.get_type_hints(cls)
+    known = {field.name: field for field in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    problems += [f"{group.name}/{name}: unknown" for name in group if name not in known]
+    for name, field in known.items():
+        if name in given:
+            continue
+        try:
+            values[name] = _read(group, name, hints[name], field.metadata, hooks)
+        except DecodeError as error:
+            problems += error.problems
+    if problems:
+        raise DecodeError(problems)
+    try:
+        return cls(**values)
+    except RecordError as error:
+        raise DecodeError([f"{group.name}: {error}"]) from None
+
+
+def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, Hook]) -> Any:
+    where = f"{group.name}/{name}"
+    allowed = [item for item in typing.get_args(hint) if item is not type(None)]
+    union = typing.get_origin(hint) in (typing.Union, types.UnionType)
+    if name not in group:
+        if union:
+            return None
+        raise DecodeError([f"{where}: missing"])
+    kind = allowed[0] if union else hint
+    if "shape" in metadata:
+        return read_array(group, name, metadata["dtype"], len(metadata["shape"]))
+    if kind is str:
+        return read_text(group, name)
+    if kind in (bool, int, float):
+        stored = {bool: "u1", int: "i8", float: "f8"}[kind]
+        return kind(_dataset(group, name, stored, 0)[()])
+    if typing.get_origin(kind) is tuple and typing.get_args(kind)[0] is str:
+        return tuple(_decoded(item, where) for item in _dataset(group, name, "S", 1)[()].tolist())
+    if not isinstance(group[name], h5py.Group):
+        if typing.get_origin(kind) is tuple and group[name].shape == (0,):
+            return ()
+        raise DecodeError([f"{where}: expected a group, found a dataset"])
+    if typing.get_origin(kind) is tuple:
+        return _read_members(group[name], typing.get_args(kind)[0], hooks)
+    return _read_one(group[name], kind, hooks)
+
+
+def _read_one(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:
+    hook = hooks.get(kind)
+    return hook(group) if hook else read_record(group, kind, hooks)
+
+
+def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[Any, ...]:
+    expected = [f"{i:04d}" for i in range(len(group))]
+    if list(group) != expected or not all(isinstance(group[name], h5py.Group) for name in expected):
+        raise DecodeError([f"{group.name}: expected groups 0000, 0001, ..."])
+    problems: list[str] = []
+    items = []
+    for name in expected:
+        try:
+            items.append(_read_one(group[name], kind, hooks))
+        except DecodeError as error:
+            problems += error.problems
+    if problems:
+        raise DecodeError(problems)
+    return tuple(items)
+
+
+def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
+    """Read an array of float64 or int64 of ``ndim`` axes (an absent one is empty, of any number of axes)."""
+    stored = np.dtype(dtype).str[1:]
+    if name in group and isinstance(group[name], h5py.Dataset) and group[name].size == 0:
+        ndim = group[name].ndim
+    return _dataset(group, name, stored, ndim)[()]
+
+
+def read_text(group: Any, name: str) -> str:
+    """Read one text."""
+    return _decoded(_dataset(group, name, "S", 0)[()], f"{group.name}/{name}")
+
+
+def _decoded(data: bytes, where: str) -> str:
+    try:
+        return bytes(data).decode("utf-8")
+    except UnicodeDecodeError:
+        raise DecodeError([f"{where}: not UTF-8 text"]) from None
+
+
+def _dataset(group: Any, name: str, stored: str, ndim: int) -> Any:
+    where = f"{group.name}/{name}"
+    if name not in group:
+        raise DecodeError([f"{where}: missing"])
+    dataset = group[name]
+    if not isinstance(dataset, h5py.Dataset):
+        raise DecodeError([f"{where}: expected a dataset, found a group"])
+    got = dataset.dtype.kind + ("" if dataset.dtype.kind == "S" else str(dataset.dtype.itemsize))
+    if got != stored or dataset.ndim != ndim or dataset.dtype.byteorder == ">":
+        raise DecodeError(
+            [f"{where}: expected type {stored} with {ndim} axes, found {dataset.dtype.str} with {dataset.ndim}"]
+        )
+    return dataset

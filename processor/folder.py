@@ -1,0 +1,271 @@
+"""A scan folder, or a single scan file, to a scene in mm."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processor import readers, store
+from processor.design_files import read_design
+from processor.fields import Table, inside
+from processor.model import (
+    KINDS,
+    ArchDesign,
+    Floats,
+    FrameDesign,
+    InputError,
+    Scan,
+    Scene,
+    Stations,
+)
+from processor.readers import RawScan
+from processor.readers.raw import decoded
+from processor.units import MM_PER_UNIT, known_unit
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+PROJECT = "project.toml"
+TRUTH = "truth.h5"
+DESIGNS = ("design.json", "design.csv")
+NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv")
+KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance")
+SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
+FEWEST_POINTS = 4
+
+# How much larger than the design a scan comes out when a unit is mistaken for another one.
+UNIT_SLIPS: tuple[float, ...] = (1000.0, 304.8, 100.0, 25.4, 10.0, 0.1, 1 / 25.4, 0.01, 1 / 304.8, 0.001)
+CLEAR_UNIT_SLIPS: tuple[float, ...] = (1000.0, 304.8, 25.4, 1 / 304.8, 0.001)
+SLIP_TOLERANCE = 0.25
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """One [[scan]] of project.toml, or a file that was found."""
+
+    path: Path
+    component: str = ""
+    station: str = ""
+    pose: Floats | None = None
+    position: Floats | None = None
+    sigma_mm: float = float("nan")
+
+
+@dataclass(frozen=True)
+class _Project:
+    name: str
+    kind: str
+    units: str
+    design: Path | None
+    temperature_C: float
+    entries: tuple[_Entry, ...]
+
+
+def truth_file(path: Path) -> Path | None:
+    """Return the file that a truth may be read from: the scene file itself, or FOLDER/truth.h5 where it is there."""
+    if path.is_dir():
+        return path / TRUTH if (path / TRUTH).is_file() else None
+    return path if path.suffix.lower() == ".h5" else None
+
+
+def read_input(path: Path, units: str | None = None) -> Scene:
+    """Read a scan folder, a single scan file or a scene file.
+
+    ``units`` are those of the scans' coordinates, whatever the format says. Without, the format's own unit counts,
+    then the project file's, then metres; ``Scene.units_reason`` says which it was.
+
+    Raises InputError for input that cannot be used, UsageError for an unknown unit.
+    """
+    asked = known_unit(units) if units else ""
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or folder")
+    if path.is_dir() and not readers.is_closed(path):
+        return _read_folder(path, asked)
+    if path.suffix.lower() == ".h5":
+        return store.read_scene(path)
+    return _scene(_Project(path.stem, "", "", None, float("nan"), (_Entry(path),)), None, asked)
+
+
+def _read_folder(folder: Path, asked: str) -> Scene:
+    project = _read_project(folder)
+    design = None
+    if project.design is not None and project.kind != "structure":
+        design = read_design(folder, project.design, asked or project.units or "m")
+    return _scene(project, design, asked)
+
+
+def _read_project(folder: Path) -> _Project:
+    path = folder / PROJECT
+    table = Table(str(path), {})
+    if path.exists():
+        inside(folder, PROJECT, str(folder))
+        try:
+            table = Table.of(str(path), tomllib.loads(decoded(path.read_bytes())))
+        except (tomllib.TOMLDecodeError, RecursionError) as error:
+            raise InputError(f"{path}: not readable TOML: {error}") from None
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    table.only(KEYS)
+    kind = table.text("kind", "")
+    if kind and kind not in KINDS:
+        raise InputError(f"{path}: unknown kind {kind!r}; expected one of {', '.join(KINDS)}")
+    named = table.text("design", "") or next((name for name in DESIGNS if (folder / name).exists()), "")
+    design = inside(folder, named, str(path)) if named else None
+    entries = [_entry(folder, scan) for scan in table.tables("scan")]
+    return _Project(
+        table.text("name", folder.resolve().name),
+        kind,
+        table.unit("units", ""),
+        design,
+        table.number("temperature_C", float("nan")),
+        tuple(entries or [_Entry(found) for found in _found(folder, design)]),
+    )
+
+
+def _entry(folder: Path, scan: Table) -> _Entry:
+    scan.only(SCAN_KEYS)
+    pose = scan.array("pose", 4, 4) if "pose" in scan.values else None
+    if pose is not None and not (
+        np.abs(pose[:3, :3].T @ pose[:3, :3] - np.eye(3)).max() < 1e-3
+        and np.linalg.det(pose[:3, :3]) > 0
+        and (pose[3] == [0, 0, 0, 1]).all()
+    ):
+        raise InputError(f"{scan.where}: 'pose' is not a rotation and a translation above a row of 0, 0, 0, 1")
+    return _Entry(
+        inside(folder, scan.text("file"), scan.where),
+        scan.text("component", ""),
+        scan.text("station", ""),
+        pose,
+        scan.array("position", 3) if "position" in scan.values else None,
+        scan.number("sigma_mm", float("nan"), positive=True),
+    )
+
+
+def _found(folder: Path, design: Path | None) -> list[Path]:
+    found = []
+    for place in (folder, folder / "scans"):
+        for path in sorted(place.iterdir()) if place.is_dir() else []:
+            scan = path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS and path != design
+            if ((scan and path.is_file()) or readers.is_closed(path)) and not path.name.startswith("."):
+                found.append(inside(folder, str(path.relative_to(folder)), str(folder)))
+    if not found:
+        raise InputError(
+            f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in scans/, found none"
+        )
+    return found
+
+
+def _scene(project: _Project, design: ArchDesign | FrameDesign | None, asked: str) -> Scene:
+    arch = design if isinstance(design, ArchDesign) else None
+    frame = design if isinstance(design, FrameDesign) else None
+    kind = "arch-bridge" if arch else "space-frame" if frame else project.kind or "structure"
+    if project.kind and project.kind != kind:
+        raise InputError(f"{project.design}: the design is of kind {kind}, but {PROJECT} says {project.kind}")
+    parts = {part.name for part in arch.parts} if arch else set()
+    scans: list[Scan] = []
+    reasons: dict[str, str] = {}
+    for entry in project.entries:
+        if entry.component and parts and entry.component not in parts:
+            raise InputError(
+                f"{entry.path}: the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}"
+            )
+        raws = readers.read(entry.path)
+        if len(raws) > 1 and (entry.pose is not None or entry.position is not None):
+            raise InputError(f"{entry.path}: holds {len(raws)} scans, so one 'pose' or 'position' does not fit them")
+        for raw in raws:
+            unit, reason = _unit(raw, entry.path, project, asked)
+            reasons.setdefault(unit, reason)
+            scan = _scan(raw, entry, unit, parts)
+            if any(scan.name == other.name for other in scans):
+                raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
+            _check_size(entry.path, scan, unit, reason, arch, frame)
+            scans.append(scan)
+    return Scene(
+        project.name,
+        kind,
+        tuple(scans),
+        arch,
+        frame,
+        _stations(scans),
+        project.temperature_C,
+        ", ".join(reasons),
+        "; ".join(dict.fromkeys(reasons.values())),
+    )
+
+
+def _unit(raw: RawScan, path: Path, project: _Project, asked: str) -> tuple[str, str]:
+    if asked:
+        return asked, "asked for by --units"
+    if raw.unit:
+        return known_unit(raw.unit), f"said by the {path.suffix.lower()[1:]} file or its format"
+    if project.units:
+        return project.units, f"said by {PROJECT}"
+    return "m", "taken as metres, as scanners write: neither the format nor the project says"
+
+
+def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str]) -> Scan:
+    if len(raw.points) < FEWEST_POINTS:
+        raise InputError(
+            f"{entry.path}: scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more"
+        )
+    scale = MM_PER_UNIT[unit]
+    pose = np.array(raw.T_project_scan if entry.pose is None else entry.pose)
+    if pose.size:
+        pose[:3, 3] *= scale
+    position = raw.position if entry.position is None else entry.position
+    return Scan(
+        raw.name,
+        raw.points * scale,
+        raw.origin * scale,
+        raw.intensity,
+        component=entry.component or (raw.name if raw.name in parts else ""),
+        station=entry.station,
+        position=position * scale,
+        T_project_scan=pose,
+        sigma_mm=entry.sigma_mm,
+    )
+
+
+def _stations(scans: list[Scan]) -> Stations | None:
+    """Return the scanner positions that the scans give, in the project's frame; the first of a name counts."""
+    places: dict[str, Any] = {}
+    for scan in scans:
+        if scan.position.size:
+            T = scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
+            places.setdefault(scan.station or scan.name, T[:3, :3] @ scan.position + T[:3, 3])
+    return Stations(tuple(places), np.array(list(places.values()))) if places else None
+
+
+def _check_size(
+    path: Path, scan: Scan, unit: str, reason: str, arch: ArchDesign | None, frame: FrameDesign | None
+) -> None:
+    """Raise InputError where a scan is larger or smaller than its design by what a mistaken unit would make it.
+
+    Sizes are distances from the middle, which hardly change when a part is turned. Of a space frame often a piece is
+    scanned, and within a hall, so only the clear cases count there.
+    """
+    part = next((one for one in arch.parts if one.name == scan.component), None) if arch else None
+    if part is not None:
+        nominal, slips = part.vertices, UNIT_SLIPS
+    elif frame is not None and len(frame.centres) > 2:
+        nominal, slips = frame.centres, CLEAR_UNIT_SLIPS
+    else:
+        return
+    middle = (nominal.min(axis=0) + nominal.max(axis=0)) / 2.0
+    size = float(np.linalg.norm(nominal - middle, axis=1).max())
+    points = scan.points[:: max(1, len(scan.points) // 100_000)]
+    centre = np.quantile(points, [0.01, 0.99], axis=0).mean(axis=0)
+    ratio = float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.99)) / size if size > 0 else 1.0
+    slip = next((one for one in slips if abs(ratio / one - 1.0) <= SLIP_TOLERANCE), None)
+    if slip is not None:
+        raise InputError(
+            f"{path}: scan {scan.name!r} is {ratio:.4g} times as large as the design, close to {slip:.4g}: its unit "
+            f"was read as {unit} ({reason}), and that seems wrong; say which it is by --units or in {PROJECT}, "
+            "or correct the design's units"
+        )

@@ -1,0 +1,182 @@
+"""Read an input, run its steps in order, hand back what they found."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+import math
+import pkgutil
+import sys
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from processor import __version__, steps
+from processor.model import InputError, Scene, StepRun, UsageError
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+SOFTWARE = ("numpy", "scipy", "h5py")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One step with its parameters."""
+
+    step: str
+    module: ModuleType
+    params: Any
+
+
+@dataclass(frozen=True)
+class Execution:
+    """What was run on which scene, and everything that made the result."""
+
+    scene: Scene
+    runs: tuple[StepRun, ...]  # the answer of each step first, then other methods for comparison
+    provenance: dict[str, Any]
+
+
+def step_modules() -> dict[str, ModuleType]:
+    """All steps by name; a step is a file in processor/steps."""
+    return {m.name: importlib.import_module(f"processor.steps.{m.name}") for m in pkgutil.iter_modules(steps.__path__)}
+
+
+def result_classes() -> dict[str, type]:
+    """Return the Result record of every step, by the step's name."""
+    return {name: module.Result for name, module in step_modules().items()}
+
+
+def read(path: Path, units: str | None) -> Scene:
+    """Read a scan folder, a scene file or one scan file; InputError where it cannot be used."""
+    from processor import folder, store
+
+    if path.is_file() and path.suffix.lower() == ".h5":
+        if units is not None:
+            raise UsageError(f"--units {units}: {path.name} is a scene file, which knows its units; leave --units out")
+        return store.read_scene(path)
+    return folder.read_input(path, units)
+
+
+def read_params(path: Path | None) -> dict[str, Any]:
+    """Read a parameter file: a table a step. UsageError where it is not TOML."""
+    if path is None:
+        return {}
+    try:
+        found: dict[str, Any] = tomllib.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise UsageError(f"{path}: not a readable parameter file: {error}") from error
+    return found
+
+
+def plan(
+    kind: str, wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int
+) -> tuple[Job, ...]:
+    """Choose the steps for a kind of scene, or those wanted, with their methods; every name and type is checked.
+
+    The first method named for a step gives the answer; further ones are run for comparison.
+    """
+    modules = step_modules()
+    chosen = list(wanted) or [name for name, module in modules.items() if kind == module.KIND]
+    if not chosen:
+        raise UsageError(
+            f"no step runs by itself on a scene of kind {kind}; name one with --steps: {', '.join(modules)}"
+        )
+    for name in (*chosen, *params):
+        if name not in modules:
+            raise UsageError(f"no step {name!r}; there are {', '.join(modules)}")
+    offered = {name: [m for m in methods if m in modules[name].METHODS] for name in chosen}
+    for method in methods:
+        if not any(method in named for named in offered.values()):
+            known = "; ".join(f"{name}: {', '.join(modules[name].METHODS)}" for name in chosen)
+            raise UsageError(f"no method {method!r} for these steps ({known})")
+    jobs = []
+    for name in chosen:
+        module = modules[name]
+        table = dict(params.get(name, {})) if isinstance(params.get(name, {}), Mapping) else params[name]
+        filled = fill(module.Params, table, name)
+        first = filled.method
+        if first not in module.METHODS:
+            raise UsageError(f"{name}.method: expected one of {', '.join(module.METHODS)}, got {first!r}")
+        used_seed = seed if seed is not None else filled.seed
+        jobs += [
+            Job(name, module, dataclasses.replace(filled, method=method, seed=used_seed))
+            for method in dict.fromkeys(offered[name] or [first])
+        ]
+    # Answers before comparisons, in the order of the steps.
+    firsts = [next(job for job in jobs if job.step == name) for name in chosen]
+    return (*firsts, *(job for job in jobs if job not in firsts))
+
+
+def fill(cls: type, table: Any, where: str) -> Any:
+    """Make a Params record of a TOML table, tables within it for records within; UsageError names what does not fit."""
+    if not isinstance(table, Mapping):
+        raise UsageError(f"{where}: expected a table, got {table!r}")
+    default = cls()
+    known = {field.name: getattr(default, field.name) for field in dataclasses.fields(cls)}
+    values: dict[str, Any] = {}
+    for key, value in table.items():
+        if key not in known:
+            raise UsageError(f"{where}.{key}: unknown parameter; there are {', '.join(known)}")
+        if dataclasses.is_dataclass(known[key]):
+            values[key] = fill(type(known[key]), value, f"{where}.{key}")
+            continue
+        if isinstance(known[key], float) and type(value) is int:
+            value = float(value)
+        if type(value) is not type(known[key]):
+            raise UsageError(f"{where}.{key}: expected a {type(known[key]).__name__}, got {value!r}")
+        values[key] = value
+    return dataclasses.replace(default, **values)
+
+
+def execute(path: Path, scene: Scene, jobs: Sequence[Job], log: Callable[[str], None] = lambda _: None) -> Execution:
+    """Run the jobs on a scene read from ``path``."""
+    from processor import store
+
+    runs = []
+    for job in jobs:
+        started = time.monotonic()
+        try:
+            result = job.module.run(scene, job.params)
+        except (MemoryError, ArithmeticError, LookupError, ValueError) as error:
+            # No input may end in a traceback: what a step did not foresee is the input's error until proved otherwise.
+            raise InputError(f"{path.name}: step {job.step} ({job.params.method}) failed: {error!r}") from error
+        log(f"{job.step} ({job.params.method}): {result.status}, {time.monotonic() - started:.1f} s")
+        runs.append(StepRun(job.step, job.params.method, as_json(dataclasses.asdict(job.params)), result))
+    provenance = {
+        "input": path.name,
+        "input_sha256": store.scene_hash(scene),
+        "seed": jobs[0].params.seed if jobs else 0,
+        "software": software(),
+        "parameters": [{"step": run.step, **json.loads(run.params)} for run in runs],
+    }
+    return Execution(scene, tuple(runs), provenance)
+
+
+def software() -> dict[str, str]:
+    """Versions of what made a result."""
+    python = ".".join(str(part) for part in sys.version_info[:3])
+    return {"processor": __version__, "python": python, **{name: version(name) for name in SOFTWARE}}
+
+
+def as_json(value: Any) -> str:
+    """Write JSON text; numbers that are not finite become null."""
+    return json.dumps(_finite(value), allow_nan=False, ensure_ascii=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _finite(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(item) for item in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,68 @@
+"""The folder of results: made under a temporary name, then moved into place whole."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import tempfile
+from pathlib import Path
+
+from processor import store
+from processor.evaluate import ErrorReport
+from processor.model import UsageError
+from processor.pipeline import Execution
+from processor.report import figures, page, results_json, tables
+
+RESULTS = "results.json"
+
+
+def check_output(out: Path) -> None:
+    """Refuse a folder that this program did not make: UsageError."""
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: is a file; name a folder for the results")
+    if out.is_dir() and any(out.iterdir()) and not (out / RESULTS).is_file():
+        raise UsageError(f"{out}: is not empty and holds no earlier results; name another folder")
+
+
+def write(out: Path, execution: Execution, report: ErrorReport) -> None:
+    """Write results.h5, results.json, CSV tables, figures and report.html into ``out``, in place of earlier ones."""
+    out = out.absolute()
+    out.parent.mkdir(parents=True, exist_ok=True)
+    making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    try:
+        os.chmod(making, 0o755)
+        store.write_results(making / "results.h5", execution.runs, execution.provenance)
+        found = results_json.results_json(execution, report)
+        _write_text(making / RESULTS, json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+        for table in tables.all_of(execution, report):
+            if table.file:
+                _write_text(making / f"{table.file}.csv", tables.csv_text(table))
+        drawn = figures.of_run(execution, report)
+        if drawn:
+            (making / "figures").mkdir()
+        for name, (_, png) in drawn.items():
+            (making / "figures" / name).write_bytes(png)
+        _write_text(making / "report.html", page.html(execution, report, drawn))
+        _replace(making, out)
+    except BaseException:
+        shutil.rmtree(making, ignore_errors=True)
+        raise
+
+
+def _write_text(path: Path, text: str) -> None:
+    with path.open("w", encoding="utf-8", newline="\n") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _replace(made: Path, out: Path) -> None:
+    """Move a folder into the place of another; the old one is gone only when the new one is there."""
+    if not out.exists():
+        os.replace(made, out)
+        return
+    old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
+    os.replace(out, old / "old")
+    os.replace(made, out)
+    shutil.rmtree(old, ignore_errors=True)

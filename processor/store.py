@@ -1,0 +1,336 @@
+"""Scenes, truths and results in HDF5.
+
+A file has the root attributes ``format``, ``format_version``, ``units`` and ``history`` (JSON list), the text
+``provenance`` (JSON) and the groups ``/scene``, ``/truth`` or ``/results``. The points of a scan lie in spatial tiles
+(:mod:`processor.tiles`), each coordinate a column of its own, with every other column of the scan and its truth labels
+in the same order. The same content makes the same bytes.
+
+Files from outside are not trusted: :mod:`processor.vetting` looks at the structure before any data is read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+
+from processor import codec, scan_tiles, vetting
+from processor.codec import DecodeError
+from processor.model import Floats, InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
+
+FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
+FORMAT_VERSION = "1.0"
+
+# All that HDF5 and h5py raise for a damaged file; none of it names the file or helps its user.
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
+
+T = TypeVar("T")
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside ``path``; what was written there takes its place once it is safe on the disk.
+
+    Raises InputError where the file cannot be written. On any error the temporary file is removed and ``path`` is left
+    as it was.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        _sync(temporary)
+        os.replace(temporary, path)
+        _sync(path.parent)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterator[Any]:
+    with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest") as file:
+        header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "history": "[]", "units": "mm"}
+        for name, text in header.items():
+            file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
+        codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
+        yield file
+
+
+def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mapping[str, object]) -> None:
+    """Write a scene, with its truth beside it where there is one.
+
+    ``provenance`` is anything that JSON can hold. Points are kept to 0.0001 mm (0.001 mm beyond an extent of 400 m).
+    Raises InputError for points that are not finite, scans of one name, and labels that do not fit their scan.
+    """
+    _check(path, scene)
+    orders: dict[str, Ints] = {}
+
+    def write_scan(group: Any, scan: Scan) -> None:
+        orders[scan.name] = scan_tiles.write_scan(group, scan)
+
+    with _new_file(path, "scene", provenance) as file:
+        codec.write_record(file.create_group("scene"), scene, hooks={Scan: write_scan})
+        if truth is not None:
+            labels = tuple(_in_order(label, orders, path) for label in truth.labels)
+            codec.write_record(file.create_group("truth"), dataclasses.replace(truth, labels=labels))
+
+
+def _check(path: Path, scene: Scene) -> None:
+    names = [scan.name for scan in scene.scans]
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: the scene has more than one scan of one name ({', '.join(sorted(names))})")
+    for scan in scene.scans:
+        bad = int(np.count_nonzero(~np.isfinite(scan.points).all(axis=1)))
+        if bad or not np.isfinite(scan.origin).all():
+            raise InputError(f"{path}: scan {scan.name!r} has {bad or 'an origin of'} points that are not finite")
+
+
+def _in_order(labels: PointLabels, orders: Mapping[str, Ints], path: Path) -> PointLabels:
+    order = orders.get(labels.scan)
+    if order is None:
+        raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r} that the scene has not")
+    columns = {name: getattr(labels, name) for name in ("part", "source")}
+    for name, column in columns.items():
+        if len(column) not in (0, len(order)):
+            raise InputError(f"{path}: {len(column)} labels ({name}) for the {len(order)} points of {labels.scan!r}")
+    return dataclasses.replace(labels, **{name: column[order] for name, column in columns.items() if len(column)})
+
+
+def write_truth(path: Path, truth: Truth, provenance: Mapping[str, object] | None = None) -> None:
+    """Write a truth on its own; its labels stay in the order given."""
+    with _new_file(path, "truth", provenance or {}) as file:
+        codec.write_record(file.create_group("truth"), truth)
+
+
+def copy_truth(src: Path, dst: Path) -> bool:
+    """Write the truth of ``src`` to a file ``dst`` of its own. Without one nothing is written: False."""
+    truth = read_truth(src)
+    if truth is None:
+        return False
+    write_truth(dst, truth, read_provenance(src))
+    return True
+
+
+def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, object]) -> None:
+    """Write the results of steps in the order they ran."""
+    with _new_file(path, "results", provenance) as file:
+        results = file.create_group("results")
+        for i, run in enumerate(runs):
+            codec.write_record(results.create_group(f"{i:04d}"), run)
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def _opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
+    """Open a file of one of ``kinds`` that passes vetting. Raises InputError for any other and for damage."""
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            found = vetting.problems(file, path)
+            found = found or _header_problems(file, kinds)
+            if found:
+                raise DecodeError(found)
+            yield file
+    except DecodeError as error:
+        raise InputError(f"{path}: {_listed(error.problems)}") from error
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file") from None
+    except DAMAGE as error:
+        wanted = " or ".join(FORMATS[kind] for kind in kinds)
+        raise InputError(
+            f"{path}: expected a {wanted} file (HDF5), found one that is damaged, cut off or of another kind "
+            f"({_first_line(error)}); make or copy it again"
+        ) from error
+
+
+def _listed(problems: Sequence[str], most: int = 20) -> str:
+    more = [f"and {len(problems) - most} more"] if len(problems) > most else []
+    return "; ".join([*problems[:most], *more])
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
+    header = {name: _attribute(file, name) for name in ("format", "format_version", "units")}
+    wanted = [FORMATS[kind] for kind in kinds]
+    if header["format"] not in wanted:
+        return [f"expected format {' or '.join(wanted)}, found {header['format'] or 'none'}"]
+    found = []
+    if header["format_version"] != FORMAT_VERSION:
+        found.append(f"expected format_version {FORMAT_VERSION}, found {header['format_version'] or 'none'}")
+    if header["units"] != "mm":
+        found.append(f"expected units mm, found {header['units'] or 'none'}")
+    return found
+
+
+def _attribute(file: Any, name: str) -> str:
+    value = file.attrs.get(name, b"")
+    return bytes(value).decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _group(file: Any, name: str) -> Any:
+    if not isinstance(file.get(name), h5py.Group):
+        raise DecodeError([f"/{name}: missing"])
+    return file[name]
+
+
+def read_scene(path: Path) -> Scene:
+    """Read a scene; its points come in the order of their tiles. Raises InputError with all that is wrong."""
+    with _opened(path, ["scene"]) as file:
+        return _decode_scene(file)
+
+
+def _decode_scene(file: Any) -> Scene:
+    scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: scan_tiles.read_scan})
+    names = [scan.name for scan in scene.scans]
+    if len(set(names)) != len(names):
+        raise DecodeError(["/scene/scans: two scans have one name"])
+    return scene
+
+
+def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats) -> Floats:
+    """Points (m, 3) of a scan within ``lower <= p <= upper`` (mm, relative to the scan's origin).
+
+    Reads the tiles that the box touches and no others. Raises InputError where the file has no such scan.
+    """
+    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    with _opened(path, ["scene"]) as file:
+        scans = _group(file, "scene").get("scans")
+        members = list(scans.values()) if isinstance(scans, h5py.Group) else []
+        names = [codec.read_text(group, "name") for group in members]
+        if scan_name not in names:
+            raise DecodeError([f"expected a scan {scan_name!r}, found {', '.join(names) or 'none'}"])
+        return scan_tiles.read_box(members[names.index(scan_name)], lower, upper)
+
+
+def read_truth(path: Path) -> Truth | None:
+    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone."""
+    with _opened(path, ["scene", "truth"]) as file:
+        if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
+            return None
+        return codec.read_record(_group(file, "truth"), Truth)
+
+
+def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:
+    """Read results in the order they ran; ``result_classes`` gives each step's Result record by the step's name.
+
+    Raises InputError for a step that is not among them, and for a damaged file.
+    """
+
+    def read_run(group: Any) -> StepRun:
+        step = codec.read_text(group, "step")
+        if step not in result_classes:
+            raise DecodeError([f"{group.name}: results of an unknown step {step!r}"])
+        if not isinstance(group.get("result"), h5py.Group):
+            raise DecodeError([f"{group.name}/result: missing"])
+        result: object = codec.read_record(group["result"], result_classes[step])
+        return codec.read_record(group, StepRun, given={"result": result})
+
+    with _opened(path, ["results"]) as file:
+        runs = _group(file, "results")
+        expected = [f"{i:04d}" for i in range(len(runs))]
+        if list(runs) != expected or not all(isinstance(runs[name], h5py.Group) for name in expected):
+            raise DecodeError(["/results: expected groups 0000, 0001, ..."])
+        return tuple(read_run(runs[name]) for name in expected)
+
+
+def read_provenance(path: Path) -> dict[str, Any]:
+    """Read what a file says of how it was made."""
+    with _opened(path, list(FORMATS)) as file:
+        try:
+            found = json.loads(codec.read_text(file, "provenance"))
+        except json.JSONDecodeError:
+            found = None
+        if not isinstance(found, dict):
+            raise DecodeError(["/provenance: expected a JSON object"])
+        return found
+
+
+def problems(path: Path) -> list[str]:
+    """List all that is wrong with a scene, truth or results file; an empty list means that it can be read."""
+
+    def attempt(read: Callable[[Path], object]) -> list[str]:
+        try:
+            read(path)
+        except InputError as error:
+            cause = error.__cause__
+            return cause.problems if isinstance(cause, DecodeError) else [str(error).removeprefix(f"{path}: ")]
+        return []
+
+    def read_kind(path: Path) -> str:
+        with _opened(path, list(FORMATS)) as file:
+            return _attribute(file, "format")
+
+    found = attempt(read_kind)
+    if found:
+        return found
+    kind = read_kind(path)
+    found = attempt(read_provenance)
+    if kind == FORMATS["scene"]:
+        found += attempt(read_scene)
+    if kind != FORMATS["results"]:
+        return found + attempt(read_truth)
+    return found + attempt(_read_runs_plainly)
+
+
+def _read_runs_plainly(path: Path) -> None:
+    """Read the parts of each run that are the same for all steps."""
+    with _opened(path, ["results"]) as file:
+        for group in _group(file, "results").values():
+            codec.read_record(group, StepRun, given={"result": None}) if isinstance(group, h5py.Group) else None
+
+
+# --- identity --------------------------------------------------------------------------------------------------------
+
+
+def scene_hash(scene: Scene) -> str:
+    """SHA-256 (hex) of all that a scene holds: names, types, shapes and bytes of its fields, in their order.
+
+    It depends on nothing else: not on the truth, the file's name, or the versions of the software.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, "scene", scene)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, name: str, value: Any) -> None:
+    if isinstance(value, np.ndarray):
+        little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+        digest.update(f"{name}:{little.dtype.str}{value.shape};".encode())
+        digest.update(little.data if little.size else b"")
+    elif dataclasses.is_dataclass(value):
+        digest.update(f"{name}:{type(value).__name__}(".encode())
+        for field in dataclasses.fields(value):
+            _feed(digest, field.name, getattr(value, field.name))
+        digest.update(b")")
+    elif isinstance(value, tuple):
+        digest.update(f"{name}:tuple{len(value)}(".encode())
+        for item in value:
+            _feed(digest, "", item)
+        digest.update(b")")
+    else:
+        text = value.hex() if isinstance(value, float) else str(value)
+        digest.update(f"{name}:{type(value).__name__}{len(text)}:{text};".encode())

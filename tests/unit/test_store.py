@@ -1,0 +1,451 @@
+"""The store: what is written comes back, bytes repeat, boxes are cut right, and nothing from outside is trusted."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from dataclasses import dataclass
+
+import h5py
+import numpy as np
+import pytest
+
+from processor import store
+from processor.model import (
+    ArchDesign,
+    ArchTruth,
+    Checked,
+    DesignPart,
+    FrameDesign,
+    FrameTruth,
+    InputError,
+    PointLabels,
+    Scan,
+    Scene,
+    Stations,
+    StepRun,
+    Truth,
+    column,
+    names,
+)
+from processor.steps import spheres
+
+HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm
+
+
+def surface_points(n, seed=0, size=(20_000.0, 2_000.0, 3_000.0)):
+    """Points on three faces of a box, with noise."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(size=(n, 3)) * size
+    face = rng.integers(0, 3, n)
+    points[np.arange(n), face] = rng.normal(0.0, 2.0, n)
+    return points
+
+
+def a_scene(n=50_000):
+    points = surface_points(n)
+    part = DesignPart("肋1", np.eye(3) * 7.5, [[0, 1, 2]], np.zeros((2, 3)), np.ones((4, 3)))
+    arch = ArchDesign((part, dataclasses.replace(part, name="b")), ("J1",), ("肋1",), ("b",), np.ones((1, 8, 3)))
+    scans = (
+        # Columns that tell from which point a row came, whatever place it takes.
+        Scan(
+            "s1",
+            points,
+            origin=[5e8, 4e8, 0],
+            intensity=points[:, 0] * 2.0,
+            point_station=np.floor(points[:, 1]).astype(np.int64),
+            component="肋1",
+            T_project_scan=np.diag([-1.0, -1.0, 1.0, 1.0]),
+            sigma_mm=2.0,
+        ),
+        Scan("s2", points[:10] + 1.0),
+    )
+    stations = Stations(("S1",), [[1.0, 2.0, 3.0]])
+    scene = Scene("桥", "arch-bridge", scans, arch, None, stations, 21.5, "m", "said")
+    labels = PointLabels("s1", ("肋1", "b"), np.floor(points[:, 2]).astype(np.int64), np.arange(n) % 3)
+    truth = Truth((labels,), ArchTruth(("肋1",), [np.eye(4)], np.full((1, 2, 8, 3), np.nan), np.zeros((1, 2, 8, 3))))
+    return scene, truth
+
+
+@pytest.fixture
+def written(tmp_path):
+    path = tmp_path / "scene.h5"
+    scene, truth = a_scene()
+    store.write_scene(path, scene, truth, {"seed": 1, "α": [1.5, None]})
+    return path
+
+
+def lexicographic(points):
+    return points[np.lexsort(points.T)]
+
+
+def same(a, b):
+    """Whether two records hold the same, NaN equal to NaN."""
+    if isinstance(a, np.ndarray):
+        return a.dtype == b.dtype and np.array_equal(a, b, equal_nan=True)
+    if dataclasses.is_dataclass(a):
+        return type(a) is type(b) and all(same(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+    if isinstance(a, tuple):
+        return len(a) == len(b) and all(map(same, a, b))
+    return type(a) is type(b) and (a == b or (a != a and b != b))
+
+
+def test_a_scene_comes_back(written):
+    scene, truth = a_scene()
+    back = store.read_scene(written)
+    assert same(back.arch, scene.arch)
+    assert same(back.stations, scene.stations)
+    assert (back.name, back.kind, back.units_reason, back.temperature_C) == ("桥", "arch-bridge", "said", 21.5)
+    assert back.frame is None
+    given, found = scene.scans[0], back.scans[0]
+    assert same(
+        dataclasses.replace(found, points=[], intensity=[], point_station=[]),
+        dataclasses.replace(given, points=[], intensity=[], point_station=[]),
+    )
+    # The order of the points changes; sorted by the exact column that travels with each, they match one to one.
+    order, given_order = np.argsort(found.intensity), np.argsort(given.intensity)
+    assert np.array_equal(found.intensity[order], given.intensity[given_order])
+    assert np.abs(found.points[order] - given.points[given_order]).max() <= HALF_STEP
+    assert np.array_equal(found.point_station[order], given.point_station[given_order])
+    labels = store.read_truth(written).labels[0]
+    assert np.array_equal(labels.part[order], truth.labels[0].part[given_order])
+    assert np.array_equal(labels.source[order], truth.labels[0].source[given_order])
+    assert same(store.read_truth(written).arch, truth.arch)
+    assert store.read_provenance(written) == {"seed": 1, "α": [1.5, None]}
+    assert store.problems(written) == []
+
+
+def test_a_space_frame_comes_back(tmp_path):
+    path = tmp_path / "f.h5"
+    frame = FrameDesign([3, 4], np.eye(3)[:2], [1.0, 2.0], [3], [4], [60.0])
+    truth = Truth(frame=FrameTruth([3, 4], np.eye(3)[:2], [1.0, 2.0], np.zeros((2, 3))), spacing_mm=5.0)
+    scene = Scene("f", "space-frame", (Scan("s", np.eye(3)),), frame=frame)
+    store.write_scene(path, scene, truth, {})
+    assert same(store.read_scene(path).frame, frame)
+    assert same(store.read_truth(path), truth)
+
+
+def test_points_that_come_back_stay_as_they_are(written, tmp_path):
+    scene, truth = store.read_scene(written), store.read_truth(written)
+    again = tmp_path / "again.h5"
+    store.write_scene(again, scene, truth, store.read_provenance(written))
+    assert again.read_bytes() == written.read_bytes()
+
+
+def test_same_content_same_bytes(written, tmp_path):
+    other = tmp_path / "renamed.h5"
+    store.write_scene(other, *a_scene(), {"α": [1.5, None], "seed": 1})
+    assert other.read_bytes() == written.read_bytes()
+
+
+def test_order_of_points_changes_only_the_order_within_tiles(written, tmp_path):
+    scene, _ = a_scene()
+    flipped = dataclasses.replace(scene, scans=(Scan("s1", scene.scans[0].points[::-1]),))
+    path = tmp_path / "flipped.h5"
+    store.write_scene(path, flipped, None, {})
+    with h5py.File(path) as a, h5py.File(written) as b:
+        for name in ("cell", "count", "lower", "edge", "offset"):
+            here = f"scene/scans/0000/points/{name}"
+            assert np.array_equal(a[here][()], b[here][()])
+
+
+def test_hash_is_of_the_scene_alone(written, tmp_path):
+    scene, _ = a_scene()
+    bare = tmp_path / "bare.h5"
+    store.write_scene(bare, scene, None, {"other": 2})
+    first = store.read_scene(written)
+    assert (
+        store.scene_hash(first)
+        == store.scene_hash(store.read_scene(written))
+        == store.scene_hash(store.read_scene(bare))
+    )
+    points = first.scans[0].points.copy()
+    points[7, 1] = np.nextafter(points[7, 1], np.inf)
+    moved = dataclasses.replace(first, scans=(dataclasses.replace(first.scans[0], points=points), first.scans[1]))
+    colder = dataclasses.replace(first, temperature_C=21.4)
+    renamed = dataclasses.replace(first, scans=(dataclasses.replace(first.scans[0], name="s3"), first.scans[1]))
+    assert len({store.scene_hash(one) for one in (first, moved, colder, renamed)}) == 4
+
+
+def test_hash_is_pinned():
+    """A change of this number loses every cached result: it needs a reason."""
+    scene = Scene("a", "structure", (Scan("s", [[1.0, 2.0, 3.0]]),))
+    assert store.scene_hash(scene) == "0dfdabae4086e70cc8db734f9f3c14eb35e71420c4e08f54d0c829ce4a5ebc0e"
+
+
+@pytest.mark.parametrize(
+    ("size_mm", "steps"),
+    [(400_000.0, 1e-4), (4_000_000.0, 1e-3), (40_000_000.0, 0.0)],
+    ids=["0.0001 mm", "0.001 mm", "float64"],
+)
+def test_precision_follows_the_extent(tmp_path, size_mm, steps):
+    points = surface_points(5_000, size=(size_mm, 1_000.0, 1_000.0)) + 12_345.678912345
+    path = tmp_path / "wide.h5"
+    store.write_scene(path, Scene("w", "structure", (Scan("s", points, intensity=points[:, 0]),)), None, {})
+    back = store.read_scene(path).scans[0]
+    off = np.abs(back.points[np.argsort(back.intensity)] - points[np.argsort(points[:, 0])]).max()
+    assert off <= 0.5 * steps * (1 + 1e-4)
+    lower, upper = points.min(axis=0) + 100.0, points.max(axis=0) - [size_mm / 2, 200.0, 0.0]
+    inside = back.points[((back.points >= lower) & (back.points <= upper)).all(axis=1)]
+    assert np.array_equal(lexicographic(store.read_points_in_box(path, "s", lower, upper)), lexicographic(inside))
+
+
+def test_one_point_and_points_in_one_place(tmp_path):
+    path = tmp_path / "one.h5"
+    scans = (Scan("one", [[1.0, 2.0, 3.0]]), Scan("same", np.full((100, 3), 7.25)), Scan("none"))
+    store.write_scene(path, Scene("o", "structure", scans), None, {})
+    back = store.read_scene(path)
+    assert [scan.points.tolist() for scan in back.scans[::2]] == [[[1.0, 2.0, 3.0]], []]
+    assert (back.scans[1].points == 7.25).all()
+    assert len(store.read_points_in_box(path, "none", np.full(3, -1.0), np.ones(3))) == 0
+
+
+def test_boxes_match_a_plain_cut(written):
+    points = store.read_scene(written).scans[0].points
+    rng = np.random.default_rng(3)
+    for _ in range(40):
+        lower = rng.uniform([-500, -500, -500], [18_000, 1_500, 2_500])
+        upper = lower + rng.uniform(0.0, [9_000, 2_000, 2_000])
+        plain = points[((points >= lower) & (points <= upper)).all(axis=1)]
+        cut = store.read_points_in_box(written, "s1", lower, upper)
+        assert np.array_equal(lexicographic(cut), lexicographic(plain))
+    # A box of no size on a point holds that point: bounds count.
+    assert len(store.read_points_in_box(written, "s1", points[5], points[5])) >= 1
+
+
+def test_a_box_reads_only_its_tiles(tmp_path):
+    path = tmp_path / "large.h5"
+    points = surface_points(300_000)
+    store.write_scene(path, Scene("l", "structure", (Scan("s", points),)), None, {})
+    with h5py.File(path) as file:
+        x = file["scene/scans/0000/points/x"]
+        assert x.chunks[0] < len(x) / 2
+        last = x.id.get_chunk_info(x.id.get_num_chunks() - 1)
+    content = bytearray(path.read_bytes())
+    content[last.byte_offset + 100 : last.byte_offset + 200] = bytes(100)
+    path.write_bytes(content)
+    lower, upper = np.array([100.0, -50.0, -50.0]), np.array([900.0, 2_100.0, 3_100.0])
+    plain = points[((points >= lower) & (points <= upper)).all(axis=1)]
+    assert abs(len(store.read_points_in_box(path, "s", lower, upper)) - len(plain)) <= 1  # of rounding
+    with pytest.raises(InputError, match="damaged"):
+        store.read_scene(path)
+
+
+def test_unknown_scan_in_a_box(written):
+    with pytest.raises(InputError, match=r"scan 's9', found s1, s2"):
+        store.read_points_in_box(written, "s9", np.zeros(3), np.ones(3))
+
+
+# --- truth and results ---------------------------------------------------------------------------------------------
+
+
+def test_truth_on_its_own(written, tmp_path):
+    alone = tmp_path / "truth.h5"
+    assert store.copy_truth(written, alone)
+    assert same(store.read_truth(alone), store.read_truth(written))
+    with pytest.raises(InputError, match="expected format processor-scene, found processor-truth"):
+        store.read_scene(alone)
+    bare, none = tmp_path / "bare.h5", tmp_path / "none.h5"
+    store.write_scene(bare, a_scene(100)[0], None, {})
+    assert store.read_truth(bare) is None
+    assert not store.copy_truth(bare, none)
+    assert not none.exists()
+
+
+@dataclass(frozen=True)
+class Inner(Checked):
+    names: tuple[str, ...] = names("k")
+    values: np.ndarray = column("k", 2)
+
+
+@dataclass(frozen=True)
+class Outer(Checked):
+    status: str
+    good: bool = True
+    count: int = 3
+    inner: Inner | None = None
+    absent: Inner | None = None
+    several: tuple[Inner, ...] = ()
+    rms: float = float("inf")
+
+
+def test_results_come_back(tmp_path):
+    path = tmp_path / "results.h5"
+    inner = Inner(("a", "", "长"), [[1, 2], [3, np.nan], [5, 6]])
+    outer = Outer("ok", False, -(2**40), inner, None, (inner, Inner()), float("-inf"))
+    balls = spheres.Result("partial", "ransac", "two lines\nof text", [1], np.ones((1, 3)), [75.0], evidence=["ball"],
+                           flag=["ok"], reason=[""])  # fmt: skip
+    runs = (StepRun("outer", "m", json.dumps({"seed": 1}), outer), StepRun("spheres", "ransac", "{}", balls))
+    classes = {"spheres": spheres.Result, "outer": Outer}
+    store.write_results(path, runs, {})
+    assert same(store.read_results(path, classes), runs)
+    assert store.problems(path) == []
+    with pytest.raises(InputError, match="unknown step 'outer'"):
+        store.read_results(path, {"spheres": spheres.Result})
+    with pytest.raises(InputError, match=r"0001/result.*(missing|unknown)"):
+        store.read_results(path, {"spheres": Outer, "outer": Outer})
+
+
+# --- writing safely ------------------------------------------------------------------------------------------------
+
+
+def test_an_error_while_writing_leaves_the_old_file(written, monkeypatch):
+    before = written.read_bytes()
+    monkeypatch.setattr("processor.codec.write_array", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    with pytest.raises(InputError, match=r"cannot be written .*No space left"):
+        store.write_scene(written, *a_scene(100), {})
+    assert written.read_bytes() == before
+    assert list(written.parent.iterdir()) == [written]
+
+
+def test_an_error_while_writing_leaves_nothing_new(tmp_path):
+    with pytest.raises(TypeError):
+        store.write_scene(tmp_path / "new.h5", a_scene(100)[0], None, {"not JSON": object()})
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(InputError, match="cannot be written"):
+        store.write_scene(tmp_path / "no" / "folder.h5", a_scene(100)[0], None, {})
+
+
+def test_scenes_that_are_not_written(tmp_path):
+    path = tmp_path / "new.h5"
+    twice = Scene("t", "structure", (Scan("s"), Scan("s")))
+    nan = Scene("n", "structure", (Scan("s", [[0.0, np.nan, 0.0]]),))
+    fine = Scene("f", "structure", (Scan("s", np.eye(3)),))
+    for scene, truth, why in [
+        (twice, None, "one name"),
+        (nan, None, "not finite"),
+        (fine, Truth((PointLabels("s", (), [0], [0]),)), "1 labels"),
+        (fine, Truth((PointLabels("t", (), [0], [0]),)), "'t' that the scene has not"),
+    ]:
+        with pytest.raises(InputError, match=why):
+            store.write_scene(path, scene, truth, {})
+    assert not path.exists()
+
+
+# --- files from outside --------------------------------------------------------------------------------------------
+
+SCAN = "scene/scans/0000"
+POINTS = SCAN + "/points"
+
+
+def virtual(file):
+    layout = h5py.VirtualLayout((10,), "f8")
+    layout[:] = h5py.VirtualSource("/etc/passwd", "x", (10,))
+    file.create_virtual_dataset("scene/virtual", layout)
+
+
+def external(file):
+    file.create_dataset("scene/outside", (10,), "u1", external=[("/etc/passwd", 0, 10)])
+
+
+def huge(file):
+    del file[SCAN + "/intensity"]
+    file.create_dataset(SCAN + "/intensity", (10**12,), "f8", chunks=(65536,), compression="gzip")
+
+
+def half_written(file):
+    del file[SCAN + "/intensity"]
+    dataset = file.create_dataset(SCAN + "/intensity", (50_000,), "f8", chunks=(10_000,), compression="gzip")
+    dataset[:10_000] = np.random.default_rng(0).uniform(size=10_000)
+
+
+def put(name, value):
+    def change(file):
+        del file[name]
+        file[name] = value
+
+    return change
+
+
+def poke(name, index, value):
+    def change(file):
+        file[name][index] = value
+
+    return change
+
+
+def remove(name):
+    return lambda file: file.__delitem__(name)
+
+
+TAMPERED = {
+    "external link": (lambda f: f["scene"].__setitem__("a", h5py.ExternalLink("/etc/x.h5", "/")), "ExternalLink"),
+    "soft link": (lambda f: f["scene"].__setitem__("a", h5py.SoftLink("/truth")), "SoftLink"),
+    "second link": (lambda f: f["scene"].__setitem__("a", f["scene/arch"]), "linked a second time"),
+    "loop": (lambda f: f["scene"].__setitem__("a", f["scene"]), "linked a second time"),
+    "virtual dataset": (virtual, "virtual dataset"),
+    "external storage": (external, "data in another file"),
+    "lzf": (lambda f: f.create_dataset("scene/l", data=np.zeros(9), chunks=(9,), compression="lzf"), "filter 32000"),
+    "objects": (lambda f: f.create_dataset("scene/o", data=["a"], dtype=h5py.string_dtype()), "type object"),
+    "references": (lambda f: f.create_dataset("scene/r", data=f["scene"].ref, dtype=h5py.ref_dtype), "type object"),
+    "attribute of objects": (lambda f: f.attrs.create("a", "text"), "type object"),
+    "declared size": (huge, "declares 8000000000000 bytes but stores 0"),
+    "chunks never written": (half_written, "holds 1 of its 5 chunks"),
+    "version": (lambda f: f.attrs.__setitem__("format_version", np.bytes_("2.0")), "found 2.0"),
+    "format": (lambda f: f.attrs.__setitem__("format", np.bytes_("other")), "expected format processor-scene"),
+    "units": (lambda f: f.attrs.__setitem__("units", np.bytes_("m")), "expected units mm, found m"),
+    "missing field": (remove(SCAN + "/component"), "/scene/scans/0000/component: missing"),
+    "unknown field": (lambda f: f[SCAN].create_group("more"), "/scene/scans/0000/more: unknown"),
+    "missing scene": (remove("scene"), "/scene: missing"),
+    "missing points": (remove(POINTS), "points: missing"),
+    "missing column": (remove(POINTS + "/y"), "expected .*, y, z"),
+    "type": (put(SCAN + "/origin", np.zeros(3, np.float32)), "expected type f8 .* found <f4"),
+    "byte order": (put(SCAN + "/origin", np.zeros(3, ">f8")), "found >f8"),
+    "shape": (put(SCAN + "/origin", np.zeros(4)), r"Scan.origin: expected .*\(4,\)"),
+    "axes": (put(SCAN + "/origin", np.zeros((1, 3))), "with 1 axes"),
+    "length": (put(SCAN + "/intensity", np.zeros(7)), "length 7 along 'n'"),
+    "number for a text": (put(SCAN + "/name", 7), "expected type S"),
+    "group for a number": (lambda f: (remove("scene/temperature_C")(f), f["scene"].create_group("temperature_C")),
+                           "expected a dataset"),
+    "number for a record": (put("scene/arch", 7), "expected a group"),
+    "not UTF-8": (put("scene/name", np.bytes_(b"\xff\xfe")), "not UTF-8"),
+    "columns of points": (put(POINTS + "/x", np.zeros(50_000, "i8")), "columns of int32 or of float64"),
+    "length of a column": (put(POINTS + "/x", np.zeros(7, "i4")), "do not fit each other"),
+    "NaN points": (lambda f: [put(f"{POINTS}/{axis}", np.full(50_000, np.nan))(f) for axis in "xyz"], "not finite"),
+    "NaN origin": (poke(SCAN + "/origin", 0, np.nan), "origin: is not finite"),
+    "tile counts": (poke(POINTS + "/count", 0, 3), "does not cover the 50000 points"),
+    "tile starts": (poke(POINTS + "/start", 1, 3), "does not cover the 50000 points"),
+    "negative counts": (poke(POINTS + "/count", 0, -(2**62)), "does not cover the 50000 points"),
+    "tile cells": (poke(POINTS + "/cell", 0, [9, 9, 9]), "lie outside of the tile"),
+    "tile edge": (put(POINTS + "/edge", 0.0), "grid of the tiles"),
+    "tile lower": (poke(POINTS + "/lower", 0, np.inf), "grid of the tiles"),
+    "members": (lambda f: f.move(SCAN, "scene/scans/7"), "expected groups 0000"),
+    "two of one name": (put("scene/scans/0001/name", np.bytes_("s1")), "two scans have one name"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", TAMPERED)
+def test_tampered_files_are_refused(written, case):
+    change, why = TAMPERED[case]
+    with h5py.File(written, "r+") as file:
+        change(file)
+    with pytest.raises(InputError, match=why) as caught:
+        store.read_scene(written)
+    assert str(caught.value).startswith(str(written))
+    assert store.problems(written)
+
+
+def test_all_problems_are_named(written):
+    with h5py.File(written, "r+") as file:
+        for name in ("scene/units", SCAN + "/component", "scene/arch/parts/0001/faces", "truth/spacing_mm"):
+            del file[name]
+    found = "\n".join(store.problems(written))
+    for name in ("/scene/units", "/scans/0000/component", "/arch/parts/0001/faces", "/truth/spacing_mm"):
+        assert f"{name}: missing" in found
+
+
+def test_cut_off_and_other_files(written, tmp_path):
+    content = written.read_bytes()
+    path = tmp_path / "bad.h5"
+    for length in (0, 7, 100, 1_000, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:length])
+        assert store.problems(path)
+        with pytest.raises(InputError, match="damaged, cut off or of another kind"):
+            store.read_scene(path)
+    path.write_bytes(b"ply\nformat ascii 1.0\n" * 100)
+    with pytest.raises(InputError, match="another kind"):
+        store.read_scene(path)
+    with pytest.raises(InputError, match="no such file"):
+        store.read_scene(tmp_path / "absent.h5")
+    with pytest.raises(InputError, match="another kind"):
+        store.read_scene(tmp_path)  # a folder
