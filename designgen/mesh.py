@@ -13,15 +13,16 @@ if TYPE_CHECKING:
 
 
 def triangulate(solid: cq.Shape, tolerance_mm: float) -> tuple[Floats, Ints]:
-    """Vertices (v, 3) and triangles (f, 3) of a solid, facets within the tolerance of it; normals look outward.
+    """Vertices (v, 3) and triangles (f, 3) of a solid, facets about the tolerance from it; normals look outward.
 
+    The vertices lie on the solid; on long curved faces the kernel lets a few facets depart by several tolerances.
     Vertices shared by faces are merged, so the mesh of a closed solid is closed.
     """
     from OCP.BRepMesh import BRepMesh_IncrementalMesh
 
     # CadQuery would take the tolerance relative to each edge's length; with this mesh in place it makes none.
     BRepMesh_IncrementalMesh(solid.wrapped, tolerance_mm, False, 0.1, False)
-    found, triangles = solid.tessellate(tolerance_mm, 0.1)
+    found, triangles = solid.tessellate(1e6, 0.1)
     points = np.array([p.toTuple() for p in found])
     # Faces have vertices of their own along a common edge; 1e-5 mm is far below any edge and far above rounding.
     _, first, inverse = np.unique(np.round(points, 5), axis=0, return_index=True, return_inverse=True)

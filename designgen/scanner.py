@@ -39,7 +39,7 @@ class Params:
 
 def _expect(fits: bool, key: str, came: object, expected: str) -> None:
     if not fits:
-        raise UsageError(f"scan.{key}: expected {expected}, got {came}")
+        raise UsageError(f"scan.{key}: expected {expected}, got {came!r}")
 
 
 @dataclass(frozen=True)

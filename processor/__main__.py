@@ -15,7 +15,7 @@ WRONG_USAGE, BAD_INPUT = 2, 3
 def main() -> None:
     """Run the command line; the exit codes are those of processor --help."""
     try:
-        commands(standalone_mode=False)
+        sys.exit(commands(standalone_mode=False))
     except click.exceptions.Exit as end:
         sys.exit(end.exit_code)
     except click.exceptions.Abort:

@@ -113,16 +113,17 @@ def _frame(design: Table) -> FrameDesign:
         ids.append(node.integer("id"))
         centres.append(node.array("centre", 3) * scale)
         radii.append(node.number("radius", positive=True) * scale)
+    _check_balls(design.where, ids)
+    known = set(ids)
     a, b, diameters = [], [], []
     for member in design.tables("members"):
         member.only(("a", "b", "tube_diameter"))
         ends = (member.integer("a"), member.integer("b"))
-        if not set(ends) <= set(ids) or ends[0] == ends[1]:
+        if not known.issuperset(ends) or ends[0] == ends[1]:
             raise InputError(f"{member.where}: a member from {ends[0]} to {ends[1]} needs two of the nodes' ids")
         a.append(ends[0])
         b.append(ends[1])
         diameters.append(member.number("tube_diameter", positive=True) * scale)
-    _check_balls(design.where, ids)
     return FrameDesign(
         np.array(ids, np.int64),
         np.array(centres),

@@ -51,7 +51,7 @@ class Params:
 
 def _expect(fits: bool, key: str, came: object, expected: str) -> None:
     if not fits:
-        raise UsageError(f"bridge.{key}: expected {expected}, got {came}")
+        raise UsageError(f"bridge.{key}: expected {expected}, got {came!r}")
 
 
 def build(params: Params) -> tuple[ArchPart, ...]:

@@ -1,0 +1,84 @@
+"""The arrows of the README's picture, read from the imports."""
+
+import ast
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+STORE = {"processor.store", "processor.codec", "processor.tiles", "processor.scan_tiles", "processor.vetting"}
+SOURCES = sorted([*(ROOT / "processor").rglob("*.py"), *(ROOT / "designgen").rglob("*.py")])
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def imports(path):
+    """Every module that a file imports, those inside functions too; of `from a import b` both a and a.b."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return found
+
+
+def within(names, *packages):
+    return {n for n in names if any(n == p or n.startswith(p + ".") for p in packages)}
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=module_name)
+def test_arrows_run_one_way(path):
+    name, used = module_name(path), imports(path)
+    own = within(used, "processor", "designgen")
+    if name.startswith("processor"):
+        assert not within(used, "designgen", "cadquery", "OCP"), "processor knows nothing of CAD"
+        if name not in STORE:
+            assert not within(used, "h5py"), "only the store uses HDF5"
+    else:
+        allowed = {"processor", "processor.model", "processor.store"}
+        reached = {n for n in within(own, "processor") if not within({n}, "processor.model", "processor.store")}
+        assert reached <= allowed, "designgen shares records and store with processor, and no geometry"
+        assert not within(used, "h5py")
+    if name == "processor.model":
+        assert not own
+    if name.startswith("processor.geometry"):
+        assert not own - within(own, "processor.geometry", "processor.model", "processor")
+    if name.startswith(("processor.steps.", "processor.preassembly")):
+        lower = within(own, "processor.geometry", "processor.model", "processor.preassembly")
+        assert not own - lower - {"processor"}, "a step sees records and geometry, not files"
+
+
+def test_only_evaluation_reads_the_truth():
+    readers = {module_name(p) for p in SOURCES if "read_truth" in p.read_text("utf-8")}
+    assert readers <= {"processor.evaluate", *STORE}
+    assert "processor.evaluate" in readers
+
+
+@pytest.mark.parametrize("package", ["processor", "designgen"])
+def test_help_comes_at_once(package):
+    code = (
+        f"import sys; from {package}.cli import commands\n"
+        "try: commands(['--help'])\n"
+        "except SystemExit: pass\n"
+        "heavy = {'scipy', 'matplotlib', 'trimesh', 'h5py', 'cadquery', 'laspy', 'pye57'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    took = []
+    for _ in range(2):
+        started = time.monotonic()
+        subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT)
+        took.append(time.monotonic() - started)
+    assert min(took) < 1.0
+
+
+def test_files_are_small_enough_to_hold_in_the_head():
+    long = {module_name(p): n for p in SOURCES if (n := len(p.read_text("utf-8").splitlines())) > 420}
+    assert not long

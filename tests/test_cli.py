@@ -1,0 +1,199 @@
+"""The command line as users and scripts meet it: exit codes, JSON, refusals, and that nothing is half written."""
+
+import csv
+import dataclasses
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processor import pipeline, store
+from processor.evaluate import evaluate
+from processor.model import FrameDesign, FrameTruth, Scan, Scene, Truth
+from processor.report import writing
+from tests import arch_clouds
+
+ROOT = Path(__file__).resolve().parents[1]
+
+
+def processor(*arguments, cwd=None):
+    return subprocess.run(
+        [sys.executable, "-m", "processor", *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd or ROOT,
+        env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "LANG": "C.UTF-8", "MPLBACKEND": "Agg"},
+        check=False,
+    )
+
+
+def ball_cloud(seed=0, radius=60.0, count=1500):
+    rng = np.random.default_rng(seed)
+    unit = rng.normal(size=(count, 3))
+    unit /= np.linalg.norm(unit, axis=1)[:, None]
+    return np.array([1000.0, -2000.0, 500.0]) + radius * unit + rng.normal(0.0, 0.5, (count, 3))
+
+
+@pytest.fixture
+def frame():
+    """Two balls with their design and truth; the second is smaller than designed."""
+    points = np.vstack([ball_cloud(1), ball_cloud(2, 50.0) + np.array([3000.0, 0.0, 0.0])])
+    centres = np.array([[1000.0, -2000.0, 500.0], [4000.0, -2000.0, 500.0]])
+    ids = np.array([7, 9])
+    design = FrameDesign(ids, centres, np.array([60.0, 60.0]))
+    truth = Truth(frame=FrameTruth(ids, centres, np.array([60.0, 50.0]), centres - [[0, 0, 60.0], [0, 0, 50.0]]))
+    return Scene("frame", "space-frame", (Scan("scan", points),), frame=design), truth
+
+
+@pytest.fixture(scope="module")
+def sphere_run(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("sphere")
+    np.savetxt(folder / "target.xyz", ball_cloud() / 1000.0, fmt="%.6f")
+    done = processor("run", folder / "target.xyz", "-o", folder / "out", "--steps", "spheres", "--json")
+    return folder, done
+
+
+def test_one_scan_file_to_results(sphere_run):
+    folder, done = sphere_run
+    assert done.returncode == 0, done.stderr
+    printed = json.loads(done.stdout)
+    assert printed == json.loads((folder / "out" / "results.json").read_text("utf-8"))
+    assert (printed["format"], printed["format_version"]) == ("processor-results", "1.0")
+    assert printed["input"] == "target.xyz"
+    assert printed["units"]["read_as"] == "m"
+    (ball,) = printed["steps"]["spheres"]["balls"]
+    np.testing.assert_allclose(ball["centre"], [1000.0, -2000.0, 500.0], atol=0.2)
+    assert ball["radius"] == pytest.approx(60.0, abs=0.1)
+    assert ball["lowest"][2] == pytest.approx(440.0, abs=0.2)
+    assert printed["checks"] == []
+    assert "taken as metres" in done.stderr
+    assert {p.name for p in (folder / "out").iterdir()} == {"results.h5", "results.json", "report.html", "balls.csv"}
+    assert store.problems(folder / "out" / "results.h5") == []
+
+
+def test_the_same_bytes_in_give_the_same_bytes_out(sphere_run, tmp_path):
+    folder, _ = sphere_run
+    (tmp_path / "target.xyz").write_bytes((folder / "target.xyz").read_bytes())
+    assert processor("run", "target.xyz", "-o", "again", "--steps", "spheres", cwd=tmp_path).returncode == 0
+    for made in sorted((folder / "out").iterdir()):
+        assert made.read_bytes() == (tmp_path / "again" / made.name).read_bytes(), made.name
+    assert str(tmp_path) not in (tmp_path / "again" / "results.json").read_text("utf-8")
+
+
+def run_in_process(path, out, methods=()):
+    scene = pipeline.read(path, None)
+    execution = pipeline.execute(path, scene, pipeline.plan(scene.kind, (), methods, {}, 0))
+    report = evaluate(path, execution)
+    writing.write(out, execution, report)
+    return json.loads((out / "results.json").read_text("utf-8")), report
+
+
+def test_truth_in_the_file_changes_no_result(frame, tmp_path):
+    scene, truth = frame
+    for name, its_truth in (("with", truth), ("without", None)):
+        (tmp_path / name).mkdir()
+        store.write_scene(tmp_path / name / "s.h5", scene, its_truth, {})
+    found, report = run_in_process(tmp_path / "with" / "s.h5", tmp_path / "a", ("ransac", "least-squares"))
+    blind, _ = run_in_process(tmp_path / "without" / "s.h5", tmp_path / "b", ("ransac", "least-squares"))
+    assert (tmp_path / "a" / "results.h5").read_bytes() == (tmp_path / "b" / "results.h5").read_bytes()
+    assert report.metrics
+    assert found.pop("checks")
+    assert blind.pop("checks") == []
+    assert found == blind
+
+
+def test_tables_hold_what_results_json_holds(frame, tmp_path):
+    scene, truth = frame
+    store.write_scene(tmp_path / "s.h5", scene, truth, {})
+    found, _ = run_in_process(tmp_path / "s.h5", tmp_path / "out")
+    with (tmp_path / "out" / "balls.csv").open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(file))
+    for row, ball in zip(rows, found["steps"]["spheres"]["balls"], strict=True):
+        assert int(row["id"]) == ball["id"]
+        assert float(row["x_mm"]) == pytest.approx(ball["centre"][0], abs=1e-6)
+        assert float(row["radius_error_mm"]) == pytest.approx(ball["radius"] - float(row["true_radius_mm"]), abs=1e-5)
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert f"{found['steps']['spheres']['balls'][0]['radius']:.3f}" in page
+    assert "http" not in page.replace("http-equiv", "")
+
+
+def test_a_missed_limit_exits_with_4(frame, tmp_path):
+    scene, truth = frame
+    wrong = dataclasses.replace(truth.frame, radii=truth.frame.radii + 10.0)
+    store.write_scene(tmp_path / "s.h5", scene, dataclasses.replace(truth, frame=wrong), {})
+    done = processor("run", tmp_path / "s.h5", "-o", tmp_path / "out")
+    assert done.returncode == 4
+    again = processor("check", tmp_path / "out", "--json")
+    assert again.returncode == 4
+    assert json.loads(again.stdout)["passed"] is False
+    assert "MISSED" in processor("check", tmp_path / "out").stdout
+
+
+def test_names_from_outside_are_shown_as_text(frame, tmp_path):
+    scene, truth = frame
+    store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, name="<script>alert(1)</script>"), truth, {})
+    run_in_process(tmp_path / "s.h5", tmp_path / "out")
+    page = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert "<script>" not in page
+    assert "&lt;script&gt;alert(1)&lt;/script&gt;" in page
+
+
+def test_a_bridge_through_the_pipeline(tmp_path):
+    scene, truth = arch_clouds.bridge(spacing_mm=14.0, sigma_mm=1.0, seed=2)
+    store.write_scene(tmp_path / "b.h5", scene, truth, {})
+    found, report = run_in_process(tmp_path / "b.h5", tmp_path / "out", ("design-aided", "corner"))
+    answer = found["steps"]["preassemble"]
+    assert (answer["status"], answer["method"]) == ("ok", "design-aided")
+    assert [c["name"] for c in answer["components"]] == list(arch_clouds.NAMES)
+    assert answer["components"][0]["key_points_scan"]["start"] == {}
+    assert set(answer["joints"][0]["points"]) == {f"P{i}" for i in range(1, 9)}
+    assert len(answer["linear_error"]["stations"]) == len(answer["linear_error"]["deviation"])
+    assert found["comparison"]["preassemble"][0]["method"] == "corner"
+    gaps = np.array([[p["gap"] for p in j["points"].values()] for j in answer["joints"]])
+    assert answer["splicing_error"]["mean"] == pytest.approx(np.abs(gaps).mean())
+    assert answer["splicing_error"]["max"] == pytest.approx(np.abs(gaps).max())
+    assert {m.name.split(":")[0] for m in report.metrics} >= {"corner"}
+    assert (tmp_path / "out" / "figures" / "linear-error.png").read_bytes()[:4] == b"\x89PNG"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["run", "nowhere", "-o", "out"], 3, "no such file or folder"),
+        (["run", "empty.xyz", "-o", "out"], 3, "empty"),
+        (["run", "nan.xyz", "-o", "out"], 3, "nan.xyz"),
+        (["run", "few.xyz", "-o", "out"], 3, "few.xyz"),
+        (["run", "photo.jpg", "-o", "out"], 3, "photo.jpg"),
+        (["run", "folder", "-o", "out"], 3, "folder"),
+        (["run", "cut.h5", "-o", "out"], 3, "cut.h5"),
+        (["run", "good.xyz", "-o", "out"], 2, "--steps"),
+        (["run", "good.xyz", "-o", "out", "--steps", "magic"], 2, "no step 'magic'"),
+        (["run", "good.xyz", "-o", "out", "--steps", "spheres", "--method", "magic"], 2, "no method 'magic'"),
+        (["run", "good.xyz", "-o", "out", "--steps", "preassemble"], 3, "design"),
+        (["run", "good.xyz", "-o", "taken", "--steps", "spheres"], 2, "not empty"),
+        (["run", "good.xyz", "-o", "out", "--units", "parsec"], 2, "parsec"),
+        (["run", "good.xyz"], 2, "output"),
+        (["check", "taken"], 3, "no readable results"),
+    ],
+)
+def test_what_cannot_be_done_is_said_in_one_line(tmp_path, arguments, code, said):
+    (tmp_path / "empty.xyz").touch()
+    (tmp_path / "nan.xyz").write_text("0 0 0\n1 nan 0\n0 1 0\n0 0 1\n1 1 1\n")
+    (tmp_path / "few.xyz").write_text("0 0 0\n1 0 0\n")
+    (tmp_path / "photo.jpg").write_bytes(b"\xff\xd8\xff")
+    (tmp_path / "folder").mkdir()
+    (tmp_path / "cut.h5").write_bytes(b"\x89HDF\r\n\x1a\n" + bytes(100))
+    (tmp_path / "taken").mkdir()
+    (tmp_path / "taken" / "mine.txt").write_text("keep")
+    np.savetxt(tmp_path / "good.xyz", ball_cloud(count=200) / 1000.0)
+    before = sorted(p.name for p in tmp_path.iterdir())
+    done = processor(*arguments, cwd=tmp_path)
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stdout == ""
+    assert sorted(p.name for p in tmp_path.iterdir()) == before
+    assert (tmp_path / "taken" / "mine.txt").read_text() == "keep"

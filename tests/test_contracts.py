@@ -1,0 +1,85 @@
+"""What every step, reader and recipe owes: found by their names, held over the folders."""
+
+import dataclasses
+import importlib
+import pkgutil
+
+import numpy as np
+import pytest
+
+from designgen import recipes
+from designgen.scene import make
+from processor import pipeline, readers, store
+from processor.model import Metric, StepRun, UsageError
+
+STEPS = pipeline.step_modules()
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_a_step_has_its_names(name):
+    module = STEPS[name]
+    assert isinstance(module.NEEDS, tuple)
+    assert module.METHODS[0] == module.Params().method
+    for record in (module.Params, module.Result):
+        assert dataclasses.is_dataclass(record)
+        assert record.__dataclass_params__.frozen
+    assert callable(module.run)
+    assert callable(module.check)
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_an_empty_result_goes_through_the_store(name, tmp_path):
+    result = STEPS[name].Result(status="failed", method=STEPS[name].METHODS[0])
+    store.write_results(tmp_path / "r.h5", [StepRun(name, result.method, "{}", result)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", pipeline.result_classes())
+    assert (back.step, back.method) == (name, result.method)
+    for field in dataclasses.fields(result):
+        np.testing.assert_array_equal(getattr(back.result, field.name), getattr(result, field.name))
+
+
+def test_every_reader_says_what_it_reads():
+    modules = [m.name for m in pkgutil.iter_modules(readers.__path__) if m.name != "raw"]
+    assert set(modules) >= {"e57", "las", "ply", "pcd", "ptx", "text"}
+    for name in modules:
+        module = importlib.import_module(f"processor.readers.{name}")
+        assert set(module.SUFFIXES) <= set(readers.SUFFIXES)
+        assert callable(module.read)
+
+
+@pytest.mark.parametrize("name", recipes.named())
+def test_every_recipe_makes_a_scene_that_goes_through_the_store(name, tmp_path):
+    recipe = recipes.overridden(recipes.load(name)[1], ["scan.spacing_mm=60"])
+    assert len(recipe["about"]) > 20
+    scene, truth = make(name, recipe)
+    store.write_scene(tmp_path / "s.h5", scene, truth, {})
+    assert store.problems(tmp_path / "s.h5") == []
+    back = store.read_scene(tmp_path / "s.h5")
+    assert back.kind == scene.kind
+    assert sum(len(s.points) for s in back.scans) == sum(len(s.points) for s in scene.scans)
+    assert pipeline.plan(back.kind, (), (), {}, 0)
+
+
+def test_parameters_are_checked_by_name_and_type():
+    filled = pipeline.plan("arch-bridge", (), (), {"preassemble": {"boxes": {"edge_box_mm": 42}}}, 3)
+    assert filled[0].params.boxes.edge_box_mm == 42.0
+    assert filled[0].params.seed == 3
+    for table, said in [
+        ({"preassemble": {"box": {}}}, "preassemble.box: unknown parameter"),
+        ({"preassemble": {"boxes": {"box_count": 1.5}}}, "box_count: expected a int"),
+        ({"preassemble": {"boxes": 3}}, "boxes: expected a table"),
+        ({"preassemble": {"method": "magic"}}, "method: expected one of"),
+        ({"magic": {}}, "no step 'magic'"),
+    ]:
+        with pytest.raises(UsageError, match=said):
+            pipeline.plan("arch-bridge", (), (), table, 0)
+    with pytest.raises(UsageError, match="no method 'magic'"):
+        pipeline.plan("arch-bridge", (), ("magic",), {}, 0)
+    with pytest.raises(UsageError, match="--steps"):
+        pipeline.plan("structure", (), (), {}, 0)
+
+
+def test_a_metric_passes_only_within_its_limit():
+    assert Metric("s", "n", 1.0, 1.0, "mm").passed
+    assert not Metric("s", "n", 1.1, 1.0, "mm").passed
+    assert not Metric("s", "n", float("nan"), 1.0, "mm").passed
+    assert Metric("s", "n", 99.0, float("nan"), "mm").passed

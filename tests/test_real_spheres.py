@@ -1,0 +1,76 @@
+"""Real scans of a sphere of 50 mm radius, against the centres a reference algorithm published for them."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processor.model import Scan, Scene
+from processor.steps import spheres
+
+DATA = Path(__file__).resolve().parents[1] / "../shared/data/spheres"
+PUBLISHED = {
+    "SPH101": (-5895.833, 3628.939, -1561.255),
+    "SPH102": (-4510.108, -6758.343, -1576.506),
+    "SPH103": (-3508.773, 5865.925, -1570.917),
+}
+
+
+def scene(name, **known):
+    file = DATA / f"{name}.xyz"
+    if not file.is_file():
+        pytest.skip(f"real scan {file.name} is not at hand")
+    points = 1000.0 * np.loadtxt(file)
+    origin = np.floor(points[0])
+    return Scene(name, "structure", (Scan(name, points - origin, origin, **known),))
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_free_radius(name):
+    result = spheres.run(scene(name), spheres.Params())
+    assert (result.status, result.flag) == ("ok", ("ok",))
+    assert "orthogonal" in result.message
+    assert np.linalg.norm(result.centres[0] - PUBLISHED[name]) < 0.25
+    assert result.radii[0] == pytest.approx(50.0, abs=0.2)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_held_radius(name):
+    result = spheres.run(scene(name), spheres.Params(radius_mm=50.0))
+    assert (result.status, result.flag, result.radii[0]) == ("ok", ("ok",), 50.0)
+    assert np.linalg.norm(result.centres[0] - PUBLISHED[name]) < 0.1
+    assert "held" in result.message
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_known_scanner(name):
+    result = spheres.run(scene(name, position=np.zeros(3)), spheres.Params(radius_mm=50.0))
+    assert result.status == "ok"
+    assert "range" in result.message
+    assert np.linalg.norm(result.centres[0] - PUBLISHED[name]) < 0.1
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_seed_makes_no_difference(name):
+    results = [spheres.run(scene(name), spheres.Params(seed=seed)) for seed in (1, 2)]
+    np.testing.assert_allclose(results[0].centres, results[1].centres, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_mount_alone_holds_no_ball(name):
+    whole = scene(name)
+    scan = whole.scans[0]
+    off = np.linalg.norm(scan.points + scan.origin - PUBLISHED[name], axis=1) - 50.0
+    rest = Scene(name, "structure", (Scan(name, scan.points[np.abs(off) > 2.0], scan.origin),))
+    result = spheres.run(rest, spheres.Params())
+    assert (result.status, len(result.radii)) == ("failed", 0)
+
+
+def test_a_large_offset_changes_nothing():
+    here = scene("SPH102")
+    scan = here.scans[0]
+    utm = np.array([500_000_000.0, 4_300_000_000.0, 0.0])
+    there = Scene("there", "structure", (Scan("there", scan.points, scan.origin + utm),))
+    a, b = (spheres.run(one, spheres.Params()) for one in (here, there))
+    np.testing.assert_allclose(b.centres - utm, a.centres, atol=1e-6)
+    np.testing.assert_allclose(b.radii, a.radii, atol=1e-6)
