@@ -18,7 +18,7 @@ from processor.model import DesignPart, Floats
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: a mark of 0.1 m shows in ten samples
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for those that can still win
-COARSE_POINTS, FINE_POINTS = 600, 4000
+COARSE_POINTS, FINE_POINTS = 600, 20_000
 PROMISING = 4.0  # a hypothesis this many times worse than the best after the coarse gates is dropped
 NO_FIT_MM = 25.0  # typical distance to the design, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses that move no corner of the part by more are one and the same
@@ -96,7 +96,8 @@ def find(points: Floats, part: DesignPart) -> Attitude:
         fitted = _aligned(_thinned(seeds, COARSE_POINTS), surface, T, COARSE_GATES_MM)
         coarse.append((_misfit(_thinned(seeds, COARSE_POINTS), surface, fitted), fitted, T))
     promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + 1.0]
-    seeds = _thinned(seeds, FINE_POINTS)
+    # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
+    seeds = _thinned(points, FINE_POINTS)
     candidates = []
     for _, T_coarse, T in promising:
         fitted = _aligned(seeds, surface, T_coarse, FINE_GATES_MM)
