@@ -48,8 +48,8 @@ def linear_error(parts: list[BottomEdges], poses: list[Floats]) -> LinearError:
     """Linear error of parts at poses T_bridge_scan, a station every 200 mm of both edges.
 
     The stations are those of the design, NaN where no scanned point is near. The deviation at a station is the length
-    of the mean vector from the design's edge to the scanned points of the 200 mm around: single distances would all be
-    positive and never fall below the noise.
+    of the median vector (by component) from the design's edge to the scanned points of the 200 mm around: single
+    distances would all be positive and never fall below the noise, and near a joint some points are of its end face.
     """
     stations: list[float] = []
     edges: list[str] = []
@@ -66,7 +66,7 @@ def linear_error(parts: list[BottomEdges], poses: list[Floats]) -> LinearError:
                 inner = (s > 0.0) & (s < design.length)  # beyond the ends the vector is not square to the edge
                 cell = np.floor(s[inner] / STATION_MM).astype(np.int64)
                 for c in np.unique(cell):
-                    vectors[c] = offset[inner][cell == c].mean(axis=0)
+                    vectors[c] = np.median(offset[inner][cell == c], axis=0)
             stations += [before + (c + 0.5) * STATION_MM for c in range(count)]
             edges += [edge] * count
             deviations += np.linalg.norm(vectors, axis=1).tolist()

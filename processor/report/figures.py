@@ -128,7 +128,7 @@ def _plan(run: StepRun) -> tuple[str, bytes]:
     axes.set(xlabel="x, m", ylabel="y, m")
     axes.set_aspect("equal")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8)
+    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3)
     missing = int((flags == "not-found").sum())
     return f"Plan of the balls, method {run.method}" + (f"; {missing} not found" if missing else ""), _png(figure)
 

@@ -14,6 +14,7 @@ from processor.report import tables
 
 TITLES = {"preassemble": "Preassembly", "spheres": "Bolt balls"}
 GOOD = "ok"
+CSV_ONLY = ("linear",)  # a row a station: the figure shows it
 
 
 def html(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str, bytes]]) -> str:
@@ -74,7 +75,7 @@ def _sections(execution: Execution, report: ErrorReport, figures: dict[str, tupl
             {
                 "title": TITLES[run.step],
                 "message": run.result.message,
-                "tables": tables.of_step(run, others, report),
+                "tables": [t for t in tables.of_step(run, others, report) if t.file not in CSV_ONLY],
                 "figures": [figure for figure in encoded if figure["file"] in own],
             }
         )

@@ -172,7 +172,7 @@ def _spheres(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
                 ),
                 tuple(rows),
                 "balls" if run is runs[0] else f"balls-{run.method}",
-                result.message,
+                "" if run is runs[0] else result.message,
             )
         )
     if report.true_balls is not None:
