@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import json
 import pkgutil
+from importlib.metadata import version
 from pathlib import Path
 
 import click
@@ -50,7 +51,8 @@ def make(recipe: str, output: Path, seed: int | None, settings: tuple[str, ...],
     loaded = recipes.overridden(loaded, settings)
     made, truth = scene.make(name, loaded, seed)
     used = loaded.get("seed", 0) if seed is None else seed
-    provenance = {"software": {"designgen": __version__}, "recipe": name, "parameters": loaded, "seed": used}
+    software = {"designgen": __version__, **{name: version(name) for name in ("cadquery", "numpy", "scipy")}}
+    provenance = {"software": software, "recipe": name, "parameters": loaded, "seed": used}
     store.write_scene(output, made, truth, provenance)
     points = sum(len(scan.points) for scan in made.scans)
     if as_json:

@@ -87,7 +87,9 @@ def point_to_plane(
             if len(r) < 6:
                 return Alignment(T, np.inf, share, done)
             rms = float(np.sqrt(np.mean(r**2)))
-            scale = max(1.4826 * float(np.median(np.abs(r))), 1e-6)
+            # On a clean scan the median is next to nothing, and the few points of an end face, far off while the part
+            # still slides along its length, would lose all their weight: the gate sets a floor.
+            scale = max(1.4826 * float(np.median(np.abs(r))), gate / 12.0)
             weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(r), 1e-12))
             centre = p.mean(axis=0)
             J = np.hstack([np.cross(p - centre, n), n])

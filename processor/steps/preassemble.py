@@ -8,7 +8,7 @@ state no uncertainty, and their key points lie on the inner edges of the plates.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
 import numpy as np
@@ -37,6 +37,7 @@ NEEDS: tuple[str, ...] = ()
 KIND = "arch-bridge"
 METHODS = ("design-aided", "line", "corner")  # the first is the default
 
+REFERENCE_C = 20.0
 GAUGES = {
     "corner": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
     "line": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
@@ -115,7 +116,11 @@ def run(scene: Scene, params: Params) -> Result:
     design = scene.arch
     if design is None or len(design.parts) < 2:
         raise InputError(f"{scene.name}: preassembly needs an arch-bridge design of at least two parts (design.json)")
-    return assemble(extract(scene, design, params), design, params)
+    result = assemble(extract(scene, design, params), design, params)
+    if np.isfinite(scene.temperature_C) and scene.temperature_C != REFERENCE_C:
+        said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
+        result = replace(result, message=f"{result.message}; {said}")
+    return result
 
 
 def extract(scene: Scene, design: ArchDesign, params: Params) -> list[Part]:

@@ -201,6 +201,12 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
     assert np.isnan(result.gaps[1:]).all()
 
 
+def test_a_temperature_that_is_not_corrected_is_said(bridge):
+    scene, _ = bridge
+    result = preassemble.run(dataclasses.replace(scene, temperature_C=31.5), preassemble.Params(method="corner"))
+    assert "temperature (31.5 C) is not corrected" in result.message
+
+
 def test_what_cannot_be_assembled_is_refused(bridge):
     scene, _ = bridge
     with pytest.raises(InputError, match="arch-bridge design"):
