@@ -269,16 +269,16 @@ def _design_lines(part: Part, spacing_mm: float) -> Floats:
 def _result(parts: list[Part], poses: list[Floats], messages: list[str], design: ArchDesign, params: Params) -> Result:
     pairs = list(pairwise(range(len(parts))))
     joint_gaps = np.full((len(pairs), 8, 3), np.nan)
+    status = [_status(part, pose) for part, pose in zip(parts, poses, strict=True)]
     for j, (left, right) in enumerate(pairs):
         a, b = parts[left].ends[1], parts[right].ends[0]
-        if a is not None and b is not None:
+        if a is not None and b is not None and "failed" not in (status[left], status[right]):
             joint_gaps[j] = errors.gaps(a.key_points, b.key_points, poses[left], poses[right])
     splicing_mean, splicing_max = errors.splicing_error(joint_gaps)
     edges = [part.edges for part in parts]
     assembled = errors.linear_error(edges, poses)
     to_design = parts[0].attitude.T_surface @ _inverse(poses[0])
     best_fit = errors.linear_error(edges, [to_design @ pose for pose in poses])
-    status = [_status(part, pose) for part, pose in zip(parts, poses, strict=True)]
     said = [
         "; ".join(filter(None, (part.attitude.message, part.trouble, message)))
         for part, message in zip(parts, messages, strict=True)
