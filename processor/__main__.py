@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import traceback
 
 import click
 
-from processor.cli import commands
+from processor.cli import commands, say
 from processor.model import InputError, UsageError
 
 WRONG_USAGE, BAD_INPUT = 2, 3
+OUTPUT_CUT = 141  # as a shell reports SIGPIPE
 
 
 def main() -> None:
@@ -24,10 +27,17 @@ def main() -> None:
         error.show()
         sys.exit(WRONG_USAGE)
     except UsageError as error:
-        click.echo(f"error: {error}", err=True)
+        say(f"error: {error}")
         sys.exit(WRONG_USAGE)
-    except (InputError, OSError) as error:
-        click.echo(f"error: {error}", err=True)
+    except BrokenPipeError:
+        # Whoever read the output has seen enough. Python would complain once more when it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(OUTPUT_CUT)
+    except Exception as error:
+        if "--debug" in sys.argv:
+            traceback.print_exc()
+        foreseen = isinstance(error, (InputError, OSError))
+        say(f"error: {error}" if foreseen else f"error: internal error: {error!r}; --debug shows where")
         sys.exit(BAD_INPUT)
 
 

@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from processor import __version__
 from processor.model import InputError, Metric
+
+if TYPE_CHECKING:
+    from processor.evaluate import ErrorReport
+    from processor.pipeline import Execution
 
 DONE, IN_PART, LIMIT_MISSED = 0, 1, 4
 UNITS = ("m", "mm", "cm", "inch", "ft")
@@ -24,6 +28,11 @@ def commands() -> None:
     """
 
 
+def say(line: str) -> None:
+    """Write one line on standard error, whatever control characters a name in it holds."""
+    click.echo("".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in line), err=True)
+
+
 def _named(_: click.Context, __: click.Parameter, value: str | None) -> tuple[str, ...]:
     return tuple(name.strip() for name in value.split(",") if name.strip()) if value else ()
 
@@ -35,8 +44,9 @@ def _named(_: click.Context, __: click.Parameter, value: str | None) -> tuple[st
 @click.option("--method", "methods", callback=_named, metavar="NAME[,NAME]", help="further ones are run for comparison")
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
 @click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
-@click.option("--seed", type=click.IntRange(min=0), default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
+@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
 def run(
     context: click.Context,
@@ -46,35 +56,61 @@ def run(
     methods: tuple[str, ...],
     params: Path | None,
     units: str | None,
-    seed: int,
+    seed: int | None,
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
     from processor import pipeline
     from processor.evaluate import evaluate
-    from processor.report import tables, writing
+    from processor.report import writing
 
     if not input_.exists():
         raise InputError(f"{input_}: there is no such file or folder")
-    writing.check_output(output)
+    writing.check_output(output, input_)
     parameters = pipeline.read_params(params)
     if steps:
         pipeline.plan("", steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
     scene = pipeline.read(input_, units)
     jobs = pipeline.plan(scene.kind, steps, methods, parameters, seed)
-    click.echo(f"{input_.name}: read as {scene.units} ({scene.units_reason})", err=True)
-    execution = pipeline.execute(input_, scene, jobs, log=lambda line: click.echo(line, err=True))
+    say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
+    execution = pipeline.execute(input_, scene, jobs, log=say)
     report = evaluate(input_, execution)
     writing.write(output, execution, report)
+    _show(context, output, execution, report, as_json)
+
+
+def _show(context: click.Context, output: Path, execution: Execution, report: ErrorReport, as_json: bool) -> None:
+    """Print what was found and set the exit code."""
+    from processor.report import printing, tables, writing
+
     if as_json:
         click.echo((output / writing.RESULTS).read_text("utf-8"), nl=False)
     else:
         for table in tables.all_of(execution, report):
-            if table.file != "linear":
-                click.echo(tables.plain_text(table) + "\n")
+            if table.on_terminal:
+                click.echo(printing.plain_text(table) + "\n")
         click.echo(f"report: {output / 'report.html'}")
     complete = all(one.result.status == "ok" for one, _ in tables.grouped(execution.runs))
     context.exit(LIMIT_MISSED if not report.passed else DONE if complete else IN_PART)
+
+
+@commands.command()
+@click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
+@click.option("--units", type=click.Choice(UNITS), help="as given to the run")
+@click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
+@click.pass_context
+def report(context: click.Context, output: Path, input_: Path, units: str | None, as_json: bool) -> None:
+    """Check and report again what is in OUT, without running its steps on INPUT anew."""
+    from processor import pipeline
+    from processor.evaluate import evaluate
+    from processor.report import writing
+
+    writing.check_output(output, input_)
+    execution = pipeline.read_execution(output / writing.RUNS, input_, units)
+    found = evaluate(input_, execution)
+    writing.write(output, execution, found)
+    _show(context, output, execution, found, as_json)
 
 
 @commands.command()
@@ -84,7 +120,7 @@ def run(
 def check(context: click.Context, output: Path, as_json: bool) -> None:
     """Print the checks of the run in OUT again; exits 4 when a limit was missed."""
     from processor.evaluate import ErrorReport
-    from processor.report import tables
+    from processor.report import printing, tables
 
     found = _read_results(output)
     metrics = tuple(
@@ -94,7 +130,7 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"passed": report.passed, "checks": found["checks"]}, ensure_ascii=False))
     elif metrics:
-        click.echo(tables.plain_text(tables.of_checks(report), most=len(metrics)))
+        click.echo(printing.plain_text(tables.of_checks(report), most=len(metrics)))
     else:
         click.echo("no checks: the input held no truth")
     context.exit(DONE if report.passed else LIMIT_MISSED)

@@ -62,8 +62,15 @@ def read(path: Path, units: str | None) -> Scene:
     if path.is_file() and path.suffix.lower() == ".h5":
         if units is not None:
             raise UsageError(f"--units {units}: {path.name} is a scene file, which knows its units; leave --units out")
-        return store.read_scene(path)
-    return folder.read_input(path, units)
+        scene = store.read_scene(path)
+    else:
+        scene = folder.read_input(path, units)
+    for name in (path.name, scene.name, *(scan.name for scan in scene.scans)):
+        try:
+            name.encode("utf-8")
+        except UnicodeEncodeError:
+            raise InputError(f"{name!a}: a file name that is not UTF-8; rename the file") from None
+    return scene
 
 
 def read_params(path: Path | None) -> dict[str, Any]:
@@ -78,14 +85,15 @@ def read_params(path: Path | None) -> dict[str, Any]:
 
 
 def plan(
-    kind: str, wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int
+    kind: str, wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None
 ) -> tuple[Job, ...]:
     """Choose the steps for a kind of scene, or those wanted, with their methods; every name and type is checked.
 
-    The first method named for a step gives the answer; further ones are run for comparison.
+    The first method named for a step gives the answer; further ones are run for comparison. Without a ``seed`` that
+    of the parameters holds. Raises UsageError for whatever is not known, saying what is.
     """
     modules = step_modules()
-    chosen = list(wanted) or [name for name, module in modules.items() if kind == module.KIND]
+    chosen = list(dict.fromkeys(wanted)) or [name for name, module in modules.items() if kind == module.KIND]
     if not chosen:
         raise UsageError(
             f"no step runs by itself on a scene of kind {kind}; name one with --steps: {', '.join(modules)}"
@@ -98,11 +106,11 @@ def plan(
         if not any(method in named for named in offered.values()):
             known = "; ".join(f"{name}: {', '.join(modules[name].METHODS)}" for name in chosen)
             raise UsageError(f"no method {method!r} for these steps ({known})")
+    # Tables of steps that do not run are checked too: one file serves many inputs, and a slip in it should not wait.
+    tables = {name: fill(modules[name].Params, params.get(name, {}), name) for name in (*chosen, *params)}
     jobs = []
     for name in chosen:
-        module = modules[name]
-        table = dict(params.get(name, {})) if isinstance(params.get(name, {}), Mapping) else params[name]
-        filled = fill(module.Params, table, name)
+        module, filled = modules[name], tables[name]
         first = filled.method
         if first not in module.METHODS:
             raise UsageError(f"{name}.method: expected one of {', '.join(module.METHODS)}, got {first!r}")
@@ -129,7 +137,7 @@ def fill(cls: type, table: Any, where: str) -> Any:
         if dataclasses.is_dataclass(known[key]):
             values[key] = fill(type(known[key]), value, f"{where}.{key}")
             continue
-        if isinstance(known[key], float) and type(value) is int:
+        if isinstance(known[key], float) and type(value) is int and abs(value) < 2**53:
             value = float(value)
         if type(value) is not type(known[key]):
             raise UsageError(f"{where}.{key}: expected a {type(known[key]).__name__}, got {value!r}")
@@ -138,7 +146,10 @@ def fill(cls: type, table: Any, where: str) -> Any:
 
 
 def execute(path: Path, scene: Scene, jobs: Sequence[Job], log: Callable[[str], None] = lambda _: None) -> Execution:
-    """Run the jobs on a scene read from ``path``."""
+    """Run the jobs on a scene read from ``path``.
+
+    Raises InputError and UsageError as the steps do, and InputError for whatever else goes wrong within one.
+    """
     from processor import store
 
     runs = []
@@ -146,9 +157,13 @@ def execute(path: Path, scene: Scene, jobs: Sequence[Job], log: Callable[[str], 
         started = time.monotonic()
         try:
             result = job.module.run(scene, job.params)
-        except (MemoryError, ArithmeticError, LookupError, ValueError) as error:
+        except (InputError, UsageError):
+            raise
+        except Exception as error:
             # No input may end in a traceback: what a step did not foresee is the input's error until proved otherwise.
-            raise InputError(f"{path.name}: step {job.step} ({job.params.method}) failed: {error!r}") from error
+            raise InputError(
+                f"{path.name}: internal error in step {job.step} ({job.params.method}): {error!r}; --debug shows where"
+            ) from error
         log(f"{job.step} ({job.params.method}): {result.status}, {time.monotonic() - started:.1f} s")
         runs.append(StepRun(job.step, job.params.method, as_json(dataclasses.asdict(job.params)), result))
     provenance = {
@@ -156,15 +171,36 @@ def execute(path: Path, scene: Scene, jobs: Sequence[Job], log: Callable[[str], 
         "input_sha256": store.scene_hash(scene),
         "seed": jobs[0].params.seed if jobs else 0,
         "software": software(),
-        "parameters": [{"step": run.step, **json.loads(run.params)} for run in runs],
+        "parameters": _parameters(runs),
     }
     return Execution(scene, tuple(runs), provenance)
+
+
+def _parameters(runs: Sequence[StepRun]) -> list[dict[str, Any]]:
+    return [{"step": run.step, **json.loads(run.params)} for run in runs]
+
+
+def read_execution(results: Path, path: Path, units: str | None) -> Execution:
+    """Read what was run on ``path`` earlier. Raises InputError where the results are those of another input."""
+    from processor import store
+
+    runs = store.read_results(results, result_classes())
+    provenance = store.read_provenance(results)
+    missing = {"input", "input_sha256", "seed", "software"} - set(provenance)
+    if missing:
+        raise InputError(f"{results}: does not say its {', '.join(sorted(missing))}; run processor run again")
+    provenance["parameters"] = _parameters(runs)  # the store sorts names, a run's parameters keep their order
+    scene = read(path, units)
+    if store.scene_hash(scene) != provenance["input_sha256"]:
+        raise InputError(f"{results}: was made from {provenance['input']!r} as it was then, not from {path} as it is")
+    return Execution(scene, runs, provenance)
 
 
 def software() -> dict[str, str]:
     """Versions of what made a result."""
     python = ".".join(str(part) for part in sys.version_info[:3])
-    return {"processor": __version__, "python": python, **{name: version(name) for name in SOFTWARE}}
+    found = {"processor": __version__, "python": python, **{name: version(name) for name in SOFTWARE}}
+    return dict(sorted(found.items()))
 
 
 def as_json(value: Any) -> str:

@@ -3,6 +3,7 @@
 import csv
 import dataclasses
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -10,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processor import pipeline, store
+from processor import __main__, pipeline, store
 from processor.evaluate import evaluate
-from processor.model import FrameDesign, FrameTruth, Scan, Scene, Truth
+from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError
 from processor.report import writing
 from tests import arch_clouds
 
@@ -81,6 +82,88 @@ def test_the_same_bytes_in_give_the_same_bytes_out(sphere_run, tmp_path):
     for made in sorted((folder / "out").iterdir()):
         assert made.read_bytes() == (tmp_path / "again" / made.name).read_bytes(), made.name
     assert str(tmp_path) not in (tmp_path / "again" / "results.json").read_text("utf-8")
+
+
+def test_results_are_replaced_but_nothing_else(sphere_run, tmp_path):
+    folder, _ = sphere_run
+    arguments = ["run", folder / "target.xyz", "-o", tmp_path / "out", "--steps", "spheres"]
+    assert processor(*arguments).returncode == 0
+    first = (tmp_path / "out" / "results.json").read_bytes()
+    assert processor(*arguments).returncode == 0
+    assert (tmp_path / "out" / "results.json").read_bytes() == first
+    (tmp_path / "out" / "notes.txt").write_text("keep")
+    done = processor(*arguments)
+    assert (done.returncode, "notes.txt" in done.stderr) == (2, True)
+    assert (tmp_path / "out" / "notes.txt").read_text() == "keep"
+    assert [p.name for p in tmp_path.iterdir()] == ["out"]
+
+
+def test_the_command_lines_seed_goes_before_the_parameters(tmp_path):
+    params = {"spheres": {"seed": 5}}
+    assert pipeline.plan("space-frame", (), (), params, None)[0].params.seed == 5
+    assert pipeline.plan("space-frame", (), (), params, 0)[0].params.seed == 0
+    assert pipeline.plan("space-frame", (), (), {}, None)[0].params.seed == 0
+    with pytest.raises(UsageError, match=r"preassemble\.seed"):  # a slip in the table of a step that does not run
+        pipeline.plan("space-frame", (), (), {"preassemble": {"seed": "x"}}, None)
+
+
+def test_a_step_named_twice_runs_once():
+    assert len(pipeline.plan("", ("spheres", "spheres"), ("ransac", "ransac"), {}, 0)) == 1
+
+
+def test_what_a_step_did_not_foresee_is_said_in_one_line(frame, tmp_path, monkeypatch, capsys):
+    scene, _ = frame
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    monkeypatch.setattr("processor.steps.spheres.run", lambda *_: [][0])
+    for debug in (False, True):
+        monkeypatch.setattr(
+            sys, "argv", ["processor", "run", str(tmp_path / "s.h5"), "-o", str(tmp_path / "out"), *["--debug"] * debug]
+        )
+        with pytest.raises(SystemExit) as end:
+            __main__.main()
+        assert end.value.code == 3
+        out, err = capsys.readouterr()
+        assert out == ""
+        assert "s.h5: internal error in step spheres (ransac): IndexError" in err
+        assert ("Traceback" in err) == debug
+    assert not (tmp_path / "out").exists()
+
+
+def test_names_with_control_characters_stay_in_one_line(tmp_path):
+    (tmp_path / "a\n\x1b[31m.xyz").touch()
+    done = processor("run", "a\n\x1b[31m.xyz", "-o", "out", cwd=tmp_path)
+    assert done.returncode == 3
+    assert len(done.stderr.splitlines()) == 1
+    assert "\x1b" not in done.stderr
+
+
+def test_a_file_name_that_is_no_text_is_refused(tmp_path):
+    path = tmp_path / os.fsdecode(b"b\xff.xyz")
+    np.savetxt(path, ball_cloud(count=100) / 1000.0)
+    with pytest.raises(InputError, match="not UTF-8"):
+        pipeline.read(path, None)
+
+
+def test_output_that_nobody_reads_ends_quietly(sphere_run):
+    folder, _ = sphere_run
+    command = f"{sys.executable} -m processor check {folder / 'out'} --json | true"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.stderr == ""
+
+
+def test_a_report_is_made_again_without_running_the_steps(frame, tmp_path):
+    scene, truth = frame
+    store.write_scene(tmp_path / "s.h5", scene, truth, {})
+    run_in_process(tmp_path / "s.h5", tmp_path / "out", ("ransac", "least-squares"))
+    before = {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()}
+    (tmp_path / "out" / "report.html").unlink()
+    done = processor("report", tmp_path / "out", tmp_path / "s.h5")
+    assert done.returncode == 0, done.stderr
+    assert {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()} == before
+    store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, name="another"), truth, {})
+    done = processor("report", tmp_path / "out", tmp_path / "s.h5")
+    assert done.returncode == 3
+    assert "was made from 's.h5' as it was then" in done.stderr
 
 
 def run_in_process(path, out, methods=()):
@@ -177,6 +260,9 @@ def test_a_bridge_through_the_pipeline(tmp_path):
         (["run", "good.xyz", "-o", "out", "--units", "parsec"], 2, "parsec"),
         (["run", "good.xyz"], 2, "output"),
         (["check", "taken"], 3, "no readable results"),
+        (["report", "taken", "good.xyz"], 2, "no earlier results"),
+        (["run", "good.xyz", "-o", "good.xyz/out", "--steps", "spheres"], 3, "good.xyz"),
+        (["run", "good.xyz", "-o", ".", "--steps", "spheres"], 2, "holds the input"),
     ],
 )
 def test_what_cannot_be_done_is_said_in_one_line(tmp_path, arguments, code, said):
@@ -195,5 +281,6 @@ def test_what_cannot_be_done_is_said_in_one_line(tmp_path, arguments, code, said
     assert said in done.stderr
     assert "Traceback" not in done.stderr
     assert done.stdout == ""
+    assert done.stderr.splitlines()[-1].lower().startswith("error: ")
     assert sorted(p.name for p in tmp_path.iterdir()) == before
     assert (tmp_path / "taken" / "mine.txt").read_text() == "keep"

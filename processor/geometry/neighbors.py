@@ -8,19 +8,32 @@ from scipy.spatial import cKDTree
 
 from processor.model import Floats
 
+SLICES, SLICE_POINTS = 5, 40_000
+
 
 def surface_spacing(points: Floats, neighbours: int = 8, sample: int = 5000) -> float:
     """Spacing d in mm of points (n, 3) on a surface, such that there is one point in d^2.
 
     Median over a regular sample of the points: k neighbours within r cover pi r^2 = k d^2, on grids and random
-    samples alike.
+    samples alike. Of a large cloud only slices across its longest axis are looked at: a tree of all would take longer
+    than everything that needs the spacing.
     """
     k = min(neighbours, len(points) - 1)
     if k < 1:
         return float("nan")
-    query = points[:: max(1, len(points) // sample)]
-    radius = cKDTree(points).query(query, k=[k + 1])[0][:, 0]
-    return float(np.median(radius) * np.sqrt(np.pi / k))
+    if len(points) <= SLICES * SLICE_POINTS:
+        slices, margin = [points], 0
+    else:
+        order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))], kind="stable")
+        starts = (np.arange(SLICES) + 0.5) / SLICES * len(points) - 0.5 * SLICE_POINTS
+        slices = [points[order[start : start + SLICE_POINTS]] for start in starts.astype(np.int64)]
+        margin = SLICE_POINTS // 4  # at a slice's ends points lack neighbours
+    radii = []
+    for one in slices:
+        inner = one[margin : len(one) - margin]
+        query = inner[:: max(1, len(inner) * len(slices) // sample)]
+        radii.append(cKDTree(one).query(query, k=[k + 1])[0][:, 0])
+    return float(np.median(np.concatenate(radii)) * np.sqrt(np.pi / k))
 
 
 def statistical_inliers(points: Floats, neighbours: int = 20, ratio: float = 3.0) -> npt.NDArray[np.bool_]:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import base64
+import collections
+import itertools
 import json
 from typing import Any
 
@@ -11,10 +13,13 @@ import jinja2
 from processor.evaluate import ErrorReport
 from processor.pipeline import Execution
 from processor.report import tables
+from processor.report.printing import headings, numeric, shown
+from processor.steps import preassemble, spheres
 
 TITLES = {"preassemble": "Preassembly", "spheres": "Bolt balls"}
 GOOD = "ok"
-CSV_ONLY = ("linear",)  # a row a station: the figure shows it
+PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
+MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 
 def html(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str, bytes]]) -> str:
@@ -22,7 +27,7 @@ def html(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("processor", "report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters["shown"] = tables.shown
+    environment.filters["shown"] = shown
     scene = execution.scene
     text: str = environment.get_template("page.html").render(
         title=scene.name,
@@ -33,7 +38,7 @@ def html(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str
         units_reason=scene.units_reason,
         verdicts=_verdicts(execution, report),
         sections=_sections(execution, report, figures),
-        provenance=json.dumps(execution.provenance, indent=2, ensure_ascii=False),
+        provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
     return text
 
@@ -41,15 +46,10 @@ def html(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]:
     found = []
     for run, _ in tables.grouped(execution.runs):
-        result = run.result
-        said = f"method {run.method}"
-        if run.step == "preassemble":
-            said += f"; splicing error {result.splicing_mean:.2f} mm mean, {result.splicing_max:.2f} mm at most"
-        else:
-            fine = sum(flag == GOOD for flag in result.flag)
-            said += f"; {fine} of {len(result.flag)} balls without a flag"
-        tone = "good" if result.status == GOOD else "bad"
-        found.append({"tone": tone, "head": f"{TITLES[run.step]}: {result.status}", "text": said})
+        head, said = SUMMARIES[run.step](run.result)
+        tone = "good" if run.result.status == GOOD else "bad"
+        title = f"{TITLES[run.step]}: {run.result.status}, {head}"
+        found.append({"tone": tone, "head": title, "text": f"Method {run.method}. {said}"})
     if report.metrics:
         limited = [m for m in report.metrics if m.limit == m.limit]
         missed = [m for m in limited if not m.passed]
@@ -57,10 +57,31 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]
             f"Truth: {len(missed)} of {len(limited)} limits missed" if missed else f"Truth: {len(limited)} limits kept"
         )
         informed = len(report.metrics) - len(limited)
-        found.append({"tone": "bad" if missed else "good", "head": head, "text": f"{informed} further figures inform"})
+        said = "; ".join(f"{m.step}: {m.name}" for m in missed) or f"{informed} further figures have no limit"
+        found.append({"tone": "bad" if missed else "good", "head": head, "text": said})
     else:
         found.append({"tone": "", "head": "No truth", "text": "a real scan: nothing to check against"})
     return found
+
+
+def _preassembled(result: preassemble.Result) -> tuple[str, str]:
+    placed = sum(status != "failed" for status in result.component_status)
+    verdicts = collections.Counter(result.verdict)
+    judged = ", ".join(f"{verdicts[name]} {name}" for name in ("pass", "fail", "indeterminate") if verdicts[name])
+    splicing = f"{shown(result.splicing_mean)} mm mean, {shown(result.splicing_max)} mm at most"
+    linear = f"{shown(result.linear_mean)} mm mean, {shown(result.linear_max)} mm at most"
+    head = f"{placed} of {len(result.components)} parts placed"
+    return head, f"Splicing error {splicing}. Linear error {linear}. Joints: {judged or 'none'}."
+
+
+def _balls(result: spheres.Result) -> tuple[str, str]:
+    flags = collections.Counter(result.flag)
+    named = ", ".join(f"{flags[name]} {name}" for name in ("low-confidence", "wrong-size", "not-found") if flags[name])
+    head = f"{flags[GOOD]} of {len(result.flag)} balls without a flag"
+    return head, f"Flagged: {named}." if named else ""
+
+
+SUMMARIES: dict[str, Any] = {"preassemble": _preassembled, "spheres": _balls}
 
 
 def _sections(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str, bytes]]) -> list[dict[str, Any]]:
@@ -75,10 +96,24 @@ def _sections(execution: Execution, report: ErrorReport, figures: dict[str, tupl
             {
                 "title": TITLES[run.step],
                 "message": run.result.message,
-                "tables": [t for t in tables.of_step(run, others, report) if t.file not in CSV_ONLY],
+                "tables": [_table(one) for one in tables.of_step(run, others, report) if one.on_page],
                 "figures": [figure for figure in encoded if figure["file"] in own],
             }
         )
     if report.metrics:
-        sections.append({"title": "Truth", "message": "", "tables": [tables.of_checks(report)], "figures": []})
+        checks = _table(tables.of_checks(report))
+        sections.append({"title": "Truth", "message": "", "tables": [checks], "figures": []})
     return sections
+
+
+def _table(table: tables.Table) -> dict[str, Any]:
+    note = table.note
+    if len(table.rows) > MOST_ROWS:
+        note = f"{note} The first {MOST_ROWS} of {len(table.rows)} rows; all are in {table.file}.csv.".strip()
+    return {
+        "title": table.title,
+        "note": note,
+        "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
+        "columns": list(zip(headings(table), numeric(table), strict=True)),
+        "rows": table.rows[:MOST_ROWS],
+    }

@@ -1,9 +1,7 @@
-"""Tables of a run: rows for the page, for CSV files and for the terminal."""
+"""Tables of a run, for the page, for CSV files and for the terminal."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,19 +10,27 @@ from typing import Any
 import numpy as np
 
 from processor.evaluate import ErrorReport
-from processor.model import KEY_POINTS, StepRun
+from processor.model import KEY_POINTS, Floats, StepRun
 from processor.pipeline import Execution
+
+NAN = float("nan")
 
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table; ``file`` is the name of its CSV file without suffix, empty for none."""
+    """A titled table: in a CSV file of the name ``file`` where that is not empty, on the page and on the terminal.
+
+    ``groups`` are headings above the columns, one each, equal neighbours taken together; CSV files have none.
+    """
 
     title: str
     columns: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
     file: str = ""
     note: str = ""
+    groups: tuple[str, ...] = ()
+    on_page: bool = True
+    on_terminal: bool = True
 
 
 def of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
@@ -63,6 +69,7 @@ def grouped(runs: Sequence[StepRun]) -> list[tuple[StepRun, list[StepRun]]]:
 
 def _preassemble(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     first = runs[0].result
+    method = runs[0].method
     summary = tuple(
         (
             run.method,
@@ -98,45 +105,100 @@ def _preassemble(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
             "Splicing and linear error by method (mm)",
             (
                 "method",
-                "splicing mean",
-                "splicing max",
-                "linear mean",
-                "linear max",
-                "Foot 1 best-fit: linear mean",
-                "linear max",
+                "splicing_mean_mm",
+                "splicing_max_mm",
+                "linear_mean_mm",
+                "linear_max_mm",
+                "foot1_best_fit_linear_mean_mm",
+                "foot1_best_fit_linear_max_mm",
             ),
             summary,
             "summary",
-            f"Gauge of the linear error as assembled: {gauges}. Foot 1 best-fit: the whole bridge moved so that "
-            "Foot 1 lies on its design.",
+            f"Linear error as assembled, that is with: {gauges}. Foot 1 best-fit to the design: the whole bridge, as "
+            "assembled, is moved so that Foot 1 lies on its design.",
+            ("", *["splicing error"] * 2, *["linear error, as assembled"] * 2, *["linear error, Foot 1 best-fit"] * 2),
         ),
         Table("Components", ("component", "status", "remark"), parts, "components"),
         Table(
-            f"Gaps at the joints, method {runs[0].method} (mm): right part minus left part, bridge axes",
+            f"Joints, method {method} (mm)",
+            ("joint", "left_part", "right_part", "mean_mm", "largest_mm", "at", "verdict"),
+            tuple(_joint(first, j) for j in range(len(first.joints))),
+            "joints",
+            "Mean and largest |d| of 8 point pairs and 3 axes. A verdict needs an uncertainty: pass where the largest "
+            "|d| and its uncertainty keep within the limit, fail where it is beyond by more, else indeterminate.",
+        ),
+        *_by_point(first, method, first.gaps, "Splicing error"),
+        *(_by_point(first, method, first.gap_ci95, "95 % half-widths") if np.isfinite(first.gap_ci95).any() else ()),
+        Table(
+            f"Gaps at the joints, method {method}",
             ("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"),
             tuple(rows),
             "gaps",
+            on_page=False,
+            on_terminal=False,
         ),
         Table(
-            "Linear error by station",
+            f"Linear error by station, method {method}",
             ("edge", "station_mm", "deviation_mm", "foot1_best_fit_deviation_mm"),
             stations,
             "linear",
+            on_page=False,
+            on_terminal=False,
         ),
     ]
 
 
+def _joint(result: Any, j: int) -> tuple[Any, ...]:
+    """Row of the table of joints; a joint without an answer shows none."""
+    size = np.abs(result.gaps[j])
+    row = (result.joints[j], result.joint_left[j], result.joint_right[j])
+    if not np.isfinite(size).any():
+        return (*row, NAN, NAN, "", result.verdict[j])
+    point, axis = np.unravel_index(int(np.nanargmax(size)), size.shape)
+    where = f"{KEY_POINTS[point]}, {'xyz'[axis]}"
+    return (*row, float(np.nanmean(size)), float(np.nanmax(size)), where, result.verdict[j])
+
+
+JOINTS_ABREAST = 4
+
+
+def _by_point(result: Any, method: str, values: Floats, what: str) -> list[Table]:
+    """Lay out (j, 8, 3) as the source paper does (paper 000, tables 4 to 7): point pairs down, joints across."""
+    found = []
+    for start in range(0, len(result.joints), JOINTS_ABREAST):
+        chosen = range(start, min(start + JOINTS_ABREAST, len(result.joints)))
+        found.append(
+            Table(
+                f"{what}, method {method} (mm)",
+                ("point", *["dx", "dy", "dz"] * len(chosen)),
+                tuple((key, *values[chosen, k].ravel().tolist()) for k, key in enumerate(KEY_POINTS)),
+                note="Right part minus left part, bridge axes: x along the span, z up. P1 to P4 are the corners "
+                "bottom-left, bottom-right, top-right, top-left (left = +y), P5 to P8 the middles of the bottom, "
+                "right, top and left edges."
+                if start == 0
+                else "",
+                groups=(
+                    "",
+                    *(
+                        f"{result.joints[j]}: {result.joint_left[j]} & {result.joint_right[j]}"
+                        for j in chosen
+                        for _ in range(3)
+                    ),
+                ),
+            )
+        )
+    return found
+
+
 def _spheres(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
-    true = {} if report.true_balls is None else {int(i): k for k, i in enumerate(report.true_balls.ids)}
     tables = []
     for run in runs:
         result = run.result
+        true = report.true_radii.get(run.method, np.full(len(result.ids), NAN)).tolist()
         rows = []
         for i, ball in enumerate(result.ids.tolist()):
-            radius = float("nan")
-            if report.true_balls is not None and ball in true:
-                radius = float(report.true_balls.radii[true[ball]])
-            sd = math.sqrt(result.covariance[i, 3, 3]) if result.covariance[i, 3, 3] >= 0.0 else float("nan")
+            radius = true[i]
+            sd = math.sqrt(result.covariance[i, 3, 3]) if result.covariance[i, 3, 3] >= 0.0 else NAN
             rows.append(
                 (
                     ball,
@@ -173,59 +235,25 @@ def _spheres(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
                 tuple(rows),
                 "balls" if run is runs[0] else f"balls-{run.method}",
                 "" if run is runs[0] else result.message,
+                on_terminal=run is runs[0],
             )
         )
-    if report.true_balls is not None:
-        tables.insert(0, _radius_errors(tables))
+    doubtful = tuple(row for row in tables[0].rows if row[-2] != "ok")
+    if doubtful:
+        columns = ("id", "flag", "remark", "x_mm", "y_mm", "z_mm", "radius_mm")
+        rows_to_see = tuple((row[0], row[-2], row[-1], *row[1:5]) for row in doubtful)
+        tables.insert(0, Table(f"Balls to look at, method {runs[0].method} (mm)", columns, rows_to_see))
+    if report.true_radii:
+        tables.insert(0, _radius_errors(runs, report))
     return tables
 
 
-def _radius_errors(balls: Sequence[Table]) -> Table:
+def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
     rows = []
-    for table in balls:
-        error = np.array([abs(row[7]) for row in table.rows], dtype=np.float64)
+    for run in runs:
+        error = np.abs(run.result.radii - report.true_radii[run.method])
         known = error[np.isfinite(error)]
-        figures = np.quantile(known, [0.5, 0.95, 1.0]).tolist() if len(known) else [float("nan")] * 3
-        rows.append((table.title[len("Balls, method ") :].split(" ")[0], len(known), len(error), *figures))
-    columns = ("method", "fitted", "balls", "median |dr|", "95 % |dr|", "largest |dr|")
-    return Table("Radius error by method (mm)", columns, tuple(rows), "summary")
-
-
-def csv_text(table: Table) -> str:
-    """Write a table as CSV; text that a spreadsheet would take for a formula gets a leading apostrophe."""
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(table.columns)
-    writer.writerows([_csv_cell(cell) for cell in row] for row in table.rows)
-    return out.getvalue()
-
-
-def _csv_cell(cell: Any) -> Any:
-    if isinstance(cell, float | np.floating):
-        return "" if not math.isfinite(cell) else repr(round(float(cell), 6))
-    if isinstance(cell, str) and cell[:1] in ("=", "+", "-", "@", "\t", "\r"):
-        return "'" + cell
-    return cell
-
-
-def shown(cell: Any) -> str:
-    """Write a cell for people: three decimals, a dash where there is no number."""
-    if isinstance(cell, float | np.floating):
-        return "–" if not math.isfinite(cell) else f"{cell:.3f}"
-    return str(cell)
-
-
-def plain_text(table: Table, most: int = 40) -> str:
-    """Write a table for the terminal, columns aligned, at most so many rows."""
-    cells = [list(table.columns), *([shown(cell) for cell in row] for row in table.rows[:most])]
-    widths = [max(len(row[i]) for row in cells) for i in range(len(table.columns))]
-    lines = [table.title]
-    lines += ["  " + "  ".join(_aligned(cell, width) for cell, width in zip(row, widths, strict=True)) for row in cells]
-    if len(table.rows) > most:
-        lines.append(f"  ... and {len(table.rows) - most} more in {table.file}.csv")
-    return "\n".join(line.rstrip() for line in lines)
-
-
-def _aligned(cell: str, width: int) -> str:
-    number = cell.replace(".", "", 1).replace("-", "", 1).isdigit() or cell == "–"
-    return cell.rjust(width) if number else cell.ljust(width)
+        figures = np.quantile(known, [0.5, 0.95, 1.0]).tolist() if len(known) else [NAN] * 3
+        rows.append((run.method, len(known), len(error), *figures))
+    columns = ("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm")
+    return Table("|radius error| by method (mm)", columns, tuple(rows), "summary")

@@ -12,17 +12,26 @@ from processor import store
 from processor.evaluate import ErrorReport
 from processor.model import UsageError
 from processor.pipeline import Execution
-from processor.report import figures, page, results_json, tables
+from processor.report import figures, page, printing, results_json, tables
 
-RESULTS = "results.json"
+RESULTS, RUNS = "results.json", "results.h5"
 
 
-def check_output(out: Path) -> None:
-    """Refuse a folder that this program did not make: UsageError."""
+OWN_NAMES = (RESULTS, RUNS, "report.html", "figures")  # and CSV tables
+
+
+def check_output(out: Path, source: Path) -> None:
+    """Refuse a folder that holds anything but earlier results, for it will be replaced as a whole: UsageError."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; name a folder for the results")
-    if out.is_dir() and any(out.iterdir()) and not (out / RESULTS).is_file():
+    if source.resolve().is_relative_to(out.resolve()):
+        raise UsageError(f"{out}: holds the input {source}, which the results would replace; name another folder")
+    inside = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    if inside and RESULTS not in inside:
         raise UsageError(f"{out}: is not empty and holds no earlier results; name another folder")
+    others = [name for name in inside if name not in OWN_NAMES and not name.endswith(".csv")]
+    if others:
+        raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
 
 
 def write(out: Path, execution: Execution, report: ErrorReport) -> None:
@@ -32,17 +41,17 @@ def write(out: Path, execution: Execution, report: ErrorReport) -> None:
     making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:
         os.chmod(making, 0o755)
-        store.write_results(making / "results.h5", execution.runs, execution.provenance)
+        store.write_results(making / RUNS, execution.runs, execution.provenance)
         found = results_json.results_json(execution, report)
         _write_text(making / RESULTS, json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
         for table in tables.all_of(execution, report):
             if table.file:
-                _write_text(making / f"{table.file}.csv", tables.csv_text(table))
+                _write_text(making / f"{table.file}.csv", printing.csv_text(table))
         drawn = figures.of_run(execution, report)
         if drawn:
             (making / "figures").mkdir()
         for name, (_, png) in drawn.items():
-            (making / "figures" / name).write_bytes(png)
+            _write(making / "figures" / name, png)
         _write_text(making / "report.html", page.html(execution, report, drawn))
         _replace(making, out)
     except BaseException:
@@ -51,8 +60,12 @@ def write(out: Path, execution: Execution, report: ErrorReport) -> None:
 
 
 def _write_text(path: Path, text: str) -> None:
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        file.write(text)
+    _write(path, text.encode("utf-8"))
+
+
+def _write(path: Path, data: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(data)
         file.flush()
         os.fsync(file.fileno())
 
@@ -64,5 +77,10 @@ def _replace(made: Path, out: Path) -> None:
         return
     old = Path(tempfile.mkdtemp(prefix=f".{out.name}-old-", dir=out.parent))
     os.replace(out, old / "old")
-    os.replace(made, out)
+    try:
+        os.replace(made, out)
+    except OSError:
+        os.replace(old / "old", out)
+        os.rmdir(old)
+        raise
     shutil.rmtree(old, ignore_errors=True)

@@ -113,6 +113,8 @@ def test_spacing_of_a_grid_and_of_random_points():
     loose = np.column_stack([rng.uniform(0.0, 700.0, (10_000, 2)), np.zeros(10_000)])
     assert neighbors.surface_spacing(loose) == pytest.approx(7.0, rel=0.10)
     assert np.isnan(neighbors.surface_spacing(np.zeros((1, 3))))
+    many = np.column_stack([rng.uniform(0.0, 7000.0, 250_000), rng.uniform(0.0, 1750.0, 250_000), np.zeros(250_000)])
+    assert neighbors.surface_spacing(many) == pytest.approx(7.0, rel=0.05)
 
 
 def test_outliers_are_those_of_open3d():

@@ -191,7 +191,8 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
     rib = scene.scans[2]
     T = truth.arch.T_bridge_scan[2]
     start = arch_clouds.CUTS[2] * arch_clouds.ARC
-    near = np.linalg.norm(rigid.apply(T, rib.points) - arch_clouds.position([start], [0.0], [550.0]), axis=1) < 1300.0  # its mark stays
+    middle = arch_clouds.position([start], [0.0], [550.0])
+    near = np.linalg.norm(rigid.apply(T, rib.points) - middle, axis=1) < 1300.0  # its mark stays
     cut = dataclasses.replace(rib, points=rib.points[~near])
     scans = (*scene.scans[:2], cut, *scene.scans[3:])
     result = preassemble.run(dataclasses.replace(scene, scans=scans), preassemble.Params(method="line"))

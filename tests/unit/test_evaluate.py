@@ -1,0 +1,110 @@
+"""What is said against the truth, and what is not said without one."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from processor import pipeline, store
+from processor.evaluate import ErrorReport, evaluate, true_radii
+from processor.model import ArchTruth, FrameDesign, FrameTruth, InputError, Metric, Scan, Scene, StepRun, Truth
+from processor.steps import preassemble, spheres
+
+NAN = float("nan")
+TRUE = FrameTruth(np.array([3, 5, 8]), np.array([[0.0, 0, 0], [1000, 0, 0], [2000, 0, 0]]), np.array([45.0, 50, 60]))
+
+
+def result(ids, centres, radii, method="ransac"):
+    k = len(ids)
+    return spheres.Result(
+        "ok",
+        method,
+        ids=np.array(ids),
+        centres=np.array(centres, np.float64).reshape(k, 3),
+        radii=np.array(radii, np.float64),
+        lowest=np.array(centres, np.float64).reshape(k, 3) - np.array(radii)[:, None] * [0.0, 0.0, 1.0],
+        covariance=np.tile(np.eye(4), (k, 1, 1)),
+        lowest_sd=np.ones(k),
+        points=np.full(k, 100),
+        visible_fraction=np.full(k, 0.5),
+        rms=np.ones(k),
+        nominal_radii=np.full(k, NAN),
+        evidence=("ball",) * k,
+        flag=("ok",) * k,
+        reason=("",) * k,
+    )
+
+
+def scene(with_design=True):
+    design = FrameDesign(TRUE.ids, TRUE.centres, TRUE.radii) if with_design else None
+    return Scene("f", "space-frame", (Scan("s", np.eye(3)),), frame=design)
+
+
+def execution(made_of, *runs):
+    return pipeline.Execution(made_of, tuple(StepRun("spheres", r.method, "{}", r) for r in runs), {})
+
+
+def test_with_a_design_a_ball_is_known_by_its_id():
+    found = result([8, 3, 99], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]], [1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(true_radii(scene(), found, TRUE), [60.0, 45.0, NAN])
+
+
+def test_without_a_design_a_ball_is_known_by_its_place():
+    found = result([3, 5, 8], [[1990.0, 0, 10], [1049, 0, 0], [500, 0, 0]], [60.0, 50.0, 45.0])
+    np.testing.assert_array_equal(true_radii(scene(False), found, TRUE), [60.0, 50.0, NAN])
+    lost = result([0], [[NAN] * 3], [NAN])
+    np.testing.assert_array_equal(true_radii(scene(False), lost, TRUE), [NAN])
+    np.testing.assert_array_equal(true_radii(scene(False), found, FrameTruth()), [NAN] * 3)
+    assert true_radii(scene(False), result([], [], []), TRUE).shape == (0,)
+
+
+def test_checks_of_comparison_runs_bear_the_methods_name(tmp_path):
+    store.write_scene(tmp_path / "f.h5", scene(), Truth(frame=dataclasses.replace(TRUE, lowest=TRUE.centres)), {})
+    good = result(TRUE.ids, TRUE.centres, TRUE.radii)
+    poor = result(TRUE.ids, TRUE.centres, TRUE.radii + 2.0, "least-squares")
+    report = evaluate(tmp_path / "f.h5", execution(scene(), good, poor))
+    values = {metric.name: metric.value for metric in report.metrics}
+    assert values["radius error, median"] == 0.0
+    assert values["least-squares: radius error, median"] == 2.0
+    assert set(report.true_radii) == {"ransac", "least-squares"}
+    assert len(values) == len(report.metrics)
+
+
+def test_no_truth_no_checks(tmp_path):
+    store.write_scene(tmp_path / "f.h5", scene(), None, {})
+    found = execution(scene(), result(TRUE.ids, TRUE.centres, TRUE.radii))
+    assert evaluate(tmp_path / "f.h5", found) == ErrorReport()
+    (tmp_path / "scans").mkdir()
+    assert evaluate(tmp_path / "scans", found) == ErrorReport()
+
+
+def test_the_truth_may_lie_beside_a_folder_of_scans(tmp_path):
+    store.write_truth(tmp_path / "truth.h5", Truth(frame=dataclasses.replace(TRUE, lowest=TRUE.centres)))
+    report = evaluate(tmp_path, execution(scene(), result(TRUE.ids, TRUE.centres, TRUE.radii)))
+    assert report.metrics
+    assert report.passed
+
+
+def test_the_truth_of_another_scene_is_refused(tmp_path):
+    from tests.unit.test_report import arch_scene, assembled
+
+    truth = Truth(arch=ArchTruth(("other",), np.eye(4)[None], np.zeros((1, 2, 8, 3)), np.zeros((1, 2, 8, 3))))
+    store.write_truth(tmp_path / "truth.h5", truth)
+    run = StepRun("preassemble", "line", "{}", assembled("line"))
+    with pytest.raises(InputError, match="of another scene"):
+        evaluate(tmp_path, pipeline.Execution(arch_scene(), (run,), {}))
+
+
+def test_a_report_passes_when_every_limit_is_kept():
+    kept, missed = Metric("s", "a", 1.0, 2.0, "mm"), Metric("s", "a", 3.0, 2.0, "mm")
+    unknown, free = Metric("s", "a", NAN, 2.0, "mm"), Metric("s", "a", NAN, NAN, "mm")
+    assert ErrorReport((kept, free)).passed
+    assert not ErrorReport((kept, missed)).passed
+    assert not ErrorReport((kept, unknown)).passed
+
+
+def test_every_step_can_be_checked():
+    assert {name for name, module in pipeline.step_modules().items() if callable(module.check)} >= {
+        preassemble.__name__.rsplit(".", 1)[1],
+        spheres.__name__.rsplit(".", 1)[1],
+    }
