@@ -26,6 +26,7 @@ class MatchParams:
     pfh_tolerance_mm: float = 100.0
     pfh_iterations: int = 2000
     pfh_limit_deg: float = 15.0  # a coarse pose turned farther from the principal axes' attitude is not believed
+    pfh_limit_mm: float = 500.0  # nor one that moves a feature point farther from where joint and attitude put it
     icp_max_distance_mm: float = 200.0
     icp_iterations: int = 200
     icp_tolerance: float = 1e-7
@@ -79,4 +80,7 @@ def _coarse(
     turn = np.degrees(rigid.rotation_angle(T[:3, :3] @ start[:3, :3].T))
     if turn > params.pfh_limit_deg:
         return start, f"coarse pose from histograms not believed: turned by {turn:.0f} deg from the principal axes"
+    moved = float(np.linalg.norm(rigid.apply(T, thin_source) - rigid.apply(start, thin_source), axis=1).max())
+    if moved > params.pfh_limit_mm:
+        return start, f"coarse pose from histograms not believed: {moved:.0f} mm from where the joint puts the part"
     return T, ""

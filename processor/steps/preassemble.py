@@ -52,6 +52,7 @@ class Params:
     method: str = METHODS[0]
     seed: int = 0
     end_limit_mm: float = 100.0  # a joint end found farther than this from its place in the design is not used
+    gap_limit_mm: float = 100.0  # a part that leaves a wider gap is called weak
     boxes: BoxParams = field(default_factory=BoxParams)
     slices: SliceParams = field(default_factory=SliceParams)
     match: MatchParams = field(default_factory=MatchParams)
@@ -270,17 +271,22 @@ def _result(parts: list[Part], poses: list[Floats], messages: list[str], design:
     pairs = list(pairwise(range(len(parts))))
     joint_gaps = np.full((len(pairs), 8, 3), np.nan)
     status = [_status(part, pose) for part, pose in zip(parts, poses, strict=True)]
+    messages = list(messages)
     for j, (left, right) in enumerate(pairs):
         a, b = parts[left].ends[1], parts[right].ends[0]
         if a is not None and b is not None and "failed" not in (status[left], status[right]):
             joint_gaps[j] = errors.gaps(a.key_points, b.key_points, poses[left], poses[right])
+            widest = float(np.abs(joint_gaps[j]).max())
+            if widest > params.gap_limit_mm:
+                messages[right] += f"; {design.joint_names[j]} gapes by {widest:.0f} mm: the alignment may have failed"
+                status[right] = "weak" if status[right] == "ok" else status[right]
     splicing_mean, splicing_max = errors.splicing_error(joint_gaps)
     edges = [part.edges for part in parts]
     assembled = errors.linear_error(edges, poses)
     to_design = parts[0].attitude.T_surface @ _inverse(poses[0])
     best_fit = errors.linear_error(edges, [to_design @ pose for pose in poses])
     said = [
-        "; ".join(filter(None, (part.attitude.message, part.trouble, message)))
+        "; ".join(filter(None, (part.attitude.message, part.trouble, message.lstrip("; "))))
         for part, message in zip(parts, messages, strict=True)
     ]
     placed = [one != "failed" for one in status]
