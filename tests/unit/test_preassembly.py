@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from processor.geometry import rigid
+from processor.geometry import pfh, rigid
 from processor.geometry.lines import Polyline
 from processor.model import InputError, Scene, UsageError
-from processor.preassembly import attitude, errors, features
+from processor.preassembly import attitude, errors, features, matching
 from processor.steps import preassemble
 from tests import arch_clouds
 
@@ -172,6 +172,30 @@ def test_the_design_keeps_the_line(runs):
     # The source paper's finding, in kind: chained by joints alone the bridge turns with Foot 1's attitude.
     assert runs["design-aided"].linear_mean < 0.5 * runs["line"].linear_mean
     assert runs["design-aided"].linear_mean < 0.5 * runs["corner"].linear_mean
+
+
+@pytest.mark.parametrize(("slide", "believed"), [(300.0, True), (1500.0, False)])
+def test_a_coarse_pose_slid_along_the_bridge_is_not_believed(slide, believed, monkeypatch):
+    # Histograms of straight lines are alike all along: a pose may be right in attitude and metres off along the line.
+    def slid(*_, **__):
+        return rigid.transform(np.eye(3), np.array([slide, 0.0, 0.0]))
+
+    monkeypatch.setattr(pfh, "coarse_alignment", slid)
+    x = np.linspace(0.0, 5000.0, 400)
+    lines = np.vstack([np.column_stack([x, np.full_like(x, y), np.zeros_like(x)]) for y in (-450.0, 450.0)])
+    T, message = matching._coarse(lines, lines, np.eye(4), matching.MatchParams(), np.random.default_rng(0))
+    assert (T[0, 3], message == "") == ((slide, True) if believed else (0.0, False))
+    assert believed or "1500 mm from where the joint puts the part" in message
+
+
+def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
+    scene, _ = bridge
+    widest = np.abs(runs["corner"].gaps).max(axis=(1, 2))
+    limit = float(np.sort(widest)[1:3].mean())  # two of the four joints gape wider
+    found = preassemble.run(scene, preassemble.Params(method="corner", gap_limit_mm=limit))
+    assert [one == "weak" for one in found.component_status] == [False, *(widest > limit)]
+    assert found.status == "partial"
+    assert sum("gapes by" in one for one in found.component_message) == 2
 
 
 def test_an_origin_taken_off_changes_nothing(bridge, runs):
