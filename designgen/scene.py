@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from designgen import mesh, scanner
+from designgen import mesh, sampler
 from designgen.designs import arch_bridge, arch_part, space_frame
 from processor.model import (
     KINDS,
@@ -47,7 +47,7 @@ def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple
     used = recipe.get("seed", 0) if seed is None else seed
     if not isinstance(used, int) or isinstance(used, bool) or used < 0:
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")
-    return maker(name, recipe, _params(scanner.Params, recipe, "scan"), used)
+    return maker(name, recipe, _params(sampler.Params, recipe, "scan"), used)
 
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
@@ -84,12 +84,12 @@ def _like(default: Any, value: Any, where: str) -> Any:
     return value
 
 
-def _bridge(name: str, recipe: Mapping[str, Any], scan: scanner.Params, seed: int) -> tuple[Scene, Truth]:
+def _bridge(name: str, recipe: Mapping[str, Any], scan: sampler.Params, seed: int) -> tuple[Scene, Truth]:
     parts = arch_bridge.build(_params(arch_bridge.Params, recipe, "bridge"))
     part_names = tuple(part.name for part in parts)
     scans, labels, poses, key_bridge, key_scan = [], [], [], [], []
     for number, part in enumerate(parts):
-        cloud = scanner.scan_part(part, number, scan, generator(seed, f"scan {part.name}"))
+        cloud = sampler.scan_part(part, number, scan, generator(seed, f"scan {part.name}"))
         T_scan_bridge = random_pose(generator(seed, f"pose {part.name}"))
         R, t = T_scan_bridge[:3, :3], T_scan_bridge[:3, 3]
         scans.append(Scan(part.name, cloud.points @ R.T + t, component=part.name, sigma_mm=scan.sigma_mm))
@@ -134,9 +134,9 @@ def random_pose(rng: np.random.Generator) -> Floats:
     return T
 
 
-def _frame(name: str, recipe: Mapping[str, Any], scan: scanner.Params, seed: int) -> tuple[Scene, Truth]:
+def _frame(name: str, recipe: Mapping[str, Any], scan: sampler.Params, seed: int) -> tuple[Scene, Truth]:
     frame = space_frame.build(_params(space_frame.Params, recipe, "frame"))
-    cloud = scanner.scan_frame(frame, scan, generator(seed, "scan"))
+    cloud = sampler.scan_frame(frame, scan, generator(seed, "scan"))
     ids = np.arange(len(frame.centres))
     diameters = np.full(len(frame.members), frame.connection.tube_diameter)
     design = FrameDesign(ids, frame.centres, frame.radii, frame.members[:, 0], frame.members[:, 1], diameters)

@@ -1,7 +1,8 @@
 """The records that travel between the parts of the project.
 
 Every record is frozen. Arrays are float64 or int64, checked for their shape and set read-only when the record is
-made; an absent array is an empty one. Lists of things are kept as columns: ``centres (k, 3)`` beside ``radii (k,)``.
+made; an absent array is an empty one. What stands beside the coordinates of each point may be of a smaller type. Lists
+of things are kept as columns: ``centres (k, 3)`` beside ``radii (k,)``.
 Lengths are in mm, angles in rad. ``T_a_b`` is a 4x4 matrix that maps coordinates in frame b to frame a.
 
 The records are also the HDF5 schema: :mod:`processor.store` walks their fields, so a new record needs no I/O code.
@@ -18,6 +19,10 @@ import numpy.typing as npt
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
+# Labels and grid numbers come by the ten million: they are kept small. Coordinates never are.
+Labels = npt.NDArray[np.int32]
+Codes = npt.NDArray[np.uint8]
+Shorts = npt.NDArray[np.float32]
 
 KEY_POINTS = ("P1", "P2", "P3", "P4", "P5", "P6", "P7", "P8")
 ENDS = ("start", "end")
@@ -125,7 +130,9 @@ class Scan(Checked):
         default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
     )
     intensity: Floats = column("n")
-    point_station: Ints = column("n", dtype=np.int64)  # row of Scene.stations a point was seen from, -1 = unknown
+    point_station: Labels = column("n", dtype=np.int32)  # row of Scene.stations a point was seen from, -1 = unknown
+    grid_row: Labels = column("n", dtype=np.int32)  # of the scanner's grid, upward; -1 = not on a grid
+    grid_column: Labels = column("n", dtype=np.int32)  # of the scanner's grid, counter-clockwise from above
     component: str = ""  # arch bridge: the part this is a scan of
     station: str = ""
     position: Floats = optional(3)  # of the scanner, in the scan's frame
@@ -137,10 +144,11 @@ class Scan(Checked):
 
 @dataclass(frozen=True)
 class Stations(Checked):
-    """Scanner positions in the project's frame."""
+    """Scanner positions in the project's frame, and the poses of the scanners where they are known."""
 
     ids: tuple[str, ...] = names("k")
     positions: Floats = column("k", 3)
+    T_project_station: Floats = column("k", 4, 4)
 
 
 @dataclass(frozen=True)
@@ -182,6 +190,15 @@ class FrameDesign(Checked):
 
 
 @dataclass(frozen=True)
+class StructureDesign(Checked):
+    """One mesh of a whole structure, in the design's frame (mm)."""
+
+    name: str
+    vertices: Floats = column("v", 3)
+    faces: Ints = column("f", 3, dtype=np.int64)
+
+
+@dataclass(frozen=True)
 class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
 
@@ -194,6 +211,7 @@ class Scene(Checked):
     temperature_C: float = float("nan")  # of the steel while it was scanned
     units: str = "mm"  # of the input's coordinates, and why they were read so
     units_reason: str = ""
+    structure: StructureDesign | None = None
 
 
 # --- the truth: evaluation alone reads it --------------------------------------------------------------------------
@@ -201,15 +219,22 @@ class Scene(Checked):
 
 @dataclass(frozen=True)
 class PointLabels(Checked):
-    """What each point of a scan really is: ``part`` a row of ``part_names``, ``source`` a row of SOURCES."""
+    """What each point of a scan really is: ``part`` a row of ``part_names``, ``source`` a row of SOURCES.
+
+    Scans by rays also name the surface, and give the range measured less the true one and the cosine of incidence.
+    """
 
     scan: str
     part_names: tuple[str, ...] = ()
-    part: Ints = column("n", dtype=np.int64)  # -1 = none
-    source: Ints = column("n", dtype=np.int64)
+    part: Labels = column("n", dtype=np.int32)  # -1 = none
+    source: Codes = column("n", dtype=np.uint8)
+    surface_names: tuple[str, ...] = ()
+    surface: Labels = column("n", dtype=np.int32)  # -1 = none
+    range_error_mm: Shorts = column("n", dtype=np.float32)
+    incidence_cos: Shorts = column("n", dtype=np.float32)
 
 
-SOURCES = ("surface", "mixed", "outlier")
+SOURCES = ("surface", "mixed", "outlier")  # the footprint on one surface; on several, or past an edge; a stray return
 
 
 @dataclass(frozen=True)
@@ -233,6 +258,49 @@ class FrameTruth(Checked):
 
 
 @dataclass(frozen=True)
+class StationTruth(Checked):
+    """Where the scanners really stood, and the systematic errors each had; both axes of ``tilt`` in rad."""
+
+    ids: tuple[str, ...] = names("k")
+    T_project_station: Floats = column("k", 4, 4)
+    zero_offset_mm: Floats = column("k")
+    scale_ppm: Floats = column("k")
+    tilt: Floats = column("k", 2)
+
+
+@dataclass(frozen=True)
+class AsBuilt(Checked):
+    """What was built or happened otherwise than designed: a row a number, e.g. ("bow, up", "rib1", 3.2, "mm")."""
+
+    what: tuple[str, ...] = names("i")
+    where: tuple[str, ...] = names("i")
+    value: Floats = column("i")
+    unit: tuple[str, ...] = names("i")
+
+
+@dataclass(frozen=True)
+class StructureTruth(Checked):
+    """Points of the design's surface with their outward normals, and where the structure really has them (mm)."""
+
+    points: Floats = column("m", 3)
+    normals: Floats = column("m", 3)
+    displacement: Floats = column("m", 3)
+
+
+@dataclass(frozen=True)
+class DefectTruth(Checked):
+    """The defects of a structure, in the design's frame; a depth inward is positive."""
+
+    ids: Ints = column("k", dtype=np.int64)
+    classes: tuple[str, ...] = names("k")
+    components: tuple[str, ...] = names("k")
+    centres: Floats = column("k", 3)
+    area_mm2: Floats = column("k")
+    depth_max_mm: Floats = column("k")
+    volume_mm3: Floats = column("k")
+
+
+@dataclass(frozen=True)
 class Truth(Checked):
     """What the generator knows and no step may see."""
 
@@ -241,6 +309,10 @@ class Truth(Checked):
     frame: FrameTruth | None = None
     spacing_mm: float = float("nan")
     sigma_mm: float = float("nan")
+    structure: StructureTruth | None = None
+    defects: DefectTruth | None = None
+    stations: StationTruth | None = None
+    as_built: AsBuilt | None = None
 
 
 # --- checks ---------------------------------------------------------------------------------------------------------

@@ -28,7 +28,11 @@ from processor.codec import DecodeError
 from processor.model import Floats, InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.0"
+FORMAT_VERSION = "1.1"
+HISTORY = [
+    "1.0: first",
+    "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
+]
 
 # All that HDF5 and h5py raise for a damaged file; none of it names the file or helps its user.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
@@ -69,7 +73,8 @@ def _sync(path: Path) -> None:
 @contextmanager
 def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterator[Any]:
     with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest") as file:
-        header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "history": "[]", "units": "mm"}
+        header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "units": "mm"}
+        header["history"] = json.dumps(HISTORY)
         for name, text in header.items():
             file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
         codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
@@ -109,7 +114,8 @@ def _in_order(labels: PointLabels, orders: Mapping[str, Ints], path: Path) -> Po
     order = orders.get(labels.scan)
     if order is None:
         raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r} that the scene has not")
-    columns = {name: getattr(labels, name) for name in ("part", "source")}
+    per_point = (field.name for field in dataclasses.fields(labels) if field.metadata.get("shape") == ("n",))
+    columns = {name: getattr(labels, name) for name in per_point}
     for name, column in columns.items():
         if len(column) not in (0, len(order)):
             raise InputError(f"{path}: {len(column)} labels ({name}) for the {len(order)} points of {labels.scan!r}")

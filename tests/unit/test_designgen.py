@@ -11,7 +11,7 @@ import pytest
 import trimesh
 from scipy.integrate import quad
 
-from designgen import curves, mesh, recipes, scan_folder, scanner
+from designgen import curves, mesh, recipes, sampler, scan_folder
 from designgen.designs import arch_bridge, arch_part, bolt_ball, space_frame
 from designgen.scene import generator, make
 from processor import folder, store
@@ -93,7 +93,7 @@ def test_solids_keep_to_the_closed_form(parts):
 
 def test_clean_points_lie_on_the_surface_evenly():
     part = arch_bridge.build(arch_bridge.Params())[0]
-    cloud = scanner.scan_part(part, 0, scanner.Params(spacing_mm=15.0, sigma_mm=0.0), generator(0, "x"))
+    cloud = sampler.scan_part(part, 0, sampler.Params(spacing_mm=15.0, sigma_mm=0.0), generator(0, "x"))
     shell = cq.Shell(arch_part.solid(part).Shells()[0].wrapped)
     sample = cloud.points[:: len(cloud.points) // 60]
     off_pad = np.linalg.norm(sample - arch_part._pad_frame(part)[0], axis=1) > 160.0
@@ -109,7 +109,7 @@ def test_clean_points_lie_on_the_surface_evenly():
     area = outer[0].element(p.ravel(), q.ravel()).mean()
     s = np.linspace(part.s0, part.s1, 20_001)
     assert area == pytest.approx(np.trapezoid(2.0 * part.b(s), s), rel=1e-4)
-    bottom = scanner._on_face(outer[0], 10.0, generator(0, "y"))
+    bottom = sampler._on_face(outer[0], 10.0, generator(0, "y"))
     assert len(bottom) == pytest.approx(area / 100.0, rel=0.02)
 
 
@@ -126,7 +126,7 @@ def test_a_bolt_ball_is_what_is_left_of_the_sphere():
     hole = np.pi * 100.0 * (bolt_ball.PROCESS_HOLE_DEPTH_MM - low) + np.pi * low * low * (3 * R - low) / 3.0
     assert solid.Volume() == pytest.approx(4.0 / 3.0 * np.pi * R**3 - 3.0 * (cap + bores) - hole, rel=1e-6)
     rng = np.random.default_rng(0)
-    unit = scanner._unit_vectors(20_000, rng)
+    unit = sampler._unit_vectors(20_000, rng)
     kept = bolt_ball.exposed(params, unit)
     expected = 1.0 - 3.0 * (R - h) / (2.0 * R) - low / (2.0 * R)  # caps by Archimedes
     assert kept.mean() == pytest.approx(expected, abs=0.01)
@@ -142,7 +142,7 @@ def test_a_frame_of_balls_sleeves_cones_and_tubes():
     box = solid.BoundingBox()
     assert box.zmax == pytest.approx(6000.0 + 2100.0 + 60.0, abs=1e-3)
     assert len(solid.Solids()) == 5 + 8 * 5
-    cloud = scanner.scan_frame(frame, scanner.Params(spacing_mm=20.0, sigma_mm=0.0), generator(0, "z"))
+    cloud = sampler.scan_frame(frame, sampler.Params(spacing_mm=20.0, sigma_mm=0.0), generator(0, "z"))
     for node in range(5):
         own = cloud.points[cloud.part == node]
         np.testing.assert_allclose(np.linalg.norm(own - frame.centres[node], axis=1), 60.0, atol=1e-9)
@@ -150,15 +150,15 @@ def test_a_frame_of_balls_sleeves_cones_and_tubes():
 
 def test_noise_and_outliers_are_what_was_asked_for():
     part = arch_bridge.build(arch_bridge.Params())[2]
-    clean = scanner.scan_part(part, 2, scanner.Params(spacing_mm=20.0, sigma_mm=0.0), generator(3, "a"))
-    noisy = scanner.scan_part(
-        part, 2, scanner.Params(spacing_mm=20.0, sigma_mm=2.0, outlier_share=0.01), generator(3, "a")
+    clean = sampler.scan_part(part, 2, sampler.Params(spacing_mm=20.0, sigma_mm=0.0), generator(3, "a"))
+    noisy = sampler.scan_part(
+        part, 2, sampler.Params(spacing_mm=20.0, sigma_mm=2.0, outlier_share=0.01), generator(3, "a")
     )
     error = noisy.points[: len(clean.points)] - clean.points
     assert error.std() == pytest.approx(2.0, rel=0.02)
     assert abs(error.mean()) < 0.03
-    assert (noisy.source == scanner.OUTLIER).mean() == pytest.approx(0.01, rel=0.01)
-    assert (noisy.part[noisy.source == scanner.OUTLIER] == -1).all()
+    assert (noisy.source == sampler.OUTLIER).mean() == pytest.approx(0.01, rel=0.01)
+    assert (noisy.part[noisy.source == sampler.OUTLIER] == -1).all()
 
 
 def test_truth_belongs_to_its_scan_and_seeds_repeat():

@@ -1,7 +1,4 @@
-"""Scans as point clouds. Mode ``surface``: random points on the exact surface with isotropic noise, as papers do.
-
-A mode that casts rays from stations belongs beside it; :func:`designgen.scene.make` dispatches on ``scan.mode``.
-"""
+"""Points sampled from exact surfaces with isotropic noise, as papers do: no station, no occlusion."""
 
 from __future__ import annotations
 
@@ -11,7 +8,7 @@ import numpy as np
 
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
-from processor.model import SOURCES, Floats, Ints, UsageError
+from processor.model import SOURCES, Codes, Floats, Labels, UsageError
 
 MODES = ("surface",)
 OUTLIER = SOURCES.index("outlier")
@@ -47,8 +44,8 @@ class Cloud:
     """Points (n, 3), the part each belongs to (-1 = none) and its source (a row of SOURCES)."""
 
     points: Floats
-    part: Ints
-    source: Ints
+    part: Labels
+    source: Codes
 
 
 def scan_part(part: arch_part.ArchPart, number: int, params: Params, rng: np.random.Generator) -> Cloud:
@@ -143,16 +140,16 @@ def _prism(corner_radius: float, z0: float, z1: float, spacing_mm: float, rng: n
     return np.stack([x, y, rng.uniform(z0, z1, count)], axis=1)
 
 
-def _with_errors(points: Floats, part: Ints, params: Params, rng: np.random.Generator) -> Cloud:
+def _with_errors(points: Floats, part: Labels, params: Params, rng: np.random.Generator) -> Cloud:
     """Add noise to every coordinate, and outliers after the points."""
     low, high = points.min(axis=0), points.max(axis=0)
     if params.sigma_mm > 0.0:
         points = points + params.sigma_mm * rng.standard_normal(points.shape)
-    source = np.zeros(len(points), np.int64)
+    source = np.zeros(len(points), np.uint8)
     if params.outlier_share > 0.0:
         count = round(len(points) * params.outlier_share / (1.0 - params.outlier_share))
         margin = 0.1 * (high - low)
         points = np.vstack([points, rng.uniform(low - margin, high + margin, (count, 3))])
         part = np.concatenate([part, np.full(count, -1)])
         source = np.concatenate([source, np.full(count, OUTLIER)])
-    return Cloud(points, part.astype(np.int64), source)
+    return Cloud(points, part.astype(np.int32), source.astype(np.uint8))
