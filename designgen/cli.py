@@ -5,13 +5,13 @@ from __future__ import annotations
 import importlib
 import json
 import pkgutil
-from importlib.metadata import version
 from pathlib import Path
 
 import click
 
 from designgen import __version__, designs
 
+DONE, IN_PART, ALL_FAILED = 0, 1, 2
 FORMATS = ("ply", "las", "laz", "e57", "xyz")
 
 
@@ -38,28 +38,57 @@ def list_() -> None:
 
 @commands.command()
 @click.argument("recipe")
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, dir_okay=False), help="scene to write")
-@click.option("--seed", type=click.IntRange(min=0), help="instead of the recipe's own")
+@click.option(
+    "-o", "--output", required=True, type=click.Path(path_type=Path), help="scene to write; of many, the folder"
+)
+@click.option("--seed", type=click.IntRange(min=0), help="instead of the recipe's own; of many scenes, the first")
 @click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="e.g. scan.sigma_mm=2; may be repeated")
+@click.option("--count", type=click.IntRange(min=1), help="make a folder of scenes: so many seeds, one after another")
+@click.option(
+    "--vary", multiple=True, metavar="KEY=V1,V2,...", help="... and every combination of values; may be repeated"
+)
+@click.option("--jobs", type=click.IntRange(min=1), help="processes that make the folder's scenes  [default: 1]")
+@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers make them, e.g. tcp://10.0.0.1:8786")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def make(recipe: str, output: Path, seed: int | None, settings: tuple[str, ...], as_json: bool) -> None:
-    """Make the scene of RECIPE (a name or a TOML file) with its truth."""
-    from designgen import recipes, scene
-    from processor import store
+@click.pass_context
+def make(
+    context: click.Context,
+    recipe: str,
+    output: Path,
+    seed: int | None,
+    settings: tuple[str, ...],
+    count: int | None,
+    vary: tuple[str, ...],
+    jobs: int | None,
+    cluster: str | None,
+    as_json: bool,
+) -> None:
+    """Make the scene of RECIPE (a name or a TOML file) with its truth.
+
+    With --count or --vary many, in a folder with an index.csv. Run again, what is there and whole is kept.
+    Exit codes: 0 done, 1 some scenes failed (the index says why), 2 all failed, or wrong usage, 3 bad input.
+    """
+    from designgen import batch, recipes
 
     name, loaded = recipes.load(recipe)
     loaded = recipes.overridden(loaded, settings)
-    made, truth = scene.make(name, loaded, seed)
-    used = loaded.get("seed", 0) if seed is None else seed
-    software = {"designgen": __version__, **{name: version(name) for name in ("cadquery", "numpy", "scipy")}}
-    provenance = {"software": software, "recipe": name, "parameters": loaded, "seed": used}
-    store.write_scene(output, made, truth, provenance)
-    points = sum(len(scan.points) for scan in made.scans)
+    many = count is not None or bool(vary)
+    batch.check_usage(output, settings, vary, many=many, jobs=jobs, cluster=cluster)
+    if many:
+        varied = batch.parse_varied(vary)
+        planned = batch.plan(output, name, loaded, varied, seed, count or 1)
+        said = batch.make_many(output, planned, list(varied), jobs or 1, cluster)
+        for failure in said["failed"]:
+            click.echo(f"{failure['file']}: failed: {failure['reason']}", err=True)
+        click.echo(
+            json.dumps(said) if as_json else "{index}: {done} of {scenes} scene(s), {made} made now".format(**said)
+        )
+        context.exit(DONE if not said["failed"] else IN_PART if said["done"] else ALL_FAILED)
+    used, scans, points = batch.make_scene(output, name, loaded, seed)
     if as_json:
-        said = {"scene": str(output), "recipe": name, "seed": used, "scans": len(made.scans), "points": points}
-        click.echo(json.dumps(said))
+        click.echo(json.dumps({"scene": str(output), "recipe": name, "seed": used, "scans": scans, "points": points}))
     else:
-        click.echo(f"{output}: recipe {name}, seed {used}, {len(made.scans)} scan(s), {points:,} points")
+        click.echo(f"{output}: recipe {name}, seed {used}, {scans} scan(s), {points:,} points")
 
 
 @commands.command()
