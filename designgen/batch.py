@@ -17,7 +17,6 @@ import json
 import os
 import re
 import sys
-import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -34,10 +33,6 @@ MOST_SEED = 2**63
 SOFTWARE = ("cadquery", "cadquery-ocp", "h5py", "numba", "numpy", "scipy")  # what a scene's bytes depend on
 SCENE_FILE = re.compile(r".+-\d{5}-seed\d+\.h5")
 LEFTOVER = re.compile(rf"\.({SCENE_FILE.pattern}|{re.escape(INDEX)})\.\d+-[0-9a-f]{{8}}\.tmp")
-
-# One scene at a time in a process: the CAD kernel and BLAS limits are the process's own, and a cluster's worker may
-# run several jobs in threads.
-ONE_AT_A_TIME = threading.Lock()
 
 
 def make_scene(path: Path, name: str, recipe: recipes.Recipe, seed: int | None) -> tuple[int, int, int]:
@@ -199,8 +194,7 @@ def plan(
 def run_job(job: Job) -> Outcome:
     """Make one scene, or keep the one that is there; whatever goes wrong is in the outcome."""
     try:
-        with ONE_AT_A_TIME:
-            return _done(job)
+        return _done(job)
     except Exception as error:  # the one place where a batch catches: the rest of the jobs go on
         # On one line, without the folder: the index is the same in another place.
         text = " ".join(str(error).split()).replace(f"{job.folder}/", "")

@@ -1,30 +1,36 @@
 """Jobs spread over processes of this machine, or over the workers of a Dask cluster.
 
-Both give every job with its result as it comes. A process that dies, killed or out of memory, costs the time of what it
-was doing: that is tried again, and is Lost only where it takes its process down by itself.
+Both give every job with its result as it comes, and both do it in a process that does nothing else. On a cluster's
+worker, its own threads would otherwise take part: they sample what runs, which keeps datasets open for longer and
+moves their bytes in the file, and they starve while compiled code holds the interpreter, so that the worker seems dead.
+
+A process that dies, killed or out of memory, costs the time of its job, which is tried once more.
 """
 
 from __future__ import annotations
 
 import importlib
-import multiprocessing
 import os
+import pickle
 import signal
+import subprocess
+import sys
 import threading
-from collections import deque
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from dataclasses import dataclass
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 from processor.model import InputError, UsageError
 
-DIED = "the process that made it died, and died again; was it out of memory?"
+DIED = "the process that made it died twice (out of memory?); run again, with fewer jobs at a time"
 STOPPED_BY_TERM = 143  # as a shell reports SIGTERM
 CONNECT_SECONDS = 10
 ONE_THREAD = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1")
+CHILD = "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); from designgen import spread; spread.serve()"
+WATCH_SECONDS = 0.2
 
 
 @dataclass(frozen=True)
@@ -55,88 +61,129 @@ def stoppable() -> Iterator[None]:
         signal.signal(signal.SIGTERM, before)
 
 
-# --- on this machine --------------------------------------------------------------------------------------------------
+# --- processes that do jobs ------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Children:
+    """Processes that do jobs: one for each thread that asks, of one thread itself, started when it is first needed."""
+
+    of_thread: threading.local = field(default_factory=threading.local)
+    started: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    stopped: bool = False
+    lock: threading.Lock = field(default_factory=threading.Lock)
+
+    def do(self, run: Callable[[J], R], job: J) -> R | Lost:
+        """Do one job in this thread's process, and once more if that dies."""
+        message = pickle.dumps((run, job))
+        for _ in range(2):
+            child = self._child()
+            if child is None:
+                return Lost("stopped")
+            assert child.stdin
+            assert child.stdout
+            try:
+                pickle.dump(message, child.stdin)
+                child.stdin.flush()
+                result: R | Lost = pickle.load(child.stdout)
+                return result
+            except (EOFError, BrokenPipeError, pickle.UnpicklingError):
+                self._end(child)
+                self.of_thread.child = None
+        return Lost(DIED)
+
+    def stop(self) -> None:
+        """Kill all processes, at work or not, and start no more."""
+        with self.lock:
+            self.stopped = True
+            for child in self.started:
+                child.kill()
+
+    def _child(self) -> subprocess.Popen[bytes] | None:
+        child: subprocess.Popen[bytes] | None = getattr(self.of_thread, "child", None)
+        with self.lock:
+            if child is None and not self.stopped:
+                # Deaf to Ctrl-C, which a terminal sends to all: the process that started this one answers it.
+                mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+                try:
+                    child = subprocess.Popen(
+                        [sys.executable, "-I", "-c", CHILD],
+                        stdin=subprocess.PIPE,
+                        stdout=subprocess.PIPE,
+                        env={**os.environ, **ONE_THREAD},
+                    )
+                finally:
+                    signal.pthread_sigmask(signal.SIG_SETMASK, mask)
+                self.of_thread.child = child
+                self.started.append(child)
+                assert child.stdin
+                pickle.dump(sys.path, child.stdin)
+                pickle.dump(os.getpid(), child.stdin)
+        return child
+
+    def _end(self, child: subprocess.Popen[bytes]) -> None:
+        child.kill()
+        with self.lock, suppress(BrokenPipeError), child:
+            self.started.remove(child)
+
+
+def serve() -> None:
+    """Do jobs from standard input, with results to standard output, until the input or the parent process ends."""
+    jobs, results = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what libraries print is no result
+    threading.Thread(target=_end_with, args=(pickle.load(jobs),), daemon=True).start()
+    with suppress(EOFError, BrokenPipeError):
+        while True:
+            message = pickle.load(jobs)
+            try:
+                run, job = pickle.loads(message)
+                result = run(job)
+            except Exception as error:  # e.g. for want of a package
+                result = Lost(f"could not be run ({type(error).__name__}: {' '.join(str(error).split())})")
+            pickle.dump(result, results)
+            results.flush()
+
+
+def _end_with(parent: int) -> None:
+    """End this process when the one that started it is gone: after a SIGKILL there nobody else would."""
+    while os.getppid() == parent:
+        time.sleep(WATCH_SECONDS)
+    os._exit(1)
 
 
 @contextmanager
 def over_processes(processes: int) -> Iterator[Spread]:
-    """Give what does jobs in processes of their own, of one thread each."""
+    """Give what does jobs in so many processes of this machine."""
 
     def spread(run: Callable[[J], R], jobs: Sequence[J]) -> Results[J, R]:
-        waiting = deque(jobs)
-        while waiting:
-            under_way = yield from _pool(run, waiting, processes)
-            # One of these took its process down. Alone, each can only take down its own.
-            for job in under_way:
-                if (yield from _pool(run, deque([job]), 1)):
-                    yield job, Lost(DIED)
+        children = Children()
+        threads = ThreadPoolExecutor(min(processes, len(jobs)))
+        try:
+            waiting: dict[Future[R | Lost], J] = {threads.submit(children.do, run, job): job for job in jobs}
+            while waiting:
+                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+                    yield waiting.pop(future), future.result()
+        finally:
+            # Nothing is waited for: a scene is moved to its name when it is whole, so no file suffers.
+            threads.shutdown(wait=False, cancel_futures=True)
+            children.stop()
+            threads.shutdown()
+            for child in children.started:
+                with suppress(BrokenPipeError):
+                    child.communicate()
 
     yield spread
 
 
-def _pool(run: Callable[[J], R], waiting: deque[J], processes: int) -> Generator[tuple[J, R | Lost], None, list[J]]:
-    """Take jobs from ``waiting`` until none is left or a process dies: the jobs that were under way then."""
-    before = set(multiprocessing.active_children())
-    # Spawned, not forked: threads and locks of the libraries loaded here do not survive a fork.
-    spawn = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(processes, len(waiting)), mp_context=spawn, initializer=_die_with_parent)
-    running: dict[Future[R], J] = {}
-    try:
-        while waiting or running:
-            while waiting and len(running) < processes:
-                job = waiting.popleft()
-                try:
-                    with _for_children():
-                        running[pool.submit(run, job)] = job
-                except BrokenProcessPool:
-                    return [job, *running.values()]
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job = running.pop(future)
-                try:
-                    result = future.result()
-                except BrokenProcessPool:
-                    return [job, *running.values()]
-                yield job, result
-        return []
-    except BaseException:
-        # Nothing is waited for: a scene is moved to its name when it is whole, so no file suffers.
-        for child in set(multiprocessing.active_children()) - before:
-            child.kill()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def _for_children() -> Iterator[None]:
-    """Set what processes started within inherit: one thread each, and deaf to Ctrl-C, which this process answers."""
-    before = {name: os.environ.get(name) for name in ONE_THREAD}
-    mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    os.environ.update(ONE_THREAD)
-    try:
-        yield
-    finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
-        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
-
-
-def _die_with_parent() -> None:
-    """End this process when the one that started it is gone: after a SIGKILL there nobody else would."""
-    parent = multiprocessing.parent_process()
-
-    def watch() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
 # --- on a cluster -----------------------------------------------------------------------------------------------------
+
+
+WORKERS_CHILDREN = Children()
+
+
+def on_worker(run: Callable[[J], R], job: J) -> R | Lost:
+    """Do a job in a process beside this cluster's worker, which it keeps for the next."""
+    return WORKERS_CHILDREN.do(run, job)
 
 
 @contextmanager
@@ -157,10 +204,12 @@ def over_cluster(address: str) -> Iterator[Spread]:
             f"--cluster {address}: expected the address of a Dask scheduler that answers ({why})"
         ) from error
     with client:
+        if not client.nthreads():
+            print(f"cluster {address}: no workers yet; waiting for them", file=sys.stderr)
 
         def spread(run: Callable[[J], R], jobs: Sequence[J]) -> Results[J, R]:
             # Impure, as a job looks at files: what another run found is not to be taken from the scheduler's memory.
-            waiting = {client.submit(run, job, pure=False): job for job in jobs}
+            waiting = {client.submit(on_worker, run, job, pure=False): job for job in jobs}
             try:
                 for future in distributed.as_completed(list(waiting), loop=client.loop):
                     job = waiting.pop(future)
