@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
+from designgen.surfaces import Patch
 from processor.model import SOURCES, Codes, Floats, Labels, UsageError
 
-MODES = ("surface",)
+MODE = "surface"
 OUTLIER = SOURCES.index("outlier")
 
 
@@ -18,7 +20,7 @@ OUTLIER = SOURCES.index("outlier")
 class Params:
     """How a scene is scanned (mm). ``spacing_mm`` d means one point in d^2 on average."""
 
-    mode: str = "surface"
+    mode: str = MODE
     spacing_mm: float = 10.0
     sigma_mm: float = 1.0  # of each coordinate
     outlier_share: float = 0.0  # of all points, anywhere in the part's box and a tenth around it
@@ -26,7 +28,6 @@ class Params:
     member_reach_mm: float = 0.0  # frames: members are sampled this far from each ball; 0 = all along
 
     def __post_init__(self) -> None:
-        _expect(self.mode in MODES, "mode", self.mode, f"one of {', '.join(MODES)}")
         _expect(0.05 <= self.spacing_mm <= 1000.0, "spacing_mm", self.spacing_mm, "0.05 to 1000")
         _expect(0.0 <= self.sigma_mm <= 1000.0, "sigma_mm", self.sigma_mm, "0 to 1000")
         _expect(0.0 <= self.outlier_share < 1.0, "outlier_share", self.outlier_share, "0 to less than 1")
@@ -37,6 +38,16 @@ class Params:
 def _expect(fits: bool, key: str, came: object, expected: str) -> None:
     if not fits:
         raise UsageError(f"scan.{key}: expected {expected}, got {came!r}")
+
+
+def spacing_mm(params: object) -> float:
+    """Return the spacing of a sampled scene; NaN for another, which has it point by point."""
+    return params.spacing_mm if isinstance(params, Params) else float("nan")
+
+
+def sigma_mm(params: object) -> float:
+    """Return the noise of a sampled scene; NaN for another, which has it point by point."""
+    return params.sigma_mm if isinstance(params, Params) else float("nan")
 
 
 @dataclass(frozen=True)
@@ -65,10 +76,29 @@ def scan_frame(frame: space_frame.Frame, params: Params, rng: np.random.Generato
         unit = unit[bolt_ball.exposed(ball, unit)]
         clouds.append(centre + ball.radius_mm * unit)
         labels.append(np.full(len(unit), node))
-    for i, j in frame.members:
-        members = _member(frame, int(i), int(j), params, rng)
+    for member in range(len(frame.members)):
+        members = _member(frame, member, params, rng)
         clouds.append(members)
         labels.append(np.full(len(members), -1))
+    return _with_errors(np.vstack(clouds), np.concatenate(labels), params, rng)
+
+
+def scan_patches(patches: Sequence[tuple[int, Patch]], params: Params, rng: np.random.Generator) -> Cloud:
+    """Scan faces with their parts' numbers: uniform by the area of their nets, on the faces themselves."""
+    clouds, labels = [], []
+    for part, patch in patches:
+        knots, triangles = patch.net()
+        a, b, c = (patch.at(knots[:, 0], knots[:, 1])[triangles[:, i]] for i in range(3))
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        count = rng.poisson(area.sum() / params.spacing_mm**2)
+        chosen = triangles[rng.choice(len(area), count, p=area / area.sum())]
+        u, v = rng.random(count), rng.random(count)
+        over = u + v > 1.0
+        u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
+        pq = knots[chosen[:, 0]] + u[:, None] * (knots[chosen[:, 1]] - knots[chosen[:, 0]])
+        pq += v[:, None] * (knots[chosen[:, 2]] - knots[chosen[:, 0]])
+        clouds.append(patch.at(pq[:, 0], pq[:, 1]))
+        labels.append(np.full(count, part))
     return _with_errors(np.vstack(clouds), np.concatenate(labels), params, rng)
 
 
@@ -78,7 +108,7 @@ def _on_face(face: Face, spacing_mm: float, rng: np.random.Generator) -> Floats:
     highest = 1.001 * float(face.element(p, q).max())
     count = rng.poisson(highest / spacing_mm**2)
     p, q = rng.uniform(size=count), rng.uniform(size=count)
-    kept = rng.uniform(size=count) * highest < face.element(p, q)
+    kept = (rng.uniform(size=count) * highest < face.element(p, q)) & face.kept(p, q)
     return face.at(p[kept], q[kept])
 
 
@@ -89,9 +119,9 @@ def _unit_vectors(count: int, rng: np.random.Generator) -> Floats:
     return np.stack([rho * np.cos(angle), rho * np.sin(angle), z], axis=1)
 
 
-def _member(frame: space_frame.Frame, i: int, j: int, params: Params, rng: np.random.Generator) -> Floats:
-    """Sleeves, cones and tube between two nodes, as surfaces of revolution (the sleeve hexagonal) about the axis."""
-    joined, a, b = frame.connection, frame.centres[i], frame.centres[j]
+def _member(frame: space_frame.Frame, member: int, params: Params, rng: np.random.Generator) -> Floats:
+    """Sleeves, cones and tube of a member, as surfaces of revolution (the sleeve hexagonal) about its axis."""
+    joined, (a, b) = frame.connection, frame.ends(member)
     length = float(np.linalg.norm(b - a))
     unit = (b - a) / length
     side = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
@@ -99,22 +129,29 @@ def _member(frame: space_frame.Frame, i: int, j: int, params: Params, rng: np.ra
     basis = np.stack([side, np.cross(unit, side), unit])
     reach = params.member_reach_mm or length
     tube = 0.5 * joined.tube_diameter
+    ends = [
+        frame.ball(int(node)).flat_distance + joined.sleeve_length + joined.cone_length
+        for node in frame.members[member]
+    ]
+
+    def bowed(cloud: Floats) -> Floats:
+        q = (cloud[:, 2] - ends[0]) / (length - sum(ends))
+        moved: Floats = cloud @ basis + np.outer(4.0 * q * (1.0 - q), frame.bow(member))
+        return moved
+
     found = []
-    starts = []
-    for node, origin, sign in ((i, a, 1.0), (j, b, -1.0)):
-        flat = frame.ball(node).flat_distance
-        tip = flat + joined.sleeve_length
-        end = tip + joined.cone_length
+    for end, (origin, sign) in enumerate(((a, 1.0), (b, -1.0))):
+        tip = ends[end] - joined.cone_length
         axial = basis * np.array([[1.0], [1.0], [sign]])
-        sleeve = _prism(joined.sleeve_corner_radius, flat, tip, params.spacing_mm, rng)
-        cone = _cone(joined.sleeve_corner_radius + 3.0, tube, tip, end, params.spacing_mm, rng)
-        near = [sleeve, cone]
-        if end < reach < 0.5 * length:
-            near.append(_cone(tube, tube, end, reach, params.spacing_mm, rng))
+        near = [_cone(joined.sleeve_corner_radius + 3.0, tube, tip, ends[end], params.spacing_mm, rng)]
+        if frame.has_sleeve(member, end):
+            near.append(_prism(joined.sleeve_corner_radius, tip - joined.sleeve_length, tip, params.spacing_mm, rng))
         found += [origin + cloud @ axial for cloud in near]
-        starts.append(end)
+        if ends[end] < reach < 0.5 * length:
+            low, high = (ends[0], reach) if end == 0 else (length - reach, length - ends[1])
+            found.append(a + bowed(_cone(tube, tube, low, high, params.spacing_mm, rng)))
     if reach >= 0.5 * length:
-        found.append(a + _cone(tube, tube, starts[0], length - starts[1], params.spacing_mm, rng) @ basis)
+        found.append(a + bowed(_cone(tube, tube, ends[0], length - ends[1], params.spacing_mm, rng)))
     return np.vstack(found)
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -15,12 +16,16 @@ if TYPE_CHECKING:
 
 ABOUT = "space frame: bolt balls on a grid, joined by sleeves, cones and tubes"
 
+SHAPES = ("flat", "free-form", "dome")
 HEXAGON = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.arange(6) * np.pi / 3.0])  # unit corners
 
 
 @dataclass(frozen=True)
 class Params:
-    """A grid of ``nodes_x`` by ``nodes_y`` balls, and with two layers one less each way above it, mm."""
+    """A grid of ``nodes_x`` by ``nodes_y`` balls, and with two layers one less each way above it, mm.
+
+    ``shape`` flat; free-form: the roof rises and falls by ``rise_mm``; dome: a cap of a sphere of that rise.
+    """
 
     nodes_x: int = 4
     nodes_y: int = 4
@@ -31,6 +36,9 @@ class Params:
     radii_mm: tuple[float, ...] = (45.0,)  # taken in turn along the grid
     tube_diameter_mm: float = 60.0
     process_hole: bool = True
+    shape: str = "flat"
+    rise_mm: float = 0.0
+    diagonals: bool = False  # of one layer, a diagonal a cell
 
     def __post_init__(self) -> None:
         _expect(self.nodes_x >= 2 and self.nodes_y >= 2, "nodes_x, nodes_y", (self.nodes_x, self.nodes_y), "2 or more")
@@ -41,6 +49,10 @@ class Params:
             "a million at most",
         )
         _expect(self.layers in (1, 2), "layers", self.layers, "1 or 2")
+        _expect(self.shape in SHAPES, "shape", self.shape, f"one of {', '.join(SHAPES)}")
+        _expect(self.rise_mm >= 0.0, "rise_mm", self.rise_mm, "0 or a length")
+        reach = 0.5 * self.spacing_mm * max(self.nodes_x - 1, self.nodes_y - 1)
+        _expect(self.shape != "dome" or self.rise_mm < 0.7 * reach, "rise_mm", self.rise_mm, "a flatter dome")
         _expect(len(self.radii_mm) > 0, "radii_mm", list(self.radii_mm), "one radius or more")
         least = 4.0 * max(self.radii_mm, default=0.0)
         _expect(self.spacing_mm > least, "spacing_mm", self.spacing_mm, f"more than four radii ({least:g})")
@@ -56,14 +68,46 @@ def _expect(fits: bool, key: str, came: object, expected: str) -> None:
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame's nodes and members; ``directions[i]`` are the unit vectors (m, 3) from node i to its neighbours."""
+    """The frame's nodes and members, as designed or as built.
+
+    A member runs from its nodes' centres moved by ``offsets`` (m, 2, 3); its tube is bowed by ``bows`` (m, 3) at the
+    middle; ``missing`` (m, 2) marks ends without sleeve and bolt. Empty arrays: none of it.
+    """
 
     centres: Floats  # (k, 3)
     radii: Floats  # (k,)
     members: Ints  # (m, 2) rows of centres
     connection: bolt_ball.Connection
     process_hole: bool
-    directions: tuple[Floats, ...]
+    offsets: Floats = field(default_factory=lambda: np.empty((0, 2, 3)))
+    bows: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    missing: np.ndarray = field(default_factory=lambda: np.empty((0, 2), bool))
+
+    @cached_property
+    def directions(self) -> tuple[Floats, ...]:
+        """Unit vectors (m, 3) from each node along its members."""
+        found: list[list[Floats]] = [[] for _ in self.centres]
+        for m, (i, j) in enumerate(self.members):
+            a, b = self.ends(m)
+            unit = (b - a) / np.linalg.norm(b - a)
+            found[i].append(unit)
+            found[j].append(-unit)
+        return tuple(np.array(units).reshape(-1, 3) for units in found)
+
+    def ends(self, member: int) -> tuple[Floats, Floats]:
+        """Where a member's axis begins and ends, (3,) each."""
+        i, j = self.members[member]
+        a, b = self.centres[i], self.centres[j]
+        return (a + self.offsets[member, 0], b + self.offsets[member, 1]) if len(self.offsets) else (a, b)
+
+    def bow(self, member: int) -> Floats:
+        """Bow (3,) of a member's tube."""
+        found: Floats = self.bows[member] if len(self.bows) else np.zeros(3)
+        return found
+
+    def has_sleeve(self, member: int, end: int) -> bool:
+        """Whether a member's end has its sleeve and bolt."""
+        return not (len(self.missing) and self.missing[member, end])
 
     def ball(self, node: int) -> bolt_ball.Params:
         """Return the design of one ball."""
@@ -91,13 +135,10 @@ def build(params: Params) -> Frame:
         ]
         for below in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]):
             members.append(np.stack([below.ravel(), upper.ravel()], axis=1))
-    nodes = np.vstack(centres)
+    elif params.diagonals:
+        members.append(np.stack([index[:-1, :-1].ravel(), index[1:, 1:].ravel()], axis=1))
+    nodes = _shaped(np.vstack(centres), params)
     ends = np.vstack(members).astype(np.int64)
-    neighbours: list[list[Floats]] = [[] for _ in nodes]
-    for i, j in ends:
-        unit = (nodes[j] - nodes[i]) / np.linalg.norm(nodes[j] - nodes[i])
-        neighbours[i].append(unit)
-        neighbours[j].append(-unit)
     radii = np.resize(np.array(params.radii_mm), len(nodes))
     frame = Frame(
         nodes,
@@ -105,11 +146,27 @@ def build(params: Params) -> Frame:
         ends,
         bolt_ball.connection(params.tube_diameter_mm),
         params.process_hole,
-        tuple(np.array(units) for units in neighbours),
     )
     for node in range(len(nodes)):
         frame.ball(node)
     return frame
+
+
+def _shaped(nodes: Floats, params: Params) -> Floats:
+    """Give a flat grid its shape: nodes (k, 3), moved upward by how high the roof is above them."""
+    span = params.spacing_mm * np.array([params.nodes_x - 1, params.nodes_y - 1])
+    x, y = (nodes[:, :2] - 0.5 * span).T
+    if params.shape == "free-form":
+        u, v = 2.0 * np.pi * x / span[0], 2.0 * np.pi * y / span[1]
+        rise = 0.25 * params.rise_mm * (2.0 + np.cos(0.5 * u) + 0.6 * np.sin(0.8 * v + 0.3) + 0.4 * np.cos(u + 0.7 * v))
+    elif params.shape == "dome":
+        reach = float(np.hypot(*(0.5 * span)))
+        radius = (reach**2 + params.rise_mm**2) / (2.0 * params.rise_mm)
+        rise = np.sqrt(radius**2 - x * x - y * y) - (radius - params.rise_mm)
+    else:
+        rise = np.zeros(len(nodes))
+    shaped: Floats = nodes + rise[:, None] * np.array([0.0, 0.0, 1.0])
+    return shaped
 
 
 def solid(frame: Frame) -> cq.Compound:

@@ -13,7 +13,8 @@ from scipy.integrate import quad
 
 from designgen import curves, mesh, recipes, sampler, scan_folder
 from designgen.designs import arch_bridge, arch_part, bolt_ball, space_frame
-from designgen.scene import generator, make
+from designgen.randomness import generator
+from designgen.scene import make
 from processor import folder, store
 from processor.model import UsageError
 
@@ -190,14 +191,14 @@ def test_truth_belongs_to_its_scan_and_seeds_repeat():
         ("bridg.span_mm=2", "unknown key 'bridg'"),
         ("scan.spacing_mm=-5", "scan.spacing_mm: expected 0.05 to 1000, got -5.0"),
         ("scan.sigma_mm=nan", "scan.sigma_mm: expected a finite number"),
-        ("scan.mode=rays", "scan.mode: expected one of surface, got 'rays'"),
+        ("scan.mode=beams", "scan.mode: expected surface or rays, got 'beams'"),
         ("bridge.plate_web_mm=700", "bridge.plate_web_mm: expected less than half of width_mm, got 700.0"),
         ("bridge.joints=[0.5,0.4,0.6,0.8]", "bridge.joints: expected four rising fractions"),
         ("bridge.rise_mm=90000", "bridge.rise_mm: expected less than half of span_mm"),
         ("bridge.span_mm=true", "bridge.span_mm: expected a float, got True"),
         ("bridge.curve=spiral", "bridge.curve: expected one of parabola, catenary, circle"),
         ("seed=-1", "seed: expected a whole number from 0"),
-        ("kind=tent", "kind: expected one of arch-bridge, space-frame"),
+        ("kind=tent", "kind: expected one of arch-bridge, space-frame, structure"),
         ("scan", "expected section.key=value"),
     ],
 )

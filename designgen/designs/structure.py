@@ -1,0 +1,135 @@
+"""What whole structures are built of: boxes and tubes as patches in closed form, and as CadQuery solids."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from designgen.surfaces import Patch
+from processor.model import Floats
+
+if TYPE_CHECKING:
+    import cadquery as cq
+
+
+@dataclass(frozen=True)
+class Box:
+    """A box: centre (3,), unit axes (3, 3, rows) and edge lengths (3,), mm."""
+
+    centre: Floats
+    axes: Floats
+    size: Floats
+
+    def patches(self, knots: tuple[Floats, Floats, Floats] | None = None) -> list[Patch]:
+        """Six faces; ``knots`` are those along each axis, 0..1. A face's p runs along the first of its two axes."""
+        along = knots or tuple(np.array([0.0, 1.0]) for _ in range(3))
+        found = []
+        for axis in range(3):
+            i, j = [a for a in range(3) if a != axis]
+            for sign, side in ((-1.0, "-"), (1.0, "+")):
+                corner = self.centre + 0.5 * sign * self.size[axis] * self.axes[axis]
+                found.append(Patch(f"{side}{'abn'[axis]}", self._face(corner, i, j), along[i], along[j]))
+        return found
+
+    def _face(self, middle: Floats, i: int, j: int) -> Callable[[Floats, Floats], Floats]:
+        one, two = self.size[i] * self.axes[i], self.size[j] * self.axes[j]
+
+        def at(p: Floats, q: Floats) -> Floats:
+            points: Floats = middle + np.outer(p - 0.5, one) + np.outer(q - 0.5, two)
+            return points
+
+        return at
+
+    def solid(self) -> cq.Solid:
+        """CadQuery solid."""
+        import cadquery as cq
+
+        low = self.centre - 0.5 * self.size @ self.axes
+        plane = cq.Plane(origin=tuple(low), xDir=tuple(self.axes[0]), normal=tuple(self.axes[2]))
+        return cq.Solid.makeBox(*self.size.tolist()).moved(cq.Location(plane))
+
+    @property
+    def volume(self) -> float:
+        """Volume, mm3."""
+        return float(np.prod(self.size))
+
+
+@dataclass(frozen=True)
+class Tube:
+    """A closed round tube from ``start`` to ``end`` (3,), mm."""
+
+    start: Floats
+    end: Floats
+    radius: float
+
+    def patches(self, step_mm: float = 500.0, around: int = 48) -> list[Patch]:
+        """Return the tube's mantle; its ends lie inside of other tubes."""
+        axis = self.end - self.start
+        length = float(np.linalg.norm(axis))
+        unit = axis / length
+        side = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
+        side = side / np.linalg.norm(side)
+        other = np.cross(unit, side)
+
+        def at(p: Floats, q: Floats) -> Floats:
+            turn = 2.0 * np.pi * q
+            ring: Floats = np.outer(np.cos(turn), side) + np.outer(np.sin(turn), other)
+            return self.start + np.outer(p, axis) + self.radius * ring
+
+        return [
+            Patch("tube", at, np.linspace(0.0, 1.0, int(np.ceil(length / step_mm)) + 1), np.linspace(0, 1, around + 1))
+        ]
+
+    def solid(self) -> cq.Solid:
+        """CadQuery solid."""
+        import cadquery as cq
+
+        axis = self.end - self.start
+        length = float(np.linalg.norm(axis))
+        return cq.Solid.makeCylinder(self.radius, length, cq.Vector(*self.start), cq.Vector(*(axis / length)))
+
+    @property
+    def volume(self) -> float:
+        """Volume, mm3."""
+        return float(np.pi * self.radius**2 * np.linalg.norm(self.end - self.start))
+
+
+@dataclass(frozen=True)
+class Component:
+    """A named component: its bodies, and their faces as designed."""
+
+    name: str
+    bodies: tuple[Box | Tube, ...]
+    patches: tuple[Patch, ...]
+
+
+def component(name: str, bodies: Sequence[Box | Tube]) -> Component:
+    """Make a component of bodies with their plain faces; a body's faces are named by its number."""
+    found = [
+        Patch(f"{i} {patch.name}", patch.at, patch.p, patch.q, patch.kept)
+        for i, body in enumerate(bodies)
+        for patch in body.patches()
+    ]
+    return Component(name, tuple(bodies), tuple(found))
+
+
+def mesh_of(components: Sequence[Component]) -> tuple[Floats, np.ndarray]:
+    """Vertices (v, 3) and triangles (f, 3) of all faces; on flat faces exact, on tubes inside by radius / 470."""
+    vertices, faces, count = [], [], 0
+    for one in components:
+        for patch in one.patches:
+            knots, triangles = patch.net()
+            vertices.append(patch.at(knots[:, 0], knots[:, 1]))
+            faces.append(triangles + count)
+            count += len(knots)
+    return np.vstack(vertices), np.vstack(faces)
+
+
+def solid(components: Sequence[Component]) -> cq.Compound:
+    """CadQuery compound of all bodies."""
+    import cadquery as cq
+
+    return cq.Compound.makeCompound([body.solid() for one in components for body in one.bodies])

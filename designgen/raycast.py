@@ -1,0 +1,164 @@
+"""Rays of a scanner's angular grid against exact surfaces, in float64.
+
+Every bounding sphere is drawn onto the grid, and the rays it covers are intersected with its shape; the nearest hit of
+a ray stays. Rays that meet nothing cost nothing, which most rays of a scan of a roof do.
+
+A scanner's frame has its origin at the scanner and z along its axis; column j looks to azimuth ``j step`` counter-
+clockwise from x, row i to elevation ``lowest + i step``. Results depend on neither the thread nor the strip.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from designgen import ray_kernels
+from designgen.surfaces import CONE, DISC, SPHERE, Surfaces
+from processor.model import Floats, Ints, Labels, Shorts
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A scanner's directions: ``columns`` all around, ``rows`` upward from elevation ``lowest``; rad."""
+
+    step: float
+    lowest: float
+    rows: int
+    columns: int
+
+    def directions(self, row: Labels, column: Labels) -> Floats:
+        """Return unit vectors (n, 3) in the scanner's frame."""
+        azimuth, elevation = 2.0 * np.pi * column / self.columns, self.lowest + self.step * row
+        level = np.cos(elevation)
+        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """The surfaces in a scanner's frame, and the grid's boxes that their pieces cover, sorted by strip."""
+
+    shapes: tuple[Any, ...]  # kind, numbers, cuts, cut_start
+    boxes: Labels  # (b, 5): piece, first and last column, first and last row
+    strip_start: Ints  # (strips + 1,)
+    piece: tuple[Any, ...]  # shape, centre, radius
+
+
+def see(surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, reach: float, spread: float) -> Seen:
+    """Move surfaces into a scanner's frame and draw their bounding spheres onto its grid.
+
+    ``width`` is the number of columns of a strip, ``reach`` the greatest range (mm), ``spread`` the angle (rad) by
+    which a ray may depart from its direction.
+    """
+    R, t = T_scanner_scene[:3, :3], T_scanner_scene[:3, 3]
+    numbers = surfaces.numbers.copy()
+    # Where points, directions and lengths stand among a shape's numbers.
+    points = {SPHERE: (0,), CONE: (0,), DISC: (0,), 3: (0, 3, 6)}
+    vectors: dict[int, tuple[int, ...]] = {SPHERE: (), CONE: (3, 9), DISC: (3,), 3: ()}
+    for kind in range(4):
+        rows = np.flatnonzero(surfaces.kind == kind)
+        for columns, shift in ((points[kind], t), (vectors[kind], np.zeros(3))):
+            for c in columns:
+                numbers[rows, c : c + 3] = numbers[rows, c : c + 3] @ R.T + shift
+    cuts = surfaces.cuts.copy()
+    cuts[:, :3] = cuts[:, :3] @ R.T
+    centres = surfaces.piece_centre @ R.T + t
+    strips = -(-grid.columns // width)
+    found = ray_kernels.boxes(
+        centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns
+    )
+    boxes, start = ray_kernels.by_strip(found, width, strips)
+    piece = (surfaces.piece_shape, centres, surfaces.piece_radius)
+    return Seen((surfaces.kind, numbers, cuts, surfaces.cut_start), boxes, start, piece)
+
+
+def cast(seen: Seen, grid: Grid, strip: int, width: int, jitter: Shorts, limits: tuple[float, float]) -> Any:
+    """Shape and range of the rays of a strip and of a column on either side: (width + 2, rows) each; -1 = no hit.
+
+    ``jitter`` (width + 2, rows, 2) turns each ray to the left and up, rad; ``limits`` are the ranges seen, mm.
+    """
+    first = strip * width
+    return ray_kernels.cast(  # type: ignore[call-arg]
+        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
+        grid.columns, grid.lowest, grid.step, jitter, *limits,
+    )  # fmt: skip
+
+
+def cast_around(
+    seen: Seen,
+    grid: Grid,
+    strip: int,
+    width: int,
+    jitter: Shorts,
+    limits: tuple[float, float],
+    number: Labels,
+    angle: Floats,
+    offsets: Floats,
+) -> Any:
+    """Shape and range (m, k) of sub-rays about m rays of a strip.
+
+    ``number`` (width + 2, rows) is a ray's row in the answer, -1 where none is wanted; ``angle`` (m,) scales the
+    directions' ``offsets`` (k, 2).
+    """
+    first = strip * width
+    return ray_kernels.cast_around(  # type: ignore[call-arg]
+        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
+        grid.columns, grid.lowest, grid.step, jitter, *limits, number, angle, offsets, len(angle),
+    )  # fmt: skip
+
+
+def directions(grid: Grid, row: Labels, column: Labels, jitter: Shorts) -> Floats:
+    """Directions (n, 3) of rays turned by ``jitter`` (n, 2), as the caster has them."""
+    azimuth, elevation = 2.0 * np.pi * column / grid.columns, grid.lowest + grid.step * row
+    level, rise, ca, sa = np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
+    da, de = jitter[:, 0].astype(np.float64), jitter[:, 1].astype(np.float64)
+    flat = level - de * rise
+    return np.stack([flat * ca - da * sa, flat * sa + da * ca, rise + de * level], axis=1)
+
+
+def normals(seen: Seen, shape: Labels, points: Floats) -> Floats:
+    """Return unit normals (n, 3), of either sense, at points (n, 3) of the scanner's frame on shapes (n,)."""
+    kind, numbers, _, _ = seen.shapes
+    found: Floats = ray_kernels.normals(kind, numbers, shape, points)
+    return found
+
+
+def on_patches(
+    surfaces: Surfaces, T_scanner_scene: Floats, shape: Labels, ray: Floats, t: Floats, tolerance_mm: float = 1e-5
+) -> Floats:
+    """Ranges (n,) at which rays (n, 3) from the scanner meet the patches' own surfaces, near where they met the nets.
+
+    ``shape`` (n,) and ``t`` (n,) are what :func:`cast` found; hits on other shapes keep their range. NaN where the
+    surface is not met within the tolerance, as at its very edge seen at a grazing angle.
+    """
+    result: Floats = t.copy()
+    R, origin = T_scanner_scene[:3, :3], -T_scanner_scene[:3, :3].T @ T_scanner_scene[:3, 3]
+    patch = surfaces.patch[shape]
+    order = np.argsort(patch, kind="stable")
+    edges = np.flatnonzero(np.diff(patch[order])) + 1
+    for rows in np.split(order, edges):
+        if not len(rows) or patch[rows[0]] < 0:
+            continue
+        at, triangle = surfaces.patches[patch[rows[0]]].at, shape[rows]
+        d = ray[rows] @ R  # the ray in the scene's frame
+        corners, pq = surfaces.numbers[triangle, :9].reshape(-1, 3, 3), surfaces.corner_pq[triangle]
+        edge, turn = corners[:, 1:] - corners[:, :1], pq[:, 1:] - pq[:, :1]
+        # The net's triangle gives the derivatives: dx = edge^T w for d(p, q) = turn^T w.
+        columns = np.stack([edge[:, 0], edge[:, 1], -d], axis=2)
+        inverse = np.linalg.inv(columns)
+        range_ = t[rows].copy()
+        weights = np.einsum("nij,nj->ni", inverse, origin + range_[:, None] * d - corners[:, 0])[:, :2]
+        off = np.full(len(rows), np.inf)
+        for _ in range(12):
+            now = pq[:, 0] + np.einsum("ni,nij->nj", weights, turn)
+            left = origin + range_[:, None] * d - at(now[:, 0], now[:, 1])
+            off = np.linalg.norm(left, axis=1)
+            if (off < 0.1 * tolerance_mm).all():
+                break
+            step = np.einsum("nij,nj->ni", inverse, left)
+            weights += step[:, :2]
+            range_ += step[:, 2]
+        range_[~(off < tolerance_mm)] = np.nan
+        result[rows] = range_
+    return result

@@ -1,0 +1,183 @@
+"""Scenes of whole structures: roofs that moved, truss bridges to be stitched, plates and girders with defects."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+
+from designgen import damage, sampler, scanner, survey
+from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
+from designgen.randomness import generator
+from designgen.reading import filled
+from designgen.scanning import ByRays, Scanning
+from designgen.surfaces import Builder, Patch
+from processor.model import (
+    AsBuilt,
+    DefectTruth,
+    Floats,
+    PointLabels,
+    Scan,
+    Scene,
+    StructureDesign,
+    StructureTruth,
+    Truth,
+    UsageError,
+)
+
+TRUTH_STEP_MM = 250.0
+Surface = Callable[[Floats, Floats], Floats]
+Built = tuple[list[tuple[int, Patch]], Callable[[Floats], Floats] | None, DefectTruth | None]
+
+
+def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
+    """Make a structure's scene; ``structure.type`` says which: stadium-roof, truss-bridge or plate-row."""
+    section = dict(recipe.get("structure", {}))
+    kind = section.pop("type", None)
+    makers = {"stadium-roof": _stadium, "truss-bridge": _truss, "plate-row": _plates}
+    if kind not in makers:
+        raise UsageError(f"structure.type: expected one of {', '.join(makers)}, got {kind!r}")
+    components, (patches, move, defects) = makers[kind]({**recipe, "structure": section}, seed)
+    names = tuple(one.name for one in components)
+    stations, station_truth = None, None
+    origin = np.zeros(3)
+    if isinstance(scanning, ByRays):
+        params = scanning.params
+        origin = np.array(params.origin_mm)
+        builder = Builder()
+        for part, patch in patches:
+            builder.patch(part, patch)
+        found = survey.survey(
+            builder.done(), names, _places(kind, patches, params, seed), scanning.device, params, seed
+        )
+        scans, labels, stations, station_truth = survey.in_project(found, origin, params.merged)
+        if not params.registered:
+            scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
+            stations = None
+    else:
+        cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"))
+        scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
+        labels = (PointLabels("scan", names, cloud.part, cloud.source),)
+    vertices, faces = structure.mesh_of(components)
+    scene = Scene(
+        name,
+        "structure",
+        scans,
+        stations=stations,
+        units="mm",
+        units_reason="made in millimetres",
+        structure=StructureDesign(kind, vertices + origin, faces),
+    )
+    return scene, Truth(
+        labels,
+        structure=_truth(components, move, origin),
+        defects=defects and dataclasses.replace(defects, centres=defects.centres + origin),
+        stations=station_truth,
+        as_built=AsBuilt(),
+        spacing_mm=sampler.spacing_mm(scanning),
+        sigma_mm=sampler.sigma_mm(scanning),
+    )
+
+
+def _stadium(recipe: Mapping[str, Any], seed: int) -> tuple[tuple[structure.Component, ...], Built]:
+    components = stadium_roof.build(filled(stadium_roof.Params, recipe, "structure"))
+    if "asbuilt" not in recipe:
+        return components, (_as_designed(components), None, None)
+    move = damage.movement(filled(damage.MovementParams, recipe, "asbuilt"), components)
+    moved = [(part, dataclasses.replace(patch, at=_moved(patch.at, move))) for part, patch in _as_designed(components)]
+    return components, (moved, move, None)
+
+
+def _moved(at: Surface, move: damage.Displacement) -> Surface:
+    def where(p: Floats, q: Floats) -> Floats:
+        points = at(p, q)
+        found: Floats = points + move(points)
+        return found
+
+    return where
+
+
+def _truss(recipe: Mapping[str, Any], seed: int) -> tuple[tuple[structure.Component, ...], Built]:
+    components = truss_bridge.build(filled(truss_bridge.Params, recipe, "structure"))
+    return components, (_as_designed(components), None, None)
+
+
+def _plates(recipe: Mapping[str, Any], seed: int) -> tuple[tuple[structure.Component, ...], Built]:
+    form = filled(plate_row.Params, recipe, "structure")
+    sizes = filled(damage.Params, recipe, "asbuilt")
+    components = plate_row.build(form)
+    patches: list[tuple[int, Patch]] = []
+    found: list[tuple[plate_row.Place, damage.Defect]] = []
+    for part, place in enumerate(plate_row.places(form)):
+        if place.defect == "none":
+            patches += [(part, patch) for patch in components[part].patches]
+            continue
+        defect = damage.draw(place.defect, sizes, form, generator(seed, f"defect {place.name}"))
+        patches += [(part, patch) for patch in damage.damaged(place, plate_row.bodies(form, place), defect)]
+        found.append((place, defect))
+    centres = [place.origin + np.array([*defect.place, 0.0]) @ plate_row.AXES for place, defect in found]
+    truth = DefectTruth(
+        np.arange(len(found)),
+        tuple(defect.kind for _, defect in found),
+        tuple(place.name for place, _ in found),
+        np.array(centres).reshape(-1, 3),
+        np.array([defect.area_mm2 for _, defect in found]),
+        np.array([defect.depth_max_mm for _, defect in found]),
+        np.array([defect.volume_mm3 for _, defect in found]),
+    )
+    return components, (patches, None, truth)
+
+
+def _as_designed(components: tuple[structure.Component, ...]) -> list[tuple[int, Patch]]:
+    return [(part, patch) for part, one in enumerate(components) for patch in one.patches]
+
+
+def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params, seed: int) -> dict[str, Floats]:
+    """Return where the stations stand: before a row of plates, else beside the structure, on the ground."""
+    corners = np.vstack([patch.at(patch.p[[0, -1, -1, 0]], patch.q[[0, 0, -1, -1]]) for _, patch in patches])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    count, poses = int(np.prod(params.stations)), {}
+    for i in range(count):
+        station = f"S{i + 1}"
+        rng = generator(seed, f"place {station}")
+        share = (i + 0.5) / count
+        if kind == "plate-row":
+            at = np.array([low[0] + share * (high[0] - low[0]), low[1] - params.distance_mm, params.height_mm])
+        elif kind == "truss-bridge":
+            # Along both sides, and turn and turn about: neighbours on one side overlap.
+            side = 1.0 if i % 2 else -1.0
+            at = np.array([12_000.0 * (i // 2) + 3_000.0, side * params.distance_mm, params.height_mm])
+        else:
+            turn = 2.0 * np.pi * share
+            reach = 0.5 * (high - low)[:2] * 0.45
+            at = np.array([*(0.5 * (low + high)[:2] + reach * [np.cos(turn), np.sin(turn)]), params.height_mm])
+        at[:2] += rng.uniform(-300.0, 300.0, 2)
+        again = params.scans_at_first if i < params.repeated else 1
+        for k in range(again):
+            heading = generator(seed, f"heading {station} {k}").uniform(0.0, 2.0 * np.pi)
+            poses[station if again == 1 else f"{station}-{k + 1}"] = survey.levelled(at, heading)
+    return poses
+
+
+def _truth(
+    components: tuple[structure.Component, ...], move: Callable[[Floats], Floats] | None, origin: Floats
+) -> StructureTruth | None:
+    """Return points of the design a step apart along every face, and how each has moved."""
+    if move is None:
+        return None
+    points, normals = [], []
+    for one in components:
+        for patch in one.patches:
+            corners = patch.at(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
+            count = max(2, int(np.linalg.norm(corners[1] - corners[0]) / TRUTH_STEP_MM))
+            p, q = (x.ravel() for x in np.meshgrid((np.arange(count) + 0.5) / count, np.arange(8) / 8.0, indexing="ij"))
+            h = 1e-4
+            du = patch.at(p + h, q) - patch.at(p - h, q)
+            dv = patch.at(p, q + h) - patch.at(p, q - h)
+            normal = np.cross(dv, du)
+            points.append(patch.at(p, q))
+            normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
+    x = np.vstack(points)
+    return StructureTruth(x + origin, np.vstack(normals), move(x))
