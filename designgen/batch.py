@@ -176,7 +176,7 @@ def plan(
             f"a folder holds at most {MOST_SCENES:,}: take several folders"
         )
     stem = re.sub(r"[^\w.+-]+", "_", name).lstrip(".-")[:60] or "scene"
-    versions = software()
+    place, versions = str(folder.resolve()), software()
     jobs: list[Job] = []
     for seed in range(first, first + count):
         for combination in itertools.product(*varied.values()):
@@ -184,7 +184,7 @@ def plan(
             # A copy, as settings of deeper sections would reach into the recipe that all jobs come from.
             parameters = recipes.overridden(copy.deepcopy(recipe), settings)
             file = f"{stem}-{len(jobs) + 1:05d}-seed{seed}.h5"
-            jobs.append(Job(str(folder.resolve()), file, name, parameters, seed, combination, versions))
+            jobs.append(Job(place, file, name, parameters, seed, combination, versions))
     return jobs
 
 

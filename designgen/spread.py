@@ -10,6 +10,7 @@ A process that dies, killed or out of memory, costs the time of its job, which i
 from __future__ import annotations
 
 import importlib
+import logging
 import os
 import pickle
 import signal
@@ -196,6 +197,8 @@ def over_cluster(address: str) -> Iterator[Spread]:
         distributed: Any = importlib.import_module("distributed")
     except ImportError:
         raise UsageError("--cluster needs Dask: pip install 'steel-scan-check[cluster]'") from None
+    # What is wrong with the connection is said below, in a line; the library's own log prints stack traces of it.
+    logging.getLogger("distributed.client").setLevel(logging.CRITICAL)
     try:
         client = distributed.Client(address, timeout=CONNECT_SECONDS, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
@@ -219,6 +222,7 @@ def over_cluster(address: str) -> Iterator[Spread]:
                     except distributed.KilledWorker:
                         result = Lost(DIED)
                     except distributed.CancelledError as error:
+                        waiting.clear()  # nobody is there to cancel them
                         raise InputError(f"--cluster {address}: the connection is lost; run again to go on") from error
                     except Exception as error:  # the worker could not run it at all, e.g. for want of a package
                         text = " ".join(str(error).split())
