@@ -1,0 +1,410 @@
+"""Scans by rays: hits against closed forms and another caster, noise against its law, what must not depend on what."""
+
+import dataclasses
+
+import numpy as np
+import open3d
+import pytest
+import scipy.stats
+import trimesh
+from scipy.optimize import minimize_scalar
+
+from designgen import echoes, frame_surfaces, raycast, scanner, survey
+from designgen.designs import arch_bridge, arch_part, space_frame
+from designgen.surfaces import Builder, Patch
+from processor.model import UsageError
+
+QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
+
+
+def frame_of_balls():
+    frame = space_frame.build(space_frame.Params(nodes_x=3, nodes_y=3, layers=2, radii_mm=(45.0, 60.0)))
+    rng = np.random.default_rng(5)
+    members = len(frame.members)
+    bows = np.zeros((members, 3))
+    for m in range(members):
+        a, b = frame.ends(m)
+        bows[m] = np.cross(b - a, rng.normal(size=3)) / np.linalg.norm(b - a)
+    return dataclasses.replace(frame, bows=bows)
+
+
+def surfaces_of(frame, clutter=0):
+    builder = Builder()
+    frame_surfaces.add_frame(builder, frame)
+    low, high = frame.centres.min(axis=0), frame.centres.max(axis=0)
+    frame_surfaces.add_clutter(builder, low, high, clutter, np.random.default_rng(0))
+    return builder.done()
+
+
+def standing(*position):
+    return survey.levelled(np.array(position, np.float64), 0.4)
+
+
+def named(surfaces, returns, name):
+    return returns.surface == surfaces.surface_names.index(name)
+
+
+def in_scene(T, points):
+    return points @ T[:3, :3].T + T[:3, 3]
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """The frame as one station sees it with encoders that turn the rays, and no other noise."""
+    frame = frame_of_balls()
+    device = dataclasses.replace(QUIET, encoder_urad=20.0)
+    T = standing(2500.0, 2800.0, 1600.0)
+    surfaces = surfaces_of(frame)
+    params = scanner.Params(step_mrad=1.0)
+    return frame, surfaces, T, echoes.scan(surfaces, T, device, params, 3, "S1", keep_hits=True).returns
+
+
+def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
+    frame, surfaces, T, returns = seen
+    hits = in_scene(T, returns.hits)
+    ball = named(surfaces, returns, "ball")
+    off = np.linalg.norm(hits[ball] - frame.centres[returns.part[ball]], axis=1) - frame.radii[returns.part[ball]]
+    assert ball.sum() > 3_000
+    assert np.abs(off).max() < 1e-6
+    # A bowed tube: the distance from its axis, moved by the bow of where it is along the tube, found member by member.
+    tube = hits[named(surfaces, returns, "tube")]
+    nearest = np.full(len(tube), np.inf)
+    for m in range(len(frame.members)):
+        a, b = frame.ends(m)
+        unit = (b - a) / np.linalg.norm(b - a)
+        starts = [frame.ball(int(n)).flat_distance + 35.0 + 50.0 for n in frame.members[m]]
+        length = np.linalg.norm(b - a) - sum(starts)
+        z = (tube - a) @ unit - starts[0]
+        axis = a + np.outer(z + starts[0], unit) + np.outer(4.0 * z * (length - z) / length**2, frame.bow(m))
+        off = np.abs(np.linalg.norm(tube - axis, axis=1) - 30.0)
+        nearest = np.minimum(nearest, np.where((z > -1e-6) & (z < length + 1e-6), off, np.inf))
+    assert len(tube) > 50_000
+    assert nearest.max() < 1e-6
+    assert {"sleeve", "cone"} <= {surfaces.surface_names[k] for k in np.unique(returns.surface)}
+
+
+def test_points_are_put_where_the_encoders_say(seen):
+    _, _, _, returns = seen
+    truth, said = (x / np.linalg.norm(x, axis=1)[:, None] for x in (returns.hits, returns.points))
+    off = said - truth
+    # Two angles of 20 urad each, on a tenth of a million rays.
+    assert np.sqrt((off**2).sum(axis=1).mean() / 2.0) == pytest.approx(20e-6, rel=0.01)
+    np.testing.assert_allclose(np.linalg.norm(returns.points, axis=1), np.linalg.norm(returns.hits, axis=1), atol=1e-4)
+
+
+def test_georeferenced_hits_stay_exact(seen):
+    frame, surfaces, T, returns = seen
+    origin = np.array([5.0e8, 4.3e9, 0.0])
+    ball = named(surfaces, returns, "ball")
+    far = T.copy()
+    far[:3, 3] += origin
+    hits = in_scene(far, returns.hits[ball])
+    centres = frame.centres[returns.part[ball]] + origin
+    # float64 itself resolves 1e-6 mm at 4300 km.
+    off = np.linalg.norm(hits - centres, axis=1) - frame.radii[returns.part[ball]]
+    assert np.abs(off).max() < 1e-4
+
+
+def test_another_caster_sees_the_same():
+    """Open3D on fine meshes of the same shapes: the same ones in front, the same ranges to the facets' error."""
+    builder, meshes = Builder(), []
+    rng = np.random.default_rng(8)
+    for i in range(12):
+        centre = rng.uniform(-2500.0, 2500.0, 3) + np.array([0.0, 6000.0, 0.0])
+        axis = rng.normal(size=3)
+        axis /= np.linalg.norm(axis)
+        builder.sphere(i, "ball", centre, 150.0, [])
+        meshes.append(trimesh.creation.icosphere(5, 150.0).apply_translation(centre))
+        start = centre + 400.0 * axis
+        builder.cone(i, "tube", start, axis, (40.0, 40.0), 1500.0)
+        matrix = trimesh.geometry.align_vectors([0, 0, 1], axis)
+        matrix[:3, 3] = start + 750.0 * axis
+        meshes.append(_mantle(40.0, 1500.0, matrix))
+        corners = centre + np.array([[-600.0, 300.0, -200.0], [600.0, 300.0, -200.0], [600.0, 350.0, 300.0]])
+        builder.polygon(i, "plate", corners)
+        meshes.append(trimesh.Trimesh(corners, [[0, 1, 2]]))
+    surfaces = builder.done()
+    T = standing(0.0, 0.0, 0.0)
+    found = echoes.scan(surfaces, T, QUIET, scanner.Params(step_mrad=2.0), 0, "S1", keep_hits=True).returns
+    scene = open3d.t.geometry.RaycastingScene()
+    owner = []
+    for number, mesh in enumerate(meshes):
+        scene.add_triangles(
+            open3d.core.Tensor(np.asarray(mesh.vertices, np.float32)),
+            open3d.core.Tensor(np.asarray(mesh.faces, np.uint32)),
+        )
+        owner.append(number // 3)
+    grid = raycast.Grid(2e-3, np.radians(-60.0), int(np.radians(150.0) / 2e-3), round(np.pi / 1e-3))
+    row, column = np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij")
+    rays = grid.directions(row.ravel(), column.ravel()) @ T[:3, :3].T
+    answer = scene.cast_rays(open3d.core.Tensor(np.hstack([np.zeros_like(rays), rays]).astype(np.float32)))
+    t, number = answer["t_hit"].numpy(), answer["geometry_ids"].numpy().astype(np.int64)
+    theirs = {
+        (r, c): (d, owner[g])
+        for r, c, d, g in zip(row.ravel(), column.ravel(), t, number, strict=True)
+        if np.isfinite(d)
+    }
+    ours = {
+        (r, c): (d, p)
+        for r, c, d, p in zip(found.row, found.column, np.linalg.norm(found.points, axis=1), found.part, strict=True)
+    }
+    assert len(theirs) > 20_000
+    both = ours.keys() & theirs.keys()
+    # Facets lie inside of the shapes: rays past a silhouette may see one of the two only.
+    assert len(both) > 0.995 * max(len(ours), len(theirs))
+    same = np.array([ours[k][1] == theirs[k][1] for k in both])
+    apart = np.array([abs(ours[k][0] - theirs[k][0]) for k in both])
+    assert same.mean() > 0.999
+    assert np.median(apart[same]) < 0.02
+    assert np.quantile(apart[same], 0.99) < 1.0
+
+
+def _mantle(radius, length, matrix):
+    """A cylinder without its ends."""
+    turn = np.linspace(0.0, 2.0 * np.pi, 361)[:-1]
+    ring = np.stack([radius * np.cos(turn), radius * np.sin(turn)], axis=1)
+    low, high = (np.column_stack([ring, np.full(360, z)]) for z in (-0.5 * length, 0.5 * length))
+    i, j = np.arange(360), np.roll(np.arange(360), -1)
+    faces = np.vstack([np.stack([i, j, i + 360], axis=1), np.stack([j, j + 360, i + 360], axis=1)])
+    return trimesh.Trimesh(np.vstack([low, high]), faces, process=False).apply_transform(matrix)
+
+
+def test_hits_on_an_arch_part_lie_on_its_parabola():
+    params = arch_bridge.Params()
+    part = arch_bridge.build(params)[2]
+    builder = Builder()
+    for patch in arch_part.ray_patches(part):
+        builder.patch(0, patch)
+    surfaces = builder.done()
+    middle = part.key_points(0.5 * (part.s0 + part.s1)).mean(axis=0)
+    T = standing(*(middle + np.array([-500.0, 6000.0, 2500.0])))
+    returns = echoes.scan(surfaces, T, QUIET, scanner.Params(step_mrad=4.0), 0, "S1", keep_hits=True).returns
+    hits = in_scene(T, returns.hits)
+    L, f = params.span_mm, params.rise_mm
+    left = named(surfaces, returns, "outer-left")
+    assert left.sum() > 5_000
+    np.testing.assert_allclose(hits[left, 1], 0.5 * params.width_mm, atol=1e-6)
+    top = hits[named(surfaces, returns, "outer-top")]
+    assert len(top) > 1_000
+    for x, _, z in top[:: len(top) // 40]:
+        # The distance to the parabola itself, by a minimiser that knows nothing of arc lengths.
+        def squared(at, x=x, z=z):
+            return (at - x) ** 2 + (4.0 * f * at * (L - at) / L**2 - z) ** 2
+
+        found = minimize_scalar(squared, bounds=(x - 3000.0, x + 3000.0), method="bounded", options={"xatol": 1e-9})
+        assert np.sqrt(found.fun) == pytest.approx(params.height_mm, abs=1e-4)
+
+
+def law(device, R, signal, cosine):
+    """The variance of a range as the documentation has it, written down once more."""
+    w = 0.5 * (device.beam_exit_mm + device.divergence_mrad * 1e-3 * R)
+    tangent = np.minimum(np.sqrt(1.0 - cosine**2) / cosine, 20.0)
+    return (
+        device.noise_mm**2
+        + (device.noise_ppm * 1e-6 * R) ** 2
+        + (device.noise_signal_mm * signal**device.signal_power) ** 2
+        + (device.footprint_share * w * tangent) ** 2
+    )
+
+
+@pytest.mark.parametrize("name", ["phase", "pulse", "long-range"])
+def test_clean_ranges_have_the_specified_noise_at_every_incidence(name):
+    device = dataclasses.replace(scanner.Scanner(**scanner.preset(name)), offset_mm=0.0, scale_ppm=0.0, tilt_urad=0.0)
+    surfaces = surfaces_of(frame_of_balls(), clutter=9)
+    params = scanner.Params(scanner=name, step_mrad=0.9)
+    returns = echoes.scan(surfaces, standing(2500.0, 2800.0, 1600.0), device, params, 1, "S1", keep_hits=True).returns
+    clean = returns.source == echoes.SURFACE
+    R = np.linalg.norm(returns.hits[clean], axis=1)
+    error = np.linalg.norm(returns.points[clean], axis=1) - R  # not what the scanner says of it, but where points are
+    np.testing.assert_allclose(error, returns.range_error_mm[clean], atol=1e-3)
+    cosine = returns.incidence_cos[clean].astype(np.float64)
+    pull = error / np.sqrt(law(device, R, returns.intensity[clean].astype(np.float64), cosine))
+    classes = np.digitize(np.degrees(np.arccos(cosine)), [20.0, 40.0, 60.0, 75.0])
+    for k in range(5):
+        own = pull[classes == k]
+        assert len(own) > 5_000
+        allowed = 4.0 / np.sqrt(len(own))  # of chance itself
+        assert abs(own.mean()) < 0.02 + allowed
+        assert own.std() == pytest.approx(1.0, abs=0.03 + allowed)
+    assert abs(pull.mean()) < 0.02
+    assert pull.std() == pytest.approx(1.0, rel=0.03)
+
+
+def test_a_beam_on_two_plates_gives_a_mixed_pixel_by_the_device():
+    builder = Builder()
+    corners = np.array([[-3000.0, 0.0, -3000.0], [0.0, 0.0, -3000.0], [0.0, 0.0, 3000.0], [-3000.0, 0.0, 3000.0]])
+    builder.polygon(0, "near", corners + np.array([0.0, 5000.0, 0.0]))
+    builder.polygon(1, "far", np.abs(corners) * [1, 1, 0] + corners * [0, 0, 1] + np.array([0.0, 7000.0, 0.0]))
+    surfaces = builder.done()
+    params = scanner.Params(step_mrad=0.4, specular=0.0, sub_rays=19)
+    depth = {}
+    for behaviour in ("phase", "pulse"):
+        device = dataclasses.replace(QUIET, behaviour=behaviour, divergence_mrad=0.8, encoder_urad=100.0)
+        device = dataclasses.replace(device, separation_mm=500.0)
+        returns = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+        edge = (
+            (returns.source == echoes.MIXED)
+            & (np.abs(returns.points[:, 0]) < 10.0)
+            & (np.abs(returns.points[:, 2]) < 2000.0)
+        )
+        depth[behaviour] = returns.points[edge, 1]
+        assert np.abs(returns.range_error_mm[returns.source == echoes.SURFACE]).max() == 0.0
+    assert len(depth["phase"]) > 1_000
+    assert ((depth["phase"] > 5000.0) & (depth["phase"] < 7000.0)).all()
+    assert np.ptp(depth["phase"]) > 800.0
+    # A pulse keeps one of the echoes: the one with more energy, and half of the beam gives the near plate (7/5)^2 more.
+    off = np.minimum(np.abs(depth["pulse"] - 5000.0), np.abs(depth["pulse"] - 7000.0))
+    assert off.max() < 5.0
+    assert (depth["pulse"] < 6000.0).mean() > 0.5
+
+
+def test_sub_rays_share_the_energy_of_a_gaussian_beam():
+    for count in (1, 7, 19):
+        offsets, share = echoes.beam(count)
+        assert len(offsets) == count
+        assert share.sum() == pytest.approx(1.0)
+        np.testing.assert_allclose(share @ offsets, 0.0, atol=1e-12)
+
+
+def test_strongest_echo_by_hand():
+    ranges = np.array([[1000.0, 1010.0, 2000.0, np.inf], [3000.0, 1000.0, 3005.0, np.inf]])
+    energy = np.array([[0.2, 0.2, 0.3, 0.0], [0.2, 0.3, 0.2, 0.0]])
+    found = echoes.strongest_echo(ranges, energy, 100.0)
+    np.testing.assert_array_equal(found, [[0.2, 0.2, 0.0, 0.0], [0.2, 0.0, 0.2, 0.0]])
+
+
+def test_edges_are_where_a_neighbour_is_on_another_surface():
+    surface = np.full((5, 6), 3, np.int32)
+    surface[2, 3] = 7
+    expected = np.zeros((5, 6), bool)
+    expected[1:4, 2:5] = True
+    np.testing.assert_array_equal(echoes.edges(surface), expected)
+
+
+def test_what_is_behind_is_not_seen_and_ranges_are_limited():
+    builder = Builder()
+    plate = np.array([[-2000.0, 0.0, -2000.0], [2000.0, 0.0, -2000.0], [2000.0, 0.0, 2000.0], [-2000.0, 0.0, 2000.0]])
+    builder.polygon(0, "near", plate + np.array([0.0, 3000.0, 0.0]))
+    builder.sphere(1, "hidden", np.array([0.0, 5000.0, 0.0]), 500.0, [])
+    builder.sphere(2, "too far", np.array([0.0, -90_000.0, 0.0]), 500.0, [])
+    builder.sphere(3, "too near", np.array([0.0, -200.0, 0.0]), 50.0, [])
+    device = dataclasses.replace(QUIET, max_range_mm=80_000.0)
+    returns = echoes.scan(builder.done(), np.eye(4), device, scanner.Params(step_mrad=2.0), 0, "S1").returns
+    assert set(returns.part) == {0}
+
+
+def test_weak_signals_are_lost_and_some_returns_stray():
+    surfaces = surfaces_of(frame_of_balls())
+    T = standing(2500.0, 2800.0, 1600.0)
+    params = scanner.Params(step_mrad=1.5)
+    every = echoes.scan(surfaces, T, QUIET, params, 1, "S1").returns
+    dim = echoes.scan(surfaces, T, dataclasses.replace(QUIET, threshold=0.5), params, 1, "S1").returns
+    # Speckle of eight looks multiplies the signal: the share that stays is a gamma law's.
+    stays = scipy.stats.gamma.sf(0.5 / every.intensity, 8.0, scale=1.0 / 8.0)
+    assert len(dim.points) == pytest.approx(stays.sum(), abs=5.0 * np.sqrt((stays * (1.0 - stays)).sum()))
+    assert np.median(dim.incidence_cos) > np.median(every.incidence_cos) + 0.05  # steel shines away from the scanner
+    stray = echoes.scan(surfaces, T, dataclasses.replace(QUIET, flying_share=0.02), params, 1, "S1").returns
+    outliers = stray.source == echoes.OUTLIER
+    assert outliers.mean() == pytest.approx(0.02, abs=0.002)
+    assert (stray.part[outliers] == -1).all()
+    assert (stray.surface[outliers] == -1).all()
+    R = np.linalg.norm(stray.points[outliers], axis=1)
+    assert R.min() >= QUIET.min_range_mm
+    assert (stray.range_error_mm[outliers] <= 0.0).mean() > 0.99
+
+
+def test_a_station_is_wrong_by_what_its_truth_says():
+    surfaces = surfaces_of(frame_of_balls())
+    T = standing(2500.0, 2800.0, 1600.0)
+    device = dataclasses.replace(QUIET, offset_mm=2.0, scale_ppm=50.0, tilt_urad=100.0)
+    found = echoes.scan(surfaces, T, device, scanner.Params(step_mrad=2.0, sub_rays=1), 7, "S1", keep_hits=True)
+    hits, points = found.returns.hits, found.returns.points
+    R = np.linalg.norm(hits, axis=1)
+    scale, offset = np.polyfit(R, np.linalg.norm(points, axis=1) - R, 1)
+    assert (offset, 1e6 * scale) == pytest.approx(found.systematic[:2], abs=0.02)
+    # A small turn w moves p by w x p.
+    turn = np.linalg.lstsq(
+        np.concatenate([np.cross(np.eye(3)[k], hits / R[:, None]).reshape(-1, 1) for k in range(3)], axis=1),
+        (points / np.linalg.norm(points, axis=1)[:, None] - hits / R[:, None]).ravel(),
+        rcond=None,
+    )[0]
+    np.testing.assert_allclose(turn, [*found.systematic[2:], 0.0], atol=1e-8)
+    assert abs(found.systematic[0]) > 0.0
+
+
+def test_a_station_does_not_depend_on_others_or_on_threads(monkeypatch):
+    surfaces = surfaces_of(frame_of_balls())
+    poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}
+    device, params = scanner.Scanner(), scanner.Params(step_mrad=3.0, registration_mm=2.0, registration_mrad=0.1)
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+    one = survey.survey(surfaces, (), {"S2": poses["S2"]}, device, params, 5)
+    monkeypatch.setenv("OMP_NUM_THREADS", "3")
+    both = survey.survey(surfaces, (), poses, device, params, 5)
+    for field in dataclasses.fields(one.scans[0]):
+        np.testing.assert_array_equal(getattr(one.scans[0], field.name), getattr(both.scans[1], field.name))
+    np.testing.assert_array_equal(one.labels[0].range_error_mm, both.labels[1].range_error_mm)
+    other = survey.survey(surfaces, (), {"S2": poses["S2"]}, device, params, 6)
+    assert (
+        other.scans[0].points.shape != one.scans[0].points.shape or (other.scans[0].points != one.scans[0].points).any()
+    )
+    moved = both.registered @ np.linalg.inv(np.array(list(poses.values())))
+    shift = (both.registered - np.array(list(poses.values())))[:, :3, 3]
+    assert 0.0 < np.abs(shift).max() < 10.0
+    np.testing.assert_allclose(np.linalg.det(moved[:, :3, :3]), 1.0)
+
+
+def test_merged_scans_lie_where_the_stations_saw_them():
+    surfaces = surfaces_of(frame_of_balls())
+    poses = {"S1": standing(2500.0, 2800.0, 1600.0), "S2": standing(100.0, 400.0, 1500.0)}
+    found = survey.survey(surfaces, (), poses, QUIET, scanner.Params(step_mrad=3.0, sub_rays=1), 5)
+    origin = np.array([5.0e8, 4.3e9, 1.0e5])
+    (scan,), (labels,), stations, truth = survey.in_project(found, origin, merge=True)
+    assert stations.ids == truth.ids == ("S1", "S2")
+    np.testing.assert_allclose(stations.positions - origin, [T[:3, 3] for T in poses.values()], atol=1e-6)
+    scans, _, _, _ = survey.in_project(found, origin, merge=False)
+    at = 0
+    for k, single in enumerate(scans):
+        own = scan.point_station == k
+        assert own.sum() == len(single.points)
+        np.testing.assert_allclose(scan.points[own], in_scene(poses[single.name], single.points), atol=1e-6)
+        np.testing.assert_allclose(single.T_project_scan[:3, 3] - origin, poses[single.name][:3, 3], atol=1e-6)
+        at += own.sum()
+    assert at == len(scan.points) == len(labels.surface)
+
+
+def test_patches_of_steep_dents_are_met_exactly():
+    def at(p, q):
+        x, y = 2000.0 * (p - 0.5), 2000.0 * (q - 0.5)
+        return np.stack([x, 4000.0 + 40.0 * np.exp(-(x * x + y * y) / 150.0**2), y], axis=1)
+
+    builder = Builder()
+    knots = np.linspace(0.0, 1.0, 60)
+    builder.patch(0, Patch("dented", at, knots, knots))
+    returns = echoes.scan(
+        builder.done(), np.eye(4), QUIET, scanner.Params(step_mrad=1.0), 0, "S1", keep_hits=True
+    ).returns
+    x, y, z = returns.hits.T
+    np.testing.assert_allclose(y, 4000.0 + 40.0 * np.exp(-(x * x + z * z) / 150.0**2), atol=1e-4)
+    assert len(x) > 200_000
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"behaviour": "magic"}, "scanner.behaviour: expected phase or pulse"),
+        ({"noise_mm": -1.0}, "scanner.noise_mm: expected 0 or more"),
+        ({"max_range_mm": 1.0}, "scanner.max_range_mm: expected more than min_range_mm"),
+    ],
+)
+def test_impossible_scanners_are_refused(changed, said):
+    with pytest.raises(UsageError, match=said):
+        dataclasses.replace(scanner.Scanner(), **changed)
+
+
+def test_presets_are_scanners_with_a_source():
+    for name, numbers in scanner.presets().items():
+        scanner.Scanner(**scanner.preset(name))
+        assert set(numbers) - {"about", "source", "verified"} == {f.name for f in dataclasses.fields(scanner.Scanner)}
+        assert len(numbers["source"]) > 5
+    with pytest.raises(UsageError, match="expected one of phase, pulse"):
+        scanner.preset("magic")
