@@ -1,15 +1,19 @@
 """Folders of scenes: the same bytes whoever makes them, taken up after a kill, failures recorded, usage refused."""
 
 import csv
+import fcntl
 import hashlib
 import json
 import os
+import pty
 import random
 import re
 import signal
 import socket
+import struct
 import subprocess
 import sys
+import termios
 import time
 from pathlib import Path
 
@@ -392,6 +396,20 @@ def test_a_file_where_the_folder_should_be_and_the_other_way_round(made, tmp_pat
     assert "many scenes need a folder" in run("-o", tmp_path / "file" / "set", "--count", 2, code=2).stderr
     assert (tmp_path / "file").read_text() == "mine"
     assert "this is a folder" in run("-o", made, code=2).stderr
+
+
+def test_a_bar_on_a_terminal_and_nowhere_else(made, tmp_path):
+    folder = copied(made, tmp_path / "set")
+    assert run("-o", folder, "--count", 3, "--seed", 7).stderr == ""
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    command = [*MAKE, "-o", str(folder), "--count", "3", "--seed", "7", "--json"]
+    done = subprocess.run(command, stdout=subprocess.PIPE, stderr=theirs, check=True)
+    shown = os.read(ours, 100_000).decode()
+    os.close(ours)
+    os.close(theirs)
+    assert "3/3" in shown
+    assert json.loads(done.stdout)["kept"] == 3
 
 
 def test_two_runs_in_one_folder_are_refused(tmp_path):
