@@ -90,6 +90,8 @@ def scan_patches(patches: Sequence[tuple[int, Patch]], params: Params, rng: np.r
         knots, triangles = patch.net()
         a, b, c = (patch.at(knots[:, 0], knots[:, 1])[triangles[:, i]] for i in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
+        if not area.sum() > 0.0:  # all of it is missing
+            continue
         count = rng.poisson(area.sum() / params.spacing_mm**2)
         chosen = triangles[rng.choice(len(area), count, p=area / area.sum())]
         u, v = rng.random(count), rng.random(count)

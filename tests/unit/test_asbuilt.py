@@ -1,0 +1,328 @@
+"""What is built otherwise than designed: each error alone against its closed form, and its truth beside it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import trimesh
+from scipy.integrate import dblquad
+
+from designgen import asbuilt, damage, recipes, sampler
+from designgen.designs import arch_bridge, arch_part, plate_row, space_frame, stadium_roof, structure, truss_bridge
+from designgen.randomness import generator
+from designgen.scene import make
+from processor.model import UsageError
+
+NONE = {wall: asbuilt._Wave(0.0, 0.0, 1000.0) for wall in ("bottom", "top", "left", "right")}
+RIB = arch_bridge.build(arch_bridge.Params())[2]
+
+
+def built(**errors):
+    still = {"ends": np.zeros((2, 3)), "twist": 0.0, "bow": (0.0, 0.0), "section": (0.0, 0.0), "waves": NONE}
+    return asbuilt.fabricate(RIB, asbuilt.ArchErrors(**{**still, **errors}), RIB.plates)
+
+
+def frames(s):
+    point, tangent, normal = RIB.curve.frame(np.array([s]))
+    return point[0], tangent[0], normal[0]
+
+
+def test_nothing_wrong_changes_nothing():
+    for s in (RIB.s0, RIB.s1):
+        np.testing.assert_allclose(built().key_points(s), RIB.key_points(s), atol=1e-9)
+    p, q = np.random.default_rng(0).uniform(size=(2, 200))
+    for ours, design in zip(arch_part.faces(built(), 500.0), arch_part.faces(RIB, 500.0), strict=True):
+        np.testing.assert_allclose(ours.at(p, q), design.at(p, q), atol=1e-9)
+
+
+def test_a_length_error_moves_one_end_along_the_curve():
+    longer = built(ends=np.array([[0.0, 0.0, 0.0], [3.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(longer.key_points(RIB.s0), RIB.key_points(RIB.s0), atol=1e-9)
+    np.testing.assert_allclose(longer.key_points(RIB.s1), RIB.key_points(RIB.s1 + 3.0), atol=1e-9)
+
+
+def test_a_skew_turns_the_end_face():
+    skewed = built(ends=np.array([[0.0, 0.0, 0.0], [0.0, 1e-3, 0.0]]))
+    _, tangent, _ = frames(RIB.s1)
+    off = (skewed.key_points(RIB.s1) - RIB.key_points(RIB.s1)) @ tangent
+    # 1 mrad over half the width, left forward and right back; the middles of bottom and top stay. The error is one of
+    # the arc length at the soffit: a height v above it, about a curve of curvature k, it is (1 + k v) times as long.
+    height = np.array([0.0, 0.0, 1100.0, 1100.0, 0.0, 550.0, 1100.0, 550.0])
+    expected = (
+        1e-3 * 450.0 * np.array([1, -1, -1, 1, 0, -1, 0, 1]) * (1.0 + RIB.curve.curvature(np.array(RIB.s1)) * height)
+    )
+    np.testing.assert_allclose(off, expected, atol=1e-4)
+
+
+def test_a_twist_turns_the_ends_against_each_other():
+    twisted = built(twist=2e-3)
+    for s, sign in ((RIB.s0, -1.0), (RIB.s1, 1.0)):
+        origin, _, normal = frames(s)
+        middle = origin + 550.0 * normal
+        arm = RIB.key_points(s) - middle
+        u, v = arm[:, 1], arm @ normal
+        turned = twisted.key_points(s) - middle
+        angle = 1e-3 * sign
+        np.testing.assert_allclose(turned[:, 1], u * np.cos(angle) - v * np.sin(angle), atol=1e-9)
+        np.testing.assert_allclose(turned @ normal, u * np.sin(angle) + v * np.cos(angle), atol=1e-9)
+
+
+def test_a_bow_is_at_the_middle_and_a_wider_section_everywhere():
+    bowed = built(bow=(4.0, -3.0))
+    for s in (RIB.s0, RIB.s1):
+        np.testing.assert_allclose(bowed.key_points(s), RIB.key_points(s), atol=1e-9)
+    s = 0.5 * (RIB.s0 + RIB.s1)
+    _, _, normal = frames(s)
+    np.testing.assert_allclose(bowed.key_points(s) - RIB.key_points(s), [[0, 4, 0] - 3.0 * normal] * 8, atol=1e-9)
+    wide = built(section=(2.0, 5.0)).key_points(RIB.s1)
+    assert np.linalg.norm(wide[0] - wide[1]) == pytest.approx(902.0)
+    assert np.linalg.norm(wide[0] - wide[3]) == pytest.approx(1105.0)
+
+
+def test_dents_waves_and_missing_pieces_are_where_the_truth_says():
+    params = asbuilt.ArchParams(dents=2, missing_pieces=1, waviness_mm=0.0)
+    ledger = asbuilt.Ledger()
+    parts = arch_bridge.build(arch_bridge.Params())
+    made = asbuilt.arch(parts, params, [generator(0, part.name) for part in parts], ledger)
+    truth = ledger.record()
+    rows = {(what, where): value for what, where, value in zip(truth.what, truth.where, truth.value, strict=True)}
+    dents = [where for what, where in rows if what == "dent, depth"]
+    assert len(dents) == 2
+    for where in dents:
+        name, wall = where.split()[:2]
+        part = next(p for p in made if p.name == name)
+        design = next(p for p in parts if p.name == name)
+        s = design.s0 + float(where.split(",")[1].split()[0])
+        v = float(where.split(",")[2].split()[0])
+        at = (np.array([s]), np.array([450.0 if wall == "left" else -450.0]), np.array([v]))
+        moved = part.point(*at, wall=wall) - design.point(*at)
+        assert np.linalg.norm(moved) == pytest.approx(8.0, abs=0.01)  # its place is written to the millimetre
+        assert moved[0, 1] * (1.0 if wall == "left" else -1.0) < 0.0
+    (hole,) = [h for p in made for h in p.holes]
+    owner = next(p for p in made if p.holes)
+    cloud = sampler.scan_part(owner, 0, sampler.Params(spacing_mm=20.0, sigma_mm=0.0), generator(0, "x"))
+    middle = owner.point(
+        *(
+            np.array([x])
+            for x in (0.5 * (hole.s0 + hole.s1), 450.0 if hole.wall == "left" else -450.0, 0.5 * (hole.c0 + hole.c1))
+        )
+    )
+    away = np.linalg.norm(cloud.points - middle, axis=1)
+    assert 100.0 < away.min() < 130.0  # 125 to the edge; the plate's cut faces reach a little inward
+    waves = asbuilt.fabricate(
+        RIB,
+        asbuilt.ArchErrors(
+            np.zeros((2, 3)), 0.0, (0.0, 0.0), (0.0, 0.0), {w: asbuilt._Wave(1.5, 0.0, 1500.0) for w in NONE}
+        ),
+        RIB.plates,
+    )
+    p, q = np.random.default_rng(0).uniform(size=(2, 20_000))
+    off = {
+        f.name: f.at(p, q) - g.at(p, q)
+        for f, g in zip(arch_part.faces(waves, 500.0), arch_part.faces(RIB, 500.0), strict=True)
+    }
+    assert np.linalg.norm(off["outer-left"], axis=1).max() == pytest.approx(1.5, abs=0.02)
+    np.testing.assert_allclose(off["ring-end"], 0.0, atol=1e-9)
+    np.testing.assert_allclose(waves.key_points(RIB.s1), RIB.key_points(RIB.s1), atol=1e-9)
+
+
+def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
+    settings = ["scan.spacing_mm=60", "asbuilt.temperature_C=45", "asbuilt.length_mm=3"]
+    scene, truth = make("x", recipes.overridden(recipes.load("arch-s1")[1], settings), 5)
+    assert scene.temperature_C == 45.0
+    grown = 1.0 + 12e-6 * 25.0
+    for i in range(5):
+        T = truth.arch.T_bridge_scan[i]
+        np.testing.assert_allclose(
+            truth.arch.key_points_scan[i] / grown @ T[:3, :3].T + T[:3, 3], truth.arch.key_points_bridge[i], atol=1e-8
+        )
+    width = truth.arch.key_points_scan[1, 0, 0] - truth.arch.key_points_scan[1, 0, 1]
+    assert np.linalg.norm(width) == pytest.approx(900.0 * grown)
+    gaps = truth.arch.key_points_bridge[1:, 0] - truth.arch.key_points_bridge[:-1, 1]
+    wanted = {f"rib{k} {end}": 0.0 for k in (1, 2, 3) for end in ("start", "end")}
+    for what, where, value in zip(truth.as_built.what, truth.as_built.where, truth.as_built.value, strict=True):
+        if what == "length error" and where in wanted:
+            wanted[where] = value
+    # At the joint of rib1 and rib2 the gap along the curve is what both ends are long, one after the other.
+    assert np.linalg.norm(gaps[1, 4]) == pytest.approx(abs(wanted["rib2 start"] - wanted["rib1 end"]), abs=2e-3)
+
+
+FRAME = space_frame.build(space_frame.Params(nodes_x=3, nodes_y=3, layers=2, radii_mm=(45.0, 60.0)))
+
+
+def frame_with(**params):
+    ledger = asbuilt.Ledger()
+    return asbuilt.frame(FRAME, asbuilt.FrameParams(**params), generator(1, "x"), ledger), ledger.record()
+
+
+def test_frames_are_built_otherwise_by_what_the_truth_says():
+    same, truth = frame_with()
+    np.testing.assert_array_equal(same.centres, FRAME.centres)
+    assert truth.what == ()
+    moved, _ = frame_with(node_movement_mm=5.0)
+    assert np.std(moved.centres - FRAME.centres) == pytest.approx(5.0, rel=0.4)
+    wrong, truth = frame_with(wrong_sizes=3)
+    changed = np.flatnonzero(wrong.radii != FRAME.radii)
+    assert {f"ball {i}" for i in changed} == set(truth.where)
+    np.testing.assert_array_equal(wrong.radii[changed], [truth.value[truth.where.index(f"ball {i}")] for i in changed])
+    bowed, truth = frame_with(bow_share=0.001, eccentricity_mm=2.0)
+    for m in range(len(FRAME.members)):
+        a, b = FRAME.ends(m)
+        assert np.linalg.norm(bowed.bow(m)) <= 0.001 * np.linalg.norm(b - a)
+        assert abs(bowed.bow(m) @ (b - a)) < 1e-6
+        assert abs(bowed.offsets[m, 0] @ (b - a)) < 1e-6
+        assert truth.value[truth.where.index(f"member {m}")] == pytest.approx(np.linalg.norm(bowed.bow(m)))
+    loose, truth = frame_with(missing_bolts=2)
+    assert loose.missing.sum() == 2
+    warm, _ = frame_with(temperature_C=30.0)
+    np.testing.assert_allclose(warm.centres, FRAME.centres * 1.00012)
+    np.testing.assert_allclose(warm.radii, FRAME.radii * 1.00012)
+    with pytest.raises(UsageError, match=r"asbuilt\.bow_share: expected 0 or more"):
+        frame_with(bow_share=-1.0)
+
+
+def test_a_frame_without_a_bolt_shows_no_sleeve():
+    loose, _ = frame_with(missing_bolts=1)
+    ((member, end),) = np.argwhere(loose.missing)
+    clouds = [
+        sampler.scan_frame(f, sampler.Params(spacing_mm=4.0, sigma_mm=0.0), generator(0, "s")) for f in (FRAME, loose)
+    ]
+    a, b = FRAME.ends(member)
+    start, unit = (a, b - a) if end == 0 else (b, a - b)
+    unit = unit / np.linalg.norm(unit)
+    flat = FRAME.ball(int(FRAME.members[member, end])).flat_distance
+    counts = []
+    for cloud in clouds:
+        along = (cloud.points - start) @ unit
+        across = np.linalg.norm(cloud.points - start - np.outer(along, unit), axis=1)
+        counts.append(((along > flat + 2.0) & (along < flat + 33.0) & (across < 20.0)).sum())
+    assert counts[0] > 100
+    assert counts[1] == 0
+
+
+# --- structures ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("form", plate_row.FORMS)
+@pytest.mark.parametrize("kind", damage.CLASSES)
+def test_defects_are_as_deep_and_large_as_their_truth(form, kind):
+    row = plate_row.Params(form=form, components=(kind,))
+    defect = damage.draw(kind, damage.Params(), row, np.random.default_rng(2))
+    (place,) = plate_row.places(row)
+    H = row.height_mm - (2.0 * row.flange_mm if form == "girder" else 0.0)
+    if len(defect.missing):
+        boxes = plate_row.bodies(row, place)
+        cloud = sampler.scan_patches(
+            [(0, patch) for patch in damage.damaged(place, boxes, defect)],
+            sampler.Params(spacing_mm=4.0, sigma_mm=0.0),
+            generator(0, "d"),
+        )
+        local = place.local(cloud.points)
+        a0, a1, b0, b1 = defect.missing[0]
+        inside = (
+            (local[:, 0] > a0 + 0.1) & (local[:, 0] < a1 - 0.1) & (local[:, 1] > b0 + 0.1) & (local[:, 1] < b1 - 0.1)
+        )
+        front = inside & (np.abs(local[:, 2]) < 1e-6)
+        assert not front.any()
+        assert defect.area_mm2 == pytest.approx((min(a1, 500.0) - a0) * (min(b1, 0.5 * H) - b0))
+        assert defect.depth_max_mm == row.plate_mm
+        rim = np.abs(local[:, 0] - a0) < 1e-6
+        assert (
+            (local[rim, 2] > -row.plate_mm) & (local[rim, 2] < 0.0)
+        ).sum() > 20  # the cut shows the plate's thickness
+        return
+    halves = (0.0, 0.5 * row.length_mm) if kind == "step" else (-0.5 * row.length_mm, 0.5 * row.length_mm)
+
+    def inward(b, a):
+        return -float(defect.move(np.array([[a, b, 0.0]]))[0, 2])
+
+    grid = np.array([[inward(b, a) for a in np.linspace(*halves, 101)] for b in np.linspace(-0.5 * H, 0.5 * H, 101)])
+    largest = grid.flat[np.argmax(np.abs(grid))]
+    if kind not in ("twist", "waviness"):  # these go both ways
+        # A pit is smaller than the cells of this grid.
+        assert defect.depth_max_mm == pytest.approx(
+            inward(*reversed(defect.place)) if kind == "pit" else largest, rel=0.02
+        )
+    else:
+        assert defect.depth_max_mm == pytest.approx(abs(largest), rel=0.03)
+    if kind in ("twist", "waviness"):
+        volume = np.abs(grid).mean() * row.length_mm * H
+        assert volume == pytest.approx(defect.volume_mm3, rel=0.05)
+    elif kind in ("dent", "bulge", "pit"):
+        a, b = defect.place
+        r = np.sqrt(defect.area_mm2 / np.pi)
+        volume = dblquad(lambda y, x: inward(b + y, a + x), -r, r, -r, r, epsrel=1e-3)[0]
+        assert volume == pytest.approx(defect.volume_mm3, rel=1e-2)
+    else:
+        assert grid.mean() * (halves[1] - halves[0]) * H == pytest.approx(defect.volume_mm3, rel=0.03)
+
+
+def test_an_unknown_defect_is_refused():
+    with pytest.raises(UsageError, match="expected classes of dent, bulge"):
+        damage.draw("rust", damage.Params(), plate_row.Params(), np.random.default_rng(0))
+
+
+def test_a_structure_moves_by_its_field():
+    recipe = recipes.overridden(recipes.load("stadium-roof")[1], ["scan.sigma_mm=0", "structure.trusses=4"])
+    scene, truth = make("x", recipe)
+    field = truth.structure
+    assert 20.0 < np.linalg.norm(field.displacement, axis=1).max() < 60.0
+    np.testing.assert_allclose(np.linalg.norm(field.normals, axis=1), 1.0, atol=1e-9)
+    components = stadium_roof.build(stadium_roof.Params(trusses=4))
+    move = damage.movement(damage.MovementParams(), components)
+    # Points of the scan, moved back, lie on the design's tubes.
+    points = scene.scans[0].points[::200]
+    design = points - move(points)
+    design = points - move(design)
+    tubes = [body for one in components for body in one.bodies]
+    nearest = np.full(len(points), np.inf)
+    for tube in tubes:
+        axis = tube.end - tube.start
+        share = np.clip((design - tube.start) @ axis / (axis @ axis), 0.0, 1.0)
+        off = np.linalg.norm(design - tube.start - np.outer(share, axis), axis=1) - tube.radius
+        nearest = np.minimum(nearest, np.abs(off))
+    assert nearest.max() < 0.05  # two steps of the inverse leave that
+
+
+@pytest.mark.parametrize(
+    "components",
+    [
+        stadium_roof.build(stadium_roof.Params()),
+        truss_bridge.build(truss_bridge.Params()),
+        plate_row.build(plate_row.Params(form="girder", components=("none", "step"))),
+    ],
+    ids=["stadium", "truss", "girders"],
+)
+def test_structures_in_cad_keep_to_the_closed_form(components):
+    import cadquery as cq
+
+    solid = structure.solid(components)
+    assert solid.isValid()
+    bodies = [body for one in components for body in one.bodies]
+    assert solid.Volume() == pytest.approx(sum(body.volume for body in bodies), rel=1e-6)
+    rng = np.random.default_rng(0)
+    for body in bodies[:: max(1, len(bodies) // 12)]:
+        shell = cq.Shell(body.solid().Shells()[0].wrapped)
+        for patch in body.patches():
+            for point in patch.at(rng.uniform(size=3), rng.uniform(size=3)):
+                assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02
+    vertices, faces = structure.mesh_of(components)
+    mesh = trimesh.Trimesh(vertices, faces)
+    assert mesh.area == pytest.approx(sum(_area(body) for body in bodies), rel=2e-3)
+
+
+def _area(body):
+    if isinstance(body, structure.Tube):
+        return 2.0 * np.pi * body.radius * np.linalg.norm(body.end - body.start)
+    a, b, c = body.size
+    return 2.0 * (a * b + b * c + c * a)
+
+
+def test_nine_scans_of_a_truss_come_from_six_stations():
+    recipe = recipes.overridden(recipes.load("truss-bridge")[1], ["scan.step_mrad=20"])
+    scene, truth = make("x", recipe)
+    assert len(scene.scans) == 9
+    places = np.array([T[:3, 3] for T in truth.stations.T_project_station])
+    assert len(np.unique(places.round(3), axis=0)) == 6
+    assert all(not scan.T_project_scan.size for scan in scene.scans)
+    assert dataclasses.asdict(scene)["stations"] is None
