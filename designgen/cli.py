@@ -12,7 +12,7 @@ import click
 from designgen import __version__, designs
 
 DONE, IN_PART, ALL_FAILED = 0, 1, 2
-FORMATS = ("ply", "las", "laz", "e57", "xyz")
+FORMATS = ("ply", "las", "laz", "e57", "ptx", "pcd", "xyz")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -96,9 +96,33 @@ def make(
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="folder to make")
 @click.option("--format", "format_", required=True, type=click.Choice(FORMATS), help="of the scans")
 @click.option("--without-truth", is_flag=True, help="leave the truth out")
-def export(scene: Path, output: Path, format_: str, without_truth: bool) -> None:
+@click.option("--spherical", is_flag=True, help="E57 with ranges and angles, as scanners write it")
+@click.option("--step", is_flag=True, help="write the design's solids as STEP, too")
+def export(scene: Path, output: Path, format_: str, without_truth: bool, spherical: bool, step: bool) -> None:
     """Write SCENE as a scan folder: project.toml, design, scans, and the truth in truth.h5."""
     from designgen import scan_folder
 
-    written = scan_folder.export(scene, output, format_, with_truth=not without_truth)
+    if spherical and format_ != "e57":
+        raise click.UsageError("--spherical is for --format e57")
+    written = scan_folder.export(scene, output, format_, with_truth=not without_truth, spherical=spherical, step=step)
     click.echo(f"{output}: {written} scan(s) as {format_}")
+
+
+@commands.command("import")
+@click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="folder to make")
+@click.option("--units", default="", help="of the file's numbers, whatever the file says: mm, m, inch, ...")
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+def import_(file: Path, output: Path, units: str, as_json: bool) -> None:
+    """Turn a STEP or IFC FILE into meshes in mm, one a body, with their sizes in import.json."""
+    from designgen import cad_files
+
+    said = cad_files.import_file(file, output, units)
+    if as_json:
+        click.echo(json.dumps(said, ensure_ascii=False))
+        return
+    click.echo(f"{file}: unit {said['unit']} ({said['unit_mm']:g} mm, {said['unit_from']})")
+    for body in said["bodies"]:
+        x, y, z = body["size_mm"]
+        volume = f"{body['volume_mm3']:.6g} mm3" if body["volume_mm3"] is not None else "no volume: a surface"
+        click.echo(f"  {body['mesh']}: {x:.3f} x {y:.3f} x {z:.3f} mm, {volume}")

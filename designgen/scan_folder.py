@@ -11,16 +11,19 @@ from typing import Any
 
 import numpy as np
 
+from designgen import scan_files
 from processor import store
-from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints, Scan, Scene, UsageError
-
-MM = 0.001  # metres
+from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Scan, Scene, UsageError
 
 
-def export(source: Path, folder: Path, format_: str, *, with_truth: bool) -> int:
+def export(
+    source: Path, folder: Path, format_: str, *, with_truth: bool, spherical: bool = False, step: bool = False
+) -> int:
     """Write the scene file ``source`` as a new scan folder; the number of scans.
 
-    The folder is made under a temporary name and moved. Raises UsageError when it exists and is not empty.
+    The folder is made under a temporary name and moved; ``spherical`` is for E57, ``step`` adds the design's
+    solids as STEP. Raises UsageError when it exists and
+    is not empty, and for a format that cannot hold the scene.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder}: exists and is not empty; name a new folder")
@@ -28,7 +31,11 @@ def export(source: Path, folder: Path, format_: str, *, with_truth: bool) -> int
     folder.parent.mkdir(parents=True, exist_ok=True)
     making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        _write(scene, making, format_)
+        _write(scene, making, format_, spherical=spherical)
+        if step:
+            from designgen import cad_files
+
+            cad_files.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
         if with_truth:
             store.copy_truth(source, making / "truth.h5")
         if folder.exists():
@@ -41,24 +48,59 @@ def export(source: Path, folder: Path, format_: str, *, with_truth: bool) -> int
     return len(scene.scans)
 
 
-def _write(scene: Scene, folder: Path, format_: str) -> None:
+def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool) -> None:
     (folder / "scans").mkdir()
-    lines = [f"name = {json.dumps(scene.name, ensure_ascii=False)}", f'kind = "{scene.kind}"']
+    lines = [f"name = {_quoted(scene.name)}", f"kind = {_quoted(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
-    if scene.arch is not None or scene.frame is not None:
-        lines.append('design = "design.json"')
-        (folder / "design.json").write_text(json.dumps(_design(scene, folder), indent=1) + "\n", encoding="utf-8")
+    scale = 1.0 if format_ == "ply" else scan_files.METRES
+    design = _design(scene, folder, scale)
+    if design:
+        lines.append(f"design = {_quoted(design)}")
     if np.isfinite(scene.temperature_C):
         lines.append(f"temperature_C = {scene.temperature_C!r}")
-    for number, scan in enumerate(scene.scans):
-        file = f"scans/{_file_name(scan.name, number)}.{format_}"
-        WRITERS[format_](folder / file, scan)
-        lines += ["", "[[scan]]", f"file = {json.dumps(file, ensure_ascii=False)}"]
-        if scan.component:
-            lines.append(f"component = {json.dumps(scan.component, ensure_ascii=False)}")
-        if np.isfinite(scan.sigma_mm):
-            lines.append(f"sigma_mm = {scan.sigma_mm!r}")
+    named = [(_file_name(scan.name, number), scan) for number, scan in enumerate(scene.scans)]
+    files = scan_files.write_all(folder / "scans", format_, named, scene.stations, spherical=spherical)
+    for file, scan in zip(files, scene.scans, strict=False):
+        lines += ["", "[[scan]]", f"file = {_quoted(f'scans/{file}')}"]
+        lines += _of_file(scene, scale) if format_ == "e57" else _of_scan(scan, scale, own_pose=format_ == "ptx")
+    if scene.stations is not None and any(len(scan.point_station) for scan in scene.scans):
+        places = {
+            name: {"position": (position * scale).tolist()}
+            for name, position in zip(scene.stations.ids, scene.stations.positions, strict=True)
+        }
+        _write_json(folder / "stations.json", places)
     (folder / "project.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def _of_file(scene: Scene, scale: float) -> list[str]:
+    """Lines of a file that holds all scans: what is the same for all of them."""
+    sigmas = {scan.sigma_mm for scan in scene.scans}
+    lines = [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
+    return lines + (_of_scan(scene.scans[0], scale, own_pose=True)[:1] if len(scene.scans) == 1 else [])
+
+
+def _of_scan(scan: Scan, scale: float, *, own_pose: bool) -> list[str]:
+    """Lines of project.toml about one scan; with ``own_pose`` its file says where the scanner stood."""
+    lines = [f"component = {_quoted(scan.component)}"] if scan.component else []
+    if scan.station:
+        lines.append(f"station = {_quoted(scan.station)}")
+    if np.isfinite(scan.sigma_mm):
+        lines.append(f"sigma_mm = {scan.sigma_mm!r}")
+    if scan.T_project_scan.size and not own_pose:
+        pose = scan.T_project_scan.copy()
+        pose[:3, 3] *= scale
+        lines.append(f"pose = {json.dumps(pose.tolist())}")
+    if scan.position.size and not own_pose:
+        lines.append(f"position = {json.dumps((scan.position * scale).tolist())}")
+    return lines
+
+
+def _quoted(text: str) -> str:
+    return json.dumps(text, ensure_ascii=False)
+
+
+def _write_json(path: Path, content: dict[str, Any]) -> None:
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _file_name(name: str, number: int) -> str:
@@ -66,15 +108,27 @@ def _file_name(name: str, number: int) -> str:
     return name if name.replace("-", "").replace("_", "").isalnum() else f"scan{number}"
 
 
-def _design(scene: Scene, folder: Path) -> dict[str, Any]:
-    return _arch_design(scene.arch, folder) if scene.arch is not None else _frame_design(scene.frame)
+def _design(scene: Scene, folder: Path, scale: float) -> str:
+    """Write the design, a structure's mesh in the folder's units; returns its file's name, empty without one."""
+    if scene.arch is not None:
+        _write_json(folder / "design.json", _arch_design(scene.arch, folder))
+    elif scene.frame is not None:
+        _write_json(folder / "design.json", _frame_design(scene.frame))
+    elif scene.structure is not None:
+        (folder / "design").mkdir(exist_ok=True)
+        vertices = scene.structure.vertices * scale
+        scan_files.write_mesh(folder / "design/structure.ply", vertices, scene.structure.faces)
+        return "design/structure.ply"
+    else:
+        return ""
+    return "design.json"
 
 
 def _arch_design(design: ArchDesign, folder: Path) -> dict[str, Any]:
-    (folder / "design").mkdir()
+    (folder / "design").mkdir(exist_ok=True)
     components = {}
     for part in design.parts:
-        _write_ply(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
+        scan_files.write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
         components[part.name] = {
             "mesh": f"design/{part.name}.ply",
             "bottom_edge_left": part.bottom_edge_left.tolist(),
@@ -90,8 +144,7 @@ def _arch_design(design: ArchDesign, folder: Path) -> dict[str, Any]:
     return {"units": "mm", "kind": "arch-bridge", "order": order, "components": components, "joints": joints}
 
 
-def _frame_design(design: FrameDesign | None) -> dict[str, Any]:
-    assert design is not None
+def _frame_design(design: FrameDesign) -> dict[str, Any]:
     nodes = [
         {"id": int(i), "centre": centre.tolist(), "radius": float(radius)}
         for i, centre, radius in zip(design.ids, design.centres, design.radii, strict=True)
@@ -101,54 +154,3 @@ def _frame_design(design: FrameDesign | None) -> dict[str, Any]:
         for a, b, d in zip(design.member_a, design.member_b, design.tube_diameters, strict=True)
     ]
     return {"units": "mm", "kind": "space-frame", "nodes": nodes, "members": members}
-
-
-def _write_ply(path: Path, points: Floats, faces: Ints | None = None) -> None:
-    """Write binary PLY with coordinates as doubles, mm."""
-    from plyfile import PlyData, PlyElement
-
-    vertex = np.empty(len(points), dtype=[("x", "<f8"), ("y", "<f8"), ("z", "<f8")])
-    vertex["x"], vertex["y"], vertex["z"] = points.T
-    elements = [PlyElement.describe(vertex, "vertex")]
-    if faces is not None:
-        face = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
-        face["vertex_indices"] = faces
-        elements.append(PlyElement.describe(face, "face"))
-    PlyData(elements, byte_order="<").write(str(path))
-
-
-def _scan_ply(path: Path, scan: Scan) -> None:
-    _write_ply(path, scan.points + scan.origin)
-
-
-def _scan_las(path: Path, scan: Scan) -> None:
-    """Write LAS or LAZ in metres, to 0.0001 m."""
-    import laspy
-
-    metres = (scan.points + scan.origin) * MM
-    header = laspy.LasHeader(point_format=0, version="1.2")
-    header.scales = np.full(3, 0.0001)
-    header.offsets = np.floor(metres.min(axis=0))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = metres.T
-    las.write(str(path))
-
-
-def _scan_e57(path: Path, scan: Scan) -> None:
-    """Write E57 in metres, doubles."""
-    import pye57
-
-    metres = (scan.points + scan.origin) * MM
-    with_axes = {f"cartesian{axis}": np.ascontiguousarray(metres[:, i]) for i, axis in enumerate("XYZ")}
-    file = pye57.E57(str(path), mode="w")
-    try:
-        file.write_scan_raw(with_axes, name=scan.name)
-    finally:
-        file.close()
-
-
-def _scan_xyz(path: Path, scan: Scan) -> None:
-    np.savetxt(path, (scan.points + scan.origin) * MM, fmt="%.7f")
-
-
-WRITERS = {"ply": _scan_ply, "las": _scan_las, "laz": _scan_las, "e57": _scan_e57, "xyz": _scan_xyz}

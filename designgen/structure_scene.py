@@ -29,17 +29,29 @@ from processor.model import (
 
 TRUTH_STEP_MM = 250.0
 Surface = Callable[[Floats, Floats], Floats]
+Components = tuple[structure.Component, ...]
 Built = tuple[list[tuple[int, Patch]], Callable[[Floats], Floats] | None, DefectTruth | None]
+
+
+def design(recipe: Mapping[str, Any]) -> tuple[structure.Component, ...]:
+    """Return the components of a structure's recipe as designed."""
+    section = dict(recipe.get("structure", {}))
+    builders: dict[Any, Callable[[], tuple[structure.Component, ...]]] = {
+        "stadium-roof": lambda: stadium_roof.build(filled(stadium_roof.Params, {"structure": section}, "structure")),
+        "truss-bridge": lambda: truss_bridge.build(filled(truss_bridge.Params, {"structure": section}, "structure")),
+        "plate-row": lambda: plate_row.build(filled(plate_row.Params, {"structure": section}, "structure")),
+    }
+    kind = section.pop("type", None)
+    if kind not in builders:
+        raise UsageError(f"structure.type: expected one of {', '.join(builders)}, got {kind!r}")
+    return builders[kind]()
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make a structure's scene; ``structure.type`` says which: stadium-roof, truss-bridge or plate-row."""
-    section = dict(recipe.get("structure", {}))
-    kind = section.pop("type", None)
-    makers = {"stadium-roof": _stadium, "truss-bridge": _truss, "plate-row": _plates}
-    if kind not in makers:
-        raise UsageError(f"structure.type: expected one of {', '.join(makers)}, got {kind!r}")
-    components, (patches, move, defects) = makers[kind]({**recipe, "structure": section}, seed)
+    components = design(recipe)
+    kind = recipe["structure"]["type"]
+    patches, move, defects = BUILDERS[kind](components, recipe, seed)
     names = tuple(one.name for one in components)
     stations, station_truth = None, None
     origin = np.zeros(3)
@@ -81,13 +93,12 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     )
 
 
-def _stadium(recipe: Mapping[str, Any], seed: int) -> tuple[tuple[structure.Component, ...], Built]:
-    components = stadium_roof.build(filled(stadium_roof.Params, recipe, "structure"))
+def _stadium(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
     if "asbuilt" not in recipe:
-        return components, (_as_designed(components), None, None)
+        return _as_designed(components), None, None
     move = damage.movement(filled(damage.MovementParams, recipe, "asbuilt"), components)
     moved = [(part, dataclasses.replace(patch, at=_moved(patch.at, move))) for part, patch in _as_designed(components)]
-    return components, (moved, move, None)
+    return moved, move, None
 
 
 def _moved(at: Surface, move: damage.Displacement) -> Surface:
@@ -99,15 +110,14 @@ def _moved(at: Surface, move: damage.Displacement) -> Surface:
     return where
 
 
-def _truss(recipe: Mapping[str, Any], seed: int) -> tuple[tuple[structure.Component, ...], Built]:
-    components = truss_bridge.build(filled(truss_bridge.Params, recipe, "structure"))
-    return components, (_as_designed(components), None, None)
+def _truss(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+    return _as_designed(components), None, None
 
 
-def _plates(recipe: Mapping[str, Any], seed: int) -> tuple[tuple[structure.Component, ...], Built]:
-    form = filled(plate_row.Params, recipe, "structure")
+def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+    section = {key: value for key, value in recipe["structure"].items() if key != "type"}
+    form = filled(plate_row.Params, {"structure": section}, "structure")
     sizes = filled(damage.Params, recipe, "asbuilt")
-    components = plate_row.build(form)
     patches: list[tuple[int, Patch]] = []
     found: list[tuple[plate_row.Place, damage.Defect]] = []
     for part, place in enumerate(plate_row.places(form)):
@@ -127,7 +137,10 @@ def _plates(recipe: Mapping[str, Any], seed: int) -> tuple[tuple[structure.Compo
         np.array([defect.depth_max_mm for _, defect in found]),
         np.array([defect.volume_mm3 for _, defect in found]),
     )
-    return components, (patches, None, truth)
+    return patches, None, truth
+
+
+BUILDERS = {"stadium-roof": _stadium, "truss-bridge": _truss, "plate-row": _plates}
 
 
 def _as_designed(components: tuple[structure.Component, ...]) -> list[tuple[int, Patch]]:

@@ -34,17 +34,22 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
         raise InputError(f"{path}: turn a {suffix[1:].upper()} design into meshes first: designgen import {path.name}")
     if suffix != ".json":
         raise InputError(f"{path}: expected a design as .json or .csv, found {suffix or 'no suffix'}")
-    try:
-        data = json.loads(_text(path))
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not readable JSON: {error}") from None
-    design = Table.of(str(path), data)
+    design = read_json(path)
     kind = design.text("kind")
     if kind == "arch-bridge":
         return _arch(folder, design)
     if kind == "space-frame":
         return _frame(design)
     raise InputError(f"{path}: expected kind arch-bridge or space-frame, found {kind!r}")
+
+
+def read_json(path: Path) -> Table:
+    """Read a JSON file whose content is an object. Raises InputError for any other."""
+    try:
+        data = json.loads(_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable JSON: {error}") from None
+    return Table.of(str(path), data)
 
 
 def _text(path: Path) -> str:

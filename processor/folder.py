@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from processor import readers, store
-from processor.design_files import read_design
+from processor.design_files import read_design, read_json, read_mesh
 from processor.fields import Table, inside
 from processor.model import (
     KINDS,
@@ -21,6 +21,7 @@ from processor.model import (
     Scan,
     Scene,
     Stations,
+    StructureDesign,
 )
 from processor.readers import RawScan
 from processor.readers.raw import decoded
@@ -33,6 +34,7 @@ else:
 
 PROJECT = "project.toml"
 TRUTH = "truth.h5"
+STATIONS = "stations.json"
 DESIGNS = ("design.json", "design.csv")
 NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv")
 KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance")
@@ -94,10 +96,28 @@ def read_input(path: Path, units: str | None = None) -> Scene:
 
 def _read_folder(folder: Path, asked: str) -> Scene:
     project = _read_project(folder)
-    design = None
-    if project.design is not None and project.kind != "structure":
+    design: ArchDesign | FrameDesign | StructureDesign | None = None
+    if project.design is not None and project.kind == "structure":
+        vertices, faces = read_mesh(project.design)
+        design = StructureDesign(project.design.stem, vertices * MM_PER_UNIT[project.units or asked or "m"], faces)
+    elif project.design is not None:
         design = read_design(folder, project.design, asked or project.units or "m")
-    return _scene(project, design, asked)
+    return _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+
+
+def _places(folder: Path, unit: str) -> Stations | None:
+    """Read stations.json, where it is there: positions of scanners by name, in the project's frame."""
+    path = folder / STATIONS
+    if not path.exists():
+        return None
+    inside(folder, STATIONS, str(folder))
+    table = read_json(path)
+    names = list(table.values)
+    places = [table.table(name) for name in names]
+    for place in places:
+        place.only(("position",))
+    positions = np.array([place.array("position", 3) for place in places]).reshape(-1, 3)
+    return Stations(tuple(names), positions * MM_PER_UNIT[unit])
 
 
 def _read_project(folder: Path) -> _Project:
@@ -161,7 +181,12 @@ def _found(folder: Path, design: Path | None) -> list[Path]:
     return found
 
 
-def _scene(project: _Project, design: ArchDesign | FrameDesign | None, asked: str) -> Scene:
+def _scene(
+    project: _Project,
+    design: ArchDesign | FrameDesign | StructureDesign | None,
+    asked: str,
+    places: Stations | None = None,
+) -> Scene:
     arch = design if isinstance(design, ArchDesign) else None
     frame = design if isinstance(design, FrameDesign) else None
     kind = "arch-bridge" if arch else "space-frame" if frame else project.kind or "structure"
@@ -181,7 +206,7 @@ def _scene(project: _Project, design: ArchDesign | FrameDesign | None, asked: st
         for raw in raws:
             unit, reason = _unit(raw, entry.path, project, asked)
             reasons.setdefault(unit, reason)
-            scan = _scan(raw, entry, unit, parts)
+            scan = _scan(raw, entry, unit, parts, places)
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
             _check_size(entry.path, scan, unit, reason, arch, frame)
@@ -192,10 +217,11 @@ def _scene(project: _Project, design: ArchDesign | FrameDesign | None, asked: st
         tuple(scans),
         arch,
         frame,
-        _stations(scans),
+        places or _stations(scans),
         project.temperature_C,
         ", ".join(reasons),
         "; ".join(dict.fromkeys(reasons.values())),
+        design if isinstance(design, StructureDesign) else None,
     )
 
 
@@ -209,7 +235,7 @@ def _unit(raw: RawScan, path: Path, project: _Project, asked: str) -> tuple[str,
     return "m", "taken as metres, as scanners write: neither the format nor the project says"
 
 
-def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str]) -> Scan:
+def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], places: Stations | None) -> Scan:
     if len(raw.points) < FEWEST_POINTS:
         raise InputError(
             f"{entry.path}: scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more"
@@ -219,11 +245,18 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str]) -> Scan:
     if pose.size:
         pose[:3, 3] *= scale
     position = raw.position if entry.position is None else entry.position
+    station = raw.station - 1 if places is not None else raw.station[:0]
+    if places is not None and len(station) and not -1 <= station.min() <= station.max() < len(places.ids):
+        raise InputError(
+            f"{entry.path}: its points name stations {raw.station.min()} to {raw.station.max()}, "
+            f"but {STATIONS} has {len(places.ids)}, counted from 1"
+        )
     return Scan(
         raw.name,
         raw.points * scale,
         raw.origin * scale,
         raw.intensity,
+        station.astype(np.int32),
         component=entry.component or (raw.name if raw.name in parts else ""),
         station=entry.station,
         position=position * scale,

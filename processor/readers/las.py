@@ -28,11 +28,13 @@ def read(path: Path) -> list[RawScan]:
         las = laspy.read(str(path))
         xyz = np.asarray(las.xyz, np.float64)
         intensity = np.asarray(las.intensity, np.float64)
+        station = np.asarray(las.point_source_id, np.int64)
         unit = _unit(las.header.vlrs)
         declared = int(las.header.point_count)
     if len(xyz) != declared:
         raise InputError(f"{path}: the header declares {declared} points, but {len(xyz)} were read; copy it again")
-    return [make(path, path.stem, xyz, unit=unit, intensity=intensity)]
+    # 0 in all of the file: it does not say.
+    return [make(path, path.stem, xyz, unit=unit, intensity=intensity, station=station if station.any() else ())]
 
 
 def _check_header(path: Path) -> None:

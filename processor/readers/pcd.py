@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.raw import INTENSITY_NAMES, RawScan, check_room, first_named, make, parsing
+from processor.readers.raw import INTENSITY_NAMES, STATION_NAMES, RawScan, check_room, first_named, make, parsing
 
 SUFFIXES = (".pcd",)
 UNIT = ""
@@ -59,4 +59,14 @@ def read(path: Path) -> list[RawScan]:
     xyz = np.stack([np.asarray(rows[name], np.float64) for name in "xyz"], axis=1)
     valid = ~np.isnan(xyz).any(axis=1)
     intensity = first_named(meta.fields, INTENSITY_NAMES)
-    return [make(path, path.stem, xyz[valid], unit=UNIT, intensity=rows[intensity][valid] if intensity else ())]
+    station = first_named(meta.fields, STATION_NAMES)
+    return [
+        make(
+            path,
+            path.stem,
+            xyz[valid],
+            unit=UNIT,
+            intensity=rows[intensity][valid] if intensity else (),
+            station=rows[station][valid] if station else (),
+        )
+    ]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.raw import INTENSITY_NAMES, RawScan, check_room, first_named, make, parsing
+from processor.readers.raw import INTENSITY_NAMES, STATION_NAMES, RawScan, check_room, first_named, make, parsing
 
 SUFFIXES = (".ply",)
 UNIT = ""
@@ -33,7 +33,17 @@ def read(path: Path) -> list[RawScan]:
         raise InputError(f"{path}: expected vertices with x, y, z, found {', '.join(fields) or 'none'}")
     intensity = first_named(fields, INTENSITY_NAMES)
     xyz = np.stack([np.asarray(vertex[name], np.float64) for name in "xyz"], axis=1)
-    return [make(path, path.stem, xyz, unit=UNIT, intensity=vertex[intensity] if intensity else ())]
+    station = first_named(fields, STATION_NAMES)
+    return [
+        make(
+            path,
+            path.stem,
+            xyz,
+            unit=UNIT,
+            intensity=vertex[intensity] if intensity else (),
+            station=vertex[station] if station else (),
+        )
+    ]
 
 
 def check_header(path: Path) -> None:

@@ -6,6 +6,7 @@ here; then a line a grid cell ``x y z intensity [r g b]``. A cell of ``0 0 0`` h
 
 from __future__ import annotations
 
+import dataclasses
 from itertools import islice
 from pathlib import Path
 from typing import TextIO
@@ -37,7 +38,7 @@ def read(path: Path) -> list[RawScan]:
 
 
 def _renamed(scan: RawScan, name: str) -> RawScan:
-    return RawScan(name, scan.points, scan.origin, scan.intensity, scan.position, scan.T_project_scan, scan.unit)
+    return dataclasses.replace(scan, name=name)
 
 
 def _next_line(file: TextIO) -> str | None:

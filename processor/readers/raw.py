@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Checked, Floats, InputError, column, optional
+from processor.model import Checked, Floats, InputError, Ints, column, optional
 
 FAR = 10_000.0  # units; beyond this an origin is taken off
 ORIGIN_STEP = 1_000.0
@@ -32,6 +32,7 @@ class RawScan(Checked):
     position: Floats = optional(3)  # of the scanner, in the scan's frame
     T_project_scan: Floats = optional(4, 4)
     unit: str = ""  # "" = the format does not say
+    station: Ints = column("n", dtype=np.int64)  # number of the station a point was seen from, from 1; 0 = unknown
 
 
 def make(
@@ -43,6 +44,7 @@ def make(
     intensity: npt.ArrayLike = (),
     position: npt.ArrayLike = (),
     T_project_scan: npt.ArrayLike = (),
+    station: npt.ArrayLike = (),
 ) -> RawScan:
     """Make the record from coordinates (n, 3), taking off an origin of whole thousands where they are far.
 
@@ -69,6 +71,7 @@ def make(
         np.asarray(position, np.float64),
         np.asarray(T_project_scan, np.float64),
         unit,
+        np.asarray(station, np.int64),
     )
 
 
@@ -114,3 +117,4 @@ def first_named(columns: Any, pattern: str) -> str | None:
 
 
 INTENSITY_NAMES = r"(scalar_)?(intensity|reflectance|reflectivity|amplitude)|i"
+STATION_NAMES = r"(scalar_)?station"

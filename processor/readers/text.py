@@ -16,7 +16,16 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.raw import INTENSITY_NAMES, RawScan, check_room, decoded, first_named, make, parsing
+from processor.readers.raw import (
+    INTENSITY_NAMES,
+    STATION_NAMES,
+    RawScan,
+    check_room,
+    decoded,
+    first_named,
+    make,
+    parsing,
+)
 
 SUFFIXES = (".asc", ".csv", ".pts", ".txt", ".xyz")
 UNIT = ""
@@ -42,9 +51,9 @@ class Layout:
 def read(path: Path) -> list[RawScan]:
     """Read a table of points as one scan."""
     layout = sniff(path)
-    axes, intensity, unit = _columns(path, layout)
+    axes, intensity, station, unit = _columns(path, layout)
     check_room(path, "text", max(layout.declared, 0), 6, path.stat().st_size)
-    wanted = axes if intensity is None else [*axes, intensity]
+    wanted = [*axes, *(one for one in (intensity, station) if one is not None)]
     with parsing(path, "text"), warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # of numpy, for a table without rows: seen below
         data = np.loadtxt(
@@ -60,7 +69,16 @@ def read(path: Path) -> list[RawScan]:
         raise InputError(
             f"{path}: the first line declares {layout.declared} points, but {len(data)} follow; export it again"
         )
-    return [make(path, path.stem, data[:, :3], unit=unit, intensity=data[:, 3] if intensity is not None else ())]
+    return [
+        make(
+            path,
+            path.stem,
+            data[:, :3],
+            unit=unit,
+            intensity=data[:, 3] if intensity is not None else (),
+            station=data[:, -1] if station is not None else (),
+        )
+    ]
 
 
 def sniff(path: Path) -> Layout:
@@ -125,23 +143,24 @@ def _is_number(cell: str) -> bool:
     return "_" not in cell
 
 
-def _columns(path: Path, layout: Layout) -> tuple[list[int], int | None, str]:
-    """Columns of x, y, z and of the intensity, and the unit that a header names."""
+def _columns(path: Path, layout: Layout) -> tuple[list[int], int | None, int | None, str]:
+    """Columns of x, y, z, of the intensity and of the station, and the unit that a header names."""
     names = [re.sub(r'["\']', "", name).strip() for name in layout.header]
     found = [first_named(names, rf"{axis}([\s_\[(]*{UNITS_IN_HEADERS}[\])]?)") for axis in "xyz"]
     if len(names) == layout.columns and all(found):
-        intensity = first_named(names, INTENSITY_NAMES)
+        intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
         units = {re.fullmatch(rf".[\s_\[(]*{UNITS_IN_HEADERS}[\])]?", name or "", re.IGNORECASE) for name in found}
         said = {(match.group(1) or "").lower() for match in units if match}
         if len(said) != 1:
             raise InputError(f"{path}: the header gives x, y, z in different units ({', '.join(layout.header)})")
         axes = [names.index(name) for name in found if name is not None]
-        return axes, names.index(intensity) if intensity else None, said.pop()
+        others = [names.index(name) if name else None for name in (intensity, station)]
+        return axes, others[0], others[1], said.pop()
     if any(found) and len(names) != layout.columns:
         raise InputError(
             f"{path}: the header names {len(names)} columns ({' '.join(names)[:80]}), but rows have {layout.columns}"
         )
-    return [0, 1, 2], 3 if layout.columns in (4, 7) else None, UNIT
+    return [0, 1, 2], 3 if layout.columns in (4, 7) else None, None, UNIT
 
 
 def _normalised(path: Path, layout: Layout) -> Iterator[str]:

@@ -1,0 +1,254 @@
+"""Exported scan folders: read back whole, and read by programs that share nothing with ours."""
+
+import dataclasses
+import hashlib
+import json
+
+import laspy
+import numpy as np
+import open3d
+import pye57
+import pytest
+
+from designgen import e57_file, scan_files, scan_folder
+from processor import folder, store
+from processor.model import FrameDesign, InputError, Scan, Scene, Stations, StructureDesign, UsageError
+
+RNG = np.random.default_rng(3)
+LIMITS_MM = {"las": 0.0501, "laz": 0.0501, "ptx": 1.1e-4, "xyz": 1.1e-4}  # the rest are doubles
+
+
+def pose(origin):
+    R, _ = np.linalg.qr(RNG.normal(size=(3, 3)))
+    T = np.eye(4)
+    T[:3, :3] = R * np.linalg.det(R)
+    T[:3, 3] = origin + RNG.uniform(-5000.0, 5000.0, 3)
+    return T
+
+
+def on_grid(count):
+    """Points of a scanner in its own frame, with their places on the grid, no two on one."""
+    cells = RNG.permutation(90 * 50)[:count]
+    row, column = cells % 50 + 7, cells // 50 + 3
+    azimuth, elevation = column * 0.06, (row - 20) * 0.02
+    R = RNG.uniform(2000.0, 30_000.0, count)
+    level = R * np.cos(elevation)
+    points = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), R * np.sin(elevation)], axis=1)
+    return points, row.astype(np.int32), column.astype(np.int32)
+
+
+def stations_apart(origin):
+    """A scene of one scan a station, in the scanner's frame."""
+    scans = []
+    for number in range(3):
+        points, row, column = on_grid(400 + number)
+        name = ("S1", "二号站", "S 3")[number]
+        scans.append(
+            Scan(
+                name,
+                points,
+                intensity=RNG.uniform(0.1, 2.0, len(points)),
+                grid_row=row,
+                grid_column=column,
+                station=name,
+                position=np.zeros(3),
+                T_project_scan=pose(origin),
+                sigma_mm=1.5,
+            )
+        )
+    design = FrameDesign([0, 1], np.array([[0.0, 0, 0], [30_000.0, 0, 0]]) + origin, [45.0, 50.0], [0], [1], [60.0])
+    poses = np.array([scan.T_project_scan for scan in scans])
+    stations = Stations(tuple(scan.name for scan in scans), poses[:, :3, 3], poses)
+    return Scene("屋盖 <1>", "space-frame", tuple(scans), frame=design, stations=stations, temperature_C=28.5)
+
+
+def merged(origin):
+    """A scene of one cloud of two stations, in the project's frame."""
+    poses = np.array([pose(np.zeros(3)) for _ in range(2)])
+    pieces = [on_grid(300), on_grid(200)]
+    points = np.vstack([p @ T[:3, :3].T + T[:3, 3] for (p, _, _), T in zip(pieces, poses, strict=True)])
+    scan = Scan(
+        "scan",
+        points,
+        origin=origin,
+        intensity=RNG.uniform(0.1, 2.0, 500),
+        point_station=np.repeat(np.array([0, 1], np.int32), [300, 200]),
+        grid_row=np.concatenate([p[1] for p in pieces]),
+        grid_column=np.concatenate([p[2] for p in pieces]),
+    )
+    poses[:, :3, 3] += origin
+    mesh = StructureDesign("roof", np.array([[0.0, 0, 0], [1000, 0, 0], [0, 1000, 0]]) + origin, [[0, 1, 2]])
+    return Scene("hall", "structure", (scan,), stations=Stations(("S1", "S2"), poses[:, :3, 3], poses), structure=mesh)
+
+
+ORIGINS = {"local": np.zeros(3), "georeferenced": np.array([5.0e8, 4.3e9, 1.0e5])}
+
+
+def exported(scene, tmp_path, format_, **options):
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    scan_folder.export(tmp_path / "s.h5", tmp_path / "out", format_, with_truth=True, **options)
+    return store.read_scene(tmp_path / "s.h5"), tmp_path / "out"
+
+
+def sorted_rows(points):
+    return points[np.lexsort(np.round(points, 1).T)]
+
+
+@pytest.mark.parametrize("where", ORIGINS)
+@pytest.mark.parametrize("format_", [*scan_files.FORMATS, "e57-spherical"])
+def test_scans_of_stations_come_back(format_, where, tmp_path):
+    name, _, spherical = format_.partition("-")
+    options = {"spherical": True} if spherical else {}
+    scene, out = exported(stations_apart(ORIGINS[where]), tmp_path, name, **options)
+    back = folder.read_input(out)
+    assert (back.name, back.kind, back.temperature_C) == ("屋盖 <1>", "space-frame", 28.5)
+    assert len(back.scans) == 3
+    limit = LIMITS_MM.get(name, 1e-6)
+    for ours, theirs in zip(scene.scans, back.scans, strict=True):
+        given, found = (s.points + s.origin for s in (ours, theirs))
+        if name == "ptx":  # a grid is written column by column
+            given, found = sorted_rows(given), sorted_rows(found)
+        np.testing.assert_allclose(found, given, atol=limit)
+        np.testing.assert_allclose(theirs.T_project_scan[:3, :3], ours.T_project_scan[:3, :3], atol=2e-9)
+        np.testing.assert_allclose(theirs.T_project_scan[:3, 3], ours.T_project_scan[:3, 3], atol=2e-6)
+        np.testing.assert_allclose(theirs.position, 0.0, atol=1e-3 if where == "georeferenced" else 1e-5)
+        assert theirs.sigma_mm == 1.5
+        assert len(theirs.intensity) == len(ours.points)
+    np.testing.assert_allclose(back.frame.centres, scene.frame.centres, atol=1e-6)
+    np.testing.assert_allclose(sorted_rows(back.stations.positions), sorted_rows(scene.stations.positions), atol=1e-3)
+
+
+@pytest.mark.parametrize("where", ORIGINS)
+@pytest.mark.parametrize("format_", ["ply", "las", "laz", "pcd", "xyz"])
+def test_a_merged_cloud_comes_back_with_its_stations(format_, where, tmp_path):
+    scene, out = exported(merged(ORIGINS[where]), tmp_path, format_)
+    back = folder.read_input(out)
+    (ours,), (theirs,) = scene.scans, back.scans
+    limit = LIMITS_MM.get(format_, 1e-6 if where == "local" else 1e-3)
+    np.testing.assert_allclose((theirs.points - ours.points) + (theirs.origin - ours.origin), 0.0, atol=limit)
+    np.testing.assert_array_equal(theirs.point_station, ours.point_station)
+    assert back.stations.ids == ("S1", "S2")
+    np.testing.assert_allclose(back.stations.positions, scene.stations.positions, atol=1e-5)
+    np.testing.assert_allclose(back.structure.vertices, scene.structure.vertices, atol=1e-5)
+    np.testing.assert_array_equal(back.structure.faces, scene.structure.faces)
+
+
+def ptx_grids(path):
+    """Read PTX with nothing but the definition: columns, rows, pose, matrix, cells."""
+    lines = path.read_text("ascii").splitlines()
+    at = 0
+    while at < len(lines):
+        columns, rows = int(lines[at]), int(lines[at + 1])
+        T = np.array([line.split() for line in lines[at + 6 : at + 10]], np.float64).T
+        cells = np.array([line.split() for line in lines[at + 10 : at + 10 + columns * rows]], np.float64)
+        yield cells.reshape(columns, rows, 4), T
+        at += 10 + columns * rows
+
+
+@pytest.mark.parametrize("make", [stations_apart, merged])
+def test_ptx_keeps_the_grid_and_the_pose(make, tmp_path):
+    scene, out = exported(make(np.zeros(3)), tmp_path, "ptx")
+    grids = [grid for path in sorted((out / "scans").iterdir()) for grid in ptx_grids(path)]
+    assert len(grids) == (3 if make is stations_apart else 2)
+    in_project = []
+    for cells, T in grids:
+        column, row = np.nonzero((cells[:, :, :3] != 0.0).any(axis=2))
+        points = cells[column, row, :3]
+        in_project.append(points @ T[:3, :3].T + T[:3, 3])
+        assert (cells[(cells[:, :, :3] == 0.0).all(axis=2)][:, 3] == 0.5).all()
+        # In the scanner's frame a column is one azimuth and a row one elevation, as the points were made.
+        turned = np.exp(1j * (np.arctan2(points[:, 1], points[:, 0]) - 0.06 * column))
+        np.testing.assert_allclose(turned, turned[0], atol=1e-6)
+        elevation = np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1]))
+        np.testing.assert_allclose(elevation - 0.02 * row, (elevation - 0.02 * row)[0], atol=1e-6)
+    given = []
+    for scan in scene.scans:
+        T = scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
+        given.append((scan.points + scan.origin) @ T[:3, :3].T + T[:3, 3])
+    np.testing.assert_allclose(sorted_rows(np.vstack(in_project) * 1000.0), sorted_rows(np.vstack(given)), atol=1e-3)
+
+
+def test_other_programs_read_the_files(tmp_path):
+    scene, _ = exported(stations_apart(ORIGINS["georeferenced"]), tmp_path, "e57")
+    file = pye57.E57(str(tmp_path / "out/scans/scans.e57"))
+    for number, scan in enumerate(scene.scans):
+        theirs = file.read_scan(number, row_column=True, intensity=True, ignore_missing_fields=True)
+        found = np.stack([theirs[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
+        T = scan.T_project_scan
+        np.testing.assert_allclose(found, (scan.points @ T[:3, :3].T + T[:3, 3]) / 1000.0, rtol=0.0, atol=2e-9 * 1e3)
+        np.testing.assert_array_equal(theirs["rowIndex"], scan.grid_row)
+        np.testing.assert_array_equal(theirs["columnIndex"], scan.grid_column)
+        np.testing.assert_allclose(theirs["intensity"], scan.intensity, rtol=1e-6)
+        assert file.get_header(number)["name"].value() == scan.name
+    file.close()
+    (tmp_path / "m").mkdir()
+    scene, _ = exported(merged(np.zeros(3)), tmp_path / "m", "ply")
+    (scan,) = scene.scans
+    cloud = open3d.t.io.read_point_cloud(str(tmp_path / "m/out/scans/scan.ply"))
+    np.testing.assert_array_equal(cloud.point.positions.numpy(), scan.points)
+    np.testing.assert_array_equal(cloud.point.station.numpy().ravel(), scan.point_station + 1)
+    scan_files.write_pcd(tmp_path / "a.pcd", scan)
+    cloud = open3d.t.io.read_point_cloud(str(tmp_path / "a.pcd"))
+    np.testing.assert_allclose(cloud.point.positions.numpy(), scan.points / 1000.0, atol=1e-15)
+    scan_files.write_las(tmp_path / "a.laz", scan)
+    las = laspy.read(tmp_path / "a.laz")
+    np.testing.assert_allclose(las.xyz, scan.points / 1000.0, atol=0.501e-4)
+    np.testing.assert_array_equal(las.point_source_id, scan.point_station + 1)
+    assert (las.header.version.minor, las.header.point_format.id) == (4, 6)
+    scan_files.write_xyz(tmp_path / "a.xyz", scan)
+    table = np.loadtxt(tmp_path / "a.xyz", skiprows=1)
+    np.testing.assert_allclose(table[:, :3], scan.points / 1000.0, atol=0.51e-7)
+
+
+@pytest.mark.parametrize("format_", scan_files.FORMATS)
+def test_the_same_scene_makes_the_same_files(format_, tmp_path):
+    scene = stations_apart(np.zeros(3))
+    digests = []
+    for turn in ("a", "b"):
+        (tmp_path / turn).mkdir()
+        _, out = exported(scene, tmp_path / turn, format_)
+        digests.append([hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(out.rglob("*")) if p.is_file()])
+    assert digests[0] == digests[1]
+
+
+def test_quaternions_of_all_kinds_of_rotations():
+    for axis, angle in [
+        ((1, 0, 0), np.pi),
+        ((0, 1, 0), np.pi),
+        ((0, 0, 1), np.pi),
+        ((1, 2, 3), 0.0),
+        ((1, -2, 3), 2.0),
+    ]:
+        n = np.array(axis) / np.linalg.norm(axis)
+        K = np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
+        R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
+        q = np.array(e57_file.quaternion(R))
+        expected = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * n)])
+        assert min(np.abs(q - expected).max(), np.abs(q + expected).max()) < 1e-12
+
+
+def test_what_cannot_be_written_is_refused(tmp_path):
+    scene = stations_apart(np.zeros(3))
+    bare = dataclasses.replace(
+        scene, scans=tuple(dataclasses.replace(s, grid_row=[], grid_column=[]) for s in scene.scans)
+    )
+    with pytest.raises(UsageError, match="not made on a scanner's grid"):
+        exported(bare, tmp_path, "ptx")
+    assert not (tmp_path / "out").exists()
+    loose = merged(np.zeros(3))
+    loose = dataclasses.replace(loose, stations=Stations(loose.stations.ids, loose.stations.positions))
+    with pytest.raises(UsageError, match="no poses of its stations"):
+        exported(loose, tmp_path, "ptx")
+    with pytest.raises(UsageError, match="by which recipe"):
+        exported(scene, tmp_path, "ply", step=True)
+
+
+def test_stations_that_points_name_must_be_there(tmp_path):
+    _, out = exported(merged(np.zeros(3)), tmp_path, "ply")
+    places = json.loads((out / "stations.json").read_text())
+    (out / "stations.json").write_text(json.dumps({"S1": places["S1"]}))
+    with pytest.raises(InputError, match=r"name stations 1 to 2, but stations\.json has 1"):
+        folder.read_input(out)
+    (out / "stations.json").write_text(json.dumps({"S1": {"place": [0, 0, 0]}}))
+    with pytest.raises(InputError, match="place"):
+        folder.read_input(out)
