@@ -22,6 +22,7 @@ lint: $(VENV)/.test
 
 bench: $(VENV)/.test
 	$(BIN)/python -m tests.bench.paper_comparison --output $(OUT)/bench.json
+	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
 
 nightly: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2

@@ -270,9 +270,16 @@ def cast_around(  # type: ignore[no-untyped-def]
     m = len(offsets)
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
+    farthest = np.full(count, np.inf)  # of a ray's sub-rays
+    rows = number.shape[1]
+    level, rise = np.empty(rows), np.empty(rows)
+    for i in range(rows):
+        level[i], rise[i] = np.cos(lowest + step * i), np.sin(lowest + step * i)
     for b in range(len(boxes)):
         k = boxes[b, 0]
         i = owner[k]
+        cx, cy, cz, r = centres[k, 0], centres[k, 1], centres[k, 2], radii[k]
+        c2 = cx * cx + cy * cy + cz * cz
         for column in range(max(boxes[b, 1], first), min(boxes[b, 2], first + width - 1) + 1):
             j = column - first + 1
             azimuth = 2.0 * np.pi * column / columns
@@ -281,15 +288,25 @@ def cast_around(  # type: ignore[no-untyped-def]
                 ray = number[j, row]
                 if ray < 0:
                     continue
-                level, rise = np.cos(lowest + step * row), np.sin(lowest + step * row)
+                da, de = jitter[j, row, 0], jitter[j, row, 1]
+                flat = level[row] - de * rise[row]
+                dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
+                along = dx * cx + dy * cy + dz * cz
+                near = r + angle[ray] * abs(along) + 1e-6 * r  # the beam's edge may touch what its middle passes by
+                if along + r < 0.0 or along - r > farthest[ray] or c2 - along * along > near * near + 1e-9 * c2:
+                    continue
+                changed = False
                 for o in range(m):
                     da = jitter[j, row, 0] + angle[ray] * offsets[o, 0]
                     de = jitter[j, row, 1] + angle[ray] * offsets[o, 1]
-                    flat = level - de * rise
-                    dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise + de * level
+                    flat = level[row] - de * rise[row]
+                    dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
                     t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
                     if least <= t <= most and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
                         best[ray, o], shape[ray, o] = t, i
+                        changed = True
+                if changed:
+                    farthest[ray] = best[ray].max()
     return shape, best
 
 
