@@ -16,6 +16,7 @@ from designgen.designs.space_frame import Frame
 from processor.model import AsBuilt, Floats, UsageError
 
 EXPANSION_PER_K = 12e-6
+CORNER_REACH_MM = 1500.0  # from an end, how far the errors of its corners reach
 REFERENCE_C = 20.0
 
 
@@ -29,6 +30,7 @@ class ArchParams:
     bow_mm: float = 0.0  # sideways and upward, at the middle
     section_mm: float = 0.0  # width and height
     plate_mm: float = 0.0  # thickness of each plate
+    corner_mm: float = 0.0  # each corner of each end, along all axes: as ends look that were cut and welded in a yard
     waviness_mm: float = 0.0  # amplitude on each wall
     waviness_length_mm: float = 1500.0
     dents: int = 0  # on all parts together
@@ -124,6 +126,7 @@ class ArchErrors:
     section: tuple[float, float]
     waves: dict[str, _Wave]
     dents: tuple[_Dent, ...] = ()
+    corners: Floats = field(default_factory=lambda: np.zeros((2, 4, 3)))  # of P1 to P4 at each end, along, left, up
 
 
 def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[Hole, ...] = ()) -> ArchPart:
@@ -151,12 +154,28 @@ def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[H
         u, vc = u * (1.0 + 0.5 * width / b), vc * (1.0 + height / h)
         first, last = errors.ends
         s = s + (1.0 - q) * (first[0] + first[1] * u + first[2] * vc) + q * (last[0] + last[1] * u + last[2] * vc)
+        moved = _off_corners(errors.corners, u / b, 2.0 * vc / h, q * span, (1.0 - q) * span)
+        s, u, vc = s + moved[0], u + moved[1], vc + moved[2]
         turn = errors.twist * (q - 0.5)
         u, vc = u * np.cos(turn) - vc * np.sin(turn), u * np.sin(turn) + vc * np.cos(turn)
         bend = np.sin(np.pi * q)
         return s, u + errors.bow[0] * bend, vc + 0.5 * h + errors.bow[1] * bend
 
     return dataclasses.replace(part, plates=plates, built=built, holes=holes)
+
+
+def _off_corners(corners: Floats, a: Floats, c: Floats, from_start: Floats, from_end: Floats) -> Floats:
+    """Movements (3, n) by those of the ends' corners: bilinear over the section, fading out along the part.
+
+    ``a`` and ``c`` (n,) run from -1 to 1 across the section, to the left and upward.
+    """
+    left, up = 0.5 * (1.0 + a), 0.5 * (1.0 + c)
+    shares = np.stack([left * (1.0 - up), (1.0 - left) * (1.0 - up), (1.0 - left) * up, left * up])
+    moved = np.zeros((3, len(a)))
+    for end, away in enumerate((from_start, from_end)):
+        x = np.clip(away / CORNER_REACH_MM, 0.0, 1.0)
+        moved += (1.0 - x) ** 2 * (1.0 + 2.0 * x) * (corners[end].T @ shares)
+    return moved
 
 
 def arch(
@@ -172,10 +191,14 @@ def arch(
         thick = params.plate_mm * rng.standard_normal(3)
         phases = rng.uniform(0.0, 2.0 * np.pi, 4)
         waves = params.waviness_mm * rng.standard_normal(4)
+        corners = params.corner_mm * rng.standard_normal((2, 4, 3)) if params.corner_mm else np.zeros((2, 4, 3))
         for i, end in enumerate(("start", "end")):
             ledger.note("length error", f"{part.name} {end}", ends[i, 0], "mm")
             ledger.note("skew about the vertical", f"{part.name} {end}", ends[i, 1], "rad")
             ledger.note("skew about the horizontal", f"{part.name} {end}", ends[i, 2], "rad")
+            for k, axis in np.ndindex(4, 3) if params.corner_mm else ():
+                what = f"corner P{k + 1}, {('along', 'left', 'up')[axis]}"
+                ledger.note(what, f"{part.name} {end}", corners[i, k, axis], "mm")
         for what, value in zip(("bow sideways", "bow upward", "width", "height"), (*bow, *section), strict=True):
             ledger.note(what, part.name, value, "mm")
         ledger.note("twist", part.name, twist, "rad")
@@ -193,6 +216,7 @@ def arch(
                 for w, a, p in zip(walls, waves, phases, strict=True)
             },
             tuple(_dent(part, params, rng, ledger) for _ in range(_share(params.dents, number, len(parts)))),
+            corners,
         )
         holes = tuple(
             _hole(part, params, rng, ledger) for _ in range(_share(params.missing_pieces, number, len(parts)))

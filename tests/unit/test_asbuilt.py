@@ -79,6 +79,30 @@ def test_a_bow_is_at_the_middle_and_a_wider_section_everywhere():
     assert np.linalg.norm(wide[0] - wide[3]) == pytest.approx(1105.0)
 
 
+def test_corners_of_an_end_move_each_on_its_own():
+    corners = np.zeros((2, 4, 3))
+    corners[1, 0], corners[1, 2] = [5.0, 0.0, 0.0], [0.0, 7.0, -3.0]
+    off = built(corners=corners)
+    np.testing.assert_allclose(off.key_points(RIB.s0), RIB.key_points(RIB.s0), atol=1e-9)
+    _, tangent, normal = frames(RIB.s1)
+    moved = off.key_points(RIB.s1) - RIB.key_points(RIB.s1)
+    np.testing.assert_allclose(moved @ tangent, [5, 0, 0, 0, 2.5, 0, 0, 2.5], atol=0.15)  # longer above the soffit
+    np.testing.assert_allclose(moved[:, 1], [0, 0, 7, 0, 0, 3.5, 3.5, 0], atol=1e-9)
+    np.testing.assert_allclose(moved @ normal, [0, 0, -3, 0, 0, -1.5, -1.5, 0], atol=2e-2)
+    far = off.key_points(RIB.s1 - asbuilt.CORNER_REACH_MM)
+    np.testing.assert_allclose(far, RIB.key_points(RIB.s1 - asbuilt.CORNER_REACH_MM), atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["arch-east", "arch-west"])
+def test_real_bridges_gape_as_in_the_source_paper(name):
+    """Tables 4 to 7 of paper 000: the mean of |d| is 15 to 17 mm, the largest 58."""
+    scene, truth = make(name, recipes.overridden(recipes.load(name)[1], ["scan.step_mrad=40"]))
+    gaps = np.abs(truth.arch.key_points_bridge[1:, 0] - truth.arch.key_points_bridge[:-1, 1])
+    assert 10.0 < gaps.mean() < 22.0
+    assert 35.0 < gaps.max() < 85.0
+    assert all(len(scan.points) for scan in scene.scans)
+
+
 def test_dents_waves_and_missing_pieces_are_where_the_truth_says():
     params = asbuilt.ArchParams(dents=2, missing_pieces=1, waviness_mm=0.0)
     ledger = asbuilt.Ledger()
