@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from designgen import asbuilt, mesh, sampler, survey
-from designgen.designs import arch_bridge, arch_part
+from designgen import asbuilt, sampler, survey
+from designgen.designs import arch_bridge, arch_mesh, arch_part
 from designgen.randomness import generator, random_pose, rigid
 from designgen.reading import filled
 from designgen.scanning import ByRays, Scanning
@@ -126,5 +126,4 @@ def _end_points(part: arch_part.ArchPart, end: str, s: float) -> Floats:
 
 
 def _design_part(part: arch_part.ArchPart) -> DesignPart:
-    vertices, faces = mesh.triangulate(arch_part.solid(part), arch_part.TESSELLATION_MM)
-    return DesignPart(part.name, vertices, faces, *part.bottom_edges())
+    return DesignPart(part.name, *arch_mesh.triangulate(part), *part.bottom_edges())

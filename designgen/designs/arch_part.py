@@ -20,7 +20,6 @@ if TYPE_CHECKING:
 SECTION_STEP_MM = 250.0
 NET_STEP_MM, NET_ACROSS = 250.0, 6  # of the nets that rays hit first, before the surface itself
 PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0
-TESSELLATION_MM = 0.05  # asked of the mesher; a few facets of the longest faces are up to 0.3 mm off
 
 
 @dataclass(frozen=True)
@@ -276,8 +275,8 @@ def _plate(part: ArchPart, name: str, s: float, p0: float, p1: float, q0: float,
     return Face(name, at, lambda p, q: np.full_like(p, area))
 
 
-def _pad_frame(part: ArchPart) -> tuple[Floats, Floats, Floats, Floats]:
-    """Origin on the top face and the axes along, left and up of the pad, (3,) each."""
+def pad_frame(part: ArchPart) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return the origin on the top face and the axes along, left and up of the pad, (3,) each."""
     s, u = part.pad
     _, tangent, normal = part.curve.frame(np.array([s]))
     origin = part.point(np.array([s]), np.array([u]), part.h(np.array([s])), wall="top")[0]
@@ -285,7 +284,7 @@ def _pad_frame(part: ArchPart) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 def _pad_faces(part: ArchPart) -> list[Face]:
-    origin, along, left, up = _pad_frame(part)
+    origin, along, left, up = pad_frame(part)
     half = 0.5 * PAD_SIZE_MM
 
     def rectangle(name: str, centre: Floats, one: Floats, two: Floats, length: float, width: float) -> Face:
@@ -346,7 +345,7 @@ def solid(part: ArchPart) -> cq.Solid:
     box = cq.Solid.makeSolid(cq.Shell.makeShell(found))
     if box.Volume() < 0.0:  # sewing leaves the faces' sense to chance
         box = cq.Solid(box.wrapped.Reversed())
-    origin, along, _, up = _pad_frame(part)
+    origin, along, _, up = pad_frame(part)
     sunk = 0.5 * t.top  # into the plate, so that the pad meets a curved face without a sliver
     corner = origin - 0.5 * PAD_SIZE_MM * along - np.array([0.0, 0.5 * PAD_SIZE_MM, 0.0]) - sunk * up
     plane = cq.Plane(origin=tuple(corner), xDir=tuple(along), normal=tuple(up))

@@ -11,8 +11,8 @@ import pytest
 import trimesh
 from scipy.integrate import quad
 
-from designgen import curves, mesh, recipes, sampler, scan_folder
-from designgen.designs import arch_bridge, arch_part, bolt_ball, space_frame
+from designgen import curves, recipes, sampler, scan_folder
+from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, space_frame
 from designgen.randomness import generator
 from designgen.scene import make
 from processor import folder, store
@@ -79,17 +79,20 @@ def test_solids_keep_to_the_closed_form(parts):
         solid = arch_part.solid(part)
         assert solid.isValid()
         assert solid.Volume() == pytest.approx(volume_by_quadrature(part), rel=1e-6)
-        vertices, faces = mesh.triangulate(solid, arch_part.TESSELLATION_MM)
-        assert trimesh.Trimesh(vertices, faces, process=False).is_watertight
-        assert trimesh.Trimesh(vertices, faces, process=False).volume == pytest.approx(solid.Volume(), rel=2e-3)
+        design = trimesh.Trimesh(*arch_mesh.triangulate(part), process=False)
+        assert design.is_watertight
+        assert design.is_winding_consistent
+        assert design.volume == pytest.approx(solid.Volume(), rel=1e-6)
         # The kernel's own distance from points of the closed form to its solid.
         shell = cq.Shell(solid.Shells()[0].wrapped)
         rng = np.random.default_rng(0)
         for face in arch_part.faces(part, 1e9):
             for point in face.at(rng.uniform(size=3), rng.uniform(size=3)):
-                if face.name == "outer-top" and np.linalg.norm(point - arch_part._pad_frame(part)[0]) < 150.0:
+                if face.name == "outer-top" and np.linalg.norm(point - arch_part.pad_frame(part)[0]) < 150.0:
                     continue  # under the pad
                 assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02, (part.name, face.name)
+        middles = design.triangles_center[rng.permutation(len(design.faces))[:60]]
+        assert max(shell.distance(cq.Vertex.makeVertex(*point)) for point in middles) < 0.02
 
 
 def test_clean_points_lie_on_the_surface_evenly():
@@ -97,13 +100,11 @@ def test_clean_points_lie_on_the_surface_evenly():
     cloud = sampler.scan_part(part, 0, sampler.Params(spacing_mm=15.0, sigma_mm=0.0), generator(0, "x"))
     shell = cq.Shell(arch_part.solid(part).Shells()[0].wrapped)
     sample = cloud.points[:: len(cloud.points) // 60]
-    off_pad = np.linalg.norm(sample - arch_part._pad_frame(part)[0], axis=1) > 160.0
+    off_pad = np.linalg.norm(sample - arch_part.pad_frame(part)[0], axis=1) > 160.0
     assert max(shell.distance(cq.Vertex.makeVertex(*point)) for point in sample[off_pad]) < 0.02
-    vertices, faces = mesh.triangulate(arch_part.solid(part), arch_part.TESSELLATION_MM)
-    shape = trimesh.Trimesh(vertices, faces, process=False)
-    distance = np.abs(trimesh.proximity.ProximityQuery(shape).on_surface(sample)[1])[off_pad]
-    assert np.median(distance) < arch_part.TESSELLATION_MM
-    assert distance.max() < 0.5
+    shape = trimesh.Trimesh(*arch_mesh.triangulate(part), process=False)
+    distance = np.abs(trimesh.proximity.ProximityQuery(shape).on_surface(sample)[1])
+    assert distance.max() < 0.004  # under the pad, too
     # One point in spacing^2: the outer faces' area by quadrature of the widening section's perimeter.
     outer = [f for f in arch_part.faces(part, 1000.0) if f.name == "outer-bottom"]
     p, q = np.meshgrid((np.arange(400) + 0.5) / 400, (np.arange(9) + 0.5) / 9)
