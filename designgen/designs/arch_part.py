@@ -248,8 +248,20 @@ def _wall(part: ArchPart, side: str, *, inner: bool, start: float, end: float) -
 
     name = f"{'inner' if inner else 'outer'}-{side}"
     along = (part.stations(start, end, NET_STEP_MM) - start) / length
-    holes = [_in_wall(hole, part, start, length, low, high, web) for hole in part.holes if hole.wall == side]
+    missing = [hole for hole in part.holes if hole.wall == side]
+    if side == "top" and not inner:
+        missing.append(_under_pad(part))
+    holes = [_in_wall(hole, part, start, length, low, high, web) for hole in missing]
     return Face(name, lambda p, q: part.point(*place(p, q), wall=side), element, along, np.array(holes).reshape(-1, 4))
+
+
+def _under_pad(part: ArchPart) -> Hole:
+    """Return what the pad hides of the top face, which is longer than the soffit by its height over the curve."""
+    s, u = part.pad
+    half = 0.5 * PAD_SIZE_MM
+    at = np.array(s)
+    reach = half / (1.0 + float(part.curve.curvature(at)) * float(part.h(at)))
+    return Hole("top", s - reach, s + reach, u - half, u + half)
 
 
 def _in_wall(

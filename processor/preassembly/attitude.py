@@ -11,9 +11,11 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry import icp, principal, rigid
+from processor.geometry import icp, mesh_surface, principal, rigid
+from processor.geometry.mesh_surface import MeshSurface
 from processor.geometry.neighbors import voxel_means
 from processor.model import DesignPart, Floats
+from processor.preassembly import registration
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: a mark of 0.1 m shows in ten samples
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
@@ -44,6 +46,7 @@ class Surface:
     points: Floats
     normals: Floats
     tree: cKDTree
+    mesh: MeshSurface
     size: float  # diagonal of the bounding box
 
 
@@ -65,7 +68,13 @@ def sample_surface(part: DesignPart) -> Surface:
     at = a[triangle]
     points = at + u[:, None] * (b[triangle] - at) + v[:, None] * (c[triangle] - at)
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
-    return Surface(points, (cross / double_area[:, None])[triangle], cKDTree(points), size)
+    return Surface(
+        points,
+        (cross / double_area[:, None])[triangle],
+        cKDTree(points),
+        mesh_surface.of_mesh(part.vertices, part.faces),
+        size,
+    )
 
 
 def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
@@ -112,6 +121,8 @@ def find(points: Floats, part: DesignPart) -> Attitude:
             break
         if _largest_move(best, rival, points) < SAME_POSE_MM:
             continue
+        # Evidence counts tens of millimetres: neither pose may be off by such along the part.
+        best, rival = (registration.fine(seeds, surface.mesh, T).T_bridge_scan for T in (best, rival))
         ours, theirs = _evidence(points, surface, best, rival)
         more, fewer = max(ours, theirs), min(ours, theirs)
         if more < LEAST_EVIDENCE or more < 2 * fewer:
@@ -158,10 +169,11 @@ def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> 
 def _only_in(surface: Surface, T: Floats, other: Floats) -> Floats:
     """Give the samples of the design that, placed in the scan by T, are far from the design as ``other`` places it."""
     there = rigid.apply(other, rigid.apply(rigid.invert(T), surface.points))
-    # Near an edge the nearest sample can be on the other face: the least of several planes is the distance.
-    index = surface.tree.query(there, k=8)[1]
-    planes = np.abs(np.einsum("nki,nki->nk", there[:, None] - surface.points[index], surface.normals[index]))
-    telling: Floats = surface.points[planes.min(axis=1) > TELLING_MM]
+    _, distance, beyond = surface.mesh.distances(there, 5.0 * TELLING_MM)
+    near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # not so where nothing is in reach: NaN
+    # Near a corner the nearest sample may be on the other face: a sample close by is surface enough.
+    near |= surface.mesh.tree.query(there)[0] <= 1.4 * TELLING_MM
+    telling: Floats = surface.points[~near]
     return telling
 
 

@@ -1,0 +1,107 @@
+"""Distances to a mesh as to a smooth surface: each point against the facet that its foot lies on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.model import Floats, Ints
+
+SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
+WALK_STEPS = 24
+
+
+@dataclass(frozen=True)
+class MeshSurface:
+    """A mesh with its facets' unit normals (f, 3), and the facets (f, 3) across each side; -1 across a sharp edge."""
+
+    vertices: Floats
+    faces: Ints
+    normals: Floats
+    neighbours: Ints  # opposite to each of a facet's vertices
+    tree: cKDTree
+    sample_face: Ints
+
+    def distances(self, points: Floats, reach: float) -> tuple[Ints, Floats, Floats]:
+        """Facet (n,), signed distance (n,) from it, and how far (n,) the foot lies beyond its face's edge; mm.
+
+        Facet -1 and NaN where no sample of the surface is within ``reach``. The search starts at the nearest sample and
+        walks over smooth edges to the facet that the foot is on, so that a curved face is not taken for a plane.
+        """
+        found, sample = self.tree.query(points, distance_upper_bound=reach, workers=-1)
+        near = np.isfinite(found)
+        face = np.full(len(points), -1, np.int64)
+        distance, beyond = np.full(len(points), np.nan), np.full(len(points), np.nan)
+        rows = np.flatnonzero(near)
+        at = self.sample_face[sample[rows]]
+        active = np.arange(len(rows))
+        for _ in range(WALK_STEPS):
+            share = self._barycentric(points[rows[active]], at[active])
+            worst = np.argmin(share, axis=1)
+            next_ = self.neighbours[at[active], worst]
+            moves = (share[np.arange(len(active)), worst] < -1e-9) & (next_ >= 0)
+            if not moves.any():
+                break
+            active, next_ = active[moves], next_[moves]
+            at[active] = next_
+        face[rows] = at
+        share = self._barycentric(points[rows], at)
+        corner = self.vertices[self.faces[at, 0]]
+        distance[rows] = np.einsum("ni,ni->n", points[rows] - corner, self.normals[at])
+        lowest = np.minimum(share.min(axis=1), 0.0)
+        side = np.argmin(share, axis=1)
+        beyond[rows] = -lowest * self._height(at, side)
+        return face, distance, beyond
+
+    def _barycentric(self, points: Floats, face: Ints) -> Floats:
+        """Barycentric coordinates (n, 3) of the points' feet on their facets."""
+        a, b, c = (self.vertices[self.faces[face, k]] for k in range(3))
+        n = np.cross(b - a, c - a)
+        square = np.einsum("ni,ni->n", n, n)
+        p = points - a
+        second = np.einsum("ni,ni->n", np.cross(p, c - a), n) / square
+        third = np.einsum("ni,ni->n", np.cross(b - a, p), n) / square
+        return np.stack([1.0 - second - third, second, third], axis=1)
+
+    def _height(self, face: Ints, side: Ints) -> Floats:
+        """Height (n,) of facets over the side opposite to a vertex."""
+        corners = self.vertices[self.faces[face]]
+        rows = np.arange(len(face))
+        a, b, c = (corners[rows, (side + k) % 3] for k in range(3))
+        base = np.linalg.norm(c - b, axis=1)
+        height: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(base, 1e-12)
+        return height
+
+
+def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurface:
+    """Prepare a mesh; samples for the first guess lie about ``spacing_mm`` apart: less than a plate is thick."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    size = np.linalg.norm(cross, axis=1)
+    used = size > 1e-9
+    faces, a, b, c, cross, size = faces[used], a[used], b[used], c[used], cross[used], size[used]
+    normals = cross / size[:, None]
+    count = np.maximum(1, np.ceil(0.5 * size / spacing_mm**2)).astype(np.int64)
+    owner = np.repeat(np.arange(len(faces)), count)
+    i = np.arange(len(owner))
+    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
+    samples = a[owner] + u[:, None] * (b - a)[owner] + v[:, None] * (c - a)[owner]
+    return MeshSurface(vertices, faces, normals, _neighbours(faces, normals), cKDTree(samples), owner)
+
+
+def _neighbours(faces: Ints, normals: Floats) -> Ints:
+    """Facets (f, 3) across the side opposite to each vertex; -1 for none, for more than one, and across sharp edges."""
+    sides = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1).reshape(-1, 2), axis=1)
+    order = np.lexsort((sides[:, 1], sides[:, 0]))
+    same = (sides[order][1:] == sides[order][:-1]).all(axis=1)
+    alone = np.concatenate([[False], same]).astype(int) + np.concatenate([same, [False]]).astype(int) == 1
+    pairs = np.flatnonzero(same & alone[1:] & alone[:-1])
+    found = np.full(len(sides), -1, np.int64)
+    one, two = order[pairs], order[pairs + 1]
+    smooth = np.einsum("ni,ni->n", normals[one // 3], normals[two // 3]) > SHARP_COS
+    found[one[smooth]], found[two[smooth]] = two[smooth] // 3, one[smooth] // 3
+    return found.reshape(-1, 3)

@@ -1,0 +1,114 @@
+"""Where the bottom edges of a part really run: departures from the design's, station by station, with their spread.
+
+An edge is where the bottom and a web meet. Near a station both faces' residuals against the design are fitted with a
+plane in the distance along and from the edge; at the edge itself they say how far it lies sideways and up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.geometry.lines import Polyline
+from processor.geometry.mesh_surface import MeshSurface
+from processor.model import Floats
+
+STATION_MM = 200.0
+REACH_MM = 200.0  # across each face
+LEAST_POINTS = 30
+FLOOR_MM = 0.004
+
+
+@dataclass(frozen=True)
+class EdgeStations:
+    """Stations of both edges of a part, a row each: design point (k, 3), unit vectors sideways and up (k, 2, 3)."""
+
+    side: tuple[str, ...]  # left | right
+    arc: Floats  # (k,) from the part's start
+    points: Floats
+    axes: Floats
+    departure: Floats  # (k, 2) sideways (to the left) and up; NaN where nothing was seen
+    variance: Floats  # (k, 2)
+
+
+def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polyline, sigma_mm: float) -> EdgeStations:
+    """Measure both edges on points (n, 3), bridge frame, registered to the design."""
+    sides: list[str] = []
+    arcs, places, axes, departures, variances = [], [], [], [], []
+    for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
+        count = max(1, int(line.length / STATION_MM))
+        arc = STATION_MM * (np.arange(count, dtype=np.float64) + 0.5)
+        fine = np.arange(0.0, line.length, 10.0, np.float64)
+        frame = _frame(line, other, fine, sense)
+        near, index = cKDTree(line.at(fine)).query(points, distance_upper_bound=1.2 * REACH_MM, workers=-1)
+        rows = np.flatnonzero(np.isfinite(near))
+        own, at = points[rows], index[rows]
+        offset = own - line.at(fine[at])
+        along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
+        face, residual, beyond = surface.distances(own, 60.0)
+        seen = (face >= 0) & (beyond < 1.0)
+        normal = np.zeros_like(own)
+        normal[seen] = surface.normals[face[seen]]
+        facing = [np.einsum("ni,ni->n", normal, frame[k][at]) for k in (1, 2)]
+        margin = 3.0 * sigma_mm + 2.0
+        station = np.floor((fine[at] + along) / STATION_MM).astype(np.int64)
+        x = fine[at] + along - arc[np.clip(station, 0, count - 1)]
+        inside = seen & (station >= 0) & (station < count)
+        web = inside & (sense * facing[0] > 0.9) & (np.abs(level) < 60.0) & (up > margin) & (up < REACH_MM)
+        bottom = inside & (facing[1] < -0.9) & (np.abs(up) < 60.0) & (-sense * level > margin)
+        bottom &= -sense * level < REACH_MM
+        found = [
+            _at_edge(station[web], x[web], up[web], sense * residual[web], count),
+            _at_edge(station[bottom], x[bottom], -sense * level[bottom], -residual[bottom], count),
+        ]
+        sides += [side] * count
+        arcs.append(arc)
+        places.append(line.at(arc))
+        frame = _frame(line, other, arc, sense)
+        axes.append(np.stack([frame[1], frame[2]], axis=1))
+        departures.append(np.stack([value for value, _ in found], axis=1))
+        variances.append(np.stack([variance for _, variance in found], axis=1))
+    return EdgeStations(
+        tuple(sides), *(np.concatenate(column) for column in (arcs, places, axes, departures, variances))
+    )
+
+
+def _frame(line: Polyline, other: Polyline, arc: Floats, sense: float) -> tuple[Floats, Floats, Floats]:
+    """Return unit vectors (k, 3) along the edge, to the left, and up, at arc lengths (k,)."""
+    along = line.at(arc + 5.0) - line.at(arc - 5.0)
+    along = along / np.linalg.norm(along, axis=1)[:, None]
+    left = sense * (line.at(arc) - other.at(arc * other.length / line.length))
+    left = left - np.einsum("ni,ni->n", left, along)[:, None] * along
+    left = left / np.linalg.norm(left, axis=1)[:, None]
+    return along, left, np.cross(along, left)
+
+
+def _at_edge(station: np.ndarray, x: Floats, w: Floats, residual: Floats, count: int) -> tuple[Floats, Floats]:
+    """Residual (count,) at the edge, of planes in x and w fitted station by station, and its variance."""
+    basis = np.stack([np.ones_like(x), x / STATION_MM, w / REACH_MM], axis=1)
+    used = np.ones(len(x), bool)
+    value, variance = np.full(count, np.nan), np.full(count, np.nan)
+    for _ in range(3):
+        s, B, r = station[used], basis[used], residual[used]
+        number = np.bincount(s, minlength=count)
+        normal = np.stack([np.bincount(s, B[:, i] * B[:, j], count) for i in range(3) for j in range(3)], axis=1)
+        right = np.stack([np.bincount(s, B[:, i] * r, count) for i in range(3)], axis=1)
+        whole = np.flatnonzero(number >= LEAST_POINTS)
+        N = normal[whole].reshape(-1, 3, 3)
+        well = np.linalg.cond(N) < 1e6
+        whole, N = whole[well], N[well]
+        solution = np.zeros((count, 3))
+        inverse = np.linalg.inv(N)
+        solution[whole] = np.einsum("nij,nj->ni", inverse, right[whole])
+        rest = residual - np.einsum("ni,ni->n", basis, solution[station])
+        known = np.isin(station, whole)
+        spread = 1.4826 * float(np.median(np.abs(rest[known & used]))) if (known & used).any() else 0.0
+        value, variance = np.full(count, np.nan), np.full(count, np.nan)
+        value[whole], variance[whole] = solution[whole, 0], spread**2 * inverse[:, 0, 0] + FLOOR_MM**2
+        now = known & (np.abs(rest) < 4.5 * max(spread, FLOOR_MM))
+        if (now == used).all():
+            break
+        used = now
+    return value, variance

@@ -1,0 +1,46 @@
+"""Distances to a mesh as to a smooth surface, against closed forms."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from processor.geometry import mesh_surface
+
+
+def test_a_cylinder_of_fine_facets_is_a_cylinder():
+    mesh = trimesh.creation.cylinder(1000.0, 4000.0, sections=3000)
+    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0.0, 2.0 * np.pi, 5000), rng.uniform(-1900.0, 1900.0, 5000)
+    off = rng.normal(0.0, 5.0, 5000)
+    radius = 1000.0 + off
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    face, distance, beyond = surface.distances(points, 50.0)
+    assert (face >= 0).all()
+    np.testing.assert_allclose(distance, off, atol=1000.0 * (1.0 - np.cos(np.pi / 3000)) * 1.1)
+    np.testing.assert_allclose(beyond, 0.0, atol=0.03)  # outside of the wedge between two facets' normals
+
+
+def test_a_plate_has_two_sides_and_edges():
+    mesh = trimesh.creation.box((2000.0, 1000.0, 20.0))
+    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    points = np.array([[300.0, 100.0, 12.0], [-700.0, -200.0, -13.0], [300.0, 495.0, 8.0], [300.0, 100.0, 400.0]])
+    face, distance, beyond = surface.distances(points, 60.0)
+    np.testing.assert_allclose(distance[:3], [2.0, 3.0, -2.0], atol=1e-9)
+    np.testing.assert_allclose(surface.normals[face[:2], 2], [1.0, -1.0], atol=1e-12)
+    assert face[3] == -1
+    assert np.isnan(distance[3])
+    np.testing.assert_allclose(beyond[:3], 0.0, atol=1e-9)
+    outside = surface.distances(np.array([[300.0, 507.0, 9.0]]), 60.0)
+    # Beside the edge: on the side's face it is 7 mm away; or on the top's it is 7 mm beyond the edge.
+    assert outside[1][0] == pytest.approx(7.0) or outside[2][0] == pytest.approx(7.0)
+
+
+def test_facets_are_neighbours_over_smooth_sides_only():
+    mesh = trimesh.creation.box((100.0, 100.0, 100.0))
+    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    # Of each facet's three sides the diagonal alone is smooth.
+    assert ((surface.neighbours >= 0).sum(axis=1) == 1).all()
+    for face, row in enumerate(surface.neighbours):
+        other = row.max()
+        np.testing.assert_allclose(surface.normals[face], surface.normals[other])
