@@ -40,7 +40,7 @@ def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polylin
     for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
         count = max(1, int(line.length / STATION_MM))
         arc = STATION_MM * (np.arange(count, dtype=np.float64) + 0.5)
-        fine = np.arange(0.0, line.length, 10.0, np.float64)
+        fine = np.arange(0.0, line.length, 10.0, dtype=np.float64)
         frame = _frame(line, other, fine, sense)
         near, index = cKDTree(line.at(fine)).query(points, distance_upper_bound=1.2 * REACH_MM, workers=-1)
         rows = np.flatnonzero(np.isfinite(near))
