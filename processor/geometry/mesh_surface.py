@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.model import Floats, Ints
@@ -21,6 +23,7 @@ class MeshSurface:
     faces: Ints
     normals: Floats
     neighbours: Ints  # opposite to each of a facet's vertices
+    part_of: Ints  # (f,) number of the smooth face that a facet belongs to
     tree: cKDTree
     sample_face: Ints
 
@@ -90,7 +93,25 @@ def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurf
     fold = u + v > 1.0
     u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
     samples = a[owner] + u[:, None] * (b - a)[owner] + v[:, None] * (c - a)[owner]
-    return MeshSurface(vertices, faces, normals, _neighbours(faces, normals), cKDTree(samples), owner)
+    neighbours = _neighbours(faces, normals)
+    return MeshSurface(vertices, faces, normals, neighbours, _smooth_faces(neighbours), cKDTree(samples), owner)
+
+
+def _smooth_faces(neighbours: Ints) -> Ints:
+    """Return a number for each facet (f,): one for all that smooth sides join."""
+    one, side = np.nonzero(neighbours >= 0)
+    links = coo_array((np.ones(len(one), np.int8), (one, neighbours[one, side])), (len(neighbours),) * 2)
+    number: Ints = connected_components(links, directed=False)[1].astype(np.int64)
+    return number
+
+
+def outermost(part_of: Ints, position: Floats) -> int:
+    """Return the smooth face whose points (n,) lie highest, of those with a fifth of them or more; -1 without any."""
+    if not len(part_of):
+        return -1
+    numbers, which, count = np.unique(part_of, return_inverse=True, return_counts=True)
+    mean = np.bincount(which, position) / count
+    return int(numbers[np.argmax(np.where(count >= 0.2 * len(part_of), mean, -np.inf))])
 
 
 def _neighbours(faces: Ints, normals: Floats) -> Ints:

@@ -11,8 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.geometry import mesh_surface
 from processor.geometry.lines import Polyline
-from processor.geometry.mesh_surface import MeshSurface
+from processor.geometry.mesh_surface import MeshSurface, outermost
 from processor.model import Floats
 
 STATION_MM = 200.0
@@ -56,12 +57,17 @@ def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polylin
         station = np.floor((fine[at] + along) / STATION_MM).astype(np.int64)
         x = fine[at] + along - arc[np.clip(station, 0, count - 1)]
         inside = seen & (station >= 0) & (station < count)
-        web = inside & (sense * facing[0] > 0.9) & (np.abs(level) < 60.0) & (up > margin) & (up < REACH_MM)
-        bottom = inside & (facing[1] < -0.9) & (np.abs(up) < 60.0) & (-sense * level > margin)
+        # Not by the sense of the normals: meshes come with either. The faces meant are those that run through the edge.
+        web = inside & (np.abs(facing[0]) > 0.9) & (np.abs(level) < 60.0) & (up > margin) & (up < REACH_MM)
+        web[web] = surface.part_of[face[web]] == outermost(surface.part_of[face[web]], -np.abs(level[web]))
+        bottom = inside & (np.abs(facing[1]) > 0.9) & (np.abs(up) < 60.0) & (-sense * level > margin)
         bottom &= -sense * level < REACH_MM
+        bottom[bottom] = surface.part_of[face[bottom]] == outermost(surface.part_of[face[bottom]], -np.abs(up[bottom]))
         found = [
-            _at_edge(station[web], x[web], up[web], sense * residual[web], count),
-            _at_edge(station[bottom], x[bottom], -sense * level[bottom], -residual[bottom], count),
+            _at_edge(station[web], x[web], up[web], np.sign(facing[0][web]) * residual[web], count),
+            _at_edge(
+                station[bottom], x[bottom], -sense * level[bottom], np.sign(facing[1][bottom]) * residual[bottom], count
+            ),
         ]
         sides += [side] * count
         arcs.append(arc)
@@ -73,6 +79,13 @@ def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polylin
     return EdgeStations(
         tuple(sides), *(np.concatenate(column) for column in (arcs, places, axes, departures, variances))
     )
+
+
+def unseen(left: Polyline, right: Polyline) -> EdgeStations:
+    """Return the stations of a part of which nothing is known."""
+    nothing = np.empty((0, 3))
+    mesh = mesh_surface.of_mesh(np.eye(3), np.array([[0, 1, 2]]))
+    return measure(nothing, mesh, left, right, 0.0)
 
 
 def _frame(line: Polyline, other: Polyline, arc: Floats, sense: float) -> tuple[Floats, Floats, Floats]:

@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.geometry import rigid
-from processor.geometry.mesh_surface import MeshSurface
+from processor.geometry.mesh_surface import MeshSurface, outermost
 from processor.model import Floats
 
 Bools = npt.NDArray[np.bool_]
@@ -65,18 +65,23 @@ def fit(points: Floats, surface: MeshSurface, T_bridge_joint: Floats, corners: F
     sums, freedom = 0.0, 0
     for name, axis, sense in FACES:
         across = 1 if axis == 2 else 2
-        own = seen & (sense * normal[:, axis] > 0.9) & (sense * local[:, axis] > 0.0)
+        # Not by the sense of the normals: meshes come with either. Of the faces that lie so the outermost is meant.
+        own = seen & (np.abs(normal[:, axis]) > 0.9) & (sense * local[:, axis] > 0.0)
+        outer = outermost(surface.part_of[face[own]], sense * local[own, axis])
+        own[own] = surface.part_of[face[own]] == outer
         own &= (np.abs(local[:, across]) < half[across] - margin) & (-outward * x > margin)
         basis = _face_basis(x[own], local[own, across] / half[across])
-        coefficients, covariance, rest = _least_squares(basis, residual[own])
+        out = residual[own] * np.sign(sense * normal[own, axis])
+        coefficients, covariance, rest = _least_squares(basis, out)
         if not len(coefficients):
             return nothing(f"too few points on the {name} face")
         fits.append((coefficients, covariance))
         sums, freedom = sums + float(rest @ rest), freedom + len(rest)
-    own = seen & (outward * normal[:, 0] > 0.9) & (np.abs(x) < max(20.0, 6.0 * noise))
-    own &= _on_ring(local, half, _thickness(rigid.apply(T_joint_bridge, surface.vertices), half), margin)
+    own = seen & (np.abs(normal[:, 0]) > 0.9) & (np.abs(x) < max(20.0, 6.0 * noise))
+    own &= _on_ring(local, half, _thickness(surface, T_joint_bridge, half), margin)
     basis = np.stack([np.ones(own.sum()), local[own, 1] / half[1], local[own, 2] / half[2]], axis=1)
-    coefficients, covariance, rest = _least_squares(basis, residual[own])
+    out = residual[own] * np.sign(outward * normal[own, 0])
+    coefficients, covariance, rest = _least_squares(basis, out)
     if not len(coefficients):
         return nothing("too few points on the end face")
     fits.append((coefficients, covariance))
@@ -88,11 +93,13 @@ def fit(points: Floats, surface: MeshSurface, T_bridge_joint: Floats, corners: F
     return JointEnd(moved, covariance, float(np.sqrt(sums / max(freedom, 1))), "")
 
 
-def _thickness(vertices: Floats, half: Floats) -> Floats:
-    """Return the thickness (2,) of webs and flanges at the joint, from the design's vertices in its plane."""
-    depth = half[1:] - np.abs(vertices[np.abs(vertices[:, 0]) < 0.5, 1:])
-    inside = depth[(depth > 1.0).all(axis=1)]
-    return inside.min(axis=0) if len(inside) else half[1:]
+def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Floats:
+    """Return the thickness (2,) of webs and flanges at the joint, as deep as samples of the design's end face lie."""
+    samples = rigid.apply(T_joint_bridge, np.asarray(surface.tree.data))
+    upright = np.abs(surface.normals[surface.sample_face] @ T_joint_bridge[0, :3]) > 0.9
+    depth = half[1:] - np.abs(samples[upright & (np.abs(samples[:, 0]) < 0.5), 1:])
+    on_web = depth[:, 0] < depth[:, 1]
+    return np.array([depth[on_web, 0].max(initial=0.0), depth[~on_web, 1].max(initial=0.0)])
 
 
 def _on_ring(local: Floats, half: Floats, thickness: Floats, margin: float) -> Bools:

@@ -13,6 +13,7 @@ from processor.model import Floats
 POINTS = 120_000
 GATES_MM = (60.0, 30.0)
 CUT = 4.5  # standard deviations
+FLOOR_MM = 0.01  # of sigma, for scans without noise
 LEAST_SHARE = 0.5  # of the points that must lie within the last gate
 
 
@@ -40,9 +41,11 @@ def fine(points: Floats, surface: MeshSurface, start: Floats) -> Registration:
         r, n = residual[used], surface.normals[face[used]]
         middle = moved[used].mean(axis=0)
         J = np.hstack([np.cross(moved[used] - middle, n), n])
-        sigma = max(1.4826 * float(np.median(np.abs(r - np.median(r)))), 1e-4)
+        sigma = max(1.4826 * float(np.median(np.abs(r))), FLOOR_MM)
         weight = np.clip(1.0 - (r / (CUT * sigma)) ** 2, 0.0, 1.0) ** 2  # Tukey's
         normal = J.T @ (J * weight[:, None])
+        if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)) + 1e-300)) > 1e10:
+            break  # what is seen does not hold the part: no covariance, and so no answer
         step = np.linalg.solve(normal, -J.T @ (weight * r))
         R = rigid.rotation_from_vector(step[:3])
         T = rigid.transform(R, middle - R @ middle + step[3:]) @ T

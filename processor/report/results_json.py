@@ -12,6 +12,7 @@ from processor.model import ENDS, KEY_POINTS, Floats, StepRun
 from processor.pipeline import Execution
 from processor.steps import preassemble, spheres
 
+TRADE_OFF = ("splicing_mean", "splicing_max", "linear_mean", "linear_max")
 FORMAT, FORMAT_VERSION = "processor-results", "1.0"
 
 
@@ -101,7 +102,10 @@ def _preassemble(result: preassemble.Result) -> dict[str, Any]:
                 "deviation": result.best_fit_linear_deviation,
             },
         },
-        "trade_off": [],
+        "trade_off": [
+            {"lambda": weight, **dict(zip(TRADE_OFF, figures, strict=True))}
+            for weight, figures in zip(result.trade_lambda, result.trade_figures, strict=True)
+        ],
     }
 
 

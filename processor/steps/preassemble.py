@@ -1,5 +1,6 @@
-"""Virtual preassembly of an arch bridge from scans of its parts, by the source paper's three methods.
+"""Virtual preassembly of an arch bridge from scans of its parts: ``adjustment``, or the source paper's three methods.
 
+``adjustment`` registers every part to its design and adjusts the whole chain at once, with an interval for every gap.
 ``corner`` (the paper's W1) chains the parts by the four corners of each joint, ``line`` (W2) by the points on the
 joint's edges, ``design-aided`` (W3) by these and the bottom edges held against the design's. They are baselines: they
 state no uncertainty, and their key points lie on the inner edges of the plates. Source: paper 000.
@@ -18,6 +19,7 @@ from processor.geometry.lines import Polyline
 from processor.geometry.neighbors import surface_spacing
 from processor.model import (
     ArchDesign,
+    ArchTruth,
     Checked,
     Floats,
     InputError,
@@ -29,13 +31,15 @@ from processor.model import (
     column,
     names,
 )
-from processor.preassembly import attitude, errors, features, matching
+from processor.preassembly import adjustment, attitude, errors, features, matching
+from processor.preassembly.adjustment import AdjustParams
 from processor.preassembly.features import BoxParams, SliceParams
 from processor.preassembly.matching import MatchParams
 
 NEEDS: tuple[str, ...] = ()
 KIND = "arch-bridge"
-METHODS = ("design-aided", "line", "corner")  # the first is the default
+PAPER_METHODS = ("design-aided", "line", "corner")
+METHODS = ("adjustment", *PAPER_METHODS)  # the first is the default
 
 REFERENCE_C = 20.0
 GAUGES = {
@@ -47,12 +51,13 @@ GAUGES = {
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters of the paper's methods: reduced boxes, slices, and the registration."""
+    """Parameters of the adjustment, and of the paper's methods: reduced boxes, slices, and the registration."""
 
     method: str = METHODS[0]
     seed: int = 0
     end_limit_mm: float = 100.0  # a joint end found farther than this from its place in the design is not used
     gap_limit_mm: float = 100.0  # a part that leaves a wider gap is called weak
+    adjust: AdjustParams = field(default_factory=AdjustParams)
     boxes: BoxParams = field(default_factory=BoxParams)
     slices: SliceParams = field(default_factory=SliceParams)
     match: MatchParams = field(default_factory=MatchParams)
@@ -92,6 +97,9 @@ class Result(Checked):
     linear_edge: tuple[str, ...] = names("s")  # left | right
     linear_deviation: Floats = column("s")  # as assembled
     best_fit_linear_deviation: Floats = column("s")
+    # of the adjustment: over the weight lambda, splicing mean and max, linear mean and max
+    trade_lambda: Floats = column("t")
+    trade_figures: Floats = column("t", 4)
 
 
 @dataclass(frozen=True)
@@ -117,6 +125,9 @@ def run(scene: Scene, params: Params) -> Result:
     design = scene.arch
     if design is None or len(design.parts) < 2:
         raise InputError(f"{scene.name}: preassembly needs an arch-bridge design of at least two parts (design.json)")
+    if params.method == "adjustment":
+        scans = _scans_in_order(scene, design)
+        return Result(**adjustment.assemble(scans, design, params.adjust, scene.temperature_C))
     result = assemble(extract(scene, design, params), design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != REFERENCE_C:
         said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
@@ -369,8 +380,19 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("preassemble", "linear error of the true edges, mean", mean, none, "mm"),
         Metric("preassemble", "linear error of the true edges, max", largest, none, "mm"),
         Metric("preassemble", "key points in the scan, rms", _rms(errors_at_points), none, "mm"),
+        *_coverage(result, truth.arch, true),
         Metric("preassemble", "pose, largest turn", 1000.0 * max(turns, default=none), none, "mrad"),
     ]
+
+
+def _coverage(result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
+    """How many of the key points' coordinates lie within their 95 % intervals, where a method states any."""
+    off = result.key_points_scan - truth.key_points_scan[[true[name] for name in result.components]]
+    known = np.isfinite(off) & np.isfinite(result.key_points_sd)
+    if not known.any():
+        return []
+    share = float((np.abs(off[known]) <= adjustment.NORMAL_95 * result.key_points_sd[known]).mean())
+    return [Metric("preassemble", "key points within their 95 % intervals", 100.0 * share, float("nan"), "%")]
 
 
 WRONG_POSE_RAD = 0.1

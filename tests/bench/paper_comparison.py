@@ -35,7 +35,10 @@ def bridges(sets, seeds, sigmas, spacing):
                 parts = preassemble.extract(scene, scene.arch, preassemble.Params(seed=seed))
                 for method in preassemble.METHODS:
                     params = preassemble.Params(method=method, seed=seed)
-                    result = preassemble.assemble(parts, scene.arch, params)
+                    if method in preassemble.PAPER_METHODS:
+                        result = preassemble.assemble(parts, scene.arch, params)
+                    else:
+                        result = preassemble.run(scene, params)
                     checks = {metric.name: metric for metric in preassemble.check(scene, result, truth)}
                     found[method].append(
                         [

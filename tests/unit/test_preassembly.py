@@ -36,7 +36,7 @@ def test_attitudes_are_right_from_any_pose(seed):
 
 def test_a_symmetric_rib_without_its_mark_is_ambiguous():
     design = arch_clouds.design().parts[2]
-    whole = design.faces[: -2 * 80]  # the pad is the last face
+    whole = design.faces[: -2 * 800]  # the pad is the last face
     bare = dataclasses.replace(design, faces=whole, vertices=design.vertices[: whole.max() + 1])
     rng = np.random.default_rng(0)
     points = arch_clouds.scan_points(2, 12.0, 1.0, rng)
@@ -155,8 +155,11 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
     assert result.splicing_mean < 10.0  # one spacing
     checks = {metric.name: metric for metric in preassemble.check(scene, result, truth)}
     assert checks["wrong poses called ok"].passed
-    # The key points lie on the inner edges: off by the root of two plates squared, as the method's authors did not say.
-    assert checks["key points in the scan, rms"].value == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
+    if method in preassemble.PAPER_METHODS:
+        # The key points lie on the inner edges: off by the root of two plates squared, as the authors did not say.
+        assert checks["key points in the scan, rms"].value == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
+    else:
+        assert checks["key points in the scan, rms"].value < 0.5
     for left, right, gap, T_left, T_right in zip(
         result.key_points_scan[:-1, 1],
         result.key_points_scan[1:, 0],
@@ -166,6 +169,76 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
         strict=True,
     ):
         np.testing.assert_allclose(rigid.apply(T_right, right) - rigid.apply(T_left, left), gap, atol=1e-9)
+
+
+def test_the_adjustment_states_intervals_that_hold(bridge, runs):
+    _, truth = bridge
+    result = runs["adjustment"]
+    off = result.key_points_scan - truth.arch.key_points_scan
+    known = np.isfinite(result.key_points_sd)
+    assert known.sum() == 8 * 8 * 3
+    pull = (off / result.key_points_sd)[known]
+    # 19 numbers an end are independent, not its 24 coordinates: 8 ends leave a spread of a tenth.
+    assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
+    assert np.sqrt((off[known] ** 2).mean()) < 0.12
+    np.testing.assert_array_less(np.abs(result.gaps), 2.0 * result.gap_ci95)  # perfect parts: no gap but noise
+    assert result.splicing_mean < 0.1
+    assert set(result.verdict) == {"pass"}
+    # The heavier the design, the nearer the line and the wider the gaps.
+    splicing, linear = result.trade_figures[:, 0], result.trade_figures[:, 2]
+    assert (np.diff(result.trade_lambda) < 0.0).all()
+    assert (np.diff(splicing) <= 1e-6).all()
+    assert (np.diff(linear) >= -1e-6).all()
+
+
+def test_the_adjustment_measures_what_was_built_otherwise(bridge):
+    """A rib cut 3 mm short at one end and shifted scans: the gap shows there and nowhere else."""
+    scene, truth = bridge
+    rib, T = scene.scans[2], truth.arch.T_bridge_scan[2]
+    points = rigid.apply(T, rib.points)
+    ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))[0]
+    here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))[0]
+    depth = (points - here) @ (ahead - here)
+    near = depth < 100.0
+    points[near] += 3.0 * np.clip(1.0 - depth[near, None] / 100.0, 0.0, 1.0) * (ahead - here)
+    cut = dataclasses.replace(rib, points=rigid.apply(rigid.invert(T), points))
+    scans = (*scene.scans[:2], cut, *scene.scans[3:])
+    result = preassemble.run(dataclasses.replace(scene, scans=scans), preassemble.Params())
+    moved = rigid.apply(T, result.key_points_scan[2, 0]) - truth.arch.key_points_bridge[2, 0]
+    np.testing.assert_allclose(moved @ (ahead - here), 3.0, atol=0.35)
+    # Edges may slide along themselves: the bridge closes the gap and is shorter between its feet by as much.
+    assert np.abs(result.gaps[1] @ (ahead - here)).max() < 0.6
+    shift = [
+        rigid.apply(result.T_bridge_scan[i] @ rigid.invert(truth.arch.T_bridge_scan[i]), points.mean(axis=0))
+        - points.mean(axis=0)
+        for i in (0, 4)
+    ]
+    assert np.linalg.norm(shift[1] - shift[0]) == pytest.approx(3.0, abs=0.6)
+
+
+def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
+    scene, truth = bridge
+    grown = 1.0 + 12e-6 * 30.0
+    warm = tuple(dataclasses.replace(s, points=s.points * grown) for s in scene.scans)
+    result = preassemble.run(dataclasses.replace(scene, scans=warm, temperature_C=50.0), preassemble.Params())
+    off = result.key_points_scan / grown - truth.arch.key_points_scan
+    assert np.sqrt(np.nanmean(off**2)) < 0.12
+    assert np.abs(result.gaps).max() < 1.0
+    assert "temperature corrected" in result.message
+
+
+def test_a_part_of_another_place_is_not_assembled(bridge):
+    scene, _ = bridge
+    swapped = list(scene.scans)
+    foot, rib = swapped[0], swapped[2]
+    swapped[0], swapped[2] = (
+        dataclasses.replace(rib, name="foot1", component="foot1"),
+        dataclasses.replace(foot, name="rib2", component="rib2"),
+    )
+    result = preassemble.run(dataclasses.replace(scene, scans=tuple(swapped)), preassemble.Params())
+    assert result.status == "partial"
+    assert "ok" not in (result.component_status[0], result.component_status[2])
+    assert np.isnan(result.gaps[[0, 1, 2]]).all()
 
 
 def test_the_design_keeps_the_line(runs):
