@@ -153,7 +153,8 @@ class _Job:
         """Return what the rays of one strip of columns give."""
         if self.seen.strip_start[number] == self.seen.strip_start[number + 1]:
             return self._returns(np.random.default_rng(0), _joined([]))
-        rng = np.random.default_rng([*self.key, number])
+        # From 1: a key that ends in 0 is the same as the key without it, which is the station's own.
+        rng = np.random.default_rng([*self.key, number + 1])
         used = min(STRIP, self.grid.columns - number * STRIP)
         jitter = np.zeros((STRIP + 2, self.grid.rows, 2), np.float32)
         if self.scanner.encoder_urad:

@@ -76,7 +76,8 @@ def _of_file(scene: Scene, scale: float) -> list[str]:
     """Lines of a file that holds all scans: what is the same for all of them."""
     sigmas = {scan.sigma_mm for scan in scene.scans}
     lines = [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
-    return lines + (_of_scan(scene.scans[0], scale, own_pose=True)[:1] if len(scene.scans) == 1 else [])
+    of_one = _of_scan(scene.scans[0], scale, own_pose=True) if len(scene.scans) == 1 else []
+    return lines + [line for line in of_one if line.startswith("component")]
 
 
 def _of_scan(scan: Scan, scale: float, *, own_pose: bool) -> list[str]:

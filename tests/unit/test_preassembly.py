@@ -191,6 +191,7 @@ def test_the_adjustment_states_intervals_that_hold(bridge, runs):
     assert (np.diff(linear) >= -1e-6).all()
 
 
+@pytest.mark.slow
 def test_the_adjustment_measures_what_was_built_otherwise(bridge):
     """A rib cut 3 mm short at one end and shifted scans: the gap shows there and nowhere else."""
     scene, truth = bridge
@@ -216,6 +217,7 @@ def test_the_adjustment_measures_what_was_built_otherwise(bridge):
     assert np.linalg.norm(shift[1] - shift[0]) == pytest.approx(3.0, abs=0.6)
 
 
+@pytest.mark.slow
 def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
     scene, truth = bridge
     grown = 1.0 + 12e-6 * 30.0

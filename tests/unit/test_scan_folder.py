@@ -243,6 +243,14 @@ def test_what_cannot_be_written_is_refused(tmp_path):
         exported(scene, tmp_path, "ply", step=True)
 
 
+def test_a_lone_cloud_with_its_noise_comes_back_from_e57(tmp_path):
+    points, _, _ = on_grid(100)
+    scene, out = exported(Scene("one", "structure", (Scan("scan", points, sigma_mm=2.0),)), tmp_path, "e57")
+    back = folder.read_input(out)
+    np.testing.assert_allclose(back.scans[0].points, scene.scans[0].points, atol=1e-6)
+    assert back.scans[0].sigma_mm == 2.0
+
+
 def test_stations_that_points_name_must_be_there(tmp_path):
     _, out = exported(merged(np.zeros(3)), tmp_path, "ply")
     places = json.loads((out / "stations.json").read_text())
