@@ -26,6 +26,7 @@ STRIP = 64  # columns worked on at a time
 LOWEST_DEG, HIGHEST_DEG = -60.0, 90.0
 TAN_MOST = 20.0  # of incidence, for the spread of a footprint
 SPECKLE_LOOKS = 8.0
+ENCODER_SIGMAS = 7.0  # no ray is turned further: a normal deviate in 32 bits stays below
 LEAST_SHARE = 0.25  # of the beam's energy that must come back for a return
 SURFACE, MIXED, OUTLIER = range(len(SOURCES))
 
@@ -94,7 +95,8 @@ def scan(
     R = T_scene_scanner[:3, :3].T
     T: Floats = np.eye(4)
     T[:3, :3], T[:3, 3] = R, -R @ T_scene_scanner[:3, 3]
-    spread = 2.0 * float(scanner.beam_angle(np.array([max(scanner.min_range_mm, 1.0)]))[0]) + 1e-4
+    nearest = np.array([max(scanner.min_range_mm, 1.0)])
+    spread = 2.0 * float(scanner.beam_angle(nearest)[0]) + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
     seen = raycast.see(surfaces, T, grid, STRIP, scanner.max_range_mm, spread)
     job = _Job(surfaces, seen, T, grid, scanner, params, key, keep_hits)
     with ThreadPoolExecutor(_threads()) as pool:  # the kernels let go of the interpreter's lock
@@ -160,10 +162,15 @@ class _Job:
         if self.scanner.encoder_urad:
             jitter[1 : used + 1] = rng.standard_normal((used, self.grid.rows, 2), np.float32)
             jitter *= np.float32(1e-6 * self.scanner.encoder_urad)
-        shape, t = raycast.cast(self.seen, self.grid, number, STRIP, jitter, self.limits)
+            # An azimuth moves a ray less the higher it looks.
+            jitter[:, :, 0] *= np.cos(self.grid.lowest + self.grid.step * np.arange(self.grid.rows))
+        half = (0.5 * self.scanner.beam_exit_mm, 0.5e-3 * self.scanner.divergence_mrad)
+        shape, t, thin = raycast.cast(self.seen, self.grid, number, STRIP, jitter, self.limits, half)
         edge = np.zeros(shape.shape, bool)
         if self.params.sub_rays > 1:
-            edge[1 : used + 1] = edges(np.where(shape >= 0, self.surfaces.surface[shape], -1))[1 : used + 1]
+            surface = np.where(shape >= 0, self.surfaces.surface[shape], -1)
+            edge[1 : used + 1] = (edges(surface) | np.isfinite(thin))[1 : used + 1]
+            t = np.minimum(t, thin)
         inside = (shape >= 0) & ~edge
         inside[0], inside[used + 1 :] = False, False
         column, row = (index.astype(np.int32) for index in np.nonzero(inside))
@@ -176,17 +183,11 @@ class _Job:
         """Return the echoes of footprints on one surface."""
         columns = (strip * STRIP + column - 1).astype(np.int32)
         ray = raycast.directions(self.grid, row, columns, jitter)
-        exact = raycast.on_patches(self.surfaces, self.T_scanner_scene, shape, ray, t)
+        exact, cosine = raycast.meet(self.seen, self.surfaces, self.T_scanner_scene, shape, ray, t)
         met = np.isfinite(exact)
-        columns, row, shape, ray, t = columns[met], row[met], shape[met], ray[met], exact[met]
-        cosine = self._cosine(shape, ray, t)
+        columns, row, shape, ray, t, cosine = columns[met], row[met], shape[met], ray[met], exact[met], cosine[met]
         source = np.full(len(t), SURFACE, np.uint8)
         return Echoes(row, columns, shape, t, t, self.params.signal(cosine, t), cosine, ray, source)
-
-    def _cosine(self, shape: Labels, ray: Floats, t: Floats) -> Floats:
-        normals = raycast.normals(self.seen, shape, ray * t[:, None])
-        found: Floats = np.minimum(np.abs(np.einsum("ni,ni->n", ray, normals)), 1.0)
-        return found
 
     def _at_edges(self, strip: int, edge: Bools, t: Floats, jitter: Shorts) -> list[Echoes]:
         """Return the echoes of rays near an edge: of footprints on one surface all the same, and mixed ones."""
@@ -196,10 +197,10 @@ class _Job:
         last = t.shape[1] - 1
         about = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
         nearest = np.minimum.reduce([t[column + a, np.clip(row + b, 0, last)] for a, b in about])
-        offsets, share = beam(self.params.sub_rays)
+        beam_ = beam(self.params.sub_rays)
         angle = self.scanner.beam_angle(nearest)
         subs, ranges = raycast.cast_around(
-            self.seen, self.grid, strip, STRIP, jitter, self.limits, number, angle, offsets
+            self.seen, self.grid, strip, STRIP, jitter, self.limits, number, angle, beam_[0]
         )
         surface = np.where(subs >= 0, self.surfaces.surface[subs], -1)
         whole = (surface == surface[:, :1]).all(axis=1) & (subs[:, 0] >= 0)
@@ -207,20 +208,31 @@ class _Job:
         near = jitter[column, row]
         return [
             self._on_one(strip, column[whole], row[whole], subs[whole, 0], ranges[whole, 0], near[whole]),
-            self._mixed(strip, column[some], row[some], subs[some], ranges[some], near[some], share),
+            self._mixed(strip, column[some], row[some], subs[some], ranges[some], near[some], angle[some], beam_),
         ]
 
     def _mixed(
-        self, strip: int, column: Labels, row: Labels, subs: Labels, ranges: Floats, jitter: Shorts, share: Floats
+        self,
+        strip: int,
+        column: Labels,
+        row: Labels,
+        subs: Labels,
+        ranges: Floats,
+        jitter: Shorts,
+        angle: Floats,
+        beam_: tuple[Floats, Floats],
     ) -> Echoes:
         """Return the echoes of footprints on several surfaces, or partly on none; ``subs``, ``ranges`` (n, k)."""
+        offsets, share = beam_
         columns = (strip * STRIP + column - 1).astype(np.int32)
-        ray = raycast.directions(self.grid, row, columns, jitter)
-        hit = subs >= 0
-        t, cosine = np.where(hit, ranges, 1.0), np.zeros(ranges.shape)
-        for k in range(subs.shape[1]):
-            seen = hit[:, k]
-            cosine[seen, k] = self._cosine(subs[seen, k], ray[seen], t[seen, k])
+        t, cosine = np.full(ranges.shape, np.nan), np.zeros(ranges.shape)
+        which, k = np.nonzero(subs >= 0)
+        ray = raycast.directions(self.grid, row[which], columns[which], jitter[which] + angle[which, None] * offsets[k])
+        t[which, k], cosine[which, k] = raycast.meet(
+            self.seen, self.surfaces, self.T_scanner_scene, subs[which, k], ray, ranges[which, k]
+        )
+        hit = np.isfinite(t)
+        ranges, t, cosine = np.where(hit, t, np.inf), np.where(hit, t, 1.0), np.where(hit, cosine, 0.0)
         energy = np.where(hit, share * self.params.signal(cosine, t), 0.0)
         if self.scanner.behaviour == "pulse":
             energy = strongest_echo(ranges, energy, self.scanner.separation_mm)
@@ -236,7 +248,7 @@ class _Job:
             (energy[back] * t[back]).sum(axis=1) / total,
             total,
             np.take_along_axis(cosine[back], most, axis=1)[:, 0],
-            ray[back],
+            raycast.directions(self.grid, row[back], columns[back], jitter[back]),
             np.full(len(total), MIXED, np.uint8),
         )
 

@@ -71,8 +71,15 @@ def add_clutter(builder: Builder, low: Floats, high: Floats, count: int, rng: np
             along = np.array([1.0, 0.0, 0.0]) if rng.random() < 0.5 else np.array([0.0, 1.0, 0.0])
             length, radius = rng.uniform(4_000.0, 10_000.0), rng.uniform(20.0, 80.0)
             at[2] = low[2] - rng.uniform(200.0, 600.0)
-            builder.cone(-1, "pipe", at - 0.5 * length * along, along, (radius, radius), length)
+            _add_bar(builder, "pipe", at - 0.5 * length * along, along, radius, length)
         else:
             radius, height = rng.uniform(25.0, 60.0), rng.uniform(1_500.0, 3_000.0)
             foot = np.array([at[0], at[1], 0.0])
-            builder.cone(-1, "pole", foot, -DOWN, (radius, radius), height)
+            _add_bar(builder, "pole", foot, -DOWN, radius, height)
+
+
+def _add_bar(builder: Builder, name: str, start: Floats, along: Floats, radius: float, length: float) -> None:
+    """Add a round bar with its ends."""
+    builder.cone(-1, name, start, along, (radius, radius), length)
+    for end in (start, start + length * along):
+        builder.disc(-1, f"{name} end", end, along, radius)

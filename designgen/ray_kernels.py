@@ -157,25 +157,30 @@ def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
     wx, wy, wz = dx - rate * n[3], dy - rate * n[4], dz - rate * n[5]
     px, py, pz = ox - z0 * n[3], oy - z0 * n[4], oz - z0 * n[5]
     w2 = wx * wx + wy * wy + wz * wz
-    if w2 < 1e-18:
-        return np.inf
-    near = -(px * wx + py * wy + pz * wz) / w2
+    near = -(px * wx + py * wy + pz * wz) / w2 if w2 > 1e-18 else 0.0
+    if rate != 0.0:  # a ray along the axis comes nearest to it far away
+        enter, leave = -z0 / rate, (n[8] - z0) / rate
+        near = min(max(near, min(enter, leave)), max(enter, leave))
     if bowed:
         q = (n[12] + min(max(z0 + near * rate, 0.0), n[8])) / n[13]
         move = 4.0 * q * (1.0 - q)
         px, py, pz = px - move * n[9], py - move * n[10], pz - move * n[11]
-        near = -(px * wx + py * wy + pz * wz) / w2
     fx, fy, fz = px + near * wx, py + near * wy, pz + near * wz
     r = n[6] + taper * (z0 + near * rate)
     a = w2 - taper * taper * rate * rate
     b = fx * wx + fy * wy + fz * wz - r * taper * rate
     c = fx * fx + fy * fy + fz * fz - r * r
     inside = b * b - a * c
-    if inside < 0.0 or a <= 0.0:
+    if inside < 0.0:
         return np.inf
-    root = np.sqrt(inside)
+    # Both roots without a difference of like numbers; a is negative for a ray steeper than the cone, 0 along its side.
+    large = -b - np.sqrt(inside) if b > 0.0 else -b + np.sqrt(inside)
+    one = c / large if large != 0.0 else (0.0 if a != 0.0 else np.inf)
+    two = large / a if a != 0.0 else np.inf
     for sign in range(2):
-        t = near + ((-b - root) if sign == 0 else (-b + root)) / a
+        t = near + (min(one, two) if sign == 0 else max(one, two))
+        if not np.isfinite(t):
+            continue
         z = z0 + t * rate
         if bowed:
             for _ in range(8):
@@ -212,10 +217,16 @@ def cast(  # type: ignore[no-untyped-def]
     jitter,
     least,
     most,
+    beam,
 ):
-    """Nearest shape and range of each ray of columns first - 1 to first + width: (width + 2, rows) each."""
+    """Nearest shape and range of each ray of columns first - 1 to first + width: (width + 2, rows) each.
+
+    A third answer is the range at which a beam, of radius ``beam[0] + beam[1] range``, may touch a thing too thin for
+    the grid's rays; infinite where there is none.
+    """
     rows = jitter.shape[1]
     best = np.full((width + 2, rows), np.inf)
+    thin = np.full((width + 2, rows), np.inf)
     shape = np.full((width + 2, rows), MISS, np.int32)
     level, rise = np.empty(rows), np.empty(rows)
     for i in range(rows):
@@ -225,6 +236,8 @@ def cast(  # type: ignore[no-untyped-def]
         i = owner[k]
         cx, cy, cz, r2 = centres[k, 0], centres[k, 1], centres[k, 2], 1.000001 * radii[k] * radii[k]
         c2 = cx * cx + cy * cy + cz * cz
+        # A bit more than what the angle between rays of the grid spans there, across.
+        slim = thickness(kind[i], numbers[i]) < 1.5 * step * (np.sqrt(c2) + radii[k])
         for column in range(max(boxes[b, 1], first - 1), min(boxes[b, 2], first + width) + 1):
             j = column - first + 1
             azimuth = 2.0 * np.pi * column / columns
@@ -235,12 +248,36 @@ def cast(  # type: ignore[no-untyped-def]
                 flat = level[row] - de * rise[row]
                 dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
                 along = dx * cx + dy * cy + dz * cz
-                if along + radii[k] < 0.0 or c2 - along * along > r2 + 1e-9 * c2 or along - radii[k] > best[j, row]:
+                if along + radii[k] < 0.0 or along - radii[k] > best[j, row]:
+                    continue
+                if slim:
+                    near = radii[k] + beam[0] + beam[1] * along
+                    if c2 - along * along <= near * near and along < thin[j, row]:
+                        thin[j, row] = along
+                if c2 - along * along > r2 + 1e-9 * c2:
                     continue
                 t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
-                if least <= t <= most and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
+                if t <= most and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
                     best[j, row], shape[j, row] = t, i
-    return shape, best
+    hide(shape, best, least)
+    return shape, best, thin
+
+
+@njit(cache=True, nogil=True)
+def hide(shape, best, least):  # type: ignore[no-untyped-def]
+    """Leave nothing of rays that end nearer than the scanner sees: what is there hides what is behind it."""
+    for j in range(best.shape[0]):
+        for k in range(best.shape[1]):
+            if best[j, k] < least:
+                best[j, k], shape[j, k] = np.inf, MISS
+
+
+@njit(cache=True, nogil=True)
+def thickness(kind, n):  # type: ignore[no-untyped-def]
+    """Return the width of a ball or bar, of which nothing may be seen but from its side; infinite of faces."""
+    if kind == 0:
+        return 2.0 * n[3]
+    return 2.0 * max(n[6], n[7]) if kind == 1 else np.inf
 
 
 @njit(cache=True, nogil=True)
@@ -302,11 +339,12 @@ def cast_around(  # type: ignore[no-untyped-def]
                     flat = level[row] - de * rise[row]
                     dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
                     t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
-                    if least <= t <= most and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
+                    if t <= most and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
                         best[ray, o], shape[ray, o] = t, i
                         changed = True
                 if changed:
                     farthest[ray] = best[ray].max()
+    hide(shape, best, least)
     return shape, best
 
 

@@ -9,6 +9,7 @@ clockwise from x, row i to elevation ``lowest + i step``. Results depend on neit
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -73,15 +74,25 @@ def see(surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, rea
     return Seen((surfaces.kind, numbers, cuts, surfaces.cut_start), boxes, start, piece)
 
 
-def cast(seen: Seen, grid: Grid, strip: int, width: int, jitter: Shorts, limits: tuple[float, float]) -> Any:
+def cast(
+    seen: Seen,
+    grid: Grid,
+    strip: int,
+    width: int,
+    jitter: Shorts,
+    limits: tuple[float, float],
+    beam: tuple[float, float],
+) -> Any:
     """Shape and range of the rays of a strip and of a column on either side: (width + 2, rows) each; -1 = no hit.
 
-    ``jitter`` (width + 2, rows, 2) turns each ray to the left and up, rad; ``limits`` are the ranges seen, mm.
+    ``jitter`` (width + 2, rows, 2) turns each ray to the left and up, rad; ``limits`` are the ranges seen, mm. What is
+    nearer hides what is behind it. A third answer is the range at which a beam of radius ``beam[0] + beam[1] range``
+    may touch a thing so thin that the rays beside it may all miss it, infinite where there is none.
     """
     first = strip * width
     return ray_kernels.cast(  # type: ignore[call-arg]
         *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
-        grid.columns, grid.lowest, grid.step, jitter, *limits,
+        grid.columns, grid.lowest, grid.step, jitter, *limits, beam,
     )  # fmt: skip
 
 
@@ -108,7 +119,7 @@ def cast_around(
     )  # fmt: skip
 
 
-def directions(grid: Grid, row: Labels, column: Labels, jitter: Shorts) -> Floats:
+def directions(grid: Grid, row: Labels, column: Labels, jitter: Floats | Shorts) -> Floats:
     """Directions (n, 3) of rays turned by ``jitter`` (n, 2), as the caster has them."""
     azimuth, elevation = 2.0 * np.pi * column / grid.columns, grid.lowest + grid.step * row
     level, rise, ca, sa = np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
@@ -117,29 +128,34 @@ def directions(grid: Grid, row: Labels, column: Labels, jitter: Shorts) -> Float
     return np.stack([flat * ca - da * sa, flat * sa + da * ca, rise + de * level], axis=1)
 
 
-def normals(seen: Seen, shape: Labels, points: Floats) -> Floats:
-    """Return unit normals (n, 3), of either sense, at points (n, 3) of the scanner's frame on shapes (n,)."""
-    kind, numbers, _, _ = seen.shapes
-    found: Floats = ray_kernels.normals(kind, numbers, shape, points)
-    return found
+def meet(
+    seen: Seen, surfaces: Surfaces, T_scanner_scene: Floats, shape: Labels, ray: Floats, t: Floats
+) -> tuple[Floats, Floats]:
+    """Ranges (n,) and cosines of incidence (n,) of rays (n, 3) that were found to meet shapes (n,) at about t (n,).
 
-
-def on_patches(
-    surfaces: Surfaces, T_scanner_scene: Floats, shape: Labels, ray: Floats, t: Floats, tolerance_mm: float = 1e-5
-) -> Floats:
-    """Ranges (n,) at which rays (n, 3) from the scanner meet the patches' own surfaces, near where they met the nets.
-
-    ``shape`` (n,) and ``t`` (n,) are what :func:`cast` found; hits on other shapes keep their range. NaN where the
-    surface is not met within the tolerance, as at its very edge seen at a grazing angle.
+    Patches are met on their own surfaces instead of their nets. NaN where one is not, as at its very edge seen at a
+    grazing angle.
     """
-    result: Floats = t.copy()
+    range_, normal = t.copy(), np.empty((len(t), 3))
+    plain = surfaces.patch[shape] < 0
+    kind, numbers, _, _ = seen.shapes
+    normal[plain] = ray_kernels.normals(kind, numbers, shape[plain], ray[plain] * t[plain, None])
+    if not plain.all():
+        curved = ~plain
+        range_[curved], normal[curved] = _on_patches(surfaces, T_scanner_scene, shape[curved], ray[curved], t[curved])
+    return range_, np.minimum(np.abs(np.einsum("ni,ni->n", ray, normal)), 1.0)
+
+
+def _on_patches(
+    surfaces: Surfaces, T_scanner_scene: Floats, shape: Labels, ray: Floats, t: Floats, tolerance_mm: float = 1e-5
+) -> tuple[Floats, Floats]:
+    """Ranges (n,) at which rays meet the patches' own surfaces, near where they met the nets, and normals (n, 3)."""
+    result, normal = t.copy(), np.empty((len(t), 3))
     R, origin = T_scanner_scene[:3, :3], -T_scanner_scene[:3, :3].T @ T_scanner_scene[:3, 3]
     patch = surfaces.patch[shape]
     order = np.argsort(patch, kind="stable")
     edges = np.flatnonzero(np.diff(patch[order])) + 1
     for rows in np.split(order, edges):
-        if not len(rows) or patch[rows[0]] < 0:
-            continue
         at, triangle = surfaces.patches[patch[rows[0]]].at, shape[rows]
         d = ray[rows] @ R  # the ray in the scene's frame
         corners, pq = surfaces.numbers[triangle, :9].reshape(-1, 3, 3), surfaces.corner_pq[triangle]
@@ -152,7 +168,8 @@ def on_patches(
         off = np.full(len(rows), np.inf)
         for _ in range(12):
             now = pq[:, 0] + np.einsum("ni,nij->nj", weights, turn)
-            left = origin + range_[:, None] * d - at(now[:, 0], now[:, 1])
+            met = at(now[:, 0], now[:, 1])
+            left = origin + range_[:, None] * d - met
             off = np.linalg.norm(left, axis=1)
             if (off < 0.1 * tolerance_mm).all():
                 break
@@ -160,5 +177,14 @@ def on_patches(
             weights += step[:, :2]
             range_ += step[:, 2]
         range_[~(off < tolerance_mm)] = np.nan
-        result[rows] = range_
-    return result
+        result[rows], normal[rows] = range_, _across(at, now, met, turn) @ R.T
+    return result, normal
+
+
+def _across(at: Callable[[Floats, Floats], Floats], pq: Floats, points: Floats, turn: Floats) -> Floats:
+    """Return unit normals (n, 3) of a patch at pq (n, 2), where it has its ``points``, by steps along a net's edges."""
+    share = 1e-5  # of the net's edges, which bend by a few degrees at most: 1e-6 rad of the normal
+    one, other = (at(*(pq + share * turn[:, k]).T) - points for k in range(2))
+    normal = np.cross(one, other)
+    found: Floats = normal / np.linalg.norm(normal, axis=1)[:, None]
+    return found

@@ -1,7 +1,7 @@
 """The exact surfaces of a scene as rays see them: spheres with parts cut off, cones, discs and triangles.
 
 Curved faces without a closed form for rays are patches: a function of two numbers and a net of triangles on it. Rays
-hit the net, and :func:`designgen.raycast.on_patches` moves the hit to the function's own surface.
+hit the net, and :func:`designgen.raycast.meet` moves the hit to the function's own surface.
 """
 
 from __future__ import annotations
