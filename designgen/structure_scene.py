@@ -189,7 +189,7 @@ def _truth(
             h = 1e-4
             du = patch.at(p + h, q) - patch.at(p - h, q)
             dv = patch.at(p, q + h) - patch.at(p, q - h)
-            normal = np.cross(dv, du)
+            normal = np.cross(du, dv)
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)

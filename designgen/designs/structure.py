@@ -24,12 +24,16 @@ class Box:
     size: Floats
 
     def patches(self, knots: tuple[Floats, Floats, Floats] | None = None) -> list[Patch]:
-        """Six faces; ``knots`` are those along each axis, 0..1. A face's p runs along the first of its two axes."""
+        """Six faces, their nets outward; ``knots`` are those along each axis, 0..1."""
         along = knots or tuple(np.array([0.0, 1.0]) for _ in range(3))
+        hand = np.sign(np.linalg.det(self.axes))
         found = []
         for axis in range(3):
-            i, j = [a for a in range(3) if a != axis]
             for sign, side in ((-1.0, "-"), (1.0, "+")):
+                # p along i and q along j, so that i x j points out.
+                i, j = (axis + 1) % 3, (axis + 2) % 3
+                if sign * hand < 0.0:
+                    i, j = j, i
                 corner = self.centre + 0.5 * sign * self.size[axis] * self.axes[axis]
                 found.append(Patch(f"{side}{'abn'[axis]}", self._face(corner, i, j), along[i], along[j]))
         return found
@@ -66,13 +70,13 @@ class Tube:
     radius: float
 
     def patches(self, step_mm: float = 500.0, around: int = 48) -> list[Patch]:
-        """Return the tube's mantle; its ends lie inside of other tubes."""
+        """Return the tube's mantle, its net outward; its ends lie inside of other tubes."""
         axis = self.end - self.start
         length = float(np.linalg.norm(axis))
         unit = axis / length
         side = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
         side = side / np.linalg.norm(side)
-        other = np.cross(unit, side)
+        other = np.cross(side, unit)
 
         def at(p: Floats, q: Floats) -> Floats:
             turn = 2.0 * np.pi * q
@@ -117,7 +121,7 @@ def component(name: str, bodies: Sequence[Box | Tube]) -> Component:
 
 
 def mesh_of(components: Sequence[Component]) -> tuple[Floats, np.ndarray]:
-    """Vertices (v, 3) and triangles (f, 3) of all faces; on flat faces exact, on tubes inside by radius / 470."""
+    """Vertices (v, 3) and triangles (f, 3) of all faces, outward; on flat faces exact, on tubes inside by radius / 470."""
     vertices, faces, count = [], [], 0
     for one in components:
         for patch in one.patches:
