@@ -99,7 +99,7 @@ class Params:
     sub_rays: int = 7
     reflectance: float = 0.5
     specular: float = 0.3  # share of the reflection that is mirror-like, as on bare steel; 0 = matt
-    stations: tuple[int, ...] = (2, 2)  # a grid below a frame; one number: around a part or structure
+    stations: tuple[int, ...] = (2, 2)  # two numbers: a grid below a frame; one: places that stay as more are added
     distance_mm: float = 5_000.0  # of the stations from a part's surface
     height_mm: float = 1_600.0  # of the scanner above the ground
     clutter: int = 0  # things in the way that are no part of the structure

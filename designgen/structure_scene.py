@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen import damage, sampler, scanner, survey
+from designgen import damage, sampler, scanner, sequences, survey
 from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
 from designgen.reading import filled
@@ -148,14 +148,17 @@ def _as_designed(components: tuple[structure.Component, ...]) -> list[tuple[int,
 
 
 def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params, seed: int) -> dict[str, Floats]:
-    """Return where the stations stand: before a row of plates, else beside the structure, on the ground."""
+    """Return where the stations stand: before a row of plates, beside a truss, within a stadium, on the ground.
+
+    A station more leaves the others where they are.
+    """
     corners = np.vstack([patch.at(patch.p[[0, -1, -1, 0]], patch.q[[0, 0, -1, -1]]) for _, patch in patches])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    count, poses = int(np.prod(params.stations)), {}
-    for i in range(count):
+    poses = {}
+    for i in range(int(np.prod(params.stations))):
         station = f"S{i + 1}"
         rng = generator(seed, f"place {station}")
-        share = (i + 0.5) / count
+        share = sequences.van_der_corput(i + 1)  # whatever the count
         if kind == "plate-row":
             at = np.array([low[0] + share * (high[0] - low[0]), low[1] - params.distance_mm, params.height_mm])
         elif kind == "truss-bridge":

@@ -121,7 +121,7 @@ def component(name: str, bodies: Sequence[Box | Tube]) -> Component:
 
 
 def mesh_of(components: Sequence[Component]) -> tuple[Floats, np.ndarray]:
-    """Vertices (v, 3) and triangles (f, 3) of all faces, outward; on flat faces exact, on tubes inside by radius / 470."""
+    """Vertices (v, 3) and triangles (f, 3) of all faces, outward; exact if flat, on tubes inside by radius / 470."""
     vertices, faces, count = [], [], 0
     for one in components:
         for patch in one.patches:
