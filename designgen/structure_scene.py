@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen import damage, sampler, scanner, sequences, survey
+from designgen import clutter, damage, sampler, scanner, sequences, survey
 from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
 from designgen.reading import filled
@@ -61,9 +61,9 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         builder = Builder()
         for part, patch in patches:
             builder.patch(part, patch)
-        found = survey.survey(
-            builder.done(), names, _places(kind, patches, params, seed), scanning.device, params, seed
-        )
+        poses = _places(kind, patches, params, seed)
+        _add_poles(builder, poses, patches, params.clutter, seed)
+        found = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
         scans, labels, stations, station_truth = survey.in_project(found, origin, params.merged)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
@@ -175,6 +175,21 @@ def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params,
             heading = generator(seed, f"heading {station} {k}").uniform(0.0, 2.0 * np.pi)
             poses[station if again == 1 else f"{station}-{k + 1}"] = survey.levelled(at, heading)
     return poses
+
+
+def _add_poles(
+    builder: Builder, poses: dict[str, Floats], patches: list[tuple[int, Patch]], count: int, seed: int
+) -> None:
+    """Add poles on the ground, each between a station, in turn, and a face drawn above the ground."""
+    places = list(dict.fromkeys(tuple(T[:3, 3]) for T in poses.values()))  # some stations scan more than once
+    half = np.array([0.5])
+    middles = np.vstack([patch.at(half, half) for _, patch in patches])
+    middles = middles[middles[:, 2] > 0.0]
+    for i in range(count):
+        rng = generator(seed, f"clutter {i}")
+        target = middles[rng.integers(len(middles))]
+        station = np.array(places[i % len(places)])
+        clutter.add_pole(builder, station, target, np.array([0.0, 0.0, 1.0]), (0.2, 0.4), rng, on_ground=True)
 
 
 def _truth(

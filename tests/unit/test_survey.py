@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from designgen import recipes, scanner, scene, sequences, structure_scene, survey
+from designgen.surfaces import Builder
+from processor.model import UsageError
 
 AXES = np.eye(3)
 HALF = np.array([2200.0, 450.0, 550.0])
@@ -93,3 +95,77 @@ def test_a_station_more_leaves_the_scans_of_the_others():
     for one, other in zip([*few.scans, *few_truth.labels], [*more.scans[:3], *more_truth.labels[:3]], strict=True):
         for field in dataclasses.fields(one):
             np.testing.assert_array_equal(getattr(one, field.name), getattr(other, field.name))
+
+
+@pytest.mark.parametrize(
+    ("name", "setting", "said"),
+    [
+        *(("arch-s1-rays", f"scan.{setting}", "not used for kind arch-bridge; there are mode, scanner, step_mrad")
+          for setting in ("origin_mm=[1.0,2.0,3.0]", "merged=true", "registered=false", "repeated=1",
+                          "scans_at_first=3", "height_mm=1000.0")),
+        *(("frame-as-built", f"scan.{setting}", "not used for kind space-frame; there are")
+          for setting in ("distance_mm=1000.0", "registered=false", "repeated=1", "scans_at_first=3")),
+        ("stadium-roof", "scan.inner_depth_mm=5.0", "not used for kind stadium-roof"),
+        ("frame-small", "scan.inner_depth_mm=5.0", "not used for kind space-frame; there are mode, spacing_mm"),
+        ("arch-s1", "scan.member_reach_mm=5.0", "not used for kind arch-bridge"),
+        ("truss-bridge", "scan.merged=true", "expected false with registered = false"),
+        ("truss-bridge", "scan.repeated=7", "expected no more than the 6 stations, got 7"),
+    ],
+)  # fmt: skip
+def test_keys_that_a_kind_does_not_use_are_refused(name, setting, said):
+    key = setting.partition("=")[0]
+    with pytest.raises(UsageError) as refused:
+        scene.make("x", recipes.overridden(recipes.load(name)[1], [setting]))
+    assert str(refused.value).startswith(f"{key}: ")
+    assert said in str(refused.value)
+    assert f" {key.removeprefix('scan.')}," not in str(refused.value).partition("there are")[2] + ","
+
+
+def test_a_stadium_is_scanned_from_within():
+    table = {key: value for key, value in recipes.load("stadium-roof")[1].items() if key != "scan"}
+    with pytest.raises(UsageError, match=r"scan\.distance_mm: not used for kind stadium-roof"):
+        scene.make("x", recipes.overridden(table, ["scan.mode=rays", "scan.distance_mm=4000.0"]))
+
+
+def poles_of(monkeypatch, name, settings):
+    """The poles (start, axis, radius, length) that a scene has, and the positions of its stations."""
+    poles = []
+    cone = Builder.cone
+
+    def noting(builder, part, surface, start, axis, radii, length, *rest):
+        if surface == "pole":
+            assert part == -1
+            poles.append((start, axis, radii[0], length))
+        cone(builder, part, surface, start, axis, radii, length, *rest)
+
+    monkeypatch.setattr(Builder, "cone", noting)
+    made, truth = scene.make("x", recipes.overridden(recipes.load(name)[1], settings))
+    return made, truth, poles
+
+
+def test_poles_stand_between_stations_and_a_structure(monkeypatch):
+    settings = ["scan.step_mrad=4", "scan.stations=2", "scan.clutter=5", 'structure.components=["none", "dent"]']
+    made, truth, poles = poles_of(monkeypatch, "plates-defects", settings)
+    assert len(poles) == 5
+    places = truth.stations.T_project_station[:, :3, 3]
+    for i, (start, axis, _, length) in enumerate(poles):
+        np.testing.assert_array_equal(axis, [0.0, 0.0, 1.0])
+        assert start[2] == 0.0
+        assert places[i % 2, 1] < start[1] < -500.0  # before the plates' fronts, which are at y = 0
+        assert 1500.0 < length < 3500.0
+    pole = truth.labels[0].surface_names.index("pole")
+    hits = np.concatenate([(label.surface == pole).nonzero()[0] for label in truth.labels])
+    assert len(hits) > 50
+    for scan, label in zip(made.scans, truth.labels, strict=True):
+        T, own = scan.T_project_scan, (label.surface == pole) & (label.source == 0)
+        points = scan.points[own] @ T[:3, :3].T + T[:3, 3]
+        off = [np.linalg.norm(points[:, :2] - start[:2], axis=1) - radius for start, _, radius, _ in poles]
+        assert np.abs(off).min(axis=0).max(initial=0.0) < 20.0
+
+
+def test_more_poles_than_stations_go_round_them(monkeypatch):
+    settings = ["scan.step_mrad=20", "scan.stations=2", "scan.clutter=5"]
+    _, _, poles = poles_of(monkeypatch, "arch-s1-rays", settings)
+    assert len(poles) == 5 * 5
+    assert all(length == 2000.0 for _, _, _, length in poles)
+    assert len({tuple(start) for start, _, _, _ in poles}) == 25
