@@ -13,7 +13,7 @@ from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import ByRays, Scanning
-from designgen.surfaces import Builder, Patch
+from designgen.surfaces import Bools, Builder, Patch
 from processor.model import (
     AsBuilt,
     DefectTruth,
@@ -69,7 +69,9 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
             stations = None
     else:
-        cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"))
+        # Where bodies meet, one hides the other: told by the design, as the movement is smooth. Plates only touch.
+        hidden = None if kind == "plate-row" else _hidden(components)
+        cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"), hidden)
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
         labels = (PointLabels("scan", names, cloud.part, cloud.source),)
     vertices, faces = structure.mesh_of(components)
@@ -145,6 +147,13 @@ BUILDERS = {"stadium-roof": _stadium, "truss-bridge": _truss, "plate-row": _plat
 
 def _as_designed(components: tuple[structure.Component, ...]) -> list[tuple[int, Patch]]:
     return [(part, patch) for part, one in enumerate(components) for patch in one.patches]
+
+
+def _hidden(components: Components) -> Callable[[int, Floats, Floats], Bools]:
+    """Return a function that says which places on the design's faces lie inside of a body."""
+    faces = [patch for _, patch in _as_designed(components)]
+    inside = structure.covered(components)
+    return lambda row, p, q: inside(faces[row].at(p, q))
 
 
 def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params, seed: int) -> dict[str, Floats]:

@@ -8,11 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.surfaces import Patch
+from designgen.surfaces import Bools, Patch
 from processor.model import Floats
 
 if TYPE_CHECKING:
     import cadquery as cq
+
+CONTACT_MM = 1e-7  # what lies no deeper in a body is on its surface
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,16 @@ class Box:
         """Volume, mm3."""
         return float(np.prod(self.size))
 
+    def depth(self, points: Floats) -> Floats:
+        """Return how far inside (n,) points (n, 3) lie, mm; negative outside."""
+        found: Floats = (0.5 * self.size - np.abs((points - self.centre) @ self.axes.T)).min(axis=1)
+        return found
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Return the lowest and highest coordinates (3,)."""
+        reach = 0.5 * self.size @ np.abs(self.axes)
+        return self.centre - reach, self.centre + reach
+
 
 @dataclass(frozen=True)
 class Tube:
@@ -100,6 +112,21 @@ class Tube:
         """Volume, mm3."""
         return float(np.pi * self.radius**2 * np.linalg.norm(self.end - self.start))
 
+    def depth(self, points: Floats) -> Floats:
+        """Return how far inside (n,) points (n, 3) lie, mm; negative outside."""
+        axis = self.end - self.start
+        length = float(np.linalg.norm(axis))
+        arm = points - self.start
+        along = arm @ (axis / length)
+        away = np.linalg.norm(arm - np.outer(along, axis / length), axis=1)
+        found: Floats = np.minimum(self.radius - away, np.minimum(along, length - along))
+        return found
+
+    def bounds(self) -> tuple[Floats, Floats]:
+        """Return the lowest and highest coordinates (3,)."""
+        ends = np.stack([self.start, self.end])
+        return ends.min(axis=0) - self.radius, ends.max(axis=0) + self.radius
+
 
 @dataclass(frozen=True)
 class Component:
@@ -118,6 +145,22 @@ def component(name: str, bodies: Sequence[Box | Tube]) -> Component:
         for patch in body.patches()
     ]
     return Component(name, tuple(bodies), tuple(found))
+
+
+def covered(components: Sequence[Component]) -> Callable[[Floats], Bools]:
+    """Return a function that says which of points (n, 3) lie inside of a body; those on its surface do not."""
+    bodies = [body for one in components for body in one.bodies]
+    low, high = (np.array(corner) for corner in zip(*(body.bounds() for body in bodies), strict=True))
+
+    def inside(points: Floats) -> Bools:
+        found = np.zeros(len(points), bool)
+        if len(points):
+            near = ((low < points.max(axis=0)) & (high > points.min(axis=0))).all(axis=1)
+            for k in np.flatnonzero(near):
+                found |= bodies[k].depth(points) > CONTACT_MM
+        return found
+
+    return inside
 
 
 def mesh_of(components: Sequence[Component]) -> tuple[Floats, np.ndarray]:

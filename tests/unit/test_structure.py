@@ -80,3 +80,50 @@ def test_tubes_and_their_truth_look_away_from_the_axis():
         np.testing.assert_allclose(truth.structure.normals[at : at + count], expected, atol=1e-6)
         at += count
     assert at == len(truth.structure.points)
+
+
+def inside_by(body, points):
+    """How far inside a body points lie, by its corners or its axis alone."""
+    if isinstance(body, structure.Tube):
+        n = body.end - body.start
+        t = (points - body.start) @ n / (n @ n)
+        radius = np.linalg.norm(np.cross(points - body.start, n), axis=1) / np.linalg.norm(n)
+        length = np.linalg.norm(n)
+        return np.minimum.reduce([body.radius - radius, t * length, (1.0 - t) * length])
+    walls = []
+    for axis, size in zip(body.axes, body.size, strict=True):
+        for sign in (-1.0, 1.0):
+            walls.append((body.centre + 0.5 * sign * size * axis - points) @ (sign * axis))
+    return np.minimum.reduce(walls)
+
+
+@pytest.mark.parametrize("name", ["stadium-roof", "truss-bridge"])
+def test_no_point_of_a_sample_lies_inside_a_body(name):
+    table = {key: value for key, value in recipes.load(name)[1].items() if key not in ("scan", "asbuilt")}
+    settings = ["scan.mode=surface", "scan.spacing_mm=60", "scan.sigma_mm=0"]
+    settings += ["structure.trusses=6"] if name == "stadium-roof" else []
+    made, truth = make("x", recipes.overridden(table, settings))
+    points, part = made.scans[0].points, truth.labels[0].part
+    module = stadium_roof if name == "stadium-roof" else truss_bridge
+    components = module.build(module.Params(**({"trusses": 6} if name == "stadium-roof" else {})))
+    bodies = [body for one in components for body in one.bodies]
+    deepest = np.full(len(points), -np.inf)
+    for body in bodies:
+        deepest = np.maximum(deepest, inside_by(body, points))
+    assert deepest.max() < 1e-6
+    np.testing.assert_allclose(deepest, 0.0, atol=1e-6)  # each is on a body's surface
+    # Far from joints nothing is left out: points a square of 60 mm along the middle of the first bodies.
+    for number, one in enumerate(components[:2]):
+        body = one.bodies[0]
+        start, end = (body.start, body.end) if name == "stadium-roof" else _ends(body)
+        own = points[(part == number) & (np.abs(inside_by(body, points)) < 1e-6)]
+        t = (own - start) @ (end - start) / ((end - start) @ (end - start))
+        low, high = (0.2, 0.8) if name == "stadium-roof" else (0.03, 0.06)
+        length = (high - low) * np.linalg.norm(end - start)
+        girth = 2.0 * np.pi * body.radius if name == "stadium-roof" else 2.0 * (body.size[1] + body.size[2])
+        count = ((t > low) & (t < high)).sum()
+        assert count == pytest.approx(girth * length / 3600.0, abs=5.0 * np.sqrt(girth * length / 3600.0))
+
+
+def _ends(box):
+    return box.centre - 0.5 * box.size[0] * box.axes[0], box.centre + 0.5 * box.size[0] * box.axes[0]
