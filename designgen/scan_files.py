@@ -201,10 +201,9 @@ def _all_rows(scan: Scan) -> Ints:
 
 def _write_e57(folder: Path, stem: str, scans: Sequence[Scan], *, spherical: bool) -> Written:
     from designgen import e57_file
-    from processor.readers import e57
 
     e57_file.write(folder / f"{stem}.e57", scans, spherical=spherical)
-    names = e57.names(stem, [scan.name for scan in scans])
+    names = [stem] if len(scans) == 1 else e57_file.names_read(stem, scans)
     read_as = tuple((name, scan, _all_rows(scan)) for name, scan in zip(names, scans, strict=True))
     return Written(f"{stem}.e57", tuple(scans), read_as)
 

@@ -17,8 +17,9 @@ import numpy as np
 from designgen import scan_files
 from designgen.scan_files import Written
 from processor import store
-from processor.folder import FEWEST_POINTS
 from processor.model import KEY_POINTS, ArchDesign, FrameDesign, PointLabels, Scan, Scene, UsageError
+
+FEWEST_POINTS = 4  # that a reader takes for a scan
 
 
 @dataclass(frozen=True)
@@ -54,12 +55,8 @@ def export(
             from designgen import cad_files
 
             cad_files.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
-        truth = store.read_truth(source) if with_truth else None
-        if truth is not None:
-            labels = _labels_as_read(truth.labels, written)
-            store.write_truth(
-                making / "truth.h5", dataclasses.replace(truth, labels=labels), store.read_provenance(source)
-            )
+        if with_truth:
+            store.copy_truth(source, making / "truth.h5", lambda labels: _labels_as_read(labels, written))
         if folder.exists():
             folder.rmdir()
         os.chmod(making, 0o755)

@@ -297,6 +297,21 @@ def test_the_truth_is_found_by_the_names_that_scans_are_read_by(make, format_, t
     assert rank == sum(len(scan.points) for scan in scene.scans)
 
 
+def test_odd_names_in_e57_are_numbers_in_the_truth_too(tmp_path):
+    """The generator's notion of an odd name is the reader's."""
+    points = on_grid(50)[0]
+    taken = [Scan(name, points) for name in ("t-2", "a/b", "ok")]
+    e57_file.write(tmp_path / "t.e57", taken, spherical=False)
+    back = folder.read_input(tmp_path / "t.e57")
+    assert [scan.name for scan in back.scans] == e57_file.names_read("t", taken) == ["t-1", "t-2", "t-3"]
+    odd = ["ok", "a/b", " a", ".a", "x" * 101, "a\\b", "a\tb", "S 1"]
+    scans = [Scan(name, points + i) for i, name in enumerate(odd)]
+    e57_file.write(tmp_path / "f.e57", scans, spherical=False)
+    back = folder.read_input(tmp_path / "f.e57")
+    assert [scan.name for scan in back.scans] == e57_file.names_read("f", scans)
+    assert [scan.name for scan in back.scans] == ["ok", *(f"f-{i}" for i in range(2, 8)), "S 1"]
+
+
 @pytest.mark.parametrize("format_", scan_files.FORMATS)
 def test_a_station_that_saw_nothing_is_left_out_and_said(format_, tmp_path):
     scene = stations_apart(np.zeros(3))
