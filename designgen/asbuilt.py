@@ -18,6 +18,7 @@ from processor.model import AsBuilt, Floats, UsageError
 EXPANSION_PER_K = 12e-6
 CORNER_REACH_MM = 1500.0  # from an end, how far the errors of its corners reach
 REFERENCE_C = 20.0
+MOST_DRAWS = 200  # of a place for a dent or a missing piece
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,25 @@ class _Dent:
     c: float  # u on the bottom and top, v on the webs
     depth: float
     radius: float
+
+
+@dataclass(frozen=True)
+class _Spot:
+    """Where a web is damaged: a square of half a side ``half`` about (s, v)."""
+
+    wall: str
+    s: float
+    v: float
+    half: float
+
+    def apart(self, other: _Spot) -> bool:
+        """Whether the squares of two spots do not meet."""
+        reach = self.half + other.half
+        return self.wall != other.wall or abs(self.s - other.s) >= reach or abs(self.v - other.v) >= reach
+
+    def where(self, part: ArchPart) -> str:
+        """Say where it is, for the ledger."""
+        return f"{part.name} {self.wall} web, {self.s - part.s0:.0f} mm from the start, {self.v:.0f} mm up"
 
 
 @dataclass(frozen=True)
@@ -206,6 +226,7 @@ def arch(
         for what, value in zip(("bottom plate", "top plate", "web plate"), thick, strict=True):
             ledger.note(what, part.name, value, "mm")
         walls = ("bottom", "top", "left", "right")
+        taken: list[_Spot] = []
         errors = ArchErrors(
             ends,
             twist,
@@ -215,11 +236,11 @@ def arch(
                 w: _Wave(float(a), float(p), params.waviness_length_mm)
                 for w, a, p in zip(walls, waves, phases, strict=True)
             },
-            tuple(_dent(part, params, rng, ledger) for _ in range(_share(params.dents, number, len(parts)))),
+            tuple(_dent(part, params, rng, ledger, taken) for _ in range(_share(params.dents, number, len(parts)))),
             corners,
         )
         holes = tuple(
-            _hole(part, params, rng, ledger) for _ in range(_share(params.missing_pieces, number, len(parts)))
+            _hole(part, params, rng, ledger, taken) for _ in range(_share(params.missing_pieces, number, len(parts)))
         )
         found.append(fabricate(part, errors, plates, holes))
     return found
@@ -231,33 +252,37 @@ def _share(count: int, number: int, of: int) -> int:
     return count // of + (order.index(number) < count % of)
 
 
-def _on_web(part: ArchPart, size: float, rng: np.random.Generator) -> tuple[str, float, float]:
-    """Draw a web and a place (s, v) on its constant section, ``size`` away from every edge."""
+def _on_web(part: ArchPart, size: float, rng: np.random.Generator, taken: list[_Spot]) -> _Spot:
+    """Draw a place on a web's constant section, ``size`` away from every edge and apart from those taken; take it."""
     s0, s1 = part.constant_section()
     h = float(part.h(np.array(s0)))
     low, high = part.plates.bottom + 1.2 * size, h - part.plates.top - 1.2 * size
     if low > high or s1 - s0 < 3.0 * size:
         raise UsageError(f"asbuilt: dents and missing pieces of {size:g} mm do not fit on a web of {part.name}")
-    return (
-        ("left", "right")[int(rng.integers(2))],
-        rng.uniform(s0 + 1.5 * size, s1 - 1.5 * size),
-        rng.uniform(low, high),
+    for _ in range(MOST_DRAWS):
+        wall = ("left", "right")[int(rng.integers(2))]
+        spot = _Spot(wall, rng.uniform(s0 + 1.5 * size, s1 - 1.5 * size), rng.uniform(low, high), size)
+        if all(spot.apart(other) for other in taken):
+            taken.append(spot)
+            return spot
+    raise UsageError(
+        f"asbuilt.dents, missing_pieces: {len(taken) + 1} of them do not fit on the webs of {part.name} apart from "
+        "each other; ask for fewer or smaller ones"
     )
 
 
-def _dent(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger) -> _Dent:
-    wall, s, v = _on_web(part, params.dent_radius_mm, rng)
-    where = f"{part.name} {wall} web, {s - part.s0:.0f} mm from the start, {v:.0f} mm up"
+def _dent(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, taken: list[_Spot]) -> _Dent:
+    spot = _on_web(part, params.dent_radius_mm, rng, taken)
+    where = spot.where(part)
     depth = ledger.note("dent, depth", where, params.dent_depth_mm, "mm")
-    return _Dent(wall, s, v, depth, ledger.note("dent, radius", where, params.dent_radius_mm, "mm"))
+    return _Dent(spot.wall, spot.s, spot.v, depth, ledger.note("dent, radius", where, params.dent_radius_mm, "mm"))
 
 
-def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger) -> Hole:
+def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, taken: list[_Spot]) -> Hole:
     half = 0.5 * params.missing_size_mm
-    wall, s, v = _on_web(part, half, rng)
-    where = f"{part.name} {wall} web, {s - part.s0:.0f} mm from the start, {v:.0f} mm up"
-    ledger.note("missing piece, side", where, params.missing_size_mm, "mm")
-    return Hole(wall, s - half, s + half, v - half, v + half)
+    spot = _on_web(part, half, rng, taken)
+    ledger.note("missing piece, side", spot.where(part), params.missing_size_mm, "mm")
+    return Hole(spot.wall, spot.s - half, spot.s + half, spot.v - half, spot.v + half)
 
 
 # --- space frames -------------------------------------------------------------------------------------------------
@@ -274,7 +299,7 @@ def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger:
     for node in np.sort(wrong):
         larger = sizes[sizes > nominal.radii[node]]
         radii[node] += (larger[0] if len(larger) else nominal.radii[node] + 10.0) - nominal.radii[node]
-        ledger.note("wrong size, radius", f"ball {node}", radii[node], "mm")
+        ledger.note("wrong size, radius", f"ball {node}", radii[node] * grown, "mm")
     radii = radii * grown
     along = centres[nominal.members[:, 1]] - centres[nominal.members[:, 0]]
     length = np.linalg.norm(along, axis=1)

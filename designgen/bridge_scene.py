@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen import asbuilt, sampler, survey
+from designgen import asbuilt, clutter, sampler, survey
 from designgen.designs import arch_bridge, arch_mesh, arch_part
 from designgen.randomness import generator, random_pose, rigid
 from designgen.reading import filled
@@ -109,11 +109,10 @@ def _survey_part(
     middle = ends.mean(axis=0)
     half = np.abs((ends - middle) @ axes.T).max(axis=0)
     poses = survey.around(axes, middle, half, params, seed, f"{part.name}/")
-    for i, T in enumerate(list(poses.values())[: params.clutter]):
+    places = [T[:3, 3] for T in poses.values()]
+    for i in range(params.clutter):
         rng = generator(seed, f"clutter {part.name} {i}")
-        foot = T[:3, 3] + (middle - T[:3, 3]) * rng.uniform(0.3, 0.6) + rng.uniform(-500.0, 500.0, 3)
-        radius = rng.uniform(25.0, 60.0)
-        builder.cone(-1, "pole", foot - 1000.0 * axes[2], axes[2], (radius, radius), 2000.0)
+        clutter.add_pole(builder, places[i % len(places)], middle, axes[2], (0.3, 0.6), rng, on_ground=False)
     return survey.survey(builder.done(), part_names, poses, scanning.device, params, seed)
 
 

@@ -105,7 +105,9 @@ def export(scene: Path, output: Path, format_: str, without_truth: bool, spheric
     if spherical and format_ != "e57":
         raise click.UsageError("--spherical is for --format e57")
     written = scan_folder.export(scene, output, format_, with_truth=not without_truth, spherical=spherical, step=step)
-    click.echo(f"{output}: {written} scan(s) as {format_}")
+    for name in written.left_out:
+        click.echo(f"{output}: scan {name!r} is left out: it saw next to nothing", err=True)
+    click.echo(f"{output}: {written.scans} scan(s) as {format_}")
 
 
 @commands.command("import")

@@ -247,8 +247,8 @@ def _cut(place: plate_row.Place, body: Box, hole: Floats, side: int, number: int
     )
 
     def at(p: Floats, q: Floats) -> Floats:
-        ab = start + np.outer(p, end - start)
-        local = np.column_stack([ab, low[2] + q * (high[2] - low[2])])
+        ab = start + np.outer(q, end - start)
+        local = np.column_stack([ab, low[2] + p * (high[2] - low[2])])
         points: Floats = place.origin + local @ plate_row.AXES
         return points
 

@@ -45,6 +45,16 @@ def write(path: Path, scans: Sequence[Scan], *, spherical: bool) -> None:
         image.close()
 
 
+def names_read(stem: str, scans: Sequence[Scan]) -> list[str]:
+    """Return what a reader calls several scans of a file: by their own names, those of odd names by their numbers."""
+    found = []
+    for number, scan in enumerate(scans, 1):
+        odd = not scan.name.isprintable() or scan.name != scan.name.strip() or len(scan.name) > 100
+        odd = odd or not scan.name or scan.name.startswith(".") or "/" in scan.name or "\\" in scan.name
+        found.append(f"{stem}-{number}" if odd else scan.name)
+    return found if len(set(found)) == len(found) else [f"{stem}-{number}" for number in range(1, len(scans) + 1)]
+
+
 def _guid(*content: bytes) -> str:
     """Return an identifier that follows from the content instead of chance: the same scan makes the same file."""
     digest = hashlib.sha256(b"".join(content)).hexdigest()

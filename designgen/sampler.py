@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
-from designgen.surfaces import Patch
+from designgen.surfaces import Bools, Patch
 from processor.model import SOURCES, Codes, Floats, Labels, UsageError
 
 MODE = "surface"
@@ -83,10 +83,18 @@ def scan_frame(frame: space_frame.Frame, params: Params, rng: np.random.Generato
     return _with_errors(np.vstack(clouds), np.concatenate(labels), params, rng)
 
 
-def scan_patches(patches: Sequence[tuple[int, Patch]], params: Params, rng: np.random.Generator) -> Cloud:
-    """Scan faces with their parts' numbers: uniform by the area of their nets, on the faces themselves."""
+def scan_patches(
+    patches: Sequence[tuple[int, Patch]],
+    params: Params,
+    rng: np.random.Generator,
+    hidden: Callable[[int, Floats, Floats], Bools] | None = None,
+) -> Cloud:
+    """Scan faces with their parts' numbers: uniform by the area of their nets, on the faces themselves.
+
+    ``hidden`` says of a face's row and numbers p, q (n,) on it which places another body covers: they are left out.
+    """
     clouds, labels = [], []
-    for part, patch in patches:
+    for row, (part, patch) in enumerate(patches):
         knots, triangles = patch.net()
         a, b, c = (patch.at(knots[:, 0], knots[:, 1])[triangles[:, i]] for i in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
@@ -99,8 +107,10 @@ def scan_patches(patches: Sequence[tuple[int, Patch]], params: Params, rng: np.r
         u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
         pq = knots[chosen[:, 0]] + u[:, None] * (knots[chosen[:, 1]] - knots[chosen[:, 0]])
         pq += v[:, None] * (knots[chosen[:, 2]] - knots[chosen[:, 0]])
+        if hidden is not None:
+            pq = pq[~hidden(row, pq[:, 0], pq[:, 1])]
         clouds.append(patch.at(pq[:, 0], pq[:, 1]))
-        labels.append(np.full(count, part))
+        labels.append(np.full(len(pq), part))
     return _with_errors(np.vstack(clouds), np.concatenate(labels), params, rng)
 
 

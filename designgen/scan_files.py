@@ -7,6 +7,7 @@ where a merged cloud says from which scanner a point was seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -118,22 +119,26 @@ def write_ptx(path: Path, scan: Scan, stations: Stations | None) -> None:
     Points are in the scanner's frame, and the matrix is the scanner's pose: of a merged cloud that of each station.
     Raises UsageError for a scan without grid numbers or poses.
     """
-    if len(scan.grid_row) != len(scan.points) or (len(scan.grid_row) and scan.grid_row.min() < 0):
-        raise UsageError(f"scan {scan.name!r} was not made on a scanner's grid: it cannot be written as PTX")
     with path.open("w", encoding="ascii", newline="\n") as file:
-        for rows, T in _grids(scan, stations):
+        for rows, T in ptx_grids(scan, stations):
             points = scan.points[rows] + (scan.origin - T[:3, 3])
             _write_grid(file, scan, rows, points @ T[:3, :3], T)
 
 
-def _grids(scan: Scan, stations: Stations | None) -> list[tuple[Ints, Floats]]:
-    """Rows of each grid's points, and the pose of its scanner in the frame that the points are in."""
+def ptx_grids(scan: Scan, stations: Stations | None) -> list[tuple[Ints, Floats]]:
+    """Return the grids as PTX has them: rows of points in the file's order, pose of the scanner in the points' frame.
+
+    Raises UsageError for a scan without grid numbers or poses.
+    """
+    if len(scan.grid_row) != len(scan.points) or (len(scan.grid_row) and scan.grid_row.min() < 0):
+        raise UsageError(f"scan {scan.name!r} was not made on a scanner's grid: it cannot be written as PTX")
+    order = np.lexsort((scan.grid_row, scan.grid_column))
     if not len(scan.point_station):
-        return [(np.arange(len(scan.points)), np.eye(4))]
+        return [(order, np.eye(4))]
     if stations is None or not len(stations.T_project_station):
         raise UsageError(f"scan {scan.name!r} has no poses of its stations: it cannot be written as PTX")
     seen = np.unique(scan.point_station)
-    return [(np.flatnonzero(scan.point_station == k), stations.T_project_station[k]) for k in seen]
+    return [(order[scan.point_station[order] == k], stations.T_project_station[k]) for k in seen]
 
 
 def _write_grid(file: Any, scan: Scan, rows: Ints, points: Floats, T_frame_scanner: Floats) -> None:
@@ -146,9 +151,8 @@ def _write_grid(file: Any, scan: Scan, rows: Ints, points: Floats, T_frame_scann
     file.write(f"{int(column.max()) + 1}\n{lines}\n{number % tuple(T[:3, 3])}\n")
     file.writelines(f"{number % tuple(T[:3, i])}\n" for i in range(3))
     file.writelines(f"{number % tuple(T[:3, i])} {float(i == 3):.0f}\n" for i in range(4))  # for row vectors
-    order = np.lexsort((row, column))
-    row, column, points = row[order], column[order], points[order] * METRES
-    bright = scan.intensity[rows][order] if len(scan.intensity) else np.full(len(rows), 0.5)
+    points = points * METRES
+    bright = scan.intensity[rows] if len(scan.intensity) else np.full(len(rows), 0.5)
     bright = bright / max(float(bright.max(initial=0.0)), 1e-12)
     start = np.searchsorted(column, np.arange(int(column.max()) + 2))
     empty = "0 0 0 0.500000\n"
@@ -160,20 +164,52 @@ def _write_grid(file: Any, scan: Scan, rows: Ints, points: Floats, T_frame_scann
         file.writelines(cells)
 
 
+@dataclass(frozen=True)
+class Written:
+    """A file of scans, by its name; of each scan that a reader finds in it the name, and its points by their rows."""
+
+    name: str
+    scans: tuple[Scan, ...]
+    read_as: tuple[tuple[str, Scan, Ints], ...]
+
+
 def write_all(
     folder: Path, format_: str, scans: Sequence[tuple[str, Scan]], stations: Stations | None, *, spherical: bool
-) -> list[str]:
-    """Write scans under ``folder`` by their file stems; returns the names of the files, one for all scans of E57."""
-    if format_ == "e57":
-        from designgen import e57_file
+) -> list[Written]:
+    """Write scans under ``folder`` by their file stems: a file each, but E57 holds the stations of one place together.
 
-        e57_file.write(folder / "scans.e57", [scan for _, scan in scans], spherical=spherical)
-        return ["scans.e57"]
+    In E57 a lone scan and scans of components have a file each as well, so that what is said of files fits them.
+    """
+    if format_ == "e57":
+        apart = len(scans) == 1 or any(scan.component for _, scan in scans)
+        groups = [(stem, [scan]) for stem, scan in scans] if apart else [("scans", [scan for _, scan in scans])]
+        return [_write_e57(folder, stem, group, spherical=spherical) for stem, group in groups]
+    if format_ == "ptx":
+        return [_write_ptx(folder, stem, scan, stations) for stem, scan in scans]
     writers = {"ply": write_ply, "las": write_las, "laz": write_las, "pcd": write_pcd, "xyz": write_xyz}
+    written = []
     for stem, scan in scans:
-        path = folder / f"{stem}.{format_}"
-        if format_ == "ptx":
-            write_ptx(path, scan, stations)
-        else:
-            writers[format_](path, scan)
-    return [f"{stem}.{format_}" for stem, _ in scans]
+        name = f"{stem}.{format_}"
+        writers[format_](folder / name, scan)
+        written.append(Written(name, (scan,), ((stem, scan, _all_rows(scan)),)))
+    return written
+
+
+def _all_rows(scan: Scan) -> Ints:
+    return np.arange(len(scan.points))
+
+
+def _write_e57(folder: Path, stem: str, scans: Sequence[Scan], *, spherical: bool) -> Written:
+    from designgen import e57_file
+
+    e57_file.write(folder / f"{stem}.e57", scans, spherical=spherical)
+    names = [stem] if len(scans) == 1 else e57_file.names_read(stem, scans)
+    read_as = tuple((name, scan, _all_rows(scan)) for name, scan in zip(names, scans, strict=True))
+    return Written(f"{stem}.e57", tuple(scans), read_as)
+
+
+def _write_ptx(folder: Path, stem: str, scan: Scan, stations: Stations | None) -> Written:
+    write_ptx(folder / f"{stem}.ptx", scan, stations)
+    grids = [rows for rows, _ in ptx_grids(scan, stations)]
+    names = [stem] if len(grids) == 1 else [f"{stem}-{i + 1}" for i in range(len(grids))]
+    return Written(f"{stem}.ptx", (scan,), tuple((n, scan, rows) for n, rows in zip(names, grids, strict=True)))

@@ -2,42 +2,61 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import shutil
 import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from designgen import scan_files
+from designgen.scan_files import Written
 from processor import store
-from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Scan, Scene, UsageError
+from processor.model import KEY_POINTS, ArchDesign, FrameDesign, PointLabels, Scan, Scene, UsageError
+
+FEWEST_POINTS = 4  # that a reader takes for a scan
+
+
+@dataclass(frozen=True)
+class Exported:
+    """How many scans a folder holds, and the names of those that were left out as they saw next to nothing."""
+
+    scans: int
+    left_out: tuple[str, ...]
 
 
 def export(
     source: Path, folder: Path, format_: str, *, with_truth: bool, spherical: bool = False, step: bool = False
-) -> int:
-    """Write the scene file ``source`` as a new scan folder; the number of scans.
+) -> Exported:
+    """Write the scene file ``source`` as a new scan folder.
 
     The folder is made under a temporary name and moved; ``spherical`` is for E57, ``step`` adds the design's
-    solids as STEP. Raises UsageError when it exists and
-    is not empty, and for a format that cannot hold the scene.
+    solids as STEP. Scans with fewer points than a reader takes are left out. The truth's labels are named and ordered
+    as the folder's scans are when they are read. Raises UsageError when the folder exists and is not empty, for a
+    format that cannot hold the scene, and where no scan is left.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder}: exists and is not empty; name a new folder")
-    scene = store.read_scene(source)
+    whole = store.read_scene(source)
+    scans = tuple(scan for scan in whole.scans if len(scan.points) >= FEWEST_POINTS)
+    if whole.scans and not scans:
+        raise UsageError(f"{source}: no scan has {FEWEST_POINTS} points or more, so there is nothing to export")
+    scene = dataclasses.replace(whole, scans=scans)
     folder.parent.mkdir(parents=True, exist_ok=True)
     making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        _write(scene, making, format_, spherical=spherical)
+        written = _write(scene, making, format_, spherical=spherical)
         if step:
             from designgen import cad_files
 
             cad_files.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
         if with_truth:
-            store.copy_truth(source, making / "truth.h5")
+            store.copy_truth(source, making / "truth.h5", lambda labels: _labels_as_read(labels, written))
         if folder.exists():
             folder.rmdir()
         os.chmod(making, 0o755)
@@ -45,10 +64,27 @@ def export(
     except BaseException:
         shutil.rmtree(making, ignore_errors=True)
         raise
-    return len(scene.scans)
+    return Exported(len(scans), tuple(scan.name for scan in whole.scans if len(scan.points) < FEWEST_POINTS))
 
 
-def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool) -> None:
+def _labels_as_read(labels: Sequence[PointLabels], written: Sequence[Written]) -> tuple[PointLabels, ...]:
+    """Name the labels of scans, and order them, as a reader of the files finds the points."""
+    known = {one.scan: one for one in labels}
+    found = []
+    for name, scan, rows in (one for file in written for one in file.read_as):
+        if scan.name not in known:
+            continue
+        given = known[scan.name]
+        columns = {
+            field.name: getattr(given, field.name)[rows]
+            for field in dataclasses.fields(given)
+            if field.metadata.get("shape") == ("n",) and len(getattr(given, field.name))
+        }
+        found.append(dataclasses.replace(given, scan=name, **columns))
+    return tuple(found)
+
+
+def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool) -> list[Written]:
     (folder / "scans").mkdir()
     lines = [f"name = {_quoted(scene.name)}", f"kind = {_quoted(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
@@ -58,11 +94,16 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool) -> None
         lines.append(f"design = {_quoted(design)}")
     if np.isfinite(scene.temperature_C):
         lines.append(f"temperature_C = {scene.temperature_C!r}")
-    named = [(_file_name(scan.name, number), scan) for number, scan in enumerate(scene.scans)]
-    files = scan_files.write_all(folder / "scans", format_, named, scene.stations, spherical=spherical)
-    for file, scan in zip(files, scene.scans, strict=False):
-        lines += ["", "[[scan]]", f"file = {_quoted(f'scans/{file}')}"]
-        lines += _of_file(scene, scale) if format_ == "e57" else _of_scan(scan, scale, own_pose=format_ == "ptx")
+    named = list(zip(_stems(scene.scans), scene.scans, strict=True))
+    written = scan_files.write_all(folder / "scans", format_, named, scene.stations, spherical=spherical)
+    for file in written:
+        lines += ["", "[[scan]]", f"file = {_quoted(f'scans/{file.name}')}"]
+        if len(file.scans) > 1:
+            lines += _of_file(file.scans)
+        else:
+            (scan,) = file.scans
+            own_pose = format_ == "ptx" or (format_ == "e57" and scan.T_project_scan.size > 0)
+            lines += _of_scan(scan, scale, own_pose=own_pose)
     if scene.stations is not None and any(len(scan.point_station) for scan in scene.scans):
         places = {
             name: {"position": (position * scale).tolist()}
@@ -70,14 +111,13 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool) -> None
         }
         _write_json(folder / "stations.json", places)
     (folder / "project.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return written
 
 
-def _of_file(scene: Scene, scale: float) -> list[str]:
-    """Lines of a file that holds all scans: what is the same for all of them."""
-    sigmas = {scan.sigma_mm for scan in scene.scans}
-    lines = [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
-    of_one = _of_scan(scene.scans[0], scale, own_pose=True) if len(scene.scans) == 1 else []
-    return lines + [line for line in of_one if line.startswith("component")]
+def _of_file(scans: Sequence[Scan]) -> list[str]:
+    """Lines of a file that holds several scans: what is the same for all of them."""
+    sigmas = {scan.sigma_mm for scan in scans}
+    return [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
 
 
 def _of_scan(scan: Scan, scale: float, *, own_pose: bool) -> list[str]:
@@ -104,9 +144,16 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
     path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def _file_name(name: str, number: int) -> str:
-    """Return the scan's name where it is a plain file name, else its number."""
-    return name if name.replace("-", "").replace("_", "").isalnum() else f"scan{number}"
+def _stems(scans: Sequence[Scan]) -> list[str]:
+    """Return each scan's name where it is a plain file name, else a number that is no other's name."""
+    plain = {scan.name for scan in scans if scan.name.replace("-", "").replace("_", "").isalnum()}
+    stems = []
+    for number, scan in enumerate(scans):
+        stem = scan.name if scan.name in plain else f"scan{number}"
+        while scan.name not in plain and stem in plain:
+            stem += "-"
+        stems.append(stem)
+    return stems
 
 
 def _design(scene: Scene, folder: Path, scale: float) -> str:

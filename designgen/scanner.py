@@ -10,6 +10,7 @@ What the device does with a ray is told in :mod:`designgen.echoes`.
 
 from __future__ import annotations
 
+import math
 import sys
 from dataclasses import dataclass
 from importlib import resources
@@ -99,10 +100,10 @@ class Params:
     sub_rays: int = 7
     reflectance: float = 0.5
     specular: float = 0.3  # share of the reflection that is mirror-like, as on bare steel; 0 = matt
-    stations: tuple[int, ...] = (2, 2)  # a grid below a frame; one number: around a part or structure
+    stations: tuple[int, ...] = (2, 2)  # two numbers: a grid below a frame; one: places that stay as more are added
     distance_mm: float = 5_000.0  # of the stations from a part's surface
     height_mm: float = 1_600.0  # of the scanner above the ground
-    clutter: int = 0  # things in the way that are no part of the structure
+    clutter: int = 0  # things in the way that are no part of the structure; poles go round the stations
     registration_mm: float = 0.0  # standard deviation of each axis of a station's registered position
     registration_mrad: float = 0.0  # and of its attitude about each axis
     registered: bool = True  # structures: whether the scans come with poses
@@ -122,6 +123,11 @@ class Params:
         _expect(self.scans_at_first >= 1, "scans_at_first", self.scans_at_first, "1 or more")
         for key in ("distance_mm", "height_mm", "clutter", "registration_mm", "registration_mrad", "repeated"):
             _expect(getattr(self, key) >= 0, key, getattr(self, key), "0 or more")
+        count = math.prod(self.stations)
+        _expect(self.repeated <= count, "repeated", self.repeated, f"no more than the {count} stations")
+        _expect(
+            self.registered or not self.merged, "merged", True, "false with registered = false: a cloud needs poses"
+        )
 
     def signal(self, cosine: Floats, R: Floats) -> Floats:
         """Return the signal (n,) of a whole beam by the cosine of incidence and the range."""

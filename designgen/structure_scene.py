@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from designgen import damage, sampler, scanner, survey
+from designgen import clutter, damage, sampler, scanner, sequences, survey
 from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import ByRays, Scanning
-from designgen.surfaces import Builder, Patch
+from designgen.surfaces import Bools, Builder, Patch
 from processor.model import (
     AsBuilt,
     DefectTruth,
@@ -61,15 +61,17 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         builder = Builder()
         for part, patch in patches:
             builder.patch(part, patch)
-        found = survey.survey(
-            builder.done(), names, _places(kind, patches, params, seed), scanning.device, params, seed
-        )
+        poses = _places(kind, patches, params, seed)
+        _add_poles(builder, poses, patches, params.clutter, seed)
+        found = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
         scans, labels, stations, station_truth = survey.in_project(found, origin, params.merged)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
             stations = None
     else:
-        cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"))
+        # Where bodies meet, one hides the other: told by the design, as the movement is smooth. Plates only touch.
+        hidden = None if kind == "plate-row" else _hidden(components)
+        cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"), hidden)
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
         labels = (PointLabels("scan", names, cloud.part, cloud.source),)
     vertices, faces = structure.mesh_of(components)
@@ -147,15 +149,25 @@ def _as_designed(components: tuple[structure.Component, ...]) -> list[tuple[int,
     return [(part, patch) for part, one in enumerate(components) for patch in one.patches]
 
 
+def _hidden(components: Components) -> Callable[[int, Floats, Floats], Bools]:
+    """Return a function that says which places on the design's faces lie inside of a body."""
+    faces = [patch for _, patch in _as_designed(components)]
+    inside = structure.covered(components)
+    return lambda row, p, q: inside(faces[row].at(p, q))
+
+
 def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params, seed: int) -> dict[str, Floats]:
-    """Return where the stations stand: before a row of plates, else beside the structure, on the ground."""
+    """Return where the stations stand: before a row of plates, beside a truss, within a stadium, on the ground.
+
+    A station more leaves the others where they are.
+    """
     corners = np.vstack([patch.at(patch.p[[0, -1, -1, 0]], patch.q[[0, 0, -1, -1]]) for _, patch in patches])
     low, high = corners.min(axis=0), corners.max(axis=0)
-    count, poses = int(np.prod(params.stations)), {}
-    for i in range(count):
+    poses = {}
+    for i in range(int(np.prod(params.stations))):
         station = f"S{i + 1}"
         rng = generator(seed, f"place {station}")
-        share = (i + 0.5) / count
+        share = sequences.van_der_corput(i + 1)  # whatever the count
         if kind == "plate-row":
             at = np.array([low[0] + share * (high[0] - low[0]), low[1] - params.distance_mm, params.height_mm])
         elif kind == "truss-bridge":
@@ -174,6 +186,21 @@ def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params,
     return poses
 
 
+def _add_poles(
+    builder: Builder, poses: dict[str, Floats], patches: list[tuple[int, Patch]], count: int, seed: int
+) -> None:
+    """Add poles on the ground, each between a station, in turn, and a face drawn above the ground."""
+    places = list(dict.fromkeys(tuple(T[:3, 3]) for T in poses.values()))  # some stations scan more than once
+    half = np.array([0.5])
+    middles = np.vstack([patch.at(half, half) for _, patch in patches])
+    middles = middles[middles[:, 2] > 0.0]
+    for i in range(count):
+        rng = generator(seed, f"clutter {i}")
+        target = middles[rng.integers(len(middles))]
+        station = np.array(places[i % len(places)])
+        clutter.add_pole(builder, station, target, np.array([0.0, 0.0, 1.0]), (0.2, 0.4), rng, on_ground=True)
+
+
 def _truth(
     components: tuple[structure.Component, ...], move: Callable[[Floats], Floats] | None, origin: Floats
 ) -> StructureTruth | None:
@@ -189,7 +216,7 @@ def _truth(
             h = 1e-4
             du = patch.at(p + h, q) - patch.at(p - h, q)
             dv = patch.at(p, q + h) - patch.at(p, q - h)
-            normal = np.cross(dv, du)
+            normal = np.cross(du, dv)
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)

@@ -8,26 +8,31 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen import echoes, scanner
+from designgen import echoes, scanner, sequences
 from designgen.randomness import generator, small_motion
 from designgen.surfaces import Surfaces
 from processor.model import Floats, PointLabels, Scan, Stations, StationTruth
 
 
 def below(low: Floats, high: Floats, params: scanner.Params, seed: int) -> dict[str, Floats]:
-    """Poses T_scene_station on a grid on the ground below a box; levelled, each near its place of the grid.
+    """Poses T_scene_station on the ground below a box; levelled, each near its place.
 
-    ``low`` and ``high`` (3,) are corners of what is scanned; the ground is at z = 0.
+    ``low`` and ``high`` (3,) are corners of what is scanned; the ground is at z = 0. Two numbers of ``stations`` are a
+    grid: it covers the area best, and another grid moves all stations. One number takes that many places of a
+    sequence: a station more leaves the others where they are.
     """
-    nx, ny = (*params.stations, 1)[:2]
+    size = (high - low)[:2]
+    grid = params.stations if len(params.stations) == 2 else None
     poses = {}
-    for i in range(nx):
-        for j in range(ny):
-            name = f"S{i * ny + j + 1}"
-            rng = generator(seed, f"place {name}")
-            cell = (high - low)[:2] / (nx, ny)
-            at = low[:2] + (np.array([i, j]) + 0.5 + rng.uniform(-0.15, 0.15, 2)) * cell
-            poses[name] = levelled(np.array([*at, params.height_mm]), rng.uniform(0.0, 2.0 * np.pi))
+    for i in range(int(np.prod(params.stations))):
+        name = f"S{i + 1}"
+        rng = generator(seed, f"place {name}")
+        if grid:
+            share = (np.array(divmod(i, grid[1])) + 0.5 + rng.uniform(-0.15, 0.15, 2)) / grid
+        else:
+            share = np.clip(sequences.in_square(i) + rng.uniform(-0.03, 0.03, 2), 0.0, 1.0)
+        at = low[:2] + share * size
+        poses[name] = levelled(np.array([*at, params.height_mm]), rng.uniform(0.0, 2.0 * np.pi))
     return poses
 
 
@@ -36,18 +41,14 @@ def around(
 ) -> dict[str, Floats]:
     """Poses T_scene_station about a box with unit ``axes`` (3, 3, rows), ``middle`` (3,) and half sizes (3,).
 
-    The stations lie evenly on an ellipsoid ``distance_mm`` outside of the box; each looks level at the middle.
+    The stations lie on an ellipsoid ``distance_mm`` outside of the box, the first two near the ends of its first axis;
+    each looks level at the middle. A station more leaves the others where they are.
     """
-    count = int(np.prod(params.stations))
-    k = np.arange(count) + 0.5
-    height, turn = 1.0 - 2.0 * k / count, np.pi * (1.0 + 5.0**0.5) * k
-    level = np.sqrt(1.0 - height**2)
-    ball = np.stack([height, level * np.cos(turn), level * np.sin(turn)], axis=1)  # first axis: the part's length
     poses = {}
-    for i, out in enumerate(ball):
+    for i in range(int(np.prod(params.stations))):
         name = f"{prefix}S{i + 1}"
         rng = generator(seed, f"place {name}")
-        at = middle + (out * (half + params.distance_mm) * rng.uniform(0.9, 1.1)) @ axes
+        at = middle + (sequences.on_sphere(i) * (half + params.distance_mm) * rng.uniform(0.9, 1.1)) @ axes
         ahead = (middle - at) / np.linalg.norm(middle - at)
         up = np.cross(ahead, np.eye(3)[np.argmin(np.abs(ahead))])
         up /= np.linalg.norm(up)

@@ -38,12 +38,13 @@ class DecodeError(ValueError):
 def write_array(group: Any, name: str, array: np.typing.NDArray[np.generic]) -> None:
     """Write an array; a large one in chunks of rows, shuffled and compressed."""
     if array.size <= PLAIN_ITEMS:
-        group.create_dataset(name, data=array)
+        _create(group, name, array)
         return
     rows = min(len(array), max(1, CHUNK_ROWS // max(1, math.prod(array.shape[1:]) // 3)))
-    group.create_dataset(
+    _create(
+        group,
         name,
-        data=array,
+        array,
         chunks=(rows, *array.shape[1:]),
         compression="gzip",
         compression_opts=GZIP_LEVEL,
@@ -51,10 +52,15 @@ def write_array(group: Any, name: str, array: np.typing.NDArray[np.generic]) -> 
     )
 
 
+def _create(group: Any, name: str, data: Any, **options: Any) -> None:
+    """Write a dataset and close it: where its bytes go must not depend on how long Python keeps its object."""
+    group.create_dataset(name, data=data, **options).id.close()
+
+
 def write_text(group: Any, name: str, text: str) -> None:
     """Write one text."""
     data = _encoded(text)
-    group.create_dataset(name, data=np.array(data, _text_type(len(data))))
+    _create(group, name, np.array(data, _text_type(len(data))))
 
 
 def _encoded(text: str) -> bytes:
@@ -87,18 +93,18 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
     elif isinstance(value, str):
         write_text(group, name, value)
     elif isinstance(value, bool):
-        group.create_dataset(name, data=np.uint8(value))
+        _create(group, name, np.uint8(value))
     elif isinstance(value, int):
-        group.create_dataset(name, data=np.int64(value))
+        _create(group, name, np.int64(value))
     elif isinstance(value, float):
-        group.create_dataset(name, data=np.float64(value))
+        _create(group, name, np.float64(value))
     elif isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
         members = group.create_group(name)
         for i, item in enumerate(value):
             _write(members, f"{i:04d}", item, {}, hooks)
     elif isinstance(value, tuple) and all(isinstance(item, str) for item in value):
         data = [_encoded(item) for item in value]
-        group.create_dataset(name, data=np.array(data, _text_type(max([1, *map(len, data)]))))
+        _create(group, name, np.array(data, _text_type(max([1, *map(len, data)]))))
     elif dataclasses.is_dataclass(value):
         hook = hooks.get(type(value))
         member = group.create_group(name)

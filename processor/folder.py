@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -203,7 +204,9 @@ def _scene(
         raws = readers.read(entry.path)
         if len(raws) > 1 and (entry.pose is not None or entry.position is not None):
             raise InputError(f"{entry.path}: holds {len(raws)} scans, so one 'pose' or 'position' does not fit them")
-        for raw in raws:
+        for number, raw in enumerate(raws, 1):
+            if len(raws) > 1 and any(raw.name == other.name for other in scans):  # scanners call each file's first S1
+                raw = dataclasses.replace(raw, name=f"{entry.path.stem}-{number}")
             unit, reason = _unit(raw, entry.path, project, asked)
             reasons.setdefault(unit, reason)
             scan = _scan(raw, entry, unit, parts, places)

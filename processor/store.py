@@ -128,11 +128,18 @@ def write_truth(path: Path, truth: Truth, provenance: Mapping[str, object] | Non
         codec.write_record(file.create_group("truth"), truth)
 
 
-def copy_truth(src: Path, dst: Path) -> bool:
-    """Write the truth of ``src`` to a file ``dst`` of its own. Without one nothing is written: False."""
+def copy_truth(
+    src: Path, dst: Path, labels: Callable[[tuple[PointLabels, ...]], tuple[PointLabels, ...]] | None = None
+) -> bool:
+    """Write the truth of ``src`` to a file ``dst`` of its own. Without one nothing is written: False.
+
+    ``labels`` makes the copy's labels of the points of those there are.
+    """
     truth = read_truth(src)
     if truth is None:
         return False
+    if labels is not None:
+        truth = dataclasses.replace(truth, labels=labels(truth.labels))
     write_truth(dst, truth, read_provenance(src))
     return True
 

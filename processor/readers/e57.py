@@ -1,10 +1,11 @@
-"""E57 (ASTM E2807): several scans a file, each with the pose of its scanner; points stay in the scanner's frame.
+"""E57 (ASTM E2807): several scans a file, each named and with the pose of its scanner, in whose frame points stay.
 
 Points whose invalid state is set are no returns and are left out. SI metres.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from processor.readers.raw import RawScan, make, parsing
 SUFFIXES = (".e57",)
 UNIT = "m"
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
+LONGEST_NAME = 100
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
@@ -29,17 +31,45 @@ def read(path: Path) -> list[RawScan]:
             count = file.scan_count
             if not count:
                 raise InputError(f"{path}: holds no scans")
-            return [_read_scan(path, file, i, count) for i in range(count)]
+            called = names(path.stem, [_own_name(file.get_header(i)) for i in range(count)])
+            return [_read_scan(path, file, i, called) for i in range(count)]
         finally:
             file.close()
 
 
-def _read_scan(path: Path, file: Any, index: int, count: int) -> RawScan:
+def names(stem: str, own: Sequence[str]) -> list[str]:
+    """Return how the scans of a file are called, by the file's stem and their own names in it.
+
+    A lone scan is named by the file, as in other formats. Of several each keeps its own name where that is plain text
+    and no other's; the rest are numbered.
+    """
+    if len(own) == 1:
+        return [stem]
+    found = [
+        name if _is_plain(name) and own.count(name) == 1 else f"{stem}-{number}" for number, name in enumerate(own, 1)
+    ]
+    return found if len(set(found)) == len(found) else [f"{stem}-{number}" for number in range(1, len(own) + 1)]
+
+
+def _is_plain(name: str) -> bool:
+    return bool(name.strip() == name and name.isprintable() and 0 < len(name) <= LONGEST_NAME and name[0] != ".") and (
+        not set(name) & set("/\\")
+    )
+
+
+def _own_name(header: Any) -> str:
+    try:
+        return str(header.node["name"].value()) if header.node.isDefined("name") else ""
+    except UnicodeDecodeError:
+        return ""
+
+
+def _read_scan(path: Path, file: Any, index: int, called: Sequence[str]) -> RawScan:
+    name, count = called[index], len(called)
     header = file.get_header(index)
     declared = int(header.point_count)
     if declared > 8 * path.stat().st_size:  # less than a bit for a point
         raise InputError(f"{path}: scan {index + 1} declares {declared} points, more than the file can hold")
-    name = path.stem if count == 1 else f"{path.stem}-{index + 1}"
     fields = set(header.point_fields)
     cartesian = fields.issuperset(CARTESIAN)
     if not cartesian and not fields.issuperset(SPHERICAL):

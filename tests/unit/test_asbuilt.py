@@ -171,6 +171,28 @@ def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
     assert np.linalg.norm(gaps[1, 4]) == pytest.approx(abs(wanted["rib2 start"] - wanted["rib1 end"]), abs=2e-3)
 
 
+def test_dents_and_missing_pieces_keep_apart():
+    """Many on each part: no dent reaches into a hole, whose edge would then not be where the truth says."""
+    parts = arch_bridge.build(arch_bridge.Params())
+    params = asbuilt.ArchParams(dents=30, missing_pieces=30, dent_radius_mm=120.0)
+    ledger = asbuilt.Ledger()
+    made = asbuilt.arch(parts, params, [generator(3, part.name) for part in parts], ledger)
+    assert sum(len(part.holes) for part in made) == 30
+    x = np.linspace(0.0, 1.0, 60)
+    for part, design in zip(made, parts, strict=True):
+        for hole in part.holes:
+            p, q = (grid.ravel() for grid in np.meshgrid(x, x))
+            s, v = hole.s0 + p * (hole.s1 - hole.s0), hole.c0 + q * (hole.c1 - hole.c0)
+            u = np.full_like(s, 1.0 if hole.wall == "left" else -1.0) * 450.0
+            np.testing.assert_allclose(part.point(s, u, v, wall=hole.wall), design.point(s, u, v), atol=1e-9)
+        for one in part.holes:
+            others = [o for o in part.holes if o is not one and o.wall == one.wall]
+            assert all(abs(one.s0 - o.s0) >= 250.0 or abs(one.c0 - o.c0) >= 250.0 for o in others)
+    crowd = asbuilt.ArchParams(dents=500)
+    with pytest.raises(UsageError, match="do not fit on the webs of rib2 apart from each other"):
+        asbuilt.arch(parts[2:3], crowd, [generator(3, "x")], ledger)
+
+
 FRAME = space_frame.build(space_frame.Params(nodes_x=3, nodes_y=3, layers=2, radii_mm=(45.0, 60.0)))
 
 
@@ -201,6 +223,9 @@ def test_frames_are_built_otherwise_by_what_the_truth_says():
     warm, _ = frame_with(temperature_C=30.0)
     np.testing.assert_allclose(warm.centres, FRAME.centres * 1.00012)
     np.testing.assert_allclose(warm.radii, FRAME.radii * 1.00012)
+    odd, truth = frame_with(temperature_C=40.0, wrong_sizes=3, radius_mm=0.2)
+    for where, value in zip(truth.where, truth.value, strict=True):
+        assert odd.radii[int(where.removeprefix("ball "))] == value
     with pytest.raises(UsageError, match=r"asbuilt\.bow_share: expected 0 or more"):
         frame_with(bow_share=-1.0)
 

@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from designgen import e57_file
 from processor import readers
-from processor.model import InputError
+from processor.model import InputError, Scan
 from processor.readers.e57 import cartesian_from_spherical
 
 DATA = Path(__file__).resolve().parents[2] / "../shared/data"
@@ -205,6 +206,22 @@ def test_las_by_the_specification(tmp_path):
     assert scan.unit == "m"
 
 
+@pytest.mark.parametrize(
+    ("own", "expected"),
+    [
+        (["S1"], ["a"]),  # a lone scan is named by its file
+        (["S1", "二号站", "S 3"], ["S1", "二号站", "S 3"]),
+        (["S1", "S1", "S2"], ["a-1", "a-2", "S2"]),
+        (["", "../x", "S\n3", " S4", ".S5", "S" * 101], [f"a-{i}" for i in range(1, 7)]),
+        (["a-2", "", "S3"], ["a-1", "a-2", "a-3"]),  # a number must not be another's name
+    ],
+)
+def test_e57_scans_keep_their_names_where_these_are_plain(own, expected, tmp_path):
+    scans = [Scan(name, POINTS + i) for i, name in enumerate(own)]
+    e57_file.write(tmp_path / "a.e57", scans, spherical=False)
+    assert [scan.name for scan in readers.read(tmp_path / "a.e57")] == expected
+
+
 def test_e57_pose_and_invalid_points(tmp_path):
     pye57 = pytest.importorskip("pye57")
     path = tmp_path / "a.e57"
@@ -215,7 +232,7 @@ def test_e57_pose_and_invalid_points(tmp_path):
         file.write_scan_raw(columns, rotation=np.array([half, 0, 0, half]), translation=np.array([10.0, 20.0, 30.0]))
         file.write_scan_raw({key: value for key, value in columns.items() if "Invalid" not in key})
     turned, plain = readers.read(path)
-    assert (turned.name, plain.name, turned.unit) == ("a-1", "a-2", "m")
+    assert (turned.name, plain.name, turned.unit) == ("Scan 0", "Scan 1", "m")  # that writer's own names
     assert np.allclose(turned.points, POINTS[[0, 2]], atol=1e-6)  # that writer keeps float32
     assert len(plain.points) == 3
     # By hand: (1, 2, 3) turned by a quarter about z is (-2, 1, 3), moved (8, 21, 33).

@@ -9,10 +9,23 @@ import numpy as np
 import open3d
 import pye57
 import pytest
+from click.testing import CliRunner
 
-from designgen import e57_file, scan_files, scan_folder
+from designgen import cli as designgen_cli
+from designgen import e57_file, recipes, scan_files, scan_folder
+from designgen.scene import make as make_scene
 from processor import folder, store
-from processor.model import FrameDesign, InputError, Scan, Scene, Stations, StructureDesign, UsageError
+from processor.model import (
+    FrameDesign,
+    InputError,
+    PointLabels,
+    Scan,
+    Scene,
+    Stations,
+    StructureDesign,
+    Truth,
+    UsageError,
+)
 
 RNG = np.random.default_rng(3)
 LIMITS_MM = {"las": 0.0501, "laz": 0.0501, "ptx": 1.1e-4, "xyz": 1.1e-4}  # the rest are doubles
@@ -249,6 +262,104 @@ def test_a_lone_cloud_with_its_noise_comes_back_from_e57(tmp_path):
     back = folder.read_input(out)
     np.testing.assert_allclose(back.scans[0].points, scene.scans[0].points, atol=1e-6)
     assert back.scans[0].sigma_mm == 2.0
+
+
+def labelled(scene):
+    """A truth whose labels rank a scan's points by their intensity, which tells them apart in every format."""
+
+    def ranks(scan):
+        return np.argsort(np.argsort(scan.intensity))
+
+    return Truth(tuple(PointLabels(s.name, ("p",), ranks(s), np.zeros(len(s.points))) for s in scene.scans))
+
+
+@pytest.mark.parametrize("make", [stations_apart, merged])
+@pytest.mark.parametrize("format_", scan_files.FORMATS)
+def test_the_truth_is_found_by_the_names_that_scans_are_read_by(make, format_, tmp_path):
+    scene = make(np.zeros(3))
+    store.write_scene(tmp_path / "s.h5", scene, labelled(scene), {})
+    scan_folder.export(tmp_path / "s.h5", tmp_path / "out", format_, with_truth=True)
+    back = folder.read_input(tmp_path / "out")
+    truth = store.read_truth(tmp_path / "out/truth.h5")
+    labels = {label.scan: label for label in truth.labels}
+    assert sorted(labels) == sorted(scan.name for scan in back.scans)
+    if make is stations_apart:
+        assert {"S1"} <= set(labels)
+    if format_ == "e57":
+        assert set(labels) == {scan.name for scan in scene.scans}
+    rank = 0
+    for scan in back.scans:
+        ranks = labels[scan.name].part
+        assert len(ranks) == len(scan.points)
+        in_order = scan.intensity[np.argsort(ranks)]
+        assert (np.diff(in_order) >= -1e-6 * in_order.max()).all()
+        rank += len(np.unique(ranks))
+    assert rank == sum(len(scan.points) for scan in scene.scans)
+
+
+def test_odd_names_in_e57_are_numbers_in_the_truth_too(tmp_path):
+    """The generator's notion of an odd name is the reader's."""
+    points = on_grid(50)[0]
+    taken = [Scan(name, points) for name in ("t-2", "a/b", "ok")]
+    e57_file.write(tmp_path / "t.e57", taken, spherical=False)
+    back = folder.read_input(tmp_path / "t.e57")
+    assert [scan.name for scan in back.scans] == e57_file.names_read("t", taken) == ["t-1", "t-2", "t-3"]
+    odd = ["ok", "a/b", " a", ".a", "x" * 101, "a\\b", "a\tb", "S 1"]
+    scans = [Scan(name, points + i) for i, name in enumerate(odd)]
+    e57_file.write(tmp_path / "f.e57", scans, spherical=False)
+    back = folder.read_input(tmp_path / "f.e57")
+    assert [scan.name for scan in back.scans] == e57_file.names_read("f", scans)
+    assert [scan.name for scan in back.scans] == ["ok", *(f"f-{i}" for i in range(2, 8)), "S 1"]
+
+
+@pytest.mark.parametrize("format_", scan_files.FORMATS)
+def test_a_station_that_saw_nothing_is_left_out_and_said(format_, tmp_path):
+    scene = stations_apart(np.zeros(3))
+    blind = Scan("S2", np.empty((0, 3)), station="S2", position=np.zeros(3), T_project_scan=np.eye(4))
+    scene = dataclasses.replace(scene, scans=(scene.scans[0], blind, scene.scans[2]))
+    truth = Truth(tuple(PointLabels(s.name, (), np.zeros(len(s.points)), np.zeros(len(s.points))) for s in scene.scans))
+    store.write_scene(tmp_path / "s.h5", scene, truth, {})
+    arguments = ["export", str(tmp_path / "s.h5"), "-o", str(tmp_path / "out"), "--format", format_]
+    done = CliRunner().invoke(designgen_cli.commands, arguments)
+    assert done.exit_code == 0, done.output
+    assert "scan 'S2' is left out: it saw next to nothing" in done.stderr
+    assert "2 scan(s)" in done.stdout
+    back = folder.read_input(tmp_path / "out")
+    assert [len(scan.points) for scan in back.scans] == [400, 402]
+    assert len(store.read_truth(tmp_path / "out/truth.h5").labels) == 2
+    store.write_scene(tmp_path / "none.h5", dataclasses.replace(scene, scans=(blind,)), None, {})
+    with pytest.raises(UsageError, match="no scan has 4 points or more, so there is nothing to export"):
+        scan_folder.export(tmp_path / "none.h5", tmp_path / "none", format_, with_truth=True)
+    assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("spherical", [False, True])
+def test_an_arch_bridge_comes_back_from_e57_with_its_components(spherical, tmp_path):
+    settings = ["scan.step_mrad=15", "scan.stations=2", "scan.clutter=0"]
+    scene, truth = make_scene("bridge", recipes.overridden(recipes.load("arch-s1-rays")[1], settings))
+    scans = [dataclasses.replace(scan, sigma_mm=1.0 + i) for i, scan in enumerate(scene.scans)]
+    scans[0] = dataclasses.replace(scans[0], station="foot1/S1")
+    store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, scans=tuple(scans)), truth, {})
+    scan_folder.export(tmp_path / "s.h5", tmp_path / "out", "e57", with_truth=True, spherical=spherical)
+    files = sorted(path.name for path in (tmp_path / "out/scans").iterdir())
+    assert files == ["foot1.e57", "foot2.e57", "rib1.e57", "rib2.e57", "rib3.e57"]
+    back, kept = folder.read_input(tmp_path / "out"), store.read_scene(tmp_path / "s.h5")
+    for ours, theirs in zip(kept.scans, back.scans, strict=True):
+        assert (theirs.name, theirs.component, theirs.sigma_mm) == (ours.name, ours.component, ours.sigma_mm)
+        assert theirs.station == ours.station
+        np.testing.assert_allclose(theirs.points + theirs.origin, ours.points + ours.origin, atol=1e-6)
+    # Each point's station has no place in E57; where the stations stood is said all the same.
+    assert len(json.loads((tmp_path / "out/stations.json").read_text())) == 10
+    labels = {label.scan: label for label in store.read_truth(tmp_path / "out/truth.h5").labels}
+    assert all(len(labels[scan.name].part) == len(scan.points) for scan in back.scans)
+
+
+def test_two_e57_files_may_hold_scans_of_one_name(tmp_path):
+    scans = stations_apart(np.zeros(3)).scans
+    for stem in ("day1", "day2"):
+        e57_file.write(tmp_path / f"{stem}.e57", scans[:2], spherical=False)
+    back = folder.read_input(tmp_path)
+    assert [scan.name for scan in back.scans] == ["S1", "二号站", "day2-1", "day2-2"]
 
 
 def test_stations_that_points_name_must_be_there(tmp_path):

@@ -138,6 +138,22 @@ def test_same_content_same_bytes(written, tmp_path):
     assert other.read_bytes() == written.read_bytes()
 
 
+def test_bytes_do_not_depend_on_how_long_objects_live(written, tmp_path, monkeypatch):
+    """A debugger or a collector that is off may keep the library's objects of datasets and groups."""
+    kept = []
+    for name in ("create_dataset", "create_group"):
+        create = getattr(h5py.Group, name)
+
+        def keeping(*arguments, create=create, **options):
+            kept.append(create(*arguments, **options))
+            return kept[-1]
+
+        monkeypatch.setattr(h5py.Group, name, keeping)
+    store.write_scene(tmp_path / "kept.h5", *a_scene(), {"seed": 1, "α": [1.5, None]})
+    assert len(kept) > 20
+    assert (tmp_path / "kept.h5").read_bytes() == written.read_bytes()
+
+
 def test_order_of_points_changes_only_the_order_within_tiles(written, tmp_path):
     scene, _ = a_scene()
     flipped = dataclasses.replace(scene, scans=(Scan("s1", scene.scans[0].points[::-1]),))

@@ -1,0 +1,129 @@
+"""Whole structures: which way their faces look, what is inside of what."""
+
+import numpy as np
+import pytest
+
+from designgen import damage, recipes
+from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
+from designgen.scene import make
+
+
+def corners_of(patches):
+    """Triangles (f, 3, 3) of the nets of patches."""
+    found = []
+    for patch in patches:
+        knots, triangles = patch.net()
+        found.append(patch.at(knots[:, 0], knots[:, 1])[triangles])
+    return np.concatenate(found)
+
+
+def signed_volume(patches, about):
+    """Volume of a closed net by the divergence theorem: positive where its triangles look outward."""
+    a, b, c = (corners_of(patches)[:, i] - about for i in range(3))
+    return float(np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6.0)
+
+
+def test_boxes_look_outward_in_frames_of_either_hand():
+    R, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
+    for axes in (R, R * [[-1.0], [1.0], [1.0]]):
+        box = structure.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
+        assert signed_volume(box.patches(), np.zeros(3)) == pytest.approx(105.0)
+        knots = tuple(np.array([0.0, 0.3, 1.0]) for _ in range(3))
+        assert signed_volume(box.patches(knots), np.zeros(3)) == pytest.approx(105.0)
+
+
+@pytest.mark.parametrize(
+    "components",
+    [truss_bridge.build(truss_bridge.Params()), plate_row.build(plate_row.Params(form="girder", components=("step",)))],
+    ids=["truss", "girder"],
+)
+def test_every_box_of_a_structure_has_its_volume(components):
+    for one in components:
+        for body in one.bodies:
+            assert signed_volume(body.patches(), body.centre) == pytest.approx(float(np.prod(body.size)))
+        volume = sum(float(np.prod(body.size)) for body in one.bodies)
+        assert signed_volume(one.patches, one.bodies[0].centre) == pytest.approx(volume)
+
+
+def test_a_hole_takes_its_volume_from_the_plate():
+    """The cut faces close the net, and look into the hole."""
+    row = plate_row.Params(components=("crack",))
+    (place,) = plate_row.places(row)
+    for kind in ("crack", "edge-loss", "missing-part"):
+        defect = damage.draw(kind, damage.Params(), row, np.random.default_rng(2))
+        patches = damage.damaged(place, plate_row.bodies(row, place), defect)
+        assert signed_volume(patches, place.origin) == pytest.approx(1000.0 * 1000.0 * 12.0 - defect.volume_mm3)
+
+
+def test_tubes_and_their_truth_look_away_from_the_axis():
+    components = stadium_roof.build(stadium_roof.Params(trusses=4))
+    tubes = [body for one in components for body in one.bodies]
+    for tube in tubes:
+        a, b, c = (corners_of(tube.patches())[:, i] for i in range(3))
+        unit = (tube.end - tube.start) / np.linalg.norm(tube.end - tube.start)
+        radial = (a + b + c) / 3.0 - tube.start
+        radial -= np.outer(radial @ unit, unit)
+        assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), radial) > 0.0).all()
+    settings = ["structure.trusses=4", "scan.spacing_mm=500"]
+    _, truth = make("x", recipes.overridden(recipes.load("stadium-roof")[1], settings))
+    at = 0
+    for tube in tubes:
+        unit = (tube.end - tube.start) / np.linalg.norm(tube.end - tube.start)
+        arm = truth.structure.points[at:] - tube.start
+        along = arm @ unit
+        radial = arm - np.outer(along, unit)
+        own = np.abs(np.linalg.norm(radial, axis=1) - tube.radius) < 1e-6
+        own &= (along > 0.0) & (along < np.linalg.norm(tube.end - tube.start))
+        count = int(np.argmin(own)) if not own.all() else len(own)
+        assert count >= 16
+        expected = radial[:count] / tube.radius
+        np.testing.assert_allclose(truth.structure.normals[at : at + count], expected, atol=1e-6)
+        at += count
+    assert at == len(truth.structure.points)
+
+
+def inside_by(body, points):
+    """How far inside a body points lie, by its corners or its axis alone."""
+    if isinstance(body, structure.Tube):
+        n = body.end - body.start
+        t = (points - body.start) @ n / (n @ n)
+        radius = np.linalg.norm(np.cross(points - body.start, n), axis=1) / np.linalg.norm(n)
+        length = np.linalg.norm(n)
+        return np.minimum.reduce([body.radius - radius, t * length, (1.0 - t) * length])
+    walls = []
+    for axis, size in zip(body.axes, body.size, strict=True):
+        for sign in (-1.0, 1.0):
+            walls.append((body.centre + 0.5 * sign * size * axis - points) @ (sign * axis))
+    return np.minimum.reduce(walls)
+
+
+@pytest.mark.parametrize("name", ["stadium-roof", "truss-bridge"])
+def test_no_point_of_a_sample_lies_inside_a_body(name):
+    table = {key: value for key, value in recipes.load(name)[1].items() if key not in ("scan", "asbuilt")}
+    settings = ["scan.mode=surface", "scan.spacing_mm=60", "scan.sigma_mm=0"]
+    settings += ["structure.trusses=6"] if name == "stadium-roof" else []
+    made, truth = make("x", recipes.overridden(table, settings))
+    points, part = made.scans[0].points, truth.labels[0].part
+    module = stadium_roof if name == "stadium-roof" else truss_bridge
+    components = module.build(module.Params(**({"trusses": 6} if name == "stadium-roof" else {})))
+    bodies = [body for one in components for body in one.bodies]
+    deepest = np.full(len(points), -np.inf)
+    for body in bodies:
+        deepest = np.maximum(deepest, inside_by(body, points))
+    assert deepest.max() < 1e-6
+    np.testing.assert_allclose(deepest, 0.0, atol=1e-6)  # each is on a body's surface
+    # Far from joints nothing is left out: points a square of 60 mm along the middle of the first bodies.
+    for number, one in enumerate(components[:2]):
+        body = one.bodies[0]
+        start, end = (body.start, body.end) if name == "stadium-roof" else _ends(body)
+        own = points[(part == number) & (np.abs(inside_by(body, points)) < 1e-6)]
+        t = (own - start) @ (end - start) / ((end - start) @ (end - start))
+        low, high = (0.2, 0.8) if name == "stadium-roof" else (0.03, 0.06)
+        length = (high - low) * np.linalg.norm(end - start)
+        girth = 2.0 * np.pi * body.radius if name == "stadium-roof" else 2.0 * (body.size[1] + body.size[2])
+        count = ((t > low) & (t < high)).sum()
+        assert count == pytest.approx(girth * length / 3600.0, abs=5.0 * np.sqrt(girth * length / 3600.0))
+
+
+def _ends(box):
+    return box.centre - 0.5 * box.size[0] * box.axes[0], box.centre + 0.5 * box.size[0] * box.axes[0]
