@@ -28,6 +28,7 @@ from processor.model import (
 )
 
 MADE_IN_MM = "made in millimetres"
+EDGE_POINTS = 501  # of each bottom edge in the truth
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
@@ -40,7 +41,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         built = asbuilt.arch(parts, errors, [generator(seed, f"built {part.name}") for part in parts], ledger)
     grown = asbuilt.expansion(errors.temperature_C)
     part_names = tuple(part.name for part in parts)
-    scans, labels, poses, key_bridge, key_scan = [], [], [], [], []
+    scans, labels, poses, key_bridge, key_scan, edges = [], [], [], [], [], []
     stations: Stations | None = None
     station_truth: list[StationTruth] = []
     for number, part in enumerate(built):
@@ -65,6 +66,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         poses.append(rigid(R.T, -R.T @ t))
         ends = np.array([_end_points(part, "start", part.s0), _end_points(part, "end", part.s1)])
         key_bridge.append(ends)
+        edges.append(_bottom_edges(part))
         key_scan.append(grown * (ends @ R.T + t))
     design = ArchDesign(
         tuple(_design_part(part) for part in parts),
@@ -85,7 +87,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     )
     return scene, Truth(
         tuple(labels),
-        arch=ArchTruth(part_names, np.array(poses), np.array(key_scan), np.array(key_bridge)),
+        arch=ArchTruth(part_names, np.array(poses), np.array(key_scan), np.array(key_bridge), np.array(edges)),
         stations=survey.joined_truth(station_truth),
         as_built=ledger.record() if "asbuilt" in recipe else None,
         spacing_mm=sampler.spacing_mm(scanning),
@@ -122,6 +124,12 @@ def _scaled(at: Callable[[Floats, Floats], Floats], factor: float) -> Callable[[
 
 def _end_points(part: arch_part.ArchPart, end: str, s: float) -> Floats:
     return np.full((8, 3), np.nan) if part.closed == end else part.key_points(s)
+
+
+def _bottom_edges(part: arch_part.ArchPart) -> Floats:
+    """Points (2, EDGE_POINTS, 3) along the left and right bottom edges as built."""
+    s = np.linspace(part.s0, part.s1, EDGE_POINTS)
+    return np.array([part.point(s, side * part.b(s), np.zeros_like(s)) for side in (1.0, -1.0)])
 
 
 def _design_part(part: arch_part.ArchPart) -> DesignPart:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen import asbuilt, frame_surfaces, sampler, survey
+from designgen import asbuilt, clutter, frame_surfaces, sampler, survey
 from designgen.designs import space_frame
 from designgen.randomness import generator
 from designgen.reading import filled
@@ -34,7 +34,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         builder = Builder()
         frame_surfaces.add_frame(builder, built)
         low, high = built.centres.min(axis=0), built.centres.max(axis=0)
-        frame_surfaces.add_clutter(builder, low, high, params.clutter, generator(seed, "clutter"))
+        clutter.add_below_roof(builder, low, high, params.clutter, generator(seed, "clutter"))
         found = survey.survey(
             builder.done(), names, survey.below(low, high, params, seed), scanning.device, params, seed
         )

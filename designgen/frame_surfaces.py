@@ -1,4 +1,4 @@
-"""A space frame's exact surfaces for rays: balls with flats and holes, hexagonal sleeves, cones, tubes; and clutter."""
+"""A space frame's exact surfaces for rays: balls with flats and holes, hexagonal sleeves, cones, tubes."""
 
 from __future__ import annotations
 
@@ -57,29 +57,3 @@ def _add_member(builder: Builder, frame: Frame, member: int) -> None:
         starts.append(tip + joined.cone_length)
     tube, radius = length - sum(starts), 0.5 * joined.tube_diameter
     builder.cone(-1, "tube", a + starts[0] * unit, unit, (radius, radius), tube, (frame.bow(member), 0.0, tube))
-
-
-def add_clutter(builder: Builder, low: Floats, high: Floats, count: int, rng: np.random.Generator) -> None:
-    """Add lamps (balls without members) and pipes below a roof's box, and poles on the ground, in turn."""
-    span = high - low
-    for i in range(count):
-        at = low + rng.uniform(0.05, 0.95, 3) * span
-        if i % 3 == 0:
-            at[2] = low[2] - rng.uniform(600.0, 1500.0)
-            builder.sphere(-1, "lamp", at, rng.uniform(190.0, 260.0), [])
-        elif i % 3 == 1:
-            along = np.array([1.0, 0.0, 0.0]) if rng.random() < 0.5 else np.array([0.0, 1.0, 0.0])
-            length, radius = rng.uniform(4_000.0, 10_000.0), rng.uniform(20.0, 80.0)
-            at[2] = low[2] - rng.uniform(200.0, 600.0)
-            _add_bar(builder, "pipe", at - 0.5 * length * along, along, radius, length)
-        else:
-            radius, height = rng.uniform(25.0, 60.0), rng.uniform(1_500.0, 3_000.0)
-            foot = np.array([at[0], at[1], 0.0])
-            _add_bar(builder, "pole", foot, -DOWN, radius, height)
-
-
-def _add_bar(builder: Builder, name: str, start: Floats, along: Floats, radius: float, length: float) -> None:
-    """Add a round bar with its ends."""
-    builder.cone(-1, name, start, along, (radius, radius), length)
-    for end in (start, start + length * along):
-        builder.disc(-1, f"{name} end", end, along, radius)

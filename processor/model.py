@@ -239,12 +239,16 @@ SOURCES = ("surface", "mixed", "outlier")  # the footprint on one surface; on se
 
 @dataclass(frozen=True)
 class ArchTruth(Checked):
-    """The true pose and key points of each component. Axis of length 2: start, end; NaN where an end has none."""
+    """The true pose and key points of each component. Axis of length 2: start, end; NaN where an end has none.
+
+    ``edges_bridge`` are points from the start to the end along the bottom edges, left and right.
+    """
 
     names: tuple[str, ...] = names("c")
     T_bridge_scan: Floats = column("c", 4, 4)
     key_points_scan: Floats = column("c", 2, 8, 3)
     key_points_bridge: Floats = column("c", 2, 8, 3)
+    edges_bridge: Floats = column("c", 2, "e", 3)
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ def scan_points(part, spacing_mm, sigma_mm, rng):
 def bridge(spacing_mm=10.0, sigma_mm=1.0, seed=0):
     """A scene of the five parts in arbitrary poses, and its truth."""
     rng = np.random.default_rng(seed)
-    scans, poses, key_scan, key_bridge = [], [], [], []
+    scans, poses, key_scan, key_bridge, edges = [], [], [], [], []
     for i, name in enumerate(NAMES):
         T_scan_bridge = random_pose(rng)
         R, t = T_scan_bridge[:3, :3], T_scan_bridge[:3, 3]
@@ -144,7 +144,9 @@ def bridge(spacing_mm=10.0, sigma_mm=1.0, seed=0):
         ends = [key_points(CUTS[j] * ARC) if 0 < j < 5 else np.full((8, 3), np.nan) for j in (i, i + 1)]
         poses.append(T)
         key_bridge.append(ends)
+        part = design().parts[i]
+        edges.append([part.bottom_edge_left, part.bottom_edge_right])
         key_scan.append([end @ R.T + t for end in ends])
     scene = Scene("bridge", "arch-bridge", tuple(scans), arch=design())
-    arch = ArchTruth(NAMES, np.array(poses), np.array(key_scan), np.array(key_bridge))
+    arch = ArchTruth(NAMES, np.array(poses), np.array(key_scan), np.array(key_bridge), np.array(edges))
     return scene, Truth(arch=arch, spacing_mm=spacing_mm, sigma_mm=sigma_mm)

@@ -8,7 +8,9 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
-from processor.model import Floats
+from processor.model import Floats, Ints
+
+MOST_WEIGHT = 100.0  # of a point, where few look along an axis
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,14 @@ def point_to_plane(
     *,
     gates_mm: tuple[float, ...],
     tree: cKDTree | None = None,
+    axes: Floats | None = None,
     max_iterations: int = 15,
 ) -> Alignment:
     """Align source (n, 3) to a surface given by samples target (m, 3) with unit normals (m, 3).
 
     Gauss-Newton on the distances along the normals, Huber-weighted by their median; pairs beyond the gate are left
     out, gates in turn from wide to narrow. The rms is over the last gate's pairs. ``tree`` is of the target, if there
-    is one already.
+    is one already; along each of the ``axes`` (3, 3, columns), where given, faces count the same: see :func:`balance`.
     """
     tree = cKDTree(target) if tree is None else tree
     T, rms, share, done = start, np.inf, 0.0, 0
@@ -91,6 +94,8 @@ def point_to_plane(
             # still slides along its length, would lose all their weight: the gate sets a floor.
             scale = max(1.4826 * float(np.median(np.abs(r))), gate / 12.0)
             weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(r), 1e-12))
+            if axes is not None:
+                weight *= balance(facing(n, axes))
             centre = p.mean(axis=0)
             J = np.hstack([np.cross(p - centre, n), n])
             step = np.linalg.lstsq(J.T @ (weight[:, None] * J), -J.T @ (weight * r), rcond=None)[0]
@@ -100,3 +105,20 @@ def point_to_plane(
             if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-3 * gate:
                 break
     return Alignment(T, rms, share, done)
+
+
+def facing(normals: Floats, axes: Floats) -> Ints:
+    """Return along which of three axes (3, 3, columns) each of unit normals (n, 3) looks most."""
+    found: Ints = np.argmax(np.abs(normals @ axes), axis=1)
+    return found
+
+
+def balance(group: Ints) -> Floats:
+    """Weights (n,) by which groups 0 to 2 of points (n,) count the same.
+
+    The two ends of a long part are a few points in a thousand, and alone hold it along its length: what its long faces
+    seem to say of that comes from how they are bent.
+    """
+    number = np.maximum(np.bincount(group, minlength=3), 1)
+    weight: Floats = np.minimum(len(group) / (3.0 * number), MOST_WEIGHT)[group]
+    return weight

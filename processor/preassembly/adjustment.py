@@ -8,14 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from processor.geometry import mesh_surface, rigid
+from processor.geometry import rigid
 from processor.geometry.lines import Polyline
 from processor.model import ArchDesign, DesignPart, Floats, Scan, UsageError
 from processor.preassembly import attitude, bottom_edges, features, joint_ends, network, registration
+from processor.preassembly.result import Result
 
 EXPANSION_PER_K = 12e-6
 REFERENCE_C = 20.0
@@ -52,12 +52,13 @@ class Measured:
 def measure(scan: Scan, index: int, design: ArchDesign, shrink: float) -> Measured:
     """Register one part and measure its ends and edges; ``index`` is its place in the design's order."""
     part, points = design.parts[index], scan.points * shrink
-    found = attitude.find(points, part)
+    design_surface = attitude.sample_surface(part)
+    found = attitude.find(points, part, design_surface)
     joints = [j if 0 <= j < len(design.joint_names) else None for j in (index - 1, index)]
     if found.status == "failed":
         return _failed(part, joints, found.message, shrink)
-    surface = mesh_surface.of_mesh(part.vertices, part.faces)
-    fitted = registration.fine(points, surface, found.T_surface)
+    surface = design_surface.mesh
+    fitted = registration.fine(points, surface, design_surface.axes, found.T_surface)
     if not (fitted.used_share > registration.LEAST_SHARE and np.isfinite(fitted.covariance).all()):
         said = f"only {fitted.used_share:.0%} of the points lie near the design's surface: is this the right part?"
         return _failed(part, joints, said, shrink)
@@ -75,7 +76,9 @@ def measure(scan: Scan, index: int, design: ArchDesign, shrink: float) -> Measur
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
     edges = bottom_edges.measure(moved, surface, *lines, fitted.sigma_mm)
     member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
-    weak = any(end is not None and end.trouble for end in ends)
+    if fitted.weak:
+        said_of.append(f"what the scan shows does not hold {' and '.join(fitted.weak)}")
+    weak = bool(fitted.weak) or any(end is not None and end.trouble for end in ends)
     status = "ambiguous" if found.status == "ambiguous" else "weak" if weak else "ok"
     return Measured(part.name, status, "; ".join(said_of), fitted.T_bridge_scan, fitted.covariance, member, shrink)
 
@@ -88,8 +91,8 @@ def _failed(part: DesignPart, joints: Sequence[int | None], message: str, shrink
     return Measured(part.name, "failed", message, np.full((4, 4), np.nan), np.full((6, 6), np.nan), member, shrink)
 
 
-def assemble(scans: Sequence[Scan], design: ArchDesign, params: AdjustParams, temperature_C: float) -> dict[str, Any]:
-    """Assemble scans in the design's order: the fields of the step's result."""
+def assemble(scans: Sequence[Scan], design: ArchDesign, params: AdjustParams, temperature_C: float) -> Result:
+    """Assemble scans in the design's order."""
     degrees = temperature_C - REFERENCE_C if np.isfinite(temperature_C) else 0.0
     shrink = 1.0 / (1.0 + EXPANSION_PER_K * degrees)
     parts = [measure(scan, index, design, shrink) for index, scan in enumerate(scans)]
@@ -111,38 +114,51 @@ def assemble(scans: Sequence[Scan], design: ArchDesign, params: AdjustParams, te
     statuses = [part.status for part in parts]
     alone = "temperature corrected" if degrees else "no temperature given: taken as the reference"
     mean, largest = _mean_max(np.abs(gaps))
-    return {
-        "status": _overall(statuses),
-        "method": "adjustment",
-        "message": f"lambda {params.weight:g}; {alone}; limit of misalignment {params.misalignment_limit_mm:g} mm "
+    return Result(
+        status=_overall(statuses),
+        method="adjustment",
+        message=f"lambda {params.weight:g}; {alone}; limit of misalignment {params.misalignment_limit_mm:g} mm "
         f"({LIMIT_SOURCE}); intervals hold noise alone: add registration and scanner errors of the scans",
-        "components": tuple(part.name for part in parts),
-        "component_status": tuple(statuses),
-        "component_message": tuple(part.message for part in parts),
-        "T_bridge_scan": placed,
-        "covariance": np.array([part.covariance for part in parts]),
-        "key_points_scan": key_points,
-        "key_points_sd": key_sd,
-        "joints": design.joint_names,
-        "joint_left": design.joint_left,
-        "joint_right": design.joint_right,
-        "gaps": gaps,
-        "gap_ci95": NORMAL_95 * sd,
-        "verdict": _verdicts(adjusted, frames, params.misalignment_limit_mm),
-        "splicing_mean": mean,
-        "splicing_max": largest,
-        "gauge": f"all joints and the design's curve at once, lambda {params.weight:g}",
-        "linear_mean": _mean_max(assembled)[0],
-        "linear_max": _mean_max(assembled)[1],
-        "best_fit_linear_mean": _mean_max(best_fit)[0],
-        "best_fit_linear_max": _mean_max(best_fit)[1],
-        "linear_station": _stations(design, members),
-        "linear_edge": tuple(side for member in members for side in member.edges.side),
-        "linear_deviation": assembled,
-        "best_fit_linear_deviation": best_fit,
-        "trade_lambda": np.array(TRADE_OFF),
-        "trade_figures": trade,
-    }
+        components=tuple(part.name for part in parts),
+        component_status=tuple(statuses),
+        component_message=tuple(part.message for part in parts),
+        T_bridge_scan=placed,
+        covariance=_pose_covariances(parts, adjusted, placed),
+        key_points_scan=key_points,
+        key_points_sd=key_sd,
+        joints=design.joint_names,
+        joint_left=design.joint_left,
+        joint_right=design.joint_right,
+        gaps=gaps,
+        gap_ci95=NORMAL_95 * sd,
+        verdict=_verdicts(adjusted, frames, params.misalignment_limit_mm),
+        splicing_mean=mean,
+        splicing_max=largest,
+        gauge=f"all joints and the design's curve at once, lambda {params.weight:g}",
+        linear_mean=_mean_max(assembled)[0],
+        linear_max=_mean_max(assembled)[1],
+        best_fit_linear_mean=_mean_max(best_fit)[0],
+        best_fit_linear_max=_mean_max(best_fit)[1],
+        linear_station=_stations(design, members),
+        linear_edge=tuple(side for member in members for side in member.edges.side),
+        linear_deviation=assembled,
+        best_fit_linear_deviation=best_fit,
+        trade_lambda=np.array(TRADE_OFF),
+        trade_figures=trade,
+        weight=params.weight,
+    )
+
+
+def _pose_covariances(parts: Sequence[Measured], adjusted: network.Adjusted, placed: Floats) -> Floats:
+    """Covariances (c, 6, 6) of the assembled poses, NaN of parts without one.
+
+    The registration's own error cancels: ends and edges were measured from where it puts the part.
+    """
+    found = np.full((len(parts), 6, 6), np.nan)
+    for i, part in enumerate(parts):
+        if np.isfinite(placed[i]).all():
+            found[i] = registration.about_origin(adjusted.motion_covariance[i], part.member.middle)
+    return found
 
 
 def _overall(statuses: Sequence[str]) -> str:

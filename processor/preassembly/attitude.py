@@ -47,6 +47,7 @@ class Surface:
     normals: Floats
     tree: cKDTree
     mesh: MeshSurface
+    axes: Floats  # (3, 3) principal axes as columns
     size: float  # diagonal of the bounding box
 
 
@@ -73,6 +74,7 @@ def sample_surface(part: DesignPart) -> Surface:
         (cross / double_area[:, None])[triangle],
         cKDTree(points),
         mesh_surface.of_mesh(part.vertices, part.faces),
+        principal.of_mesh(part.vertices, part.faces).axes,
         size,
     )
 
@@ -90,13 +92,13 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
     return [rigid.transform(R, design.centre - R @ scan.centre) for R in rotations]
 
 
-def find(points: Floats, part: DesignPart) -> Attitude:
-    """Attitude of the part scanned as points (n, 3), against its design.
+def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> Attitude:
+    """Attitude of the part scanned as points (n, 3), against its design, whose samples may be there already.
 
     Symmetric parts are told apart by what the designs in the two poses do not share (a pad, a taper); where there is
     nothing of the kind, or the scan does not show it, the answer is ``ambiguous``.
     """
-    surface = sample_surface(part)
+    surface = sample_surface(part) if surface is None else surface
     seeds = voxel_means(points, surface.size / 150.0, least=2)
     if len(seeds) < 50:
         seeds = points
@@ -122,7 +124,7 @@ def find(points: Floats, part: DesignPart) -> Attitude:
         if _largest_move(best, rival, points) < SAME_POSE_MM:
             continue
         # Evidence counts tens of millimetres: neither pose may be off by such along the part.
-        best, rival = (registration.fine(seeds, surface.mesh, T).T_bridge_scan for T in (best, rival))
+        best, rival = (registration.fine(seeds, surface.mesh, surface.axes, T).T_bridge_scan for T in (best, rival))
         ours, theirs = _evidence(points, surface, best, rival)
         more, fewer = max(ours, theirs), min(ours, theirs)
         if more < LEAST_EVIDENCE or more < 2 * fewer:
@@ -138,7 +140,9 @@ def _thinned(points: Floats, count: int) -> Floats:
 
 
 def _aligned(points: Floats, surface: Surface, T: Floats, gates_mm: tuple[float, ...]) -> Floats:
-    found = icp.point_to_plane(points, surface.points, surface.normals, T, gates_mm=gates_mm, tree=surface.tree)
+    found = icp.point_to_plane(
+        points, surface.points, surface.normals, T, gates_mm=gates_mm, tree=surface.tree, axes=surface.axes
+    )
     return found.T_target_source
 
 

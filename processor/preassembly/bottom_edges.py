@@ -1,7 +1,8 @@
 """Where the bottom edges of a part really run: departures from the design's, station by station, with their spread.
 
 An edge is where the bottom and a web meet. Near a station both faces' residuals against the design are fitted with a
-plane in the distance along and from the edge; at the edge itself they say how far it lies sideways and up.
+plane in the distance along and from the edge; at the edge itself they say how far it lies sideways and up. The stations
+of an edge are then smoothed along it.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_surface
 from processor.geometry.lines import Polyline
 from processor.geometry.mesh_surface import MeshSurface, outermost
 from processor.model import Floats
+from processor.preassembly.smoothing import smooth
 
 STATION_MM = 200.0
 REACH_MM = 200.0  # across each face
@@ -30,14 +33,14 @@ class EdgeStations:
     arc: Floats  # (k,) from the part's start
     points: Floats
     axes: Floats
-    departure: Floats  # (k, 2) sideways (to the left) and up; NaN where nothing was seen
-    variance: Floats  # (k, 2)
+    departure: Floats  # (k, 2) sideways (to the left) and up; NaN where nothing is known
+    covariance: Floats  # (2, k, k) of departures sideways, and of those up
 
 
 def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polyline, sigma_mm: float) -> EdgeStations:
     """Measure both edges on points (n, 3), bridge frame, registered to the design."""
     sides: list[str] = []
-    arcs, places, axes, departures, variances = [], [], [], [], []
+    arcs, places, axes, smoothed = [], [], [], []
     for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
         count = max(1, int(line.length / STATION_MM))
         arc = STATION_MM * (np.arange(count, dtype=np.float64) + 0.5)
@@ -74,10 +77,14 @@ def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polylin
         places.append(line.at(arc))
         frame = _frame(line, other, arc, sense)
         axes.append(np.stack([frame[1], frame[2]], axis=1))
-        departures.append(np.stack([value for value, _ in found], axis=1))
-        variances.append(np.stack([variance for _, variance in found], axis=1))
+        smoothed.append([smooth(arc, value, variance) for value, variance in found])
     return EdgeStations(
-        tuple(sides), *(np.concatenate(column) for column in (arcs, places, axes, departures, variances))
+        tuple(sides),
+        np.concatenate(arcs),
+        np.concatenate(places),
+        np.concatenate(axes),
+        np.concatenate([np.stack([one.mean for one in both], axis=1) for both in smoothed]),
+        np.array([block_diag(*(both[k].covariance for both in smoothed)) for k in range(2)]),
     )
 
 

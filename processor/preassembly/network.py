@@ -15,9 +15,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from processor.geometry import rigid
-from processor.model import Floats
+from processor.model import Floats, Ints
 from processor.preassembly.bottom_edges import EdgeStations
 from processor.preassembly.joint_ends import JointEnd
 
@@ -33,12 +34,33 @@ class Member:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Motions T (c, 4, 4) of the registered parts; gaps (j, 8, 3) in bridge axes with covariance (j, 24, 24)."""
+    """Motions T (c, 4, 4) of the registered parts, with covariance (c, 6, 6) about each part's middle, and the gaps.
+
+    ``gaps`` (j, 8, 3) in bridge axes with covariance (j, 24, 24); ``departures`` (k, 2) a part, sideways and up, after
+    the adjustment, with variances (k, 2).
+    """
 
     motions: Floats
+    motion_covariance: Floats
     gaps: Floats
     gap_covariance: Floats
-    departures: tuple[Floats, ...]  # (k, 2) a part: sideways and up, after the adjustment
+    departures: tuple[Floats, ...]
+    departure_variance: tuple[Floats, ...]
+
+
+@dataclass(frozen=True)
+class _Observations:
+    """What was measured: values (n,) and covariance (n, n); A (n, p) is how they change with the parts' motions.
+
+    First the known joints' gaps, 24 rows each, then the edges' departures; ``gap_row`` of joints without an answer is
+    -1, ``edge_rows`` are those of each part.
+    """
+
+    A: Floats
+    value: Floats
+    covariance: Floats
+    gap_row: Ints
+    edge_rows: tuple[slice, ...]
 
 
 def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats, weight: float) -> Adjusted:
@@ -46,53 +68,81 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
 
     ``weight`` is lambda. Joints with an end of which nothing is known do not pull; their gaps are NaN.
     """
-    count, joints = len(members), len(joint_points)
-    rows, values = [], []
-    known = [j for j in range(joints) if _known(members[j].ends[1]) and _known(members[j + 1].ends[0])]
-    A_gap = np.zeros((joints, 24, 6 * count))
-    b_gap = np.full((joints, 24), np.nan)
-    for j in known:
-        for part, sign in ((j, -1.0), (j + 1, 1.0)):
-            A_gap[j, :, 6 * part : 6 * part + 6] = sign * _motion(joint_points[j] - members[part].middle).reshape(24, 6)
-        b_gap[j] = _moved(members[j + 1].ends[0], joint_frames[j]) - _moved(members[j].ends[1], joint_frames[j])
-        rows.append(A_gap[j])
-        values.append(b_gap[j])
-    root = np.sqrt(weight)
-    A_edge, b_edge, variance = [], [], []
-    for i, member in enumerate(members):
-        full = _edge_rows(member)
-        seen = np.isfinite(member.edges.departure).ravel()
-        A = np.zeros((int(seen.sum()), 6 * count))
-        A[:, 6 * i : 6 * i + 6] = full[seen]
-        A_edge.append(A)
-        b_edge.append(member.edges.departure.ravel()[seen])
-        variance.append(member.edges.variance.ravel()[seen])
-        rows.append(root * A)
-        values.append(root * b_edge[-1])
-    A, b = np.vstack(rows), np.concatenate(values)
+    seen = _observations(members, joint_points, joint_frames)
+    root = np.ones(len(seen.value))
+    root[24 * int((seen.gap_row >= 0).sum()) :] = np.sqrt(weight)
+    weighted = seen.A * root[:, None]
     # Lengths about their own middle and turns differ by thousands: unit columns keep the solution's digits.
-    size = np.linalg.norm(A, axis=0)
+    size = np.linalg.norm(weighted, axis=0)
     size[size == 0.0] = 1.0
-    inverse = np.linalg.pinv(A / size, rcond=1e-12) / size[:, None]
-    x = -inverse @ b
-    motions = np.array([_as_motion(x[6 * i : 6 * i + 6], members[i].middle) for i in range(count)])
-    gaps = (b_gap + A_gap @ x).reshape(joints, 8, 3)
-    covariance = _gap_covariance(members, joint_frames, known, A_gap, inverse, root, np.concatenate(variance))
-    departures = tuple(
-        member.edges.departure + (_edge_rows(member) @ x[6 * i : 6 * i + 6]).reshape(-1, 2)
-        for i, member in enumerate(members)
+    to_motion = -(np.linalg.pinv(weighted / size, rcond=1e-12) / size[:, None]) * root
+    x = to_motion @ seen.value
+    # What is left of an observation after the motion, by all that was observed.
+    after = np.eye(len(seen.value)) + seen.A @ to_motion
+    left = after @ seen.value
+    spread = after @ seen.covariance @ after.T
+    gaps, gap_covariance = np.full((len(joint_points), 8, 3), np.nan), np.full((len(joint_points), 24, 24), np.nan)
+    for j, row in enumerate(seen.gap_row):
+        if row >= 0:
+            gaps[j] = left[row : row + 24].reshape(8, 3)
+            gap_covariance[j] = spread[row : row + 24, row : row + 24]
+    departures, variances = [], []
+    for member, rows in zip(members, seen.edge_rows, strict=True):
+        departure, variance = (np.full(member.edges.departure.shape, np.nan) for _ in range(2))
+        known = np.isfinite(member.edges.departure)
+        departure[known], variance[known] = left[rows], np.diag(spread)[rows]
+        departures.append(departure)
+        variances.append(variance)
+    moved = to_motion @ seen.covariance @ to_motion.T
+    blocks = [slice(6 * i, 6 * i + 6) for i in range(len(members))]
+    return Adjusted(
+        np.array([_as_motion(x[block], member.middle) for block, member in zip(blocks, members, strict=True)]),
+        np.array([moved[block, block] for block in blocks]),
+        gaps,
+        gap_covariance,
+        tuple(departures),
+        tuple(variances),
     )
-    return Adjusted(motions, gaps, covariance, departures)
 
 
-def _known(end: JointEnd | None) -> bool:
-    return end is not None and bool(np.isfinite(end.moved).all())
+def _observations(members: Sequence[Member], joint_points: Floats, joint_frames: Floats) -> _Observations:
+    count, joints = len(members), len(joint_points)
+    rows: list[Floats] = []
+    values, blocks = [], []
+    gap_row = np.full(joints, -1, np.int64)
+    for j in range(joints):
+        left, right = members[j].ends[1], members[j + 1].ends[0]
+        if left is None or right is None or not (_known(left) and _known(right)):
+            continue
+        gap_row[j] = 24 * len(rows)
+        A = np.zeros((24, 6 * count))
+        for part, sign in ((j, -1.0), (j + 1, 1.0)):
+            A[:, 6 * part : 6 * part + 6] = sign * _motion(joint_points[j] - members[part].middle).reshape(24, 6)
+        turn = np.kron(np.eye(8), joint_frames[j][:3, :3])
+        rows.append(A)
+        values.append(turn @ (right.moved - left.moved).ravel())
+        blocks.append(turn @ (left.covariance + right.covariance) @ turn.T)
+    edge_rows = []
+    start = 24 * len(rows)
+    for i, member in enumerate(members):
+        edges = member.edges
+        known = np.isfinite(edges.departure).ravel()
+        A = np.zeros((int(known.sum()), 6 * count))
+        motion = _motion(edges.points - member.middle)
+        A[:, 6 * i : 6 * i + 6] = np.einsum("kai,kij->kaj", edges.axes, motion).reshape(-1, 6)[known]
+        whole = np.zeros((len(edges.points), 2, len(edges.points), 2))
+        for k in range(2):
+            whole[:, k, :, k] = edges.covariance[k]
+        rows.append(A)
+        values.append(edges.departure.ravel()[known])
+        blocks.append(whole.reshape(len(known), len(known))[np.ix_(known, known)])
+        edge_rows.append(slice(start, start + len(A)))
+        start += len(A)
+    return _Observations(np.vstack(rows), np.concatenate(values), block_diag(*blocks), gap_row, tuple(edge_rows))
 
 
-def _moved(end: JointEnd | None, T_bridge_joint: Floats) -> Floats:
-    assert end is not None
-    found: Floats = (end.moved @ T_bridge_joint[:3, :3].T).ravel()
-    return found
+def _known(end: JointEnd) -> bool:
+    return bool(np.isfinite(end.moved).all())
 
 
 def _motion(arm: Floats) -> Floats:
@@ -106,45 +156,6 @@ def _motion(arm: Floats) -> Floats:
     return found
 
 
-def _edge_rows(member: Member) -> Floats:
-    """Return the derivative (2 k, 6) of the departures sideways and up."""
-    motion = _motion(member.edges.points - member.middle)
-    found: Floats = np.einsum("kai,kij->kaj", member.edges.axes, motion).reshape(-1, 6)
-    return found
-
-
 def _as_motion(x: Floats, middle: Floats) -> Floats:
     R = rigid.rotation_from_vector(x[:3])
     return rigid.transform(R, middle - R @ middle + x[3:])
-
-
-def _gap_covariance(
-    members: Sequence[Member],
-    joint_frames: Floats,
-    known: Sequence[int],
-    A_gap: Floats,
-    inverse: Floats,
-    root: float,
-    edge_variance: Floats,
-) -> Floats:
-    """Covariance (j, 24, 24) of the gaps, from those of the ends and the edges through the whole adjustment."""
-    joints = len(joint_frames)
-    found = np.full((joints, 24, 24), np.nan)
-    ends = []
-    for j in known:
-        turn = np.kron(np.eye(8), joint_frames[j][:3, :3])
-        left, right = members[j].ends[1], members[j + 1].ends[0]
-        assert left is not None
-        assert right is not None
-        ends.append(turn @ (left.covariance + right.covariance) @ turn.T)
-    width = 24 * len(known)
-    for j in known:
-        # gap_j = e_j + A_j x, x = -inverse (all e; root edges): what is measured at one joint moves all others.
-        through = -A_gap[j] @ inverse
-        total = np.zeros((24, 24))
-        for k, other in enumerate(known):
-            block = through[:, 24 * k : 24 * k + 24] + (np.eye(24) if other == j else 0.0)
-            total += block @ ends[k] @ block.T
-        edge = root * through[:, width:]
-        found[j] = total + (edge * edge_variance) @ edge.T
-    return found

@@ -6,32 +6,48 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import rigid
+from processor.geometry import icp, rigid
 from processor.geometry.mesh_surface import MeshSurface
-from processor.model import Floats
+from processor.model import Floats, Ints
 
-POINTS = 120_000
+POINTS = 40_000
 GATES_MM = (60.0, 30.0)
 CUT = 4.5  # standard deviations
 FLOOR_MM = 0.01  # of sigma, for scans without noise
 LEAST_SHARE = 0.5  # of the points that must lie within the last gate
+CELL_MM = 500.0  # residuals nearer to each other along the part, on one face, are taken as dependent
+WEAK_MM = 2.0  # a direction in which the ends of a part may lie off by more (95 %) is weak
+MOTIONS = (
+    "a turn about its length", "a turn sideways", "a turn up and down", "a shift along its length", "a shift sideways",
+    "a shift up and down",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Registration:
-    """T_bridge_scan (4, 4), its covariance (6, 6: turn about the bridge's axes, translation), sigma and shares."""
+    """T_bridge_scan (4, 4), its covariance (6, 6: turn about the bridge's axes, translation), sigma and shares.
+
+    ``weak`` names the motions that what is seen of the part does not hold.
+    """
 
     T_bridge_scan: Floats
     covariance: Floats
     sigma_mm: float
     used_share: float
+    weak: tuple[str, ...] = ()
 
 
-def fine(points: Floats, surface: MeshSurface, start: Floats) -> Registration:
-    """Robust point-to-surface least squares of points (n, 3), scan frame, from ``start`` (4, 4)."""
+def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> Registration:
+    """Robust point-to-surface least squares of points (n, 3), scan frame, from ``start`` (4, 4).
+
+    Faces that look along each of the design's principal ``axes`` (3, 3, columns) count the same, so that its ends
+    hold the part along its length. The covariance is a sandwich over cells of neighbouring residuals: what they have in
+    common, form and all, counts once (Liang and Zeger 1986).
+    """
     thin = points[:: max(1, len(points) // POINTS)]
     T = start.copy()
     gate, sigma, covariance, share = GATES_MM[0], float("nan"), np.full((6, 6), np.nan), 0.0
+    weak: tuple[str, ...] = ()
     for turn in range(30):
         moved = rigid.apply(T, thin)
         face, residual, beyond = surface.distances(moved, gate + 60.0)
@@ -41,24 +57,53 @@ def fine(points: Floats, surface: MeshSurface, start: Floats) -> Registration:
         r, n = residual[used], surface.normals[face[used]]
         middle = moved[used].mean(axis=0)
         J = np.hstack([np.cross(moved[used] - middle, n), n])
-        sigma = max(1.4826 * float(np.median(np.abs(r))), FLOOR_MM)
-        weight = np.clip(1.0 - (r / (CUT * sigma)) ** 2, 0.0, 1.0) ** 2  # Tukey's
+        looks = icp.facing(n, axes)
+        spread = np.array([_spread(r[looks == k]) for k in range(3)])
+        sigma = _spread(r)
+        weight = np.clip(1.0 - (r / (CUT * spread[looks])) ** 2, 0.0, 1.0) ** 2 * icp.balance(looks)  # Tukey's
         normal = J.T @ (J * weight[:, None])
         if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)) + 1e-300)) > 1e10:
             break  # what is seen does not hold the part: no covariance, and so no answer
         step = np.linalg.solve(normal, -J.T @ (weight * r))
         R = rigid.rotation_from_vector(step[:3])
         T = rigid.transform(R, middle - R @ middle + step[3:]) @ T
-        covariance = _about_origin(sigma**2 * np.linalg.inv(normal), middle)
         share = float(used.mean())
         if turn >= 3:
             gate = max(GATES_MM[1], 6.0 * sigma)
-        if turn > 4 and np.linalg.norm(step[3:]) < 1e-5 and np.linalg.norm(step[:3]) < 1e-9:
+        if turn == 29 or (turn > 4 and np.linalg.norm(step[3:]) < 1e-5 and np.linalg.norm(step[:3]) < 1e-9):
+            inverse = np.linalg.inv(normal)
+            at_middle = inverse @ _scatter(J * (weight * r)[:, None], moved[used] @ axes, looks, n @ axes) @ inverse
+            weak = _weak(at_middle, axes, float(np.abs((moved[used] - middle) @ axes[:, 0]).max()))
+            covariance = about_origin(at_middle, middle)
             break
-    return Registration(T, covariance, sigma, share)
+    return Registration(T, covariance, sigma, share, weak)
 
 
-def _about_origin(covariance: Floats, middle: Floats) -> Floats:
+def _spread(residual: Floats) -> float:
+    return max(1.4826 * float(np.median(np.abs(residual))), FLOOR_MM) if len(residual) else FLOOR_MM
+
+
+def _scatter(gradient: Floats, place: Floats, looks: Ints, normal: Floats) -> Floats:
+    """Sum (6, 6) of the outer products of gradients (n, 6), added up over each cell of a face first."""
+    cell = np.floor(place[:, 0] / CELL_MM).astype(np.int64)
+    side = normal[np.arange(len(looks)), looks] > 0.0
+    key = np.unique(np.stack([cell - cell.min(), 2 * looks + side], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
+    cells = int(key.max()) + 1
+    sums = np.stack([np.bincount(key, gradient[:, k], cells) for k in range(6)], axis=1)
+    found: Floats = sums.T @ sums * (cells / max(cells - 6, 1))
+    return found
+
+
+def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[str, ...]:
+    """Name the motions about the part's middle and its axes that may move its ends by more than WEAK_MM."""
+    turned = np.kron(np.eye(2), axes.T)
+    spread = 1.96 * np.sqrt(np.diag(turned @ covariance @ turned.T))
+    arms = np.array([0.1 * half_length, half_length, half_length, 1.0, 1.0, 1.0])
+    order = (0, 2, 1, 3, 4, 5)  # a turn about the third axis is sideways where the second one is
+    return tuple(name for name, k in zip(MOTIONS, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
+
+
+def about_origin(covariance: Floats, middle: Floats) -> Floats:
     """Covariance of a turn and a translation about ``middle`` (3,) as one about the frame's origin."""
     x, y, z = middle
     move = np.eye(6)

@@ -17,6 +17,8 @@ import numpy as np
 
 from designgen import recipes
 from designgen.scene import make
+from processor.preassembly import paper
+from processor.preassembly.params import PAPER_METHODS
 from processor.steps import preassemble, spheres
 
 FIGURES = ("splicing mean", "splicing max", "linear mean", "linear max", "best-fit linear mean", "true linear mean")
@@ -32,11 +34,12 @@ def bridges(sets, seeds, sigmas, spacing):
                 settings = [f"scan.sigma_mm={float(sigma)}", f"scan.spacing_mm={float(spacing)}"]
                 scene, truth = make(name, recipes.overridden(recipes.load(f"arch-{name.lower()}")[1], settings), seed)
                 started = time.monotonic()
-                parts = preassemble.extract(scene, scene.arch, preassemble.Params(seed=seed))
+                scans = preassemble.scans_in_order(scene, scene.arch)
+                parts = paper.extract(scans, scene.arch, preassemble.Params(seed=seed))
                 for method in preassemble.METHODS:
                     params = preassemble.Params(method=method, seed=seed)
-                    if method in preassemble.PAPER_METHODS:
-                        result = preassemble.assemble(parts, scene.arch, params)
+                    if method in PAPER_METHODS:
+                        result = paper.assemble(parts, scene.arch, params)
                     else:
                         result = preassemble.run(scene, params)
                     checks = {metric.name: metric for metric in preassemble.check(scene, result, truth)}

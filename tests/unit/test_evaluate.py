@@ -88,7 +88,8 @@ def test_the_truth_may_lie_beside_a_folder_of_scans(tmp_path):
 def test_the_truth_of_another_scene_is_refused(tmp_path):
     from tests.unit.test_report import arch_scene, assembled
 
-    truth = Truth(arch=ArchTruth(("other",), np.eye(4)[None], np.zeros((1, 2, 8, 3)), np.zeros((1, 2, 8, 3))))
+    ends = np.zeros((1, 2, 8, 3))
+    truth = Truth(arch=ArchTruth(("other",), np.eye(4)[None], ends, ends, np.zeros((1, 2, 5, 3))))
     store.write_truth(tmp_path / "truth.h5", truth)
     run = StepRun("preassemble", "line", "{}", assembled("line"))
     with pytest.raises(InputError, match="of another scene"):

@@ -9,6 +9,7 @@ from processor.geometry import pfh, rigid
 from processor.geometry.lines import Polyline
 from processor.model import InputError, Scene, UsageError
 from processor.preassembly import attitude, errors, features, matching
+from processor.preassembly.params import PAPER_METHODS
 from processor.steps import preassemble
 from tests import arch_clouds
 
@@ -155,7 +156,7 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
     assert result.splicing_mean < 10.0  # one spacing
     checks = {metric.name: metric for metric in preassemble.check(scene, result, truth)}
     assert checks["wrong poses called ok"].passed
-    if method in preassemble.PAPER_METHODS:
+    if method in PAPER_METHODS:
         # The key points lie on the inner edges: off by the root of two plates squared, as the authors did not say.
         assert checks["key points in the scan, rms"].value == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
     else:

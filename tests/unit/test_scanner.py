@@ -9,7 +9,7 @@ import scipy.stats
 import trimesh
 from scipy.optimize import brentq, minimize_scalar
 
-from designgen import echoes, frame_surfaces, ray_kernels, raycast, scanner, survey
+from designgen import clutter, echoes, frame_surfaces, ray_kernels, raycast, scanner, survey
 from designgen.designs import arch_bridge, arch_part, space_frame, structure
 from designgen.surfaces import Builder, Patch
 from processor.model import UsageError
@@ -28,11 +28,11 @@ def frame_of_balls():
     return dataclasses.replace(frame, bows=bows)
 
 
-def surfaces_of(frame, clutter=0):
+def surfaces_of(frame, things=0):
     builder = Builder()
     frame_surfaces.add_frame(builder, frame)
     low, high = frame.centres.min(axis=0), frame.centres.max(axis=0)
-    frame_surfaces.add_clutter(builder, low, high, clutter, np.random.default_rng(0))
+    clutter.add_below_roof(builder, low, high, things, np.random.default_rng(0))
     return builder.done()
 
 
@@ -246,7 +246,7 @@ def without_systematics(name):
 def test_clean_ranges_have_the_specified_noise_at_every_incidence(name):
     device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=0.9)
     frame = frame_of_balls()
-    surfaces, T = surfaces_of(frame, clutter=9), standing(2500.0, 2800.0, 1600.0)
+    surfaces, T = surfaces_of(frame, things=9), standing(2500.0, 2800.0, 1600.0)
     returns = echoes.scan(surfaces, T, device, params, 1, "S1", keep_hits=True).returns
     clean = returns.source == echoes.SURFACE
     R = np.linalg.norm(returns.hits[clean], axis=1)

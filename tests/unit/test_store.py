@@ -63,7 +63,8 @@ def a_scene(n=50_000):
     stations = Stations(("S1",), [[1.0, 2.0, 3.0]])
     scene = Scene("桥", "arch-bridge", scans, arch, None, stations, 21.5, "m", "said")
     labels = PointLabels("s1", ("肋1", "b"), np.floor(points[:, 2]).astype(np.int64), np.arange(n) % 3)
-    truth = Truth((labels,), ArchTruth(("肋1",), [np.eye(4)], np.full((1, 2, 8, 3), np.nan), np.zeros((1, 2, 8, 3))))
+    ends, edges = np.full((1, 2, 8, 3), np.nan), np.zeros((1, 2, 5, 3))
+    truth = Truth((labels,), ArchTruth(("肋1",), [np.eye(4)], ends, np.zeros((1, 2, 8, 3)), edges))
     return scene, truth
 
 

@@ -1,0 +1,158 @@
+"""An assembly held against the truth of the parts that were scanned.
+
+The gaps of parts that are not perfect depend on the objective: they are held against those that the same objective has
+on the true key points and edges, found by a general minimiser that shares nothing with the adjustment.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from processor.geometry import rigid
+from processor.geometry.lines import Polyline
+from processor.model import ArchDesign, ArchTruth, Floats, Metric, Scene, Truth
+from processor.preassembly import adjustment, errors
+from processor.preassembly.result import Result
+
+WRONG_POSE_RAD = 0.1
+
+
+def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
+    """Hold an assembly against the truth of scanned parts.
+
+    Limits: a pose given as ok must be the right one (a wrong answer without a flag is never accepted); the splicing of
+    perfect parts keeps within 5 mm at a spacing of 5 mm or less. All else informs.
+    """
+    if truth.arch is None or scene.arch is None:
+        return []
+    true = {name: i for i, name in enumerate(truth.arch.names)}
+    true_poses = [truth.arch.T_bridge_scan[true[name]] for name in result.components]
+    key_error, turns, wrong = [], [], 0
+    for i, name in enumerate(result.components):
+        points = result.key_points_scan[i] - truth.arch.key_points_scan[true[name]]
+        key_error.append(points[np.isfinite(points).all(axis=2)])
+        if np.isfinite(result.T_bridge_scan[i]).all():
+            turn = rigid.rotation_angle(result.T_bridge_scan[i][:3, :3] @ true_poses[i][:3, :3].T)
+            turns.append(turn)
+            wrong += turn > WRONG_POSE_RAD and result.component_status[i] == "ok"
+    errors_at_points = np.vstack(key_error)
+    mean, largest = _true_linear_error(scene.arch, result, true_poses)
+    limit = 5.0 if truth.spacing_mm <= 5.0 else float("nan")
+    none = float("nan")
+    own = np.abs(_gaps_of_truth(result, truth.arch, true, true_poses))
+    return [
+        Metric("preassemble", "wrong poses called ok", float(wrong), 0.0, ""),
+        Metric("preassemble", "splicing error, mean", result.splicing_mean, limit, "mm"),
+        Metric("preassemble", "splicing error, max", result.splicing_max, none, "mm"),
+        Metric("preassemble", "splicing error of the true key points, mean", _over(np.mean, own), none, "mm"),
+        Metric("preassemble", "splicing error of the true key points, max", _over(np.max, own), none, "mm"),
+        Metric("preassemble", "linear error of the true edges, mean", mean, none, "mm"),
+        Metric("preassemble", "linear error of the true edges, max", largest, none, "mm"),
+        Metric("preassemble", "key points in the scan, rms", _rms(errors_at_points), none, "mm"),
+        *_coverage(result, truth.arch, true),
+        *_gaps_as_they_should_be(scene.arch, result, truth.arch, true),
+        Metric("preassemble", "pose, largest turn", 1000.0 * max(turns, default=none), none, "mrad"),
+    ]
+
+
+def _coverage(result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
+    """How many of the key points' coordinates lie within their 95 % intervals, where a method states any."""
+    off = result.key_points_scan - truth.key_points_scan[[true[name] for name in result.components]]
+    known = np.isfinite(off) & np.isfinite(result.key_points_sd)
+    if not known.any():
+        return []
+    share = float((np.abs(off[known]) <= adjustment.NORMAL_95 * result.key_points_sd[known]).mean())
+    return [Metric("preassemble", "key points within their 95 % intervals", 100.0 * share, float("nan"), "%")]
+
+
+def _rms(vectors: Floats) -> float:
+    return float(np.sqrt(np.mean(np.sum(vectors**2, axis=1)))) if len(vectors) else float("nan")
+
+
+def _over(what: Callable[[Floats], Floats], values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(what(known)) if len(known) else float("nan")
+
+
+def _gaps_of_truth(result: Result, truth: ArchTruth, true: dict[str, int], true_poses: list[Floats]) -> Floats:
+    """Gaps (j, 8, 3) of the true key points at the poses found: the poses' own error where parts are perfect."""
+    moved = []
+    for name, pose, true_pose in zip(result.components, result.T_bridge_scan, true_poses, strict=True):
+        moved.append(rigid.apply(pose @ rigid.invert(true_pose), truth.key_points_bridge[true[name]]))
+    ends = np.array(moved)
+    found: Floats = ends[1:, 0] - ends[:-1, 1]
+    return found
+
+
+def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
+    """Hold the gaps of an adjustment against those of the truth under its objective."""
+    if not np.isfinite(result.weight) or not np.isfinite(result.T_bridge_scan).all():
+        return []
+    rows = [true[name] for name in result.components]
+    expected = gaps_by_objective(design, truth.key_points_bridge[rows], truth.edges_bridge[rows], result.weight)
+    off = result.gaps - expected
+    known = np.isfinite(off) & np.isfinite(result.gap_ci95)
+    if not known.any():
+        return []
+    share = 100.0 * float((np.abs(off[known]) <= result.gap_ci95[known]).mean())
+    none = float("nan")
+    return [
+        Metric("preassemble", "gaps against the truth's, rms", float(np.sqrt(np.mean(off[known] ** 2))), none, "mm"),
+        Metric("preassemble", "gaps within their 95 % intervals", share, none, "%"),
+    ]
+
+
+def gaps_by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: float) -> Floats:
+    """Gaps (j, 8, 3) where the sum of squared gaps and ``weight`` times that of the edges' departures is least.
+
+    ``key_points`` (c, 2, 8, 3) and ``edges`` (c, 2, e, 3) of the parts, near where the design has them; bridge frame.
+    """
+    lines = [(Polyline.through(p.bottom_edge_left), Polyline.through(p.bottom_edge_right)) for p in design.parts]
+    middles = [part.vertices.mean(axis=0) for part in design.parts]
+    stations = [[_at_stations(edges[i, k], lines[i][k]) for k in range(2)] for i in range(len(lines))]
+
+    def placed(x: Floats, i: int, points: Floats) -> Floats:
+        R = rigid.rotation_from_vector(1e-3 * x[6 * i : 6 * i + 3])
+        found: Floats = (points - middles[i]) @ R.T + middles[i] + x[6 * i + 3 : 6 * i + 6]
+        return found
+
+    def gaps(x: Floats) -> Floats:
+        pairs = range(len(lines) - 1)
+        return np.array([placed(x, i + 1, key_points[i + 1, 0]) - placed(x, i, key_points[i, 1]) for i in pairs])
+
+    def objective(x: Floats) -> Floats:
+        off = [
+            lines[i][k].nearest(placed(x, i, stations[i][k]))[1].ravel() for i in range(len(lines)) for k in range(2)
+        ]
+        return np.concatenate([gaps(x).ravel(), np.sqrt(weight) * np.concatenate(off)])
+
+    found = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    return gaps(found.x)
+
+
+def _at_stations(edge: Floats, line: Polyline) -> Floats:
+    """Points of an edge as built at the design's stations."""
+    arc = line.nearest(edge)[0]
+    count = max(1, int(line.length / errors.STATION_MM))
+    at = errors.STATION_MM * (np.arange(count) + 0.5)
+    return np.stack([np.interp(at, arc, edge[:, k]) for k in range(3)], axis=1)
+
+
+def _true_linear_error(design: ArchDesign, result: Result, true_poses: list[Floats]) -> tuple[float, float]:
+    """Mean and maximum distance to the design of the true bottom edges at the poses found: the method's own error."""
+    distances = []
+    for part, pose, true_pose in zip(design.parts, result.T_bridge_scan, true_poses, strict=True):
+        if not np.isfinite(pose).all():
+            continue
+        for edge in (part.bottom_edge_left, part.bottom_edge_right):
+            line = Polyline.through(edge)
+            stations = line.at(np.arange(0.0, line.length, errors.STATION_MM))
+            moved = rigid.apply(pose @ rigid.invert(true_pose), stations)
+            distances.append(np.linalg.norm(line.nearest(moved)[1], axis=1))
+    if not distances:
+        return float("nan"), float("nan")
+    joined = np.concatenate(distances)
+    return float(joined.mean()), float(joined.max())

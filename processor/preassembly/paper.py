@@ -1,0 +1,241 @@
+"""The source paper's three methods, as baselines: corner (W1), line (W2) and design-aided (W3).
+
+They chain the parts by the edges of their joints; ``design-aided`` also holds the bottom edges against the design's.
+They state no uncertainty, and their key points lie on the inner edges of the plates. Source: paper 000.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.geometry.lines import Polyline
+from processor.geometry.neighbors import surface_spacing
+from processor.model import ArchDesign, Floats, Scan
+from processor.preassembly import attitude, errors, features, matching
+from processor.preassembly.params import Params
+from processor.preassembly.result import Result
+
+NOWHERE = np.full((4, 4), np.nan)
+GAUGES = {
+    "corner": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
+    "line": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
+    "design-aided": "Foot 1 aligned to the design's lines",
+}
+
+
+@dataclass(frozen=True)
+class Part:
+    """What was taken from one scan: its attitude, joint ends (None where none was found) and bottom edges."""
+
+    name: str
+    scan: Scan
+    attitude: attitude.Attitude
+    ends: tuple[features.JointEdges | None, features.JointEdges | None]  # start, end; scan's frame, origin taken off
+    lines: Floats  # (n, 3) along both bottom edges, for matching; scan's frame
+    edges: errors.BottomEdges  # the same from thicker slices, for the linear error
+    trouble: str
+
+
+def extract(scans: Sequence[Scan], design: ArchDesign, params: Params) -> list[Part]:
+    """Take from every scan, in the design's order, what any of the methods needs."""
+    return [_extract(scan, index, design, params) for index, scan in enumerate(scans)]
+
+
+def assemble(parts: list[Part], design: ArchDesign, params: Params) -> Result:
+    """Assemble extracted parts by the method of the parameters."""
+    poses, messages = _assemble(parts, design, params)
+    return _result(parts, poses, messages, design, params)
+
+
+def _generator(params: Params, purpose: str) -> np.random.Generator:
+    return np.random.default_rng([params.seed, zlib.crc32(purpose.encode())])
+
+
+def _extract(scan: Scan, index: int, design: ArchDesign, params: Params) -> Part:
+    part = design.parts[index]
+    points = scan.points
+    found = attitude.find(points, part)
+    spacing = surface_spacing(points)
+    ends: list[features.JointEdges | None] = []
+    trouble: list[str] = []
+    for outward, joint in ((-1.0, index - 1), (1.0, index)):
+        if not 0 <= joint < len(design.joint_names):
+            ends.append(None)
+            continue
+        edges, said = _joint_end(points, found, design.joint_points[joint], outward, spacing, params, part.name)
+        ends.append(edges)
+        trouble += [f"{design.joint_names[joint]}: {said}"] if said else []
+    slices = params.slices
+    lines, checked = (
+        features.slice_edges(points, found.T_principal, spacing, thickness, slices)
+        for thickness in (slices.thickness, slices.check_thickness)
+    )
+    bottom = errors.BottomEdges(
+        *checked, Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
+    )
+    return Part(part.name, scan, found, (ends[0], ends[1]), np.vstack(lines), bottom, "; ".join(trouble))
+
+
+def _joint_end(
+    points: Floats,
+    found: attitude.Attitude,
+    design_points: Floats,
+    outward: float,
+    spacing: float,
+    params: Params,
+    purpose: str,
+) -> tuple[features.JointEdges | None, str]:
+    """Edges of one joint end in the scan's frame, or None and the reason why there are none."""
+    T_joint_scan = rigid.invert(features.joint_frame(design_points)) @ found.T_principal
+    corners = design_points[:4]
+    size = np.array([np.linalg.norm(corners[0] - corners[1]), np.linalg.norm(corners[3] - corners[0])])
+    cut = features.cut_joint_end(points, T_joint_scan, outward, size, params.boxes)
+    rng = _generator(params, f"{purpose} {outward}")
+    edges = features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
+    if edges is None:
+        return None, "no joint edges found"
+    T_scan_joint = rigid.invert(T_joint_scan)
+    edges = features.JointEdges(rigid.apply(T_scan_joint, edges.points), rigid.apply(T_scan_joint, edges.key_points))
+    off = rigid.apply(found.T_surface, edges.key_points[:4]).mean(axis=0) - corners.mean(axis=0)
+    distance = float(np.linalg.norm(off))
+    if not distance <= params.end_limit_mm:
+        return None, f"what was taken for the joint's end lies {distance:.0f} mm from where the design has it"
+    return edges, ""
+
+
+def _assemble(parts: list[Part], design: ArchDesign, params: Params) -> tuple[list[Floats], list[str]]:
+    """Chain the parts from the first: T_bridge_scan of each (NaN where the chain is broken) and a message each."""
+    poses = [_place_first(parts[0], design, params)]
+    messages = [""]
+    for before, part in pairwise(parts):
+        placement = _place_next(before, poses[-1], part, params)
+        poses.append(placement.T_bridge_scan)
+        messages.append(placement.message)
+    return poses, messages
+
+
+def _place_first(part: Part, design: ArchDesign, params: Params) -> Floats:
+    end = part.ends[1]
+    if end is None:
+        return NOWHERE
+    T = part.attitude.T_principal
+    corners = design.joint_points[0][:4]
+    T = _shifted(T, corners.mean(axis=0) - rigid.apply(T, end.key_points[:4]).mean(axis=0))
+    if params.method != "design-aided":
+        return T
+    source = np.vstack([end.points, part.lines])
+    target = np.vstack([_outline(corners, 5.0), _design_lines(part, 5.0)])
+    return matching.by_lines(source, target, T, params.match, _generator(params, "match " + part.name)).T_bridge_scan
+
+
+def _place_next(before: Part, T_before: Floats, part: Part, params: Params) -> matching.Placement:
+    theirs, ours = before.ends[1], part.ends[0]
+    if theirs is None or ours is None or not np.isfinite(T_before).all():
+        return matching.Placement(NOWHERE, "not placed: the chain is broken before it")
+    corners = rigid.apply(T_before, theirs.key_points[:4])
+    if params.method == "corner":
+        return matching.Placement(rigid.fit(ours.key_points[:4], corners), "")
+    start = _shifted(
+        part.attitude.T_principal,
+        corners.mean(axis=0) - rigid.apply(part.attitude.T_principal, ours.key_points[:4]).mean(axis=0),
+    )
+    source, target = ours.points, rigid.apply(T_before, theirs.points)
+    if params.method == "design-aided":
+        source = np.vstack([source, part.lines])
+        target = np.vstack([target, _design_lines(part, 5.0)])
+    return matching.by_lines(source, target, start, params.match, _generator(params, "match " + part.name))
+
+
+def _shifted(T: Floats, by: Floats) -> Floats:
+    return rigid.transform(T[:3, :3], T[:3, 3] + by)
+
+
+def _outline(corners: Floats, spacing_mm: float) -> Floats:
+    """Points (k, 3) along the rectangle of four corners."""
+    ring = Polyline.through(np.vstack([corners, corners[:1]]))
+    return ring.at(np.arange(0.0, ring.length, spacing_mm))
+
+
+def _design_lines(part: Part, spacing_mm: float) -> Floats:
+    """Points (k, 3) along both bottom edges of the design."""
+    lines = (part.edges.design_left, part.edges.design_right)
+    return np.vstack([line.at(np.arange(0.0, line.length, spacing_mm)) for line in lines])
+
+
+def _result(parts: list[Part], poses: list[Floats], messages: list[str], design: ArchDesign, params: Params) -> Result:
+    pairs = list(pairwise(range(len(parts))))
+    joint_gaps = np.full((len(pairs), 8, 3), np.nan)
+    status = [_status(part, pose) for part, pose in zip(parts, poses, strict=True)]
+    messages = list(messages)
+    for j, (left, right) in enumerate(pairs):
+        a, b = parts[left].ends[1], parts[right].ends[0]
+        if a is not None and b is not None and "failed" not in (status[left], status[right]):
+            joint_gaps[j] = errors.gaps(a.key_points, b.key_points, poses[left], poses[right])
+            widest = float(np.abs(joint_gaps[j]).max())
+            if widest > params.gap_limit_mm:
+                messages[right] += f"; {design.joint_names[j]} gapes by {widest:.0f} mm: the alignment may have failed"
+                status[right] = "weak" if status[right] == "ok" else status[right]
+    splicing_mean, splicing_max = errors.splicing_error(joint_gaps)
+    edges = [part.edges for part in parts]
+    assembled = errors.linear_error(edges, poses)
+    to_design = parts[0].attitude.T_surface @ _inverse(poses[0])
+    best_fit = errors.linear_error(edges, [to_design @ pose for pose in poses])
+    said = [
+        "; ".join(filter(None, (part.attitude.message, part.trouble, message.lstrip("; "))))
+        for part, message in zip(parts, messages, strict=True)
+    ]
+    placed = [one != "failed" for one in status]
+    return Result(
+        status="ok" if all(one == "ok" for one in status) else "partial" if any(placed) else "failed",
+        method=params.method,
+        message="no uncertainty is stated by this method; key points lie on the plates' inner edges",
+        components=tuple(part.name for part in parts),
+        component_status=tuple(status),
+        component_message=tuple(said),
+        T_bridge_scan=np.array([_with_origin(pose, part.scan.origin) for pose, part in zip(poses, parts, strict=True)]),
+        covariance=np.full((len(parts), 6, 6), np.nan),
+        key_points_scan=np.array([[_key_points(part, end) for end in part.ends] for part in parts]),
+        key_points_sd=np.full((len(parts), 2, 8, 3), np.nan),
+        joints=design.joint_names,
+        joint_left=design.joint_left,
+        joint_right=design.joint_right,
+        gaps=joint_gaps,
+        gap_ci95=np.full_like(joint_gaps, np.nan),
+        verdict=("indeterminate",) * len(pairs),
+        splicing_mean=splicing_mean,
+        splicing_max=splicing_max,
+        gauge=GAUGES[params.method],
+        linear_mean=assembled.mean,
+        linear_max=assembled.max,
+        best_fit_linear_mean=best_fit.mean,
+        best_fit_linear_max=best_fit.max,
+        linear_station=assembled.station,
+        linear_edge=assembled.edge,
+        linear_deviation=assembled.deviation,
+        best_fit_linear_deviation=best_fit.deviation,
+    )
+
+
+def _inverse(T: Floats) -> Floats:
+    return rigid.invert(T) if np.isfinite(T).all() else NOWHERE
+
+
+def _status(part: Part, pose: Floats) -> str:
+    if part.trouble or part.attitude.status == "failed" or not np.isfinite(pose).all():
+        return "failed"
+    return part.attitude.status
+
+
+def _with_origin(T: Floats, origin: Floats) -> Floats:
+    """T_bridge_scan for coordinates with the scan's origin put back."""
+    return rigid.transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ origin)
+
+
+def _key_points(part: Part, end: features.JointEdges | None) -> Floats:
+    return np.full((8, 3), np.nan) if end is None else end.key_points + part.scan.origin

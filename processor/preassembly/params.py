@@ -1,0 +1,26 @@
+"""Parameters of preassembly: of the adjustment, and of the source paper's methods."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from processor.preassembly.adjustment import AdjustParams
+from processor.preassembly.features import BoxParams, SliceParams
+from processor.preassembly.matching import MatchParams
+
+PAPER_METHODS = ("design-aided", "line", "corner")
+METHODS = ("adjustment", *PAPER_METHODS)  # the first is the default
+
+
+@dataclass(frozen=True)
+class Params:
+    """Parameters of the adjustment, and of the paper's methods: reduced boxes, slices, and the registration."""
+
+    method: str = METHODS[0]
+    seed: int = 0
+    end_limit_mm: float = 100.0  # a joint end found farther than this from its place in the design is not used
+    gap_limit_mm: float = 100.0  # a part that leaves a wider gap is called weak
+    adjust: AdjustParams = field(default_factory=AdjustParams)
+    boxes: BoxParams = field(default_factory=BoxParams)
+    slices: SliceParams = field(default_factory=SliceParams)
+    match: MatchParams = field(default_factory=MatchParams)
