@@ -36,8 +36,8 @@ UNITS_MM = {
 class Body:
     """A solid of a CAD file, or a surface without a volume: vertices (v, 3) in mm and triangles (f, 3).
 
-    ``closed`` says whether the mesh has no open edge; ``deviation_mm`` about how far the mesh is from the body, in
-    STEP by the kernel's own figure, in IFC the deflection that was asked of it; ``volume_mm3`` is NaN for a surface.
+    ``closed`` says whether the mesh has no open edge; ``deviation_mm`` how far it may be from the body, by the kernel's
+    own figure; ``volume_mm3`` is NaN for a surface.
     """
 
     name: str

@@ -14,7 +14,7 @@ from designgen import mesh
 from designgen.cad_reading import NO_UNIT, UNITS_MM, Body, CadFile, finest_mm, is_closed, unit_name
 from processor.model import InputError, UsageError
 
-MOST_TRIANGLES = 1_000_000  # of a body
+MOST_TRIANGLES = 700_000  # of a body: about ten seconds
 LARGE_MM = 1000.0  # bodies from here on are meshed by the algorithm for many triangles
 
 
@@ -42,10 +42,10 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     reader.SetSystemLengthUnit(declared / taken)
     problems += _damaged(reader, entities)
     reader.TransferRoots()
-    problems += _lost(reader, entities)
+    names = _Names(reader, entities)
+    problems += _lost(reader, entities, names)
     bodies = []
     if reader.NbShapes():
-        names = _Names(reader, entities)
         stem = re.sub(r"\.\w+$", "", os.path.basename(path))
         for number, (shape, solid) in enumerate(_pieces(reader.OneShape())):
             body = _body(path, names.of(shape) or f"{stem}-{number + 1}", shape, solid=solid)
@@ -88,7 +88,7 @@ def _damaged(reader: Any, entities: list[Any]) -> list[str]:
     return [f"{len(found)} damaged entities, first {found[0]}: bodies may be missing"] if found else []
 
 
-def _lost(reader: Any, entities: list[Any]) -> list[str]:
+def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
     """Say which solids and how many faces of the file did not become any."""
     from OCP.StepShape import StepShape_FaceSurface, StepShape_ManifoldSolidBrep
     from OCP.TopAbs import TopAbs_FACE, TopAbs_SOLID
@@ -101,11 +101,10 @@ def _lost(reader: Any, entities: list[Any]) -> list[str]:
     for kind in (TopAbs_SOLID, TopAbs_FACE) if shape is not None else ():
         explorer = TopExp_Explorer(shape, kind)
         while explorer.More():
-            one = explorer.Current().Located(nowhere)
             if kind == TopAbs_FACE:
-                faces.Add(one)
+                faces.Add(explorer.Current().Located(nowhere))
             else:
-                made.add(reader.WS().TransferReader().EntityFromShapeResult(one, 1))
+                made.add(names.item(explorer.Current()))
             explorer.Next()
     solids = [one for one in entities if isinstance(one, StepShape_ManifoldSolidBrep)]
     found = [f"solid {_text(one)!r} is damaged, so that it did not become one" for one in solids if one not in made]
@@ -176,8 +175,10 @@ class _Names:
             StepRepr_ShapeRepresentationRelationshipWithTransformation,
         )
         from OCP.StepShape import StepShape_ShapeDefinitionRepresentation
+        from OCP.TopTools import TopTools_IndexedMapOfShape
 
         self._transfers = reader.WS().TransferReader()
+        self._known, self._items = TopTools_IndexedMapOfShape(), list[Any]()
         products: dict[Any, str] = {}  # of representations
         pairs = []
         for entity in entities:
@@ -201,13 +202,24 @@ class _Names:
     def of(self, shape: Any) -> str:
         """Return the name of a shape as it lies in the file, or nothing."""
         from OCP.StepRepr import StepRepr_NextAssemblyUsageOccurrence, StepRepr_RepresentationItem
+
+        item = self.item(shape)
+        own = _text(item) if isinstance(item, StepRepr_RepresentationItem) else ""
+        if own:
+            return own
+        place = None if shape.Location().IsIdentity() else self._transfers.EntityFromShapeResult(shape, 1)
+        placed = _text(place) if isinstance(place, StepRepr_NextAssemblyUsageOccurrence) else ""
+        return placed or (self._products.get(item, "") if item is not None else "")
+
+    def item(self, shape: Any) -> Any:
+        """Return the entity that a shape was made of, wherever it lies; None where the kernel does not know."""
         from OCP.TopLoc import TopLoc_Location
 
-        place = self._transfers.EntityFromShapeResult(shape, 1)
-        item = self._transfers.EntityFromShapeResult(shape.Located(TopLoc_Location()), 1)
-        own = _text(item) if isinstance(item, StepRepr_RepresentationItem) else ""
-        placed = _text(place) if isinstance(place, StepRepr_NextAssemblyUsageOccurrence) else ""
-        return own or placed or (self._products.get(item, "") if item is not None else "")
+        bare = shape.Located(TopLoc_Location())
+        if not self._known.Contains(bare):  # the kernel looks through everything, so it is asked once
+            self._known.Add(bare)
+            self._items.append(self._transfers.EntityFromShapeResult(bare, 1))
+        return self._items[self._known.FindIndex(bare) - 1]
 
 
 def _product(representation: Any) -> str:
