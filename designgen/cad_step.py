@@ -30,9 +30,14 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     # Kept together: an entity is the same object only as long as somebody holds it.
     entities = [model.Value(i) for i in range(1, model.NbEntities() + 1)]
     said, sizes = _units(reader, entities)
-    if not sizes and not units and any("SHAPE" in type(one).__name__.upper() for one in entities):
+    damaged = _damaged(reader, entities)
+    known = bool(sizes) and not any(re.match("StepBasic_.*(Length|Conversion)", kind) for kind in damaged)
+    if not known and not units and any("SHAPE" in type(one).__name__.upper() for one in entities):
         raise InputError(f"{path}: {NO_UNIT}")
-    unit, problems = unit_name(path, said, sizes[0]) if sizes else ("", [])
+    unit, problems = unit_name(path, said, sizes[0]) if known else ("", [])
+    geometry = [kind.split("_", 1)[1] for kind in damaged if kind.startswith(("StepShape_", "StepGeom_"))]
+    if geometry:
+        problems.append(f"{len(geometry)} damaged entities, first {geometry[0]}: bodies may be missing")
     if len(sizes) > 1:
         unit = " and ".join(f"{size:.10g} mm" for size in sizes)
         if units:
@@ -40,7 +45,6 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     declared = sizes[0] if sizes else 1.0  # the kernel's own guess
     taken = UNITS_MM[units] if units else declared
     reader.SetSystemLengthUnit(declared / taken)
-    problems += _damaged(reader, entities)
     reader.TransferRoots()
     names = _Names(reader, entities)
     problems += _lost(reader, entities, names)
@@ -75,17 +79,23 @@ def _units(reader: Any, entities: list[Any]) -> tuple[str, list[float]]:
 
 
 def _damaged(reader: Any, entities: list[Any]) -> list[str]:
-    """Say which geometry the kernel cannot make sense of: it leaves it out, with the whole solid around it."""
+    """Return the kinds of the entities that the kernel cannot make sense of.
+
+    It leaves geometry out, with the whole solid around it, and takes a damaged unit for another.
+    """
+    from OCP.StepBasic import StepBasic_SiUnitAndLengthUnit, StepBasic_SiUnitName
+
+    metre = StepBasic_SiUnitName.StepBasic_sunMetre
+    lengths = [one for one in entities if isinstance(one, StepBasic_SiUnitAndLengthUnit)]
+    found = ["StepBasic_SiUnitAndLengthUnit" for one in lengths if one.Name() != metre]
     checks = reader.WS().ModelCheckList(False)
     checks.Start()
-    found = []
     while checks.More():
         number = checks.Number()
-        kind = type(entities[number - 1]).__name__ if 0 < number <= len(entities) else ""
-        if checks.Value().NbFails() and kind.startswith(("StepShape_", "StepGeom_")):
-            found.append(kind.split("_", 1)[1])
+        if checks.Value().NbFails() and 0 < number <= len(entities):
+            found.append(type(entities[number - 1]).__name__)
         checks.Next()
-    return [f"{len(found)} damaged entities, first {found[0]}: bodies may be missing"] if found else []
+    return found
 
 
 def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
