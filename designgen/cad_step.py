@@ -42,9 +42,11 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
         unit = " and ".join(f"{size:.10g} mm" for size in sizes)
         if units:
             raise UsageError(f"--units: {path} has numbers in several units ({unit}); leave --units out")
-    declared = sizes[0] if sizes else 1.0  # the kernel's own guess
+    declared = sizes[0] if sizes else 1.0
     taken = UNITS_MM[units] if units else declared
-    reader.SetSystemLengthUnit(declared / taken)
+    if sizes:
+        reader.SetSystemLengthUnit(declared / taken)
+    scale = 1.0 if sizes else taken  # without a unit, the kernel takes the numbers as they are
     reader.TransferRoots()
     names = _Names(reader, entities)
     problems += _lost(reader, entities, names)
@@ -52,7 +54,7 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     if reader.NbShapes():
         stem = re.sub(r"\.\w+$", "", os.path.basename(path))
         for number, (shape, solid) in enumerate(_pieces(reader.OneShape())):
-            body = _body(path, names.of(shape) or f"{stem}-{number + 1}", shape, solid=solid)
+            body = _body(path, names.of(shape) or f"{stem}-{number + 1}", shape, scale, solid=solid)
             if isinstance(body, Body):
                 bodies.append(body)
             else:
@@ -145,8 +147,8 @@ def _pieces(shape: Any) -> Iterator[tuple[Any, bool]]:
         yield loose, False
 
 
-def _body(path: str, name: str, shape: Any, *, solid: bool) -> Body | str:
-    """Return a shape as a body, or what is wrong with it."""
+def _body(path: str, name: str, shape: Any, scale: float, *, solid: bool) -> Body | str:
+    """Return a shape, ``scale`` mm its unit, as a body, or what is wrong with it."""
     from OCP.Bnd import Bnd_Box
     from OCP.BRepBndLib import BRepBndLib
     from OCP.BRepGProp import BRepGProp
@@ -158,9 +160,9 @@ def _body(path: str, name: str, shape: Any, *, solid: bool) -> Body | str:
         return f"{name!r} is empty and left out"
     if not np.isfinite(box.SquareExtent()):
         return f"{name!r} has a face without bounds and is left out"
-    size = float(np.sqrt(box.SquareExtent()))
+    size = scale * float(np.sqrt(box.SquareExtent()))
     deviation = finest_mm(
-        path, name, size, MOST_TRIANGLES, lambda mm: mesh.mesh_faces(shape, mm, large=size > LARGE_MM)
+        path, name, size, MOST_TRIANGLES, lambda mm: mesh.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
     )
     volumes, areas = GProp_GProps(), GProp_GProps()
     BRepGProp.VolumeProperties_s(shape, volumes)
@@ -169,11 +171,14 @@ def _body(path: str, name: str, shape: Any, *, solid: bool) -> Body | str:
         vertices, faces, measured = mesh.facets(shape)
     except ValueError:
         return f"{name!r} has faces that cannot be meshed and is left out"
-    numbers = np.array([volumes.Mass(), areas.Mass(), measured])
+    vertices = scale * vertices
+    numbers = np.array([volumes.Mass(), areas.Mass(), measured]) * [scale**3, scale**2, scale]
     if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(numbers).all():
         return f"{name!r} has no extent and is left out"
     volume = float(numbers[0]) if solid else float("nan")
-    return Body(name, solid, is_closed(faces), vertices, faces, volume, float(numbers[1]), max(deviation, measured))
+    return Body(
+        name, solid, is_closed(faces), vertices, faces, volume, float(numbers[1]), max(deviation, float(numbers[2]))
+    )
 
 
 class _Names:
