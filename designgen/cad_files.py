@@ -10,55 +10,37 @@ import json
 import os
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
-from collections.abc import Mapping
-from dataclasses import dataclass
+import unicodedata
+from collections.abc import Mapping, Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from designgen import mesh
+from designgen.cad_reading import UNITS_MM, Body, CadFile, escape, received
 from designgen.scan_files import write_mesh
-from processor.model import Floats, InputError, Ints, UsageError
+from processor import store
+from processor.model import InputError, UsageError
 
 if TYPE_CHECKING:
     import cadquery as cq
 
-TESSELLATION_MM = 0.05
+__all__ = ["Body", "CadFile", "import_file", "read", "summary", "unit_mm", "write_design", "write_step"]
+
 STEP_SUFFIXES, IFC_SUFFIXES = (".step", ".stp"), (".ifc",)
-UNITS_MM = {
-    "millimetre": 1.0, "mm": 1.0, "centimetre": 10.0, "cm": 10.0, "decimetre": 100.0, "metre": 1000.0, "m": 1000.0,
-    "kilometre": 1e6, "micrometre": 1e-3, "inch": 25.4, "in": 25.4, "foot": 304.8, "ft": 304.8, "yard": 914.4,
-}  # fmt: skip
+MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"
+LIMIT_S = 600.0  # for reading a file
+MEMORY_BYTES = 8 * 10**9  # for reading a file, where the platform can limit it
+CHILD = (
+    "import json, sys; job = json.loads(sys.stdin.buffer.readline()); sys.path[:] = job['sys_path']; "
+    "from designgen import cad_reading; cad_reading.serve(job)"
+)
+FILE_NAME_BYTES = 200
+WRITTEN = "1970-01-01T00:00:00"  # for every file, so that the same design makes the same bytes
 
-
-@dataclass(frozen=True)
-class Body:
-    """A solid of a CAD file, or a surface without a volume: vertices (v, 3) and triangles (f, 3), mm."""
-
-    name: str
-    solid: bool
-    vertices: Floats
-    faces: Ints
-    volume_mm3: float
-    area_mm2: float
-
-    @property
-    def size_mm(self) -> Floats:
-        """Sizes (3,) of the box around it."""
-        found: Floats = np.ptp(self.vertices, axis=0)
-        return found
-
-
-@dataclass(frozen=True)
-class CadFile:
-    """The unit that a file says, what that is in mm, and its bodies."""
-
-    unit: str
-    unit_mm: float
-    bodies: tuple[Body, ...]
+# --- in --------------------------------------------------------------------------------------------------------------
 
 
 def unit_mm(name: str) -> float:
@@ -68,129 +50,78 @@ def unit_mm(name: str) -> float:
     return UNITS_MM[name.lower()]
 
 
-def read(path: Path, units: str = "") -> CadFile:
+def read(path: Path, units: str = "", *, limit_s: float = LIMIT_S, memory_bytes: int = MEMORY_BYTES) -> CadFile:
     """Read a STEP or IFC file; ``units`` are those of its numbers, whatever it says itself.
 
-    Raises InputError for a file that cannot be read, of another kind, or without geometry.
+    A process of its own reads it, within ``limit_s`` seconds and ``memory_bytes`` of memory. Raises InputError for a
+    file that cannot be read so, is of another kind, cut off, damaged, or without geometry, UsageError for unknown units
+    and where IFC's library is missing.
     """
+    return _read(path, _content(path), units, limit_s, memory_bytes)
+
+
+def _content(path: Path) -> bytes:
+    """Return a file's bytes, if they are what its name says and end as they should."""
     suffix = path.suffix.lower()
     if suffix not in STEP_SUFFIXES + IFC_SUFFIXES:
         raise InputError(f"{path}: expected a CAD file (.step, .stp, .ifc), found {suffix or 'no suffix'}")
     try:
-        with path.open("rb") as file:
-            head = file.read(4096)
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: expected a CAD file, found a folder or device")
+        content = path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if not head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith(b"ISO-10303-21"):
+    if not content[:4096].lstrip(b"\xef\xbb\xbf \r\n\t").startswith(MAGIC):
         raise InputError(
             f"{path}: expected a STEP or IFC text file (ISO-10303-21), found another kind; export it again"
         )
-    asked = unit_mm(units) if units else None
-    found = _read_step(path) if suffix in STEP_SUFFIXES else _read_ifc(path)
-    if not found.bodies:
-        raise InputError(f"{path}: holds no geometry; export it with solids or surfaces")
-    if asked is None:
-        return found
-    factor = asked / found.unit_mm
-    scaled = tuple(
-        Body(b.name, b.solid, b.vertices * factor, b.faces, b.volume_mm3 * factor**3, b.area_mm2 * factor**2)
-        for b in found.bodies
-    )
-    return CadFile(units, asked, scaled)
+    schema = re.search(rb"FILE_SCHEMA\s*\(\s*\(\s*'([\w ]*)", content[:65536])
+    if schema and schema[1].upper().startswith(b"IFC") != (suffix in IFC_SUFFIXES):
+        article = "a STEP" if suffix in IFC_SUFFIXES else "an IFC"
+        raise InputError(f"{path}: by its schema {schema[1].decode()} it is {article} file; give it the ending of one")
+    # Without its end, the kernels take what is there for all there is.
+    if content.rfind(END) < 0:
+        raise InputError(f"{path}: is cut off: its last line, {END.decode()}, is missing; copy or export it again")
+    return content
 
 
-def _read_step(path: Path) -> CadFile:
-    import cadquery as cq
-    from OCP.IFSelect import IFSelect_RetDone
-    from OCP.Message import Message, Message_Gravity
-    from OCP.STEPControl import STEPControl_Reader
-    from OCP.TColStd import TColStd_SequenceOfAsciiString
-
-    for printer in Message.DefaultMessenger_s().Printers():
-        printer.SetTraceLevel(Message_Gravity.Message_Fail)
-    reader = STEPControl_Reader()
-    if reader.ReadFile(str(path)) != IFSelect_RetDone:
-        raise InputError(f"{path}: not a readable STEP file: it is cut off or damaged; copy or export it again")
-    lengths, angles, solid_angles = (TColStd_SequenceOfAsciiString() for _ in range(3))
-    reader.FileUnits(lengths, angles, solid_angles)
-    unit = lengths.Value(1).ToCString().lower() if lengths.Length() else ""
-    if unit not in UNITS_MM:
-        raise InputError(f"{path}: says no unit of length that is known ({unit or 'none'}); name it with --units")
-    reader.TransferRoots()
-    if not reader.NbShapes():
-        return CadFile(unit, UNITS_MM[unit], ())
-    shape = cq.Shape.cast(reader.OneShape())
-    solids = shape.Solids()
-    inside = {face.hashCode() for solid in solids for face in solid.Faces()}
-    shells = [shell for shell in shape.Shells() if not any(face.hashCode() in inside for face in shell.Faces())]
-    bodies = [_body(path, reader, one, number, solid=True) for number, one in enumerate(solids)]
-    bodies += [_body(path, reader, one, len(solids) + i, solid=False) for i, one in enumerate(shells)]
-    return CadFile(unit, UNITS_MM[unit], tuple(bodies))
-
-
-def _body(path: Path, reader: Any, shape: cq.Shape, number: int, *, solid: bool) -> Body:
-    vertices, faces = mesh.triangulate(shape, TESSELLATION_MM)
-    volume = float(shape.Volume()) if solid else float("nan")
-    return Body(
-        _name(reader, shape) or f"{path.stem}-{number + 1}", solid, vertices, faces, volume, float(shape.Area())
-    )
-
-
-def _name(reader: Any, shape: cq.Shape) -> str:
-    """Return the name that the file gives a shape, where it does."""
-    from OCP.StepRepr import StepRepr_RepresentationItem
-
-    entity = reader.WS().TransferReader().EntityFromShapeResult(shape.wrapped, 1)
-    if not isinstance(entity, StepRepr_RepresentationItem) or entity.Name() is None:
-        return ""
-    name = str(entity.Name().ToCString())
-    return re.sub(
-        r"\\X2\\([0-9A-F]+)\\X0\\", lambda m: bytes.fromhex(m[1]).decode("utf-16-be", "replace"), name
-    ).strip()
-
-
-def _read_ifc(path: Path) -> CadFile:
-    try:
-        import ifcopenshell
-        import ifcopenshell.geom
-        import ifcopenshell.util.unit
-    except ImportError:
-        raise UsageError("IFC files need the extra 'ifc': pip install 'steel-scan-check[ifc]'") from None
-    try:
-        model = ifcopenshell.open(str(path))
-        if not isinstance(model, ifcopenshell.file) or not model.by_type("IfcProject"):
-            raise ValueError("it has no project")
-        scale = 1000.0 * float(ifcopenshell.util.unit.calculate_unit_scale(model))
-    except Exception as error:
-        said = (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
-        raise InputError(f"{path}: not a readable IFC file: {said}; copy or export it again") from None
-    names = [name for name, size in UNITS_MM.items() if abs(size / scale - 1.0) < 1e-6 and len(name) > 2]
-    settings = ifcopenshell.geom.settings()
-    settings.set("use-world-coords", True)
-    settings.set("weld-vertices", True)
-    bodies = []
-    for product in model.by_type("IfcProduct"):
-        if product.Representation is None:
-            continue
+def _read(path: Path, content: bytes, units: str, limit_s: float, memory_bytes: int) -> CadFile:
+    if units:
+        unit_mm(units)
+    job: dict[str, Any] = {"path": str(path), "suffix": path.suffix.lower(), "units": units.lower()}
+    job |= {"sys_path": sys.path, "limit_s": limit_s, "memory_bytes": memory_bytes}
+    # Damaged files can end the process at once, and the kernels print what they like.
+    with tempfile.TemporaryFile() as question, tempfile.TemporaryFile() as answer:
+        question.write(json.dumps(job).encode("ascii") + b"\n" + content)
+        question.seek(0)
         try:
-            shape: Any = ifcopenshell.geom.create_shape(settings, product)
-        except RuntimeError:  # axes, grids, annotations: there is nothing to see of them
-            continue
-        vertices = np.array(shape.geometry.verts, np.float64).reshape(-1, 3) * 1000.0  # the library gives metres
-        faces = np.array(shape.geometry.faces, np.int64).reshape(-1, 3)
-        if len(faces):
-            bodies.append(_ifc_body(product.Name or product.is_a(), vertices, faces))
-    return CadFile(names[0] if names else f"{scale:g} mm", scale, tuple(bodies))
-
-
-def _ifc_body(name: str, vertices: Floats, faces: Ints) -> Body:
-    import trimesh
-
-    shape = trimesh.Trimesh(vertices, faces, process=False)
-    shape.merge_vertices()
-    closed = bool(shape.is_watertight)
-    volume = abs(float(shape.volume)) if closed else float("nan")
-    return Body(name, closed, np.array(shape.vertices), np.array(shape.faces, np.int64), volume, float(shape.area))
+            done = subprocess.run(
+                [sys.executable, "-I", "-c", CHILD],
+                stdin=question,
+                stdout=answer,
+                stderr=subprocess.DEVNULL,
+                timeout=limit_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            raise InputError(
+                f"{path}: the CAD kernel did not read it within {limit_s:g} s; export it in parts, or again"
+            ) from None
+        if done.returncode:
+            why = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+            raise InputError(
+                f"{path}: reading it ended the CAD kernel ({why}): it is damaged, or takes more than "
+                f"{memory_bytes / 1e9:g} GB of memory; export it again, or in parts"
+            )
+        answer.seek(0)
+        try:
+            found = received(answer)
+        except (ValueError, KeyError, TypeError, EOFError, MemoryError):
+            raise InputError(f"{path}: the CAD kernel made nonsense of it: it is damaged; export it again") from None
+    if not found.bodies:
+        why = f" ({found.problems[0]})" if found.problems else ""
+        raise InputError(f"{path}: holds no geometry{why}; export it with solids or surfaces")
+    return found
 
 
 def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
@@ -200,71 +131,124 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder}: exists and is not empty; name a new folder")
-    found = read(path, units)
+    content = _content(path)
+    found = _read(path, content, units, LIMIT_S, MEMORY_BYTES)
+    said: dict[str, Any] = {
+        "file": path.name,
+        "sha256": sha256(content).hexdigest(),
+        "unit": found.unit,
+        "unit_mm": found.unit_mm,
+        "unit_from": "asked for by --units" if units else "said by the file",
+        "unit_said": found.unit_said or None,
+        "bodies": [],
+        "problems": list(found.problems),
+    }
     folder.parent.mkdir(parents=True, exist_ok=True)
     making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        listed, taken = [], set[str]()
+        taken = set[str]()
         for body in found.bodies:
-            stem = re.sub(r"[^\w.-]+", "_", body.name).strip("._")[:100] or "body"
-            name = next(n for n in (stem, *(f"{stem}-{i}" for i in range(2, 10**6))) if n.lower() not in taken)
-            taken.add(name.lower())
-            write_mesh(making / f"{name}.ply", body.vertices, body.faces)
-            listed.append(
+            file = f"{_file_stem(body.name, taken)}.ply"
+            write_mesh(making / file, body.vertices, body.faces)
+            said["bodies"].append(
                 {
                     "name": body.name,
-                    "mesh": f"{name}.ply",
+                    "mesh": file,
                     "kind": "solid" if body.solid else "surface",
+                    "closed": body.closed,
                     "size_mm": body.size_mm.tolist(),
                     "volume_mm3": body.volume_mm3 if body.solid else None,
                     "area_mm2": body.area_mm2,
                     "triangles": len(body.faces),
+                    "deviation_mm": body.deviation_mm,
                 }
             )
-        said = {
-            "file": path.name,
-            "sha256": sha256(path.read_bytes()).hexdigest(),
-            "unit": found.unit,
-            "unit_mm": found.unit_mm,
-            "unit_from": "asked for by --units" if units else "said by the file",
-            "bodies": listed,
-        }
-        text = json.dumps(said, indent=1, ensure_ascii=False) + "\n"
+        text = json.dumps(said, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         (making / "import.json").write_text(text, encoding="utf-8")
+        for one in (*making.iterdir(), making):
+            _sync(one)
         if folder.exists():
             folder.rmdir()
         os.chmod(making, 0o755)
         os.replace(making, folder)
+        _sync(folder.parent)
     except BaseException:
         shutil.rmtree(making, ignore_errors=True)
         raise
     return said
 
 
+def summary(said: Mapping[str, Any]) -> list[str]:
+    """Return lines that say what :func:`import_file` found: the unit, then a line a body."""
+    other = f"; the file says {said['unit_said'] or 'none'}" if said["unit_said"] != said["unit"] else ""
+    lines = [f"{said['file']}: unit {said['unit']} ({said['unit_mm']:.10g} mm, {said['unit_from']}{other})"]
+    for body in said["bodies"]:
+        x, y, z = body["size_mm"]
+        volume = f"{body['volume_mm3']:.6g} mm3" if body["kind"] == "solid" else "no volume: a surface"
+        unclosed = ", not closed" if body["kind"] == "solid" and not body["closed"] else ""
+        lines.append(f"  {body['mesh']}: {x:.3f} x {y:.3f} x {z:.3f} mm, {volume}{unclosed}")
+    return lines
+
+
+def _file_stem(name: str, taken: set[str]) -> str:
+    """Return a name for a file that is safe, not too long, and not taken on disks that ignore case either."""
+    plain = re.sub(r"[^\w.-]+", "_", unicodedata.normalize("NFC", name)).strip("._")
+    plain = plain.encode()[:FILE_NAME_BYTES].decode(errors="ignore") or "body"
+    stems = itertools.chain([plain], (f"{plain}-{i}" for i in itertools.count(2)))
+    stem = next(stem for stem in stems if stem.casefold() not in taken)
+    taken.add(stem.casefold())
+    return stem
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
 # --- out -------------------------------------------------------------------------------------------------------------
 
 
-def write_step(path: Path, shapes: Mapping[str, cq.Shape]) -> None:
-    """Write shapes with their names as one STEP file (AP214, mm); the same shapes make the same bytes."""
+def write_step(path: Path, shapes: Mapping[str, cq.Shape], origin_mm: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+    """Write shapes with their names as one STEP file (AP214, mm); the same shapes make the same bytes.
+
+    ``origin_mm`` is where the shapes' own origin comes to lie. Raises InputError where the file cannot be written.
+    """
     import cadquery as cq
 
     assembly = cq.Assembly(name="assembly")
-    for name, shape in shapes.items():
-        assembly.add(shape, name=name)
-    assembly.export(str(path), exportType="STEP")
-    text = path.read_text("utf-8", errors="surrogateescape")
-    # The kernel writes when and into which file it wrote.
-    text = re.sub(
-        r"FILE_NAME\([^;]*?\);", f"FILE_NAME('{path.stem}','',(''),(''),'','','');", text, count=1, flags=re.S
-    )
-    # ... and counts the parts of assemblies on through all files of a run.
-    numbers = itertools.count(1)
-    text = re.sub(r"(NEXT_ASSEMBLY_USAGE_OCCURRENCE\(')\d+'", lambda m: f"{m[1]}{next(numbers)}'", text)
-    path.write_text(text, "utf-8", errors="surrogateescape")
+    there = cq.Location(cq.Vector(*map(float, origin_mm)))
+    # The kernel takes the bytes of a name for letters, so names are put into the text afterwards.
+    places = {f"name-{number:06d}-of-shape": name for number, name in enumerate(shapes)}
+    for place, shape in zip(places, shapes.values(), strict=True):
+        assembly.add(shape, name=place, loc=there)
+    with store.replacing(path) as temporary:
+        assembly.export(str(temporary), exportType="STEP")
+        text = temporary.read_text("ascii")
+        # The kernel writes when and into which file it wrote.
+        header = f"FILE_NAME('{_quoted(path.stem)}','{WRITTEN}',(''),(''),'','','');\n"
+        text = re.sub(r"FILE_NAME\(.*?\);\s*(?=FILE_SCHEMA)", lambda _: header, text, count=1, flags=re.S)
+        # ... and counts the parts of assemblies on through all files of a run, and breaks lines by the number's length.
+        numbers = itertools.count(1)
+        text = re.sub(
+            r"(NEXT_ASSEMBLY_USAGE_OCCURRENCE\(')\d+([^;]*;)",
+            lambda m: m[1] + str(next(numbers)) + re.sub(r"\s*\n\s*", "", m[2]),
+            text,
+        )
+        text = re.sub(r"'(name-\d{6}-of-shape)'", lambda m: f"'{_quoted(places[m[1]])}'", text)
+        temporary.write_text(text, "ascii")
+
+
+def _quoted(name: str) -> str:
+    """Return a name as it stands between the quotes of a STEP file."""
+    plain = "".join(c if c.isprintable() else " " for c in name)
+    return escape(plain.replace("\\", "\\\\").replace("'", "''"))
 
 
 def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Write the solids of a recipe's design as STEP, an arch part a file; returns the files.
+    """Write the solids of a recipe's design as STEP, an arch part a file, where the scene has them; returns the files.
 
     Raises UsageError for what is no recipe of a design.
     """
@@ -282,12 +266,13 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
         return written
     if kind == "space-frame":
         path = folder / "frame.step"
-        write_step(path, {"frame": space_frame.solid(space_frame.build(filled(space_frame.Params, recipe, "frame")))})
-        return [path]
-    if kind == "structure":
+        shapes = {"frame": space_frame.solid(space_frame.build(filled(space_frame.Params, recipe, "frame")))}
+    elif kind == "structure":
         from designgen.designs import structure
 
         path = folder / "structure.step"
-        write_step(path, {one.name: structure.solid([one]) for one in structure_design(recipe)})
-        return [path]
-    raise UsageError("--step: the scene does not say by which recipe it was made, so its solids are not known")
+        shapes = {one.name: structure.solid([one]) for one in structure_design(recipe)}
+    else:
+        raise UsageError("--step: the scene does not say by which recipe it was made, so its solids are not known")
+    write_step(path, shapes, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))
+    return [path]

@@ -115,16 +115,19 @@ def export(scene: Path, output: Path, format_: str, without_truth: bool, spheric
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="folder to make")
 @click.option("--units", default="", help="of the file's numbers, whatever the file says: mm, m, inch, ...")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-def import_(file: Path, output: Path, units: str, as_json: bool) -> None:
-    """Turn a STEP or IFC FILE into meshes in mm, one a body, with their sizes in import.json."""
+@click.pass_context
+def import_(context: click.Context, file: Path, output: Path, units: str, as_json: bool) -> None:
+    """Turn a STEP or IFC FILE into meshes in mm, one a body, with their sizes in import.json.
+
+    Exit codes: 0 done, 1 some bodies could not be taken (they are listed), 2 wrong usage, 3 bad input.
+    """
     from designgen import cad_files
 
     said = cad_files.import_file(file, output, units)
     if as_json:
         click.echo(json.dumps(said, ensure_ascii=False))
-        return
-    click.echo(f"{file}: unit {said['unit']} ({said['unit_mm']:g} mm, {said['unit_from']})")
-    for body in said["bodies"]:
-        x, y, z = body["size_mm"]
-        volume = f"{body['volume_mm3']:.6g} mm3" if body["volume_mm3"] is not None else "no volume: a surface"
-        click.echo(f"  {body['mesh']}: {x:.3f} x {y:.3f} x {z:.3f} mm, {volume}")
+    else:
+        click.echo("\n".join(cad_files.summary(said)))
+    for problem in said["problems"]:
+        click.echo(f"{file}: {problem}", err=True)
+    context.exit(IN_PART if said["problems"] else DONE)

@@ -1,18 +1,24 @@
 """CAD files in and out: units said by the file, sizes worked by hand, bad files refused with a reason."""
 
 import json
+import random
+import re
 import subprocess
 import sys
+import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cadquery as cq
 import ifcopenshell
 import ifcopenshell.api.aggregate
 import ifcopenshell.api.context
+import ifcopenshell.api.feature
 import ifcopenshell.api.geometry
 import ifcopenshell.api.project
 import ifcopenshell.api.root
 import ifcopenshell.api.unit
+import numpy as np
 import pytest
 import trimesh
 
@@ -63,8 +69,8 @@ def test_surfaces_without_a_solid_are_said_to_be_such(tmp_path):
     assert said["bodies"][0]["volume_mm3"] is None
 
 
-def wall(path, prefix, sizes):
-    """An IFC file with one extruded wall of ``sizes`` in the file's unit."""
+def wall(path, prefix, sizes, more=None):
+    """An IFC file with one extruded wall of ``sizes`` in the file's unit; ``more`` adds to its model."""
     model = ifcopenshell.api.project.create_file(version="IFC4")
     project = ifcopenshell.api.root.create_entity(model, ifc_class="IfcProject", name="p")
     length = ifcopenshell.api.unit.add_si_unit(model, unit_type="LENGTHUNIT", prefix=prefix)
@@ -84,6 +90,8 @@ def wall(path, prefix, sizes):
     shape = model.create_entity("IfcShapeRepresentation", body, "Body", "SweptSolid", [solid])
     ifcopenshell.api.geometry.assign_representation(model, product=made, representation=shape)
     assert project
+    if more is not None:
+        more(model, made, representation=shape)
     model.write(str(path))
 
 
@@ -114,6 +122,7 @@ def test_bad_files_are_refused(box, tmp_path):
         ("other.step", b"solid x\nendsolid x\n", "found another kind"),
         ("empty.stp", b"", "found another kind"),
         ("a.dwg", b"AC1027", "expected a CAD file"),
+        ("end.step", content.rstrip()[: -len("END-ISO-10303-21;")], "is cut off"),
         ("broken.ifc", b"ISO-10303-21;\nHEADER;\nENDSEC;\nDATA;\n#1=", r"broken\.ifc"),
         ("none.step", content.split(b"DATA;")[0] + b"DATA;\nENDSEC;\nEND-ISO-10303-21;\n", r"none\.step"),
     ]:
@@ -173,3 +182,237 @@ def test_names_make_safe_and_different_files(tmp_path):
     assert {p.name.lower() for p in (tmp_path / "out").iterdir()} == files | {"import.json"}
     with pytest.raises(UsageError, match="not empty"):
         cad_files.import_file(tmp_path / "n.step", tmp_path / "out")
+
+
+# --- what the file says ----------------------------------------------------------------------------------------------
+
+
+def test_a_file_without_a_known_unit_needs_one(box, tmp_path):
+    text = box.read_text()
+    path = tmp_path / "unknown.step"
+    # None at all; a prefix and a name that do not exist, which the kernel would take for metres.
+    for wrong in (
+        text.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT(.MILKI.,.METRE.)"),
+        text.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT(.MILLI.,.GRAM.)"),
+        re.sub(r"(GLOBAL_UNIT_ASSIGNED_CONTEXT\s*\(\s*\()#\d+,", r"\1", text),
+    ):
+        path.write_text(wrong)
+        with pytest.raises(InputError, match=r"no unit of length that is known; name it with --units"):
+            cad_files.read(path)
+        found = cad_files.read(path, "inch")
+        assert (found.unit, found.unit_mm, found.unit_said) == ("inch", 25.4, "")
+        assert found.bodies[0].size_mm == pytest.approx([2540.0, 5080.0, 7620.0])
+    said = cad_files.import_file(box, tmp_path / "out", "inch")
+    line = f"{box.name}: unit inch (25.4 mm, asked for by --units; the file says millimetre)"
+    assert cad_files.summary(said)[0] == line
+    wall(tmp_path / "wall.ifc", "MILLI", (4000, 200, 2700))
+    nowhere = re.sub(r"\n#\d+=\s?IFCUNITASSIGNMENT\([^;]*;", "", (tmp_path / "wall.ifc").read_text())
+    nowhere = re.sub(r"(IFCPROJECT\([^;]*),#\d+\);", r"\1,$);", nowhere)
+    (tmp_path / "none.ifc").write_text(nowhere)
+    with pytest.raises(InputError, match="name it with --units"):
+        cad_files.read(tmp_path / "none.ifc")
+    assert cad_files.read(tmp_path / "none.ifc", "cm").bodies[0].size_mm == pytest.approx([40000.0, 2000.0, 27000.0])
+
+
+def test_inches_go_by_their_factor(box, tmp_path):
+    text, inch = box.read_text(), tmp_path / "inch.step"
+    numbers = re.findall(r"#(\d+) = \( LENGTH_UNIT\(\) NAMED_UNIT\(\*\) SI_UNIT\(.MILLI.,.METRE.\) \);", text)
+    for at, number in enumerate(numbers):
+        made = (
+            f"#{number} = ( CONVERSION_BASED_UNIT('INCH',#900{at}1) LENGTH_UNIT() NAMED_UNIT(#900{at}2) );\n"
+            f"#900{at}1 = LENGTH_MEASURE_WITH_UNIT(LENGTH_MEASURE(25.4),#900{at}3);\n"
+            f"#900{at}2 = DIMENSIONAL_EXPONENTS(1.,0.,0.,0.,0.,0.,0.);\n"
+            f"#900{at}3 = ( LENGTH_UNIT() NAMED_UNIT(*) SI_UNIT(.MILLI.,.METRE.) );"
+        )
+        text = re.sub(rf"#{number} = [^;]*;", made, text)
+    inch.write_text(text)
+    found = cad_files.read(inch)
+    assert (found.unit, found.unit_mm, found.problems) == ("inch", pytest.approx(25.4), ())
+    assert found.bodies[0].size_mm == pytest.approx([2540.0, 5080.0, 7620.0])
+
+
+def test_names_are_escaped_when_written_and_read_however_written(tmp_path):
+    path = tmp_path / "n.step"
+    cad_files.write_step(path, {"梁 'A'": cq.Solid.makeBox(1, 1, 1), "\U00020000\\x": cq.Solid.makeBox(2, 2, 2)})
+    content = path.read_bytes()
+    assert rb"\X2\6881\X0\ ''A''" in content
+    assert rb"\X4\00020000\X0\\\x" in content
+    assert [body.name for body in cad_files.read(path).bodies] == ["梁 'A'", "\U00020000\\x"]
+    for coding in ("utf-8", "gb18030"):
+        path.write_bytes(content.replace(rb"\X2\6881\X0" b"\\", "钢梁".encode(coding)))
+        assert cad_files.read(path).bodies[0].name == "钢梁 'A'"
+    wall(tmp_path / "w.ifc", None, (4, 0.2, 2.7))
+    escaped = (tmp_path / "w.ifc").read_bytes()
+    assert rb"\X2\5899\X0" in escaped
+    for coding in ("utf-8", "gb18030"):
+        (tmp_path / "w.ifc").write_bytes(escaped.replace(rb"\X2\5899\X0" b"\\", "钢墙".encode(coding)))
+        assert cad_files.read(tmp_path / "w.ifc").bodies[0].name == "钢墙 1"
+
+
+def test_openings_are_cut_and_spaces_are_no_bodies(tmp_path):
+    def more(model, made, representation):
+        item = representation.Items[0]
+        profile = model.create_entity("IfcRectangleProfileDef", ProfileType="AREA", XDim=1000.0, YDim=500.0)
+        hole = model.create_entity("IfcExtrudedAreaSolid", profile, item.Position, item.ExtrudedDirection, 2000.0)
+        shape = model.create_entity(
+            "IfcShapeRepresentation", representation.ContextOfItems, "Body", "SweptSolid", [hole]
+        )
+        for kind in ("IfcOpeningElement", "IfcSpace", "IfcVirtualElement"):
+            one = ifcopenshell.api.root.create_entity(model, ifc_class=kind, name=kind)
+            ifcopenshell.api.geometry.assign_representation(model, product=one, representation=shape)
+            if kind == "IfcOpeningElement":
+                ifcopenshell.api.feature.add_feature(model, feature=one, element=made)
+
+    wall(tmp_path / "w.ifc", "MILLI", (4000, 200, 2700), more)
+    found = cad_files.read(tmp_path / "w.ifc")
+    (body,) = found.bodies
+    assert (body.name, body.closed, found.problems) == ("墙 1", True, ())
+    assert body.volume_mm3 == pytest.approx(200.0 * (4000.0 * 2700.0 - 1000.0 * 2000.0))
+
+
+def test_round_walls_in_ifc_keep_the_deviation(tmp_path):
+    wall(tmp_path / "w.ifc", "MILLI", (4000, 200, 2700))
+    text = (tmp_path / "w.ifc").read_text()
+    round_ = re.sub(r"IFCRECTANGLEPROFILEDEF\(\.AREA\.,\$,\$,[^;]*;", "IFCCIRCLEPROFILEDEF(.AREA.,$,$,500.);", text)
+    (tmp_path / "w.ifc").write_text(round_)
+    (body,) = cad_files.read(tmp_path / "w.ifc").bodies
+    triangles = body.vertices[body.faces]
+    middles = 0.5 * (triangles + np.roll(triangles, 1, axis=1))[np.ptp(triangles[..., 2], axis=1) > 1.0]
+    deepest = 500.0 - np.linalg.norm(middles[..., :2], axis=2).min()
+    assert 0.0 < deepest <= body.deviation_mm <= 0.1
+
+
+# --- what the kernel does --------------------------------------------------------------------------------------------
+
+
+def mutations(content, rng, count):
+    """Damage a file: bytes changed, a stretch of it gone, lines gone; the end stays, without which nothing is read."""
+    for number in range(count):
+        data = bytearray(content)
+        if number % 3 == 0:
+            for _ in range(rng.randint(1, 20)):
+                data[rng.randrange(40, len(data) - 40)] = rng.randrange(256)
+        elif number % 3 == 1:
+            start = rng.randrange(40, len(data) - 40)
+            del data[start : min(start + rng.randint(1, 3000), len(data) - 40)]
+        else:
+            lines = data.splitlines(keepends=True)
+            for _ in range(rng.randint(1, 4)):
+                del lines[rng.randrange(1, len(lines) - 1)]
+            data = bytearray(b"".join(lines))
+        yield bytes(data)
+
+
+def test_damaged_files_end_in_a_result_or_an_input_error(tmp_path, capfd):
+    """Forty files, a process each, two at a time; sixty take longer than a unit test may."""
+    shapes = {"a": cq.Workplane().box(30, 20, 10).edges("|Z").fillet(2).faces(">Z").hole(4).val()}
+    cad_files.write_step(tmp_path / "whole.step", shapes)
+    wall(tmp_path / "whole.ifc", "MILLI", (4000, 200, 2700))
+    rng, files = random.Random(7), []
+    for whole in (tmp_path / "whole.step", tmp_path / "whole.ifc"):
+        for number, data in enumerate(mutations(whole.read_bytes(), rng, 20)):
+            files.append(tmp_path / f"{number}{whole.suffix}")
+            files[-1].write_bytes(data)
+    capfd.readouterr()
+
+    def outcome(path):
+        try:
+            found = cad_files.read(path, limit_s=60.0)
+        except InputError as error:
+            plain = str(path) in str(error) and "\n" not in str(error) and "within" not in str(error)
+            return "refused" if plain else str(error)
+        return "said" if found.problems else "read"
+
+    with ThreadPoolExecutor(2) as pool:
+        outcomes = list(pool.map(outcome, files))
+    assert capfd.readouterr() == ("", "")
+    assert len(outcomes) == 40
+    for kind in (outcomes[:20], outcomes[20:]):
+        assert {"refused", "said"} <= set(kind) <= {"refused", "said", "read"}
+
+
+@pytest.mark.parametrize(
+    ("child", "said"),
+    [
+        ("import os, signal; print('noise'); os.kill(os.getpid(), signal.SIGSEGV)", "signal 11"),
+        ("import sys; print('noise'); print('noise', file=sys.stderr); sys.exit(3)", "exit code 3"),
+        ("print('noise')", "nonsense"),
+        ("print('[1, 2]')", "nonsense"),
+        ('print(\'{"unit": "mm", "unit_mm": 1, "unit_said": "", "problems": [], "bodies": [{}]}\')', "nonsense"),
+        ("import time; time.sleep(60)", "within 0.5 s"),
+    ],
+)
+def test_a_kernel_that_dies_or_hangs_is_one_error(child, said, box, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(cad_files, "CHILD", child)
+    started = time.monotonic()
+    with pytest.raises(InputError, match=rf"box\.step: .*{said}.*again") as caught:
+        cad_files.read(box, limit_s=0.5 if "sleep" in child else 60.0)
+    assert time.monotonic() - started < 30.0
+    assert "\n" not in str(caught.value)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux holds a process to its memory")
+def test_memory_is_limited(box):
+    with pytest.raises(InputError, match=r"box\.step"):
+        cad_files.read(box, memory_bytes=2 * 10**8)
+
+
+def test_what_is_lost_is_said(tmp_path):
+    shapes = {"whole": cq.Solid.makeBox(1, 2, 3), "torn": cq.Solid.makeBox(40, 50, 60)}
+    path = tmp_path / "torn.step"
+    cad_files.write_step(path, shapes)
+    text = path.read_text()
+    assert cad_files.read(path).problems == ()
+    faces = list(re.finditer(r"#\d+ = ADVANCED_FACE\([^;]*;\n", text))
+    assert len(faces) == 12
+    path.write_text(text.replace(faces[-1][0], ""))
+    command = [sys.executable, "-m", "designgen", "import", str(path), "-o", str(tmp_path / "out")]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    said = json.loads((tmp_path / "out/import.json").read_text("utf-8"))
+    assert done.returncode == 1
+    assert done.stdout.splitlines() == cad_files.summary(said)
+    assert done.stderr.splitlines() == [f"{path}: {problem}" for problem in said["problems"]]
+    assert any("did not become one" in problem for problem in said["problems"])
+    assert [body["name"] for body in said["bodies"] if body["kind"] == "solid"] == ["whole"]
+
+
+def test_a_large_sphere_takes_seconds_and_says_its_deviation(tmp_path):
+    radius = 2500.0
+    cad_files.write_step(tmp_path / "s.step", {"tank": cq.Solid.makeSphere(radius, angleDegrees1=-90)})
+    started = time.monotonic()
+    (body,) = cad_files.read(tmp_path / "s.step").bodies
+    assert time.monotonic() - started < 20.0
+    assert len(body.faces) < 2_000_000
+    assert body.closed
+    assert body.volume_mm3 == pytest.approx(4.0 / 3.0 * np.pi * radius**3)
+    depth = radius - np.linalg.norm(body.vertices[body.faces].mean(axis=1), axis=1)
+    assert 0.0 < depth.max() <= body.deviation_mm < 0.2
+
+
+# --- out -------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["plates-defects", "frame-small"])
+def test_georeferenced_designs_lie_where_their_scene_has_them(name, tmp_path):
+    origin, recipe = [5.0e8, 4.3e9, 1.0e5], recipes.load(name)[1]
+    if name == "frame-small":
+        recipe["frame"] |= {"nodes_x": 2, "nodes_y": 2, "layers": 1}
+    corners = []
+    for section in (recipe["scan"], {**recipe["scan"], "origin_mm": origin}):
+        (path,) = cad_files.write_design({**recipe, "scan": section}, tmp_path / name)
+        vertices = np.vstack([body.vertices for body in cad_files.read(path).bodies])
+        corners.append([vertices.min(axis=0), vertices.max(axis=0)])
+    assert np.abs(corners[1] - (np.array(corners[0]) + origin)).max() < 1e-5
+
+
+def test_a_step_file_that_cannot_be_written_leaves_the_old_one(box, monkeypatch):
+    def fails(*_, **__):
+        raise OSError(28, "No space left on device")
+
+    before = box.read_bytes()
+    monkeypatch.setattr(cq.Assembly, "export", fails)
+    with pytest.raises(InputError, match=r"box\.step: cannot be written \(No space"):
+        cad_files.write_step(box, {"b": cq.Solid.makeBox(1.0, 1.0, 1.0)})
+    assert box.read_bytes() == before
+    assert [one.name for one in box.parent.iterdir()] == [box.name]
