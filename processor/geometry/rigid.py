@@ -44,6 +44,17 @@ def rotation_from_vector(w: Floats) -> Floats:
     return R
 
 
+def motion(points: Floats) -> Floats:
+    """Return the derivative (n, 3, 6) of points (n, 3) by a small turn about the origin and a translation."""
+    found = np.zeros((len(points), 3, 6))
+    x, y, z = points.T
+    found[:, 0, 1], found[:, 0, 2] = z, -y
+    found[:, 1, 0], found[:, 1, 2] = -z, x
+    found[:, 2, 0], found[:, 2, 1] = y, -x
+    found[:, :, 3:] = np.eye(3)
+    return found
+
+
 def fit(source: Floats, target: Floats) -> Floats:
     """Rigid T_target_source that minimises the squared distances of paired points (n, 3), n >= 3.
 

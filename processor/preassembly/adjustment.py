@@ -60,8 +60,12 @@ def measure(scan: Scan, index: int, design: ArchDesign, shrink: float) -> Measur
     surface = design_surface.mesh
     fitted = registration.fine(points, surface, design_surface.axes, found.T_surface)
     if not (fitted.used_share > registration.LEAST_SHARE and np.isfinite(fitted.covariance).all()):
-        said = f"only {fitted.used_share:.0%} of the points lie near the design's surface: is this the right part?"
-        return _failed(part, joints, said, shrink)
+        said = f"only {fitted.used_share:.0%} of the points lie near the design's surface"
+        return _failed(part, joints, f"{said}; {_looks_like(points, design, part)}", shrink)
+    if not registration.fits(fitted):
+        said = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface, "
+        said += f"the others typically {fitted.sigma_mm / 1.4826:.0f} mm"
+        return _failed(part, joints, f"{said}; {_looks_like(points, design, part)}", shrink)
     moved = rigid.apply(fitted.T_bridge_scan, points)
     ends: list[joint_ends.JointEnd | None] = []
     said_of: list[str] = [found.message] if found.message else []
@@ -70,17 +74,35 @@ def measure(scan: Scan, index: int, design: ArchDesign, shrink: float) -> Measur
             ends.append(None)
             continue
         corners = design.joint_points[joint]
-        end = joint_ends.fit(moved, surface, features.joint_frame(corners), corners[:4], outward)
+        end = joint_ends.fit(moved, surface, features.joint_frame(corners), corners[:4], outward, fitted.covariance)
         said_of += [f"{design.joint_names[joint]}: {end.trouble}"] if end.trouble else []
         ends.append(end)
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
-    edges = bottom_edges.measure(moved, surface, *lines, fitted.sigma_mm)
+    edges = bottom_edges.measure(moved, surface, *lines, fitted.sigma_mm, fitted.covariance)
     member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
     if fitted.weak:
         said_of.append(f"what the scan shows does not hold {' and '.join(fitted.weak)}")
     weak = bool(fitted.weak) or any(end is not None and end.trouble for end in ends)
     status = "ambiguous" if found.status == "ambiguous" else "weak" if weak else "ok"
     return Measured(part.name, status, "; ".join(said_of), fitted.T_bridge_scan, fitted.covariance, member, shrink)
+
+
+def _looks_like(points: Floats, design: ArchDesign, part: DesignPart) -> str:
+    """Say which part of the design has the size of the scan."""
+    size = _size_of(points)
+    apart = [float(np.abs(_size_of(one.vertices) - size).max()) for one in design.parts]
+    nearest = design.parts[int(np.argmin(apart))]
+    if nearest.name == part.name or min(apart) > 0.5 * apart[design.parts.index(part)]:
+        return "is this the right part, and whole?"
+    return f"by its size it is rather {nearest.name}"
+
+
+def _size_of(points: Floats) -> Floats:
+    """Return the sizes (3,) of points (n, 3) along their principal axes."""
+    middle = points.mean(axis=0)
+    axes = np.linalg.eigh(np.cov((points - middle).T))[1]
+    found: Floats = np.sort(np.ptp((points - middle) @ axes, axis=0))
+    return found
 
 
 def _failed(part: DesignPart, joints: Sequence[int | None], message: str, shrink: float) -> Measured:

@@ -13,7 +13,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
-from processor.geometry import mesh_surface
+from processor.geometry import mesh_surface, rigid
 from processor.geometry.lines import Polyline
 from processor.geometry.mesh_surface import MeshSurface, outermost
 from processor.model import Floats
@@ -37,8 +37,10 @@ class EdgeStations:
     covariance: Floats  # (2, k, k) of departures sideways, and of those up
 
 
-def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polyline, sigma_mm: float) -> EdgeStations:
-    """Measure both edges on points (n, 3), bridge frame, registered to the design."""
+def measure(
+    points: Floats, surface: MeshSurface, left: Polyline, right: Polyline, sigma_mm: float, pose: Floats
+) -> EdgeStations:
+    """Measure both edges on points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6)."""
     sides: list[str] = []
     arcs, places, axes, smoothed = [], [], [], []
     for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
@@ -77,7 +79,9 @@ def measure(points: Floats, surface: MeshSurface, left: Polyline, right: Polylin
         places.append(line.at(arc))
         frame = _frame(line, other, arc, sense)
         axes.append(np.stack([frame[1], frame[2]], axis=1))
-        smoothed.append([smooth(arc, value, variance) for value, variance in found])
+        moves = rigid.motion(line.at(arc))
+        by_pose = [np.einsum("ki,kij->kj", frame[k], moves) for k in (1, 2)]
+        smoothed.append([smooth(arc, *one, moved @ pose @ moved.T) for one, moved in zip(found, by_pose, strict=True)])
     return EdgeStations(
         tuple(sides),
         np.concatenate(arcs),
@@ -92,7 +96,7 @@ def unseen(left: Polyline, right: Polyline) -> EdgeStations:
     """Return the stations of a part of which nothing is known."""
     nothing = np.empty((0, 3))
     mesh = mesh_surface.of_mesh(np.eye(3), np.array([[0, 1, 2]]))
-    return measure(nothing, mesh, left, right, 0.0)
+    return measure(nothing, mesh, left, right, 0.0, np.zeros((6, 6)))
 
 
 def _frame(line: Polyline, other: Polyline, arc: Floats, sense: float) -> tuple[Floats, Floats, Floats]:

@@ -1,8 +1,9 @@
 """A joint end from its surfaces: faces and end ring fitted to their residuals against the design.
 
 In the joint's zone each outer face departs from the design by ``c0 + c1 x + c2 w + c3 x w`` (x along the bridge from
-the joint, w across the face), the ring by ``c0 + c1 u + c2 v``. A corner moves by what its two faces and the ring say;
-the covariance is that of these 19 numbers, so points of one corner are as dependent as they are.
+the joint, w across the face), the ring by ``c0 + c1 u + c2 v`` and what bends it, see
+:mod:`processor.preassembly.end_ring`. A corner moves by what its two faces and the ring say; the covariance is that of
+these 22 numbers, so points of one corner are as dependent as they are.
 """
 
 from __future__ import annotations
@@ -11,10 +12,13 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from scipy.linalg import block_diag
 
 from processor.geometry import rigid
 from processor.geometry.mesh_surface import MeshSurface, outermost
 from processor.model import Floats
+from processor.preassembly import end_ring
+from processor.preassembly.evidence import SIZES_MM, Believed, weigh
 
 Bools = npt.NDArray[np.bool_]
 
@@ -22,6 +26,8 @@ ZONE_MM = 500.0
 ALONG, ACROSS = 0, 1
 FACES = (("bottom", 2, -1.0), ("right", 1, -1.0), ("top", 2, 1.0), ("left", 1, 1.0))  # axis and sense of the normal
 LEAST_POINTS = 60
+# Weights of bends of each size beforehand: ends are cut by a plane.
+STRAIGHT = (1.0, 1.0, 0.3, *(0.03,) * (len(SIZES_MM) - 3))
 FORM_MM = 5.0  # a face may depart from the design by this much more than noise before it is fitted
 FLOOR_MM = 0.004  # of the design's mesh and of rounding: no standard deviation is smaller
 
@@ -41,8 +47,10 @@ def nothing(trouble: str) -> JointEnd:
     return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), float("nan"), trouble)
 
 
-def fit(points: Floats, surface: MeshSurface, T_bridge_joint: Floats, corners: Floats, outward: float) -> JointEnd:
-    """Fit one joint end of points (n, 3), bridge frame, registered to the design.
+def fit(
+    points: Floats, surface: MeshSurface, T_bridge_joint: Floats, corners: Floats, outward: float, pose: Floats
+) -> JointEnd:
+    """Fit one joint end of points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
 
     ``corners`` (4, 3) are the design's P1..P4; ``outward`` is +1 where the part ends at the joint, -1 where it starts.
     """
@@ -77,43 +85,61 @@ def fit(points: Floats, surface: MeshSurface, T_bridge_joint: Floats, corners: F
             return nothing(f"too few points on the {name} face")
         fits.append((coefficients, covariance))
         sums, freedom = sums + float(rest @ rest), freedom + len(rest)
-    own = seen & (np.abs(normal[:, 0]) > 0.9) & (np.abs(x) < max(20.0, 6.0 * noise))
-    own &= _on_ring(local, half, _thickness(surface, T_joint_bridge, half), margin)
-    basis = np.stack([np.ones(own.sum()), local[own, 1] / half[1], local[own, 2] / half[2]], axis=1)
-    out = residual[own] * np.sign(outward * normal[own, 0])
-    coefficients, covariance, rest = _least_squares(basis, out)
-    if not len(coefficients):
+    sigma = float(np.sqrt(sums / max(freedom, 1)))
+    ring = _ring(
+        rigid.apply(T_joint_bridge, points[zone]), fits, half, _thickness(surface, T_joint_bridge, half), outward, sigma
+    )
+    if not len(ring.coefficients):
         return nothing("too few points on the end face")
-    fits.append((coefficients, covariance))
-    moved, derivative = _corners(fits, half, outward)
-    whole = np.zeros((19, 19))
-    for k, (_, block) in enumerate(fits):
-        whole[4 * k : 4 * k + len(block), 4 * k : 4 * k + len(block)] = block
-    covariance = derivative @ whole @ derivative.T + FLOOR_MM**2 * np.eye(24)
-    return JointEnd(moved, covariance, float(np.sqrt(sums / max(freedom, 1))), "")
+    fits.append((ring.coefficients, ring.covariance))
+    number = np.concatenate([coefficients for coefficients, _ in fits])
+    believed = _weighed(
+        number, block_diag(*(block for _, block in fits)), _by_pose(T_bridge_joint, half, outward, pose)
+    )
+    derivative = _corners(half, outward)
+    moved = (derivative @ believed.mean).reshape(8, 3)
+    covariance = derivative @ believed.covariance @ derivative.T + FLOOR_MM**2 * np.eye(24)
+    return JointEnd(moved, covariance, sigma, "")
 
 
 def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Floats:
-    """Return the thickness (2,) of webs and flanges at the joint, as deep as samples of the design's end face lie."""
-    samples = rigid.apply(T_joint_bridge, np.asarray(surface.tree.data))
-    upright = np.abs(surface.normals[surface.sample_face] @ T_joint_bridge[0, :3]) > 0.9
-    depth = half[1:] - np.abs(samples[upright & (np.abs(samples[:, 0]) < 0.5), 1:])
-    on_web = depth[:, 0] < depth[:, 1]
-    return np.array([depth[on_web, 0].max(initial=0.0), depth[~on_web, 1].max(initial=0.0)])
+    """Return the thickness (2,) of webs and flanges at the joint: how deep the facets of the design's end reach."""
+    upright = np.flatnonzero(np.abs(surface.normals @ T_joint_bridge[0, :3]) > 0.9)
+    corners = rigid.apply(T_joint_bridge, surface.vertices[surface.faces[upright]])
+    corners = corners[(np.abs(corners[:, :, 0]) < 0.5).all(axis=1)]
+    depth = half[1:] - np.abs(corners[:, :, 1:])
+    middle = depth.mean(axis=1)
+    on_web = middle[:, 0] < middle[:, 1]
+    return np.array([depth[on_web, :, 0].max(initial=0.0), depth[~on_web, :, 1].max(initial=0.0)])
 
 
-def _on_ring(local: Floats, half: Floats, thickness: Floats, margin: float) -> Bools:
-    """Mark points (n, 3) on the end ring, a margin away from its edges, where points of other faces would mix in."""
-    depth = half[1:] - np.abs(local[:, 1:])
-    on_web = depth[:, 0] < thickness[0] - margin
-    on_flange = depth[:, 1] < thickness[1] - margin
-    marked: Bools = (depth > margin).all(axis=1) & (on_web | on_flange)
-    return marked
+def _ring(
+    local: Floats, fits: list[tuple[Floats, Floats]], half: Floats, thickness: Floats, outward: float, sigma: float
+) -> end_ring.Ring:
+    """Fit the end ring to points (n, 3) of the joint's frame, plate by plate between the corners."""
+    columns = []
+    clear = thickness + end_ring.REACH * sigma + 1.0  # of the corners, where two walls meet
+    for (_, axis, sense), (coefficients, _) in zip(FACES, fits, strict=True):
+        across = 1 if axis == 2 else 2
+        w = local[:, across] / half[across]
+        e = half[axis] + _face_basis(np.zeros(len(w)), w) @ coefficients - sense * local[:, axis]
+        plate = thickness[axis - 1]
+        near = (np.abs(local[:, across]) < half[across] - clear[across - 1]) & (e < plate + 60.0) & (e > -60.0)
+        near &= np.abs(local[:, 0]) < 80.0
+        basis = _ring_basis(local[near, 1] / half[1], local[near, 2] / half[2])
+        columns.append((outward * local[near, 0], e[near], np.full(near.sum(), plate), basis))
+    x, e, plates, basis = (np.concatenate(column) for column in zip(*columns, strict=True))
+    return end_ring.fit(x, e, plates, basis, sigma)
 
 
 def _face_basis(x: Floats, w: Floats) -> Floats:
     scaled = x / ZONE_MM
     return np.stack([np.ones_like(scaled), scaled, w, scaled * w], axis=1)
+
+
+def _ring_basis(u: Floats, v: Floats) -> Floats:
+    one = np.ones_like(u)
+    return np.stack([one, u, v, u * u - one, u * v, v * v - one], axis=1)
 
 
 def _noise(residual: Floats) -> float:
@@ -142,19 +168,56 @@ def _least_squares(basis: Floats, residual: Floats) -> tuple[Floats, Floats, Flo
     return coefficients, variance * np.linalg.inv(normal), rest
 
 
-def _corners(fits: list[tuple[Floats, Floats]], half: Floats, outward: float) -> tuple[Floats, Floats]:
-    """Movements (8, 3) of P1..P8 and their derivative (24, 19) by the coefficients of the four faces and the ring."""
+def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
+    """Weigh the numbers (22,) of an end against an end as designed, which the registration alone moves: ``by_pose``.
+
+    Those of the faces are of one unknown size, those of the ring's plane, and what bends it, of others.
+    """
+    mean, spread = np.zeros(len(number)), np.zeros((len(number),) * 2)
+    faces = [(1.0, np.full(16, size)) for size in SIZES_MM]
+    ring = [
+        (before, np.repeat([plane, bend], 3))
+        for plane in SIZES_MM
+        for bend, before in zip(SIZES_MM, STRAIGHT, strict=True)
+    ]
+    for rows, sizes in ((slice(0, 16), faces), (slice(16, 22), ring)):
+        noise = covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
+        found = weigh(number[rows], noise, [(before, by_pose[rows, rows] + np.diag(size**2)) for before, size in sizes])
+        mean[rows], spread[rows, rows] = found.mean, found.covariance
+    return Believed(mean, spread)
+
+
+def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats) -> Floats:
+    """Covariance (22, 22) of an end's numbers by that of the part's registration, (6, 6) about the bridge's origin."""
+    rows = []
+    x, w = (a.ravel() for a in np.meshgrid([0.0, -outward * ZONE_MM], [-1.0, 1.0]))
+    for _, axis, sense in FACES:
+        local = np.zeros((4, 3))
+        local[:, 0], local[:, axis], local[:, 3 - axis] = x, sense * half[axis], w * half[3 - axis]
+        field = sense * np.einsum(
+            "i,nij->nj", T_bridge_joint[:3, axis], rigid.motion(rigid.apply(T_bridge_joint, local))
+        )
+        rows.append(np.linalg.solve(_face_basis(x, w), field))
+    u, v = np.array([1.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+    local = np.stack([np.zeros(3), u * half[1], v * half[2]], axis=1)
+    field = outward * np.einsum("i,nij->nj", T_bridge_joint[:3, 0], rigid.motion(rigid.apply(T_bridge_joint, local)))
+    rows.append(np.linalg.solve(_ring_basis(u, v)[:, :3], field))
+    moves = np.vstack([*rows, np.zeros((3, 6))])
+    found: Floats = moves @ pose @ moves.T
+    return found
+
+
+def _corners(half: Floats, outward: float) -> Floats:
+    """Return the derivative (24, 22) of the movements of P1..P8 by the numbers of the four faces and the ring."""
     # P1..P4: bottom left, bottom right, top right, top left, with their upright and their level face.
     places = [(1.0, -1.0, 3, 0), (-1.0, -1.0, 1, 0), (-1.0, 1.0, 1, 2), (1.0, 1.0, 3, 2)]
-    derivative = np.zeros((8, 3, 19))
+    derivative = np.zeros((8, 3, 22))
     for k, (u, v, upright, level) in enumerate(places):
-        derivative[k, 0, 16:19] = outward * np.array([1.0, u, v])
-        side = FACES[upright][2]
-        derivative[k, 1, 4 * upright : 4 * upright + 4] = side * _face_basis(np.zeros(1), np.array([v]))[0]
-        side = FACES[level][2]
-        derivative[k, 2, 4 * level : 4 * level + 4] = side * _face_basis(np.zeros(1), np.array([u]))[0]
+        derivative[k, 0, 16:] = outward * _ring_basis(np.array([u]), np.array([v]))[0]
+        for axis, face, w in ((1, upright, v), (2, level, u)):
+            derivative[k, axis, 4 * face : 4 * face + 4] = FACES[face][2] * _face_basis(np.zeros(1), np.array([w]))[0]
     for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 3), (3, 0))):  # the middles of the edges
         derivative[4 + k] = 0.5 * (derivative[a] + derivative[b])
-    flat = derivative.reshape(24, 19)
-    numbers = np.concatenate([coefficients for coefficients, _ in fits])
-    return (flat @ numbers).reshape(8, 3), flat
+        u, v = (0.5 * (places[a][i] + places[b][i]) for i in range(2))
+        derivative[4 + k, 0, 16:] = outward * _ring_basis(np.array([u]), np.array([v]))[0]
+    return derivative.reshape(24, 22)

@@ -117,7 +117,7 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
         gap_row[j] = 24 * len(rows)
         A = np.zeros((24, 6 * count))
         for part, sign in ((j, -1.0), (j + 1, 1.0)):
-            A[:, 6 * part : 6 * part + 6] = sign * _motion(joint_points[j] - members[part].middle).reshape(24, 6)
+            A[:, 6 * part : 6 * part + 6] = sign * rigid.motion(joint_points[j] - members[part].middle).reshape(24, 6)
         turn = np.kron(np.eye(8), joint_frames[j][:3, :3])
         rows.append(A)
         values.append(turn @ (right.moved - left.moved).ravel())
@@ -128,7 +128,7 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
         edges = member.edges
         known = np.isfinite(edges.departure).ravel()
         A = np.zeros((int(known.sum()), 6 * count))
-        motion = _motion(edges.points - member.middle)
+        motion = rigid.motion(edges.points - member.middle)
         A[:, 6 * i : 6 * i + 6] = np.einsum("kai,kij->kaj", edges.axes, motion).reshape(-1, 6)[known]
         whole = np.zeros((len(edges.points), 2, len(edges.points), 2))
         for k in range(2):
@@ -143,17 +143,6 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
 
 def _known(end: JointEnd) -> bool:
     return bool(np.isfinite(end.moved).all())
-
-
-def _motion(arm: Floats) -> Floats:
-    """Return the derivative (n, 3, 6) of points at arms (n, 3) by a turn and a translation."""
-    found = np.zeros((len(arm), 3, 6))
-    x, y, z = arm.T
-    found[:, 0, 1], found[:, 0, 2] = z, -y
-    found[:, 1, 0], found[:, 1, 2] = -z, x
-    found[:, 2, 0], found[:, 2, 1] = y, -x
-    found[:, :, 3:] = np.eye(3)
-    return found
 
 
 def _as_motion(x: Floats, middle: Floats) -> Floats:

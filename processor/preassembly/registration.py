@@ -10,13 +10,20 @@ from processor.geometry import icp, rigid
 from processor.geometry.mesh_surface import MeshSurface
 from processor.model import Floats, Ints
 
-POINTS = 40_000
+POINTS, LAST_POINTS = 30_000, 250_000
+MOST_TURNS = 30
+STILL_MM = 1e-4  # a pose that moves the part by less stands still
+NO_FORM = 2.0  # of the cells' means over what chance makes them
 GATES_MM = (60.0, 30.0)
 CUT = 4.5  # standard deviations
 FLOOR_MM = 0.01  # of sigma, for scans without noise
 LEAST_SHARE = 0.5  # of the points that must lie within the last gate
+NO_FIT_MM = (10.0, 4.0)  # no noise and no form of a part is as large; the second where much lies beside the design
+CLUTTER_SHARE = 0.15
 CELL_MM = 500.0  # residuals nearer to each other along the part, on one face, are taken as dependent
-WEAK_MM = 2.0  # a direction in which the ends of a part may lie off by more (95 %) is weak
+WEAK_MM = (
+    5.0  # a direction in which the ends of a part may lie off by more (95 %) is weak: ends are looked for no further
+)
 MOTIONS = (
     "a turn about its length", "a turn sideways", "a turn up and down", "a shift along its length", "a shift sideways",
     "a shift up and down",
@@ -41,15 +48,33 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> R
     """Robust point-to-surface least squares of points (n, 3), scan frame, from ``start`` (4, 4).
 
     Faces that look along each of the design's principal ``axes`` (3, 3, columns) count the same, so that its ends
-    hold the part along its length. The covariance is a sandwich over cells of neighbouring residuals: what they have in
-    common, form and all, counts once (Liang and Zeger 1986).
+    hold the part along its length. Where the part shows no form of its own every point counts the same in the end,
+    which is then the best there is. The covariance is a sandwich over cells of neighbouring residuals: what they have
+    in common, form and all, counts once (Liang and Zeger 1986).
     """
-    thin = points[:: max(1, len(points) // POINTS)]
-    T = start.copy()
-    gate, sigma, covariance, share = GATES_MM[0], float("nan"), np.full((6, 6), np.nan), 0.0
+    held, form = _iterate(_thinned(points, POINTS), surface, axes, start, GATES_MM[0], even=True)
+    if not form < NO_FORM:
+        return held
+    return _iterate(_thinned(points, LAST_POINTS), surface, axes, held.T_bridge_scan, GATES_MM[1], even=False)[0]
+
+
+def fits(found: Registration) -> bool:
+    """Tell whether the scan is of the design's part: what is not clutter lies on its surface."""
+    return found.sigma_mm < NO_FIT_MM[found.used_share < 1.0 - CLUTTER_SHARE]
+
+
+def _thinned(points: Floats, count: int) -> Floats:
+    return points[:: max(1, len(points) // count)]
+
+
+def _iterate(
+    points: Floats, surface: MeshSurface, axes: Floats, start: Floats, gate: float, *, even: bool
+) -> tuple[Registration, float]:
+    """Iterate until the pose stands still; also the variance of the cells' means against that of chance."""
+    T, sigma, covariance, share, form = start.copy(), float("nan"), np.full((6, 6), np.nan), 0.0, float("inf")
     weak: tuple[str, ...] = ()
-    for turn in range(30):
-        moved = rigid.apply(T, thin)
+    for turn in range(MOST_TURNS):
+        moved = rigid.apply(T, points)
         face, residual, beyond = surface.distances(moved, gate + 60.0)
         used = (face >= 0) & (np.abs(residual) < gate) & (beyond < 1.0)
         if used.sum() < 100:
@@ -60,7 +85,8 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> R
         looks = icp.facing(n, axes)
         spread = np.array([_spread(r[looks == k]) for k in range(3)])
         sigma = _spread(r)
-        weight = np.clip(1.0 - (r / (CUT * spread[looks])) ** 2, 0.0, 1.0) ** 2 * icp.balance(looks)  # Tukey's
+        weight = np.clip(1.0 - (r / (CUT * spread[looks])) ** 2, 0.0, 1.0) ** 2  # Tukey's
+        weight = weight * icp.balance(looks) if even else weight
         normal = J.T @ (J * weight[:, None])
         if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)) + 1e-300)) > 1e10:
             break  # what is seen does not hold the part: no covariance, and so no answer
@@ -70,26 +96,45 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> R
         share = float(used.mean())
         if turn >= 3:
             gate = max(GATES_MM[1], 6.0 * sigma)
-        if turn == 29 or (turn > 4 and np.linalg.norm(step[3:]) < 1e-5 and np.linalg.norm(step[:3]) < 1e-9):
+        still = np.linalg.norm(step[3:]) < STILL_MM and np.linalg.norm(step[:3]) * np.ptp(moved[:, 0]) < STILL_MM
+        if turn == MOST_TURNS - 1 or (still and (turn > 4 or not even)):
+            cell = _cells(moved[used] @ axes, looks, n @ axes)
+            form = _form(r, np.sqrt(weight), cell)
             inverse = np.linalg.inv(normal)
-            at_middle = inverse @ _scatter(J * (weight * r)[:, None], moved[used] @ axes, looks, n @ axes) @ inverse
+            at_middle = inverse @ _scatter(J * (weight * r)[:, None], cell) @ inverse
             weak = _weak(at_middle, axes, float(np.abs((moved[used] - middle) @ axes[:, 0]).max()))
             covariance = about_origin(at_middle, middle)
             break
-    return Registration(T, covariance, sigma, share, weak)
+    return Registration(T, covariance, sigma, share, weak), form
 
 
 def _spread(residual: Floats) -> float:
     return max(1.4826 * float(np.median(np.abs(residual))), FLOOR_MM) if len(residual) else FLOOR_MM
 
 
-def _scatter(gradient: Floats, place: Floats, looks: Ints, normal: Floats) -> Floats:
-    """Sum (6, 6) of the outer products of gradients (n, 6), added up over each cell of a face first."""
+def _cells(place: Floats, looks: Ints, normal: Floats) -> Ints:
+    """Return the number (n,) of the cell along the part, and of the side, that points at (n, 3) are in."""
     cell = np.floor(place[:, 0] / CELL_MM).astype(np.int64)
     side = normal[np.arange(len(looks)), looks] > 0.0
-    key = np.unique(np.stack([cell - cell.min(), 2 * looks + side], axis=1), axis=0, return_inverse=True)[1].reshape(-1)
-    cells = int(key.max()) + 1
-    sums = np.stack([np.bincount(key, gradient[:, k], cells) for k in range(6)], axis=1)
+    key = np.stack([cell, 2 * looks + side], axis=1)
+    number: Ints = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+    return number
+
+
+def _form(residual: Floats, root: Floats, cell: Ints) -> float:
+    """Return the mean square of the cells' means over what chance makes it: 1 for a part without form of its own."""
+    number = np.bincount(cell, root > 0.0)
+    full = number > 20
+    mean = np.bincount(cell, residual * (root > 0.0)) / np.maximum(number, 1)
+    rest = (residual - mean[cell])[(root > 0.0) & full[cell]]
+    chance = max(float(rest.var()) if len(rest) else 0.0, FLOOR_MM**2)
+    return float(np.mean(number[full] * mean[full] ** 2)) / chance if full.any() else float("inf")
+
+
+def _scatter(gradient: Floats, cell: Ints) -> Floats:
+    """Sum (6, 6) of the outer products of gradients (n, 6), added up over each cell first."""
+    cells = int(cell.max()) + 1
+    sums = np.stack([np.bincount(cell, gradient[:, k], cells) for k in range(6)], axis=1)
     found: Floats = sums.T @ sums * (cells / max(cells - 6, 1))
     return found
 

@@ -1,0 +1,55 @@
+"""What noisy values say of the departures behind them, when it is not known how large departures may be.
+
+Departures are taken as normal about zero, with a covariance that depends on their size. Every size is a hypothesis;
+the answer is the average over all of them, each counted by how well it explains the values (Rasmussen and Williams,
+Gaussian Processes for Machine Learning, 2006, eqs. 2.23, 2.24 and 2.30). So a part as designed is told from one that is
+not, what is large is taken as measured, and the interval knows that the size is not known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.linalg import cho_factor, cho_solve
+
+from processor.model import Floats
+
+SIZES_MM = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+LEAST_SHARE = 1e-4  # of a hypothesis, to be counted
+
+
+@dataclass(frozen=True)
+class Believed:
+    """Departures (k,) with their covariance (k, k)."""
+
+    mean: Floats
+    covariance: Floats
+
+
+def weigh(
+    value: Floats, noise: Floats, hypotheses: Sequence[tuple[float, Floats]], known: npt.NDArray[np.bool_] | None = None
+) -> Believed:
+    """Departures (k,) by values (n,) with covariance ``noise`` (n, n) of those that are ``known`` (k,), or of all.
+
+    A hypothesis is its weight beforehand and the departures' covariance (k, k).
+    """
+    at = np.ones(len(hypotheses[0][1]), bool) if known is None else known
+    logs, fits = [], []
+    for before, prior in hypotheses:
+        factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
+        fit = cho_solve(factor, value)
+        logs.append(np.log(before) - 0.5 * float(value @ fit) - float(np.log(np.diag(factor[0])).sum()))
+        fits.append((prior, factor, fit))
+    share = np.exp(np.array(logs) - max(logs))
+    share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
+    share /= share.sum()
+    mean, second = np.zeros(len(at)), np.zeros((len(at),) * 2)
+    for weight, (prior, factor, fit) in zip(share, fits, strict=True):
+        if weight:
+            own = prior[:, at] @ fit
+            mean += weight * own
+            second += weight * (prior - prior[:, at] @ cho_solve(factor, prior[at]) + np.outer(own, own))
+    return Believed(mean, second - np.outer(mean, mean))
