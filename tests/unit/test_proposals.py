@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
 
-from processor.model import Tolerance, UsageError
-from processor.preassembly import joint_measures, proposals, tolerance
+from processor import store
+from processor.model import Checked, StepRun, Tolerance, UsageError
+from processor.preassembly import joint_measures, joint_verdicts, proposals, tolerance
 from processor.preassembly.proposals import TrimParams, propose
 
 B, H = 700.0, 900.0  # half the width and the height of the section; y left, z up
@@ -199,3 +200,21 @@ def test_the_same_proposal_every_time():
     covariance = 0.04 * np.eye(24)
     one, two = (proposed(along(-2.0 + POINTS[:, 2] / H), covariance, params=TrimParams()) for _ in range(2))
     assert repr(one) == repr(two)
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged(Checked):
+    measures: tuple[joint_measures.Measures, ...]
+    verdicts: tuple[joint_verdicts.Verdict, ...]
+    proposals: tuple[proposals.Proposal, ...]
+
+
+def test_the_records_go_through_the_store(tmp_path):
+    gaps = (along(-3.0), np.full((8, 3), np.nan))
+    measured = tuple(joint_measures.measure(one, one[:1, 0] * np.eye(24) * 0.0, np.eye(4), POINTS) for one in gaps)
+    verdicts = tuple(joint_verdicts.judge(one, GB) for one in measured)
+    result = Judged(measured, verdicts, tuple(propose("J", one, GB) for one in measured))
+    store.write_results(tmp_path / "r.h5", [StepRun("x", "m", "{}", result)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", {"x": Judged})
+    assert repr(back.result) == repr(result)
+    assert store.problems(tmp_path / "r.h5") == []
