@@ -126,7 +126,7 @@ def _misalignment_row(gaps: Floats, covariance: Floats) -> _Row:
 def _greatest(values: Floats, covariance: Floats, folded: bool = False) -> tuple[float, float, float]:
     """Greatest of values (n,) with errors of covariance (n, n), and its 95 % interval; ``folded``: of magnitudes."""
     if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
-        return float("nan"), float("nan"), float("nan")
+        return float(values.max()), float("nan"), float("nan")
     top = int(np.argmax(values))
     var = np.maximum(np.diag(covariance), 0.0)
     apart = np.sqrt(np.maximum(var + var[top] - 2.0 * covariance[top], 0.0))

@@ -138,7 +138,8 @@ def _said(rows: Sequence[Limit], found: Sequence[tuple[float, float, float, floa
         within = f"{low:g} to {high:g}" if math.isfinite(low) else f"at most {high:g}"
         if math.isnan(low) or math.isnan(high):
             within = f"a limit by the {limit.of}, which is not known"
-        text = f"{limit.what}: {value:.2f} +- {half:.2f} mm, {within}: {verdict}"
+        spread = f"+- {half:.2f} mm" if math.isfinite(half) else "mm, its interval not known"
+        text = f"{limit.what}: {value:.2f} {spread}, {within}: {verdict}"
         text += f" ({probability:.0%} conforms)" if math.isfinite(probability) else ""
         parts.append(text + ("" if limit.verified else "; limit not verified"))
     return "; ".join(parts)

@@ -264,6 +264,18 @@ def test_unknown_gaps_and_unknown_sizes_are_indeterminate():
     assert nothing.said == "JGJ 7-2010 has no limit for joints"
 
 
+def test_gaps_without_a_covariance_are_measured_and_not_judged():
+    gaps = np.zeros((8, 3))
+    gaps[:, 0], gaps[5, 1] = np.arange(8.0), -9.0
+    found = at_rest(gaps, np.full((24, 24), np.nan))
+    assert found.value[:4].tolist() == [3.5, 0.0, 7.0, 9.0]
+    assert np.isfinite(found.value).all()
+    assert np.isnan(found.ci95).all()
+    verdict = judge(found, GB)
+    assert (verdict.verdict, verdict.each) == ("indeterminate", ("indeterminate",) * 2)
+    assert "9.00 mm, its interval not known, at most 2: indeterminate" in verdict.said
+
+
 def test_eccentricity():
     gaps = np.tile([0.0, 3.0, 4.0], (8, 1))  # 5 mm off
     en = tolerance.load("EN 1090-2")
