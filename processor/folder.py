@@ -23,7 +23,9 @@ from processor.model import (
     Scene,
     Stations,
     StructureDesign,
+    Tolerance,
 )
+from processor.preassembly import tolerance
 from processor.readers import RawScan
 from processor.readers.raw import decoded
 from processor.units import MM_PER_UNIT, known_unit
@@ -68,6 +70,7 @@ class _Project:
     design: Path | None
     temperature_C: float
     entries: tuple[_Entry, ...]
+    tolerance: Tolerance | None = None
 
 
 def truth_file(path: Path) -> Path | None:
@@ -146,7 +149,31 @@ def _read_project(folder: Path) -> _Project:
         design,
         table.number("temperature_C", float("nan")),
         tuple(entries or [_Entry(found) for found in _found(folder, design)]),
+        _tolerance(table),
     )
+
+
+def _tolerance(project: Table) -> Tolerance | None:
+    """Read [tolerance]: a standard, limits of the project's own, or both; None where there is nothing."""
+    if not project.values.get("tolerance"):
+        return None
+    table = project.table("tolerance")
+    standard = table.text("standard", "")
+    try:
+        base = tolerance.load(standard) if standard else Tolerance()
+        choice = tolerance.choice(base)
+    except InputError as error:
+        raise InputError(f"{table.where}: {error}") from None
+    table.only(("standard", "root_gap_mm", *choice))
+    own = {}
+    for key in table.values:
+        if key in choice:
+            given = table.array(key, 2) if tolerance.two_sided(choice[key]) else np.array([table.number(key)])
+            if not (given[0] < given[-1] if len(given) == 2 else given[0] > 0.0):
+                expected = "a number above 0" if len(given) == 1 else "two numbers, least and greatest"
+                raise InputError(f"{table.where}: expected {expected} as {key!r}, found {given.tolist()}")
+            own[key] = given
+    return tolerance.with_own(base, own, PROJECT, table.number("root_gap_mm", 0.0))
 
 
 def _entry(folder: Path, scan: Table) -> _Entry:
@@ -225,6 +252,7 @@ def _scene(
         ", ".join(reasons),
         "; ".join(dict.fromkeys(reasons.values())),
         design if isinstance(design, StructureDesign) else None,
+        project.tolerance,
     )
 
 

@@ -199,6 +199,42 @@ class StructureDesign(Checked):
 
 
 @dataclass(frozen=True)
+class Limit(Checked):
+    """One row of a standard: what it limits, from ``low`` to ``high`` (NaN = no bound), and where that stands.
+
+    ``low_ratio`` and ``high_ratio`` are multiples of the size named by ``of``; by ``rule`` the smaller of number and
+    multiple counts, or their sum. The row is for sizes above ``above_mm`` up to ``up_to_mm``. ``measure`` is what of a
+    joint is held against it: misalignment | groove_gap | eccentricity, or nothing.
+    """
+
+    key: str
+    what: str
+    unit: str = "mm"
+    low: float = float("nan")
+    high: float = float("nan")
+    low_ratio: float = float("nan")
+    high_ratio: float = float("nan")
+    of: str = ""  # length | thickness | diameter | spacing | depth
+    rule: str = ""  # smaller | sum
+    above_mm: float = float("nan")
+    up_to_mm: float = float("nan")
+    measure: str = ""
+    clause: str = ""
+    verified: bool = False  # the number was held against the published text
+    source: str = ""
+
+
+@dataclass(frozen=True)
+class Tolerance(Checked):
+    """The limits that results are held against: those of a standard, of the project, or both (the project's win)."""
+
+    standard: str = ""
+    edition: str = ""
+    limits: tuple[Limit, ...] = ()
+    root_gap_mm: float = 0.0  # between two ends as assembled, by the design; their gap is held against it
+
+
+@dataclass(frozen=True)
 class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
 
@@ -212,6 +248,7 @@ class Scene(Checked):
     units: str = "mm"  # of the input's coordinates, and why they were read so
     units_reason: str = ""
     structure: StructureDesign | None = None
+    tolerance: Tolerance | None = None  # None: nothing was said
 
 
 # --- the truth: evaluation alone reads it --------------------------------------------------------------------------

@@ -17,7 +17,20 @@ from processor.geometry.merging import MergedCloud, merged
 from processor.geometry.sphere import Mask, Sphere, algebraic, visible_fraction
 from processor.geometry.sphere_ransac import ransac
 from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
-from processor.model import Checked, Floats, FrameDesign, Ints, Metric, Scene, Truth, UsageError, column, names
+from processor.model import (
+    Checked,
+    Floats,
+    FrameDesign,
+    Ints,
+    Metric,
+    Scene,
+    Tolerance,
+    Truth,
+    UsageError,
+    column,
+    names,
+)
+from processor.preassembly import tolerance
 
 NEEDS: tuple[str, ...] = ()
 KIND = "space-frame"
@@ -92,7 +105,7 @@ def run(scene: Scene, params: Params) -> Result:
     _checked(params, scene.frame is not None)
     if scene.frame is None:
         return _search(merged(scene, with_scanner=True), params)
-    return _fit_nodes(merged(scene, with_scanner=False), scene.frame, params)
+    return _fit_nodes(merged(scene, with_scanner=False), scene.frame, params, tolerance.default_for(scene.tolerance))
 
 
 def _checked(params: Params, has_design: bool) -> None:
@@ -124,17 +137,17 @@ def _generator(params: Params, purpose: str) -> np.random.Generator:
 # --- with a design -------------------------------------------------------------------------------------------------
 
 
-def _fit_nodes(cloud: MergedCloud, design: FrameDesign, params: Params) -> Result:
+def _fit_nodes(cloud: MergedCloud, design: FrameDesign, params: Params, limits: Tolerance) -> Result:
     nodes = design.centres - cloud.origin
     crops = nearest_crops(cloud.points, nodes, design.radii + params.crop_margin_mm)
     balls = [
-        _fit_node(int(design.ids[i]), nodes[i], float(design.radii[i]), cloud.points[rows], params)
+        _fit_node(int(design.ids[i]), nodes[i], float(design.radii[i]), cloud.points[rows], params, limits)
         for i, rows in enumerate(crops)
     ]
     return _result(balls, cloud.origin, params, "covariances are formal: bias by sleeves and mixed pixels is left out")
 
 
-def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Params) -> _Ball:
+def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Params, limits: Tolerance) -> _Ball:
     if len(crop) < 4:
         return _Ball(id_, nominal, None, len(crop), reason=f"{len(crop)} points in the crop; a sphere needs 4")
     on: Mask = np.ones(len(crop), bool)
@@ -154,12 +167,13 @@ def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Para
         reason = f"the fit left the crop: centre {away:.0f} mm off, radius {sphere.radius:.0f} mm"
         return _Ball(id_, nominal, None, int(on.sum()), reason=reason)
     share = float(on.mean()) if params.method == "ransac" else 1.0
-    return _judged(
-        id_, nominal, Sphere(sphere.centre + node, sphere.radius, sphere.covariance), crop[on], share, params
-    )
+    placed = Sphere(sphere.centre + node, sphere.radius, sphere.covariance)
+    return _judged(id_, nominal, placed, crop[on], share, params, limits)
 
 
-def _judged(id_: int, nominal: float, sphere: Sphere, points: Floats, share: float, params: Params) -> _Ball:
+def _judged(
+    id_: int, nominal: float, sphere: Sphere, points: Floats, share: float, params: Params, limits: Tolerance
+) -> _Ball:
     """Give a found ball its flag and every reason for it."""
     visible = visible_fraction(points, sphere.centre)
     rms = float(np.sqrt(np.mean(sphere.residuals(points) ** 2)))
@@ -177,7 +191,7 @@ def _judged(id_: int, nominal: float, sphere: Sphere, points: Floats, share: flo
     ]
     flag = "low-confidence" if doubts else "ok"
     error = sphere.radius - nominal
-    below, above = _blank_tolerance(nominal)
+    below, above = _blank_tolerance(nominal, limits)
     if not doubts and not np.isnan(nominal) and not -below <= error <= above:
         # The interval is formal; what the method is known to reach decides whether it may call a size wrong.
         margin = max(1.96 * sd, PAPER_RADIUS_ERROR_MM)
@@ -192,12 +206,17 @@ def _judged(id_: int, nominal: float, sphere: Sphere, points: Floats, share: flo
     return _Ball(id_, nominal, sphere, len(points), visible, rms, flag, "; ".join(doubts))
 
 
-def _blank_tolerance(radius: float) -> tuple[float, float]:
-    """How much smaller and larger in mm a ball's radius may be.
+def _blank_tolerance(radius: float, limits: Tolerance) -> tuple[float, float]:
+    """How much smaller and larger in mm a ball's radius may be: half of the limits on the blank's diameter.
 
-    Half of the limits on the blank's diameter, +2/-1 mm up to 120 mm and +3/-1.5 mm above (GB 50205-2020, unverified).
+    Limits that do not speak of balls leave them to those of the default standard.
     """
-    return (0.5, 1.0) if 2.0 * radius <= 120.0 else (0.75, 1.5)
+    for one in (limits, tolerance.load(tolerance.DEFAULT)):
+        for limit in one.limits:
+            if limit.key.startswith("ball_blank_diameter_") and tolerance.applies(limit, 2.0 * radius):
+                low, high = tolerance.bounds(limit, {"diameter": 2.0 * radius})
+                return -0.5 * low, 0.5 * high
+    return NAN, NAN
 
 
 # --- without a design ----------------------------------------------------------------------------------------------
@@ -237,7 +256,7 @@ def _searched(id_: int, found: Found, cloud: MergedCloud, params: Params) -> _Ba
         sphere = algebraic(on)
     if sphere is None:
         return _Ball(id_, NAN, None, len(on), reason="the points determine no sphere")
-    return _judged(id_, NAN, sphere, on, found.inlier_share, params)
+    return _judged(id_, NAN, sphere, on, found.inlier_share, params, Tolerance())
 
 
 def _result(balls: list[_Ball], origin: Floats, params: Params, message: str, complete: bool = True) -> Result:

@@ -1,0 +1,220 @@
+"""Trim and build-up of a joint: amounts by hand, optima by another solver, probabilities by draws of their own."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.optimize import minimize
+from scipy.stats import norm
+
+from processor import store
+from processor.model import Checked, StepRun, Tolerance, UsageError
+from processor.preassembly import joint_measures, joint_verdicts, proposals, tolerance
+from processor.preassembly.proposals import TrimParams, propose
+
+B, H = 700.0, 900.0  # half the width and the height of the section; y left, z up
+POINTS = np.array(
+    [[0, B, -H], [0, -B, -H], [0, -B, H], [0, B, H], [0, 0, -H], [0, -B, 0], [0, 0, H], [0, B, 0]], np.float64
+)
+GB = tolerance.load("GB 50205-2020")  # groove gap -1 to +2, misalignment 2
+EXACT = TrimParams(cut_sd_mm=0.0)
+
+
+def along(x):
+    gaps = np.zeros((8, 3))
+    gaps[:, 0] = x
+    return gaps
+
+
+def proposed(gaps, covariance=None, limits=GB, params=EXACT, name="J1"):
+    covariance = np.zeros((24, 24)) if covariance is None else covariance
+    return propose(name, joint_measures.measure(gaps, covariance, np.eye(4), POINTS), limits, params)
+
+
+def test_a_joint_that_fits_is_left_alone():
+    found = proposed(along(0.3), 0.01 * np.eye(24))
+    assert (found.action, found.probability, found.probability_as_is) == ("nothing", 1.0, 1.0)
+    assert not found.cut.any()
+    assert not found.build_up.any()
+    assert found.sentence == "J1: nothing to do; all limits hold with 100%."
+
+
+@pytest.mark.parametrize("root", [0.0, 4.0])
+def test_an_overlap_is_cut_by_itself_and_the_root_gap(root):
+    found = proposed(along(-3.0), limits=dataclasses.replace(GB, root_gap_mm=root))
+    assert found.action == "trim"
+    np.testing.assert_allclose(found.cut, 3.0 + root, atol=1e-9)
+    np.testing.assert_allclose(found.plane, [3.0 + root, 0.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(found.gap_after, root, atol=1e-9)
+    assert not found.build_up.any()
+    assert (found.probability, found.probability_as_is) == (1.0, 0.0)
+    assert found.sentence == (
+        f"J1: cut the right part's end by {3.0 + root:.1f} mm all round; done to 0 mm (one sd), all limits then hold "
+        "with 100% (groove gap 100%), as it is with 0%."
+    )
+
+
+def test_a_gap_too_wide_is_filled():
+    found = proposed(along(5.0))
+    assert found.action == "build up"
+    np.testing.assert_allclose(found.build_up, 5.0)
+    assert not found.cut.any()
+    assert "fill by shims or weld build-up 5.0 mm all round" in found.sentence
+
+
+def test_a_tilted_end_is_cut_parallel():
+    """The right part turned by 2 mrad about y and 4 mm too long: 5.8 mm at the bottom, 2.2 mm at the top."""
+    found = proposed(along(-4.0 + 2e-3 * POINTS[:, 2]))
+    np.testing.assert_allclose(found.cut, [5.8, 5.8, 2.2, 2.2, 5.8, 4.0, 2.2, 4.0], atol=1e-9)
+    np.testing.assert_allclose(found.plane, [4.0, 0.0, -2.0], atol=1e-9)
+    np.testing.assert_allclose(found.gap_after, 0.0, atol=1e-9)
+    assert "5.8 mm at P1 bottom left down to 2.2 mm at P3 top right" in found.sentence
+    # And about z: what is 1 mm per m more to the right (y < 0).
+    turned = proposed(along(-4.0 + 1e-3 * POINTS[:, 1]))
+    np.testing.assert_allclose(turned.plane, [4.0, -1.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(turned.cut[[5, 7]], [4.7, 3.3], atol=1e-9)
+
+
+def test_a_wedge_is_cut_where_it_is_narrow_and_filled_where_it_is_wide():
+    """From -1.5 at the bottom to 5.5 at the top: cutting 1.5 mm to nothing leaves 0 to 5.5, and that is filled."""
+    found = proposed(along(2.0 + 3.5 * POINTS[:, 2] / H))
+    assert found.action == "trim and build up"
+    np.testing.assert_allclose(found.cut, [1.5, 1.5, 0, 0, 1.5, 0.75, 0, 0.75], atol=1e-9)
+    np.testing.assert_allclose(found.build_up, [0, 0, 5.5, 5.5, 0, 2.75, 5.5, 2.75], atol=1e-9)
+    np.testing.assert_allclose(found.gap_after, 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_cuts_are_planes_that_take_nothing_on(seed):
+    rng = np.random.default_rng(seed)
+    A = np.column_stack([np.ones(8), POINTS[:, 1:] / 1000.0])
+    lacking = rng.normal(1.0, 2.0, 8) + A[:, 1:] @ rng.normal(0.0, 3.0, 2)
+    nearest = A @ proposals._nearest(A, lacking)
+    assert nearest.min() > -1e-8
+    solved = minimize(
+        lambda p: ((A @ p - lacking) ** 2).sum(),
+        [10.0, 0.0, 0.0],
+        constraints={"type": "ineq", "fun": lambda p: A @ p},
+        method="SLSQP",
+        options={"ftol": 1e-12},
+    )
+    np.testing.assert_allclose(nearest, A @ solved.x, atol=1e-4)
+    even = A @ proposals._even(A, lacking)
+    assert even.min() > -1e-9
+    rest = even - lacking
+    np.testing.assert_allclose(A[:, 1:].T @ rest, 0.0, atol=1e-9)  # nothing is left to tilt
+    covering = A @ proposals._covering(A, lacking)
+    assert (covering - np.maximum(lacking, 0.0)).min() > -1e-9
+    assert covering.sum() <= 8.0 * max(lacking.max(), 0.0) + 1e-9  # no more than a straight cut of that depth
+    found = proposed(along(-lacking), 0.01 * np.eye(24), params=TrimParams())
+    assert found.cut.min() >= 0.0
+    assert found.build_up.min() >= 0.0
+    np.testing.assert_allclose(A @ (found.plane * [1.0, 1.0, 1.0]), found.cut, atol=1e-9)
+    np.testing.assert_allclose(found.gap_after, -lacking + found.cut - found.build_up)
+
+
+def test_the_probability_after_a_cut_against_draws():
+    """What is left: the gaps' own errors and a plane's, off by 0.6 mm at a corner in depth and both tilts together."""
+    covariance = 0.09 * np.eye(24)
+    found = proposed(along(-3.0), covariance, params=TrimParams(cut_sd_mm=0.6))
+    rng = np.random.default_rng(77)
+    depth, left, up = rng.normal(0.0, 0.6 / np.sqrt(3.0), (3, 400_000))
+    gap = depth[:, None] + left[:, None] * np.sign(POINTS[:, 1]) + up[:, None] * np.sign(POINTS[:, 2])
+    assert gap[:, :4].std(axis=0) == pytest.approx(np.full(4, 0.6), rel=0.01)
+    gap += rng.normal(0.0, 0.3, gap.shape)
+    expected = ((gap >= -1.0) & (gap <= 2.0)).all(axis=1).mean()
+    assert found.groove_probability == pytest.approx(expected, abs=0.03)
+    # Twelve misalignments of sd 0.3 against 2: 6.7 sd, all but sure.
+    assert found.misalignment_probability == 1.0
+    assert found.probability == found.groove_probability
+    better = proposed(along(-3.0), covariance, params=TrimParams(cut_sd_mm=0.6, aim_mm=0.5))
+    assert better.probability > found.probability
+    np.testing.assert_allclose(better.cut, 3.5, atol=1e-9)
+
+
+def test_as_it_is_half_of_the_draws_keep_a_limit_that_a_value_is_on():
+    covariance = np.zeros((24, 24))
+    covariance[3 * 6 + 2, 3 * 6 + 2] = 0.25
+    gaps = along(0.0)
+    gaps[6, 2] = 2.0
+    found = proposed(gaps, covariance)
+    assert (found.probability, found.probability_as_is, found.misalignment_probability) == (0.5, 0.5, 0.5)
+    assert found.groove_probability == 1.0
+    assert found.sentence == (
+        "J1: nothing to cut; all limits hold with 50%; no trim changes the misalignment, which is near its limit."
+    )
+    gaps[6, 2] = 1.5
+    assert proposed(gaps, covariance).probability == pytest.approx(norm.cdf(1.0), abs=0.01)
+
+
+def test_no_trim_mends_what_is_misaligned():
+    gaps = along(-2.0)
+    gaps[6, 2], gaps[5, 1] = 3.1, -2.4
+    found = proposed(gaps, name="J3")
+    assert found.action == "trim"
+    assert (found.probability, found.groove_probability, found.misalignment_probability) == (0.0, 1.0, 0.0)
+    np.testing.assert_allclose(found.misaligned_by, [0, 0, 0, 0, 0, 0.4, 1.1, 0], atol=1e-9)
+    assert found.sentence.endswith(
+        "no trim mends the misalignment, 2 mm at most, of the right part at P7 top 3.1 mm up (1.1 too much), "
+        "P6 right 2.4 mm to the right (0.4 too much)."
+    )
+
+
+def test_a_cut_that_gains_too_little_is_not_proposed():
+    # A gap of -0.8 with errors of 0.2: 0.84 of it alone keep -1; cut by a saw of 2 mm that would fall.
+    covariance = np.zeros((24, 24))
+    covariance[0, 0] = 0.04
+    gaps = along(0.0)
+    gaps[0, 0] = -0.8
+    found = proposed(gaps, covariance, params=TrimParams(cut_sd_mm=2.0))
+    assert found.action == "nothing"
+    assert found.probability == pytest.approx(norm.cdf(1.0), abs=0.01)
+    assert "nothing proposed, for no cut or build-up makes the groove gap much surer" in found.sentence
+
+
+def test_what_is_not_known_is_said():
+    unknown = proposed(np.full((8, 3), np.nan), np.full((24, 24), np.nan))
+    assert unknown.action == "unknown"
+    assert np.isnan(unknown.cut).all()
+    assert unknown.sentence.startswith("J1: the gaps are not known")
+    no_groove = proposed(along(-3.0), limits=tolerance.with_own(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x"))
+    assert (no_groove.action, no_groove.probability) == ("nothing", 1.0)
+    assert "groove_gap_mm" in no_groove.sentence
+    by_thickness = proposed(along(-3.0), limits=tolerance.load("JTG arch rib"))
+    assert np.isnan(by_thickness.probability)
+    assert np.isnan(by_thickness.misaligned_by).all()
+    bare = proposed(along(-3.0), limits=Tolerance())
+    assert np.isnan(bare.probability)
+    assert "not known" in bare.sentence
+
+
+def test_parameters_that_make_no_sense():
+    for bad in (-1.0, float("nan"), float("inf")):
+        with pytest.raises(UsageError, match="cut_sd_mm"):
+            TrimParams(cut_sd_mm=bad)
+
+
+def test_the_same_proposal_every_time():
+    covariance = 0.04 * np.eye(24)
+    one, two = (proposed(along(-2.0 + POINTS[:, 2] / H), covariance, params=TrimParams()) for _ in range(2))
+    assert repr(one) == repr(two)
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged(Checked):
+    measures: tuple[joint_measures.Measures, ...]
+    verdicts: tuple[joint_verdicts.Verdict, ...]
+    proposals: tuple[proposals.Proposal, ...]
+
+
+def test_the_records_go_through_the_store(tmp_path):
+    gaps = (along(-3.0), np.full((8, 3), np.nan))
+    measured = tuple(joint_measures.measure(one, one[:1, 0] * np.eye(24) * 0.0, np.eye(4), POINTS) for one in gaps)
+    verdicts = tuple(joint_verdicts.judge(one, GB) for one in measured)
+    result = Judged(measured, verdicts, tuple(propose("J", one, GB) for one in measured))
+    store.write_results(tmp_path / "r.h5", [StepRun("x", "m", "{}", result)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", {"x": Judged})
+    assert repr(back.result) == repr(result)
+    assert store.problems(tmp_path / "r.h5") == []

@@ -1,0 +1,137 @@
+"""Limits as data: what the files hold, what a project may say, and what it hears of a slip."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from processor import folder, store
+from processor.model import InputError, Limit, Scan, Scene, Tolerance
+from processor.preassembly import tolerance
+from processor.steps import spheres
+
+MEASURES = ("", "misalignment", "groove_gap", "eccentricity")
+
+
+def limit(standard, key):
+    return tolerance.find(tolerance.load(standard), key)
+
+
+def write_project(place, text):
+    np.savetxt(place / "scan.xyz", np.random.default_rng(0).uniform(size=(50, 3)))
+    (place / "project.toml").write_text(text)
+    return place
+
+
+def test_every_row_says_what_it_is():
+    assert len(tolerance.standards()) >= 6
+    for name, standard in tolerance.standards().items():
+        keys = [row.key for row in standard.limits]
+        assert len(set(keys)) == len(keys), name
+        for row in standard.limits:
+            assert row.what, row.key
+            assert row.source, row.key
+            assert row.measure in MEASURES
+            assert row.key.endswith({"mm": "_mm", "arcmin": "_arcmin", "1": "_ratio"}[row.unit])
+            assert (row.rule in ("smaller", "sum")) == (not math.isnan(row.high_ratio) and not math.isnan(row.high)), (
+                row.key
+            )
+            assert bool(row.of) == (not all(map(math.isnan, (row.high_ratio, row.above_mm, row.up_to_mm))))
+            low, high = tolerance.bounds(row, dict.fromkeys(("length", "thickness", "diameter", "spacing"), 1000.0))
+            assert low < high < math.inf
+            assert not (row.verified and not row.clause), "a verified row has its clause"
+
+
+def test_only_what_was_seen_in_print_is_verified():
+    seen = {(name, row.clause) for name, one in tolerance.standards().items() for row in one.limits if row.verified}
+    assert seen == {("GB 50205-2020", "11.3.6"), ("JGJ 7-2010", "6.11"), ("AWS D1.1", "7.22.9")}
+
+
+def test_numbers_by_hand():
+    assert tolerance.bounds(limit("GB 50205-2020", "misalignment_mm"), {}) == (-math.inf, 2.0)
+    assert tolerance.bounds(limit("GB 50205-2020", "groove_gap_mm"), {}) == (-1.0, 2.0)
+    bow = limit("GB 50205-2020", "bow_mm")  # l/1500 and 10
+    assert tolerance.bounds(bow, {"length": 12_000.0})[1] == pytest.approx(8.0)
+    assert tolerance.bounds(bow, {"length": 30_000.0})[1] == 10.0
+    assert math.isnan(tolerance.bounds(bow, {})[1])
+    for name, expected in (("EN 1090-2", 4.0), ("EN 1090-2 class 1", 4.0), ("EN 1090-2 class 2", 3.0)):
+        # At 10 m: 10000/5000 + 2 = 4 and 10000/10000 + 2 = 3.
+        bounds = tolerance.bounds(limit(name, "length_mm"), {"length": 10_000.0})
+        assert bounds == pytest.approx((-expected, expected))
+    edge = limit("JTG arch rib", "misalignment_mm")  # 0.2 t and 2
+    assert tolerance.bounds(edge, {"thickness": 8.0})[1] == pytest.approx(1.6)
+    assert tolerance.bounds(edge, {"thickness": 24.0})[1] == 2.0
+    camber = limit("GB 50205-2020", "camber_not_specified_mm")  # +l/2000, -0
+    assert tolerance.bounds(camber, {"length": 40_000.0}) == pytest.approx((0.0, 20.0))
+
+
+def test_unknown_standard_names_those_there_are():
+    with pytest.raises(InputError, match=r"'GB 50205'.*GB 50205-2020, JGJ 7-2010"):
+        tolerance.load("GB 50205")
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ('standard = "ISO 1"', r"project\.toml: tolerance: unknown standard 'ISO 1'; there are .*EN 1090-2 class 2"),
+        ("misalignment = 2.0", r"tolerance: unknown key 'misalignment'; known are standard, root_gap_mm, misalignment"),
+        (
+            'standard = "JGJ 7-2010"\nmisalignment_mm = 2.0',
+            r"unknown key 'misalignment_mm'; known are .*deflection_ratio",
+        ),
+        ("misalignment_mm = -2.0", r"expected a number above 0 as 'misalignment_mm', found \[-2\.0\]"),
+        ("misalignment_mm = [0, 2]", r"expected a number as 'misalignment_mm', found a list"),
+        ("groove_gap_mm = 2.0", r"expected numbers of shape 2 as 'groove_gap_mm', found 2\.0"),
+        ("groove_gap_mm = [2.0, -1.0]", r"expected two numbers, least and greatest as 'groove_gap_mm'"),
+        ("root_gap_mm = 'no'", r"expected a number as 'root_gap_mm'"),
+        ("standard = 5", "expected a text as 'standard'"),
+    ],
+)
+def test_a_slip_in_a_project_is_named(tmp_path, text, said):
+    with pytest.raises(InputError, match=said):
+        folder.read_input(write_project(tmp_path, f"[tolerance]\n{text}\n"))
+
+
+def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
+    text = '[tolerance]\nstandard = "GB 50205-2020"\nmisalignment_mm = 1.5\ngroove_gap_mm = [-2, 3]\nroot_gap_mm = 6\n'
+    scene = folder.read_input(write_project(tmp_path, text))
+    found = scene.tolerance
+    own = tolerance.find(found, "misalignment_mm")
+    assert (own.high, own.verified, own.clause, own.source) == (1.5, True, "", "project.toml")
+    assert tolerance.bounds(tolerance.find(found, "groove_gap_mm"), {}) == (-2.0, 3.0)
+    assert tolerance.find(found, "span_mm").high == 5.0
+    assert len(found.limits) == len(tolerance.load("GB 50205-2020").limits)
+    assert found.root_gap_mm == 6.0
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    assert store.problems(tmp_path / "s.h5") == []
+    back = store.read_scene(tmp_path / "s.h5").tolerance
+    assert repr(back) == repr(found)
+    assert store.scene_hash(scene) != store.scene_hash(dataclasses.replace(scene, tolerance=None))
+
+
+def test_limits_without_a_standard_are_all_there_is(tmp_path):
+    scene = folder.read_input(write_project(tmp_path, "[tolerance]\nsplice_eccentricity_mm = 4.0\n"))
+    assert [row.key for row in scene.tolerance.limits] == ["splice_eccentricity_mm"]
+    assert tolerance.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
+
+
+def test_nothing_said_is_nothing_held(tmp_path):
+    assert folder.read_input(write_project(tmp_path, "[tolerance]\n")).tolerance is None
+    assert tolerance.default_for(None).standard == "GB 50205-2020"
+    empty = Scene("e", "structure", (Scan("s", np.eye(3)),), tolerance=Tolerance())
+    store.write_scene(tmp_path / "e.h5", empty, None, {})
+    assert store.read_scene(tmp_path / "e.h5").tolerance == Tolerance()
+
+
+def test_blanks_of_balls():
+    # Half of +2/-1 up to a diameter of 120 and of +3/-1.5 above.
+    gb = tolerance.load("GB 50205-2020")
+    for limits in (gb, Tolerance(), tolerance.load("JGJ 7-2010")):
+        assert spheres._blank_tolerance(60.0, limits) == (0.5, 1.0)
+        assert spheres._blank_tolerance(60.001, limits) == (0.75, 1.5)
+    own = Tolerance(limits=(Limit("ball_blank_diameter_small_mm", "x", low=-4.0, high=6.0, up_to_mm=120.0),))
+    assert spheres._blank_tolerance(50.0, own) == (2.0, 3.0)
+    assert spheres._blank_tolerance(75.0, own) == (0.75, 1.5)
