@@ -126,7 +126,7 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
         if place.defect == "none":
             patches += [(part, patch) for patch in components[part].patches]
             continue
-        defect = damage.draw(place.defect, sizes, form, generator(seed, f"defect {place.name}"))
+        defect = damage.draw(place.defect, sizes, form, generator(seed, f"defect {place.name}"), place.name)
         patches += [(part, patch) for patch in damage.damaged(place, plate_row.bodies(form, place), defect)]
         found.append((place, defect))
     centres = [place.origin + np.array([*defect.place, 0.0]) @ plate_row.AXES for place, defect in found]

@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from scipy.integrate import dblquad
 
 from designgen import asbuilt, damage, recipes, sampler
 from designgen.designs import arch_bridge, arch_part, plate_row, space_frame, stadium_roof, structure, truss_bridge
@@ -250,65 +249,6 @@ def test_a_frame_without_a_bolt_shows_no_sleeve():
 
 
 # --- structures ----------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("form", plate_row.FORMS)
-@pytest.mark.parametrize("kind", damage.CLASSES)
-def test_defects_are_as_deep_and_large_as_their_truth(form, kind):
-    row = plate_row.Params(form=form, components=(kind,))
-    defect = damage.draw(kind, damage.Params(), row, np.random.default_rng(2))
-    (place,) = plate_row.places(row)
-    H = row.height_mm - (2.0 * row.flange_mm if form == "girder" else 0.0)
-    if len(defect.missing):
-        boxes = plate_row.bodies(row, place)
-        cloud = sampler.scan_patches(
-            [(0, patch) for patch in damage.damaged(place, boxes, defect)],
-            sampler.Params(spacing_mm=4.0, sigma_mm=0.0),
-            generator(0, "d"),
-        )
-        local = place.local(cloud.points)
-        a0, a1, b0, b1 = defect.missing[0]
-        inside = (
-            (local[:, 0] > a0 + 0.1) & (local[:, 0] < a1 - 0.1) & (local[:, 1] > b0 + 0.1) & (local[:, 1] < b1 - 0.1)
-        )
-        front = inside & (np.abs(local[:, 2]) < 1e-6)
-        assert not front.any()
-        assert defect.area_mm2 == pytest.approx((min(a1, 500.0) - a0) * (min(b1, 0.5 * H) - b0))
-        assert defect.depth_max_mm == row.plate_mm
-        rim = np.abs(local[:, 0] - a0) < 1e-6
-        assert (
-            (local[rim, 2] > -row.plate_mm) & (local[rim, 2] < 0.0)
-        ).sum() > 20  # the cut shows the plate's thickness
-        return
-    halves = (0.0, 0.5 * row.length_mm) if kind == "step" else (-0.5 * row.length_mm, 0.5 * row.length_mm)
-
-    def inward(b, a):
-        return -float(defect.move(np.array([[a, b, 0.0]]))[0, 2])
-
-    grid = np.array([[inward(b, a) for a in np.linspace(*halves, 101)] for b in np.linspace(-0.5 * H, 0.5 * H, 101)])
-    largest = grid.flat[np.argmax(np.abs(grid))]
-    if kind not in ("twist", "waviness"):  # these go both ways
-        # A pit is smaller than the cells of this grid.
-        assert defect.depth_max_mm == pytest.approx(
-            inward(*reversed(defect.place)) if kind == "pit" else largest, rel=0.02
-        )
-    else:
-        assert defect.depth_max_mm == pytest.approx(abs(largest), rel=0.03)
-    if kind in ("twist", "waviness"):
-        volume = np.abs(grid).mean() * row.length_mm * H
-        assert volume == pytest.approx(defect.volume_mm3, rel=0.05)
-    elif kind in ("dent", "bulge", "pit"):
-        a, b = defect.place
-        r = np.sqrt(defect.area_mm2 / np.pi)
-        volume = dblquad(lambda y, x: inward(b + y, a + x), -r, r, -r, r, epsrel=1e-3)[0]
-        assert volume == pytest.approx(defect.volume_mm3, rel=1e-2)
-    else:
-        assert grid.mean() * (halves[1] - halves[0]) * H == pytest.approx(defect.volume_mm3, rel=0.03)
-
-
-def test_an_unknown_defect_is_refused():
-    with pytest.raises(UsageError, match="expected classes of dent, bulge"):
-        damage.draw("rust", damage.Params(), plate_row.Params(), np.random.default_rng(0))
 
 
 def test_a_structure_moves_by_its_field():
