@@ -251,6 +251,21 @@ def test_a_frame_without_a_bolt_shows_no_sleeve():
 # --- structures ----------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("setting", ["asbuilt.sag_mm=5", "asbuilt.nonsense=5", "asbuilt=5"])
+@pytest.mark.parametrize("name", ["arch-s1", "frame-small", "truss-bridge", "plates-defects", "stadium-roof"])
+def test_what_a_kind_cannot_be_built_with_is_refused(name, setting):
+    recipe = {key: value for key, value in recipes.load(name)[1].items() if key != "asbuilt"}
+    recipe = recipes.overridden(recipe, [setting])
+    if (name, setting) == ("stadium-roof", "asbuilt.sag_mm=5"):
+        settings = ["asbuilt.ripples=2", "structure.trusses=4", "scan.spacing_mm=500"]
+        truth = make("x", recipes.overridden(recipe, settings))[1].as_built
+        assert truth.what == ("sag at the middle", "lean at the top", "ripple at the middle", "ripples around")
+        np.testing.assert_array_equal(truth.value, [5.0, 12.0, 8.0, 2.0])
+        return
+    with pytest.raises(UsageError, match=r"^asbuilt"):
+        make("x", recipe)
+
+
 def test_a_structure_moves_by_its_field():
     recipe = recipes.overridden(recipes.load("stadium-roof")[1], ["scan.sigma_mm=0", "structure.trusses=4"])
     scene, truth = make("x", recipe)
