@@ -19,6 +19,8 @@ EXPANSION_PER_K = 12e-6
 CORNER_REACH_MM = 1500.0  # from an end, how far the errors of its corners reach
 REFERENCE_C = 20.0
 MOST_DRAWS = 200  # of a place for a dent or a missing piece
+LEAST_PLATE_MM = 2.0
+LEAST_SHARE = 0.5  # of a section's size as designed; a tenth of its size is hollow
 
 
 @dataclass(frozen=True)
@@ -30,7 +32,7 @@ class ArchParams:
     twist_mrad: float = 0.0  # between the ends
     bow_mm: float = 0.0  # sideways and upward, at the middle
     section_mm: float = 0.0  # width and height
-    plate_mm: float = 0.0  # thickness of each plate
+    plate_mm: float = 0.0  # thickness of each plate, which is LEAST_PLATE_MM at least
     corner_mm: float = 0.0  # each corner of each end, along all axes: as ends look that were cut and welded in a yard
     waviness_mm: float = 0.0  # amplitude on each wall
     waviness_length_mm: float = 1500.0
@@ -53,7 +55,7 @@ class FrameParams:
     wrong_sizes: int = 0  # balls of another size than designed
     radius_mm: float = 0.0  # standard deviation of a ball's radius
     eccentricity_mm: float = 0.0  # of each member's ends off the nodes, standard deviation across the axis
-    bow_share: float = 0.0  # of tubes, uniform up to this share of their length (1/1000 is common)
+    bow_share: float = 0.0  # of tubes, uniform up to this share of their own length (1/1000 is common)
     missing_bolts: int = 0  # ends of members whose sleeve is not there
     temperature_C: float = REFERENCE_C
 
@@ -223,6 +225,9 @@ def arch(
             ledger.note(what, part.name, value, "mm")
         ledger.note("twist", part.name, twist, "rad")
         plates = Plates(*(np.array([part.plates.bottom, part.plates.top, part.plates.web]) + thick).tolist())
+        if params.plate_mm:
+            _check_plates(part, plates)
+        _check_section(part, section)
         for what, value in zip(("bottom plate", "top plate", "web plate"), thick, strict=True):
             ledger.note(what, part.name, value, "mm")
         walls = ("bottom", "top", "left", "right")
@@ -244,6 +249,41 @@ def arch(
         )
         found.append(fabricate(part, errors, plates, holes))
     return found
+
+
+def _sizes(part: ArchPart) -> tuple[float, float]:
+    """Return the least width and height of a part as designed."""
+    return 2.0 * float(part.half_widths.min()), float(part.heights.min())
+
+
+def _check_plates(part: ArchPart, plates: Plates) -> None:
+    """Raise UsageError for drawn plates that are too thin or fill the part."""
+    width, height = _sizes(part)
+    for what, thick in zip(("bottom", "top", "web"), dataclasses.astuple(plates), strict=True):
+        if thick < LEAST_PLATE_MM:
+            raise UsageError(
+                f"asbuilt.plate_mm: expected plates of {LEAST_PLATE_MM:g} mm at least, drew a {what} plate of "
+                f"{thick:.1f} mm for {part.name}; ask for smaller errors of plates"
+            )
+    for what, both, size in (
+        ("bottom and top", plates.bottom + plates.top, height),
+        ("two web", 2.0 * plates.web, width),
+    ):
+        if both > 0.9 * size:
+            raise UsageError(
+                f"asbuilt.plate_mm: expected plates that leave {part.name} hollow, drew {what} plates of {both:.1f} mm "
+                f"together where the section measures {size:g} mm; ask for smaller errors of plates"
+            )
+
+
+def _check_section(part: ArchPart, section: Floats) -> None:
+    """Raise UsageError for a drawn section much smaller than designed."""
+    for what, error, size in zip(("width", "height"), section, _sizes(part), strict=True):
+        if size + error < LEAST_SHARE * size:
+            raise UsageError(
+                f"asbuilt.section_mm: expected at least half of {part.name}'s section, drew an error of its {what} "
+                f"of {error:.1f} mm where it measures {size:g} mm; ask for smaller errors of sections"
+            )
 
 
 def _share(count: int, number: int, of: int) -> int:
@@ -289,8 +329,14 @@ def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: 
 
 
 def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger: Ledger) -> Frame:
-    """Draw a frame's errors, write them down, and return the frame as built, at its temperature."""
+    """Draw a frame's errors, write them down, and return the frame as built, at its temperature.
+
+    Raises UsageError for more wrong balls or missing bolts than there are, and for errors that leave no room to build.
+    """
     count, members = len(nominal.centres), len(nominal.members)
+    for key, most, of in (("wrong_sizes", count, "balls"), ("missing_bolts", 2 * members, "bolts")):
+        if getattr(params, key) > most:
+            raise UsageError(f"asbuilt.{key}: expected at most {most}, all {of}, got {getattr(params, key)}")
     grown = expansion(params.temperature_C)
     centres = (nominal.centres + params.node_movement_mm * rng.standard_normal((count, 3))) * grown
     radii = nominal.radii + params.radius_mm * rng.standard_normal(count)
@@ -314,7 +360,13 @@ def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger:
 
     offsets = across(params.eccentricity_mm * rng.standard_normal((members, 2, 2)))
     angle = rng.uniform(0.0, 2.0 * np.pi, members)
-    bow = params.bow_share * length * rng.uniform(0.0, 1.0, members)
+    joined = nominal.connection.scaled(grown)
+    built = dataclasses.replace(nominal, centres=centres, radii=radii, offsets=offsets, connection=joined)
+    try:
+        tubes = built.tube_lengths()
+    except UsageError as error:
+        raise UsageError(f"asbuilt: this frame cannot be built with errors so large: {error}") from error
+    bow = params.bow_share * tubes * rng.uniform(0.0, 1.0, members)
     bows = bow[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other)
     missing = np.zeros((members, 2), bool)
     for place in np.sort(rng.permutation(2 * members)[: params.missing_bolts]):
@@ -327,4 +379,4 @@ def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger:
             for end in range(2):
                 size = float(np.linalg.norm(offsets[m, end]))
                 ledger.note("eccentricity", f"member {m} end {end}", size, "mm")
-    return dataclasses.replace(nominal, centres=centres, radii=radii, offsets=offsets, bows=bows, missing=missing)
+    return dataclasses.replace(built, bows=bows, missing=missing)

@@ -22,9 +22,16 @@ CLASSES = (
 Displacement = Callable[[Floats], Floats]  # local coordinates (n, 3) -> (n, 3)
 
 
+MOST_SHARE = 0.95  # of a component's length or height that a defect may take
+SIZED = (
+    "dent_depth_mm", "bend_mm", "twist_mrad", "wave_mm", "loss_mm", "pit_depth_mm", "step_mm", "shift_mm", "tilt_mrad",
+)  # fmt: skip
+NOWHERE = np.empty((0, 4))
+
+
 @dataclass(frozen=True)
 class Params:
-    """Sizes of defects, mm; ``size`` multiplies all depths. Places on the component are drawn."""
+    """Sizes of defects, mm; ``size`` multiplies depths, angles and ``loss_mm``. Places on the component are drawn."""
 
     size: float = 1.0
     dent_depth_mm: float = 6.0
@@ -33,7 +40,7 @@ class Params:
     twist_mrad: float = 12.0  # between the ends
     wave_mm: float = 3.0  # amplitude
     wave_length_mm: float = 300.0
-    loss_mm: float = 60.0  # side of a piece lost at an edge; a missing part is three times as large
+    loss_mm: float = 60.0  # depth and half the length of a piece lost at an edge; a missing part is three times that
     pit_depth_mm: float = 3.0
     pit_radius_mm: float = 15.0
     crack_width_mm: float = 4.0
@@ -47,10 +54,19 @@ class Params:
             if not getattr(self, key) > 0.0:
                 raise UsageError(f"asbuilt.{key}: expected a number above 0, got {getattr(self, key)!r}")
 
+    def sized(self, key: str) -> float:
+        """Return a size as it is built: times ``size`` where that counts."""
+        value: float = getattr(self, key)
+        return self.size * value if key in SIZED else value
+
 
 @dataclass(frozen=True)
 class Defect:
-    """One defect: its displacement, rectangles (k, 4) that are missing as a0, a1, b0, b1, and its truth."""
+    """One defect: its displacement, rectangles (k, 4) that are missing as a0, a1, b0, b1, and its truth.
+
+    The truth is that of the front, a girder's web: the area that moved or is missing, the largest movement, and its
+    integral over the area, or the steel that is missing. What goes both ways counts as inward, and both ways add up.
+    """
 
     kind: str
     place: tuple[float, float]  # a, b of its middle
@@ -60,97 +76,134 @@ class Defect:
     front_only: bool
     area_mm2: float
     depth_max_mm: float  # inward positive
-    volume_mm3: float
+    volume_mm3: float  # likewise
 
 
-def draw(kind: str, params: Params, form: plate_row.Params, rng: np.random.Generator) -> Defect:
-    """Draw a defect of a class on a component of a form. UsageError for an unknown class."""
-    L, H = form.length_mm, form.height_mm - (2.0 * form.flange_mm if form.form == "girder" else 0.0)
-    a, b = rng.uniform(-0.2, 0.2) * L, rng.uniform(-0.2, 0.2) * H
-    whole = (0.0, 0.0)
-    far = (0.5 * L, 40.0)
-    none = np.empty((0, 4))
+def extent(form: plate_row.Params) -> tuple[float, float]:
+    """Return length and height of the front: of a girder, its web's between the flanges."""
+    return form.length_mm, form.height_mm - (2.0 * form.flange_mm if form.form == "girder" else 0.0)
+
+
+def draw(kind: str, params: Params, form: plate_row.Params, rng: np.random.Generator, name: str = "") -> Defect:
+    """Draw a defect of a class on a component of a form, called ``name`` in messages.
+
+    Raises UsageError for an unknown class and for a size that does not fit on the component.
+    """
+    if kind not in CLASSES:
+        raise UsageError(f"structure.components: expected classes of {', '.join(CLASSES)} or none, got {kind!r}")
+    _check_fits(kind, params, form, name or f"{form.form} with {kind}")
+    shares = rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)
     if kind in ("dent", "bulge", "pit"):
-        radius = params.pit_radius_mm if kind == "pit" else min(params.dent_radius_mm, 0.3 * H)
-        depth = params.size * (params.pit_depth_mm if kind == "pit" else params.dent_depth_mm)
-        depth = -depth if kind == "bulge" else depth
-        area = np.pi * radius**2
-        fine = (1.3 * radius, radius / 8.0)
-        return Defect(
-            kind, (a, b), _bump(a, b, depth, radius), none, fine, kind == "pit", area, depth, area * depth / 3.0
-        )
-    if kind == "bend":
-        depth = params.size * params.bend_mm
-        return Defect(
-            kind,
-            whole,
-            _out(lambda p: -depth * np.cos(np.pi * p[:, 0] / L)),
-            none,
-            far,
-            False,
-            L * H,
-            depth,
-            L * H * depth * 2.0 / np.pi,
-        )
-    if kind == "twist":
-        rate = params.size * 1e-3 * params.twist_mrad / L
-        # Inward on two quarters, outward on two: the volume moved is that of both together.
-        return Defect(
-            kind, whole, _twist(rate), none, far, False, L * H, rate * L * H / 4.0, rate * (L * H) ** 2 / 16.0
-        )
-    if kind == "waviness":
-        depth = params.size * params.wave_mm
-        wave = _out(
-            lambda p: depth * np.sin(2.0 * np.pi * p[:, 0] / params.wave_length_mm) * np.cos(np.pi * p[:, 1] / H) ** 2
-        )
-        return Defect(
-            kind, whole, wave, none, (0.5 * L, 0.08 * params.wave_length_mm), False, L * H, depth, depth * L * H / np.pi
-        )
+        return _bumped(kind, params, form, shares)
     if kind in ("edge-loss", "missing-part", "crack"):
-        return _missing(kind, params, form, (a, b), (L, H))
-    if kind == "step":
-        depth = params.size * params.step_mm
-        return Defect(
-            kind,
-            (0.25 * L, 0.0),
-            _out(lambda p: np.full(len(p), -depth)),
-            none,
-            far,
-            False,
-            0.5 * L * H,
-            depth,
-            0.5 * L * H * depth,
-        )
-    if kind == "misalignment":
-        shift, tilt = params.size * params.shift_mm, params.size * 1e-3 * params.tilt_mrad
-        return Defect(
-            kind, whole, _rigid(shift, tilt), none, far, False, L * H, shift + 0.5 * H * np.sin(tilt), L * H * shift
-        )
-    raise UsageError(f"structure.components: expected classes of {', '.join(CLASSES)} or none, got {kind!r}")
+        return _missing(kind, params, form, shares)
+    return _whole(kind, params, form)
 
 
-def _missing(
-    kind: str, params: Params, form: plate_row.Params, at: tuple[float, float], size: tuple[float, float]
-) -> Defect:
-    (a, b), (L, H) = at, size
-    side = params.loss_mm * params.size
-    if kind == "edge-loss":
-        box = (a - side, a + side, 0.5 * H - side, 0.5 * H + 1.0)
-    elif kind == "missing-part":
-        box = (0.5 * L - 3.0 * side, 0.5 * L + 1.0, 0.5 * H - 3.0 * side, 0.5 * H + 1.0)
+def _check_fits(kind: str, params: Params, form: plate_row.Params, name: str) -> None:
+    L, H = extent(form)
+    least = min(L, H)
+    along, across = (L, H) if form.form == "plate" else (H, L)  # of the edge that loses a piece
+    round_ = 0.5 * MOST_SHARE * least
+    most = {
+        "dent": {"dent_radius_mm": round_, "dent_depth_mm": params.dent_radius_mm},
+        "bulge": {"dent_radius_mm": round_, "dent_depth_mm": params.dent_radius_mm},
+        "pit": {"pit_radius_mm": round_, "pit_depth_mm": MOST_SHARE * form.plate_mm},
+        "bend": {"bend_mm": 0.25 * L},
+        "twist": {"twist_mrad": 1000.0},
+        "waviness": {"wave_mm": 0.25 * params.wave_length_mm},
+        "edge-loss": {"loss_mm": MOST_SHARE * min(0.5 * along, across)},
+        "missing-part": {"loss_mm": MOST_SHARE * least / 3.0},
+        "crack": {"crack_width_mm": MOST_SHARE * L, "crack_length_mm": MOST_SHARE * H},
+        "step": {"step_mm": 0.25 * L},
+        "misalignment": {"shift_mm": 0.25 * L, "tilt_mrad": 500.0},
+    }[kind]
+    front = f"{name}, {L:g} x {H:g} x {form.plate_mm:g} mm"
+    for key, limit in most.items():
+        value = params.sized(key)
+        if not value <= limit * (1.0 + 1e-12):
+            by = f" times asbuilt.size {params.size:g}" if key in SIZED and params.size != 1.0 else ""
+            raise UsageError(f"asbuilt.{key}{by}: expected at most {limit:g} on {front}, got {value:g}")
+    if kind == "waviness" and not params.wave_length_mm >= 4.0 * form.plate_mm:
+        raise UsageError(
+            f"asbuilt.wave_length_mm: expected at least {4.0 * form.plate_mm:g}, four times the thickness, on {front}, "
+            f"got {params.wave_length_mm:g}"
+        )
+
+
+def _spot(shares: tuple[float, float], size: tuple[float, float], half: tuple[float, float]) -> tuple[float, float]:
+    """Return where the middle of something lies that reaches ``half`` to each side: all of it on the component."""
+    a, b = (share * min(full, (0.5 * full - own) / 0.2) for share, full, own in zip(shares, size, half, strict=True))
+    return a, b
+
+
+def _bumped(kind: str, params: Params, form: plate_row.Params, shares: tuple[float, float]) -> Defect:
+    pit = kind == "pit"
+    radius = params.pit_radius_mm if pit else params.dent_radius_mm
+    depth = params.sized("pit_depth_mm" if pit else "dent_depth_mm") * (-1.0 if kind == "bulge" else 1.0)
+    at = _spot(shares, extent(form), (radius, radius))
+    area = np.pi * radius**2
+    move, fine = _bump(*at, depth, radius), (1.3 * radius, radius / 8.0)
+    return Defect(kind, at, move, NOWHERE, fine, pit, area, depth, area * depth / 3.0)
+
+
+def _whole(kind: str, params: Params, form: plate_row.Params) -> Defect:
+    """Return a defect of the whole component, or of its second half: a step."""
+    L, H = extent(form)
+    place, step, area = (0.0, 0.0), 40.0, L * H
+    if kind == "bend":
+        depth = params.sized("bend_mm")
+        move, volume = _out(lambda p: -depth * np.cos(np.pi * p[:, 0] / L)), area * depth * 2.0 / np.pi
+    elif kind == "twist":
+        turn = 1e-3 * params.sized("twist_mrad")
+        move, depth = _twist(turn / L), 0.5 * H * np.sin(0.5 * turn)
+        # Inward on two quarters, outward on two: |b| over the height times |sin| of the angle along the length.
+        volume = 0.25 * H**2 * 2.0 * L / turn * (1.0 - np.cos(0.5 * turn))
+    elif kind == "waviness":
+        high, per = params.sized("wave_mm"), 2.0 * np.pi / params.wave_length_mm
+        half_waves, rest = divmod(0.5 * L * per, np.pi)
+        depth = high if half_waves or rest > 0.5 * np.pi else high * np.sin(rest)
+        # |sin| from the middle to both ends: 2 a half wave and what is left; cos^2 over the height: half of it.
+        volume = high * 2.0 * (2.0 * half_waves + 1.0 - np.cos(rest)) / per * 0.5 * H
+        move, step = _out(lambda p: high * np.sin(per * p[:, 0]) * _fading(p[:, 1], H)), 0.08 * params.wave_length_mm
+    elif kind == "step":
+        depth = params.sized("step_mm")
+        place, area = (0.25 * L, 0.0), 0.5 * area
+        move, volume = _out(lambda p: np.full(len(p), -depth)), area * depth
     else:
-        box = (
-            a - 0.5 * params.crack_width_mm,
-            a + 0.5 * params.crack_width_mm,
-            b - 0.5 * params.crack_length_mm,
-            b + 0.5 * params.crack_length_mm,
-        )
+        shift, tilt = params.sized("shift_mm"), 1e-3 * params.sized("tilt_mrad")
+        reach = 0.5 * H * np.sin(tilt)
+        move, depth = _rigid(shift, tilt), shift + reach
+        # Tilted by more than it is shifted, its upper end stands out.
+        volume = area * (shift if reach <= shift else 0.5 * (shift**2 + reach**2) / reach)
+    return Defect(kind, place, move, NOWHERE, (0.5 * L, step), False, area, float(depth), float(volume))
+
+
+def _fading(b: Floats, H: float) -> Floats:
+    """Return 1 at the middle of the height, 0 at its ends and on a girder's flanges beyond."""
+    found: Floats = np.cos(np.pi * np.clip(b / H, -0.5, 0.5)) ** 2
+    return found
+
+
+def _missing(kind: str, params: Params, form: plate_row.Params, shares: tuple[float, float]) -> Defect:
+    L, H = extent(form)
+    side, beyond = params.sized("loss_mm"), 1.0  # what reaches beyond an edge leaves no cut there
+    if kind == "edge-loss" and form.form == "plate":
+        a, _ = _spot(shares, (L, H), (side, 0.0))
+        box = (a - side, a + side, 0.5 * H - side, 0.5 * H + beyond)
+    elif kind == "edge-loss":  # a web's upper and lower edges are in its flanges: its ends are free
+        _, b = _spot(shares, (L, H), (0.0, side))
+        box = (0.5 * L - side, 0.5 * L + beyond, b - side, b + side)
+    elif kind == "missing-part":
+        box = (0.5 * L - 3.0 * side, 0.5 * L + beyond, 0.5 * H - 3.0 * side, 0.5 * H + beyond)
+    else:
+        wide, long = 0.5 * params.crack_width_mm, 0.5 * params.crack_length_mm
+        a, b = _spot(shares, (L, H), (wide, long))
+        box = (a - wide, a + wide, b - long, b + long)
     a0, a1, b0, b1 = box[0], min(box[1], 0.5 * L), box[2], min(box[3], 0.5 * H)
-    area = (a1 - a0) * (b1 - b0)
+    area, t = (a1 - a0) * (b1 - b0), form.plate_mm
     middle = (0.5 * (a0 + a1), 0.5 * (b0 + b1))
-    return Defect(
-        kind, middle, np.zeros_like, np.array([box]), (0.0, 1.0), False, area, form.plate_mm, area * form.plate_mm
-    )
+    return Defect(kind, middle, np.zeros_like, np.array([box]), (0.0, 1.0), False, area, t, area * t)
 
 
 def _out(height: Callable[[Floats], Floats]) -> Displacement:

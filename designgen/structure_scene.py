@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen import clutter, damage, sampler, scanner, sequences, survey
+from designgen import asbuilt, clutter, damage, sampler, scanner, sequences, survey
 from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
 from designgen.reading import filled
@@ -89,7 +89,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         structure=_truth(components, move, origin),
         defects=defects and dataclasses.replace(defects, centres=defects.centres + origin),
         stations=station_truth,
-        as_built=AsBuilt(),
+        as_built=_ledger(kind, recipe),
         spacing_mm=sampler.spacing_mm(scanning),
         sigma_mm=sampler.sigma_mm(scanning),
     )
@@ -103,6 +103,18 @@ def _stadium(components: Components, recipe: Mapping[str, Any], seed: int) -> Bu
     return moved, move, None
 
 
+def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
+    """Return how a roof moved; what is wrong with plates and girders is in the truth of their defects."""
+    ledger = asbuilt.Ledger()
+    if kind == "stadium-roof" and "asbuilt" in recipe:
+        params = filled(damage.MovementParams, recipe, "asbuilt")
+        ledger.note("sag at the middle", "roof", params.sag_mm, "mm")
+        ledger.note("lean at the top", "roof", params.lean_mm, "mm")
+        ledger.note("ripple at the middle", "roof", params.ripple_mm, "mm")
+        ledger.note("ripples around", "roof", params.ripples, "count")
+    return ledger.record()
+
+
 def _moved(at: Surface, move: damage.Displacement) -> Surface:
     def where(p: Floats, q: Floats) -> Floats:
         points = at(p, q)
@@ -113,6 +125,8 @@ def _moved(at: Surface, move: damage.Displacement) -> Surface:
 
 
 def _truss(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+    if "asbuilt" in recipe:
+        raise UsageError("asbuilt: a truss-bridge is built as designed; leave the section asbuilt out")
     return _as_designed(components), None, None
 
 
@@ -126,7 +140,7 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
         if place.defect == "none":
             patches += [(part, patch) for patch in components[part].patches]
             continue
-        defect = damage.draw(place.defect, sizes, form, generator(seed, f"defect {place.name}"))
+        defect = damage.draw(place.defect, sizes, form, generator(seed, f"defect {place.name}"), place.name)
         patches += [(part, patch) for patch in damage.damaged(place, plate_row.bodies(form, place), defect)]
         found.append((place, defect))
     centres = [place.origin + np.array([*defect.place, 0.0]) @ plate_row.AXES for place, defect in found]
@@ -204,7 +218,7 @@ def _add_poles(
 def _truth(
     components: tuple[structure.Component, ...], move: Callable[[Floats], Floats] | None, origin: Floats
 ) -> StructureTruth | None:
-    """Return points of the design a step apart along every face, and how each has moved."""
+    """Return points of the design a step apart along every face but inside of other bodies, and how each has moved."""
     if move is None:
         return None
     points, normals = [], []
@@ -220,4 +234,6 @@ def _truth(
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)
-    return StructureTruth(x + origin, np.vstack(normals), move(x))
+    seen = ~structure.covered(components)(x)
+    x = x[seen]
+    return StructureTruth(x + origin, np.vstack(normals)[seen], move(x))

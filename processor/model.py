@@ -290,7 +290,11 @@ class ArchTruth(Checked):
 
 @dataclass(frozen=True)
 class FrameTruth(Checked):
-    """The true balls, in the frame of the scan: as built, not as designed."""
+    """The true balls, in the frame of the scan: as built, not as designed.
+
+    ``lowest`` is the lowest point of the sphere, its centre minus its radius: where a ball has its process hole, the
+    hole cuts that point away.
+    """
 
     ids: Ints = column("k", dtype=np.int64)
     centres: Floats = column("k", 3)

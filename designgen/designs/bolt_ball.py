@@ -5,6 +5,7 @@ Sizes follow the pattern of catalogues and are plausible, not those of a standar
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -39,6 +40,10 @@ class Connection:
     def flat_radius(self) -> float:
         """Radius of the flat milled for the sleeve."""
         return self.sleeve_corner_radius + 1.0
+
+    def scaled(self, factor: float) -> Connection:
+        """Return the connection with all its sizes times ``factor``."""
+        return Connection(**{key: factor * size for key, size in dataclasses.asdict(self).items()})
 
 
 CONNECTIONS = (

@@ -105,6 +105,25 @@ class Frame:
         found: Floats = self.bows[member] if len(self.bows) else np.zeros(3)
         return found
 
+    def tube_lengths(self) -> Floats:
+        """Lengths (m,) of the members' tubes between their cones.
+
+        Raises UsageError for a ball that cannot be built, and for a tube without length.
+        """
+        flats = np.array([self.ball(node).flat_distance for node in range(len(self.centres))])
+        axes = self.centres[self.members[:, 1]] - self.centres[self.members[:, 0]]
+        if len(self.offsets):
+            axes = axes + self.offsets[:, 1] - self.offsets[:, 0]
+        joints = flats[self.members] + self.connection.sleeve_length + self.connection.cone_length
+        found: Floats = np.linalg.norm(axes, axis=1) - joints.sum(axis=1)
+        if not (found > 0.0).all():
+            worst = int(np.argmin(found))
+            raise UsageError(
+                f"frame.spacing_mm, depth_mm: expected balls so far apart that tubes fit between, got member {worst} "
+                f"with {-found[worst]:.1f} mm too little for its sleeves and cones"
+            )
+        return found
+
     def has_sleeve(self, member: int, end: int) -> bool:
         """Whether a member's end has its sleeve and bolt."""
         return not (len(self.missing) and self.missing[member, end])
@@ -147,8 +166,7 @@ def build(params: Params) -> Frame:
         bolt_ball.connection(params.tube_diameter_mm),
         params.process_hole,
     )
-    for node in range(len(nodes)):
-        frame.ball(node)
+    frame.tube_lengths()
     return frame
 
 

@@ -5,10 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 import trimesh
-from scipy.integrate import dblquad
 
 from designgen import asbuilt, damage, recipes, sampler
-from designgen.designs import arch_bridge, arch_part, plate_row, space_frame, stadium_roof, structure, truss_bridge
+from designgen.designs import arch_bridge, arch_part, plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
 from designgen.scene import make
 from processor.model import UsageError
@@ -193,122 +192,58 @@ def test_dents_and_missing_pieces_keep_apart():
         asbuilt.arch(parts[2:3], crowd, [generator(3, "x")], ledger)
 
 
-FRAME = space_frame.build(space_frame.Params(nodes_x=3, nodes_y=3, layers=2, radii_mm=(45.0, 60.0)))
+@pytest.mark.parametrize(
+    ("errors", "bridge", "said"),
+    [
+        (
+            {"plate_mm": 50.0, "section_mm": 1.0},
+            {},
+            r"plate_mm: expected plates of 2 mm at least, drew .* for (foot|rib)",
+        ),
+        (
+            {"plate_mm": 4.0},
+            {"height_mm": 55.0},
+            r"plate_mm: expected plates that leave (foot|rib)\d hollow, drew bottom",
+        ),
+        (
+            {"plate_mm": 4.0},
+            {"width_mm": 42.5},
+            r"plate_mm: expected plates that leave (foot|rib)\d hollow, drew two web",
+        ),
+        ({"section_mm": 900.0}, {}, r"section_mm: expected at least half of (foot|rib)\d's section, drew"),
+    ],
+)
+def test_parts_that_cannot_be_built_are_refused(errors, bridge, said):
+    parts = arch_bridge.build(arch_bridge.Params(**bridge))
+    rngs = [generator(1, f"built {part.name}") for part in parts]
+    with pytest.raises(UsageError, match=rf"^asbuilt\.{said}"):
+        asbuilt.arch(parts, asbuilt.ArchParams(**errors), rngs, asbuilt.Ledger())
 
 
-def frame_with(**params):
-    ledger = asbuilt.Ledger()
-    return asbuilt.frame(FRAME, asbuilt.FrameParams(**params), generator(1, "x"), ledger), ledger.record()
-
-
-def test_frames_are_built_otherwise_by_what_the_truth_says():
-    same, truth = frame_with()
-    np.testing.assert_array_equal(same.centres, FRAME.centres)
-    assert truth.what == ()
-    moved, _ = frame_with(node_movement_mm=5.0)
-    assert np.std(moved.centres - FRAME.centres) == pytest.approx(5.0, rel=0.4)
-    wrong, truth = frame_with(wrong_sizes=3)
-    changed = np.flatnonzero(wrong.radii != FRAME.radii)
-    assert {f"ball {i}" for i in changed} == set(truth.where)
-    np.testing.assert_array_equal(wrong.radii[changed], [truth.value[truth.where.index(f"ball {i}")] for i in changed])
-    bowed, truth = frame_with(bow_share=0.001, eccentricity_mm=2.0)
-    for m in range(len(FRAME.members)):
-        a, b = FRAME.ends(m)
-        assert np.linalg.norm(bowed.bow(m)) <= 0.001 * np.linalg.norm(b - a)
-        assert abs(bowed.bow(m) @ (b - a)) < 1e-6
-        assert abs(bowed.offsets[m, 0] @ (b - a)) < 1e-6
-        assert truth.value[truth.where.index(f"member {m}")] == pytest.approx(np.linalg.norm(bowed.bow(m)))
-    loose, truth = frame_with(missing_bolts=2)
-    assert loose.missing.sum() == 2
-    warm, _ = frame_with(temperature_C=30.0)
-    np.testing.assert_allclose(warm.centres, FRAME.centres * 1.00012)
-    np.testing.assert_allclose(warm.radii, FRAME.radii * 1.00012)
-    odd, truth = frame_with(temperature_C=40.0, wrong_sizes=3, radius_mm=0.2)
-    for where, value in zip(truth.where, truth.value, strict=True):
-        assert odd.radii[int(where.removeprefix("ball "))] == value
-    with pytest.raises(UsageError, match=r"asbuilt\.bow_share: expected 0 or more"):
-        frame_with(bow_share=-1.0)
-
-
-def test_a_frame_without_a_bolt_shows_no_sleeve():
-    loose, _ = frame_with(missing_bolts=1)
-    ((member, end),) = np.argwhere(loose.missing)
-    clouds = [
-        sampler.scan_frame(f, sampler.Params(spacing_mm=4.0, sigma_mm=0.0), generator(0, "s")) for f in (FRAME, loose)
-    ]
-    a, b = FRAME.ends(member)
-    start, unit = (a, b - a) if end == 0 else (b, a - b)
-    unit = unit / np.linalg.norm(unit)
-    flat = FRAME.ball(int(FRAME.members[member, end])).flat_distance
-    counts = []
-    for cloud in clouds:
-        along = (cloud.points - start) @ unit
-        across = np.linalg.norm(cloud.points - start - np.outer(along, unit), axis=1)
-        counts.append(((along > flat + 2.0) & (along < flat + 33.0) & (across < 20.0)).sum())
-    assert counts[0] > 100
-    assert counts[1] == 0
+def test_plates_that_vary_a_little_are_built():
+    parts = arch_bridge.build(arch_bridge.Params())
+    rngs = [generator(1, f"built {part.name}") for part in parts]
+    made = asbuilt.arch(parts, asbuilt.ArchParams(plate_mm=1.0, section_mm=3.0), rngs, asbuilt.Ledger())
+    thick = np.array([dataclasses.astuple(part.plates) for part in made])
+    assert 0.3 < np.std(thick - [24.0, 24.0, 20.0]) < 2.0
 
 
 # --- structures ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("form", plate_row.FORMS)
-@pytest.mark.parametrize("kind", damage.CLASSES)
-def test_defects_are_as_deep_and_large_as_their_truth(form, kind):
-    row = plate_row.Params(form=form, components=(kind,))
-    defect = damage.draw(kind, damage.Params(), row, np.random.default_rng(2))
-    (place,) = plate_row.places(row)
-    H = row.height_mm - (2.0 * row.flange_mm if form == "girder" else 0.0)
-    if len(defect.missing):
-        boxes = plate_row.bodies(row, place)
-        cloud = sampler.scan_patches(
-            [(0, patch) for patch in damage.damaged(place, boxes, defect)],
-            sampler.Params(spacing_mm=4.0, sigma_mm=0.0),
-            generator(0, "d"),
-        )
-        local = place.local(cloud.points)
-        a0, a1, b0, b1 = defect.missing[0]
-        inside = (
-            (local[:, 0] > a0 + 0.1) & (local[:, 0] < a1 - 0.1) & (local[:, 1] > b0 + 0.1) & (local[:, 1] < b1 - 0.1)
-        )
-        front = inside & (np.abs(local[:, 2]) < 1e-6)
-        assert not front.any()
-        assert defect.area_mm2 == pytest.approx((min(a1, 500.0) - a0) * (min(b1, 0.5 * H) - b0))
-        assert defect.depth_max_mm == row.plate_mm
-        rim = np.abs(local[:, 0] - a0) < 1e-6
-        assert (
-            (local[rim, 2] > -row.plate_mm) & (local[rim, 2] < 0.0)
-        ).sum() > 20  # the cut shows the plate's thickness
+@pytest.mark.parametrize("setting", ["asbuilt.sag_mm=5", "asbuilt.nonsense=5", "asbuilt=5"])
+@pytest.mark.parametrize("name", ["arch-s1", "frame-small", "truss-bridge", "plates-defects", "stadium-roof"])
+def test_what_a_kind_cannot_be_built_with_is_refused(name, setting):
+    recipe = {key: value for key, value in recipes.load(name)[1].items() if key != "asbuilt"}
+    recipe = recipes.overridden(recipe, [setting])
+    if (name, setting) == ("stadium-roof", "asbuilt.sag_mm=5"):
+        settings = ["asbuilt.ripples=2", "structure.trusses=4", "scan.spacing_mm=500"]
+        truth = make("x", recipes.overridden(recipe, settings))[1].as_built
+        assert truth.what == ("sag at the middle", "lean at the top", "ripple at the middle", "ripples around")
+        np.testing.assert_array_equal(truth.value, [5.0, 12.0, 8.0, 2.0])
         return
-    halves = (0.0, 0.5 * row.length_mm) if kind == "step" else (-0.5 * row.length_mm, 0.5 * row.length_mm)
-
-    def inward(b, a):
-        return -float(defect.move(np.array([[a, b, 0.0]]))[0, 2])
-
-    grid = np.array([[inward(b, a) for a in np.linspace(*halves, 101)] for b in np.linspace(-0.5 * H, 0.5 * H, 101)])
-    largest = grid.flat[np.argmax(np.abs(grid))]
-    if kind not in ("twist", "waviness"):  # these go both ways
-        # A pit is smaller than the cells of this grid.
-        assert defect.depth_max_mm == pytest.approx(
-            inward(*reversed(defect.place)) if kind == "pit" else largest, rel=0.02
-        )
-    else:
-        assert defect.depth_max_mm == pytest.approx(abs(largest), rel=0.03)
-    if kind in ("twist", "waviness"):
-        volume = np.abs(grid).mean() * row.length_mm * H
-        assert volume == pytest.approx(defect.volume_mm3, rel=0.05)
-    elif kind in ("dent", "bulge", "pit"):
-        a, b = defect.place
-        r = np.sqrt(defect.area_mm2 / np.pi)
-        volume = dblquad(lambda y, x: inward(b + y, a + x), -r, r, -r, r, epsrel=1e-3)[0]
-        assert volume == pytest.approx(defect.volume_mm3, rel=1e-2)
-    else:
-        assert grid.mean() * (halves[1] - halves[0]) * H == pytest.approx(defect.volume_mm3, rel=0.03)
-
-
-def test_an_unknown_defect_is_refused():
-    with pytest.raises(UsageError, match="expected classes of dent, bulge"):
-        damage.draw("rust", damage.Params(), plate_row.Params(), np.random.default_rng(0))
+    with pytest.raises(UsageError, match=r"^asbuilt"):
+        make("x", recipe)
 
 
 def test_a_structure_moves_by_its_field():
