@@ -44,6 +44,14 @@ def rotation_from_vector(w: Floats) -> Floats:
     return R
 
 
+def vector_from_rotation(R: Floats) -> Floats:
+    """Return the axis (3,) of a rotation (3, 3), as long as its angle in rad; less than half a turn."""
+    skew = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
+    sine = float(np.linalg.norm(skew))
+    found: Floats = skew * (rotation_angle(R) / sine if sine > 0.0 else 1.0)
+    return found
+
+
 def motion(points: Floats) -> Floats:
     """Return the derivative (n, 3, 6) of points (n, 3) by a small turn about the origin and a translation."""
     found = np.zeros((len(points), 3, 6))

@@ -7,121 +7,35 @@ gaps of imperfect parts depend on: the weight lambda of the design's curve again
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from processor.geometry import rigid
 from processor.geometry.lines import Polyline
-from processor.model import ArchDesign, DesignPart, Floats, Scan, UsageError
-from processor.preassembly import attitude, bottom_edges, features, joint_ends, network, registration
+from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
+from processor.preassembly import chain_figures, features, joint_measures, network, registration, tolerance
+from processor.preassembly.chain_figures import NORMAL_95
+from processor.preassembly.joint_verdicts import Verdict, judge
+from processor.preassembly.measuring import Measured, measure
+from processor.preassembly.params import Params
+from processor.preassembly.proposals import propose
 from processor.preassembly.result import Result
+from processor.preassembly.systematic import EXPANSION_PER_K
 
-EXPANSION_PER_K = 12e-6
 REFERENCE_C = 20.0
 TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)
-NORMAL_95 = 1.959964
-LIMIT_SOURCE = "GB 50205-2020 table 9.2.3, not verified"
 
 
-@dataclass(frozen=True)
-class AdjustParams:
-    """Parameters of the adjustment."""
-
-    weight: float = 0.1  # lambda: of a squared departure of the edges from the design, against a squared gap
-    misalignment_limit_mm: float = 2.0  # across a joint: GB 50205-2020 table 9.2.3, not verified
-
-    def __post_init__(self) -> None:
-        if not self.weight > 0.0:
-            raise UsageError(f"preassemble.adjust.weight: expected a number above 0, got {self.weight!r}")
-
-
-@dataclass(frozen=True)
-class Measured:
-    """One part as measured: pose by its whole surface, ends, edges; scan frame with the origin taken off."""
-
-    name: str
-    status: str  # ok | ambiguous | weak | failed
-    message: str
-    T_bridge_scan: Floats
-    covariance: Floats
-    member: network.Member
-    shrink: float  # lengths at the reference temperature by lengths as scanned
-
-
-def measure(scan: Scan, index: int, design: ArchDesign, shrink: float) -> Measured:
-    """Register one part and measure its ends and edges; ``index`` is its place in the design's order."""
-    part, points = design.parts[index], scan.points * shrink
-    design_surface = attitude.sample_surface(part)
-    found = attitude.find(points, part, design_surface)
-    joints = [j if 0 <= j < len(design.joint_names) else None for j in (index - 1, index)]
-    if found.status == "failed":
-        return _failed(part, joints, found.message, shrink)
-    surface = design_surface.mesh
-    fitted = registration.fine(points, surface, design_surface.axes, found.T_surface)
-    if not (fitted.used_share > registration.LEAST_SHARE and np.isfinite(fitted.covariance).all()):
-        said = f"only {fitted.used_share:.0%} of the points lie near the design's surface"
-        return _failed(part, joints, f"{said}; {_looks_like(points, design, part)}", shrink)
-    if not registration.fits(fitted):
-        said = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface, "
-        said += f"the others typically {fitted.sigma_mm / 1.4826:.0f} mm"
-        return _failed(part, joints, f"{said}; {_looks_like(points, design, part)}", shrink)
-    moved = rigid.apply(fitted.T_bridge_scan, points)
-    ends: list[joint_ends.JointEnd | None] = []
-    said_of: list[str] = [found.message] if found.message else []
-    for outward, joint in zip((-1.0, 1.0), joints, strict=True):
-        if joint is None:
-            ends.append(None)
-            continue
-        corners = design.joint_points[joint]
-        end = joint_ends.fit(moved, surface, features.joint_frame(corners), corners[:4], outward, fitted.covariance)
-        said_of += [f"{design.joint_names[joint]}: {end.trouble}"] if end.trouble else []
-        ends.append(end)
-    lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
-    edges = bottom_edges.measure(moved, surface, *lines, fitted.sigma_mm, fitted.covariance)
-    member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
-    if fitted.weak:
-        said_of.append(f"what the scan shows does not hold {' and '.join(fitted.weak)}")
-    weak = bool(fitted.weak) or any(end is not None and end.trouble for end in ends)
-    status = "ambiguous" if found.status == "ambiguous" else "weak" if weak else "ok"
-    return Measured(part.name, status, "; ".join(said_of), fitted.T_bridge_scan, fitted.covariance, member, shrink)
-
-
-def _looks_like(points: Floats, design: ArchDesign, part: DesignPart) -> str:
-    """Say which part of the design has the size of the scan."""
-    size = _size_of(points)
-    apart = [float(np.abs(_size_of(one.vertices) - size).max()) for one in design.parts]
-    nearest = design.parts[int(np.argmin(apart))]
-    if nearest.name == part.name or min(apart) > 0.5 * apart[design.parts.index(part)]:
-        return "is this the right part, and whole?"
-    return f"by its size it is rather {nearest.name}"
-
-
-def _size_of(points: Floats) -> Floats:
-    """Return the sizes (3,) of points (n, 3) along their principal axes."""
-    middle = points.mean(axis=0)
-    axes = np.linalg.eigh(np.cov((points - middle).T))[1]
-    found: Floats = np.sort(np.ptp((points - middle) @ axes, axis=0))
-    return found
-
-
-def _failed(part: DesignPart, joints: Sequence[int | None], message: str, shrink: float) -> Measured:
-    ends = tuple(None if joint is None else joint_ends.nothing(message) for joint in joints)
-    lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
-    edges = bottom_edges.unseen(*lines)
-    member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
-    return Measured(part.name, "failed", message, np.full((4, 4), np.nan), np.full((6, 6), np.nan), member, shrink)
-
-
-def assemble(scans: Sequence[Scan], design: ArchDesign, params: AdjustParams, temperature_C: float) -> Result:
+def assemble(scans: Sequence[Scan], scene: Scene, design: ArchDesign, params: Params) -> Result:
     """Assemble scans in the design's order."""
+    temperature_C, weight = scene.temperature_C, params.adjust.weight
     degrees = temperature_C - REFERENCE_C if np.isfinite(temperature_C) else 0.0
     shrink = 1.0 / (1.0 + EXPANSION_PER_K * degrees)
-    parts = [measure(scan, index, design, shrink) for index, scan in enumerate(scans)]
+    parts = [measure(scan, index, design, shrink, params.systematic) for index, scan in enumerate(scans)]
     frames = np.array([features.joint_frame(points) for points in design.joint_points])
     members = [part.member for part in parts]
-    curve = {weight: network.adjust(members, design.joint_points, frames, weight) for weight in TRADE_OFF}
-    adjusted = network.adjust(members, design.joint_points, frames, params.weight)
+    curve = [network.adjust(members, design.joint_points, frames, one) for one in TRADE_OFF]
+    adjusted = network.adjust(members, design.joint_points, frames, weight)
     sd = np.sqrt(np.einsum("jkk->jk", adjusted.gap_covariance)).reshape(-1, 8, 3)
     poses = np.array([motion @ part.T_bridge_scan for motion, part in zip(adjusted.motions, parts, strict=True)])
     key_points, key_sd = _key_points(parts, scans, design, frames)
@@ -132,15 +46,24 @@ def assemble(scans: Sequence[Scan], design: ArchDesign, params: AdjustParams, te
     gaps = ends[1:, 0] - ends[:-1, 1]  # the linear answer's, but for its second order
     assembled = np.concatenate([_size(one) for one in adjusted.departures])
     best_fit = np.concatenate(_with_first_at_rest(members, adjusted))
-    trade = np.array([_figures(curve[weight]) for weight in TRADE_OFF])
+    limits = tolerance.default_for(scene.tolerance)
+    measures = [
+        joint_measures.measure(*one)
+        for one in zip(gaps, adjusted.gap_covariance, frames, design.joint_points, strict=True)
+    ]
+    judged = [judge(one, limits) for one in measures]
+    proposals = [propose(*one, limits, params.trim) for one in zip(design.joint_names, measures, strict=True)]
+    span, span_ci95 = chain_figures.span(parts, adjusted, design)
+    closure, closure_ci95 = chain_figures.closure(parts, members, design, frames)
+    limiting, advice = chain_figures.limiting(parts, adjusted, design, frames)
+    budget = params.systematic.budget(max(Polyline.through(part.bottom_edge_left).length for part in design.parts))
+    noise = float(np.nanmedian(key_sd)) if np.isfinite(key_sd).any() else float("nan")
     statuses = [part.status for part in parts]
-    alone = "temperature corrected" if degrees else "no temperature given: taken as the reference"
     mean, largest = _mean_max(np.abs(gaps))
     return Result(
         status=_overall(statuses),
         method="adjustment",
-        message=f"lambda {params.weight:g}; {alone}; limit of misalignment {params.misalignment_limit_mm:g} mm "
-        f"({LIMIT_SOURCE}); intervals hold noise alone: add registration and scanner errors of the scans",
+        message=_message(params, limits, degrees, judged),
         components=tuple(part.name for part in parts),
         component_status=tuple(statuses),
         component_message=tuple(part.message for part in parts),
@@ -153,10 +76,10 @@ def assemble(scans: Sequence[Scan], design: ArchDesign, params: AdjustParams, te
         joint_right=design.joint_right,
         gaps=gaps,
         gap_ci95=NORMAL_95 * sd,
-        verdict=_verdicts(adjusted, frames, params.misalignment_limit_mm),
+        verdict=tuple(one.verdict for one in judged),
         splicing_mean=mean,
         splicing_max=largest,
-        gauge=f"all joints and the design's curve at once, lambda {params.weight:g}",
+        gauge=f"all joints and the design's curve at once, lambda {weight:g}",
         linear_mean=_mean_max(assembled)[0],
         linear_max=_mean_max(assembled)[1],
         best_fit_linear_mean=_mean_max(best_fit)[0],
@@ -166,8 +89,25 @@ def assemble(scans: Sequence[Scan], design: ArchDesign, params: AdjustParams, te
         linear_deviation=assembled,
         best_fit_linear_deviation=best_fit,
         trade_lambda=np.array(TRADE_OFF),
-        trade_figures=trade,
-        weight=params.weight,
+        trade_figures=np.array([_figures(one) for one in curve]),
+        weight=weight,
+        T_rival_scan=np.array([_with_origin(p.T_rival, s.origin * shrink) for p, s in zip(parts, scans, strict=True)]),
+        measures=tuple(measures),
+        judged=tuple(judged),
+        proposals=tuple(proposals),
+        linear_offset=np.vstack(adjusted.departures),
+        linear_offset_ci95=NORMAL_95 * np.sqrt(np.maximum(np.vstack(adjusted.departure_variance), 0.0)),
+        span_departure=span,
+        span_ci95=span_ci95,
+        closure=closure,
+        closure_ci95=closure_ci95,
+        limiting=limiting,
+        advice=advice,
+        budget_source=("noise of the points, median", *budget),
+        budget_sd=np.array([noise, *budget.values()]),
+        residual_points=np.vstack([part.residual_points for part in parts]),
+        residual=np.concatenate([part.residuals for part in parts]),
+        residual_component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
     )
 
 
@@ -179,7 +119,8 @@ def _pose_covariances(parts: Sequence[Measured], adjusted: network.Adjusted, pla
     found = np.full((len(parts), 6, 6), np.nan)
     for i, part in enumerate(parts):
         if np.isfinite(placed[i]).all():
-            found[i] = registration.about_origin(adjusted.motion_covariance[i], part.member.middle)
+            own = slice(6 * i, 6 * i + 6)
+            found[i] = registration.about_origin(adjusted.motion_covariance[own, own], part.member.middle)
     return found
 
 
@@ -251,18 +192,11 @@ def _figures(adjusted: network.Adjusted) -> tuple[float, float, float, float]:
     return (*_mean_max(np.abs(adjusted.gaps)), *_mean_max(sizes))
 
 
-def _verdicts(adjusted: network.Adjusted, frames: Floats, limit: float) -> tuple[str, ...]:
-    """Judge each joint's misalignment across it by ISO 14253-1: only what is surely within or without is said so."""
-    found = []
-    for gaps, covariance, frame in zip(adjusted.gaps, adjusted.gap_covariance, frames, strict=True):
-        R = frame[:3, :3]
-        across = np.abs(gaps @ R)[:, 1:]
-        turn = np.kron(np.eye(8), R.T)
-        spread = NORMAL_95 * np.sqrt(np.diag(turn @ covariance @ turn.T)).reshape(8, 3)[:, 1:]
-        if not np.isfinite(across).all():
-            found.append("indeterminate")
-        elif (across + spread <= limit).all():
-            found.append("pass")
-        else:
-            found.append("fail" if (across - spread > limit).any() else "indeterminate")
-    return tuple(found)
+def _message(params: Params, limits: Tolerance, degrees: float, judged: Sequence[Verdict]) -> str:
+    said = [f"lambda {params.adjust.weight:g}"]
+    said.append("temperature corrected" if degrees else "no temperature given: taken as the reference")
+    unverified = any(not verified for one in judged for verified in one.verified)
+    said.append(f"limits of {limits.standard or 'the project'}{', not verified' if unverified else ''}")
+    if not params.systematic.known:
+        said.append("intervals hold the points' noise alone: state the stations' registration and the scanner's errors")
+    return "; ".join(said)

@@ -6,7 +6,7 @@ Principal axes leave four proper rotations, eight where the section is nearly sq
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -37,6 +37,7 @@ class Attitude:
     T_surface: Floats
     status: str  # ok | ambiguous | failed
     message: str
+    T_rival: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))  # of an ambiguous part: the other pose
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     misfit, best, start = candidates[0]
     if misfit > NO_FIT_MM:
         return Attitude(start, best, "failed", f"no attitude fits the design (typical distance {misfit:.0f} mm)")
-    message = ""
+    message, other = "", np.full((4, 4), np.nan)
     for rival_misfit, rival, rival_start in candidates[1:]:
         if rival_misfit > RIVAL_RATIO * misfit + 0.5:
             break
@@ -130,9 +131,10 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         if more < LEAST_EVIDENCE or more < 2 * fewer:
             turn = np.degrees(rigid.rotation_angle(best[:3, :3] @ rival[:3, :3].T))
             message = f"the part fits its design as well when turned by {turn:.0f} deg; a mark on it would tell"
+            other = rival
         elif theirs > ours:
-            best, start, message = rival, rival_start, ""
-    return Attitude(start, best, "ambiguous" if message else "ok", message)
+            best, start, message, other = rival, rival_start, "", np.full((4, 4), np.nan)
+    return Attitude(start, best, "ambiguous" if message else "ok", message, other)
 
 
 def _thinned(points: Floats, count: int) -> Floats:

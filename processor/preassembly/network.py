@@ -34,7 +34,7 @@ class Member:
 
 @dataclass(frozen=True)
 class Adjusted:
-    """Motions T (c, 4, 4) of the registered parts, with covariance (c, 6, 6) about each part's middle, and the gaps.
+    """Motions T (c, 4, 4) of the registered parts, with covariance (6 c, 6 c) about the parts' middles, and the gaps.
 
     ``gaps`` (j, 8, 3) in bridge axes with covariance (j, 24, 24); ``departures`` (k, 2) a part, sideways and up, after
     the adjustment, with variances (k, 2).
@@ -93,11 +93,10 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
         departure[known], variance[known] = left[rows], np.diag(spread)[rows]
         departures.append(departure)
         variances.append(variance)
-    moved = to_motion @ seen.covariance @ to_motion.T
     blocks = [slice(6 * i, 6 * i + 6) for i in range(len(members))]
     return Adjusted(
         np.array([_as_motion(x[block], member.middle) for block, member in zip(blocks, members, strict=True)]),
-        np.array([moved[block, block] for block in blocks]),
+        to_motion @ seen.covariance @ to_motion.T,
         gaps,
         gap_covariance,
         tuple(departures),

@@ -4,12 +4,25 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from processor.preassembly.adjustment import AdjustParams
+from processor.model import UsageError
 from processor.preassembly.features import BoxParams, SliceParams
 from processor.preassembly.matching import MatchParams
+from processor.preassembly.proposals import TrimParams
+from processor.preassembly.systematic import SystematicParams
 
 PAPER_METHODS = ("design-aided", "line", "corner")
 METHODS = ("adjustment", *PAPER_METHODS)  # the first is the default
+
+
+@dataclass(frozen=True)
+class AdjustParams:
+    """Parameters of the adjustment."""
+
+    weight: float = 0.1  # lambda: of a squared departure of the edges from the design, against a squared gap
+
+    def __post_init__(self) -> None:
+        if not self.weight > 0.0:
+            raise UsageError(f"preassemble.adjust.weight: expected a number above 0, got {self.weight!r}")
 
 
 @dataclass(frozen=True)
@@ -21,6 +34,8 @@ class Params:
     end_limit_mm: float = 100.0  # a joint end found farther than this from its place in the design is not used
     gap_limit_mm: float = 100.0  # a part that leaves a wider gap is called weak
     adjust: AdjustParams = field(default_factory=AdjustParams)
+    systematic: SystematicParams = field(default_factory=SystematicParams)
+    trim: TrimParams = field(default_factory=TrimParams)
     boxes: BoxParams = field(default_factory=BoxParams)
     slices: SliceParams = field(default_factory=SliceParams)
     match: MatchParams = field(default_factory=MatchParams)

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from processor.model import Checked, Floats, column, names
+import numpy as np
+
+from processor.model import Checked, Floats, Labels, column, names
+from processor.preassembly.joint_measures import Measures
+from processor.preassembly.joint_verdicts import Verdict
+from processor.preassembly.proposals import Proposal
 
 
 @dataclass(frozen=True)
@@ -20,6 +25,7 @@ class Result(Checked):
     component_message: tuple[str, ...] = names("c")
     T_bridge_scan: Floats = column("c", 4, 4)
     covariance: Floats = column("c", 6, 6)  # NaN: the paper's methods state none
+    T_rival_scan: Floats = column("r", 4, 4)  # of the adjustment: the other pose of an ambiguous part; NaN of others
     key_points_scan: Floats = column("c", 2, 8, 3)  # P1..P8 of the start and the end, in the scan's frame
     key_points_sd: Floats = column("c", 2, 8, 3)
     # a row a joint
@@ -41,6 +47,23 @@ class Result(Checked):
     linear_edge: tuple[str, ...] = names("s")  # left | right
     linear_deviation: Floats = column("s")  # as assembled
     best_fit_linear_deviation: Floats = column("s")
+    # of the adjustment alone, so empty or NaN for other methods
+    measures: tuple[Measures, ...] = ()  # a record a joint
+    judged: tuple[Verdict, ...] = ()
+    proposals: tuple[Proposal, ...] = ()
+    linear_offset: Floats = column("o", 2)  # at each station: to the left and up, as assembled
+    linear_offset_ci95: Floats = column("o", 2)
+    span_departure: float = float("nan")  # of the outer ends' distance from the design's, mm
+    span_ci95: float = float("nan")
+    closure: Floats = column("k")  # of the joints alone: mm along the bridge's axes, mrad about them
+    closure_ci95: Floats = column("k")
+    limiting: str = ""  # the joint and what was measured there that limit the accuracy
+    advice: str = ""  # the further scan that would help most
+    budget_source: tuple[str, ...] = names("b")
+    budget_sd: Floats = column("b")  # mm, of an end of the longest part
+    residual_points: Floats = column("p", 3)  # of all parts, thinned, on the design; bridge frame
+    residual: Floats = column("p")  # distance from the design's surface
+    residual_component: Labels = column("p", dtype=np.int32)
     weight: float = float("nan")  # lambda of the adjustment
     # of the adjustment: over the weight lambda, splicing mean and max, linear mean and max
     trade_lambda: Floats = column("t")

@@ -60,7 +60,7 @@ def step_json(run: StepRun) -> dict[str, Any]:
 
 
 def _preassemble(result: preassemble.Result) -> dict[str, Any]:
-    return {
+    found = {
         "status": result.status,
         "method": result.method,
         "message": result.message,
@@ -106,6 +106,55 @@ def _preassemble(result: preassemble.Result) -> dict[str, Any]:
             {"lambda": weight, **dict(zip(TRADE_OFF, figures, strict=True))}
             for weight, figures in zip(result.trade_lambda, result.trade_figures, strict=True)
         ],
+    }
+    return found | _adjusted(result) if result.measures else found
+
+
+def _adjusted(result: preassemble.Result) -> dict[str, Any]:
+    """Write what the adjustment alone says; the records of measures, verdicts and proposals as they are."""
+    judged = []
+    for joint, measures, verdict, proposal in zip(
+        result.joints, result.measures, result.judged, result.proposals, strict=True
+    ):
+        rows = zip(measures.name, measures.value, measures.ci95, measures.unit, strict=True)
+        limits = zip(
+            verdict.key, verdict.what, verdict.value, verdict.ci95, verdict.low, verdict.high, verdict.each,
+            verdict.each_probability, verdict.clause, verdict.verified, strict=True,
+        )  # fmt: skip
+        keys = ("limit", "what", "value", "ci95", "low", "high", "verdict", "probability", "clause")
+        judged.append(
+            {
+                "name": joint,
+                "gaps_joint_axes": dict(zip(KEY_POINTS, measures.gaps, strict=True)),
+                "measures": {name: {"value": v, "ci95": ci, "unit": unit} for name, v, ci, unit in rows},
+                "limits": [{**dict(zip(keys, row[:-1], strict=True)), "verified": bool(row[-1])} for row in limits],
+                "probability": verdict.probability,
+                "proposal": {
+                    "action": proposal.action,
+                    "cut": dict(zip(KEY_POINTS, proposal.cut, strict=True)),
+                    "build_up": dict(zip(KEY_POINTS, proposal.build_up, strict=True)),
+                    "probability": proposal.probability,
+                    "probability_as_is": proposal.probability_as_is,
+                    "sentence": proposal.sentence,
+                },
+            }
+        )
+    ambiguous = [i for i in range(len(result.components)) if np.isfinite(result.T_rival_scan[i]).all()]
+    return {
+        "lambda": result.weight,
+        "joint_measures": judged,
+        "span": {"departure": result.span_departure, "ci95": result.span_ci95},
+        "closure": {
+            "mm": result.closure[:3],
+            "mrad": result.closure[3:],
+            "ci95_mm": result.closure_ci95[:3],
+            "ci95_mrad": result.closure_ci95[3:],
+        },
+        "linear_offset": {"left_up": result.linear_offset, "ci95": result.linear_offset_ci95},
+        "ambiguous": {result.components[i]: {"T_rival_scan": result.T_rival_scan[i]} for i in ambiguous},
+        "limiting": result.limiting,
+        "advice": result.advice,
+        "budget_sd": dict(zip(result.budget_source, result.budget_sd, strict=True)),
     }
 
 

@@ -35,7 +35,7 @@ def run(scene: Scene, params: Params) -> Result:
         raise InputError(f"{scene.name}: preassembly needs an arch-bridge design of at least two parts (design.json)")
     scans = scans_in_order(scene, design)
     if params.method == "adjustment":
-        return adjustment.assemble(scans, design, params.adjust, scene.temperature_C)
+        return adjustment.assemble(scans, scene, design, params)
     result = paper.assemble(paper.extract(scans, design, params), design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != adjustment.REFERENCE_C:
         said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"

@@ -1,0 +1,114 @@
+"""Figures of the whole chain: its span, how it closes by the joints alone, and what limits the accuracy of its gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import KEY_POINTS, ArchDesign, Floats
+from processor.preassembly import network
+from processor.preassembly.measuring import Measured
+from processor.preassembly.network import Adjusted
+
+NORMAL_95 = 1.959964
+JOINTS_ALONE = 1e-9  # lambda with which the design's curve only says which way the bridge lies
+AXES = ("end face", "webs", "bottom and top")  # what places a joint end along its x, y and z
+
+
+def span(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> tuple[float, float]:
+    """How much farther apart the bridge's outer ends are than designed, mm, and the half-width of its interval.
+
+    Nothing in the adjustment holds the span: parts that are too short bring the feet nearer to each other.
+    """
+    ends = _outer_ends(design)
+    chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
+    moves = [_move(parts[i], adjusted, i, at) for i, at in ((0, ends[0]), (-1, ends[1]))]
+    D = np.concatenate([-chord, chord]) @ np.vstack(
+        [_to_points(parts, i, at) for i, at in ((0, ends[0]), (-1, ends[1]))]
+    )
+    variance = float(D @ adjusted.motion_covariance @ D)
+    for i, at in ((0, ends[0]), (-1, ends[1])):
+        own = chord @ rigid.motion(at[None])[0]
+        variance += float(own @ parts[i].covariance @ own)
+    return float(chord @ (moves[1] - moves[0])), NORMAL_95 * float(np.sqrt(variance))
+
+
+def closure(
+    parts: Sequence[Measured], members: Sequence[network.Member], design: ArchDesign, frames: Floats
+) -> tuple[Floats, Floats]:
+    """Where the last part's outer end comes to lie when the joints alone place all parts after the first.
+
+    Departure (6,) from the design, mm along the bridge's axes and mrad about them, with half-widths (6,); NaN where a
+    joint has no answer. The first part rests on its design.
+    """
+    alone = network.adjust(members, design.joint_points, frames, JOINTS_ALONE)
+    if not np.isfinite(alone.gaps).all():
+        return np.full(6, np.nan), np.full(6, np.nan)
+    at = _outer_ends(design)[1]
+    T = rigid.invert(alone.motions[0]) @ alone.motions[-1]
+    shift, turn = rigid.apply(T, at[None])[0] - at, rigid.vector_from_rotation(T[:3, :3])
+    D = np.zeros((6, len(alone.motion_covariance)))
+    for i, sign in ((0, -1.0), (len(parts) - 1, 1.0)):
+        D[:3, 6 * i : 6 * i + 6] += sign * rigid.motion((at - parts[i].member.middle)[None])[0]
+        D[3:, 6 * i : 6 * i + 3] += sign * np.eye(3)
+    covariance = D @ alone.motion_covariance @ D.T
+    for part in (parts[0], parts[-1]):
+        own = np.vstack([rigid.motion(at[None])[0], np.hstack([np.eye(3), np.zeros((3, 3))])])
+        covariance += own @ part.covariance @ own.T
+    unit = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
+    return np.concatenate([shift, turn]) * unit, NORMAL_95 * np.sqrt(np.diag(covariance)) * unit
+
+
+def limiting(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> tuple[str, str]:
+    """Say which joint and which measured face limit the gaps' accuracy, and which further scan would help."""
+    worst, where = 0.0, (0, 0, 0)
+    for j, (covariance, frame) in enumerate(zip(adjusted.gap_covariance, frames, strict=True)):
+        turn = np.kron(np.eye(8), frame[:3, :3].T)
+        spread = np.sqrt(np.maximum(np.diag(turn @ covariance @ turn.T), 0.0))
+        if np.isfinite(spread).all() and spread.max() > worst:
+            k = int(np.argmax(spread))
+            worst, where = float(spread[k]), (j, k // 3, k % 3)
+    unknown = [
+        name for name, gaps in zip(design.joint_names, adjusted.gaps, strict=True) if not np.isfinite(gaps).all()
+    ]
+    missing = f"no answer at {', '.join(unknown)}: scan both ends there" if unknown else ""
+    if worst == 0.0:
+        return missing, missing
+    j, point, axis = where
+    ends = {"end": parts[j].member.ends[1], "start": parts[j + 1].member.ends[0]}
+    own = {
+        side: float(end.covariance[3 * point + axis, 3 * point + axis]) for side, end in ends.items() if end is not None
+    }
+    side = max(own, key=lambda one: own[one])
+    part = parts[j].name if side == "end" else parts[j + 1].name
+    share = own[side] / sum(own.values())
+    limit = f"{design.joint_names[j]} {KEY_POINTS[point]}: +-{NORMAL_95 * worst:.3f} mm (95 %), {share:.0%} of the "
+    limit += f"variance from the {AXES[axis]} at the {side} of {part}"
+    advice = f"a scan of {part} that shows more of the {AXES[axis]} at its {side}: four times the points halve its part"
+    return limit, "; ".join(filter(None, (missing, advice)))
+
+
+def _outer_ends(design: ArchDesign) -> Floats:
+    """Points (2, 3) in the middle of the bottom at the start of the first and at the end of the last part."""
+    first, last = design.parts[0], design.parts[-1]
+    return np.array(
+        [
+            0.5 * (first.bottom_edge_left[0] + first.bottom_edge_right[0]),
+            0.5 * (last.bottom_edge_left[-1] + last.bottom_edge_right[-1]),
+        ]
+    )
+
+
+def _move(part: Measured, adjusted: Adjusted, index: int, at: Floats) -> Floats:
+    moved: Floats = rigid.apply(adjusted.motions[index], at[None])[0] - at
+    return moved
+
+
+def _to_points(parts: Sequence[Measured], index: int, at: Floats) -> Floats:
+    """Return the derivative (3, 6 c) of a point of a part by all motions."""
+    index = index % len(parts)
+    found = np.zeros((3, 6 * len(parts)))
+    found[:, 6 * index : 6 * index + 6] = rigid.motion((at - parts[index].member.middle)[None])[0]
+    return found
