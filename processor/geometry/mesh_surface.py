@@ -27,18 +27,22 @@ class MeshSurface:
     tree: cKDTree
     sample_face: Ints
 
-    def distances(self, points: Floats, reach: float) -> tuple[Ints, Floats, Floats]:
+    def distances(self, points: Floats, reach: float, before: Ints | None = None) -> tuple[Ints, Floats, Floats]:
         """Facet (n,), signed distance (n,) from it, and how far (n,) the foot lies beyond its face's edge; mm.
 
         Facet -1 and NaN where no sample of the surface is within ``reach``. The search starts at the nearest sample and
-        walks over smooth edges to the facet that the foot is on, so that a curved face is not taken for a plane.
+        walks over smooth edges to the facet that the foot is on, so that a curved face is not taken for a plane. Points
+        that have moved little start where they were ``before`` (n,) instead.
         """
-        found, sample = self.tree.query(points, distance_upper_bound=reach, workers=-1)
-        near = np.isfinite(found)
         face = np.full(len(points), -1, np.int64)
         distance, beyond = np.full(len(points), np.nan), np.full(len(points), np.nan)
-        rows = np.flatnonzero(near)
-        at = self.sample_face[sample[rows]]
+        if before is None:
+            found, sample = self.tree.query(points, distance_upper_bound=reach, workers=-1)
+            rows = np.flatnonzero(np.isfinite(found))
+            at = self.sample_face[sample[rows]]
+        else:
+            rows = np.flatnonzero(before >= 0)
+            at = before[rows]
         active = np.arange(len(rows))
         for _ in range(WALK_STEPS):
             share = self._barycentric(points[rows[active]], at[active])

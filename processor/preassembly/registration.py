@@ -12,7 +12,8 @@ from processor.model import Floats, Ints
 
 POINTS, LAST_POINTS = 30_000, 250_000
 MOST_TURNS = 30
-STILL_MM = 1e-4  # a pose that moves the part by less stands still
+STILL_MM = 3e-4  # a pose that moves the part by less stands still
+SMALL_MM = 0.3  # ... or by less leaves each point on its face
 NO_FORM = 2.0  # of the cells' means over what chance makes them
 GATES_MM = (60.0, 30.0)
 CUT = 4.5  # standard deviations
@@ -73,9 +74,10 @@ def _iterate(
     """Iterate until the pose stands still; also the variance of the cells' means against that of chance."""
     T, sigma, covariance, share, form = start.copy(), float("nan"), np.full((6, 6), np.nan), 0.0, float("inf")
     weak: tuple[str, ...] = ()
+    face: Ints | None = None
     for turn in range(MOST_TURNS):
         moved = rigid.apply(T, points)
-        face, residual, beyond = surface.distances(moved, gate + 60.0)
+        face, residual, beyond = surface.distances(moved, gate + 60.0, face)
         used = (face >= 0) & (np.abs(residual) < gate) & (beyond < 1.0)
         if used.sum() < 100:
             break
@@ -96,8 +98,8 @@ def _iterate(
         share = float(used.mean())
         if turn >= 3:
             gate = max(GATES_MM[1], 6.0 * sigma)
-        still = np.linalg.norm(step[3:]) < STILL_MM and np.linalg.norm(step[:3]) * np.ptp(moved[:, 0]) < STILL_MM
-        if turn == MOST_TURNS - 1 or (still and (turn > 4 or not even)):
+        move = float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.ptp(moved[:, 0]))
+        if turn == MOST_TURNS - 1 or (move < STILL_MM and (turn > 4 or not even)):
             cell = _cells(moved[used] @ axes, looks, n @ axes)
             form = _form(r, np.sqrt(weight), cell)
             inverse = np.linalg.inv(normal)
@@ -105,6 +107,7 @@ def _iterate(
             weak = _weak(at_middle, axes, float(np.abs((moved[used] - middle) @ axes[:, 0]).max()))
             covariance = about_origin(at_middle, middle)
             break
+        face = face if move < SMALL_MM else None
     return Registration(T, covariance, sigma, share, weak), form
 
 
@@ -116,8 +119,7 @@ def _cells(place: Floats, looks: Ints, normal: Floats) -> Ints:
     """Return the number (n,) of the cell along the part, and of the side, that points at (n, 3) are in."""
     cell = np.floor(place[:, 0] / CELL_MM).astype(np.int64)
     side = normal[np.arange(len(looks)), looks] > 0.0
-    key = np.stack([cell, 2 * looks + side], axis=1)
-    number: Ints = np.unique(key, axis=0, return_inverse=True)[1].reshape(-1)
+    number: Ints = np.unique(6 * cell + 2 * looks + side, return_inverse=True)[1].reshape(-1)
     return number
 
 
