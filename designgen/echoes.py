@@ -151,6 +151,11 @@ class _Job:
         """Ranges that the scanner sees, mm."""
         return self.scanner.min_range_mm, self.scanner.max_range_mm
 
+    @property
+    def turned(self) -> float:
+        """Angle by which encoders turn no ray further, rad, and what rounding may do."""
+        return 1.5e-6 * ENCODER_SIGMAS * self.scanner.encoder_urad + 1e-6  # by two encoders, square to each other
+
     def strip(self, number: int) -> Returns:
         """Return what the rays of one strip of columns give."""
         if self.seen.strip_start[number] == self.seen.strip_start[number + 1]:
@@ -165,7 +170,7 @@ class _Job:
             # An azimuth moves a ray less the higher it looks.
             jitter[:, :, 0] *= np.cos(self.grid.lowest + self.grid.step * np.arange(self.grid.rows))
         half = (0.5 * self.scanner.beam_exit_mm, 0.5e-3 * self.scanner.divergence_mrad)
-        shape, t, thin = raycast.cast(self.seen, self.grid, number, STRIP, jitter, self.limits, half)
+        shape, t, thin = raycast.cast(self.seen, self.grid, number, STRIP, jitter, self.turned, self.limits, half)
         edge = np.zeros(shape.shape, bool)
         if self.params.sub_rays > 1:
             surface = np.where(shape >= 0, self.surfaces.surface[shape], -1)
@@ -200,7 +205,7 @@ class _Job:
         beam_ = beam(self.params.sub_rays)
         angle = self.scanner.beam_angle(nearest)
         subs, ranges = raycast.cast_around(
-            self.seen, self.grid, strip, STRIP, jitter, self.limits, number, angle, beam_[0]
+            self.seen, self.grid, strip, STRIP, jitter, self.turned, self.limits, number, angle, beam_[0]
         )
         surface = np.where(subs >= 0, self.surfaces.surface[subs], -1)
         whole = (surface == surface[:, :1]).all(axis=1) & (subs[:, 0] >= 0)

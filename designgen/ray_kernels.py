@@ -1,4 +1,4 @@
-"""Compiled kernels of the ray caster: bounding boxes on the grid, shapes against rays, all in float64.
+"""Compiled kernels of the ray caster: shapes against rays, all in float64.
 
 Every kernel works on one strip of columns, alone, so that results do not depend on the threads. The shapes' numbers are
 those of :class:`designgen.surfaces.Builder`; a ray starts at the origin of the scanner's frame.
@@ -10,69 +10,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from designgen.ray_boxes import edge_planes, rows_within
+
 MISS = -1
 SLACK = 1e-9  # relative: two triangles that share an edge leave no gap
-
-
-@njit(cache=True, nogil=True)
-def boxes(centres, radii, reach, spread, step, lowest, rows, columns):  # type: ignore[no-untyped-def]
-    """Boxes (b, 5) of the pieces: piece, first and last column, first and last row.
-
-    Columns run from -1 to ``columns``, so that a box over the seam is there on both of its sides.
-    """
-    found = np.empty((3 * len(radii), 5), np.int32)
-    count = 0
-    across = columns / (2.0 * np.pi)
-    for k in range(len(radii)):
-        x, y, z = centres[k, 0], centres[k, 1], centres[k, 2]
-        d = np.sqrt(x * x + y * y + z * z)
-        if d - radii[k] > reach:
-            continue
-        first, last, low, high = -1, columns, 0, rows - 1
-        if d > 1.000001 * radii[k]:
-            half = np.arcsin(radii[k] / d) + spread
-            elevation = np.arcsin(z / d)
-            low = max(low, int(np.floor((elevation - half - lowest) / step)))
-            high = min(high, int(np.ceil((elevation + half - lowest) / step)))
-            if abs(elevation) + half < 0.5 * np.pi - 1e-6 and half < 1.5:
-                side = np.arcsin(min(1.0, np.sin(half) / np.cos(elevation)))
-                azimuth = np.arctan2(y, x)
-                first = int(np.floor((azimuth - side) * across))
-                last = int(np.ceil((azimuth + side) * across))
-        if low > high:
-            continue
-        whole = last - first >= columns
-        for turn in range(-1, 2):
-            a, z_ = max(first + turn * columns, -1), min(last + turn * columns, columns)
-            if whole and turn != 0:
-                continue
-            if whole:
-                a, z_ = -1, columns
-            if a <= z_:
-                found[count, 0], found[count, 1], found[count, 2] = k, a, z_
-                found[count, 3], found[count, 4] = low, high
-                count += 1
-    return found[:count].copy()
-
-
-@njit(cache=True, nogil=True)
-def by_strip(boxes, width, strips):  # type: ignore[no-untyped-def]
-    """Copy boxes into each strip they touch, a column beside it on either side included: (c, 5), (strips + 1,)."""
-    start = np.zeros(strips + 1, np.int64)
-    for fill in range(2):
-        if fill:
-            start = np.cumsum(start)
-            place = start[:-1].copy()
-            result = np.empty((start[-1], 5), np.int32)
-        for b in range(len(boxes)):
-            low = max(0, -((width - boxes[b, 1]) // width))
-            for s in range(low, min(strips - 1, (boxes[b, 2] + 1) // width) + 1):
-                if fill:
-                    result[place[s]] = boxes[b]
-                    place[s] += 1
-                else:
-                    start[s + 1] += 1
-    return result, start
+FEW_ROWS = 12  # testing so many rays costs no more than finding those that may meet a triangle
 
 
 @njit(cache=True, nogil=True)
@@ -215,6 +157,7 @@ def cast(  # type: ignore[no-untyped-def]
     lowest,
     step,
     jitter,
+    turned,
     least,
     most,
     beam,
@@ -238,11 +181,17 @@ def cast(  # type: ignore[no-untyped-def]
         c2 = cx * cx + cy * cy + cz * cz
         # A bit more than what the angle between rays of the grid spans there, across.
         slim = thickness(kind[i], numbers[i]) < 1.5 * step * (np.sqrt(c2) + radii[k])
+        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        if wide:
+            planes = edge_planes(numbers[i])
         for column in range(max(boxes[b, 1], first - 1), min(boxes[b, 2], first + width) + 1):
             j = column - first + 1
             azimuth = 2.0 * np.pi * column / columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
-            for row in range(boxes[b, 3], boxes[b, 4] + 1):
+            low, high = boxes[b, 3], boxes[b, 4]
+            if wide:
+                low, high = rows_within(planes, ca, sa, turned, lowest, step, low, high)
+            for row in range(low, high + 1):
                 da, de = jitter[j, row, 0], jitter[j, row, 1]
                 # First order in the encoders' noise: the direction stays a unit vector to 1e-10.
                 flat = level[row] - de * rise[row]
@@ -296,6 +245,7 @@ def cast_around(  # type: ignore[no-untyped-def]
     lowest,
     step,
     jitter,
+    turned,
     least,
     most,
     number,
@@ -308,6 +258,7 @@ def cast_around(  # type: ignore[no-untyped-def]
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
     farthest = np.full(count, np.inf)  # of a ray's sub-rays
+    broadest = angle.max() if count else 0.0
     rows = number.shape[1]
     level, rise = np.empty(rows), np.empty(rows)
     for i in range(rows):
@@ -317,11 +268,17 @@ def cast_around(  # type: ignore[no-untyped-def]
         i = owner[k]
         cx, cy, cz, r = centres[k, 0], centres[k, 1], centres[k, 2], radii[k]
         c2 = cx * cx + cy * cy + cz * cz
+        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        if wide:
+            planes = edge_planes(numbers[i])
         for column in range(max(boxes[b, 1], first), min(boxes[b, 2], first + width - 1) + 1):
             j = column - first + 1
             azimuth = 2.0 * np.pi * column / columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
-            for row in range(boxes[b, 3], boxes[b, 4] + 1):
+            low, high = boxes[b, 3], boxes[b, 4]
+            if wide:
+                low, high = rows_within(planes, ca, sa, turned + broadest, lowest, step, low, high)
+            for row in range(low, high + 1):
                 ray = number[j, row]
                 if ray < 0:
                     continue

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen import ray_kernels
+from designgen import ray_boxes, ray_kernels
 from designgen.surfaces import CONE, DISC, SPHERE, Surfaces
 from processor.model import Floats, Ints, Labels, Shorts
 
@@ -66,10 +66,10 @@ def see(surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, rea
     cuts[:, :3] = cuts[:, :3] @ R.T
     centres = surfaces.piece_centre @ R.T + t
     strips = -(-grid.columns // width)
-    found = ray_kernels.boxes(
+    found = ray_boxes.boxes(
         centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns
     )
-    boxes, start = ray_kernels.by_strip(found, width, strips)
+    boxes, start = ray_boxes.by_strip(found, width, strips)
     piece = (surfaces.piece_shape, centres, surfaces.piece_radius)
     return Seen((surfaces.kind, numbers, cuts, surfaces.cut_start), boxes, start, piece)
 
@@ -80,19 +80,21 @@ def cast(
     strip: int,
     width: int,
     jitter: Shorts,
+    turned: float,
     limits: tuple[float, float],
     beam: tuple[float, float],
 ) -> Any:
     """Shape and range of the rays of a strip and of a column on either side: (width + 2, rows) each; -1 = no hit.
 
-    ``jitter`` (width + 2, rows, 2) turns each ray to the left and up, rad; ``limits`` are the ranges seen, mm. What is
-    nearer hides what is behind it. A third answer is the range at which a beam of radius ``beam[0] + beam[1] range``
-    may touch a thing so thin that the rays beside it may all miss it, infinite where there is none.
+    ``jitter`` (width + 2, rows, 2) turns each ray to the left and up, rad, by no more than ``turned``; ``limits`` are
+    the ranges seen, mm. What is nearer hides what is behind it. A third answer is the range at which a beam of radius
+    ``beam[0] + beam[1] range`` may touch a thing so thin that the rays beside it may all miss it, infinite where there
+    is none.
     """
     first = strip * width
     return ray_kernels.cast(  # type: ignore[call-arg]
         *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
-        grid.columns, grid.lowest, grid.step, jitter, *limits, beam,
+        grid.columns, grid.lowest, grid.step, jitter, turned, *limits, beam,
     )  # fmt: skip
 
 
@@ -102,6 +104,7 @@ def cast_around(
     strip: int,
     width: int,
     jitter: Shorts,
+    turned: float,
     limits: tuple[float, float],
     number: Labels,
     angle: Floats,
@@ -115,7 +118,7 @@ def cast_around(
     first = strip * width
     return ray_kernels.cast_around(  # type: ignore[call-arg]
         *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
-        grid.columns, grid.lowest, grid.step, jitter, *limits, number, angle, offsets, len(angle),
+        grid.columns, grid.lowest, grid.step, jitter, turned, *limits, number, angle, offsets, len(angle),
     )  # fmt: skip
 
 

@@ -366,6 +366,39 @@ def test_rays_meet_cones_where_bisection_does():
     assert met > 300
 
 
+def test_large_and_slim_triangles_are_met_wherever_they_are():
+    """Around the scanner, over its head, seen edge on: each ray against each plane's equation, without boxes."""
+    rng = np.random.default_rng(6)
+    builder, triangles = Builder(), []
+    for i in range(60):
+        middle = rng.uniform(-6000.0, 6000.0, 3)
+        corners = middle + rng.normal(size=(3, 3)) * rng.choice([300.0, 2000.0, 8000.0])
+        if i % 3 == 0:  # slim
+            corners[2] = corners[1] + rng.uniform(-80.0, 80.0, 3)
+        if i % 10 == 1:  # in one plane with the scanner
+            corners[2] = 0.7 * corners[0] + 0.6 * corners[1]
+        triangles.append(corners)
+        builder.polygon(i, "face", corners)
+    device = dataclasses.replace(QUIET, min_range_mm=0.0, max_range_mm=1e6, divergence_mrad=0.0)
+    params = scanner.Params(step_mrad=12.0, sub_rays=1)
+    returns = echoes.scan(builder.done(), np.eye(4), device, params, 0, "S1").returns
+    grid = raycast.Grid(0.012, np.radians(-60.0), int(np.radians(150.0) / 0.012), round(2.0 * np.pi / 0.012))
+    row, column = (x.ravel() for x in np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij"))
+    rays, nearest = grid.directions(row, column), np.full(len(row), np.inf)
+    for corners in triangles:
+        # The ray t d is in the cone of the corners where d is a sum of them with shares above 0: t = 1 / their sum.
+        if abs(np.linalg.det(corners)) < 1e-9 * np.prod(np.linalg.norm(corners, axis=1)):
+            continue
+        shares = rays @ np.linalg.inv(corners)
+        met = (shares >= 0.0).all(axis=1)
+        nearest[met] = np.minimum(nearest[met], 1.0 / shares[met].sum(axis=1))
+    found = np.full(len(row), np.inf)
+    found[returns.row * grid.columns + returns.column] = np.linalg.norm(returns.points, axis=1)
+    assert np.isfinite(nearest).sum() > 50_000
+    np.testing.assert_array_equal(np.isfinite(found), np.isfinite(nearest))
+    np.testing.assert_allclose(found, nearest, rtol=1e-9)
+
+
 def test_what_is_too_near_hides_what_is_behind_it():
     builder = Builder()
     plate = np.array([[-2000.0, 0.0, -2000.0], [2000.0, 0.0, -2000.0], [2000.0, 0.0, 2000.0], [-2000.0, 0.0, 2000.0]])

@@ -1,0 +1,111 @@
+"""Compiled kernels of the ray caster: which rays of a grid a shape may be met by, all in float64."""
+# Numba infers the types of the arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def boxes(centres, radii, reach, spread, step, lowest, rows, columns):  # type: ignore[no-untyped-def]
+    """Boxes (b, 5) of the pieces: piece, first and last column, first and last row.
+
+    Columns run from -1 to ``columns``, so that a box over the seam is there on both of its sides.
+    """
+    found = np.empty((3 * len(radii), 5), np.int32)
+    count = 0
+    across = columns / (2.0 * np.pi)
+    for k in range(len(radii)):
+        x, y, z = centres[k, 0], centres[k, 1], centres[k, 2]
+        d = np.sqrt(x * x + y * y + z * z)
+        if d - radii[k] > reach:
+            continue
+        first, last, low, high = -1, columns, 0, rows - 1
+        if d > 1.000001 * radii[k]:
+            half = np.arcsin(radii[k] / d) + spread
+            elevation = np.arcsin(z / d)
+            low = max(low, int(np.floor((elevation - half - lowest) / step)))
+            high = min(high, int(np.ceil((elevation + half - lowest) / step)))
+            if abs(elevation) + half < 0.5 * np.pi - 1e-6 and half < 1.5:
+                side = np.arcsin(min(1.0, np.sin(half) / np.cos(elevation)))
+                azimuth = np.arctan2(y, x)
+                first = int(np.floor((azimuth - side) * across))
+                last = int(np.ceil((azimuth + side) * across))
+        if low > high:
+            continue
+        whole = last - first >= columns
+        for turn in range(-1, 2):
+            a, z_ = max(first + turn * columns, -1), min(last + turn * columns, columns)
+            if whole and turn != 0:
+                continue
+            if whole:
+                a, z_ = -1, columns
+            if a <= z_:
+                found[count, 0], found[count, 1], found[count, 2] = k, a, z_
+                found[count, 3], found[count, 4] = low, high
+                count += 1
+    return found[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def by_strip(boxes, width, strips):  # type: ignore[no-untyped-def]
+    """Copy boxes into each strip they touch, a column beside it on either side included: (c, 5), (strips + 1,)."""
+    start = np.zeros(strips + 1, np.int64)
+    for fill in range(2):
+        if fill:
+            start = np.cumsum(start)
+            place = start[:-1].copy()
+            result = np.empty((start[-1], 5), np.int32)
+        for b in range(len(boxes)):
+            low = max(0, -((width - boxes[b, 1]) // width))
+            for s in range(low, min(strips - 1, (boxes[b, 2] + 1) // width) + 1):
+                if fill:
+                    result[place[s]] = boxes[b]
+                    place[s] += 1
+                else:
+                    start[s + 1] += 1
+    return result, start
+
+
+@njit(cache=True, nogil=True)
+def edge_planes(n):  # type: ignore[no-untyped-def]
+    """Return inward unit normals (3, 3) of planes through the origin and a triangle's edges, 0 of one seen end on."""
+    planes = np.zeros((3, 3))
+    for k in range(3):
+        a, b, c = 3 * k, 3 * ((k + 1) % 3), 3 * ((k + 2) % 3)
+        x = n[a + 1] * n[b + 2] - n[a + 2] * n[b + 1]
+        y = n[a + 2] * n[b] - n[a] * n[b + 2]
+        z = n[a] * n[b + 1] - n[a + 1] * n[b]
+        size = np.sqrt(x * x + y * y + z * z)
+        if size > 0.0:
+            if x * n[c] + y * n[c + 1] + z * n[c + 2] < 0.0:
+                size = -size
+            planes[k, 0], planes[k, 1], planes[k, 2] = x / size, y / size, z / size
+    return planes
+
+
+@njit(cache=True, nogil=True)
+def rows_within(planes, ca, sa, slack, lowest, step, low, high):  # type: ignore[no-untyped-def]
+    """First and last of the rows ``low`` to ``high`` of a column that are no further than ``slack`` beyond a plane.
+
+    ``ca`` and ``sa`` are the cosine and sine of the column's azimuth. Where none is, the first is above the last.
+    """
+    bottom, top = lowest + step * low, lowest + step * high
+    for k in range(3):
+        across, up = planes[k, 0] * ca + planes[k, 1] * sa, planes[k, 2]
+        size = np.sqrt(across * across + up * up)
+        if size <= slack:
+            continue
+        # across cos e + up sin e >= -slack holds about one elevation.
+        middle, half = np.arctan2(up, across), np.arccos(-slack / size)
+        a, z = np.inf, -np.inf
+        for turn in range(-1, 2):
+            first = max(bottom, middle - half + 2.0 * np.pi * turn)
+            last = min(top, middle + half + 2.0 * np.pi * turn)
+            if first <= last:
+                a, z = min(a, first), max(z, last)
+        if a > z:
+            return 1, 0
+        bottom, top = a, z
+    return max(low, int(np.floor((bottom - lowest) / step))), min(high, int(np.ceil((top - lowest) / step)))
