@@ -16,8 +16,10 @@ from typing import Any
 import numpy as np
 
 from designgen import ray_boxes, ray_kernels
-from designgen.surfaces import CONE, DISC, SPHERE, Surfaces
+from designgen.surfaces import CONE, DISC, SPHERE, Bools, Surfaces
 from processor.model import Floats, Ints, Labels, Shorts
+
+WEIGHTS = (-3.0, 4.0)  # of a net triangle's edges, between which a ray may meet the face that the net stands for
 
 
 @dataclass(frozen=True)
@@ -164,24 +166,40 @@ def _on_patches(
         corners, pq = surfaces.numbers[triangle, :9].reshape(-1, 3, 3), surfaces.corner_pq[triangle]
         edge, turn = corners[:, 1:] - corners[:, :1], pq[:, 1:] - pq[:, :1]
         # The net's triangle gives the derivatives: dx = edge^T w for d(p, q) = turn^T w.
-        columns = np.stack([edge[:, 0], edge[:, 1], -d], axis=2)
-        inverse = np.linalg.inv(columns)
+        inverse, regular = _inverse(edge[:, 0], edge[:, 1], -d)
         range_ = t[rows].copy()
         weights = np.einsum("nij,nj->ni", inverse, origin + range_[:, None] * d - corners[:, 0])[:, :2]
-        off = np.full(len(rows), np.inf)
+        now, met, off = np.empty((len(rows), 2)), np.empty((len(rows), 3)), np.full(len(rows), np.inf)
+        live: Any = slice(None)  # most of the time all of them
         for _ in range(12):
-            now = pq[:, 0] + np.einsum("ni,nij->nj", weights, turn)
-            met = at(now[:, 0], now[:, 1])
-            left = origin + range_[:, None] * d - met
-            off = np.linalg.norm(left, axis=1)
-            if (off < 0.1 * tolerance_mm).all():
+            now[live] = pq[live, 0] + np.einsum("ni,nij->nj", weights[live], turn[live])
+            met[live] = at(now[live, 0], now[live, 1])
+            left = origin + range_[live, None] * d[live] - met[live]
+            off[live] = np.sqrt(np.einsum("ni,ni->n", left, left))
+            step = np.einsum("nij,nj->ni", inverse[live], left)
+            # A grazing ray may step far away, where the face's function has no meaning.
+            weights[live] = np.clip(weights[live] + step[:, :2], *WEIGHTS)
+            range_[live] += step[:, 2]
+            more = np.flatnonzero(off >= 0.1 * tolerance_mm)
+            if not len(more):
                 break
-            step = np.einsum("nij,nj->ni", inverse, left)
-            weights += step[:, :2]
-            range_ += step[:, 2]
-        range_[~(off < tolerance_mm)] = np.nan
+            live = more if len(more) < len(rows) else live
+        range_[~(off < tolerance_mm) | ~regular] = np.nan
         result[rows], normal[rows] = range_, _across(at, now, met, turn) @ R.T
     return result, normal
+
+
+def _inverse(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Bools]:
+    """Inverses (n, 3, 3) of matrices with columns a, b and the unit vectors c (n, 3), and which of them (n,) have one.
+
+    Those that have none get 0.
+    """
+    found = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    volume = np.einsum("ni,ni->n", a, found[:, 0])
+    regular = np.abs(volume) > 1e-12 * np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    found[~regular], volume[~regular] = 0.0, 1.0
+    found /= volume[:, None, None]
+    return found, regular
 
 
 def _across(at: Callable[[Floats, Floats], Floats], pq: Floats, points: Floats, turn: Floats) -> Floats:
@@ -189,5 +207,5 @@ def _across(at: Callable[[Floats, Floats], Floats], pq: Floats, points: Floats, 
     share = 1e-5  # of the net's edges, which bend by a few degrees at most: 1e-6 rad of the normal
     one, other = (at(*(pq + share * turn[:, k]).T) - points for k in range(2))
     normal = np.cross(one, other)
-    found: Floats = normal / np.linalg.norm(normal, axis=1)[:, None]
+    found: Floats = normal / np.sqrt(np.einsum("ni,ni->n", normal, normal))[:, None]
     return found

@@ -399,6 +399,52 @@ def test_large_and_slim_triangles_are_met_wherever_they_are():
     np.testing.assert_allclose(found, nearest, rtol=1e-9)
 
 
+def test_only_flat_faces_are_met_on_their_nets():
+    """A dent, a wave that is 0 at every knot, a tube: none of them is taken for its net; a face of a box is."""
+
+    def flat(p, q):
+        return np.stack([2000.0 * p, 500.0 + 300.0 * p, 1000.0 * q + 100.0 * p * q], axis=1)
+
+    def dented(p, q):
+        return flat(p, q) + np.outer(30.0 * np.exp(-((p - 0.3) ** 2 + (q - 0.4) ** 2) / 0.06**2), [0.0, 1.0, 0.0])
+
+    def wavy(p, q):
+        return flat(p, q) + np.outer(1e-4 * np.sin(np.pi * 8.0 * p), [0.0, 1.0, 0.0])
+
+    two, many = np.linspace(0.0, 1.0, 2), np.linspace(0.0, 1.0, 9)
+    builder = Builder()
+    cases = [(flat, two), (flat, many), (dented, two), (wavy, many), (flat, two)]
+    for i, (at, knots) in enumerate(cases):
+        builder.patch(i, Patch("face", at, knots, two))
+    for patch in structure.Tube(*TUBE).patches():
+        builder.patch(len(cases), patch)
+    surfaces = builder.done()
+    on_net = [set(surfaces.patch[surfaces.part == i]) == {-1} for i in range(len(cases) + 1)]
+    assert on_net == [True, True, False, False, True, False]
+
+
+def test_grazing_rays_stay_near_their_net():
+    """A face whose function knows nothing far outside of 0 to 1, seen along its bends: no ray asks for that."""
+    asked = [0.0]
+
+    def at(p, q):
+        asked[0] = max(asked[0], np.abs(p).max(), np.abs(q).max())
+        return np.stack(
+            [3000.0 * (p - 0.5), 2000.0 + 3000.0 * q, 3.0 * np.sin(9.0 * p) + 3.0 * np.cos(9.0 * q)], axis=1
+        )
+
+    builder = Builder()
+    knots = np.linspace(0.0, 1.0, 12)
+    builder.patch(0, Patch("wavy", at, knots, knots))
+    T = standing(0.0, 0.0, 6.0)
+    returns = echoes.scan(builder.done(), T, QUIET, scanner.Params(step_mrad=0.1), 0, "S1", keep_hits=True).returns
+    assert asked[0] < 1.0 + 4.0 / 11.0 + 1e-3
+    x, y, z = in_scene(T, returns.hits).T
+    p, q = x / 3000.0 + 0.5, (y - 2000.0) / 3000.0
+    np.testing.assert_allclose(z, 3.0 * np.sin(9.0 * p) + 3.0 * np.cos(9.0 * q), atol=1e-5)
+    assert len(x) > 50_000
+
+
 def test_what_is_too_near_hides_what_is_behind_it():
     builder = Builder()
     plate = np.array([[-2000.0, 0.0, -2000.0], [2000.0, 0.0, -2000.0], [2000.0, 0.0, 2000.0], [-2000.0, 0.0, 2000.0]])
