@@ -8,10 +8,10 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def boxes(centres, radii, reach, spread, step, lowest, rows, columns):  # type: ignore[no-untyped-def]
+def boxes(centres, radii, reach, spread, step, lowest, rows, columns, side):  # type: ignore[no-untyped-def]
     """Boxes (b, 5) of the pieces: piece, first and last column, first and last row.
 
-    Columns run from -1 to ``columns``, so that a box over the seam is there on both of its sides.
+    Columns run ``side`` beyond the first and the last, so that a box over the seam is there on both of its sides.
     """
     found = np.empty((3 * len(radii), 5), np.int32)
     count = 0
@@ -21,7 +21,7 @@ def boxes(centres, radii, reach, spread, step, lowest, rows, columns):  # type: 
         d = np.sqrt(x * x + y * y + z * z)
         if d - radii[k] > reach:
             continue
-        first, last, low, high = -1, columns, 0, rows - 1
+        first, last, low, high = -side, columns - 1 + side, 0, rows - 1
         if d > 1.000001 * radii[k]:
             half = np.arcsin(radii[k] / d) + spread
             elevation = np.arcsin(z / d)
@@ -36,11 +36,11 @@ def boxes(centres, radii, reach, spread, step, lowest, rows, columns):  # type: 
             continue
         whole = last - first >= columns
         for turn in range(-1, 2):
-            a, z_ = max(first + turn * columns, -1), min(last + turn * columns, columns)
+            a, z_ = max(first + turn * columns, -side), min(last + turn * columns, columns - 1 + side)
             if whole and turn != 0:
                 continue
             if whole:
-                a, z_ = -1, columns
+                a, z_ = -side, columns - 1 + side
             if a <= z_:
                 found[count, 0], found[count, 1], found[count, 2] = k, a, z_
                 found[count, 3], found[count, 4] = low, high
@@ -49,8 +49,8 @@ def boxes(centres, radii, reach, spread, step, lowest, rows, columns):  # type: 
 
 
 @njit(cache=True, nogil=True)
-def by_strip(boxes, width, strips):  # type: ignore[no-untyped-def]
-    """Copy boxes into each strip they touch, a column beside it on either side included: (c, 5), (strips + 1,)."""
+def by_strip(boxes, width, strips, side):  # type: ignore[no-untyped-def]
+    """Copy boxes into each strip they touch, ``side`` columns on either side included: (c, 5), (strips + 1,)."""
     start = np.zeros(strips + 1, np.int64)
     for fill in range(2):
         if fill:
@@ -58,8 +58,8 @@ def by_strip(boxes, width, strips):  # type: ignore[no-untyped-def]
             place = start[:-1].copy()
             result = np.empty((start[-1], 5), np.int32)
         for b in range(len(boxes)):
-            low = max(0, -((width - boxes[b, 1]) // width))
-            for s in range(low, min(strips - 1, (boxes[b, 2] + 1) // width) + 1):
+            low = max(0, (boxes[b, 1] - side) // width)
+            for s in range(low, min(strips - 1, (boxes[b, 2] + side) // width) + 1):
                 if fill:
                     result[place[s]] = boxes[b]
                     place[s] += 1

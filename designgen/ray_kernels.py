@@ -153,6 +153,7 @@ def cast(  # type: ignore[no-untyped-def]
     boxes,
     first,
     width,
+    side,
     columns,
     lowest,
     step,
@@ -161,16 +162,20 @@ def cast(  # type: ignore[no-untyped-def]
     least,
     most,
     beam,
+    beside,
 ):
-    """Nearest shape and range of each ray of columns first - 1 to first + width: (width + 2, rows) each.
+    """Nearest shape and range of each ray of a strip and beside it: (width + 2 side, rows) each.
+
+    Columns ``first - side`` to ``first + width - 1 + side`` are cast; beside the strip only ``beside`` (rows,) of them.
 
     A third answer is the range at which a beam, of radius ``beam[0] + beam[1] range``, may touch a thing too thin for
     the grid's rays; infinite where there is none.
     """
     rows = jitter.shape[1]
-    best = np.full((width + 2, rows), np.inf)
-    thin = np.full((width + 2, rows), np.inf)
-    shape = np.full((width + 2, rows), MISS, np.int32)
+    best = np.full((width + 2 * side, rows), np.inf)
+    thin = np.full((width + 2 * side, rows), np.inf)
+    shape = np.full((width + 2 * side, rows), MISS, np.int32)
+    used = min(width, columns - first)
     level, rise = np.empty(rows), np.empty(rows)
     for i in range(rows):
         level[i], rise[i] = np.cos(lowest + step * i), np.sin(lowest + step * i)
@@ -184,14 +189,17 @@ def cast(  # type: ignore[no-untyped-def]
         wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
         if wide:
             planes = edge_planes(numbers[i])
-        for column in range(max(boxes[b, 1], first - 1), min(boxes[b, 2], first + width) + 1):
-            j = column - first + 1
+        for column in range(max(boxes[b, 1], first - side), min(boxes[b, 2], first + used - 1 + side) + 1):
+            j = column - first + side
+            away = max(first - column, column - first - used + 1)
             azimuth = 2.0 * np.pi * column / columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
             low, high = boxes[b, 3], boxes[b, 4]
             if wide:
                 low, high = rows_within(planes, ca, sa, turned, lowest, step, low, high)
             for row in range(low, high + 1):
+                if away > beside[row]:
+                    continue
                 da, de = jitter[j, row, 0], jitter[j, row, 1]
                 # First order in the encoders' noise: the direction stays a unit vector to 1e-10.
                 flat = level[row] - de * rise[row]
@@ -241,6 +249,7 @@ def cast_around(  # type: ignore[no-untyped-def]
     boxes,
     first,
     width,
+    side,
     columns,
     lowest,
     step,
@@ -253,7 +262,7 @@ def cast_around(  # type: ignore[no-untyped-def]
     offsets,
     count,
 ):
-    """Cast sub-rays about the rays numbered in ``number`` (width + 2, rows; -1 = none): (count, offsets) each."""
+    """Cast sub-rays about the rays numbered in ``number`` (width + 2 side, rows; -1 = none): (count, offsets) each."""
     m = len(offsets)
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
@@ -272,7 +281,7 @@ def cast_around(  # type: ignore[no-untyped-def]
         if wide:
             planes = edge_planes(numbers[i])
         for column in range(max(boxes[b, 1], first), min(boxes[b, 2], first + width - 1) + 1):
-            j = column - first + 1
+            j = column - first + side
             azimuth = 2.0 * np.pi * column / columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
             low, high = boxes[b, 3], boxes[b, 4]

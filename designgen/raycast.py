@@ -40,19 +40,26 @@ class Grid:
 
 @dataclass(frozen=True)
 class Seen:
-    """The surfaces in a scanner's frame, and the grid's boxes that their pieces cover, sorted by strip."""
+    """The surfaces in a scanner's frame, and the grid's boxes that their pieces cover, sorted by strip.
+
+    A strip has ``width`` columns; ``side`` columns on either side have a say in its edges.
+    """
 
     shapes: tuple[Any, ...]  # kind, numbers, cuts, cut_start
     boxes: Labels  # (b, 5): piece, first and last column, first and last row
     strip_start: Ints  # (strips + 1,)
     piece: tuple[Any, ...]  # shape, centre, radius
+    width: int
+    side: int
 
 
-def see(surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, reach: float, spread: float) -> Seen:
+def see(
+    surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, side: int, reach: float, spread: float
+) -> Seen:
     """Move surfaces into a scanner's frame and draw their bounding spheres onto its grid.
 
-    ``width`` is the number of columns of a strip, ``reach`` the greatest range (mm), ``spread`` the angle (rad) by
-    which a ray may depart from its direction.
+    ``width`` is the number of columns of a strip, ``side`` of those that are cast beside it on either side; ``reach``
+    is the greatest range (mm), ``spread`` the angle (rad) by which a ray may depart from its direction.
     """
     R, t = T_scanner_scene[:3, :3], T_scanner_scene[:3, 3]
     numbers = surfaces.numbers.copy()
@@ -69,34 +76,36 @@ def see(surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, rea
     centres = surfaces.piece_centre @ R.T + t
     strips = -(-grid.columns // width)
     found = ray_boxes.boxes(
-        centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns
-    )
-    boxes, start = ray_boxes.by_strip(found, width, strips)
+        centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns,
+        side,
+    )  # fmt: skip
+    boxes, start = ray_boxes.by_strip(found, width, strips, side)
     piece = (surfaces.piece_shape, centres, surfaces.piece_radius)
-    return Seen((surfaces.kind, numbers, cuts, surfaces.cut_start), boxes, start, piece)
+    return Seen((surfaces.kind, numbers, cuts, surfaces.cut_start), boxes, start, piece, width, side)
 
 
 def cast(
     seen: Seen,
     grid: Grid,
     strip: int,
-    width: int,
     jitter: Shorts,
     turned: float,
     limits: tuple[float, float],
     beam: tuple[float, float],
+    beside: Labels,
 ) -> Any:
-    """Shape and range of the rays of a strip and of a column on either side: (width + 2, rows) each; -1 = no hit.
+    """Shape and range of the rays of a strip and beside it: (width + 2 side, rows) each; -1 = no hit.
 
-    ``jitter`` (width + 2, rows, 2) turns each ray to the left and up, rad, by no more than ``turned``; ``limits`` are
-    the ranges seen, mm. What is nearer hides what is behind it. A third answer is the range at which a beam of radius
+    Beside the strip only the next ``beside`` (rows,) columns are cast. ``jitter`` (width + 2 side, rows, 2) turns each
+    ray to the left and up, rad, by no more than ``turned``; ``limits`` are the ranges seen, mm. What is nearer hides
+    what is behind it. A third answer is the range at which a beam of radius
     ``beam[0] + beam[1] range`` may touch a thing so thin that the rays beside it may all miss it, infinite where there
     is none.
     """
-    first = strip * width
+    first = strip * seen.width
     return ray_kernels.cast(  # type: ignore[call-arg]
-        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
-        grid.columns, grid.lowest, grid.step, jitter, turned, *limits, beam,
+        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, seen.width,
+        seen.side, grid.columns, grid.lowest, grid.step, jitter, turned, *limits, beam, beside,
     )  # fmt: skip
 
 
@@ -104,7 +113,6 @@ def cast_around(
     seen: Seen,
     grid: Grid,
     strip: int,
-    width: int,
     jitter: Shorts,
     turned: float,
     limits: tuple[float, float],
@@ -114,13 +122,13 @@ def cast_around(
 ) -> Any:
     """Shape and range (m, k) of sub-rays about m rays of a strip.
 
-    ``number`` (width + 2, rows) is a ray's row in the answer, -1 where none is wanted; ``angle`` (m,) scales the
+    ``number`` (width + 2 side, rows) is a ray's row in the answer, -1 where none is wanted; ``angle`` (m,) scales the
     directions' ``offsets`` (k, 2).
     """
-    first = strip * width
+    first = strip * seen.width
     return ray_kernels.cast_around(  # type: ignore[call-arg]
-        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
-        grid.columns, grid.lowest, grid.step, jitter, turned, *limits, number, angle, offsets, len(angle),
+        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, seen.width,
+        seen.side, grid.columns, grid.lowest, grid.step, jitter, turned, *limits, number, angle, offsets, len(angle),
     )  # fmt: skip
 
 
