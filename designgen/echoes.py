@@ -175,10 +175,11 @@ class _Job:
         used, side = min(STRIP, self.grid.columns - number * STRIP), self.margin.side
         jitter = np.zeros((STRIP + 2 * side, self.grid.rows, 2), np.float32)
         if self.scanner.encoder_urad:
-            jitter[side : side + used] = rng.standard_normal((used, self.grid.rows, 2), np.float32)
-            jitter *= np.float32(1e-6 * self.scanner.encoder_urad)
+            own = jitter[side : side + used]
+            own[:] = rng.standard_normal((used, self.grid.rows, 2), np.float32)
+            own *= np.float32(1e-6 * self.scanner.encoder_urad)
             # An azimuth moves a ray less the higher it looks.
-            jitter[:, :, 0] *= np.cos(self.grid.lowest + self.grid.step * np.arange(self.grid.rows))
+            own[:, :, 0] *= footprints.levels(self.grid)
         half = (0.5 * self.scanner.beam_exit_mm, 0.5e-3 * self.scanner.divergence_mrad)
         shape, t, thin = raycast.cast(
             self.seen, self.grid, number, jitter, self.turned, self.limits, half, self.margin.cast

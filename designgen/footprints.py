@@ -111,23 +111,27 @@ def mark(  # type: ignore[no-untyped-def]
     """
     columns, rows = surface.shape
     edge, near = np.zeros((columns, rows), np.bool_), np.full((columns, rows), np.inf)
+    # Of a ray and those before and after it: the numbers of their surfaces, and the least range.
+    low, high, close = np.empty(rows, np.int32), np.empty(rows, np.int32), np.empty(rows)
     for j in range(max(side - MOST_CELLS, 0), min(side + used + MOST_CELLS, columns)):
         beside = side - j if j < side else max(0, j - side - used + 1)
+        before, after = max(0, j - 1), min(columns - 1, j + 1)
+        for i in range(rows):
+            low[i] = min(surface[before, i], surface[j, i], surface[after, i])
+            high[i] = max(surface[before, i], surface[j, i], surface[after, i])
+            close[i] = min(t[before, i], t[j, i], t[after, i], thin[before, i], thin[j, i], thin[after, i])
         for i in range(rows):
             if beside > marked[i]:
                 continue
-            # What is below the lowest row is not known.
-            own, differs, nearest = surface[j, i], i == 0, np.inf
-            for a in range(max(0, j - 1), min(columns, j + 2)):
-                for b in range(max(0, i - 1), min(rows, i + 2)):
-                    differs = differs or surface[a, b] != own
-                    nearest = min(nearest, t[a, b], thin[a, b])
+            below, above = max(0, i - 1), min(rows - 1, i + 1)
+            nearest = min(close[below], close[i], close[above])
+            differs = min(low[below], low[i], low[above]) != max(high[below], high[i], high[above])
             nearest = max(nearest, least)
             if beside == 0:
                 near[j, i] = min(near[j, i], nearest)
                 if whole[i] or np.isfinite(thin[j, i]):
                     edge[j, i] = True
-            if not differs:
+            if not differs and i > 0:  # what is below the lowest row is not known
                 continue
             reach = offset * (beam[1] + beam[0] / nearest)
             over = cells(reach / step)
