@@ -10,8 +10,6 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from designgen.ray_boxes import edge_planes, rows_within
-
 MISS = -1
 SLACK = 1e-9  # relative: two triangles that share an edge leave no gap
 FEW_ROWS = 12  # testing so many rays costs no more than finding those that may meet a triangle
@@ -218,6 +216,49 @@ def cast(  # type: ignore[no-untyped-def]
                     best[j, row], shape[j, row] = t, i
     hide(shape, best, least)
     return shape, best, thin
+
+
+@njit(cache=True, nogil=True)
+def edge_planes(n):  # type: ignore[no-untyped-def]
+    """Return inward unit normals (3, 3) of planes through the origin and a triangle's edges, 0 of one seen end on."""
+    planes = np.zeros((3, 3))
+    for k in range(3):
+        a, b, c = 3 * k, 3 * ((k + 1) % 3), 3 * ((k + 2) % 3)
+        x = n[a + 1] * n[b + 2] - n[a + 2] * n[b + 1]
+        y = n[a + 2] * n[b] - n[a] * n[b + 2]
+        z = n[a] * n[b + 1] - n[a + 1] * n[b]
+        size = np.sqrt(x * x + y * y + z * z)
+        if size > 0.0:
+            if x * n[c] + y * n[c + 1] + z * n[c + 2] < 0.0:
+                size = -size
+            planes[k, 0], planes[k, 1], planes[k, 2] = x / size, y / size, z / size
+    return planes
+
+
+@njit(cache=True, nogil=True)
+def rows_within(planes, ca, sa, slack, lowest, step, low, high):  # type: ignore[no-untyped-def]
+    """First and last of the rows ``low`` to ``high`` of a column that are no further than ``slack`` beyond a plane.
+
+    ``ca`` and ``sa`` are the cosine and sine of the column's azimuth. Where none is, the first is above the last.
+    """
+    bottom, top = lowest + step * low, lowest + step * high
+    for k in range(3):
+        across, up = planes[k, 0] * ca + planes[k, 1] * sa, planes[k, 2]
+        size = np.sqrt(across * across + up * up)
+        if size <= slack:
+            continue
+        # across cos e + up sin e >= -slack holds about one elevation.
+        middle, half = np.arctan2(up, across), np.arccos(-slack / size)
+        a, z = np.inf, -np.inf
+        for turn in range(-1, 2):
+            first = max(bottom, middle - half + 2.0 * np.pi * turn)
+            last = min(top, middle + half + 2.0 * np.pi * turn)
+            if first <= last:
+                a, z = min(a, first), max(z, last)
+        if a > z:
+            return 1, 0
+        bottom, top = a, z
+    return max(low, int(np.floor((bottom - lowest) / step))), min(high, int(np.ceil((top - lowest) / step)))
 
 
 @njit(cache=True, nogil=True)
