@@ -16,7 +16,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen import raycast
+from designgen import footprints, raycast
 from designgen.raycast import Grid, Seen
 from designgen.scanner import Params, Scanner
 from designgen.surfaces import Bools, Surfaces
@@ -97,8 +97,11 @@ def scan(
     T[:3, :3], T[:3, 3] = R, -R @ T_scene_scanner[:3, 3]
     nearest = np.array([max(scanner.min_range_mm, 1.0)])
     spread = 2.0 * float(scanner.beam_angle(nearest)[0]) + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
-    seen = raycast.see(surfaces, T, grid, STRIP, scanner.max_range_mm, spread)
-    job = _Job(surfaces, seen, T, grid, scanner, params, key, keep_hits)
+    place: Floats = T_scene_scanner[:3, 3]
+    least = max(float(nearest[0]), footprints.nearest_mm(surfaces, place))
+    margin = footprints.margin(grid, outermost(params.sub_rays) * float(scanner.beam_angle(np.array([least]))[0]))
+    seen = raycast.see(surfaces, T, grid, STRIP, margin.side, scanner.max_range_mm, spread)
+    job = _Job(surfaces, seen, T, grid, scanner, params, key, keep_hits, margin, least)
     with ThreadPoolExecutor(_threads()) as pool:  # the kernels let go of the interpreter's lock
         returns = _joined_returns(list(pool.map(job.strip, range(-(-grid.columns // STRIP)))))
     measured = np.linalg.norm(returns.points, axis=1)
@@ -133,6 +136,11 @@ def beam(count: int) -> tuple[Floats, Floats]:
     return offsets, energy / energy.sum()
 
 
+def outermost(count: int) -> float:
+    """Return how far from a beam's middle its sub-rays lie, in radii of the beam."""
+    return float(np.linalg.norm(beam(count)[0], axis=1).max())
+
+
 @dataclass(frozen=True)
 class _Job:
     """One station's work, strip by strip."""
@@ -145,11 +153,18 @@ class _Job:
     params: Params
     key: tuple[int, int]
     keep_hits: bool
+    margin: footprints.Margin
+    least: float  # nothing is seen nearer, mm
 
     @property
     def limits(self) -> tuple[float, float]:
         """Ranges that the scanner sees, mm."""
         return self.scanner.min_range_mm, self.scanner.max_range_mm
+
+    @property
+    def turned(self) -> float:
+        """Angle by which encoders turn no ray further, rad, and what rounding may do."""
+        return 1.5e-6 * ENCODER_SIGMAS * self.scanner.encoder_urad + 1e-6  # by two encoders, square to each other
 
     def strip(self, number: int) -> Returns:
         """Return what the rays of one strip of columns give."""
@@ -157,31 +172,45 @@ class _Job:
             return self._returns(np.random.default_rng(0), _joined([]))
         # From 1: a key that ends in 0 is the same as the key without it, which is the station's own.
         rng = np.random.default_rng([*self.key, number + 1])
-        used = min(STRIP, self.grid.columns - number * STRIP)
-        jitter = np.zeros((STRIP + 2, self.grid.rows, 2), np.float32)
+        used, side = min(STRIP, self.grid.columns - number * STRIP), self.margin.side
+        jitter = np.zeros((STRIP + 2 * side, self.grid.rows, 2), np.float32)
         if self.scanner.encoder_urad:
-            jitter[1 : used + 1] = rng.standard_normal((used, self.grid.rows, 2), np.float32)
-            jitter *= np.float32(1e-6 * self.scanner.encoder_urad)
+            own = jitter[side : side + used]
+            own[:] = rng.standard_normal((used, self.grid.rows, 2), np.float32)
+            own *= np.float32(1e-6 * self.scanner.encoder_urad)
             # An azimuth moves a ray less the higher it looks.
-            jitter[:, :, 0] *= np.cos(self.grid.lowest + self.grid.step * np.arange(self.grid.rows))
+            own[:, :, 0] *= footprints.levels(self.grid)
         half = (0.5 * self.scanner.beam_exit_mm, 0.5e-3 * self.scanner.divergence_mrad)
-        shape, t, thin = raycast.cast(self.seen, self.grid, number, STRIP, jitter, self.limits, half)
-        edge = np.zeros(shape.shape, bool)
+        shape, t, thin = raycast.cast(
+            self.seen, self.grid, number, jitter, self.turned, self.limits, half, self.margin.cast
+        )
+        inside = shape >= 0
+        inside[:side], inside[side + used :] = False, False
+        edge, near = np.zeros(shape.shape, bool), t
         if self.params.sub_rays > 1:
             surface = np.where(shape >= 0, self.surfaces.surface[shape], -1)
-            edge[1 : used + 1] = (edges(surface) | np.isfinite(thin))[1 : used + 1]
-            t = np.minimum(t, thin)
-        inside = (shape >= 0) & ~edge
-        inside[0], inside[used + 1 :] = False, False
+            edge, near = self._edges(surface, t, thin, used, half)
+            inside &= ~edge
         column, row = (index.astype(np.int32) for index in np.nonzero(inside))
         found = [self._on_one(number, column, row, shape[column, row], t[column, row], jitter[column, row])]
         if edge.any():
-            found += self._at_edges(number, edge, t, jitter)
+            found += self._at_edges(number, edge, near, jitter)
         return self._returns(rng, _joined(found))
+
+    def _edges(
+        self, surface: Labels, t: Floats, thin: Floats, used: int, half: tuple[float, float]
+    ) -> tuple[Bools, Floats]:
+        """Mark the strip's rays whose footprints may meet several surfaces, and give the nearest range of each."""
+        margin, grid = self.margin, self.grid
+        edge, near = footprints.mark(
+            surface, t, thin, margin.side, used, margin.marked, margin.whole, footprints.levels(grid), grid.step,
+            2.0 * np.pi / grid.columns, self.least, half, outermost(self.params.sub_rays),
+        )  # fmt: skip
+        return edge, near
 
     def _on_one(self, strip: int, column: Labels, row: Labels, shape: Labels, t: Floats, jitter: Shorts) -> Echoes:
         """Return the echoes of footprints on one surface."""
-        columns = (strip * STRIP + column - 1).astype(np.int32)
+        columns = (strip * STRIP + column - self.margin.side).astype(np.int32)
         ray = raycast.directions(self.grid, row, columns, jitter)
         exact, cosine = raycast.meet(self.seen, self.surfaces, self.T_scanner_scene, shape, ray, t)
         met = np.isfinite(exact)
@@ -189,26 +218,23 @@ class _Job:
         source = np.full(len(t), SURFACE, np.uint8)
         return Echoes(row, columns, shape, t, t, self.params.signal(cosine, t), cosine, ray, source)
 
-    def _at_edges(self, strip: int, edge: Bools, t: Floats, jitter: Shorts) -> list[Echoes]:
+    def _at_edges(self, strip: int, edge: Bools, near: Floats, jitter: Shorts) -> list[Echoes]:
         """Return the echoes of rays near an edge: of footprints on one surface all the same, and mixed ones."""
         column, row = (index.astype(np.int32) for index in np.nonzero(edge))
         number = np.full(edge.shape, -1, np.int32)
         number[column, row] = np.arange(len(column), dtype=np.int32)
-        last = t.shape[1] - 1
-        about = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-        nearest = np.minimum.reduce([t[column + a, np.clip(row + b, 0, last)] for a, b in about])
         beam_ = beam(self.params.sub_rays)
-        angle = self.scanner.beam_angle(nearest)
+        angle = self.scanner.beam_angle(near[column, row])
         subs, ranges = raycast.cast_around(
-            self.seen, self.grid, strip, STRIP, jitter, self.limits, number, angle, beam_[0]
+            self.seen, self.grid, strip, jitter, self.turned, self.limits, number, angle, beam_[0]
         )
         surface = np.where(subs >= 0, self.surfaces.surface[subs], -1)
         whole = (surface == surface[:, :1]).all(axis=1) & (subs[:, 0] >= 0)
         some = (subs >= 0).any(axis=1) & ~whole
-        near = jitter[column, row]
+        turned = jitter[column, row]
         return [
-            self._on_one(strip, column[whole], row[whole], subs[whole, 0], ranges[whole, 0], near[whole]),
-            self._mixed(strip, column[some], row[some], subs[some], ranges[some], near[some], angle[some], beam_),
+            self._on_one(strip, column[whole], row[whole], subs[whole, 0], ranges[whole, 0], turned[whole]),
+            self._mixed(strip, column[some], row[some], subs[some], ranges[some], turned[some], angle[some], beam_),
         ]
 
     def _mixed(
@@ -224,7 +250,7 @@ class _Job:
     ) -> Echoes:
         """Return the echoes of footprints on several surfaces, or partly on none; ``subs``, ``ranges`` (n, k)."""
         offsets, share = beam_
-        columns = (strip * STRIP + column - 1).astype(np.int32)
+        columns = (strip * STRIP + column - self.margin.side).astype(np.int32)
         t, cosine = np.full(ranges.shape, np.nan), np.zeros(ranges.shape)
         which, k = np.nonzero(subs >= 0)
         ray = raycast.directions(self.grid, row[which], columns[which], jitter[which] + angle[which, None] * offsets[k])
@@ -290,21 +316,6 @@ def _joined(pieces: Sequence[Echoes]) -> Echoes:
     columns = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names}
     order = np.lexsort((columns["row"], columns["column"]))
     return Echoes(**{name: column[order] for name, column in columns.items()})
-
-
-def edges(surface: Labels) -> Bools:
-    """Mark rays (columns, rows) with one of eight neighbours on another surface, -1 being none."""
-    edge = np.zeros(surface.shape, bool)
-    across, along = surface[1:] != surface[:-1], surface[:, 1:] != surface[:, :-1]
-    edge[1:] |= across
-    edge[:-1] |= across
-    edge[:, 1:] |= along
-    edge[:, :-1] |= along
-    for a, b in ((slice(1, None), slice(None, -1)), (slice(None, -1), slice(1, None))):
-        corner = surface[a, 1:] != surface[b, :-1]
-        edge[a, 1:] |= corner
-        edge[b, :-1] |= corner
-    return edge
 
 
 def strongest_echo(ranges: Floats, energy: Floats, separation_mm: float) -> Floats:

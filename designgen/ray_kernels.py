@@ -1,4 +1,4 @@
-"""Compiled kernels of the ray caster: bounding boxes on the grid, shapes against rays, all in float64.
+"""Compiled kernels of the ray caster: shapes against rays, all in float64.
 
 Every kernel works on one strip of columns, alone, so that results do not depend on the threads. The shapes' numbers are
 those of :class:`designgen.surfaces.Builder`; a ray starts at the origin of the scanner's frame.
@@ -12,67 +12,7 @@ from numba import njit
 
 MISS = -1
 SLACK = 1e-9  # relative: two triangles that share an edge leave no gap
-
-
-@njit(cache=True, nogil=True)
-def boxes(centres, radii, reach, spread, step, lowest, rows, columns):  # type: ignore[no-untyped-def]
-    """Boxes (b, 5) of the pieces: piece, first and last column, first and last row.
-
-    Columns run from -1 to ``columns``, so that a box over the seam is there on both of its sides.
-    """
-    found = np.empty((3 * len(radii), 5), np.int32)
-    count = 0
-    across = columns / (2.0 * np.pi)
-    for k in range(len(radii)):
-        x, y, z = centres[k, 0], centres[k, 1], centres[k, 2]
-        d = np.sqrt(x * x + y * y + z * z)
-        if d - radii[k] > reach:
-            continue
-        first, last, low, high = -1, columns, 0, rows - 1
-        if d > 1.000001 * radii[k]:
-            half = np.arcsin(radii[k] / d) + spread
-            elevation = np.arcsin(z / d)
-            low = max(low, int(np.floor((elevation - half - lowest) / step)))
-            high = min(high, int(np.ceil((elevation + half - lowest) / step)))
-            if abs(elevation) + half < 0.5 * np.pi - 1e-6 and half < 1.5:
-                side = np.arcsin(min(1.0, np.sin(half) / np.cos(elevation)))
-                azimuth = np.arctan2(y, x)
-                first = int(np.floor((azimuth - side) * across))
-                last = int(np.ceil((azimuth + side) * across))
-        if low > high:
-            continue
-        whole = last - first >= columns
-        for turn in range(-1, 2):
-            a, z_ = max(first + turn * columns, -1), min(last + turn * columns, columns)
-            if whole and turn != 0:
-                continue
-            if whole:
-                a, z_ = -1, columns
-            if a <= z_:
-                found[count, 0], found[count, 1], found[count, 2] = k, a, z_
-                found[count, 3], found[count, 4] = low, high
-                count += 1
-    return found[:count].copy()
-
-
-@njit(cache=True, nogil=True)
-def by_strip(boxes, width, strips):  # type: ignore[no-untyped-def]
-    """Copy boxes into each strip they touch, a column beside it on either side included: (c, 5), (strips + 1,)."""
-    start = np.zeros(strips + 1, np.int64)
-    for fill in range(2):
-        if fill:
-            start = np.cumsum(start)
-            place = start[:-1].copy()
-            result = np.empty((start[-1], 5), np.int32)
-        for b in range(len(boxes)):
-            low = max(0, -((width - boxes[b, 1]) // width))
-            for s in range(low, min(strips - 1, (boxes[b, 2] + 1) // width) + 1):
-                if fill:
-                    result[place[s]] = boxes[b]
-                    place[s] += 1
-                else:
-                    start[s + 1] += 1
-    return result, start
+FEW_ROWS = 12  # testing so many rays costs no more than finding those that may meet a triangle
 
 
 @njit(cache=True, nogil=True)
@@ -211,23 +151,29 @@ def cast(  # type: ignore[no-untyped-def]
     boxes,
     first,
     width,
+    side,
     columns,
     lowest,
     step,
     jitter,
+    turned,
     least,
     most,
     beam,
+    beside,
 ):
-    """Nearest shape and range of each ray of columns first - 1 to first + width: (width + 2, rows) each.
+    """Nearest shape and range of each ray of a strip and beside it: (width + 2 side, rows) each.
+
+    Columns ``first - side`` to ``first + width - 1 + side`` are cast; beside the strip only ``beside`` (rows,) of them.
 
     A third answer is the range at which a beam, of radius ``beam[0] + beam[1] range``, may touch a thing too thin for
     the grid's rays; infinite where there is none.
     """
     rows = jitter.shape[1]
-    best = np.full((width + 2, rows), np.inf)
-    thin = np.full((width + 2, rows), np.inf)
-    shape = np.full((width + 2, rows), MISS, np.int32)
+    best = np.full((width + 2 * side, rows), np.inf)
+    thin = np.full((width + 2 * side, rows), np.inf)
+    shape = np.full((width + 2 * side, rows), MISS, np.int32)
+    used = min(width, columns - first)
     level, rise = np.empty(rows), np.empty(rows)
     for i in range(rows):
         level[i], rise[i] = np.cos(lowest + step * i), np.sin(lowest + step * i)
@@ -238,11 +184,20 @@ def cast(  # type: ignore[no-untyped-def]
         c2 = cx * cx + cy * cy + cz * cz
         # A bit more than what the angle between rays of the grid spans there, across.
         slim = thickness(kind[i], numbers[i]) < 1.5 * step * (np.sqrt(c2) + radii[k])
-        for column in range(max(boxes[b, 1], first - 1), min(boxes[b, 2], first + width) + 1):
-            j = column - first + 1
+        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        if wide:
+            planes = edge_planes(numbers[i])
+        for column in range(max(boxes[b, 1], first - side), min(boxes[b, 2], first + used - 1 + side) + 1):
+            j = column - first + side
+            away = max(first - column, column - first - used + 1)
             azimuth = 2.0 * np.pi * column / columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
-            for row in range(boxes[b, 3], boxes[b, 4] + 1):
+            low, high = boxes[b, 3], boxes[b, 4]
+            if wide:
+                low, high = rows_within(planes, ca, sa, turned, lowest, step, low, high)
+            for row in range(low, high + 1):
+                if away > beside[row]:
+                    continue
                 da, de = jitter[j, row, 0], jitter[j, row, 1]
                 # First order in the encoders' noise: the direction stays a unit vector to 1e-10.
                 flat = level[row] - de * rise[row]
@@ -261,6 +216,49 @@ def cast(  # type: ignore[no-untyped-def]
                     best[j, row], shape[j, row] = t, i
     hide(shape, best, least)
     return shape, best, thin
+
+
+@njit(cache=True, nogil=True)
+def edge_planes(n):  # type: ignore[no-untyped-def]
+    """Return inward unit normals (3, 3) of planes through the origin and a triangle's edges, 0 of one seen end on."""
+    planes = np.zeros((3, 3))
+    for k in range(3):
+        a, b, c = 3 * k, 3 * ((k + 1) % 3), 3 * ((k + 2) % 3)
+        x = n[a + 1] * n[b + 2] - n[a + 2] * n[b + 1]
+        y = n[a + 2] * n[b] - n[a] * n[b + 2]
+        z = n[a] * n[b + 1] - n[a + 1] * n[b]
+        size = np.sqrt(x * x + y * y + z * z)
+        if size > 0.0:
+            if x * n[c] + y * n[c + 1] + z * n[c + 2] < 0.0:
+                size = -size
+            planes[k, 0], planes[k, 1], planes[k, 2] = x / size, y / size, z / size
+    return planes
+
+
+@njit(cache=True, nogil=True)
+def rows_within(planes, ca, sa, slack, lowest, step, low, high):  # type: ignore[no-untyped-def]
+    """First and last of the rows ``low`` to ``high`` of a column that are no further than ``slack`` beyond a plane.
+
+    ``ca`` and ``sa`` are the cosine and sine of the column's azimuth. Where none is, the first is above the last.
+    """
+    bottom, top = lowest + step * low, lowest + step * high
+    for k in range(3):
+        across, up = planes[k, 0] * ca + planes[k, 1] * sa, planes[k, 2]
+        size = np.sqrt(across * across + up * up)
+        if size <= slack:
+            continue
+        # across cos e + up sin e >= -slack holds about one elevation.
+        middle, half = np.arctan2(up, across), np.arccos(-slack / size)
+        a, z = np.inf, -np.inf
+        for turn in range(-1, 2):
+            first = max(bottom, middle - half + 2.0 * np.pi * turn)
+            last = min(top, middle + half + 2.0 * np.pi * turn)
+            if first <= last:
+                a, z = min(a, first), max(z, last)
+        if a > z:
+            return 1, 0
+        bottom, top = a, z
+    return max(low, int(np.floor((bottom - lowest) / step))), min(high, int(np.ceil((top - lowest) / step)))
 
 
 @njit(cache=True, nogil=True)
@@ -292,10 +290,12 @@ def cast_around(  # type: ignore[no-untyped-def]
     boxes,
     first,
     width,
+    side,
     columns,
     lowest,
     step,
     jitter,
+    turned,
     least,
     most,
     number,
@@ -303,11 +303,12 @@ def cast_around(  # type: ignore[no-untyped-def]
     offsets,
     count,
 ):
-    """Cast sub-rays about the rays numbered in ``number`` (width + 2, rows; -1 = none): (count, offsets) each."""
+    """Cast sub-rays about the rays numbered in ``number`` (width + 2 side, rows; -1 = none): (count, offsets) each."""
     m = len(offsets)
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
     farthest = np.full(count, np.inf)  # of a ray's sub-rays
+    broadest = angle.max() if count else 0.0
     rows = number.shape[1]
     level, rise = np.empty(rows), np.empty(rows)
     for i in range(rows):
@@ -317,11 +318,17 @@ def cast_around(  # type: ignore[no-untyped-def]
         i = owner[k]
         cx, cy, cz, r = centres[k, 0], centres[k, 1], centres[k, 2], radii[k]
         c2 = cx * cx + cy * cy + cz * cz
+        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        if wide:
+            planes = edge_planes(numbers[i])
         for column in range(max(boxes[b, 1], first), min(boxes[b, 2], first + width - 1) + 1):
-            j = column - first + 1
+            j = column - first + side
             azimuth = 2.0 * np.pi * column / columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
-            for row in range(boxes[b, 3], boxes[b, 4] + 1):
+            low, high = boxes[b, 3], boxes[b, 4]
+            if wide:
+                low, high = rows_within(planes, ca, sa, turned + broadest, lowest, step, low, high)
+            for row in range(low, high + 1):
                 ray = number[j, row]
                 if ray < 0:
                     continue

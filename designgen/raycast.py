@@ -15,9 +15,11 @@ from typing import Any
 
 import numpy as np
 
-from designgen import ray_kernels
-from designgen.surfaces import CONE, DISC, SPHERE, Surfaces
+from designgen import ray_boxes, ray_kernels
+from designgen.surfaces import CONE, DISC, SPHERE, Bools, Surfaces
 from processor.model import Floats, Ints, Labels, Shorts
+
+WEIGHTS = (-3.0, 4.0)  # of a net triangle's edges, between which a ray may meet the face that the net stands for
 
 
 @dataclass(frozen=True)
@@ -38,19 +40,26 @@ class Grid:
 
 @dataclass(frozen=True)
 class Seen:
-    """The surfaces in a scanner's frame, and the grid's boxes that their pieces cover, sorted by strip."""
+    """The surfaces in a scanner's frame, and the grid's boxes that their pieces cover, sorted by strip.
+
+    A strip has ``width`` columns; ``side`` columns on either side have a say in its edges.
+    """
 
     shapes: tuple[Any, ...]  # kind, numbers, cuts, cut_start
     boxes: Labels  # (b, 5): piece, first and last column, first and last row
     strip_start: Ints  # (strips + 1,)
     piece: tuple[Any, ...]  # shape, centre, radius
+    width: int
+    side: int
 
 
-def see(surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, reach: float, spread: float) -> Seen:
+def see(
+    surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, side: int, reach: float, spread: float
+) -> Seen:
     """Move surfaces into a scanner's frame and draw their bounding spheres onto its grid.
 
-    ``width`` is the number of columns of a strip, ``reach`` the greatest range (mm), ``spread`` the angle (rad) by
-    which a ray may depart from its direction.
+    ``width`` is the number of columns of a strip, ``side`` of those that are cast beside it on either side; ``reach``
+    is the greatest range (mm), ``spread`` the angle (rad) by which a ray may depart from its direction.
     """
     R, t = T_scanner_scene[:3, :3], T_scanner_scene[:3, 3]
     numbers = surfaces.numbers.copy()
@@ -66,33 +75,37 @@ def see(surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, rea
     cuts[:, :3] = cuts[:, :3] @ R.T
     centres = surfaces.piece_centre @ R.T + t
     strips = -(-grid.columns // width)
-    found = ray_kernels.boxes(
-        centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns
-    )
-    boxes, start = ray_kernels.by_strip(found, width, strips)
+    found = ray_boxes.boxes(
+        centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns,
+        side,
+    )  # fmt: skip
+    boxes, start = ray_boxes.by_strip(found, width, strips, side)
     piece = (surfaces.piece_shape, centres, surfaces.piece_radius)
-    return Seen((surfaces.kind, numbers, cuts, surfaces.cut_start), boxes, start, piece)
+    return Seen((surfaces.kind, numbers, cuts, surfaces.cut_start), boxes, start, piece, width, side)
 
 
 def cast(
     seen: Seen,
     grid: Grid,
     strip: int,
-    width: int,
     jitter: Shorts,
+    turned: float,
     limits: tuple[float, float],
     beam: tuple[float, float],
+    beside: Labels,
 ) -> Any:
-    """Shape and range of the rays of a strip and of a column on either side: (width + 2, rows) each; -1 = no hit.
+    """Shape and range of the rays of a strip and beside it: (width + 2 side, rows) each; -1 = no hit.
 
-    ``jitter`` (width + 2, rows, 2) turns each ray to the left and up, rad; ``limits`` are the ranges seen, mm. What is
-    nearer hides what is behind it. A third answer is the range at which a beam of radius ``beam[0] + beam[1] range``
-    may touch a thing so thin that the rays beside it may all miss it, infinite where there is none.
+    Beside the strip only the next ``beside`` (rows,) columns are cast. ``jitter`` (width + 2 side, rows, 2) turns each
+    ray to the left and up, rad, by no more than ``turned``; ``limits`` are the ranges seen, mm. What is nearer hides
+    what is behind it. A third answer is the range at which a beam of radius
+    ``beam[0] + beam[1] range`` may touch a thing so thin that the rays beside it may all miss it, infinite where there
+    is none.
     """
-    first = strip * width
+    first = strip * seen.width
     return ray_kernels.cast(  # type: ignore[call-arg]
-        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
-        grid.columns, grid.lowest, grid.step, jitter, *limits, beam,
+        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, seen.width,
+        seen.side, grid.columns, grid.lowest, grid.step, jitter, turned, *limits, beam, beside,
     )  # fmt: skip
 
 
@@ -100,8 +113,8 @@ def cast_around(
     seen: Seen,
     grid: Grid,
     strip: int,
-    width: int,
     jitter: Shorts,
+    turned: float,
     limits: tuple[float, float],
     number: Labels,
     angle: Floats,
@@ -109,13 +122,13 @@ def cast_around(
 ) -> Any:
     """Shape and range (m, k) of sub-rays about m rays of a strip.
 
-    ``number`` (width + 2, rows) is a ray's row in the answer, -1 where none is wanted; ``angle`` (m,) scales the
+    ``number`` (width + 2 side, rows) is a ray's row in the answer, -1 where none is wanted; ``angle`` (m,) scales the
     directions' ``offsets`` (k, 2).
     """
-    first = strip * width
+    first = strip * seen.width
     return ray_kernels.cast_around(  # type: ignore[call-arg]
-        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, width,
-        grid.columns, grid.lowest, grid.step, jitter, *limits, number, angle, offsets, len(angle),
+        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, seen.width,
+        seen.side, grid.columns, grid.lowest, grid.step, jitter, turned, *limits, number, angle, offsets, len(angle),
     )  # fmt: skip
 
 
@@ -161,24 +174,40 @@ def _on_patches(
         corners, pq = surfaces.numbers[triangle, :9].reshape(-1, 3, 3), surfaces.corner_pq[triangle]
         edge, turn = corners[:, 1:] - corners[:, :1], pq[:, 1:] - pq[:, :1]
         # The net's triangle gives the derivatives: dx = edge^T w for d(p, q) = turn^T w.
-        columns = np.stack([edge[:, 0], edge[:, 1], -d], axis=2)
-        inverse = np.linalg.inv(columns)
+        inverse, regular = _inverse(edge[:, 0], edge[:, 1], -d)
         range_ = t[rows].copy()
         weights = np.einsum("nij,nj->ni", inverse, origin + range_[:, None] * d - corners[:, 0])[:, :2]
-        off = np.full(len(rows), np.inf)
+        now, met, off = np.empty((len(rows), 2)), np.empty((len(rows), 3)), np.full(len(rows), np.inf)
+        live: Any = slice(None)  # most of the time all of them
         for _ in range(12):
-            now = pq[:, 0] + np.einsum("ni,nij->nj", weights, turn)
-            met = at(now[:, 0], now[:, 1])
-            left = origin + range_[:, None] * d - met
-            off = np.linalg.norm(left, axis=1)
-            if (off < 0.1 * tolerance_mm).all():
+            now[live] = pq[live, 0] + np.einsum("ni,nij->nj", weights[live], turn[live])
+            met[live] = at(now[live, 0], now[live, 1])
+            left = origin + range_[live, None] * d[live] - met[live]
+            off[live] = np.sqrt(np.einsum("ni,ni->n", left, left))
+            step = np.einsum("nij,nj->ni", inverse[live], left)
+            # A grazing ray may step far away, where the face's function has no meaning.
+            weights[live] = np.clip(weights[live] + step[:, :2], *WEIGHTS)
+            range_[live] += step[:, 2]
+            more = np.flatnonzero(off >= 0.1 * tolerance_mm)
+            if not len(more):
                 break
-            step = np.einsum("nij,nj->ni", inverse, left)
-            weights += step[:, :2]
-            range_ += step[:, 2]
-        range_[~(off < tolerance_mm)] = np.nan
+            live = more if len(more) < len(rows) else live
+        range_[~(off < tolerance_mm) | ~regular] = np.nan
         result[rows], normal[rows] = range_, _across(at, now, met, turn) @ R.T
     return result, normal
+
+
+def _inverse(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Bools]:
+    """Inverses (n, 3, 3) of matrices with columns a, b and the unit vectors c (n, 3), and which of them (n,) have one.
+
+    Those that have none get 0.
+    """
+    found = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)
+    volume = np.einsum("ni,ni->n", a, found[:, 0])
+    regular = np.abs(volume) > 1e-12 * np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
+    found[~regular], volume[~regular] = 0.0, 1.0
+    found /= volume[:, None, None]
+    return found, regular
 
 
 def _across(at: Callable[[Floats, Floats], Floats], pq: Floats, points: Floats, turn: Floats) -> Floats:
@@ -186,5 +215,5 @@ def _across(at: Callable[[Floats, Floats], Floats], pq: Floats, points: Floats, 
     share = 1e-5  # of the net's edges, which bend by a few degrees at most: 1e-6 rad of the normal
     one, other = (at(*(pq + share * turn[:, k]).T) - points for k in range(2))
     normal = np.cross(one, other)
-    found: Floats = normal / np.linalg.norm(normal, axis=1)[:, None]
+    found: Floats = normal / np.sqrt(np.einsum("ni,ni->n", normal, normal))[:, None]
     return found

@@ -16,6 +16,8 @@ from processor.model import Floats, Ints, Labels
 
 SPHERE, CONE, DISC, TRIANGLE = range(4)
 NUMBERS = 14  # a shape's own: see Builder
+FLAT_MM = 1e-7  # a face this near to a plane is one, and its net is the face itself
+FLAT_SAMPLES = 1000  # of a face, at least
 Bools = npt.NDArray[np.bool_]
 
 
@@ -55,7 +57,7 @@ class Surfaces:
     numbers: Floats  # (m, NUMBERS)
     surface: Labels  # (m,) row of surface_names; equal numbers of one smooth surface
     part: Labels  # (m,) row of part_names, -1 = none
-    patch: Labels  # (m,) row of patches, -1 = none
+    patch: Labels  # (m,) row of patches, -1 = none or a flat one, whose net is exact
     corner_pq: Floats  # (m, 3, 2) of a patch's triangles
     cuts: Floats  # (c, 4)
     cut_start: Ints  # (m + 1,)
@@ -172,7 +174,7 @@ class Builder:
                 known[of_part, one.name] = self._name(one.name)
             surface.append(np.full(len(faces), known[of_part, one.name], np.int32))
             part.append(np.full(len(faces), of_part, np.int32))
-            patch.append(np.full(len(faces), number, np.int32))
+            patch.append(np.full(len(faces), -1 if _is_flat(one, knots[faces], corners) else number, np.int32))
             pq.append(knots[faces])
             middle = corners.mean(axis=1)
             owner.append(np.arange(count, count + len(faces), dtype=np.int32))
@@ -198,3 +200,26 @@ class Builder:
             names,
             np.array([rows_of[label] for label in self._labels], np.int32),
         )
+
+
+def _is_flat(patch: Patch, pq: Floats, corners: Floats) -> bool:
+    """Say whether a face is plane: at the corners (f, 3, 3) of its net, and within its triangles, of pq (f, 3, 2)."""
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(normal, axis=1)
+    if not len(size) or not size.max() > 0.0:
+        return False
+    largest = np.argmax(size)
+    unit = normal[largest] / size[largest]
+
+    def plane(points: Floats) -> bool:
+        return bool((np.abs((points - corners[largest, 0]) @ unit) <= FLAT_MM).all())
+
+    if not plane(corners.reshape(-1, 3)):
+        return False
+    # Spread evenly over a triangle, and in step with nothing.
+    number = np.arange(max(6, -(-FLAT_SAMPLES // len(pq))))
+    shares = (0.5 + np.outer(number, [0.7548776662466927, 0.5698402909980532])) % 1.0
+    over = shares.sum(axis=1) > 1.0
+    shares[over] = 1.0 - shares[over]
+    samples = (pq[:, :1] + np.einsum("nk,fkc->fnc", shares, pq[:, 1:] - pq[:, :1])).reshape(-1, 2)
+    return plane(patch.at(samples[:, 0], samples[:, 1]))

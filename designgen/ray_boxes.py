@@ -1,0 +1,68 @@
+"""Compiled kernels of the ray caster: the boxes that shapes cover on the grid, all in float64."""
+# Numba infers the types of the arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def boxes(centres, radii, reach, spread, step, lowest, rows, columns, side):  # type: ignore[no-untyped-def]
+    """Boxes (b, 5) of the pieces: piece, first and last column, first and last row.
+
+    Columns run ``side`` beyond the first and the last, so that a box over the seam is there on both of its sides.
+    """
+    found = np.empty((3 * len(radii), 5), np.int32)
+    count = 0
+    across = columns / (2.0 * np.pi)
+    for k in range(len(radii)):
+        x, y, z = centres[k, 0], centres[k, 1], centres[k, 2]
+        d = np.sqrt(x * x + y * y + z * z)
+        if d - radii[k] > reach:
+            continue
+        first, last, low, high = -side, columns - 1 + side, 0, rows - 1
+        if d > 1.000001 * radii[k]:
+            half = np.arcsin(radii[k] / d) + spread
+            elevation = np.arcsin(z / d)
+            low = max(low, int(np.floor((elevation - half - lowest) / step)))
+            high = min(high, int(np.ceil((elevation + half - lowest) / step)))
+            if abs(elevation) + half < 0.5 * np.pi - 1e-6 and half < 1.5:
+                side = np.arcsin(min(1.0, np.sin(half) / np.cos(elevation)))
+                azimuth = np.arctan2(y, x)
+                first = int(np.floor((azimuth - side) * across))
+                last = int(np.ceil((azimuth + side) * across))
+        if low > high:
+            continue
+        whole = last - first >= columns
+        for turn in range(-1, 2):
+            a, z_ = max(first + turn * columns, -side), min(last + turn * columns, columns - 1 + side)
+            if whole and turn != 0:
+                continue
+            if whole:
+                a, z_ = -side, columns - 1 + side
+            if a <= z_:
+                found[count, 0], found[count, 1], found[count, 2] = k, a, z_
+                found[count, 3], found[count, 4] = low, high
+                count += 1
+    return found[:count].copy()
+
+
+@njit(cache=True, nogil=True)
+def by_strip(boxes, width, strips, side):  # type: ignore[no-untyped-def]
+    """Copy boxes into each strip they touch, ``side`` columns on either side included: (c, 5), (strips + 1,)."""
+    start = np.zeros(strips + 1, np.int64)
+    for fill in range(2):
+        if fill:
+            start = np.cumsum(start)
+            place = start[:-1].copy()
+            result = np.empty((start[-1], 5), np.int32)
+        for b in range(len(boxes)):
+            low = max(0, (boxes[b, 1] - side) // width)
+            for s in range(low, min(strips - 1, (boxes[b, 2] + side) // width) + 1):
+                if fill:
+                    result[place[s]] = boxes[b]
+                    place[s] += 1
+                else:
+                    start[s + 1] += 1
+    return result, start
