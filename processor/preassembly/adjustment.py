@@ -26,20 +26,21 @@ REFERENCE_C = 20.0
 TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)
 
 
-def assemble(scans: Sequence[Scan], scene: Scene, design: ArchDesign, params: Params) -> Result:
-    """Assemble scans in the design's order."""
+def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, params: Params) -> Result:
+    """Assemble a bridge; ``scans`` are those of each part, in the design's order."""
     temperature_C, weight = scene.temperature_C, params.adjust.weight
     degrees = temperature_C - REFERENCE_C if np.isfinite(temperature_C) else 0.0
     shrink = 1.0 / (1.0 + EXPANSION_PER_K * degrees)
-    parts = [measure(scan, index, design, shrink, params.systematic) for index, scan in enumerate(scans)]
+    parts = [measure(own, index, design, shrink, params.systematic) for index, own in enumerate(scans)]
+    firsts = [part.scans[0] for part in parts]
     frames = np.array([features.joint_frame(points) for points in design.joint_points])
     members = [part.member for part in parts]
     curve = [network.adjust(members, design.joint_points, frames, one) for one in TRADE_OFF]
     adjusted = network.adjust(members, design.joint_points, frames, weight)
     sd = np.sqrt(np.einsum("jkk->jk", adjusted.gap_covariance)).reshape(-1, 8, 3)
     poses = np.array([motion @ part.T_bridge_scan for motion, part in zip(adjusted.motions, parts, strict=True)])
-    key_points, key_sd = _key_points(parts, scans, design, frames)
-    placed = np.array([_with_origin(T, scan.origin * shrink) for T, scan in zip(poses, scans, strict=True)])
+    key_points, key_sd = _key_points(parts, firsts, design, frames)
+    placed = np.array([_with_origin(T, scan.origin * shrink) for T, scan in zip(poses, firsts, strict=True)])
     ends = np.array(
         [[rigid.apply(T, end * shrink) for end in both] for T, both in zip(placed, key_points, strict=True)]
     )
@@ -67,6 +68,7 @@ def assemble(scans: Sequence[Scan], scene: Scene, design: ArchDesign, params: Pa
         components=tuple(part.name for part in parts),
         component_status=tuple(statuses),
         component_message=tuple(part.message for part in parts),
+        component_scans=tuple(", ".join(scan.name for scan in part.scans) for part in parts),
         T_bridge_scan=placed,
         covariance=_pose_covariances(parts, adjusted, placed),
         key_points_scan=key_points,
@@ -91,7 +93,7 @@ def assemble(scans: Sequence[Scan], scene: Scene, design: ArchDesign, params: Pa
         trade_lambda=np.array(TRADE_OFF),
         trade_figures=np.array([_figures(one) for one in curve]),
         weight=weight,
-        T_rival_scan=np.array([_with_origin(p.T_rival, s.origin * shrink) for p, s in zip(parts, scans, strict=True)]),
+        T_rival_scan=np.array([_with_origin(p.T_rival, s.origin * shrink) for p, s in zip(parts, firsts, strict=True)]),
         measures=tuple(measures),
         judged=tuple(judged),
         proposals=tuple(proposals),

@@ -22,6 +22,7 @@ COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for those that can still win
 COARSE_POINTS, FINE_POINTS = 600, 20_000
 PROMISING = 4.0  # a hypothesis this many times worse than the best after the coarse gates is dropped
+SHORT_SHARE = 0.1  # of its length, by which a scan may be shorter than the part and still be of all of it
 NO_FIT_MM = 25.0  # typical distance to the design, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses that move no corner of the part by more are one and the same
 TELLING_MM = 10.0  # design surface this far from the rival's design can tell two poses apart
@@ -81,7 +82,10 @@ def sample_surface(part: DesignPart) -> Surface:
 
 
 def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
-    """T_bridge_scan that lay the scan's principal axes on the design's: eight proper rotations about the long axis."""
+    """T_bridge_scan that lay the scan's principal axes on the design's: eight proper rotations about the long axis.
+
+    A scan that is shorter than the part is also laid to either end of it.
+    """
     scan = principal.of_points(points)
     design = principal.of_mesh(part.vertices, part.faces)
     quarter_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
@@ -90,7 +94,18 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
         for turn in (np.eye(3), quarter_turn)
         for signs in principal.proper_sign_choices()
     ]
-    return [rigid.transform(R, design.centre - R @ scan.centre) for R in rotations]
+    low, high = np.quantile((points - scan.centre) @ scan.axes[:, 0], [0.01, 0.99])
+    whole = (part.vertices - design.centre) @ design.axes[:, 0]
+    short = np.ptp(whole) - (high - low)
+    shifts = [0.0] if short < SHORT_SHARE * np.ptp(whole) else [0.0, -1.0, 1.0]
+    found = []
+    for R in rotations:
+        for shift in shifts:
+            ahead = R @ scan.axes[:, 0] @ design.axes[:, 0]  # 1 or -1: which way the scan lies on the design
+            own = (low, high) if ahead > 0.0 else (-high, -low)
+            move = 0.0 if shift == 0.0 else whole.min() - own[0] if shift < 0.0 else whole.max() - own[1]
+            found.append(rigid.transform(R, design.centre + move * design.axes[:, 0] - R @ scan.centre))
+    return found
 
 
 def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> Attitude:

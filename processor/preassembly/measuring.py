@@ -30,6 +30,7 @@ class Measured:
     """One part as measured: pose by its whole surface, ends, edges; scan frame with the origin taken off."""
 
     name: str
+    scans: tuple[Scan, ...]  # those used; poses and key points are in the frame of the first
     status: str  # ok | ambiguous | weak | failed
     message: str
     T_bridge_scan: Floats
@@ -41,49 +42,84 @@ class Measured:
     residuals: Floats  # (r,) from the design's surface, outward
 
 
-def measure(scan: Scan, index: int, design: ArchDesign, shrink: float, doubts: SystematicParams) -> Measured:
-    """Register one part and measure its ends and edges; ``index`` is its place in the design's order.
+@dataclass(frozen=True)
+class _Placed:
+    """One scan registered to the design, or why it is not: then ``trouble`` says so."""
 
-    ``doubts`` are added to the covariance of both.
+    scan: Scan
+    found: attitude.Attitude
+    fitted: registration.Registration
+    trouble: str
+
+    @property
+    def rank(self) -> tuple[bool, bool, int]:
+        """How well it stands: told from its mirror poses, held in all directions, by many points."""
+        return self.found.status == "ok", not self.fitted.weak, len(self.scan.points)
+
+
+def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, doubts: SystematicParams) -> Measured:
+    """Register the scans of one part and measure its ends and edges; ``index`` is its place in the design's order.
+
+    Each scan is registered to the design by itself; the best of them is the part's, and others that are as sure add
+    their points to it. ``doubts`` are added to the covariance of ends and edges.
     """
-    part, points = design.parts[index], scan.points * shrink
-    design_surface = attitude.sample_surface(part)
-    found = attitude.find(points, part, design_surface)
+    part = design.parts[index]
+    shape = attitude.sample_surface(part)
     joints = [j if 0 <= j < len(design.joint_names) else None for j in (index - 1, index)]
-    if found.status == "failed":
-        return _failed(part, joints, found.message, shrink)
-    surface = design_surface.mesh
-    fitted = registration.fine(points, surface, design_surface.axes, found.T_surface)
-    if not (fitted.used_share > registration.LEAST_SHARE and np.isfinite(fitted.covariance).all()):
-        said = f"only {fitted.used_share:.0%} of the points lie near the design's surface"
-        return _failed(part, joints, f"{said}; {_looks_like(points, design, part)}", shrink)
-    if not registration.fits(fitted):
-        said = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface, "
-        said += f"the others typically {fitted.sigma_mm / 1.4826:.0f} mm"
-        return _failed(part, joints, f"{said}; {_looks_like(points, design, part)}", shrink)
-    moved = rigid.apply(fitted.T_bridge_scan, points)
+    every = [_place(scan, part, design, shape, shrink) for scan in scans]
+    usable = sorted((one for one in every if not one.trouble), key=lambda one: one.rank, reverse=True)
+    if not usable:
+        return _failed(part, scans, joints, "; ".join(_named(one, one.trouble, every) for one in every), shrink)
+    first = usable[0]
+    used = [first, *(one for one in usable[1:] if one.rank[:2] == (True, True))]
+    said_of = [first.found.message] if first.found.message else []
+    for one in every:
+        if one not in used:
+            said_of.append(f"scan {one.scan.name} is not used: {one.trouble or one.found.message or _unheld(one)}")
+    moved = np.vstack([rigid.apply(one.fitted.T_bridge_scan, one.scan.points * shrink) for one in used])
     ends: list[joint_ends.JointEnd | None] = []
-    said_of: list[str] = [found.message] if found.message else []
+    pose = first.fitted.covariance
     for outward, joint in zip((-1.0, 1.0), joints, strict=True):
         if joint is None:
             ends.append(None)
             continue
         corners = design.joint_points[joint]
-        end = joint_ends.fit(moved, surface, features.joint_frame(corners), corners[:4], outward, fitted.covariance)
+        end = joint_ends.fit(moved, shape.mesh, features.joint_frame(corners), corners[:4], outward, pose)
         said_of += [f"{design.joint_names[joint]}: {end.trouble}"] if end.trouble else []
         ends.append(systematic.of_end(end, doubts, part))
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
-    edges = bottom_edges.measure(moved, surface, *lines, fitted.sigma_mm, fitted.covariance)
-    edges = systematic.of_edges(edges, doubts)
-    member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
-    if fitted.weak:
-        said_of.append(f"what the scan shows does not hold {' and '.join(fitted.weak)}")
-    weak = bool(fitted.weak) or any(end is not None and end.trouble for end in ends)
-    status = "ambiguous" if found.status == "ambiguous" else "weak" if weak else "ok"
+    edges = bottom_edges.measure(moved, shape.mesh, *lines, first.fitted.sigma_mm, pose)
+    member = network.Member((ends[0], ends[1]), systematic.of_edges(edges, doubts), part.vertices.mean(axis=0))
+    said_of += [_unheld(first)] if first.fitted.weak else []
+    weak = bool(first.fitted.weak) or any(end is not None and end.trouble for end in ends)
+    status = "ambiguous" if first.found.status == "ambiguous" else "weak" if weak else "ok"
     return Measured(
-        part.name, status, "; ".join(said_of), fitted.T_bridge_scan, fitted.covariance, member, shrink, found.T_rival,
-        *_residuals(moved, surface),
+        part.name, tuple(one.scan for one in used), status, "; ".join(said_of), first.fitted.T_bridge_scan, pose,
+        member, shrink, first.found.T_rival, *_residuals(moved, shape.mesh),
     )  # fmt: skip
+
+
+def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Surface, shrink: float) -> _Placed:
+    points = scan.points * shrink
+    found = attitude.find(points, part, shape)
+    if found.status == "failed":
+        return _Placed(scan, found, registration.NOWHERE, found.message)
+    fitted = registration.fine(points, shape.mesh, shape.axes, found.T_surface)
+    trouble = ""
+    if not (fitted.used_share > registration.LEAST_SHARE and np.isfinite(fitted.covariance).all()):
+        trouble = f"only {fitted.used_share:.0%} of the points lie near the design's surface"
+    elif not registration.fits(fitted):
+        trouble = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface, "
+        trouble += f"the others typically {fitted.sigma_mm / 1.4826:.0f} mm"
+    return _Placed(scan, found, fitted, f"{trouble}; {_looks_like(points, design, part)}" if trouble else "")
+
+
+def _unheld(one: _Placed) -> str:
+    return f"what the scan shows does not hold {' and '.join(one.fitted.weak)}"
+
+
+def _named(one: _Placed, said: str, every: Sequence[_Placed]) -> str:
+    return f"scan {one.scan.name}: {said}" if len(every) > 1 else said
 
 
 def _residuals(moved: Floats, surface: MeshSurface) -> tuple[Floats, Floats]:
@@ -112,11 +148,15 @@ def _size_of(points: Floats) -> Floats:
     return found
 
 
-def _failed(part: DesignPart, joints: Sequence[int | None], message: str, shrink: float) -> Measured:
+def _failed(
+    part: DesignPart, scans: Sequence[Scan], joints: Sequence[int | None], message: str, shrink: float
+) -> Measured:
     ends = tuple(None if joint is None else joint_ends.nothing(message) for joint in joints)
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
     edges = bottom_edges.unseen(*lines)
     member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
     nowhere, nothing = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
     no_points = np.empty((0, 3))
-    return Measured(part.name, "failed", message, nowhere, nothing, member, shrink, nowhere, no_points, np.empty(0))
+    return Measured(
+        part.name, (scans[0],), "failed", message, nowhere, nothing, member, shrink, nowhere, no_points, np.empty(0)
+    )

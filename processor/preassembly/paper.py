@@ -198,6 +198,7 @@ def _result(parts: list[Part], poses: list[Floats], messages: list[str], design:
         components=tuple(part.name for part in parts),
         component_status=tuple(status),
         component_message=tuple(said),
+        component_scans=tuple(part.scan.name for part in parts),
         T_bridge_scan=np.array([_with_origin(pose, part.scan.origin) for pose, part in zip(poses, parts, strict=True)]),
         covariance=np.full((len(parts), 6, 6), np.nan),
         key_points_scan=np.array([[_key_points(part, end) for end in part.ends] for part in parts]),

@@ -45,6 +45,9 @@ class Registration:
     weak: tuple[str, ...] = ()
 
 
+NOWHERE = Registration(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
+
+
 def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> Registration:
     """Robust point-to-surface least squares of points (n, 3), scan frame, from ``start`` (4, 4).
 

@@ -36,25 +36,26 @@ def run(scene: Scene, params: Params) -> Result:
     scans = scans_in_order(scene, design)
     if params.method == "adjustment":
         return adjustment.assemble(scans, scene, design, params)
-    result = paper.assemble(paper.extract(scans, design, params), design, params)
+    several = [part.name for part, own in zip(design.parts, scans, strict=True) if len(own) > 1]
+    if several:
+        raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")
+    result = paper.assemble(paper.extract([own[0] for own in scans], design, params), design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != adjustment.REFERENCE_C:
         said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
         result = replace(result, message=f"{result.message}; {said}")
     return result
 
 
-def scans_in_order(scene: Scene, design: ArchDesign) -> list[Scan]:
-    """Return the scans in the design's order. Raises InputError for a part without its one scan."""
-    scans: list[Scan] = []
-    for part in design.parts:
-        found = [scan for scan in scene.scans if scan.component == part.name]
-        if len(found) != 1:
+def scans_in_order(scene: Scene, design: ArchDesign) -> list[list[Scan]]:
+    """Return the scans of each part in the design's order. Raises InputError for a part without any."""
+    scans = [[scan for scan in scene.scans if scan.component == part.name] for part in design.parts]
+    for part, own in zip(design.parts, scans, strict=True):
+        if not own:
             named = ", ".join(sorted(scan.component or scan.name for scan in scene.scans))
             raise InputError(
-                f"{scene.name}: expected one scan of component {part.name!r}, found {len(found)} "
+                f"{scene.name}: expected a scan of component {part.name!r}, found none "
                 f"(scans are of: {named}); name them by 'component' in project.toml"
             )
-        scans.append(found[0])
     return scans
 
 

@@ -34,7 +34,7 @@ def bridges(sets, seeds, sigmas, spacing):
                 settings = [f"scan.sigma_mm={float(sigma)}", f"scan.spacing_mm={float(spacing)}"]
                 scene, truth = make(name, recipes.overridden(recipes.load(f"arch-{name.lower()}")[1], settings), seed)
                 started = time.monotonic()
-                scans = preassemble.scans_in_order(scene, scene.arch)
+                scans = [own[0] for own in preassemble.scans_in_order(scene, scene.arch)]
                 parts = paper.extract(scans, scene.arch, preassemble.Params(seed=seed))
                 for method in preassemble.METHODS:
                     params = preassemble.Params(method=method, seed=seed)

@@ -312,7 +312,7 @@ def test_what_cannot_be_assembled_is_refused(bridge):
     scene, _ = bridge
     with pytest.raises(InputError, match="arch-bridge design"):
         preassemble.run(Scene("x", "arch-bridge", scene.scans), preassemble.Params())
-    with pytest.raises(InputError, match="expected one scan of component 'rib3', found 0"):
+    with pytest.raises(InputError, match="expected a scan of component 'rib3', found none"):
         preassemble.run(dataclasses.replace(scene, scans=scene.scans[:3]), preassemble.Params())
     with pytest.raises(UsageError, match="unknown method 'magic'"):
         preassemble.run(scene, preassemble.Params(method="magic"))
