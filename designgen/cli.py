@@ -98,13 +98,24 @@ def make(
 @click.option("--without-truth", is_flag=True, help="leave the truth out")
 @click.option("--spherical", is_flag=True, help="E57 with ranges and angles, as scanners write it")
 @click.option("--step", is_flag=True, help="write the design's solids as STEP, too")
-def export(scene: Path, output: Path, format_: str, without_truth: bool, spherical: bool, step: bool) -> None:
+@click.option("--without-meshes", is_flag=True, help="leave the meshes of an arch bridge's parts out of its design")
+def export(
+    scene: Path, output: Path, format_: str, without_truth: bool, spherical: bool, step: bool, without_meshes: bool
+) -> None:
     """Write SCENE as a scan folder: project.toml, design, scans, and the truth in truth.h5."""
     from designgen import scan_folder
 
     if spherical and format_ != "e57":
         raise click.UsageError("--spherical is for --format e57")
-    written = scan_folder.export(scene, output, format_, with_truth=not without_truth, spherical=spherical, step=step)
+    written = scan_folder.export(
+        scene,
+        output,
+        format_,
+        with_truth=not without_truth,
+        spherical=spherical,
+        step=step,
+        with_meshes=not without_meshes,
+    )
     for name in written.left_out:
         click.echo(f"{output}: scan {name!r} is left out: it saw next to nothing", err=True)
     click.echo(f"{output}: {written.scans} scan(s) as {format_}")

@@ -31,14 +31,22 @@ class Exported:
 
 
 def export(
-    source: Path, folder: Path, format_: str, *, with_truth: bool, spherical: bool = False, step: bool = False
+    source: Path,
+    folder: Path,
+    format_: str,
+    *,
+    with_truth: bool,
+    spherical: bool = False,
+    step: bool = False,
+    with_meshes: bool = True,
 ) -> Exported:
     """Write the scene file ``source`` as a new scan folder.
 
     The folder is made under a temporary name and moved; ``spherical`` is for E57, ``step`` adds the design's
-    solids as STEP. Scans with fewer points than a reader takes are left out. The truth's labels are named and ordered
-    as the folder's scans are when they are read. Raises UsageError when the folder exists and is not empty, for a
-    format that cannot hold the scene, and where no scan is left.
+    solids as STEP; without ``with_meshes`` an arch bridge's design is its curves and joints alone. Scans with fewer
+    points than a reader takes are left out. The truth's labels are named and ordered as the folder's scans are when
+    they are read. Raises UsageError when the folder exists and is not empty, for a
+    format that cannot hold the scene, where no scan is left, and without meshes for what is no arch bridge.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder}: exists and is not empty; name a new folder")
@@ -46,11 +54,13 @@ def export(
     scans = tuple(scan for scan in whole.scans if len(scan.points) >= FEWEST_POINTS)
     if whole.scans and not scans:
         raise UsageError(f"{source}: no scan has {FEWEST_POINTS} points or more, so there is nothing to export")
+    if not with_meshes and whole.arch is None:
+        raise UsageError(f"{source}: only an arch bridge has a design without meshes")
     scene = dataclasses.replace(whole, scans=scans)
     folder.parent.mkdir(parents=True, exist_ok=True)
     making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
     try:
-        written = _write(scene, making, format_, spherical=spherical)
+        written = _write(scene, making, format_, spherical=spherical, with_meshes=with_meshes)
         if step:
             from designgen import cad_files
 
@@ -84,12 +94,12 @@ def _labels_as_read(labels: Sequence[PointLabels], written: Sequence[Written]) -
     return tuple(found)
 
 
-def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool) -> list[Written]:
+def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_meshes: bool) -> list[Written]:
     (folder / "scans").mkdir()
     lines = [f"name = {_quoted(scene.name)}", f"kind = {_quoted(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
     scale = 1.0 if format_ == "ply" else scan_files.METRES
-    design = _design(scene, folder, scale)
+    design = _design(scene, folder, scale, with_meshes=with_meshes)
     if design:
         lines.append(f"design = {_quoted(design)}")
     if np.isfinite(scene.temperature_C):
@@ -156,10 +166,10 @@ def _stems(scans: Sequence[Scan]) -> list[str]:
     return stems
 
 
-def _design(scene: Scene, folder: Path, scale: float) -> str:
+def _design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool) -> str:
     """Write the design, a structure's mesh in the folder's units; returns its file's name, empty without one."""
     if scene.arch is not None:
-        _write_json(folder / "design.json", _arch_design(scene.arch, folder))
+        _write_json(folder / "design.json", _arch_design(scene.arch, folder if with_meshes else None))
     elif scene.frame is not None:
         _write_json(folder / "design.json", _frame_design(scene.frame))
     elif scene.structure is not None:
@@ -172,16 +182,18 @@ def _design(scene: Scene, folder: Path, scale: float) -> str:
     return "design.json"
 
 
-def _arch_design(design: ArchDesign, folder: Path) -> dict[str, Any]:
-    (folder / "design").mkdir(exist_ok=True)
-    components = {}
+def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
+    """Return the design as JSON; meshes go to ``folder``, or nowhere."""
+    components: dict[str, dict[str, Any]] = {}
     for part in design.parts:
-        scan_files.write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
         components[part.name] = {
-            "mesh": f"design/{part.name}.ply",
             "bottom_edge_left": part.bottom_edge_left.tolist(),
             "bottom_edge_right": part.bottom_edge_right.tolist(),
         }
+        if folder is not None:
+            (folder / "design").mkdir(exist_ok=True)
+            scan_files.write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
+            components[part.name] = {"mesh": f"design/{part.name}.ply", **components[part.name]}
     joints = [
         {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, points.tolist(), strict=True))}
         for name, left, right, points in zip(

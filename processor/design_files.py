@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import numpy as np
 
 from processor.fields import Table, inside
 from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints
+from processor.preassembly import surrogate
 from processor.readers import ply
 from processor.readers.raw import decoded, parsing
 from processor.units import MM_PER_UNIT, SYNONYMS
@@ -73,7 +75,6 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
             f"{design.where}: 'order' ({', '.join(order)}) does not name each of the components "
             f"({', '.join(components.values)}) once"
         )
-    parts = tuple(_part(folder, name, components.table(name), scale) for name in order)
     joints: dict[tuple[str, str], tuple[str, Floats]] = {}
     for joint in design.tables("joints"):
         joint.only(("name", "left", "right", "points"))
@@ -90,6 +91,8 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
         raise InputError(
             f"{design.where}: expected one joint for each two neighbours in 'order' (left, right); see {wrong}"
         )
+    at = [None, *(joints[sides][1] for sides in expected), None]
+    parts = tuple(_part(folder, name, components.table(name), scale, at[i : i + 2]) for i, name in enumerate(order))
     return ArchDesign(
         parts,
         tuple(joints[sides][0] for sides in expected),
@@ -99,14 +102,22 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
     )
 
 
-def _part(folder: Path, name: str, part: Table, scale: float) -> DesignPart:
-    part.only(("mesh", "bottom_edge_left", "bottom_edge_right"))
-    vertices, faces = read_mesh(inside(folder, part.text("mesh"), part.where))
+def _part(folder: Path, name: str, part: Table, scale: float, joints: Sequence[Floats | None]) -> DesignPart:
+    """Read a component between its joints' key points (8, 3, mm); without a mesh it gets one from what is known."""
+    part.only(("mesh", "bottom_edge_left", "bottom_edge_right", "plate_mm"))
     edges = [part.array(f"bottom_edge_{side}", -1, 3) * scale for side in ("left", "right")]
     for side, edge in zip(("left", "right"), edges, strict=True):
         if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():
             raise InputError(f"{part.where}: bottom_edge_{side} needs two points or more, none of them twice in a row")
-    return DesignPart(name, vertices * scale, faces, edges[0], edges[1])
+    plate_mm = part.number("plate_mm", surrogate.PLATE_MM, positive=True)
+    if "mesh" in part.values:
+        vertices, faces = read_mesh(inside(folder, part.text("mesh"), part.where))
+        return DesignPart(name, vertices * scale, faces, edges[0], edges[1])
+    try:
+        vertices, faces = surrogate.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
+    except InputError as error:
+        raise InputError(f"{part.where}: without a mesh: {error}") from None
+    return DesignPart(name, vertices, faces, edges[0], edges[1], surrogate.SOURCE)
 
 
 def _frame(design: Table) -> FrameDesign:

@@ -160,6 +160,7 @@ class DesignPart(Checked):
     faces: Ints = column("f", 3, dtype=np.int64)
     bottom_edge_left: Floats = column("l", 3)  # from the start to the end of the component; left = +Y
     bottom_edge_right: Floats = column("r", 3)
+    source: str = "mesh"  # of vertices and faces: mesh, or curves: the outer box between joints and bottom edges alone
 
 
 @dataclass(frozen=True)

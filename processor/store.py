@@ -32,7 +32,8 @@ FORMAT_VERSION = "1.2"
 HISTORY = [
     "1.0: first",
     "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
-    "1.2: bottom edges as built, in the truth of arch bridges; limits that the project names",
+    "1.2: bottom edges as built, in the truth of arch bridges; limits that the project names; "
+    "what a part's mesh is made from",
 ]
 
 # All that HDF5 and h5py raise for a damaged file; none of it names the file or helps its user.

@@ -7,6 +7,8 @@ gaps of imperfect parts depend on: the weight lambda of the design's curve again
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -52,7 +54,8 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         joint_measures.measure(*one)
         for one in zip(gaps, adjusted.gap_covariance, frames, design.joint_points, strict=True)
     ]
-    judged = [judge(one, limits) for one in measures]
+    sides = list(pairwise(parts))
+    judged = [_if_told(judge(one, limits), *both) for one, both in zip(measures, sides, strict=True)]
     proposals = [propose(*one, limits, params.trim) for one in zip(design.joint_names, measures, strict=True)]
     span, span_ci95 = chain_figures.span(parts, adjusted, design)
     closure, closure_ci95 = chain_figures.closure(parts, members, design, frames)
@@ -111,6 +114,15 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         residual=np.concatenate([part.residuals for part in parts]),
         residual_component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
     )
+
+
+def _if_told(verdict: Verdict, left: Measured, right: Measured) -> Verdict:
+    """Leave a joint open where a part may lie the other way round: then its gaps are those of the wrong end."""
+    unsure = [part.name for part in (left, right) if part.status == "ambiguous"]
+    if not unsure:
+        return verdict
+    said = f"{' and '.join(unsure)} may lie the other way round"
+    return replace(verdict, verdict="indeterminate", probability=float("nan"), said=said)
 
 
 def _pose_covariances(parts: Sequence[Measured], adjusted: network.Adjusted, placed: Floats) -> Floats:

@@ -16,7 +16,9 @@ from scipy.spatial import cKDTree
 from processor.geometry import mesh_surface, rigid
 from processor.geometry.lines import Polyline
 from processor.geometry.mesh_surface import MeshSurface, outermost
-from processor.model import Floats
+from processor.model import Floats, Ints
+from processor.preassembly import layers
+from processor.preassembly.layers import Bools
 from processor.preassembly.smoothing import smooth
 
 STATION_MM = 200.0
@@ -68,6 +70,8 @@ def measure(
         bottom = inside & (np.abs(facing[1]) > 0.9) & (np.abs(up) < 60.0) & (-sense * level > margin)
         bottom &= -sense * level < REACH_MM
         bottom[bottom] = surface.part_of[face[bottom]] == outermost(surface.part_of[face[bottom]], -np.abs(up[bottom]))
+        for own, out in ((web, sense * np.sign(facing[0])), (bottom, -np.sign(facing[1]))):
+            own[own] = _outer(station[own], (out * residual)[own])
         found = [
             _at_edge(station[web], x[web], up[web], np.sign(facing[0][web]) * residual[web], count),
             _at_edge(
@@ -107,6 +111,15 @@ def _frame(line: Polyline, other: Polyline, arc: Floats, sense: float) -> tuple[
     left = left - np.einsum("ni,ni->n", left, along)[:, None] * along
     left = left / np.linalg.norm(left, axis=1)[:, None]
     return along, left, np.cross(along, left)
+
+
+def _outer(station: Ints, out: Floats) -> Bools:
+    """Mark points (n,) that are not of a plate's inner side, station by station."""
+    kept = np.ones(len(out), bool)
+    for one in np.unique(station[out < -layers.LAYER_MM]):
+        at = np.flatnonzero(station == one)
+        kept[at] = layers.outer(out[at])
+    return kept
 
 
 def _at_edge(station: np.ndarray, x: Floats, w: Floats, residual: Floats, count: int) -> tuple[Floats, Floats]:

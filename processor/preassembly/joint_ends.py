@@ -16,8 +16,8 @@ from scipy.linalg import block_diag
 
 from processor.geometry import rigid
 from processor.geometry.mesh_surface import MeshSurface, outermost
-from processor.model import Floats
-from processor.preassembly import end_ring
+from processor.model import Floats, Ints
+from processor.preassembly import between, end_ring, layers
 from processor.preassembly.evidence import SIZES_MM, Believed, weigh
 
 Bools = npt.NDArray[np.bool_]
@@ -48,11 +48,19 @@ def nothing(trouble: str) -> JointEnd:
 
 
 def fit(
-    points: Floats, surface: MeshSurface, T_bridge_joint: Floats, corners: Floats, outward: float, pose: Floats
+    points: Floats,
+    surface: MeshSurface,
+    T_bridge_joint: Floats,
+    corners: Floats,
+    outward: float,
+    pose: Floats,
+    station: Ints,
+    apart: float,
 ) -> JointEnd:
     """Fit one joint end of points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
 
     ``corners`` (4, 3) are the design's P1..P4; ``outward`` is +1 where the part ends at the joint, -1 where it starts.
+    ``station`` (n,) says from where each point was seen, ``apart`` is the variance between stations, mm^2.
     """
     T_joint_bridge = rigid.invert(T_bridge_joint)
     size = np.ptp(rigid.apply(T_joint_bridge, corners), axis=0)
@@ -66,32 +74,28 @@ def fit(
     seen = (face >= 0) & (beyond < 1.0)
     normal = np.zeros_like(local)
     normal[seen] = surface.normals[face[seen]] @ T_bridge_joint[:3, :3]
-    noise = _noise(residual[seen & (np.abs(normal[:, 0]) < 0.3)])
+    out_of = [residual * np.sign(sense * normal[:, axis]) for _, axis, sense in FACES]
+    on, inner = _faces(surface, local, normal, face, seen, out_of)
+    noise = _noise(residual[seen & ~inner & (np.abs(normal[:, 0]) < 0.3)])
     margin = 3.0 * noise + 2.0
     half = 0.5 * size
     fits: list[tuple[Floats, Floats]] = []
     sums, freedom = 0.0, 0
-    for name, axis, sense in FACES:
+    station = station[zone]
+    for (name, axis, _), own, out in zip(FACES, on, out_of, strict=True):
         across = 1 if axis == 2 else 2
-        # Not by the sense of the normals: meshes come with either. Of the faces that lie so the outermost is meant.
-        own = seen & (np.abs(normal[:, axis]) > 0.9) & (sense * local[:, axis] > 0.0)
-        outer = outermost(surface.part_of[face[own]], sense * local[own, axis])
-        own[own] = surface.part_of[face[own]] == outer
-        own &= (np.abs(local[:, across]) < half[across] - margin) & (-outward * x > margin)
+        own = own & (np.abs(local[:, across]) < half[across] - margin) & (-outward * x > margin)
         basis = _face_basis(x[own], local[own, across] / half[across])
-        out = residual[own] * np.sign(sense * normal[own, axis])
-        coefficients, covariance, rest = _least_squares(basis, out)
+        coefficients, covariance, rest, used = _least_squares(basis, out[own])
         if not len(coefficients):
             return nothing(f"too few points on the {name} face")
-        fits.append((coefficients, covariance))
+        fits.append((coefficients, covariance + between.added(basis[used], station[own][used], apart)))
         sums, freedom = sums + float(rest @ rest), freedom + len(rest)
     sigma = float(np.sqrt(sums / max(freedom, 1)))
-    ring = _ring(
-        rigid.apply(T_joint_bridge, points[zone]), fits, half, _thickness(surface, T_joint_bridge, half), outward, sigma
-    )
+    ring, on_ring = _ring(local, station, fits, half, _thickness(surface, T_joint_bridge, half), outward, sigma)
     if not len(ring.coefficients):
         return nothing("too few points on the end face")
-    fits.append((ring.coefficients, ring.covariance))
+    fits.append((ring.coefficients, ring.covariance + between.added(*on_ring, apart)))
     number = np.concatenate([coefficients for coefficients, _ in fits])
     believed = _weighed(
         number, block_diag(*(block for _, block in fits)), _by_pose(T_bridge_joint, half, outward, pose)
@@ -100,6 +104,22 @@ def fit(
     moved = (derivative @ believed.mean).reshape(8, 3)
     covariance = derivative @ believed.covariance @ derivative.T + FLOOR_MM**2 * np.eye(24)
     return JointEnd(moved, covariance, sigma, "")
+
+
+def _faces(
+    surface: MeshSurface, local: Floats, normal: Floats, face: Ints, seen: Bools, out_of: list[Floats]
+) -> tuple[list[Bools], Bools]:
+    """Mark the points (n,) of each of FACES, and those about any of them that are of the plate's inner side."""
+    found, inner = [], np.zeros(len(local), bool)
+    for (_, axis, sense), out in zip(FACES, out_of, strict=True):
+        # Not by the sense of the normals: meshes come with either. Of the faces that lie so the outermost is meant.
+        own = seen & (np.abs(normal[:, axis]) > 0.9) & (sense * local[:, axis] > 0.0)
+        own[own] = surface.part_of[face[own]] == outermost(surface.part_of[face[own]], sense * local[own, axis])
+        layer = layers.outer(out[own])
+        inner[np.flatnonzero(own)[~layer]] = True
+        own[own] = layer
+        found.append(own)
+    return found, inner
 
 
 def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Floats:
@@ -114,22 +134,40 @@ def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Fl
 
 
 def _ring(
-    local: Floats, fits: list[tuple[Floats, Floats]], half: Floats, thickness: Floats, outward: float, sigma: float
-) -> end_ring.Ring:
-    """Fit the end ring to points (n, 3) of the joint's frame, plate by plate between the corners."""
+    local: Floats,
+    station: Ints,
+    fits: list[tuple[Floats, Floats]],
+    half: Floats,
+    thickness: Floats,
+    outward: float,
+    sigma: float,
+) -> tuple[end_ring.Ring, tuple[Floats, Ints]]:
+    """Fit the end ring to points (n, 3) of the joint's frame, plate by plate between the corners.
+
+    Also the basis and the station of the points that are surely of the ring.
+    """
     columns = []
-    clear = thickness + end_ring.REACH * sigma + 1.0  # of the corners, where two walls meet
+    depth, plates, x = [], [], outward * local[:, 0]
     for (_, axis, sense), (coefficients, _) in zip(FACES, fits, strict=True):
         across = 1 if axis == 2 else 2
         w = local[:, across] / half[across]
         e = half[axis] + _face_basis(np.zeros(len(w)), w) @ coefficients - sense * local[:, axis]
-        plate = thickness[axis - 1]
-        near = (np.abs(local[:, across]) < half[across] - clear[across - 1]) & (e < plate + 60.0) & (e > -60.0)
-        near &= np.abs(local[:, 0]) < 80.0
+        wide = np.abs(local[:, across]) < half[across] - np.minimum(layers.REACH_MM, 0.5 * half[across])
+        plates.append(layers.plate_mm(x[wide], e[wide], sigma, float(thickness[axis - 1])))
+        depth.append(e)
+    clear = np.array([max(plates[1], plates[3]), max(plates[0], plates[2])]) + end_ring.REACH * sigma + 1.0
+    for (_, axis, _), e, plate in zip(FACES, depth, plates, strict=True):
+        across = 1 if axis == 2 else 2
+        near = np.abs(local[:, across]) < half[across] - clear[across - 1]  # of the corners, where two walls meet
+        near &= (e < plate + 60.0) & (e > -60.0) & (np.abs(x) < 80.0)
         basis = _ring_basis(local[near, 1] / half[1], local[near, 2] / half[2])
-        columns.append((outward * local[near, 0], e[near], np.full(near.sum(), plate), basis))
-    x, e, plates, basis = (np.concatenate(column) for column in zip(*columns, strict=True))
-    return end_ring.fit(x, e, plates, basis, sigma)
+        columns.append((x[near], e[near], np.full(near.sum(), plate), basis, station[near]))
+    at, inward, thick, basis, seen_from = (np.concatenate(column) for column in zip(*columns, strict=True))
+    found = end_ring.fit(at, inward, thick, basis, sigma)
+    rest = at - basis @ found.coefficients if len(found.coefficients) else np.full(len(at), np.inf)
+    margin = np.minimum(2.0 * sigma, 0.35 * thick)
+    surely = (np.abs(rest) < end_ring.REACH * max(sigma, FLOOR_MM)) & (inward > margin) & (inward < thick - margin)
+    return found, (basis[surely], seen_from[surely])
 
 
 def _face_basis(x: Floats, w: Floats) -> Floats:
@@ -147,14 +185,17 @@ def _noise(residual: Floats) -> float:
     return float(1.4826 * np.median(np.abs(residual - middle))) if len(residual) else 0.0
 
 
-def _least_squares(basis: Floats, residual: Floats) -> tuple[Floats, Floats, Floats]:
-    """Coefficients (k,), covariance (k, k) and rests of the used points; empty for too few. Outliers are left out."""
+def _least_squares(basis: Floats, residual: Floats) -> tuple[Floats, Floats, Floats, Bools]:
+    """Coefficients (k,), covariance (k, k), rests of the used points, and which they are; outliers are left out.
+
+    Empty for too few points.
+    """
     middle = np.median(residual) if len(residual) else 0.0
     used = np.abs(residual - middle) < 6.0 * _noise(residual) + FORM_MM
     coefficients: Floats = np.empty(0, np.float64)
     for _ in range(6):
         if used.sum() < LEAST_POINTS:
-            return np.empty(0), np.empty((0, 0)), np.empty(0)
+            return np.empty(0), np.empty((0, 0)), np.empty(0), used
         coefficients = np.asarray(np.linalg.lstsq(basis[used], residual[used], rcond=None)[0], np.float64)
         rest = residual - basis @ coefficients
         limit = 4.5 * max(_noise(rest[used]), FLOOR_MM)
@@ -165,16 +206,16 @@ def _least_squares(basis: Floats, residual: Floats) -> tuple[Floats, Floats, Flo
     rest = residual[used] - basis[used] @ coefficients
     variance = float(rest @ rest) / max(len(rest) - len(coefficients), 1)
     normal = basis[used].T @ basis[used]
-    return coefficients, variance * np.linalg.inv(normal), rest
+    return coefficients, variance * np.linalg.inv(normal), rest, used
 
 
 def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
     """Weigh the numbers (22,) of an end against an end as designed, which the registration alone moves: ``by_pose``.
 
-    Those of the faces are of one unknown size, those of the ring's plane, and what bends it, of others.
+    The faces' shifts are of one unknown size, how they lie and bend of another; so are the ring's plane and its bends.
     """
     mean, spread = np.zeros(len(number)), np.zeros((len(number),) * 2)
-    faces = [(1.0, np.full(16, size)) for size in SIZES_MM]
+    faces = [(1.0, np.tile([shift, bend, bend, bend], 4)) for shift in SIZES_MM for bend in SIZES_MM]
     ring = [
         (before, np.repeat([plane, bend], 3))
         for plane in SIZES_MM

@@ -7,17 +7,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import rigid
+from processor.geometry import icp, rigid
 from processor.geometry.lines import Polyline
 from processor.geometry.mesh_surface import MeshSurface
-from processor.model import ArchDesign, DesignPart, Floats, Scan
+from processor.model import ArchDesign, DesignPart, Floats, Ints, Scan
 from processor.preassembly import (
     attitude,
+    between,
     bottom_edges,
     features,
     joint_ends,
     network,
     registration,
+    surrogate,
     systematic,
 )
 from processor.preassembly.systematic import SystematicParams
@@ -77,6 +79,8 @@ def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float
         if one not in used:
             said_of.append(f"scan {one.scan.name} is not used: {one.trouble or one.found.message or _unheld(one)}")
     moved = np.vstack([rigid.apply(one.fitted.T_bridge_scan, one.scan.points * shrink) for one in used])
+    station = _stations([one.scan for one in used])
+    apart = _between_stations(moved, station, shape)
     ends: list[joint_ends.JointEnd | None] = []
     pose = first.fitted.covariance
     for outward, joint in zip((-1.0, 1.0), joints, strict=True):
@@ -84,19 +88,52 @@ def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float
             ends.append(None)
             continue
         corners = design.joint_points[joint]
-        end = joint_ends.fit(moved, shape.mesh, features.joint_frame(corners), corners[:4], outward, pose)
+        frame = features.joint_frame(corners)
+        end = joint_ends.fit(moved, shape.mesh, frame, corners[:4], outward, pose, station, apart)
         said_of += [f"{design.joint_names[joint]}: {end.trouble}"] if end.trouble else []
         ends.append(systematic.of_end(end, doubts, part))
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
     edges = bottom_edges.measure(moved, shape.mesh, *lines, first.fitted.sigma_mm, pose)
-    member = network.Member((ends[0], ends[1]), systematic.of_edges(edges, doubts), part.vertices.mean(axis=0))
+    edges = systematic.of_edges(edges, doubts, apart * between.share(station))
+    member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
     said_of += [_unheld(first)] if first.fitted.weak else []
+    said_of += _without_mesh(part, design)
     weak = bool(first.fitted.weak) or any(end is not None and end.trouble for end in ends)
     status = "ambiguous" if first.found.status == "ambiguous" else "weak" if weak else "ok"
     return Measured(
         part.name, tuple(one.scan for one in used), status, "; ".join(said_of), first.fitted.T_bridge_scan, pose,
         member, shrink, first.found.T_rival, *_residuals(moved, shape.mesh),
     )  # fmt: skip
+
+
+def _without_mesh(part: DesignPart, design: ArchDesign) -> list[str]:
+    """Say what it costs that a part has no mesh, and which others it may be taken for."""
+    if part.source == "mesh":
+        return []
+    twins = surrogate.alike(part, design)
+    taken = [f"of the same shape as {' and '.join(twins)}: the scan may be of either"] if twins else []
+    return [surrogate.cost(part), *taken]
+
+
+def _between_stations(moved: Floats, station: Ints, shape: attitude.Surface) -> float:
+    """Variance between the stations that points (n, 3) on the design were seen from, mm^2."""
+    thin = slice(None, None, max(1, len(moved) // registration.LAST_POINTS))
+    face, residual, beyond = shape.mesh.distances(moved[thin], 60.0)
+    near = (face >= 0) & (beyond < 1.0) & (np.abs(residual) < registration.GATES_MM[1])
+    normals = shape.mesh.normals[face[near]]
+    cell = registration.cells(moved[thin][near] @ shape.axes, icp.facing(normals, shape.axes), normals @ shape.axes)
+    return between.variance(residual[near], station[thin][near], cell)
+
+
+def _stations(scans: Sequence[Scan]) -> Ints:
+    """Return a number (n,) for each point of the scans, joined: one for all that were seen from one station."""
+    found, before = [], 0
+    for scan in scans:
+        given = scan.point_station if len(scan.point_station) else np.zeros(len(scan.points), np.int32)
+        own = np.unique(given, return_inverse=True)[1].reshape(-1).astype(np.int64)
+        found.append(own + before)
+        before += int(own.max(initial=-1)) + 1
+    return np.concatenate(found)
 
 
 def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Surface, shrink: float) -> _Placed:

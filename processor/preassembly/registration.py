@@ -103,7 +103,7 @@ def _iterate(
             gate = max(GATES_MM[1], 6.0 * sigma)
         move = float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.ptp(moved[:, 0]))
         if turn == MOST_TURNS - 1 or (move < STILL_MM and (turn > 4 or not even)):
-            cell = _cells(moved[used] @ axes, looks, n @ axes)
+            cell = cells(moved[used] @ axes, looks, n @ axes)
             form = _form(r, np.sqrt(weight), cell)
             inverse = np.linalg.inv(normal)
             at_middle = inverse @ _scatter(J * (weight * r)[:, None], cell) @ inverse
@@ -118,7 +118,7 @@ def _spread(residual: Floats) -> float:
     return max(1.4826 * float(np.median(np.abs(residual))), FLOOR_MM) if len(residual) else FLOOR_MM
 
 
-def _cells(place: Floats, looks: Ints, normal: Floats) -> Ints:
+def cells(place: Floats, looks: Ints, normal: Floats) -> Ints:
     """Return the number (n,) of the cell along the part, and of the side, that points at (n, 3) are in."""
     cell = np.floor(place[:, 0] / CELL_MM).astype(np.int64)
     side = normal[np.arange(len(looks)), looks] > 0.0

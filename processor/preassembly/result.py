@@ -23,7 +23,7 @@ class Result(Checked):
     components: tuple[str, ...] = names("c")
     component_status: tuple[str, ...] = names("c")  # ok | ambiguous | weak | failed
     component_message: tuple[str, ...] = names("c")
-    component_scans: tuple[str, ...] = names("c")  # names; poses and key points are in the frame of the first
+    component_scans: tuple[str, ...] = names("used")  # names; poses and key points are in the frame of the first
     T_bridge_scan: Floats = column("c", 4, 4)
     covariance: Floats = column("c", 6, 6)  # NaN: the paper's methods state none
     T_rival_scan: Floats = column("r", 4, 4)  # of the adjustment: the other pose of an ambiguous part; NaN of others

@@ -56,9 +56,9 @@ def of_end(end: JointEnd, params: SystematicParams, part: DesignPart) -> JointEn
     return replace(end, covariance=end.covariance + same)
 
 
-def of_edges(edges: EdgeStations, params: SystematicParams) -> EdgeStations:
-    """Add what is systematic to the covariance of a part's edges: all of an edge moves by it."""
-    variance = params.registration_mm**2 + params.offset_mm**2
+def of_edges(edges: EdgeStations, params: SystematicParams, between_stations: float) -> EdgeStations:
+    """Add what is systematic, and a variance between stations, to the covariance of edges: all of an edge moves."""
+    variance = params.registration_mm**2 + params.offset_mm**2 + between_stations
     return replace(edges, covariance=edges.covariance + variance)
 
 

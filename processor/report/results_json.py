@@ -69,7 +69,7 @@ def _preassemble(result: preassemble.Result) -> dict[str, Any]:
                 "name": name,
                 "status": result.component_status[i],
                 "message": result.component_message[i],
-                "scans": result.component_scans[i],
+                "scans": result.component_scans[i] if result.component_scans else "",
                 "T_bridge_scan": result.T_bridge_scan[i],
                 "covariance": result.covariance[i],
                 "key_points_scan": _ends(result.key_points_scan[i]),

@@ -108,7 +108,10 @@ DESIGNS = {
     "order": (change(["order"], ["foot1"]), "does not name each of the components"),
     "order twice": (change(["order"], ["foot1", "foot1", "rib1"]), "does not name each"),
     "order of numbers": (change(["order"], [1, 2]), "expected 'order'"),
-    "mesh missing": (change(["components", "rib1", "mesh"], None), "components: rib1: expected a text as 'mesh'"),
+    "mesh missing": (
+        change(["components", "rib1", "mesh"], None),
+        r"components: rib1: without a mesh: expected the bottom edges to start at P1 and P2 .* 390 mm away",
+    ),
     "mesh outside": (change(["components", "rib1", "mesh"], "../rib1.ply"), "leads out of the folder"),
     "mesh absent": (change(["components", "rib1", "mesh"], "design/x.ply"), "there is no file"),
     "mesh of STEP": (change(["components", "rib1", "mesh"], "design.json"), "expected a mesh"),
