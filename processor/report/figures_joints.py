@@ -38,7 +38,7 @@ def gap_vectors(result: preassemble.Result) -> tuple[str, bytes]:
         axes.set_visible(False)
     handles = [
         Line2D([], [], color=COLOURS[0], marker=">", label=f"gap across, drawn {times:,.0f} times its size"),
-        Line2D([], [], color=COLOURS[1], linestyle=":", label="95 % region of the gap across"),
+        Line2D([], [], color=COLOURS[1], label="95 % region of the gap across"),
         Line2D([], [], color="black", marker="o", fillstyle="none", linestyle="", label="dx +: open along the bridge"),
         Line2D([], [], color="black", marker="s", linestyle="", label="dx −: overlap"),
     ]
@@ -113,5 +113,5 @@ def _ellipse(at: Floats, covariance: Floats) -> Ellipse:
     turn = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
     return Ellipse(
         (float(at[0]), float(at[1])), float(length[1]), float(length[0]), angle=turn,
-        facecolor="none", edgecolor=COLOURS[1], linestyle=":", linewidth=1.6, zorder=4,
+        facecolor="none", edgecolor=COLOURS[1], linewidth=1.1, zorder=4,
     )  # fmt: skip

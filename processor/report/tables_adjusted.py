@@ -20,21 +20,22 @@ CLOSURE = (
 )
 _PAIRS = ("misalignment", "groove_gap_least", "groove_gap_greatest")
 WHAT_TO_DO = (
-    "joint", "verdict", "misalignment_mm", "misalignment_ci95_mm", "least_groove_gap_mm", "least_groove_gap_ci95_mm",
-    "greatest_groove_gap_mm", "greatest_groove_gap_ci95_mm", "rotation_mrad", "rotation_ci95_mrad", "rotation_about",
-    "probability_now", "probability_after", "proposal",
+    "joint", "verdict", "proposal", "misalignment_mm", "misalignment_ci95_mm", "least_groove_gap_mm",
+    "least_groove_gap_ci95_mm", "greatest_groove_gap_mm", "greatest_groove_gap_ci95_mm", "rotation_mrad",
+    "rotation_ci95_mrad", "rotation_about", "probability_now", "probability_after",
 )  # fmt: skip
+PROPOSAL = WHAT_TO_DO.index("proposal")
 _GROUPS = (
-    "", "", *["misalignment (mm)"] * 2, *["groove gap, least (mm)"] * 2, *["groove gap, greatest (mm)"] * 2,
-    *["largest rotation (mrad)"] * 3, *["all limits hold, probability"] * 2, "",
+    "", "", "", *["misalignment (mm)"] * 2, *["groove gap, least (mm)"] * 2, *["groove gap, greatest (mm)"] * 2,
+    *["largest rotation (mrad)"] * 3, *["probability that all limits hold"] * 2,
 )  # fmt: skip
 _NOTE = (
-    "± is the 95 % half-width. Groove gap: right part minus left along the bridge, positive is open. Pass and fail are "
-    "sure with 95 %, indeterminate is neither. Probabilities: as it is, and after what is proposed."
+    "± is the 95 % half-width. Groove gap: right part minus left along the bridge, positive is open. Pass and fail "
+    "are sure with 95 %, indeterminate is neither. Probabilities: as it is, and after what is proposed."
 )
 LIMITS_NOTE = (
-    "Least and greatest allowed; a dash is no bound. Limits that are not verified were not compared with the standard's "
-    "text: do so before the verdicts are relied on."
+    "Least and greatest allowed; a dash is no bound. Limits that are not verified were not compared with the "
+    "standard's text: do so before the verdicts are relied on."
 )
 
 
@@ -42,18 +43,19 @@ def adjusted(result: Result, method: str) -> list[Table]:
     """Tables of the adjustment's own records, what to do first; none for a result without them."""
     if not result.measures:
         return []
+    title = f"Joints: what to do, method {method}"
     todo = tuple(_todo(result))
     weights, traded = result.trade_lambda.tolist(), result.trade_figures.tolist()
     return [
-        Table(f"Joints: what to do, method {method}", WHAT_TO_DO, todo, TODO, _NOTE, _GROUPS, on_terminal=False),
+        Table(title, WHAT_TO_DO, todo, TODO, _NOTE, _GROUPS, on_terminal=False),
         Table(
-            f"Joints: what to do, method {method}",
-            WHAT_TO_DO[:-1],
-            tuple(row[:-1] for row in todo),
-            groups=_GROUPS[:-1],
+            title,
+            _without_proposal(WHAT_TO_DO),
+            tuple(map(_without_proposal, todo)),
+            groups=_without_proposal(_GROUPS),
             on_page=False,
         ),
-        Table("Proposals", ("joint", "proposal"), tuple((row[0], row[-1]) for row in todo), on_page=False),
+        Table("Proposals", ("joint", "proposal"), tuple((row[0], row[PROPOSAL]) for row in todo), on_page=False),
         _limits(result, method),
         Table(
             f"Measures of the joints, method {method}",
@@ -89,6 +91,10 @@ def adjusted(result: Result, method: str) -> list[Table]:
     ]  # fmt: skip
 
 
+def _without_proposal(row: tuple[Any, ...]) -> tuple[Any, ...]:
+    return row[:PROPOSAL] + row[PROPOSAL + 1 :]
+
+
 def _todo(result: Result) -> Iterator[tuple[Any, ...]]:
     for j, joint in enumerate(result.joints):
         measures, proposal = result.measures[j], result.proposals[j]
@@ -97,7 +103,7 @@ def _todo(result: Result) -> Iterator[tuple[Any, ...]]:
         known = [turn for turn in turns if math.isfinite(turn[0])]
         turn = max(known, key=lambda one: abs(one[0])) if known else (NAN, NAN, "")
         probability = result.judged[j].probability
-        yield (joint, result.verdict[j], *pairs, *turn, probability, proposal.probability, proposal.sentence)
+        yield (joint, result.verdict[j], proposal.sentence, *pairs, *turn, probability, proposal.probability)
 
 
 def _limits(result: Result, method: str) -> Table:
@@ -110,13 +116,13 @@ def _limits(result: Result, method: str) -> Table:
                 standing += "; hangs on a size that is not known"
             rows.append(
                 (
-                    joint, what, float(one.value[k]), float(one.ci95[k]), low, high, one.each[k],
-                    float(one.each_probability[k]), one.clause[k], standing,
+                    joint, what, one.each[k], standing, float(one.value[k]), float(one.ci95[k]), low, high,
+                    float(one.each_probability[k]), one.clause[k],
                 )
             )  # fmt: skip
     columns = (
-        "joint", "limit", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "verdict", "probability", "clause",
-        "standing",
+        "joint", "limit", "verdict", "standing", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability",
+        "clause",
     )  # fmt: skip
     return Table(f"Limits, method {method} (mm)", columns, tuple(rows), LIMITS, LIMITS_NOTE)
 

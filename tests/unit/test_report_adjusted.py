@@ -1,0 +1,381 @@
+"""What the report shows of an adjustment: tables, pictures, and the live figures of the page."""
+
+import csv
+import dataclasses
+import html
+import io
+import json
+import re
+import shutil
+import subprocess
+from html.parser import HTMLParser
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from processor.evaluate import ErrorReport
+from processor.model import Limit, StepRun, Tolerance
+from processor.pipeline import Execution
+from processor.preassembly import joint_measures, joint_verdicts, proposals
+from processor.report import figures, figures_residuals, page, printing, results_json, tables, view
+from processor.report.drawing import rounded
+from tests.unit.test_report import PROVENANCE, arch_scene, assembled
+
+NAN = float("nan")
+OWN = {"linear-offset.png", "gap-vectors.png", "trade-off.png", "residuals.png"}
+BAD = "</script><script>alert(1)</script>"
+ACROSS = [[450, -550], [-450, -550], [-450, 550], [450, 550], [0, -550], [-450, 0], [0, 550], [450, 0]]
+SECTION = np.column_stack([np.zeros(8), np.array(ACROSS, float)])
+LIMITS = Tolerance(
+    "GB 50205-2020",
+    limits=(
+        Limit("misalignment_mm", "misalignment", measure="misalignment", high=2.0, clause="9.2.3"),
+        Limit("groove_gap_mm", "groove gap", measure="groove_gap", low=-1.0, high=2.0, clause="9.2.3", verified=True),
+    ),
+)
+
+
+def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600):
+    """Two joints with gaps of k / 2 and -k / 4 mm, sd 0.1; residuals of 1 mm on a box 4 m long, 0.9 m by 1.1 m."""
+    base = assembled("adjustment", names, joints)
+    gaps = np.stack([np.outer(np.arange(8.0), [0.5, 0.2, -0.3]), np.outer(np.arange(8.0), [-0.25, 0.1, 0.2])])
+    records = [joint_measures.measure(gap, 0.01 * np.eye(24), np.eye(4), SECTION) for gap in gaps]
+    judged = [joint_verdicts.judge(one, LIMITS) for one in records]
+    rng = np.random.default_rng(3)
+    points, residual, component = [], [], []
+    for i in range(len(names)):
+        side = rng.integers(0, 4, per_part)
+        y, z = rng.uniform(0.0, 450.0, per_part), rng.uniform(0.0, 1100.0, per_part)
+        y, z = np.choose(side, [y, 0.0 * y, y, 0.0 * y + 450.0]), np.choose(side, [0.0 * z, z, 0.0 * z + 1100.0, z])
+        points.append(np.column_stack([rng.uniform(0.0, 4000.0, per_part) + 4000.0 * i, y, z]))
+        residual.append(rng.normal(0.0, 1.0, per_part))
+        component.append(np.full(per_part, i, np.int32))
+    return dataclasses.replace(
+        base,
+        component_status=("ok",) * len(names),
+        gaps=gaps,
+        gap_ci95=np.full((2, 8, 3), 0.196),
+        verdict=tuple(one.verdict for one in judged),
+        measures=tuple(records),
+        judged=tuple(judged),
+        proposals=tuple(proposals.propose(j, one, LIMITS) for j, one in zip(joints, records, strict=True)),
+        T_rival_scan=np.full((3, 4, 4), NAN),
+        linear_offset=np.column_stack([base.linear_deviation, np.zeros(120)]),
+        linear_offset_ci95=np.full((120, 2), 0.3),
+        span_departure=-1.25,
+        span_ci95=0.5,
+        closure=np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]),
+        closure_ci95=np.full(6, 0.25),
+        limiting="J1 P1: the end face",
+        advice="a scan of rib1",
+        budget_source=("noise", "scanner offset"),
+        budget_sd=np.array([0.05, 0.2]),
+        residual_points=np.concatenate(points),
+        residual=np.concatenate(residual),
+        residual_component=np.concatenate(component),
+        weight=0.1,
+        trade_lambda=np.array([1.0, 0.1, 0.01]),
+        trade_figures=np.array([[2.0, 5.0, 1.0, 2.0], [1.0, 3.0, 1.5, 3.0], [0.5, 1.0, 4.0, 9.0]]),
+    )
+
+
+def of_bridge(**kwargs):
+    runs = (
+        StepRun("preassemble", "adjustment", "{}", adjusted(**kwargs)),
+        StepRun("preassemble", "line", "{}", assembled("line", scale=40)),
+    )
+    scene = arch_scene(kwargs.get("names", ("foot1", "rib1", "foot2")), kwargs.get("joints", ("J1", "J2")))
+    scene = dataclasses.replace(
+        scene,
+        arch=dataclasses.replace(scene.arch, joint_points=SECTION + np.array([[[4e3, 0, 0]], [[8e3, 0, 0]]])),
+    )
+    return Execution(scene, runs, PROVENANCE)
+
+
+def rendered(execution):
+    return page.html(execution, ErrorReport(), figures.of_run(execution, ErrorReport()))
+
+
+class Page(HTMLParser):
+    """Tables by title, ids, scripts by their type, and all text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tables, self.scripts, self.text, self._title, self._in, self._kind = {}, [], "", "", "", ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self._in = tag
+        if tag == "script":
+            self.scripts.append([dict(attrs).get("type", ""), ""])
+        if tag == "h3":
+            self._title = ""
+        if tag == "tr":
+            self.tables.setdefault(self._title, []).append([])
+        if tag in ("td", "th"):
+            self.tables[self._title][-1].append("")
+
+    def handle_data(self, data):
+        if self._in == "script":
+            self.scripts[-1][1] += data
+        else:
+            self.text += data
+        if self._in == "h3":
+            self._title += data
+        if self._in in ("td", "th"):
+            self.tables[self._title][-1][-1] += data
+
+    def handle_endtag(self, tag):
+        self._in = ""
+
+
+def of_file(execution, file):
+    (table,) = [one for one in tables.all_of(execution, ErrorReport()) if one.file == file]
+    return list(csv.DictReader(io.StringIO(printing.csv_text(table))))
+
+
+def number(text):
+    return None if text in ("", "–") else float(text)
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+def test_what_to_do_holds_the_numbers_of_results_json():
+    execution = of_bridge()
+    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
+    rows = of_file(execution, "what-to-do")
+    assert [row["joint"] for row in rows] == ["J1", "J2"]
+    for row, shown, joint, verdict in zip(rows, on_page, step["joint_measures"], step["joints"], strict=True):
+        assert row["verdict"] == verdict["verdict"] == "fail"
+        assert row["proposal"] == shown[2] == joint["proposal"]["sentence"]
+        wanted = [
+            joint["measures"][name][part]
+            for name in ("misalignment", "groove_gap_least", "groove_gap_greatest")
+            for part in ("value", "ci95")
+        ]
+        assert [float(cell) for cell in list(row.values())[3:9]] == pytest.approx(wanted, abs=1e-6)
+        assert [float(cell) for cell in shown[3:9]] == pytest.approx(wanted, abs=5e-4)
+        turns = {axis: joint["measures"][f"rotation_{axis}"] for axis in "xyz"}
+        assert max(abs(one["value"]) for one in turns.values()) == pytest.approx(
+            abs(float(row["rotation_mrad"])), abs=1e-6
+        )
+        assert turns[row["rotation_about"]]["ci95"] == pytest.approx(float(row["rotation_ci95_mrad"]), abs=1e-6)
+        assert number(row["probability_now"]) == pytest.approx(joint["probability"], abs=1e-6)
+        assert number(row["probability_after"]) == pytest.approx(joint["proposal"]["probability"], abs=1e-6)
+    assert float(rows[0]["greatest_groove_gap_mm"]) == 3.5
+    assert float(rows[1]["least_groove_gap_mm"]) == -1.75
+
+
+def test_limits_say_clause_and_whether_they_were_verified():
+    execution = of_bridge()
+    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    rows = of_file(execution, "limits")
+    wanted = [limit for joint in step["joint_measures"] for limit in joint["limits"]]
+    assert len(rows) == len(wanted) == 4
+    for row, limit in zip(rows, wanted, strict=True):
+        assert (row["limit"], row["verdict"], row["clause"]) == (limit["what"], limit["verdict"], limit["clause"])
+        cells = [number(row[f"{name}_mm"]) for name in ("value", "ci95", "least", "greatest")]
+        for cell, name in zip(cells, ("value", "ci95", "low", "high"), strict=True):
+            assert cell == (None if limit[name] is None else pytest.approx(limit[name], abs=1e-6))
+        assert row["standing"] == ("verified" if limit["verified"] else "NOT VERIFIED")
+    assert {row["standing"] for row in rows} == {"verified", "NOT VERIFIED"}
+
+
+def test_span_closure_budget_and_trade_off_as_tables():
+    execution = of_bridge()
+    span, along, *rest = of_file(execution, "span")
+    assert (span["departure"], span["ci95"], span["unit"], span["beyond_its_interval"]) == ("-1.25", "0.5", "mm", "yes")
+    assert (along["departure"], along["ci95"], along["unit"]) == ("1.0", "0.25", "mm")
+    assert [row["unit"] for row in rest] == ["mm", "mm", "mrad", "mrad", "mrad"]
+    assert [row["beyond_its_interval"] for row in rest] == ["yes", "yes", "no", "no", "yes"]
+    assert of_file(execution, "budget")[1] == {"source": "scanner offset", "sd_mm": "0.2"}
+    assert [row["linear_max_mm"] for row in of_file(execution, "trade-off")] == ["2.0", "3.0", "9.0"]
+    measures = of_file(execution, "measures")
+    assert len(measures) == 22
+    low, value, high = (float(measures[0][name]) for name in ("low95", "value", "high95"))
+    assert low < value < high
+
+
+def test_methods_without_intervals_have_none_of_these():
+    runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
+    execution = Execution(arch_scene(), runs, PROVENANCE)
+    files = {table.file for table in tables.all_of(execution, ErrorReport())}
+    assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
+    assert not set(figures.of_run(execution, ErrorReport())) & OWN
+    assert "What limits the accuracy" not in rendered(execution)
+
+
+def test_the_verdict_stands_before_all_else_and_what_to_do_before_the_pictures():
+    text = rendered(of_bridge())
+    places = [
+        text.index(one)
+        for one in ("joints 2 fail", "NOT VERIFIED", "-1.250 ± 0.500", "J1 P1: the end face", "a scan of rib1", "<h2>")
+    ]
+    assert places == sorted(places)
+    assert text.index("Joints: what to do") < text.index("data:image/png")
+    assert '<li class="bad">' in text
+
+
+# --- pictures ------------------------------------------------------------------------------------------------------
+
+
+def test_every_picture_shows_something():
+    found = figures.of_run(of_bridge(), ErrorReport())
+    assert set(found) == OWN | {"bridge.png", "linear-error.png"}
+    for name, (caption, png) in found.items():
+        pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
+        dark = (pixels.min(axis=2) < 0.9).mean()
+        assert 0.005 < dark < 0.9, name
+        assert caption
+    assert "95 %" in found["linear-error.png"][0]
+
+
+def test_pictures_follow_what_they_show():
+    """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
+    before = figures.of_run(of_bridge(), ErrorReport())
+    execution = of_bridge()
+    run = execution.runs[0]
+    other = dataclasses.replace(run.result, residual=-3.0 * np.abs(run.result.residual), weight=1.0)
+    after = figures.of_run(
+        dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
+    )
+    assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
+
+
+@pytest.mark.parametrize(
+    ("value", "wanted"), [(0.3, 1.0), (1.0, 1.0), (4.99, 2.0), (5.0, 5.0), (760.0, 500.0), (1e4, 1e4)]
+)
+def test_scales_are_round_numbers(value, wanted):
+    assert rounded(value) == pytest.approx(wanted)
+
+
+def test_parts_unroll_face_by_face():
+    """A straight box 4 m by 0.45 m by 1.1 m: the middle of each face is where the girth says."""
+    part = arch_scene().arch.parts[0]
+    corners = [[x, y, z] for x in np.linspace(50.0, 3950.0, 40) for y in (0.0, 450.0) for z in (0.0, 1100.0)]
+    middles = [[1000.0, 225, 0], [1000, 0, 550], [1000, 225, 1100], [1000, 450, 550], [3000, 450, 100]]
+    flat = figures_residuals.unroll(part, np.array(corners + middles))
+    np.testing.assert_allclose(flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1], atol=0.01)
+    np.testing.assert_allclose(flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0], atol=0.01)
+    np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
+
+
+# --- live figures --------------------------------------------------------------------------------------------------
+
+
+def test_the_page_carries_what_its_script_draws():
+    execution = of_bridge()
+    kinds = Page(rendered(execution)).scripts
+    assert [kind for kind, _ in kinds] == ["application/json", ""]
+    data = json.loads(kinds[0][1])
+    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    for drawn, joint in zip(data["joints"], step["joints"], strict=True):
+        assert drawn["gap"] == [pytest.approx(joint["points"][key]["gap"]) for key in data["keys"]]
+        assert drawn["ci95"] == [pytest.approx(joint["points"][key]["ci95"]) for key in data["keys"]]
+    assert data["linear"][0]["deviation"] == pytest.approx(step["linear_error"]["deviation"])
+    assert data["trade"]["lambda"] == [1.0, 0.1, 0.01]
+    assert data["trade"]["linear_max"] == [2.0, 3.0, 9.0]
+    assert [len(part["points"]) for part in data["parts"]] == [1800] * 3
+
+
+def test_no_name_ends_the_data_or_becomes_markup():
+    execution = of_bridge(names=(BAD, "rib1", "<img src=x onerror=alert(2)>"), joints=(BAD, "<!--"))
+    text = rendered(execution)
+    found = Page(text)
+    assert [kind for kind, _ in found.scripts] == ["application/json", ""]
+    data = json.loads(found.scripts[0][1])
+    assert (data["parts"][0]["name"], data["joints"][1]["name"]) == (BAD, "<!--")
+    assert not re.search("[<>&]", found.scripts[0][1])
+    assert "<img src=x" not in text
+    assert BAD in found.text
+    assert "innerHTML" not in found.scripts[1][1]
+
+
+def test_the_page_runs_its_own_script_alone_and_loads_nothing():
+    text = rendered(of_bridge())
+    script, digest = view.script()
+    assert "default-src 'none'" in text
+    assert f"script-src {html.escape(digest)}" in text.replace("&#39;", "&#x27;")
+    assert script in text
+    assert not any(word in text for word in ("@import", "url(", "http://", "https://", "fetch(", "XMLHttpRequest"))
+
+
+def test_many_points_keep_the_page_small():
+    text = rendered(of_bridge(per_part=100_000))
+    assert len(text.encode()) < 3_000_000
+    data = json.loads(Page(text).scripts[0][1])
+    assert sum(len(part["residual"]) for part in data["parts"]) <= view.MOST_POINTS
+
+
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+def test_the_script_is_valid(tmp_path):
+    (tmp_path / "live.js").write_text(view.script()[0])
+    done = subprocess.run(["node", "--check", tmp_path / "live.js"], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+
+
+PROBE = """<script>
+const errors = [];
+addEventListener("error", (event) => errors.push(event.message));
+window.requestAnimationFrame = (act) => setTimeout(act, 16); // frames are rare without a screen
+const later = (act) => setTimeout(act, 200);
+addEventListener("load", () => later(() => {
+  const canvas = document.querySelector("canvas.space"), box = canvas.getBoundingClientRect();
+  const picture = () => canvas.toDataURL();
+  const first = picture(), seen = {};
+  const send = (kind, x, y) => canvas.dispatchEvent(new PointerEvent(kind, {
+    pointerId: 1, clientX: box.left + x, clientY: box.top + y, bubbles: true }));
+  send("pointerdown", 100, 100); send("pointermove", 180, 130); send("pointerup", 180, 130);
+  later(() => {
+    const turned = picture();
+    seen.drag = turned !== first;
+    document.querySelectorAll("#live fieldset input")[0].click();
+    later(() => {
+      seen.component = picture() !== turned;
+      seen.errors = errors;
+      seen.canvases = document.querySelectorAll("#live canvas").length;
+      seen.names = Array.from(document.querySelectorAll("#live fieldset label"), (one) => one.textContent.trim());
+      seen.wide = document.documentElement.scrollWidth > innerWidth;
+      document.title = JSON.stringify(seen);
+    });
+  });
+}));
+</script>"""
+
+
+@pytest.mark.skipif(shutil.which("chromium") is None, reason="no chromium")
+@pytest.mark.parametrize("window", ["1200,900", "500,900"])
+def test_the_live_figures_react_in_a_browser(tmp_path, window):
+    """Names that are markup; a drag turns the view, a component goes off, nothing is said on the console."""
+    text = rendered(of_bridge(names=(BAD, "rib1", "foot2")))
+    probed = re.sub(r'<meta http-equiv="Content-Security-Policy"[^>]*>', "", text).replace(
+        "<title>", PROBE + "<title>", 1
+    )
+    answers = []
+    for name, content in (("as-is", text), ("probed", probed)):
+        (tmp_path / f"{name}.html").write_text(content, "utf-8")
+        done = subprocess.run(
+            [
+                "chromium", "--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}",
+                "--disable-background-networking", "--enable-logging=stderr", f"--window-size={window}",
+                "--virtual-time-budget=5000", "--dump-dom", (tmp_path / f"{name}.html").as_uri(),
+            ],
+            capture_output=True, text=True, timeout=120, check=True,
+        )  # fmt: skip
+        assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
+        answers.append(done.stdout)
+    assert '<div id="live" hidden' not in answers[0]
+    assert answers[0].count("<canvas") == 4
+    title = re.search("<title>(.*?)</title>", answers[1], re.DOTALL).group(1)
+    seen = json.loads(title.replace("&lt;", "<").replace("&gt;", ">").replace("&amp;", "&"))
+    assert seen == {
+        "drag": True,
+        "component": True,
+        "errors": [],
+        "canvases": 4,
+        "names": [BAD, "rib1", "foot2"],
+        "wide": False,
+    }
