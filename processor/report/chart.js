@@ -11,7 +11,7 @@ function lineChart(host, wanted) {
   let waiting = false, ratio = 1, spots = [];
   const swatch = (one) => {
     const found = make("span", { className: "swatch" });
-    found.style.borderTop = `3px ${["solid", "dashed", "dotted", "double"][one.style % 4]} ${one.colour}`;
+    found.style.borderTop = `${one.thin ? 1 : 3}px ${["solid", "dashed", "dotted", "double"][one.style % 4]} ${one.colour}`;
     return found;
   };
   const tick = (parts, on, act) => {
@@ -54,7 +54,7 @@ function lineChart(host, wanted) {
       const known = fits(values, log);
       if (!known.length) return [log ? 0.1 : 0, 1];
       const low = known.reduce((a, b) => Math.min(a, b)), high = known.reduce((a, b) => Math.max(a, b));
-      if (log) return [Math.max(low, high / 1e6) / 1.25, high * 1.25];
+      if (log) return [Math.max(low, high / 1e6) / 1.25, high * 1.6]; // room for what is written at the points
       return [Math.min(low, 0), high > low ? high * 1.05 : low + 1];
     };
     const [x0, x1] = ends(xs, logX), [y0, y1] = ends(ys, logY);

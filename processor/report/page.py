@@ -97,7 +97,7 @@ def _preassembled(result: preassemble.Result) -> tuple[str, str]:
     linear = f"{shown(result.linear_mean)} mm mean, {shown(result.linear_max)} mm at most"
     head = f"{result.status}, {placed} of {len(result.components)} parts placed"
     if result.judged:
-        head = f"joints {judged}; assembly {head}"
+        head = f"of {len(result.joints)} joints {judged}; assembly {head}"
     unverified = any((one.verified == 0).any() for one in result.judged)
     said = f"Splicing error {splicing}. Linear error {linear}. Joints: {judged or 'none'}."
     return head, said + (" The limits are NOT VERIFIED against the standard's text." if unverified else "")

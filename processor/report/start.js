@@ -44,7 +44,7 @@
         x: trade[`splicing_${which}`], y: trade[`linear_${which}`],
         read: (i) => `lambda ${trade.lambda[i]}, ${which}: splicing ${mm(trade[`splicing_${which}`][i])} mm, linear ${mm(trade[`linear_${which}`][i])} mm`,
       })),
-      note: `The numbers at the points are lambda; the answer's, ${trade.weight}, is framed.`,
+      note: `The numbers at the points are lambda; the answer's, ${trade.weight}, is ${own < 0 ? "not among them" : "framed"}.`,
     });
   }
 })();

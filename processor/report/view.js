@@ -27,7 +27,7 @@ function spaceView(host, data) {
   const whole = { target: low.map((value, k) => (value + high[k]) / 2), reach: Math.max(...low.map((v, k) => high[k] - v)) };
   const largest = data.joints.flatMap((joint) => joint.gap.flat()).reduce((m, v) => Math.max(m, Math.abs(v || 0)), 0);
   const camera = { yaw: -0.5, pitch: 0.35, zoom: 1, ...whole };
-  const state = { times: 1, limit: data.limit, points: true, arrows: true };
+  const state = { times: 1, limit: data.limit, points: true, arrows: true, joint: -1 };
 
   const canvas = make("canvas", { className: "space", tabIndex: 0 });
   canvas.setAttribute("aria-label", "the bridge in space; arrow keys turn it, plus and minus zoom");
@@ -71,6 +71,7 @@ function spaceView(host, data) {
 
   function goTo(j) {
     const joint = data.joints[j];
+    state.joint = joint ? j : -1; // a joint is shown without the others, which would stand behind it
     if (!joint) Object.assign(camera, whole, { zoom: 1 });
     else {
       camera.target = [0, 1, 2].map((k) => joint.at.reduce((sum, p) => sum + p[k] / joint.at.length, 0));
@@ -119,22 +120,26 @@ function spaceView(host, data) {
     if (state.points) paintPoints(at, new Uint32Array(image.data.buffer));
     context.putImageData(image, 0, 0);
     for (const part of parts) if (part.on) for (const edge of part.edges) line(edge.map((p) => at(...p)), "#555", 1.2);
-    for (const joint of data.joints) line([0, 1, 2, 3, 0].map((k) => at(...joint.at[k])), "#222", 1);
+    for (const joint of data.joints.filter(visible)) line([0, 1, 2, 3, 0].map((k) => at(...joint.at[k])), "#222", 1);
     tips = [];
-    if (state.arrows) data.joints.forEach((joint, j) => joint.at.forEach((p, k) => arrow(at, joint, j, p, k)));
-    if (camera.reach * camera.zoom > 0) names(at);
+    if (state.arrows) data.joints.forEach((joint, j) => visible(joint, j) && joint.at.forEach((p, k) => arrow(at, joint, j, p, k)));
+    names(at);
     sliderSaid.textContent = ` ${Number(state.times.toPrecision(2)).toLocaleString("en")} times their size`;
     least.textContent = `−${state.limit.toPrecision(2)} mm `;
     most.textContent = ` +${state.limit.toPrecision(2)} mm outward`;
   }
+  function visible(_, j) { return state.joint < 0 || j === state.joint; }
   function paintPoints(at, pixels) {
+    const near = state.joint < 0 ? Infinity : 1.2 * camera.reach, [tx, ty, tz] = camera.target;
     const depth = new Float32Array(width * height).fill(-Infinity);
     const size = Math.max(2, Math.round(2 * ratio * Math.min(Math.max(camera.zoom, 1), 2)));
     let first = 0;
     for (const part of parts) {
       const { points, residual } = part;
       if (part.on) for (let i = 0; i < residual.length; i++) {
-        const [x, y, z] = at(points[3 * i], points[3 * i + 1], points[3 * i + 2]);
+        const a = points[3 * i], b = points[3 * i + 1], c = points[3 * i + 2];
+        if (Math.hypot(a - tx, b - ty, c - tz) > near) continue;
+        const [x, y, z] = at(a, b, c);
         const share = Math.min(Math.max(residual[i] / state.limit, -1), 1);
         const colour = packed[Math.round(50 + 50 * share)];
         const left = Math.round(x), top = Math.round(y);
@@ -169,7 +174,7 @@ function spaceView(host, data) {
     context.fillStyle = "#111";
     context.font = `${12 * ratio}px system-ui, sans-serif`;
     context.textAlign = "center";
-    for (const joint of data.joints) {
+    for (const joint of data.joints.filter(visible)) {
       const spots = joint.at.map((p) => at(...p));
       const x = spots.reduce((sum, p) => sum + p[0] / spots.length, 0);
       context.fillText(joint.name, x, Math.min(...spots.map((p) => p[1])) - 14 * ratio);
