@@ -40,10 +40,11 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
         found["linear-offset.png"] = _linear_offset(scene, runs[0])
     if any(np.isfinite(one.gaps).all() for one in result.measures):
         found["gap-vectors.png"] = gap_vectors(result)
-    if np.isfinite(result.trade_figures).any():
+    if np.isfinite(result.trade_figures).all(axis=1).any():
         found["trade-off.png"] = _trade_off(result)
-    if np.isfinite(result.residual).any():
-        found["residuals.png"] = figures_residuals.residuals(scene, result)
+    residuals = figures_residuals.residuals(scene, result)
+    if residuals is not None:
+        found["residuals.png"] = residuals
     return found
 
 
@@ -280,7 +281,8 @@ def _trade_off(result: preassemble.Result) -> tuple[str, bytes]:
         own = np.maximum(own_figures(result), LEAST_SHOWN_MM)
         marked = f"as answered, lambda {result.weight:g}"
         axes.plot(own[x], own[y], "s", color=COLOURS[1], markersize=12, fillstyle="none", mew=2.0, label=marked)
-        for weight, at in zip(result.trade_lambda, figures, strict=True):
+        known = np.isfinite(figures).all(axis=1)
+        for weight, at in zip(result.trade_lambda[known], figures[known], strict=True):
             axes.annotate(
                 f"{weight:g}", (at[x], at[y]), xytext=(8, 6), textcoords="offset points", fontsize=9, bbox=BEHIND_TEXT
             )

@@ -95,12 +95,19 @@ def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
     return found, x, y
 
 
-def residuals(scene: Scene, result: preassemble.Result) -> tuple[str, bytes]:
-    """Draw the distances from the design's surface, a panel a part, up to MOST_PARTS of them."""
+def _can_show(part: DesignPart, result: preassemble.Result, i: int) -> bool:
+    known = (result.residual_component == i) & np.isfinite(result.residual)
+    return bool(known.any()) and min(len(part.bottom_edge_left), len(part.bottom_edge_right)) > 1
+
+
+def residuals(scene: Scene, result: preassemble.Result) -> tuple[str, bytes] | None:
+    """Draw the distances from the design's surface, a panel a part, up to MOST_PARTS of them; None without any."""
     assert scene.arch is not None
     parts = {part.name: part for part in scene.arch.parts}
-    with_points = [i for i in range(len(result.components)) if (result.residual_component == i).any()]
+    with_points = [i for i, name in enumerate(result.components) if name in parts and _can_show(parts[name], result, i)]
     shown = with_points[:MOST_PARTS]
+    if not shown:
+        return None
     down = math.ceil(len(shown) / ACROSS)
     figure = Figure(figsize=(9.0, 2.9 * down + 0.6), layout="constrained")
     panels = figure.subplots(down, ACROSS, squeeze=False).ravel()

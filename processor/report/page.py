@@ -9,6 +9,7 @@ import json
 from typing import Any
 
 import jinja2
+import numpy as np
 
 from processor.evaluate import ErrorReport
 from processor.model import StepRun
@@ -113,8 +114,10 @@ def _further(run: StepRun) -> list[dict[str, str]]:
         f"{shown(value)} ± {shown(half)}"
         for value, half in zip(result.closure[:3].tolist(), result.closure_ci95[:3].tolist(), strict=True)
     )
+    known = np.isfinite(result.closure).any()
+    closure = f" Closure by the joints alone, along / across / up: {shift} mm." if known else ""
     rows = (
-        ("Span", f"{span}. Closure by the joints alone, along / across / up: {shift} mm."),
+        ("Span", f"{span}.{closure}" if np.isfinite(result.span_departure) else ""),
         ("What limits the accuracy", result.limiting),
         ("Which scan would help", result.advice),
     )
