@@ -58,7 +58,7 @@ def plain_text(table: Table, most: int = 40) -> str:
 
 def headings(table: Table) -> tuple[str, ...]:
     """Return the columns' names as people read them: the title tells the unit, groups what a column belongs to."""
-    names = [column.removesuffix("_mm").replace("_", " ") for column in table.columns]
+    names = [column.removesuffix("_mm").removesuffix("_mrad").replace("_", " ") for column in table.columns]
     if table.groups:
         names = [name.split(" ")[-1] if group else name for name, group in zip(names, table.groups, strict=True)]
     return tuple(names)

@@ -49,8 +49,8 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
             for metric in report.metrics
         ],
     }
-    plain: dict[str, Any] = _plain(found)
-    return plain
+    written: dict[str, Any] = plain(found)
+    return written
 
 
 def step_json(run: StepRun) -> dict[str, Any]:
@@ -196,16 +196,16 @@ def _spheres(result: spheres.Result) -> dict[str, Any]:
 WRITERS: dict[str, Any] = {"preassemble": _preassemble, "spheres": _spheres}
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
     """Turn arrays and numpy numbers into lists and numbers, and what is not finite into None."""
     if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
+        return [plain(item) for item in value]
     if isinstance(value, np.ndarray):
-        return _plain(value.tolist())
+        return plain(value.tolist())
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

@@ -4,38 +4,21 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from processor.evaluate import ErrorReport
-from processor.model import KEY_POINTS, Floats, StepRun
+from processor.model import StepRun
 from processor.pipeline import Execution
+from processor.report import tables_preassembly
+from processor.report.table import NAN, Table
 
-NAN = float("nan")
-
-
-@dataclass(frozen=True)
-class Table:
-    """A titled table: in a CSV file of the name ``file`` where that is not empty, on the page and on the terminal.
-
-    ``groups`` are headings above the columns, one each, equal neighbours taken together; CSV files have none.
-    """
-
-    title: str
-    columns: tuple[str, ...]
-    rows: tuple[tuple[Any, ...], ...]
-    file: str = ""
-    note: str = ""
-    groups: tuple[str, ...] = ()
-    on_page: bool = True
-    on_terminal: bool = True
+__all__ = ["Table", "all_of", "grouped", "of_checks", "of_step"]
 
 
 def of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tables of a step's answer, beside other methods on the same scene."""
-    return {"preassemble": _preassemble, "spheres": _spheres}[run.step]((run, *others), report)
+    return {"preassemble": tables_preassembly.of_runs, "spheres": _spheres}[run.step]((run, *others), report)
 
 
 def of_checks(report: ErrorReport) -> Table:
@@ -65,129 +48,6 @@ def grouped(runs: Sequence[StepRun]) -> list[tuple[StepRun, list[StepRun]]]:
         else:
             answers[run.step] = (run, [])
     return list(answers.values())
-
-
-def _preassemble(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
-    first = runs[0].result
-    method = runs[0].method
-    summary = tuple(
-        (
-            run.method,
-            run.result.splicing_mean,
-            run.result.splicing_max,
-            run.result.linear_mean,
-            run.result.linear_max,
-            run.result.best_fit_linear_mean,
-            run.result.best_fit_linear_max,
-        )
-        for run in runs
-    )
-    gauges = "; ".join(f"{run.method}: {run.result.gauge}" for run in runs)
-    rows = [
-        (joint, key, *first.gaps[j, k], *first.gap_ci95[j, k])
-        for j, joint in enumerate(first.joints)
-        for k, key in enumerate(KEY_POINTS)
-    ]
-    parts = tuple(
-        (name, first.component_status[i], first.component_message[i]) for i, name in enumerate(first.components)
-    )
-    stations = tuple(
-        zip(
-            first.linear_edge,
-            first.linear_station.tolist(),
-            first.linear_deviation.tolist(),
-            first.best_fit_linear_deviation.tolist(),
-            strict=True,
-        )
-    )
-    return [
-        Table(
-            "Splicing and linear error by method (mm)",
-            (
-                "method",
-                "splicing_mean_mm",
-                "splicing_max_mm",
-                "linear_mean_mm",
-                "linear_max_mm",
-                "foot1_best_fit_linear_mean_mm",
-                "foot1_best_fit_linear_max_mm",
-            ),
-            summary,
-            "summary",
-            f"Linear error as assembled, that is with: {gauges}. Foot 1 best-fit to the design: the whole bridge, as "
-            "assembled, is moved so that Foot 1 lies on its design.",
-            ("", *["splicing error"] * 2, *["linear error, as assembled"] * 2, *["linear error, Foot 1 best-fit"] * 2),
-        ),
-        Table("Components", ("component", "status", "remark"), parts, "components"),
-        Table(
-            f"Joints, method {method} (mm)",
-            ("joint", "left_part", "right_part", "mean_mm", "largest_mm", "at", "verdict"),
-            tuple(_joint(first, j) for j in range(len(first.joints))),
-            "joints",
-            "Mean and largest |d| of 8 point pairs and 3 axes. A verdict needs an uncertainty: pass where the largest "
-            "|d| and its uncertainty keep within the limit, fail where it is beyond by more, else indeterminate.",
-        ),
-        *_by_point(first, method, first.gaps, "Splicing error"),
-        *(_by_point(first, method, first.gap_ci95, "95 % half-widths") if np.isfinite(first.gap_ci95).any() else ()),
-        Table(
-            f"Gaps at the joints, method {method}",
-            ("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"),
-            tuple(rows),
-            "gaps",
-            on_page=False,
-            on_terminal=False,
-        ),
-        Table(
-            f"Linear error by station, method {method}",
-            ("edge", "station_mm", "deviation_mm", "foot1_best_fit_deviation_mm"),
-            stations,
-            "linear",
-            on_page=False,
-            on_terminal=False,
-        ),
-    ]
-
-
-def _joint(result: Any, j: int) -> tuple[Any, ...]:
-    """Row of the table of joints; a joint without an answer shows none."""
-    size = np.abs(result.gaps[j])
-    row = (result.joints[j], result.joint_left[j], result.joint_right[j])
-    if not np.isfinite(size).any():
-        return (*row, NAN, NAN, "", result.verdict[j])
-    point, axis = np.unravel_index(int(np.nanargmax(size)), size.shape)
-    where = f"{KEY_POINTS[point]}, {'xyz'[axis]}"
-    return (*row, float(np.nanmean(size)), float(np.nanmax(size)), where, result.verdict[j])
-
-
-JOINTS_ABREAST = 4
-
-
-def _by_point(result: Any, method: str, values: Floats, what: str) -> list[Table]:
-    """Lay out (j, 8, 3) as the source paper does (paper 000, tables 4 to 7): point pairs down, joints across."""
-    found = []
-    for start in range(0, len(result.joints), JOINTS_ABREAST):
-        chosen = range(start, min(start + JOINTS_ABREAST, len(result.joints)))
-        found.append(
-            Table(
-                f"{what}, method {method} (mm)",
-                ("point", *["dx", "dy", "dz"] * len(chosen)),
-                tuple((key, *values[chosen, k].ravel().tolist()) for k, key in enumerate(KEY_POINTS)),
-                note="Right part minus left part, bridge axes: x along the span, z up. P1 to P4 are the corners "
-                "bottom-left, bottom-right, top-right, top-left (left = +y), P5 to P8 the middles of the bottom, "
-                "right, top and left edges."
-                if start == 0
-                else "",
-                groups=(
-                    "",
-                    *(
-                        f"{result.joints[j]}: {result.joint_left[j]} & {result.joint_right[j]}"
-                        for j in chosen
-                        for _ in range(3)
-                    ),
-                ),
-            )
-        )
-    return found
 
 
 def _spheres(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:

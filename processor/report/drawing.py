@@ -1,0 +1,57 @@
+"""What all figures share: colours, dashes and marks, names as a figure can show them, PNG bytes.
+
+Lines and bars are told apart by dash, marker or hatch as well as by colour (Okabe and Ito's, safe without colour
+vision). The same run gives the same bytes: no dates, and none of the user's own settings.
+"""
+
+from __future__ import annotations
+
+import io
+from functools import cache
+
+import numpy as np
+from matplotlib import font_manager
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+from matplotlib.ft2font import FT2Font
+
+COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
+DASHES = ("-", "--", ":", "-.")
+HATCHES = ("", "///", "...", "xxx")
+MARKERS = ("o", "^", "s", "D")
+# Orange through grey to blue: told apart without colour vision, both ends darker than the middle. The page has it too.
+DIVERGING_STOPS = ("#7a3300", "#D55E00", "#e4e4e4", "#0072B2", "#00304d")
+DIVERGING = LinearSegmentedColormap.from_list("residual", DIVERGING_STOPS)
+DECADES_APART = 20.0  # ratio between methods from which a linear axis would flatten the better one
+LEAST_SHOWN_MM = 1e-3
+BEHIND_TEXT = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
+LONGEST_LABEL = 24
+
+Drawn = dict[str, tuple[str, bytes]]  # file name -> (caption, PNG)
+
+
+def png(figure: Figure) -> bytes:
+    """Write a figure as PNG, without a date."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    return out.getvalue()
+
+
+@cache
+def _font() -> FT2Font:
+    return font_manager.get_font(font_manager.findfont("DejaVu Sans"))
+
+
+def label(name: str, place: int) -> str:
+    """Return a name as a figure can show it, or its place in the tables where the font lacks its characters."""
+    if not all(one.isprintable() and _font().get_char_index(ord(one)) for one in name):
+        return f"#{place + 1}"
+    return name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
+
+
+def rounded(value: float) -> float:
+    """Round down to 1, 2 or 5 times a power of ten, and to 1 at least."""
+    if not value > 1.0:
+        return 1.0
+    ten = 10.0 ** np.floor(np.log10(value))
+    return float(max(step for step in (1.0, 2.0, 5.0) if step * ten <= value * (1.0 + 1e-9)) * ten)

@@ -1,0 +1,300 @@
+"""What the report shows of an adjustment: tables, pictures, and the live figures of the page."""
+
+import csv
+import dataclasses
+import io
+import json
+from html.parser import HTMLParser
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from processor.evaluate import ErrorReport
+from processor.model import Limit, StepRun, Tolerance
+from processor.pipeline import Execution
+from processor.preassembly import joint_measures, joint_verdicts, proposals
+from processor.report import figures, figures_residuals, page, printing, results_json, tables
+from processor.report.drawing import rounded
+from tests.unit.test_report import PROVENANCE, arch_scene, assembled
+
+NAN = float("nan")
+OWN = {"linear-offset.png", "gap-vectors.png", "trade-off.png", "residuals.png"}
+BAD = "</script><script>alert(1)</script>"
+ACROSS = [[450, -550], [-450, -550], [-450, 550], [450, 550], [0, -550], [-450, 0], [0, 550], [450, 0]]
+SECTION = np.column_stack([np.zeros(8), np.array(ACROSS, float)])
+LIMITS = Tolerance(
+    "GB 50205-2020",
+    limits=(
+        Limit("misalignment_mm", "misalignment", measure="misalignment", high=2.0, clause="9.2.3"),
+        Limit("groove_gap_mm", "groove gap", measure="groove_gap", low=-1.0, high=2.0, clause="9.2.3", verified=True),
+    ),
+)
+
+
+def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600):
+    """Two joints with gaps of k / 2 and -k / 4 mm, sd 0.1; residuals of 1 mm on a box 4 m long, 0.9 m by 1.1 m."""
+    base = assembled("adjustment", names, joints)
+    gaps = np.stack([np.outer(np.arange(8.0), [0.5, 0.2, -0.3]), np.outer(np.arange(8.0), [-0.25, 0.1, 0.2])])
+    records = [joint_measures.measure(gap, 0.01 * np.eye(24), np.eye(4), SECTION) for gap in gaps]
+    judged = [joint_verdicts.judge(one, LIMITS) for one in records]
+    rng = np.random.default_rng(3)
+    points, residual, component = [], [], []
+    for i in range(len(names)):
+        side = rng.integers(0, 4, per_part)
+        y, z = rng.uniform(0.0, 450.0, per_part), rng.uniform(0.0, 1100.0, per_part)
+        y, z = np.choose(side, [y, 0.0 * y, y, 0.0 * y + 450.0]), np.choose(side, [0.0 * z, z, 0.0 * z + 1100.0, z])
+        points.append(np.column_stack([rng.uniform(0.0, 4000.0, per_part) + 4000.0 * i, y, z]))
+        residual.append(rng.normal(0.0, 1.0, per_part))
+        component.append(np.full(per_part, i, np.int32))
+    return dataclasses.replace(
+        base,
+        component_status=("ok",) * len(names),
+        gaps=gaps,
+        gap_ci95=np.full((2, 8, 3), 0.196),
+        verdict=tuple(one.verdict for one in judged),
+        measures=tuple(records),
+        judged=tuple(judged),
+        proposals=tuple(proposals.propose(j, one, LIMITS) for j, one in zip(joints, records, strict=True)),
+        T_rival_scan=np.full((3, 4, 4), NAN),
+        linear_offset=np.column_stack([base.linear_deviation, np.zeros(120)]),
+        linear_offset_ci95=np.full((120, 2), 0.3),
+        span_departure=-1.25,
+        span_ci95=0.5,
+        closure=np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]),
+        closure_ci95=np.full(6, 0.25),
+        limiting="J1 P1: the end face",
+        advice="a scan of rib1",
+        budget_source=("noise", "scanner offset"),
+        budget_sd=np.array([0.05, 0.2]),
+        residual_points=np.concatenate(points),
+        residual=np.concatenate(residual),
+        residual_component=np.concatenate(component),
+        weight=0.1,
+        trade_lambda=np.array([1.0, 0.1, 0.01]),
+        trade_figures=np.array([[2.0, 5.0, 1.0, 2.0], [1.0, 3.0, 1.5, 3.0], [0.5, 1.0, 4.0, 9.0]]),
+    )
+
+
+def of_bridge(**kwargs):
+    runs = (
+        StepRun("preassemble", "adjustment", "{}", adjusted(**kwargs)),
+        StepRun("preassemble", "line", "{}", assembled("line", scale=40)),
+    )
+    scene = arch_scene(kwargs.get("names", ("foot1", "rib1", "foot2")), kwargs.get("joints", ("J1", "J2")))
+    scene = dataclasses.replace(
+        scene,
+        arch=dataclasses.replace(scene.arch, joint_points=SECTION + np.array([[[4e3, 0, 0]], [[8e3, 0, 0]]])),
+    )
+    return Execution(scene, runs, PROVENANCE)
+
+
+def rendered(execution):
+    return page.html(execution, ErrorReport(), figures.of_run(execution, ErrorReport()))
+
+
+class Page(HTMLParser):
+    """Tables by title, ids, scripts by their type, and all text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tables, self.scripts, self.text, self._title, self._in, self._kind = {}, [], "", "", "", ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self._in = tag
+        if tag == "script":
+            self.scripts.append([dict(attrs).get("type", ""), ""])
+        if tag == "h3":
+            self._title = ""
+        if tag == "tr":
+            self.tables.setdefault(self._title, []).append([])
+        if tag in ("td", "th"):
+            self.tables[self._title][-1].append("")
+
+    def handle_data(self, data):
+        if self._in == "script":
+            self.scripts[-1][1] += data
+        else:
+            self.text += data
+        if self._in == "h3":
+            self._title += data
+        if self._in in ("td", "th"):
+            self.tables[self._title][-1][-1] += data
+
+    def handle_endtag(self, tag):
+        self._in = ""
+
+
+def of_file(execution, file):
+    (table,) = [one for one in tables.all_of(execution, ErrorReport()) if one.file == file]
+    return list(csv.DictReader(io.StringIO(printing.csv_text(table))))
+
+
+def number(text):
+    return None if text in ("", "–") else float(text)
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+def test_what_to_do_holds_the_numbers_of_results_json():
+    execution = of_bridge()
+    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
+    rows = of_file(execution, "what-to-do")
+    assert [row["joint"] for row in rows] == ["J1", "J2"]
+    for row, shown, joint, verdict in zip(rows, on_page, step["joint_measures"], step["joints"], strict=True):
+        assert row["verdict"] == verdict["verdict"] == "fail"
+        assert row["proposal"] == shown[2] == joint["proposal"]["sentence"]
+        wanted = [
+            joint["measures"][name][part]
+            for name in ("misalignment", "groove_gap_least", "groove_gap_greatest")
+            for part in ("value", "ci95")
+        ]
+        assert [float(cell) for cell in list(row.values())[3:9]] == pytest.approx(wanted, abs=1e-6)
+        assert [float(cell) for cell in shown[3:9]] == pytest.approx(wanted, abs=5e-4)
+        turns = {axis: joint["measures"][f"rotation_{axis}"] for axis in "xyz"}
+        assert max(abs(one["value"]) for one in turns.values()) == pytest.approx(
+            abs(float(row["rotation_mrad"])), abs=1e-6
+        )
+        assert turns[row["rotation_about"]]["ci95"] == pytest.approx(float(row["rotation_ci95_mrad"]), abs=1e-6)
+        assert number(row["probability_now"]) == pytest.approx(joint["probability"], abs=1e-6)
+        assert number(row["probability_after"]) == pytest.approx(joint["proposal"]["probability"], abs=1e-6)
+    assert float(rows[0]["greatest_groove_gap_mm"]) == 3.5
+    assert float(rows[1]["least_groove_gap_mm"]) == -1.75
+
+
+def test_limits_say_clause_and_whether_they_were_verified():
+    execution = of_bridge()
+    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    rows = of_file(execution, "limits")
+    wanted = [limit for joint in step["joint_measures"] for limit in joint["limits"]]
+    assert len(rows) == len(wanted) == 4
+    for row, limit in zip(rows, wanted, strict=True):
+        assert (row["limit"], row["verdict"], row["clause"]) == (limit["what"], limit["verdict"], limit["clause"])
+        cells = [number(row[f"{name}_mm"]) for name in ("value", "ci95", "least", "greatest")]
+        for cell, name in zip(cells, ("value", "ci95", "low", "high"), strict=True):
+            assert cell == (None if limit[name] is None else pytest.approx(limit[name], abs=1e-6))
+        assert row["standing"] == ("verified" if limit["verified"] else "NOT VERIFIED")
+    assert {row["standing"] for row in rows} == {"verified", "NOT VERIFIED"}
+
+
+def test_span_closure_budget_and_trade_off_as_tables():
+    execution = of_bridge()
+    span, along, *rest = of_file(execution, "span")
+    assert (span["departure"], span["ci95"], span["unit"], span["beyond_its_interval"]) == ("-1.25", "0.5", "mm", "yes")
+    assert (along["departure"], along["ci95"], along["unit"]) == ("1.0", "0.25", "mm")
+    assert [row["unit"] for row in rest] == ["mm", "mm", "mrad", "mrad", "mrad"]
+    assert [row["beyond_its_interval"] for row in rest] == ["yes", "yes", "no", "no", "yes"]
+    assert of_file(execution, "budget")[1] == {"source": "scanner offset", "sd_mm": "0.2"}
+    assert [row["linear_max_mm"] for row in of_file(execution, "trade-off")] == ["2.0", "3.0", "9.0"]
+    measures = of_file(execution, "measures")
+    assert len(measures) == 22
+    low, value, high = (float(measures[0][name]) for name in ("low95", "value", "high95"))
+    assert low < value < high
+
+
+def test_methods_without_intervals_have_none_of_these():
+    runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
+    execution = Execution(arch_scene(), runs, PROVENANCE)
+    files = {table.file for table in tables.all_of(execution, ErrorReport())}
+    assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
+    assert not set(figures.of_run(execution, ErrorReport())) & OWN
+    assert "What limits the accuracy" not in rendered(execution)
+
+
+def test_the_verdict_stands_before_all_else_and_what_to_do_before_the_pictures():
+    text = rendered(of_bridge())
+    places = [
+        text.index(one)
+        for one in ("joints 2 fail", "NOT VERIFIED", "-1.250 ± 0.500", "J1 P1: the end face", "a scan of rib1", "<h2>")
+    ]
+    assert places == sorted(places)
+    assert text.index("Joints: what to do") < text.index("data:image/png")
+    assert '<li class="bad">' in text
+
+
+def unknown(result, joints, parts):
+    """Take away what is known of these joints and parts."""
+    gaps, residual = result.gaps.copy(), result.residual.copy()
+    gaps[joints], residual[np.isin(result.residual_component, parts)] = NAN, NAN
+    records = list(result.measures)
+    for j in joints:
+        records[j] = joint_measures.measure(np.full((8, 3), NAN), np.full((24, 24), NAN), np.eye(4), SECTION)
+    judged = [joint_verdicts.judge(one, LIMITS) for one in records]
+    return dataclasses.replace(
+        result,
+        gaps=gaps,
+        residual=residual,
+        measures=tuple(records),
+        judged=tuple(judged),
+        verdict=tuple(one.verdict for one in judged),
+        proposals=tuple(proposals.propose(j, one, LIMITS) for j, one in zip(result.joints, records, strict=True)),
+        span_departure=NAN,
+        span_ci95=NAN,
+        closure=np.full(6, NAN),
+        closure_ci95=np.full(6, NAN),
+        trade_figures=np.full((3, 4), NAN),
+    )
+
+
+@pytest.mark.parametrize(("joints", "parts", "drawn"), [((1,), (2,), 2), ((0, 1), (0, 1, 2), 0)])
+def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
+    execution = of_bridge()
+    result = unknown(execution.runs[0].result, list(joints), parts)
+    execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
+    found = figures.of_run(execution, ErrorReport())
+    assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == drawn
+    parsed = Page(rendered(execution))
+    last = parsed.tables["Joints: what to do, method adjustment"][-1]
+    assert last[:2] == ["J2", "indeterminate"]
+    assert "scan both ends" in last[2]
+    assert set(last[3:]) <= {"–", ""}
+    assert "Closure by" not in parsed.text
+    data = json.loads(parsed.scripts[0][1])
+    assert data["joints"][1]["gap"] == [[None] * 3] * 8
+
+
+# --- pictures ------------------------------------------------------------------------------------------------------
+
+
+def test_every_picture_shows_something():
+    found = figures.of_run(of_bridge(), ErrorReport())
+    assert set(found) == OWN | {"bridge.png", "linear-error.png"}
+    for name, (caption, png) in found.items():
+        pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
+        dark = (pixels.min(axis=2) < 0.9).mean()
+        assert 0.005 < dark < 0.9, name
+        assert caption
+    assert "95 %" in found["linear-error.png"][0]
+
+
+def test_pictures_follow_what_they_show():
+    """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
+    before = figures.of_run(of_bridge(), ErrorReport())
+    execution = of_bridge()
+    run = execution.runs[0]
+    other = dataclasses.replace(run.result, residual=-3.0 * np.abs(run.result.residual), weight=1.0)
+    after = figures.of_run(
+        dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
+    )
+    assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
+
+
+@pytest.mark.parametrize(
+    ("value", "wanted"), [(0.3, 1.0), (1.0, 1.0), (4.99, 2.0), (5.0, 5.0), (760.0, 500.0), (1e4, 1e4)]
+)
+def test_scales_are_round_numbers(value, wanted):
+    assert rounded(value) == pytest.approx(wanted)
+
+
+def test_parts_unroll_face_by_face():
+    """A straight box 4 m by 0.45 m by 1.1 m: the middle of each face is where the girth says."""
+    part = arch_scene().arch.parts[0]
+    corners = [[x, y, z] for x in np.linspace(50.0, 3950.0, 40) for y in (0.0, 450.0) for z in (0.0, 1100.0)]
+    middles = [[1000.0, 225, 0], [1000, 0, 550], [1000, 225, 1100], [1000, 450, 550], [3000, 450, 100]]
+    flat = figures_residuals.unroll(part, np.array(corners + middles))
+    np.testing.assert_allclose(flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1], atol=0.01)
+    np.testing.assert_allclose(flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0], atol=0.01)
+    np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
