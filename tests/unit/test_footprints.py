@@ -57,7 +57,7 @@ def before_a_wall():
 OUTERMOST = 0.7 * np.cos(np.radians(30.0))  # of the middle to an edge upright: the six stand at 30, 90 degrees, ...
 
 
-@pytest.mark.parametrize("step_mrad", [0.75, 0.4, 0.2])
+@pytest.mark.parametrize("step_mrad", [0.75, 0.4, pytest.param(0.2, marks=pytest.mark.slow)])
 def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     surfaces, device = before_a_wall()
     params = scanner.Params(step_mrad=step_mrad, specular=0.0)
@@ -244,6 +244,7 @@ def test_nothing_is_nearer_than_the_nearest_range():
     assert footprints.nearest_mm(Builder().done(), np.zeros(3)) == np.inf
 
 
+@pytest.mark.slow
 def test_a_beam_many_times_the_step_is_cut_in_every_row(monkeypatch):
     """Where edges may be further than they are followed: 27 steps here."""
     surfaces = large_faces()

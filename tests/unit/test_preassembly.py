@@ -274,6 +274,7 @@ def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
     assert sum("gapes by" in one for one in found.component_message) == 2
 
 
+@pytest.mark.slow
 def test_an_origin_taken_off_changes_nothing(bridge, runs):
     scene, _ = bridge
     far = np.array([5.0e8, 4.3e9, 1.0e5])
@@ -286,6 +287,7 @@ def test_an_origin_taken_off_changes_nothing(bridge, runs):
     np.testing.assert_allclose(again, expected, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
     scene, truth = bridge
     rib = scene.scans[2]

@@ -220,6 +220,7 @@ def test_parts_of_one_shape_are_named():
     assert [surrogate.alike(part, scene.arch) for part in scene.arch.parts] == [()] * 5
 
 
+@pytest.mark.slow
 def test_a_wrong_part_is_not_called_ok(without_meshes):
     scene, _ = without_meshes
     scans = {scan.component: scan for scan in scene.scans}
