@@ -166,12 +166,12 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
         text = json.dumps(said, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         (making / "import.json").write_text(text, encoding="utf-8")
         for one in (*making.iterdir(), making):
-            _sync(one)
+            store.sync(one)
         if folder.exists():
             folder.rmdir()
         os.chmod(making, 0o755)
         os.replace(making, folder)
-        _sync(folder.parent)
+        store.sync(folder.parent)
     except BaseException:
         shutil.rmtree(making, ignore_errors=True)
         raise
@@ -198,14 +198,6 @@ def _file_stem(name: str, taken: set[str]) -> str:
     stem = next(stem for stem in stems if stem.casefold() not in taken)
     taken.add(stem.casefold())
     return stem
-
-
-def _sync(path: Path) -> None:
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 # --- out -------------------------------------------------------------------------------------------------------------

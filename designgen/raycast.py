@@ -52,6 +52,11 @@ class Seen:
     width: int
     side: int
 
+    def of_strip(self, strip: int) -> tuple[Any, ...]:
+        """Shapes, pieces, boxes, first column, width and side of a strip, as the kernels take them."""
+        boxes = self.boxes[self.strip_start[strip] : self.strip_start[strip + 1]]
+        return (*self.shapes, *self.piece, boxes, strip * self.width, self.width, self.side)
+
 
 def see(
     surfaces: Surfaces, T_scanner_scene: Floats, grid: Grid, width: int, side: int, reach: float, spread: float
@@ -102,10 +107,8 @@ def cast(
     ``beam[0] + beam[1] range`` may touch a thing so thin that the rays beside it may all miss it, infinite where there
     is none.
     """
-    first = strip * seen.width
     return ray_kernels.cast(  # type: ignore[call-arg]
-        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, seen.width,
-        seen.side, grid.columns, grid.lowest, grid.step, jitter, turned, *limits, beam, beside,
+        *seen.of_strip(strip), grid.columns, grid.lowest, grid.step, jitter, turned, *limits, beam, beside,
     )  # fmt: skip
 
 
@@ -125,10 +128,9 @@ def cast_around(
     ``number`` (width + 2 side, rows) is a ray's row in the answer, -1 where none is wanted; ``angle`` (m,) scales the
     directions' ``offsets`` (k, 2).
     """
-    first = strip * seen.width
     return ray_kernels.cast_around(  # type: ignore[call-arg]
-        *seen.shapes, *seen.piece, seen.boxes[seen.strip_start[strip] : seen.strip_start[strip + 1]], first, seen.width,
-        seen.side, grid.columns, grid.lowest, grid.step, jitter, turned, *limits, number, angle, offsets, len(angle),
+        *seen.of_strip(strip), grid.columns, grid.lowest, grid.step, jitter, turned, *limits, number, angle, offsets,
+        len(angle),
     )  # fmt: skip
 
 

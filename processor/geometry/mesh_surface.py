@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
@@ -13,6 +14,7 @@ from processor.model import Floats, Ints
 
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
 WALK_STEPS = 24
+EDGE_MM = 1.0  # a foot beyond its face by no more is still on it
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,12 @@ def _smooth_faces(neighbours: Ints) -> Ints:
     links = coo_array((np.ones(len(one), np.int8), (one, neighbours[one, side])), (len(neighbours),) * 2)
     number: Ints = connected_components(links, directed=False)[1].astype(np.int64)
     return number
+
+
+def on_face(face: Ints, beyond: Floats) -> npt.NDArray[np.bool_]:
+    """Mark the points (n,) that have a face and their foot on it, by what :meth:`MeshSurface.distances` found."""
+    found: npt.NDArray[np.bool_] = (face >= 0) & (beyond < EDGE_MM)
+    return found
 
 
 def outermost(part_of: Ints, position: Floats) -> int:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.model import Floats
+
+T = TypeVar("T", bound=np.generic)
 
 SLICES, SLICE_POINTS = 5, 40_000
 
@@ -46,6 +50,11 @@ def statistical_inliers(points: Floats, neighbours: int = 20, ratio: float = 3.0
         return np.ones(len(points), bool)
     mean = cKDTree(points).query(points, k=k + 1, workers=-1)[0][:, 1:].mean(axis=1)
     return np.asarray(mean <= mean.mean() + ratio * mean.std(), bool)
+
+
+def thinned(points: npt.NDArray[T], count: int) -> npt.NDArray[T]:
+    """Every k-th of points (n, ...), k as large as leaves ``count`` or more of them."""
+    return points[:: max(1, len(points) // count)]
 
 
 def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:

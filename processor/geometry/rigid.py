@@ -27,6 +27,11 @@ def invert(T: Floats) -> Floats:
     return transform(R.T, -R.T @ T[:3, 3])
 
 
+def with_origin(T: Floats, origin: Floats) -> Floats:
+    """T (4, 4) for coordinates that an ``origin`` (3,), taken off before, has been put back to."""
+    return transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ origin)
+
+
 def rotation_angle(R: Floats) -> float:
     """Angle of a rotation (3, 3) in rad, accurate near 0 and near pi."""
     sine = 0.5 * np.linalg.norm([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])

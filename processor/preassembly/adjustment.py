@@ -16,7 +16,7 @@ from processor.geometry import rigid
 from processor.geometry.lines import Polyline
 from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
 from processor.preassembly import chain_figures, features, joint_measures, network, registration, tolerance
-from processor.preassembly.chain_figures import NORMAL_95
+from processor.preassembly.joint_measures import NORMAL_95
 from processor.preassembly.joint_verdicts import Verdict, judge
 from processor.preassembly.measuring import Measured, measure
 from processor.preassembly.params import Params
@@ -37,12 +37,12 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     firsts = [part.scans[0] for part in parts]
     frames = np.array([features.joint_frame(points) for points in design.joint_points])
     members = [part.member for part in parts]
-    curve = [network.adjust(members, design.joint_points, frames, one) for one in TRADE_OFF]
-    adjusted = network.adjust(members, design.joint_points, frames, weight)
+    curve = {one: network.adjust(members, design.joint_points, frames, one) for one in {*TRADE_OFF, weight}}
+    adjusted = curve[weight]
     sd = np.sqrt(np.einsum("jkk->jk", adjusted.gap_covariance)).reshape(-1, 8, 3)
     poses = np.array([motion @ part.T_bridge_scan for motion, part in zip(adjusted.motions, parts, strict=True)])
     key_points, key_sd = _key_points(parts, firsts, design, frames)
-    placed = np.array([_with_origin(T, scan.origin * shrink) for T, scan in zip(poses, firsts, strict=True)])
+    placed = np.array([rigid.with_origin(T, scan.origin * shrink) for T, scan in zip(poses, firsts, strict=True)])
     ends = np.array(
         [[rigid.apply(T, end * shrink) for end in both] for T, both in zip(placed, key_points, strict=True)]
     )
@@ -94,9 +94,11 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         linear_deviation=assembled,
         best_fit_linear_deviation=best_fit,
         trade_lambda=np.array(TRADE_OFF),
-        trade_figures=np.array([_figures(one) for one in curve]),
+        trade_figures=np.array([_figures(curve[one]) for one in TRADE_OFF]),
         weight=weight,
-        T_rival_scan=np.array([_with_origin(p.T_rival, s.origin * shrink) for p, s in zip(parts, firsts, strict=True)]),
+        T_rival_scan=np.array(
+            [rigid.with_origin(p.T_rival, s.origin * shrink) for p, s in zip(parts, firsts, strict=True)]
+        ),
         measures=tuple(measures),
         judged=tuple(judged),
         proposals=tuple(proposals),
@@ -142,10 +144,6 @@ def _overall(statuses: Sequence[str]) -> str:
     if all(one == "ok" for one in statuses):
         return "ok"
     return "failed" if all(one == "failed" for one in statuses) else "partial"
-
-
-def _with_origin(T: Floats, origin: Floats) -> Floats:
-    return rigid.transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ origin)
 
 
 def _key_points(
@@ -212,5 +210,5 @@ def _message(params: Params, limits: Tolerance, degrees: float, judged: Sequence
     unverified = any(not verified for one in judged for verified in one.verified)
     said.append(f"limits of {limits.standard or 'the project'}{', not verified' if unverified else ''}")
     if not params.systematic.known:
-        said.append("intervals hold the points' noise alone: state the stations' registration and the scanner's errors")
+        said.append("intervals hold noise and what stations differ by: state what they share, offset and scale")
     return "; ".join(said)

@@ -14,7 +14,8 @@ from scipy.optimize import least_squares
 from processor.geometry import rigid
 from processor.geometry.lines import Polyline
 from processor.model import ArchDesign, ArchTruth, Floats, Metric, Scene, Truth
-from processor.preassembly import chain_figures, errors
+from processor.preassembly import errors
+from processor.preassembly.joint_measures import NORMAL_95
 from processor.preassembly.result import Result
 
 WRONG_POSE_RAD = 0.1
@@ -64,7 +65,7 @@ def _coverage(result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Me
     known = np.isfinite(off) & np.isfinite(result.key_points_sd)
     if not known.any():
         return []
-    share = float((np.abs(off[known]) <= chain_figures.NORMAL_95 * result.key_points_sd[known]).mean())
+    share = float((np.abs(off[known]) <= NORMAL_95 * result.key_points_sd[known]).mean())
     return [Metric("preassemble", "key points within their 95 % intervals", 100.0 * share, float("nan"), "%")]
 
 

@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import icp, mesh_surface, principal, rigid
 from processor.geometry.mesh_surface import MeshSurface
-from processor.geometry.neighbors import voxel_means
+from processor.geometry.neighbors import thinned, voxel_means
 from processor.model import DesignPart, Floats
 from processor.preassembly import registration
 
@@ -120,11 +120,11 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         seeds = points
     coarse = []
     for T in principal_hypotheses(points, part):
-        fitted = _aligned(_thinned(seeds, COARSE_POINTS), surface, T, COARSE_GATES_MM)
-        coarse.append((_misfit(_thinned(seeds, COARSE_POINTS), surface, fitted), fitted, T))
+        fitted = _aligned(thinned(seeds, COARSE_POINTS), surface, T, COARSE_GATES_MM)
+        coarse.append((_misfit(thinned(seeds, COARSE_POINTS), surface, fitted), fitted, T))
     promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + 1.0]
     # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
-    seeds = _thinned(points, FINE_POINTS)
+    seeds = thinned(points, FINE_POINTS)
     candidates = []
     for _, T_coarse, T in promising:
         fitted = _aligned(seeds, surface, T_coarse, FINE_GATES_MM)
@@ -150,10 +150,6 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         elif theirs > ours:
             best, start, message, other = rival, rival_start, "", np.full((4, 4), np.nan)
     return Attitude(start, best, "ambiguous" if message else "ok", message, other)
-
-
-def _thinned(points: Floats, count: int) -> Floats:
-    return points[:: max(1, len(points) // count)]
 
 
 def _aligned(points: Floats, surface: Surface, T: Floats, gates_mm: tuple[float, ...]) -> Floats:

@@ -11,8 +11,8 @@ import numpy as np
 from scipy import stats
 
 from processor.model import Floats, Ints
+from processor.preassembly.joint_measures import NORMAL_95
 
-NORMAL_95 = 1.959964
 LEAST_POINTS = 25  # of a station on a face
 
 

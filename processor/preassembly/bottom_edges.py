@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_surface, rigid
 from processor.geometry.lines import Polyline
-from processor.geometry.mesh_surface import MeshSurface, outermost
+from processor.geometry.mesh_surface import MeshSurface, on_face, outermost
 from processor.model import Floats, Ints
 from processor.preassembly import layers
 from processor.preassembly.layers import Bools
@@ -56,7 +56,7 @@ def measure(
         offset = own - line.at(fine[at])
         along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
         face, residual, beyond = surface.distances(own, 60.0)
-        seen = (face >= 0) & (beyond < 1.0)
+        seen = on_face(face, beyond)
         normal = np.zeros_like(own)
         normal[seen] = surface.normals[face[seen]]
         facing = [np.einsum("ni,ni->n", normal, frame[k][at]) for k in (1, 2)]

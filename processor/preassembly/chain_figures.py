@@ -9,10 +9,10 @@ import numpy as np
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, ArchDesign, Floats
 from processor.preassembly import network
+from processor.preassembly.joint_measures import NORMAL_95
 from processor.preassembly.measuring import Measured
 from processor.preassembly.network import Adjusted
 
-NORMAL_95 = 1.959964
 JOINTS_ALONE = 1e-9  # lambda with which the design's curve only says which way the bridge lies
 AXES = ("end face", "webs", "bottom and top")  # what places a joint end along its x, y and z
 
@@ -24,15 +24,14 @@ def span(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> t
     """
     ends = _outer_ends(design)
     chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    moves = [_move(parts[i], adjusted, i, at) for i, at in ((0, ends[0]), (-1, ends[1]))]
-    D = np.concatenate([-chord, chord]) @ np.vstack(
-        [_to_points(parts, i, at) for i, at in ((0, ends[0]), (-1, ends[1]))]
-    )
-    variance = float(D @ adjusted.motion_covariance @ D)
-    for i, at in ((0, ends[0]), (-1, ends[1])):
+    found, variance, D = 0.0, 0.0, np.zeros(len(adjusted.motion_covariance))
+    for i, at, sign in ((0, ends[0], -1.0), (len(parts) - 1, ends[1], 1.0)):
+        found += sign * float(chord @ (rigid.apply(adjusted.motions[i], at[None])[0] - at))
+        D += sign * chord @ _to_point(parts, i, at)
         own = chord @ rigid.motion(at[None])[0]
         variance += float(own @ parts[i].covariance @ own)
-    return float(chord @ (moves[1] - moves[0])), NORMAL_95 * float(np.sqrt(variance))
+    variance += float(D @ adjusted.motion_covariance @ D)
+    return found, NORMAL_95 * float(np.sqrt(variance))
 
 
 def closure(
@@ -51,7 +50,7 @@ def closure(
     shift, turn = rigid.apply(T, at[None])[0] - at, rigid.vector_from_rotation(T[:3, :3])
     D = np.zeros((6, len(alone.motion_covariance)))
     for i, sign in ((0, -1.0), (len(parts) - 1, 1.0)):
-        D[:3, 6 * i : 6 * i + 6] += sign * rigid.motion((at - parts[i].member.middle)[None])[0]
+        D[:3] += sign * _to_point(parts, i, at)
         D[3:, 6 * i : 6 * i + 3] += sign * np.eye(3)
     covariance = D @ alone.motion_covariance @ D.T
     for part in (parts[0], parts[-1]):
@@ -101,14 +100,8 @@ def _outer_ends(design: ArchDesign) -> Floats:
     )
 
 
-def _move(part: Measured, adjusted: Adjusted, index: int, at: Floats) -> Floats:
-    moved: Floats = rigid.apply(adjusted.motions[index], at[None])[0] - at
-    return moved
-
-
-def _to_points(parts: Sequence[Measured], index: int, at: Floats) -> Floats:
+def _to_point(parts: Sequence[Measured], index: int, at: Floats) -> Floats:
     """Return the derivative (3, 6 c) of a point of a part by all motions."""
-    index = index % len(parts)
     found = np.zeros((3, 6 * len(parts)))
     found[:, 6 * index : 6 * index + 6] = rigid.motion((at - parts[index].member.middle)[None])[0]
     return found

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from processor.geometry import rigid
-from processor.geometry.mesh_surface import MeshSurface, outermost
+from processor.geometry.mesh_surface import MeshSurface, on_face, outermost
 from processor.model import Floats, Ints
 from processor.preassembly import between, end_ring, layers
 from processor.preassembly.evidence import SIZES_MM, Believed, weigh
@@ -23,7 +23,6 @@ from processor.preassembly.evidence import SIZES_MM, Believed, weigh
 Bools = npt.NDArray[np.bool_]
 
 ZONE_MM = 500.0
-ALONG, ACROSS = 0, 1
 FACES = (("bottom", 2, -1.0), ("right", 1, -1.0), ("top", 2, 1.0), ("left", 1, 1.0))  # axis and sense of the normal
 LEAST_POINTS = 60
 # Weights of bends of each size beforehand: ends are cut by a plane.
@@ -71,7 +70,7 @@ def fit(
         return nothing("too few points near the joint")
     local, x = local[zone], local[zone, 0]
     face, residual, beyond = surface.distances(points[zone], 60.0)
-    seen = (face >= 0) & (beyond < 1.0)
+    seen = on_face(face, beyond)
     normal = np.zeros_like(local)
     normal[seen] = surface.normals[face[seen]] @ T_bridge_joint[:3, :3]
     out_of = [residual * np.sign(sense * normal[:, axis]) for _, axis, sense in FACES]

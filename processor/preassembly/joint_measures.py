@@ -166,13 +166,7 @@ def motion_of(points: Floats) -> Floats:
 
     ``points`` (8, 3) and gaps in the joint's axes. A turn w and an offset t open the gap w x r + t at r.
     """
-    A = np.zeros((8, 3, 6))
-    x, y, z = points.T
-    A[:, 0, 1], A[:, 0, 2] = z, -y
-    A[:, 1, 0], A[:, 1, 2] = -z, x
-    A[:, 2, 0], A[:, 2, 1] = y, -x
-    A[:, :, 3:] = np.eye(3)
-    flat = A.reshape(24, 6)
+    flat = rigid.motion(points).reshape(24, 6)
     size = np.linalg.norm(flat, axis=0)
     found: Floats = np.linalg.pinv(flat / size) / size[:, None]
     return found

@@ -9,7 +9,8 @@ import numpy as np
 
 from processor.geometry import icp, rigid
 from processor.geometry.lines import Polyline
-from processor.geometry.mesh_surface import MeshSurface
+from processor.geometry.mesh_surface import MeshSurface, on_face
+from processor.geometry.neighbors import thinned
 from processor.model import ArchDesign, DesignPart, Floats, Ints, Scan
 from processor.preassembly import (
     attitude,
@@ -117,12 +118,12 @@ def _without_mesh(part: DesignPart, design: ArchDesign) -> list[str]:
 
 def _between_stations(moved: Floats, station: Ints, shape: attitude.Surface) -> float:
     """Variance between the stations that points (n, 3) on the design were seen from, mm^2."""
-    thin = slice(None, None, max(1, len(moved) // registration.LAST_POINTS))
-    face, residual, beyond = shape.mesh.distances(moved[thin], 60.0)
-    near = (face >= 0) & (beyond < 1.0) & (np.abs(residual) < registration.GATES_MM[1])
+    moved, station = thinned(moved, registration.LAST_POINTS), thinned(station, registration.LAST_POINTS)
+    face, residual, beyond = shape.mesh.distances(moved, 60.0)
+    near = on_face(face, beyond) & (np.abs(residual) < registration.GATES_MM[1])
     normals = shape.mesh.normals[face[near]]
-    cell = registration.cells(moved[thin][near] @ shape.axes, icp.facing(normals, shape.axes), normals @ shape.axes)
-    return between.variance(residual[near], station[thin][near], cell)
+    cell = registration.cells(moved[near] @ shape.axes, icp.facing(normals, shape.axes), normals @ shape.axes)
+    return between.variance(residual[near], station[near], cell)
 
 
 def _stations(scans: Sequence[Scan]) -> Ints:
@@ -161,9 +162,9 @@ def _named(one: _Placed, said: str, every: Sequence[_Placed]) -> str:
 
 def _residuals(moved: Floats, surface: MeshSurface) -> tuple[Floats, Floats]:
     """Return thinned points (r, 3) and their distances (r,) from the design's surface."""
-    thin = moved[:: max(1, len(moved) // RESIDUALS)]
+    thin = thinned(moved, RESIDUALS)
     face, distance, beyond = surface.distances(thin, 60.0)
-    near = (face >= 0) & (beyond < 1.0)
+    near = on_face(face, beyond)
     return thin[near], distance[near]
 
 

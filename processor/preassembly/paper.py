@@ -199,7 +199,9 @@ def _result(parts: list[Part], poses: list[Floats], messages: list[str], design:
         component_status=tuple(status),
         component_message=tuple(said),
         component_scans=tuple(part.scan.name for part in parts),
-        T_bridge_scan=np.array([_with_origin(pose, part.scan.origin) for pose, part in zip(poses, parts, strict=True)]),
+        T_bridge_scan=np.array(
+            [rigid.with_origin(pose, part.scan.origin) for pose, part in zip(poses, parts, strict=True)]
+        ),
         covariance=np.full((len(parts), 6, 6), np.nan),
         key_points_scan=np.array([[_key_points(part, end) for end in part.ends] for part in parts]),
         key_points_sd=np.full((len(parts), 2, 8, 3), np.nan),
@@ -231,11 +233,6 @@ def _status(part: Part, pose: Floats) -> str:
     if part.trouble or part.attitude.status == "failed" or not np.isfinite(pose).all():
         return "failed"
     return part.attitude.status
-
-
-def _with_origin(T: Floats, origin: Floats) -> Floats:
-    """T_bridge_scan for coordinates with the scan's origin put back."""
-    return rigid.transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ origin)
 
 
 def _key_points(part: Part, end: features.JointEdges | None) -> Floats:

@@ -5,10 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from processor.geometry import icp, rigid
-from processor.geometry.mesh_surface import MeshSurface
+from processor.geometry.mesh_surface import MeshSurface, on_face
+from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
+
+Bools = npt.NDArray[np.bool_]
 
 POINTS, LAST_POINTS = 30_000, 250_000
 MOST_TURNS = 30
@@ -22,9 +26,7 @@ LEAST_SHARE = 0.5  # of the points that must lie within the last gate
 NO_FIT_MM = (10.0, 4.0)  # no noise and no form of a part is as large; the second where much lies beside the design
 CLUTTER_SHARE = 0.15
 CELL_MM = 500.0  # residuals nearer to each other along the part, on one face, are taken as dependent
-WEAK_MM = (
-    5.0  # a direction in which the ends of a part may lie off by more (95 %) is weak: ends are looked for no further
-)
+WEAK_MM = 5.0  # a motion that may move a part's ends by more (95 %) is weak: they are looked for no further off
 MOTIONS = (
     "a turn about its length", "a turn sideways", "a turn up and down", "a shift along its length", "a shift sideways",
     "a shift up and down",
@@ -56,19 +58,15 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> R
     which is then the best there is. The covariance is a sandwich over cells of neighbouring residuals: what they have
     in common, form and all, counts once (Liang and Zeger 1986).
     """
-    held, form = _iterate(_thinned(points, POINTS), surface, axes, start, GATES_MM[0], even=True)
+    held, form = _iterate(thinned(points, POINTS), surface, axes, start, GATES_MM[0], even=True)
     if not form < NO_FORM:
         return held
-    return _iterate(_thinned(points, LAST_POINTS), surface, axes, held.T_bridge_scan, GATES_MM[1], even=False)[0]
+    return _iterate(thinned(points, LAST_POINTS), surface, axes, held.T_bridge_scan, GATES_MM[1], even=False)[0]
 
 
 def fits(found: Registration) -> bool:
     """Tell whether the scan is of the design's part: what is not clutter lies on its surface."""
     return found.sigma_mm < NO_FIT_MM[found.used_share < 1.0 - CLUTTER_SHARE]
-
-
-def _thinned(points: Floats, count: int) -> Floats:
-    return points[:: max(1, len(points) // count)]
 
 
 def _iterate(
@@ -81,7 +79,7 @@ def _iterate(
     for turn in range(MOST_TURNS):
         moved = rigid.apply(T, points)
         face, residual, beyond = surface.distances(moved, gate + 60.0, face)
-        used = (face >= 0) & (np.abs(residual) < gate) & (beyond < 1.0)
+        used = on_face(face, beyond) & (np.abs(residual) < gate)
         if used.sum() < 100:
             break
         r, n = residual[used], surface.normals[face[used]]
@@ -104,7 +102,7 @@ def _iterate(
         move = float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.ptp(moved[:, 0]))
         if turn == MOST_TURNS - 1 or (move < STILL_MM and (turn > 4 or not even)):
             cell = cells(moved[used] @ axes, looks, n @ axes)
-            form = _form(r, np.sqrt(weight), cell)
+            form = _form(r, weight > 0.0, cell)
             inverse = np.linalg.inv(normal)
             at_middle = inverse @ _scatter(J * (weight * r)[:, None], cell) @ inverse
             weak = _weak(at_middle, axes, float(np.abs((moved[used] - middle) @ axes[:, 0]).max()))
@@ -126,12 +124,12 @@ def cells(place: Floats, looks: Ints, normal: Floats) -> Ints:
     return number
 
 
-def _form(residual: Floats, root: Floats, cell: Ints) -> float:
+def _form(residual: Floats, counted: Bools, cell: Ints) -> float:
     """Return the mean square of the cells' means over what chance makes it: 1 for a part without form of its own."""
-    number = np.bincount(cell, root > 0.0)
+    number = np.bincount(cell, counted)
     full = number > 20
-    mean = np.bincount(cell, residual * (root > 0.0)) / np.maximum(number, 1)
-    rest = (residual - mean[cell])[(root > 0.0) & full[cell]]
+    mean = np.bincount(cell, residual * counted) / np.maximum(number, 1)
+    rest = (residual - mean[cell])[counted & full[cell]]
     chance = max(float(rest.var()) if len(rest) else 0.0, FLOOR_MM**2)
     return float(np.mean(number[full] * mean[full] ** 2)) / chance if full.any() else float("inf")
 

@@ -9,7 +9,7 @@ from typing import Any
 from processor.preassembly.result import Result
 from processor.report.table import NAN, Table
 
-TODO, LIMITS = "what-to-do", "limits"
+TO_DO, LIMITS = "what-to-do", "limits"
 CLOSURE = (
     "along the span",
     "across, to the left",
@@ -47,7 +47,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
     todo = tuple(_todo(result))
     weights, traded = result.trade_lambda.tolist(), result.trade_figures.tolist()
     return [
-        Table(title, WHAT_TO_DO, todo, TODO, _NOTE, _GROUPS, on_terminal=False),
+        Table(title, WHAT_TO_DO, todo, TO_DO, _NOTE, _GROUPS, on_terminal=False),
         Table(
             title,
             _without_proposal(WHAT_TO_DO),
