@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import cadquery as cq
 
 SECTION_STEP_MM = 250.0
+EDGE_STEP_MM = 20.0
 NET_STEP_MM, NET_ACROSS = 250.0, 6  # of the nets that rays hit first, before the surface itself
 PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0
 
@@ -104,8 +105,8 @@ class ArchPart:
         return self.point(np.full(8, s), u, v)
 
     def bottom_edges(self) -> tuple[Floats, Floats]:
-        """Outer bottom edges, left and right, (n, 3) each, from start to end, a vertex at most every 100 mm."""
-        s = self.stations(self.s0, self.s1, 100.0)
+        """Outer bottom edges, left and right, (n, 3) each, from start to end, a vertex at most every 20 mm."""
+        s = self.stations(self.s0, self.s1, EDGE_STEP_MM)
         b = self.b(s)
         zero = np.zeros_like(s)
         return self.point(s, b, zero), self.point(s, -b, zero)

@@ -9,6 +9,8 @@ import numpy as np
 
 from processor.model import Floats
 
+PAIRS_AT_ONCE = 500_000
+
 
 @dataclass(frozen=True)
 class Line:
@@ -91,16 +93,14 @@ class Polyline:
         """Arc lengths (n,) of, and vectors (n, 3) from, the nearest point of the polyline to each of points (n, 3)."""
         start, along = self.vertices[:-1], np.diff(self.vertices, axis=0)
         squared = np.einsum("mi,mi->m", along, along)
-        best = np.full(len(points), np.inf)
+        whole = squared > 0.0
+        start, along, squared, arc = start[whole], along[whole], squared[whole], self.arc[:-1][whole]
         s, offset = np.zeros(len(points)), np.zeros((len(points), 3))
-        for i in range(len(along)):
-            if squared[i] == 0.0:
-                continue
-            t = np.clip((points - start[i]) @ along[i] / squared[i], 0.0, 1.0)
-            vector = points - start[i] - t[:, None] * along[i]
-            distance = np.einsum("ni,ni->n", vector, vector)
-            closer = distance < best
-            best[closer] = distance[closer]
-            offset[closer] = vector[closer]
-            s[closer] = self.arc[i] + t[closer] * math.sqrt(squared[i])
+        for rows in np.array_split(np.arange(len(points)), len(points) * len(start) // PAIRS_AT_ONCE + 1):
+            off = points[rows, None] - start
+            t = np.clip(np.einsum("nmi,mi->nm", off, along) / squared, 0.0, 1.0)
+            off -= t[..., None] * along
+            one, best = np.arange(len(rows)), np.einsum("nmi,nmi->nm", off, off).argmin(axis=1)
+            offset[rows] = off[one, best]
+            s[rows] = arc[best] + t[one, best] * np.sqrt(squared[best])
         return s, offset

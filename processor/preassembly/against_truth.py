@@ -40,7 +40,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
             turns.append(turn)
             wrong += turn > WRONG_POSE_RAD and result.component_status[i] == "ok"
     errors_at_points = np.vstack(key_error)
-    mean, largest = _true_linear_error(scene.arch, result, true_poses)
+    mean, largest = _true_linear_error(scene.arch, result, truth.arch, true, true_poses)
     limit = 5.0 if truth.spacing_mm <= 5.0 else float("nan")
     none = float("nan")
     own = np.abs(_gaps_of_truth(result, truth.arch, true, true_poses))
@@ -142,18 +142,15 @@ def _at_stations(edge: Floats, line: Polyline) -> Floats:
     return np.stack([np.interp(at, arc, edge[:, k]) for k in range(3)], axis=1)
 
 
-def _true_linear_error(design: ArchDesign, result: Result, true_poses: list[Floats]) -> tuple[float, float]:
-    """Mean and maximum distance to the design of the true bottom edges at the poses found: the method's own error."""
+def _true_linear_error(
+    design: ArchDesign, result: Result, truth: ArchTruth, true: dict[str, int], true_poses: list[Floats]
+) -> tuple[float, float]:
+    """Mean and maximum distance to the design of the bottom edges as built, at the poses found, at all stations."""
     distances = []
     for part, pose, true_pose in zip(design.parts, result.T_bridge_scan, true_poses, strict=True):
-        if not np.isfinite(pose).all():
-            continue
-        for edge in (part.bottom_edge_left, part.bottom_edge_right):
-            line = Polyline.through(edge)
-            stations = line.at(np.arange(0.0, line.length, errors.STATION_MM))
-            moved = rigid.apply(pose @ rigid.invert(true_pose), stations)
+        lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
+        for line, edge in zip(lines, truth.edges_bridge[true[part.name]], strict=True):
+            moved = rigid.apply(pose @ rigid.invert(true_pose), _at_stations(edge, line))
             distances.append(np.linalg.norm(line.nearest(moved)[1], axis=1))
-    if not distances:
-        return float("nan"), float("nan")
     joined = np.concatenate(distances)
-    return float(joined.mean()), float(joined.max())
+    return _over(np.mean, joined), _over(np.max, joined)
