@@ -14,6 +14,7 @@ from processor.model import Floats, Ints
 
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
 WALK_STEPS = 24
+OUTER_SPACING_MM = 40.0  # of samples where there is one face only to choose
 EDGE_MM = 1.0  # a foot beyond its face by no more is still on it
 
 
@@ -63,6 +64,10 @@ class MeshSurface:
         side = np.argmin(share, axis=1)
         beyond[rows] = -lowest * self._height(at, side)
         return face, distance, beyond
+
+    def only(self, facets: npt.NDArray[np.bool_]) -> MeshSurface:
+        """Return the surface of the marked facets (f,) alone, for points up to a plate's thickness and more away."""
+        return of_mesh(self.vertices, self.faces[facets], OUTER_SPACING_MM)
 
     def _barycentric(self, points: Floats, face: Ints) -> Floats:
         """Barycentric coordinates (n, 3) of the points' feet on their facets."""
@@ -115,15 +120,6 @@ def on_face(face: Ints, beyond: Floats) -> npt.NDArray[np.bool_]:
     """Mark the points (n,) that have a face and their foot on it, by what :meth:`MeshSurface.distances` found."""
     found: npt.NDArray[np.bool_] = (face >= 0) & (beyond < EDGE_MM)
     return found
-
-
-def outermost(part_of: Ints, position: Floats) -> int:
-    """Return the smooth face whose points (n,) lie highest, of those with a fifth of them or more; -1 without any."""
-    if not len(part_of):
-        return -1
-    numbers, which, count = np.unique(part_of, return_inverse=True, return_counts=True)
-    mean = np.bincount(which, position) / count
-    return int(numbers[np.argmax(np.where(count >= 0.2 * len(part_of), mean, -np.inf))])
 
 
 def _neighbours(faces: Ints, normals: Floats) -> Ints:

@@ -119,12 +119,13 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
 
 
 def _if_told(verdict: Verdict, left: Measured, right: Measured) -> Verdict:
-    """Leave a joint open where a part may lie the other way round: then its gaps are those of the wrong end."""
-    unsure = [part.name for part in (left, right) if part.status == "ambiguous"]
+    """Leave a joint open where a part may lie the other way round, or an end may have been taken for another side."""
+    unsure = [f"{part.name} may lie the other way round" for part in (left, right) if part.status == "ambiguous"]
+    for part, end in ((left, left.member.ends[1]), (right, right.member.ends[0])):
+        unsure += [f"{part.name}: {end.trouble}"] if end is not None and end.trouble else []
     if not unsure:
         return verdict
-    said = f"{' and '.join(unsure)} may lie the other way round"
-    return replace(verdict, verdict="indeterminate", probability=float("nan"), said=said)
+    return replace(verdict, verdict="indeterminate", probability=float("nan"), said="; ".join(unsure))
 
 
 def _pose_covariances(parts: Sequence[Measured], adjusted: network.Adjusted, placed: Floats) -> Floats:

@@ -15,10 +15,11 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_surface, rigid
 from processor.geometry.lines import Polyline
-from processor.geometry.mesh_surface import MeshSurface, on_face, outermost
+from processor.geometry.mesh_surface import MeshSurface, on_face
 from processor.model import Floats, Ints
 from processor.preassembly import layers
 from processor.preassembly.layers import Bools
+from processor.preassembly.outer_faces import ALONG
 from processor.preassembly.smoothing import smooth
 
 STATION_MM = 200.0
@@ -40,9 +41,18 @@ class EdgeStations:
 
 
 def measure(
-    points: Floats, surface: MeshSurface, left: Polyline, right: Polyline, sigma_mm: float, pose: Floats
+    points: Floats,
+    surface: MeshSurface,
+    outer: MeshSurface,
+    left: Polyline,
+    right: Polyline,
+    sigma_mm: float,
+    pose: Floats,
 ) -> EdgeStations:
-    """Measure both edges on points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6)."""
+    """Measure both edges on points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
+
+    ``outer`` are the outer faces of ``surface``.
+    """
     sides: list[str] = []
     arcs, places, axes, smoothed = [], [], [], []
     for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
@@ -55,21 +65,20 @@ def measure(
         own, at = points[rows], index[rows]
         offset = own - line.at(fine[at])
         along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
-        face, residual, beyond = surface.distances(own, 60.0)
-        seen = on_face(face, beyond)
-        normal = np.zeros_like(own)
-        normal[seen] = surface.normals[face[seen]]
-        facing = [np.einsum("ni,ni->n", normal, frame[k][at]) for k in (1, 2)]
+        nearest = surface.distances(own, REACH_MM)[0]
+        face, residual, beyond = outer.distances(own, REACH_MM)
+        seen = (nearest >= 0) & on_face(face, beyond) & (np.abs(residual) < layers.REACH_MM)
+        # Not by the sense of the normals: meshes come with either.
+        normal, on = outer.normals[face], surface.normals[nearest]
+        facing, nearly = ([np.einsum("ni,ni->n", n, frame[k][at]) for k in (1, 2)] for n in (normal, on))
+        lies = [(np.abs(facing[k]) > ALONG) & (np.abs(nearly[k]) > ALONG) for k in range(2)]
         margin = 3.0 * sigma_mm + 2.0
         station = np.floor((fine[at] + along) / STATION_MM).astype(np.int64)
         x = fine[at] + along - arc[np.clip(station, 0, count - 1)]
         inside = seen & (station >= 0) & (station < count)
-        # Not by the sense of the normals: meshes come with either. The faces meant are those that run through the edge.
-        web = inside & (np.abs(facing[0]) > 0.9) & (np.abs(level) < 60.0) & (up > margin) & (up < REACH_MM)
-        web[web] = surface.part_of[face[web]] == outermost(surface.part_of[face[web]], -np.abs(level[web]))
-        bottom = inside & (np.abs(facing[1]) > 0.9) & (np.abs(up) < 60.0) & (-sense * level > margin)
+        web = inside & lies[0] & (np.abs(level) < layers.REACH_MM) & (up > margin) & (up < REACH_MM)
+        bottom = inside & lies[1] & (np.abs(up) < layers.REACH_MM) & (-sense * level > margin)
         bottom &= -sense * level < REACH_MM
-        bottom[bottom] = surface.part_of[face[bottom]] == outermost(surface.part_of[face[bottom]], -np.abs(up[bottom]))
         for own, out in ((web, sense * np.sign(facing[0])), (bottom, -np.sign(facing[1]))):
             own[own] = _outer(station[own], (out * residual)[own])
         found = [
@@ -100,7 +109,7 @@ def unseen(left: Polyline, right: Polyline) -> EdgeStations:
     """Return the stations of a part of which nothing is known."""
     nothing = np.empty((0, 3))
     mesh = mesh_surface.of_mesh(np.eye(3), np.array([[0, 1, 2]]))
-    return measure(nothing, mesh, left, right, 0.0, np.zeros((6, 6)))
+    return measure(nothing, mesh, mesh, left, right, 0.0, np.zeros((6, 6)))
 
 
 def _frame(line: Polyline, other: Polyline, arc: Floats, sense: float) -> tuple[Floats, Floats, Floats]:

@@ -18,11 +18,12 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.special import ndtr
 
-from processor.model import Floats
+from processor.model import Floats, Ints
+from processor.preassembly import layers
 
 REACH = 4.0  # standard deviations about ring and walls
 LEAST_REACH_MM = 3.0
-FORM_MM = 6.0  # the ring may lie this far from the design before it is found
+AROUND = 24  # sectors of the ring
 STRAY_SHARE = 0.005  # of points, even over the window
 LEAST_POINTS = 40
 FLOOR_MM = 0.01  # of the noise
@@ -30,7 +31,7 @@ FLOOR_MM = 0.01  # of the noise
 
 @dataclass(frozen=True)
 class Ring:
-    """Coefficients (6,) of the basis, their covariance (6, 6), and the noise across the ring; empty without points."""
+    """Coefficients (k,) of the basis, their covariance (k, k), and the noise across the ring; empty without points."""
 
     coefficients: Floats
     covariance: Floats
@@ -41,7 +42,7 @@ NOTHING = Ring(np.empty(0), np.empty((0, 0)), float("nan"))
 
 
 def fit(x: Floats, e: Floats, thickness: Floats, basis: Floats, sigma_mm: float) -> Ring:
-    """Fit the ring to points near it: x, e, the plate's thickness (n,) each, and the basis (n, 6).
+    """Fit the ring to points near it: x, e, the plate's thickness (n,) each, and the basis (n, k).
 
     Points near the corners, where walls meet, are to be left out before.
     """
@@ -81,11 +82,20 @@ def fit(x: Floats, e: Floats, thickness: Floats, basis: Floats, sigma_mm: float)
     return Ring(coefficients, covariance, sigma)
 
 
+def sectors(basis: Floats) -> Ints:
+    """Return in which of AROUND sectors of the ring points (n,) lie, by their basis (n, k)."""
+    turn = np.arctan2(basis[:, 2], basis[:, 1]) / (2.0 * np.pi) + 0.5
+    found: Ints = np.minimum(np.floor(AROUND * turn), AROUND - 1).astype(np.int64)
+    return found
+
+
 def _start(x: Floats, e: Floats, thickness: Floats, basis: Floats, sigma: float) -> tuple[Floats, np.ndarray] | None:
     """Least squares on points that are surely of the ring by their place across it, and which they are."""
     margin = np.minimum(3.0 * sigma + 1.0, 0.35 * thickness)
     inside = (e > margin) & (e < thickness - margin)
-    used = inside & (np.abs(x) < max(FORM_MM + REACH * sigma, 10.0))
+    used = inside.copy()
+    # Around the ring, so that its slope does not smear what lies beside it: an end may be centimetres off.
+    used[inside] = layers.outer_surface(x[inside], basis[inside, :3], sectors(basis[inside]))
     coefficients = np.zeros(basis.shape[1])
     for _ in range(8):
         if used.sum() < LEAST_POINTS:

@@ -1,9 +1,9 @@
 """A joint end from its surfaces: faces and end ring fitted to their residuals against the design.
 
-In the joint's zone each outer face departs from the design by ``c0 + c1 x + c2 w + c3 x w`` (x along the bridge from
-the joint, w across the face), the ring by ``c0 + c1 u + c2 v`` and what bends it, see
-:mod:`processor.preassembly.end_ring`. A corner moves by what its two faces and the ring say; the covariance is that of
-these 22 numbers, so points of one corner are as dependent as they are.
+In the joint's zone each outer face departs from the design by a plane in x (along the bridge from the joint) and w
+(across the face), a warp x w, and what bends it: x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
+and v and what bends it, see :mod:`processor.preassembly.end_ring`. A corner is where its two faces and the ring meet,
+as built; the covariance is that of these 40 numbers, so points of one corner are as dependent as they are.
 """
 
 from __future__ import annotations
@@ -11,24 +11,21 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from processor.geometry import rigid
-from processor.geometry.mesh_surface import MeshSurface, on_face, outermost
+from processor.geometry.mesh_surface import MeshSurface
 from processor.model import Floats, Ints
-from processor.preassembly import between, end_ring, layers
+from processor.preassembly import between, end_faces, end_ring, form, layers
+from processor.preassembly.end_faces import FACE, FLOOR_MM, LEAST_POINTS, REACH_MM, ZONE_MM
 from processor.preassembly.evidence import SIZES_MM, Believed, weigh
+from processor.preassembly.outer_faces import FACES
 
-Bools = npt.NDArray[np.bool_]
-
-ZONE_MM = 500.0
-FACES = (("bottom", 2, -1.0), ("right", 1, -1.0), ("top", 2, 1.0), ("left", 1, 1.0))  # axis and sense of the normal
-LEAST_POINTS = 60
 # Weights of bends of each size beforehand: ends are cut by a plane.
 STRAIGHT = (1.0, 1.0, 0.3, *(0.03,) * (len(SIZES_MM) - 3))
-FORM_MM = 5.0  # a face may depart from the design by this much more than noise before it is fitted
-FLOOR_MM = 0.004  # of the design's mesh and of rounding: no standard deviation is smaller
+RING = 8  # numbers of the ring
+TURNS = 4
+COUNT = len(FACES) * FACE + RING
 
 
 @dataclass(frozen=True)
@@ -41,6 +38,16 @@ class JointEnd:
     trouble: str
 
 
+@dataclass(frozen=True)
+class _OnRing:
+    """Points of the ring: their basis (n, 8), rests (n,), and from where and where on the ring they were seen."""
+
+    basis: Floats
+    rest: Floats
+    station: Ints
+    sector: Ints
+
+
 def nothing(trouble: str) -> JointEnd:
     """Return the end of which nothing is known."""
     return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), float("nan"), trouble)
@@ -49,6 +56,7 @@ def nothing(trouble: str) -> JointEnd:
 def fit(
     points: Floats,
     surface: MeshSurface,
+    outer: MeshSurface,
     T_bridge_joint: Floats,
     corners: Floats,
     outward: float,
@@ -58,67 +66,61 @@ def fit(
 ) -> JointEnd:
     """Fit one joint end of points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
 
-    ``corners`` (4, 3) are the design's P1..P4; ``outward`` is +1 where the part ends at the joint, -1 where it starts.
-    ``station`` (n,) says from where each point was seen, ``apart`` is the variance between stations, mm^2.
+    ``outer`` are the outer faces of ``surface``, ``corners`` (4, 3) the design's P1..P4; ``outward`` is +1 where the
+    part ends at the joint, -1 where it starts. ``station`` (n,) says from where each point was seen, ``apart`` is the
+    variance between stations, mm^2.
     """
     T_joint_bridge = rigid.invert(T_bridge_joint)
     size = np.ptp(rigid.apply(T_joint_bridge, corners), axis=0)
     local = rigid.apply(T_joint_bridge, points)
     depth = -outward * local[:, 0]
-    zone = (depth < ZONE_MM) & (depth > -50.0) & (np.abs(local[:, 1:]) < 0.5 * size[1:] + 60.0).all(axis=1)
+    zone = (depth < ZONE_MM) & (depth > -REACH_MM) & (np.abs(local[:, 1:]) < 0.5 * size[1:] + REACH_MM).all(axis=1)
     if zone.sum() < 5 * LEAST_POINTS:
         return nothing("too few points near the joint")
-    local, x = local[zone], local[zone, 0]
-    face, residual, beyond = surface.distances(points[zone], 60.0)
-    seen = on_face(face, beyond)
-    normal = np.zeros_like(local)
-    normal[seen] = surface.normals[face[seen]] @ T_bridge_joint[:3, :3]
-    out_of = [residual * np.sign(sense * normal[:, axis]) for _, axis, sense in FACES]
-    on, inner = _faces(surface, local, normal, face, seen, out_of)
-    noise = _noise(residual[seen & ~inner & (np.abs(normal[:, 0]) < 0.3)])
-    margin = 3.0 * noise + 2.0
+    local = local[zone]
     half = 0.5 * size
-    fits: list[tuple[Floats, Floats]] = []
-    sums, freedom = 0.0, 0
     station = station[zone]
-    for (name, axis, _), own, out in zip(FACES, on, out_of, strict=True):
-        across = 1 if axis == 2 else 2
-        own = own & (np.abs(local[:, across]) < half[across] - margin) & (-outward * x > margin)
-        basis = _face_basis(x[own], local[own, across] / half[across])
-        coefficients, covariance, rest, used = _least_squares(basis, out[own])
-        if not len(coefficients):
-            return nothing(f"too few points on the {name} face")
-        fits.append((coefficients, covariance + between.added(basis[used], station[own][used], apart)))
-        sums, freedom = sums + float(rest @ rest), freedom + len(rest)
-    sigma = float(np.sqrt(sums / max(freedom, 1)))
-    ring, on_ring = _ring(local, station, fits, half, _thickness(surface, T_joint_bridge, half), outward, sigma)
+    faces = end_faces.fit(points[zone], local, station, surface, outer, T_bridge_joint, half, outward)
+    if isinstance(faces, str):
+        return nothing(faces)
+    rest = np.concatenate([face.rest for face in faces])
+    sigma = float(np.sqrt(rest @ rest / max(len(rest) - FACE * len(faces), 1)))
+    unfollowed = form.variance([(face.rest, face.cell) for face in faces], FACE)
+    fits = [
+        (
+            face.coefficients,
+            face.covariance
+            + between.added(face.basis, face.station, apart)
+            + between.added(face.basis, face.cell, unfollowed),
+        )
+        for face in faces
+    ]
+    thickness = _thickness(surface, T_joint_bridge, half)
+    ring, about = _ring(local, station, [face.coefficients for face in faces], half, thickness, outward, sigma)
     if not len(ring.coefficients):
         return nothing("too few points on the end face")
-    fits.append((ring.coefficients, ring.covariance + between.added(*on_ring, apart)))
+    unfollowed = form.variance([(about.rest, about.sector)], RING)
+    fits.append(
+        (
+            ring.coefficients,
+            ring.covariance
+            + between.added(about.basis, about.station, apart)
+            + between.added(about.basis, about.sector, unfollowed),
+        )
+    )
     number = np.concatenate([coefficients for coefficients, _ in fits])
     believed = _weighed(
         number, block_diag(*(block for _, block in fits)), _by_pose(T_bridge_joint, half, outward, pose)
     )
-    derivative = _corners(half, outward)
-    moved = (derivative @ believed.mean).reshape(8, 3)
+    moved, derivative = _corners(half, outward, believed.mean)
     covariance = derivative @ believed.covariance @ derivative.T + FLOOR_MM**2 * np.eye(24)
-    return JointEnd(moved, covariance, sigma, "")
-
-
-def _faces(
-    surface: MeshSurface, local: Floats, normal: Floats, face: Ints, seen: Bools, out_of: list[Floats]
-) -> tuple[list[Bools], Bools]:
-    """Mark the points (n,) of each of FACES, and those about any of them that are of the plate's inner side."""
-    found, inner = [], np.zeros(len(local), bool)
-    for (_, axis, sense), out in zip(FACES, out_of, strict=True):
-        # Not by the sense of the normals: meshes come with either. Of the faces that lie so the outermost is meant.
-        own = seen & (np.abs(normal[:, axis]) > 0.9) & (sense * local[:, axis] > 0.0)
-        own[own] = surface.part_of[face[own]] == outermost(surface.part_of[face[own]], sense * local[own, axis])
-        layer = layers.outer(out[own])
-        inner[np.flatnonzero(own)[~layer]] = True
-        own[own] = layer
-        found.append(own)
-    return found, inner
+    doubtful = [
+        name
+        for (name, axis, _), face in zip(FACES, faces, strict=True)
+        if face.alone and face.coefficients[0] < -0.5 * thickness[axis - 1] < 0.0
+    ]
+    trouble = f"the {' and the '.join(doubtful)} face may be the plate's inner side" if doubtful else ""
+    return JointEnd(moved.reshape(8, 3), covariance, sigma, trouble)
 
 
 def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Floats:
@@ -135,22 +137,22 @@ def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Fl
 def _ring(
     local: Floats,
     station: Ints,
-    fits: list[tuple[Floats, Floats]],
+    faces: list[Floats],
     half: Floats,
     thickness: Floats,
     outward: float,
     sigma: float,
-) -> tuple[end_ring.Ring, tuple[Floats, Ints]]:
+) -> tuple[end_ring.Ring, _OnRing]:
     """Fit the end ring to points (n, 3) of the joint's frame, plate by plate between the corners.
 
-    Also the basis and the station of the points that are surely of the ring.
+    ``faces`` are the coefficients of the outer faces. Also what is known of the points that are surely of the ring.
     """
     columns = []
     depth, plates, x = [], [], outward * local[:, 0]
-    for (_, axis, sense), (coefficients, _) in zip(FACES, fits, strict=True):
+    for (_, axis, sense), coefficients in zip(FACES, faces, strict=True):
         across = 1 if axis == 2 else 2
         w = local[:, across] / half[across]
-        e = half[axis] + _face_basis(np.zeros(len(w)), w) @ coefficients - sense * local[:, axis]
+        e = half[axis] + end_faces.basis(local[:, 0], w) @ coefficients - sense * local[:, axis]
         wide = np.abs(local[:, across]) < half[across] - np.minimum(layers.REACH_MM, 0.5 * half[across])
         plates.append(layers.plate_mm(x[wide], e[wide], sigma, float(thickness[axis - 1])))
         depth.append(e)
@@ -166,61 +168,34 @@ def _ring(
     rest = at - basis @ found.coefficients if len(found.coefficients) else np.full(len(at), np.inf)
     margin = np.minimum(2.0 * sigma, 0.35 * thick)
     surely = (np.abs(rest) < end_ring.REACH * max(sigma, FLOOR_MM)) & (inward > margin) & (inward < thick - margin)
-    return found, (basis[surely], seen_from[surely])
-
-
-def _face_basis(x: Floats, w: Floats) -> Floats:
-    scaled = x / ZONE_MM
-    return np.stack([np.ones_like(scaled), scaled, w, scaled * w], axis=1)
+    return found, _OnRing(basis[surely], rest[surely], seen_from[surely], end_ring.sectors(basis[surely]))
 
 
 def _ring_basis(u: Floats, v: Floats) -> Floats:
     one = np.ones_like(u)
-    return np.stack([one, u, v, u * u - one, u * v, v * v - one], axis=1)
-
-
-def _noise(residual: Floats) -> float:
-    middle = np.median(residual) if len(residual) else 0.0
-    return float(1.4826 * np.median(np.abs(residual - middle))) if len(residual) else 0.0
-
-
-def _least_squares(basis: Floats, residual: Floats) -> tuple[Floats, Floats, Floats, Bools]:
-    """Coefficients (k,), covariance (k, k), rests of the used points, and which they are; outliers are left out.
-
-    Empty for too few points.
-    """
-    middle = np.median(residual) if len(residual) else 0.0
-    used = np.abs(residual - middle) < 6.0 * _noise(residual) + FORM_MM
-    coefficients: Floats = np.empty(0, np.float64)
-    for _ in range(6):
-        if used.sum() < LEAST_POINTS:
-            return np.empty(0), np.empty((0, 0)), np.empty(0), used
-        coefficients = np.asarray(np.linalg.lstsq(basis[used], residual[used], rcond=None)[0], np.float64)
-        rest = residual - basis @ coefficients
-        limit = 4.5 * max(_noise(rest[used]), FLOOR_MM)
-        now = np.abs(rest) < limit
-        if (now == used).all():
-            break
-        used = now
-    rest = residual[used] - basis[used] @ coefficients
-    variance = float(rest @ rest) / max(len(rest) - len(coefficients), 1)
-    normal = basis[used].T @ basis[used]
-    return coefficients, variance * np.linalg.inv(normal), rest, used
+    bent_u, bent_v = u * u - one, v * v - one
+    return np.stack([one, u, v, u * v, bent_u, bent_v, v * bent_u, u * bent_v], axis=1)
 
 
 def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
-    """Weigh the numbers (22,) of an end against an end as designed, which the registration alone moves: ``by_pose``.
+    """Weigh the numbers (40,) of an end against an end as designed, which the registration alone moves: ``by_pose``.
 
-    The faces' shifts are of one unknown size, how they lie and bend of another; so are the ring's plane and its bends.
+    The faces' shifts are of one unknown size, how they lie of another, how they bend of a third; so are the ring's
+    plane and its bends.
     """
     mean, spread = np.zeros(len(number)), np.zeros((len(number),) * 2)
-    faces = [(1.0, np.tile([shift, bend, bend, bend], 4)) for shift in SIZES_MM for bend in SIZES_MM]
+    faces = [
+        (before, np.tile(np.repeat([shift, tilt, bend], (1, 3, 4)), 4))
+        for shift in SIZES_MM
+        for tilt in SIZES_MM
+        for bend, before in zip(SIZES_MM, STRAIGHT, strict=True)
+    ]
     ring = [
-        (before, np.repeat([plane, bend], 3))
+        (before, np.repeat([plane, bend], (3, RING - 3)))
         for plane in SIZES_MM
         for bend, before in zip(SIZES_MM, STRAIGHT, strict=True)
     ]
-    for rows, sizes in ((slice(0, 16), faces), (slice(16, 22), ring)):
+    for rows, sizes in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
         noise = covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
         found = weigh(number[rows], noise, [(before, by_pose[rows, rows] + np.diag(size**2)) for before, size in sizes])
         mean[rows], spread[rows, rows] = found.mean, found.covariance
@@ -228,7 +203,7 @@ def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
 
 
 def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats) -> Floats:
-    """Covariance (22, 22) of an end's numbers by that of the part's registration, (6, 6) about the bridge's origin."""
+    """Covariance (40, 38) of an end's numbers by that of the part's registration, (6, 6) about the bridge's origin."""
     rows = []
     x, w = (a.ravel() for a in np.meshgrid([0.0, -outward * ZONE_MM], [-1.0, 1.0]))
     for _, axis, sense in FACES:
@@ -237,27 +212,45 @@ def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats)
         field = sense * np.einsum(
             "i,nij->nj", T_bridge_joint[:3, axis], rigid.motion(rigid.apply(T_bridge_joint, local))
         )
-        rows.append(np.linalg.solve(_face_basis(x, w), field))
+        rows += [np.linalg.solve(end_faces.basis(x, w)[:, :4], field), np.zeros((FACE - 4, 6))]
     u, v = np.array([1.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
     local = np.stack([np.zeros(3), u * half[1], v * half[2]], axis=1)
     field = outward * np.einsum("i,nij->nj", T_bridge_joint[:3, 0], rigid.motion(rigid.apply(T_bridge_joint, local)))
     rows.append(np.linalg.solve(_ring_basis(u, v)[:, :3], field))
-    moves = np.vstack([*rows, np.zeros((3, 6))])
+    moves = np.vstack([*rows, np.zeros((RING - 3, 6))])
     found: Floats = moves @ pose @ moves.T
     return found
 
 
-def _corners(half: Floats, outward: float) -> Floats:
-    """Return the derivative (24, 22) of the movements of P1..P8 by the numbers of the four faces and the ring."""
+def _corners(half: Floats, outward: float, number: Floats) -> tuple[Floats, Floats]:
+    """Return the movements (24,) of P1..P8 by the numbers (40,) of faces and ring, and their derivative (24, 40).
+
+    A corner is where its faces and the ring meet: each of them is taken where the others have it, so it is found by
+    turns.
+    """
     # P1..P4: bottom left, bottom right, top right, top left, with their upright and their level face.
     places = [(1.0, -1.0, 3, 0), (-1.0, -1.0, 1, 0), (-1.0, 1.0, 1, 2), (1.0, 1.0, 3, 2)]
-    derivative = np.zeros((8, 3, 22))
+    moved, derivative = np.zeros((8, 3)), np.zeros((8, 3, COUNT))
     for k, (u, v, upright, level) in enumerate(places):
-        derivative[k, 0, 16:] = outward * _ring_basis(np.array([u]), np.array([v]))[0]
-        for axis, face, w in ((1, upright, v), (2, level, u)):
-            derivative[k, axis, 4 * face : 4 * face + 4] = FACES[face][2] * _face_basis(np.zeros(1), np.array([w]))[0]
+        for _ in range(TURNS):
+            at_u, at_v = u + moved[k, 1] / half[1], v + moved[k, 2] / half[2]
+            derivative[k, 0, -RING:] = outward * _ring_basis(np.array([at_u]), np.array([at_v]))[0]
+            for axis, face, w in ((1, upright, at_v), (2, level, at_u)):
+                derivative[k, axis, FACE * face : FACE * (face + 1)] = _of_face(face, moved[k, 0], w)
+            moved[k] = derivative[k] @ number
     for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 3), (3, 0))):  # the middles of the edges
         derivative[4 + k] = 0.5 * (derivative[a] + derivative[b])
-        u, v = (0.5 * (places[a][i] + places[b][i]) for i in range(2))
-        derivative[4 + k, 0, 16:] = outward * _ring_basis(np.array([u]), np.array([v]))[0]
-    return derivative.reshape(24, 22)
+        moved[4 + k] = 0.5 * (moved[a] + moved[b])
+        u, v = (0.5 * (places[a][i] + places[b][i]) + moved[4 + k, axis] / half[axis] for i, axis in ((0, 1), (1, 2)))
+        derivative[4 + k, 0, -RING:] = outward * _ring_basis(np.array([u]), np.array([v]))[0]
+        axis, w = (2, u) if k % 2 == 0 else (1, v)
+        derivative[4 + k, axis] = 0.0
+        derivative[4 + k, axis, FACE * k : FACE * (k + 1)] = _of_face(k, moved[4 + k, 0], w)
+        moved[4 + k] = derivative[4 + k] @ number
+    return moved.ravel(), derivative.reshape(24, COUNT)
+
+
+def _of_face(face: int, x: float, w: float) -> Floats:
+    """Return the derivative (8,) of a coordinate of a face, at x and w, by the face's numbers."""
+    found: Floats = FACES[face][2] * end_faces.basis(np.array([x]), np.array([w]))[0]
+    return found

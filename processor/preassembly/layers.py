@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Floats
+from processor.model import Floats, Ints
 
 Bools = npt.NDArray[np.bool_]
 
@@ -19,6 +19,9 @@ LAYER_MM = 9.0  # about the middle of a layer; plates are thicker than this
 CLEAR_SHARE = 0.35  # of the most crowded bin: a layer, and no strays
 SECOND_SHARE = 0.05  # of the points further in: less is strays
 FEWEST = 40
+FEWEST_OF_CELL = 12
+CLIMBS = 2  # a plate has two sides
+ONE_LAYER_SHARE = 0.7  # of points above a layer: they are one, and no strays
 THINNEST_MM = 6.0
 RING_SHARE = 0.95  # of a ring's points lie within this share of its plate's thickness
 
@@ -38,6 +41,54 @@ def outer(out: Floats) -> Bools:
     if inside.sum() < SECOND_SHARE * near.sum():
         return everything
     found: Bools = np.abs(out - centre) < LAYER_MM
+    return found
+
+
+def outer_surface(out: Floats, basis: Floats, cell: Ints) -> Bools:
+    """Mark the points (n,) of the outermost layer where it is not level: a surface in a basis (n, k) over cells (n,).
+
+    Each cell's own outermost layer is found first; the surface is the one with the least sum of distances from these.
+    """
+    level = _through_cells(out, basis, cell)
+    if level is None:
+        return outer(out)
+    for _ in range(CLIMBS):
+        # Where the outer side was seen in few places, most cells found the inner one.
+        above = np.flatnonzero((out - level > LAYER_MM) & (out - level < REACH_MM))
+        if len(above) < max(SECOND_SHARE * len(out), FEWEST):
+            break
+        coefficients = least_distances(basis[above], out[above])
+        if np.mean(np.abs(out[above] - basis[above] @ coefficients) < LAYER_MM) < ONE_LAYER_SHARE:
+            break
+        level = basis @ coefficients
+    found: Bools = np.abs(out - level) < LAYER_MM
+    return found
+
+
+def _through_cells(out: Floats, basis: Floats, cell: Ints) -> Floats | None:
+    """Heights (n,) of the surface through the outermost layers of the cells; None where too few have any."""
+    at, which = np.unique(cell, return_inverse=True)
+    places, centres = [], []
+    for one in range(len(at)):
+        rows = np.flatnonzero(which == one)
+        if len(rows) >= FEWEST_OF_CELL:
+            kept = rows[outer(out[rows])]
+            centres.append(float(np.median(out[kept])))
+            places.append(basis[kept].mean(axis=0))
+    if len(centres) < 2 * basis.shape[1]:
+        return None
+    found: Floats = basis @ least_distances(np.array(places), np.array(centres))
+    return found
+
+
+def least_distances(basis: Floats, value: Floats) -> Floats:
+    """Coefficients (k,) with the least sum of absolute residuals of values (n,), by reweighting."""
+    weight = np.ones(len(value))
+    found = np.zeros(basis.shape[1])
+    for _ in range(30):
+        root = np.sqrt(weight)
+        found = np.asarray(np.linalg.lstsq(basis * root[:, None], value * root, rcond=None)[0], np.float64)
+        weight = 1.0 / np.maximum(np.abs(value - basis @ found), 0.1)
     return found
 
 

@@ -19,6 +19,7 @@ from processor.preassembly import (
     features,
     joint_ends,
     network,
+    outer_faces,
     registration,
     surrogate,
     systematic,
@@ -82,6 +83,7 @@ def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float
     moved = np.vstack([rigid.apply(one.fitted.T_bridge_scan, one.scan.points * shrink) for one in used])
     station = _stations([one.scan for one in used])
     apart = _between_stations(moved, station, shape)
+    outer = outer_faces.of_part(shape.mesh, [design.joint_points[j] for j in joints if j is not None])
     ends: list[joint_ends.JointEnd | None] = []
     pose = first.fitted.covariance
     for outward, joint in zip((-1.0, 1.0), joints, strict=True):
@@ -90,11 +92,11 @@ def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float
             continue
         corners = design.joint_points[joint]
         frame = features.joint_frame(corners)
-        end = joint_ends.fit(moved, shape.mesh, frame, corners[:4], outward, pose, station, apart)
+        end = joint_ends.fit(moved, shape.mesh, outer, frame, corners[:4], outward, pose, station, apart)
         said_of += [f"{design.joint_names[joint]}: {end.trouble}"] if end.trouble else []
         ends.append(systematic.of_end(end, doubts, part))
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
-    edges = bottom_edges.measure(moved, shape.mesh, *lines, first.fitted.sigma_mm, pose)
+    edges = bottom_edges.measure(moved, shape.mesh, outer, *lines, first.fitted.sigma_mm, pose)
     edges = systematic.of_edges(edges, doubts, apart * between.share(station))
     member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
     said_of += [_unheld(first)] if first.fitted.weak else []

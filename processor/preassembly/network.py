@@ -4,9 +4,11 @@ Every part i, registered to its design, is moved by a small motion x_i (turn abo
 
     sum of squared gaps + lambda sum of squared departures of the bottom edges
 
-is least: gaps of eight pairs a joint along three axes, departures sideways and up at stations of both edges. The gap of
-parts that are not perfect depends on lambda, so it is stated, and the curve over lambda is part of the answer. All is
-linear in what was measured; its covariance goes through.
+is least: gaps of eight pairs a joint along three axes, departures sideways and up at stations of both edges. A part
+whose joint is not known could slide along itself: the square of every part's movement along its chord counts too, by a
+weight of HOLD, too small to move a gap by a thousandth of a millimetre. The gap of parts that are not perfect depends
+on lambda, so it is stated, and the curve over lambda is part of the answer. All is linear in what was measured; its
+covariance goes through.
 """
 
 from __future__ import annotations
@@ -21,6 +23,8 @@ from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.preassembly.bottom_edges import EdgeStations
 from processor.preassembly.joint_ends import JointEnd
+
+HOLD = 1e-3  # of a part where its registration has it
 
 
 @dataclass(frozen=True)
@@ -52,8 +56,8 @@ class Adjusted:
 class _Observations:
     """What was measured: values (n,) and covariance (n, n); A (n, p) is how they change with the parts' motions.
 
-    First the known joints' gaps, 24 rows each, then the edges' departures; ``gap_row`` of joints without an answer is
-    -1, ``edge_rows`` are those of each part.
+    First the known joints' gaps, 24 rows each, then the edges' departures, then each part's movement along its chord;
+    ``gap_row`` of joints without an answer is -1, ``edge_rows`` are those of each part.
     """
 
     A: Floats
@@ -70,7 +74,8 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
     """
     seen = _observations(members, joint_points, joint_frames)
     root = np.ones(len(seen.value))
-    root[24 * int((seen.gap_row >= 0).sum()) :] = np.sqrt(weight)
+    root[24 * int((seen.gap_row >= 0).sum()) : -len(members)] = np.sqrt(weight)
+    root[-len(members) :] = np.sqrt(HOLD)
     weighted = seen.A * root[:, None]
     # Lengths about their own middle and turns differ by thousands: unit columns keep the solution's digits.
     size = np.linalg.norm(weighted, axis=0)
@@ -137,6 +142,13 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
         blocks.append(whole.reshape(len(known), len(known))[np.ix_(known, known)])
         edge_rows.append(slice(start, start + len(A)))
         start += len(A)
+    held = np.zeros((count, count, 6))
+    for i, member in enumerate(members):
+        chord = member.edges.points[-1] - member.edges.points[0]
+        held[i, i, 3:] = chord / max(float(np.linalg.norm(chord)), 1e-12)
+    rows.append(held.reshape(count, 6 * count))
+    values.append(np.zeros(count))
+    blocks.append(np.zeros((count, count)))
     return _Observations(np.vstack(rows), np.concatenate(values), block_diag(*blocks), gap_row, tuple(edge_rows))
 
 
