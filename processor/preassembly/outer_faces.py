@@ -17,7 +17,7 @@ from processor.preassembly import features
 
 FACES = (("bottom", 2, -1.0), ("right", 1, -1.0), ("top", 2, 1.0), ("left", 1, 1.0))  # axis and sense of the normal
 ALONG = 0.9  # cosine: a facet that looks this much along an axis is of a face across it
-NEAR_MM = 500.0  # of a joint
+NEAR_MM = 500.0  # of a joint, beyond the facet nearest to it
 
 
 def of_part(surface: MeshSurface, joints: Sequence[Floats]) -> MeshSurface:
@@ -32,11 +32,11 @@ def of_part(surface: MeshSurface, joints: Sequence[Floats]) -> MeshSurface:
         frame = features.joint_frame(corners)
         half = 0.5 * np.ptp(rigid.apply(rigid.invert(frame), corners[:4]), axis=0)
         local, normal = rigid.apply(rigid.invert(frame), centre), surface.normals @ frame[:3, :3]
-        reach = max(NEAR_MM, float(np.abs(local[:, 0]).min()) + 1.0)
         for _, axis, sense in FACES:
-            own = (np.abs(normal[:, axis]) > ALONG) & (sense * local[:, axis] > 0.0) & (np.abs(local[:, 0]) < reach)
+            own = (np.abs(normal[:, axis]) > ALONG) & (sense * local[:, axis] > 0.0)
             if not own.any():
                 return surface
+            own &= np.abs(local[:, 0]) < NEAR_MM + np.abs(local[own, 0]).min()
             groups, which = np.unique(surface.part_of[own], return_inverse=True)
             off = np.bincount(which, np.abs(sense * local[own, axis] - half[axis])) / np.bincount(which)
             chosen |= surface.part_of == groups[np.argmin(off)]

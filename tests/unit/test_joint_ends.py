@@ -1,0 +1,157 @@
+"""Ends of a straight box whose corners were built elsewhere, by points made with numpy: closed forms throughout."""
+
+import numpy as np
+import pytest
+
+from processor.geometry import mesh_surface
+from processor.preassembly import features, form, joint_ends, layers, network, outer_faces
+from processor.preassembly.bottom_edges import EdgeStations
+
+LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
+
+
+def box(b, low, high):
+    """Vertices and faces of an open tube of four walls."""
+    corners = [(b, low), (-b, low), (-b, high), (b, high)]
+    vertices = np.array([[x, y, z] for x in (-LENGTH, 0.0) for y, z in corners])
+    quads = [(k, (k + 1) % 4, 4 + (k + 1) % 4, 4 + k) for k in range(4)]
+    return vertices, np.array([face for q in quads for face in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))])
+
+
+def design():
+    outer, faces = box(B, 0.0, H)
+    inner, same = box(B - T, T, H - T)
+    ring = [(4 + k, 4 + (k + 1) % 4, 12 + (k + 1) % 4, 12 + k) for k in range(4)]
+    ends = [face for q in ring for face in ((q[0], q[1], q[2]), (q[0], q[2], q[3]))]
+    corners = np.array([[0.0, y, z] for y, z in ((B, 0.0), (-B, 0.0), (-B, H), (B, H))])
+    middles = [0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))]
+    joint = np.vstack([corners, middles])
+    return mesh_surface.of_mesh(np.vstack([outer, inner]), np.vstack([faces, same + 8, np.array(ends)])), joint
+
+
+def cloud(rng, spacing, shares=(1.0, 1.0, 1.0, 1.0), inner=1.0):
+    """Points (n, 3) on the outer walls (bottom, right, top, left), the inner ones and the ring."""
+
+    def spread(area):
+        count = int(area / spacing**2)
+        return rng.uniform(size=count), rng.uniform(size=count)
+
+    found = []
+    for depth, how_many in ((0.0, shares), (T, (inner,) * 4)):
+        b, low, high = B - depth, depth, H - depth
+        for side, share in enumerate(how_many):
+            p, q = spread(share * 800.0 * 2.0 * (b if side % 2 == 0 else 0.5 * (high - low)))
+            y = (2.0 * q - 1.0) * b if side % 2 == 0 else np.full(len(p), -b if side == 1 else b)
+            z = np.full(len(p), low if side == 0 else high) if side % 2 == 0 else low + q * (high - low)
+            found.append(np.stack([-800.0 * p, y, z], axis=1))
+    p, q = spread(2.0 * B * H)
+    ring = np.stack([np.zeros(len(p)), (2.0 * p - 1.0) * B, q * H], axis=1)
+    hollow = (np.abs(ring[:, 1]) < B - T) & (ring[:, 2] > T) & (ring[:, 2] < H - T)
+    return np.vstack([*found, ring[~hollow]])
+
+
+def built(points, corners):
+    """Move points by what the corners P1..P4 (4, 3) of the end moved, fading out within 1.5 m."""
+    a, c = points[:, 1] / B, 2.0 * points[:, 2] / H - 1.0
+    shares = 0.25 * np.stack([(1 + a) * (1 - c), (1 - a) * (1 - c), (1 - a) * (1 + c), (1 + a) * (1 + c)])
+    fade = np.clip(1.0 + points[:, 0] / 1500.0, 0.0, 1.0)
+    return points + ((corners.T @ shares) * fade**2 * (3.0 - 2.0 * fade)).T
+
+
+def fitted(points, rng, sigma=1.0):
+    surface, joint = design()
+    outer = outer_faces.of_part(surface, [joint])
+    noisy = points + sigma * rng.standard_normal(points.shape)
+    station = np.zeros(len(points), np.int64)
+    frame = features.joint_frame(joint)
+    assert np.allclose(frame[:3, :3], np.eye(3))
+    return joint_ends.fit(noisy, surface, outer, frame, joint[:4], 1.0, 1e-12 * np.eye(6), station, 0.0)
+
+
+def test_the_outer_faces_are_those_that_the_corners_lie_on():
+    surface, joint = design()
+    outer = outer_faces.of_part(surface, [joint])
+    assert len(outer.faces) == 8
+    assert np.isin(np.abs(outer.vertices[outer.faces][:, :, 1]), [B]).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_corners_centimetres_off_are_found_within_their_intervals(seed):
+    rng = np.random.default_rng(seed)
+    corners = rng.uniform(-20.0, 20.0, (4, 3))
+    end = fitted(built(cloud(rng, 8.0), corners), rng)
+    assert end.trouble == ""
+    truth = np.vstack([corners, *(0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)))])
+    off = end.moved - truth
+    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
+    assert sd.max() < 0.4
+    assert (np.abs(off) < 4.0 * np.hypot(sd, 0.05)).all()
+
+
+@pytest.mark.parametrize("side", range(4))
+def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
+    """The outer side then lies where the design has the inner one, and was seen in a fifth of the points."""
+    rng = np.random.default_rng(side)
+    inward = np.array([[0.0, 0, 1], [0, 1, 0], [0, 0, -1], [0, -1, 0]])[side]
+    on_side = ((0, 1), (1, 2), (2, 3), (3, 0))[side]
+    corners = np.zeros((4, 3))
+    corners[list(on_side)] = 0.9 * T * inward
+    shares = np.ones(4)
+    shares[side] = 0.2
+    end = fitted(built(cloud(rng, 8.0, shares), corners), rng)
+    assert end.trouble == ""
+    assert np.abs(end.moved[list(on_side)] - corners[list(on_side)]).max() < 1.0
+
+
+def test_a_face_of_which_one_side_alone_was_seen_may_be_the_inner_one():
+    rng = np.random.default_rng(5)
+    end = fitted(built(cloud(rng, 8.0, (1.0, 1.0, 0.0, 1.0)), np.zeros((4, 3))), rng)  # of the top, the inside alone
+    assert end.trouble == "the top face may be the plate's inner side"
+
+
+def test_the_outermost_layer_of_a_tilted_plate():
+    rng = np.random.default_rng(1)
+    x, w = rng.uniform(size=4000), rng.uniform(-1.0, 1.0, 4000)
+    basis = np.stack([np.ones(4000), x, w, x * w], axis=1)
+    level = basis @ np.array([3.0, -12.0, 18.0, 5.0])  # by more across the plate than it is thick
+    inner = np.arange(4000) % 3 > 0
+    out = level - 24.0 * inner + rng.standard_normal(4000)
+    cell = (np.floor(5 * x) * 6 + np.floor(3.0 * (w + 1.0))).astype(np.int64)
+    kept = layers.outer_surface(out, basis, cell)
+    assert kept[~inner].mean() > 0.99
+    assert not kept[inner].any()
+
+
+def test_variance_of_form():
+    rng = np.random.default_rng(2)
+    cell = np.repeat(np.arange(40), 100)
+    found = [form.variance([(rng.standard_normal(4000), cell)], 0) for _ in range(40)]
+    # By noise alone the sum of squares between 40 cells is chi-squared: its mean is 40, its sd sqrt(80).
+    assert max(found) < 5.0 * np.sqrt(80.0) / 4000.0
+    steps = 0.5 * rng.standard_normal(40)
+    assert form.variance([(rng.standard_normal(4000) + steps[cell], cell)], 0) == pytest.approx(
+        float(np.mean(steps**2)), abs=0.05
+    )
+    assert form.variance([(np.zeros(3), np.arange(3))], 0) == 0.0
+
+
+def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
+    """The edges of a shallow arch hardly hold it along itself: noise of 0.02 mm would move it by decimetres."""
+    rng = np.random.default_rng(3)
+    arc = np.linspace(-6000.0, 6000.0, 60)
+    angle = arc / 60_000.0
+    points, axes = [], []
+    for side in (700.0, -700.0):
+        points.append(np.stack([60_000.0 * np.sin(angle), np.full(60, side), 60_000.0 * np.cos(angle)], axis=1))
+        up = np.stack([np.sin(angle), np.zeros(60), np.cos(angle)], axis=1)
+        axes.append(np.stack([np.broadcast_to([0.0, 1.0, 0.0], up.shape), up], axis=1))
+    noise = 0.02 * rng.standard_normal((120, 2))
+    edges = EdgeStations(
+        ("left",) * 60 + ("right",) * 60, np.tile(arc, 2), np.vstack(points), np.vstack(axes), noise,
+        np.stack([0.02**2 * np.eye(120)] * 2),
+    )  # fmt: skip
+    member = network.Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]))
+    adjusted = network.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
+    assert np.abs(adjusted.motions[0][:3, 3]).max() < 1.0 + 60_000.0 * 2e-5  # its turn is about the middle
+    moved = adjusted.motions[0] @ np.array([0.0, 0.0, 60_000.0, 1.0])
+    assert abs(moved[0]) < 1.0
