@@ -1,8 +1,9 @@
-"""Figure of the gaps at every joint: the section with its eight points, arrows across it, numbers along it."""
+"""Figures of the gaps at every joint: the section with arrows across it, and all methods beside each other."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,9 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 
-from processor.model import KEY_POINTS, Floats
+from processor.model import KEY_POINTS, Floats, StepRun
 from processor.preassembly.joint_measures import NORMAL_95, RAYLEIGH_95, Measures
-from processor.report.drawing import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, label, png, rounded
+from processor.report.drawing import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, label, png, rounded
 from processor.steps import preassemble
 
 MOST_JOINTS = 24
@@ -49,6 +50,35 @@ def gap_vectors(result: preassemble.Result) -> tuple[str, bytes]:
         f"its 95 % interval, mm{more}",
         png(figure),
     )
+
+
+def by_axis(runs: Sequence[StepRun]) -> tuple[str, bytes]:
+    """Draw the gaps of all methods along each axis, point pair by point pair (paper 000, figures 19 to 21)."""
+    joints = runs[0].result.joints[:MOST_JOINTS]
+    figure = Figure(figsize=(max(8.0, 1.8 * len(joints)), 8.2), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    place = np.arange(len(joints))[:, None] + np.linspace(-0.38, 0.38, 8)
+    for axis, (axes, name) in enumerate(zip(panels, ("dx, along the span", "dy, across", "dz, up"), strict=True)):
+        for k, run in enumerate(runs):
+            width = run.result.gap_ci95[: len(joints), :, axis]
+            axes.errorbar(
+                (place + 0.022 * (k - 0.5 * (len(runs) - 1))).ravel(),
+                run.result.gaps[: len(joints), :, axis].ravel(),
+                yerr=width.ravel() if np.isfinite(width).any() else None,
+                fmt=MARKERS[k % len(MARKERS)],
+                color=COLOURS[k % len(COLOURS)],
+                markersize=4,
+                markerfacecolor="none",
+                label=run.method,
+            )
+        axes.axhline(0.0, color="0.3", linewidth=0.8)
+        for line in range(1, len(joints)):
+            axes.axvline(line - 0.5, color="0.8", linewidth=0.8)
+        axes.set(ylabel=f"{name}, mm")
+    panels[2].set_xticks(np.arange(len(joints)), [label(joint, j) for j, joint in enumerate(joints)])
+    panels[2].set(xlabel="joint, P1 to P8 from left to right")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+    return "Gaps by every method along each axis, right part minus left", png(figure)
 
 
 def _times(measures: list[Measures]) -> float:

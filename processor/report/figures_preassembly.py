@@ -25,7 +25,7 @@ from processor.report.drawing import (
     png,
     rounded,
 )
-from processor.report.figures_joints import gap_vectors
+from processor.report.figures_joints import by_axis, gap_vectors
 from processor.steps import preassemble
 
 GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
@@ -40,6 +40,8 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
         found["linear-offset.png"] = _linear_offset(scene, runs[0])
     if any(np.isfinite(one.gaps).all() for one in result.measures):
         found["gap-vectors.png"] = gap_vectors(result)
+    if len(runs) > 1:
+        found["gaps-by-axis.png"] = by_axis(runs)
     if np.isfinite(result.trade_figures).all(axis=1).any():
         found["trade-off.png"] = _trade_off(result)
     residuals = figures_residuals.residuals(scene, result)

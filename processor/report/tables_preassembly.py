@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -35,11 +36,6 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
         for run in runs
     )
     gauges = "; ".join(f"{run.method}: {run.result.gauge}" for run in runs)
-    rows = [
-        (joint, key, *first.gaps[j, k], *first.gap_ci95[j, k])
-        for j, joint in enumerate(first.joints)
-        for k, key in enumerate(KEY_POINTS)
-    ]
     parts = tuple(
         (name, first.component_status[i], first.component_message[i]) for i, name in enumerate(first.components)
     )
@@ -82,14 +78,12 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
         ),
         *_by_point(first, method, first.gaps, "Splicing error"),
         *(_by_point(first, method, first.gap_ci95, "95 % half-widths") if np.isfinite(first.gap_ci95).any() else ()),
-        Table(
-            f"Gaps at the joints, method {method}",
-            ("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"),
-            tuple(rows),
-            "gaps",
-            on_page=False,
-            on_terminal=False,
+        *(
+            replace(one, on_terminal=False)
+            for run in runs[1:]
+            for one in _by_point(run.result, run.method, run.result.gaps, "Splicing error")
         ),
+        *(_gaps(run, "gaps" if run is runs[0] else f"gaps-{run.method}") for run in runs),
         Table(
             f"Linear error by station, method {method}",
             ("edge", "station_mm", "deviation_mm", "foot1_best_fit_deviation_mm"),
@@ -99,6 +93,17 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
             on_terminal=False,
         ),
     ]
+
+
+def _gaps(run: StepRun, name: str) -> Table:
+    result = run.result
+    rows = tuple(
+        (joint, key, *result.gaps[j, k], *result.gap_ci95[j, k])
+        for j, joint in enumerate(result.joints)
+        for k, key in enumerate(KEY_POINTS)
+    )
+    columns = ("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm")
+    return Table(f"Gaps at the joints, method {run.method}", columns, rows, name, on_page=False, on_terminal=False)
 
 
 def _joint(result: Any, j: int) -> tuple[Any, ...]:
