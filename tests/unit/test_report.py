@@ -293,7 +293,7 @@ def test_figures_are_the_same_bytes_whatever_the_users_settings():
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0, "savefig.facecolor": "black"}):
         again = {**figures.of_run(of_bridge(), ErrorReport()), **figures.of_run(execution, report)}
         assert mpl.rcParams["font.size"] == 20.0
-    assert set(first) == {"bridge.png", "linear-error.png", "plan.png", "radius-errors.png"}
+    assert set(first) == {"bridge.png", "linear-error.png", "gaps-by-axis.png", "plan.png", "radius-errors.png"}
     assert first == again
     for _, png in first.values():
         assert png[:8] == b"\x89PNG\r\n\x1a\n"

@@ -261,7 +261,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
 
 def test_every_picture_shows_something():
     found = figures.of_run(of_bridge(), ErrorReport())
-    assert set(found) == OWN | {"bridge.png", "linear-error.png"}
+    assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
     for name, (caption, png) in found.items():
         pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
         dark = (pixels.min(axis=2) < 0.9).mean()
