@@ -104,7 +104,7 @@ def step(  # type: ignore[no-untyped-def]
     Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where ``station_sd`` is above 0 each
     station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard deviation;
     they are eliminated, and the inverse of the normal equations knows of them. ``own`` gets the inverse without
-    them, ``shares`` (g,) how much of what is known of the axis comes from each station, ``sizes`` the weighted residuals.
+    them, ``shares`` (g,) what each station alone tells of an offset, as one over its variance, ``sizes`` the weighted residuals.
     Returns (points used, sum of squared weighted residuals, largest movement, whether it could be solved).
     """
     groups = len(bounds) - 1
@@ -134,16 +134,14 @@ def step(  # type: ignore[no-untyped-def]
     if n < 2 * free:
         return n, total, 0.0, False
     N, right = np.zeros((NP, NP)), np.zeros(NP)
-    known = 0.0
     for g in range(groups):
         shares[g] = A[g, 0, 0] + A[g, 1, 1]
-        known += shares[g]
         for a in range(free):
             right[a] += y[g, a]
             for b in range(a + 1):
                 N[a, b] += A[g, a, b]
     for g in range(groups):
-        shares[g] /= known
+        shares[g] /= 2.0 * sigma * sigma
     if free == NP:
         for a in range(5, NP):
             N[a, a] += (sigma / bow_sd) ** 2
@@ -227,8 +225,10 @@ def roughly(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def reach_of(p, h, P, U, seen, sigma, bins, width, span):  # type: ignore[no-untyped-def]
+def reach_of(p, h, P, U, seen, bounds, shifts, sigma, bins, width, span):  # type: ignore[no-untyped-def]
     """Ends (low, high) of the stretch that lies on the cylinder, from bins of ``width`` over +-span about the middle.
+
+    Stations are moved by ``shifts`` as in :func:`step`.
 
     Outward from the middle every point on the surface adds to a sum and every other one takes away from it: a point's
     part is 2 less its squared residual in standard deviations, which counts for 6 at most: one mixed pixel in five
@@ -237,18 +237,21 @@ def reach_of(p, h, P, U, seen, sigma, bins, width, span):  # type: ignore[no-unt
     J = np.zeros(NP)
     bins[:] = 0.0
     count = len(bins)
-    for i in range(len(P)):
-        at = int(np.floor((P[i, 2] + span) / width))
-        if at < 0 or at >= count:
-            continue
-        v, cos = residual(p, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
-        if cos < GRAZING_COS:
+    q = p.copy()
+    for g in range(len(bounds) - 1):
+        q[0], q[1] = p[0] + shifts[g, 0], p[1] + shifts[g, 1]
+        for i in range(bounds[g], bounds[g + 1]):
+            at = int(np.floor((P[i, 2] + span) / width))
+            if at < 0 or at >= count:
+                continue
+            v, cos = residual(q, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
+            if cos >= GRAZING_COS:
+                bins[at] += 2.0 - min(6.0, (v * cos / sigma) ** 2)
+                continue
             # A ray that grazes or passes by says something only where its point is far off the surface.
-            qx, qy = P[i, 0] - p[0] - p[2] * P[i, 2] / h, P[i, 1] - p[1] - p[3] * P[i, 2] / h
-            if np.sqrt(qx * qx + qy * qy) - p[4] > max(5.0 * sigma, 12.0):
+            dx, dy = P[i, 0] - q[0] - q[2] * P[i, 2] / h, P[i, 1] - q[1] - q[3] * P[i, 2] / h
+            if np.sqrt(dx * dx + dy * dy) - p[4] > max(5.0 * sigma, 12.0):
                 bins[at] -= 4.0
-            continue
-        bins[at] += 2.0 - min(6.0, (v * cos / sigma) ** 2)
     middle = count // 2
     high, total, best = 0.0, 0.0, 0.0
     for k in range(middle, count):

@@ -111,8 +111,10 @@ def _nodes(fits: Fits, off: float, starts: Floats, pairs: Ints, params: Params) 
     )
     met = axes.meet(ends, starts, params.eccentricity_floor_mm)
     # What is wrong with a station moves all axes at a node alike: their scatter does not show it.
-    share = np.bincount(node, fits.station_share[tube], len(starts)) / np.maximum(np.bincount(node, minlength=len(starts)), 1)
-    covariance = met.covariance + (off**2 * share)[:, None, None] * np.eye(3)
+    share = np.zeros((len(starts), fits.station_share.shape[1]))
+    np.add.at(share, node[met.used], fits.station_share[tube[met.used]])
+    common = (share**2).sum(axis=1) / np.maximum(met.axes, 1) ** 2
+    covariance = met.covariance + (off**2 * common)[:, None, None] * np.eye(3)
     nodes = Nodes(met.positions, covariance, met.axes, met.scatter)
     tubes = Tubes(
         points=fits.points[rows],

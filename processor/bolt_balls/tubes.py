@@ -53,8 +53,8 @@ class Fits:
     """Tubes (m,): middle of the cylinder ``points``, ``directions``, ``side`` across; see :class:`Tubes`.
 
     ``ok`` marks the tubes that could be fitted; ``sigma`` is the standard deviation of a residual. ``noise`` is the
-    part of ``covariance`` that comes from noise alone, without that of the stations; ``station_share`` is the sum of
-    the squares of the stations' shares in the fit.
+    part of ``covariance`` that comes from noise alone, without that of the stations; ``station_share`` (m, s) is
+    what each station counts for in the fit, 1 in all.
     """
 
     ok: npt.NDArray[np.bool_]
@@ -270,7 +270,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
         tell(p, h, P, U, seen, bounds, np.sqrt(total / max(count - 5, 1)), cut, inverse, by_incidence[m], scatter[m])
         bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
         slack = np.sqrt(sigma**2 + ROUGH_MM**2)
-        low, high = reach_of(p, h, P, U, seen, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
+        low, high = reach_of(p, h, P, U, seen, bounds, none, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
         if high - low < 100.0:
             continue
         moved(p, h, point, direction, side, other)
@@ -307,7 +307,7 @@ def refine(  # type: ignore[no-untyped-def]
                 # Now that the axis is known the cylinder's ends show, and all goes on about its middle.
                 bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
                 slack = np.sqrt(sigma**2 + station_sd**2 + FINE_MM**2)
-                low, high = reach_of(p, h, P, U, seen, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
+                low, high = reach_of(p, h, P, U, seen, bounds, shifts, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
                 middle, half = 0.5 * (low + high), 0.5 * (high - low) - TRIM_MM
                 if half < 50.0:
                     good = False
@@ -342,7 +342,12 @@ def refine(  # type: ignore[no-untyped-def]
             points[m, i], directions[m, i], sides[m, i] = point[i], direction[i], side[i]
         ok[m], lengths[m], radii[m], used[m], sigmas[m] = True, 2.0 * h, p[4], count, sigma
         bows[m, 0], bows[m, 1] = p[5], p[6]
-        shares_out[m] = (shares**2).sum()
+        # What each station counts for, where it may be off as a whole.
+        for g in range(len(bounds) - 1):
+            if at[bounds[g]] >= 0 and shares[g] > 0.0:
+                shares_out[m, at[bounds[g]]] = 1.0 / (station_sd**2 + 1.0 / shares[g])
+        if shares_out[m].sum() > 0.0:
+            shares_out[m] /= shares_out[m].sum()
         scale = np.array([1.0, 1.0, 1.0 / h, 1.0 / h, 1.0])
         for i in range(5):
             for j in range(5):
@@ -397,7 +402,7 @@ def refined(
     m = len(start.points)
     points, directions, sides = start.points.copy(), start.directions.copy(), np.zeros((m, 3))
     ok, lengths, radii, bows = start.ok.copy(), start.lengths.copy(), start.radii.copy(), np.zeros((m, 2))
-    covariances, noises, shares = np.zeros((m, 5, 5)), np.zeros((m, 5, 5)), np.zeros(m)
+    covariances, noises, shares = np.zeros((m, 5, 5)), np.zeros((m, 5, 5)), np.zeros((m, len(scanners)))
     used, sigmas = np.zeros(m, np.int64), start.sigma.copy()
     kernel = partial(
         refine, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners, points,
