@@ -101,7 +101,7 @@ def step(  # type: ignore[no-untyped-def]
 ):
     """One Gauss-Newton step of the first ``free`` parameters over points with |z| <= h and |residual| <= cut mm.
 
-    Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where ``station_sd`` is above 0 each
+    Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where its ``station_sd`` (g,) is above 0 a
     station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard deviation;
     they are eliminated, and the inverse of the normal equations knows of them. ``own`` gets the inverse without
     them, ``shares`` (g,) what each station alone tells of an offset, as one over its variance, ``sizes`` the weighted residuals.
@@ -146,11 +146,12 @@ def step(  # type: ignore[no-untyped-def]
         for a in range(5, NP):
             N[a, a] += (sigma / bow_sd) ** 2
             right[a] -= (sigma / bow_sd) ** 2 * p[a]
-    ratio = (sigma / station_sd) ** 2 if station_sd > 0.0 else 0.0
-    if station_sd > 0.0:
+    moving = station_sd.max() > 0.0
+    if moving:
         if not solve(N, right.copy(), free, x, own, True):
             return n, total, 0.0, False
         for g in range(groups):
+            ratio = (sigma / station_sd[g]) ** 2
             d00, d11, d10 = A[g, 0, 0] + ratio, A[g, 1, 1] + ratio, A[g, 1, 0]
             det = d00 * d11 - d10 * d10
             r0, r1 = y[g, 0] - ratio * shifts[g, 0], y[g, 1] - ratio * shifts[g, 1]
@@ -162,8 +163,9 @@ def step(  # type: ignore[no-untyped-def]
                     N[a, b] -= e0 * column(A[g], b, 0) + e1 * column(A[g], b, 1)
     if not solve(N, right, free, x, inverse, True):
         return n, total, 0.0, False
-    if station_sd > 0.0:
+    if moving:
         for g in range(groups):
+            ratio = (sigma / station_sd[g]) ** 2
             d00, d11, d10 = A[g, 0, 0] + ratio, A[g, 1, 1] + ratio, A[g, 1, 0]
             det = d00 * d11 - d10 * d10
             r0, r1 = y[g, 0] - ratio * shifts[g, 0], y[g, 1] - ratio * shifts[g, 1]

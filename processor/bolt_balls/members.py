@@ -13,7 +13,7 @@ from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.segments import segments
 from processor.bolt_balls.source import Source
 from processor.bolt_balls.thinning import STEPS_PER_MM, thinned
-from processor.bolt_balls.tubes import Fits, least_cosine, refined, rough, station_sd
+from processor.bolt_balls.tubes import Fits, least_cosine, refined, rough, station_variance
 from processor.bolt_balls.voxels import gathered
 from processor.model import Floats, Ints
 
@@ -93,14 +93,14 @@ def measure(source: Source, starts: Floats, pairs: Ints, params: Params | None =
         points, source.scanners, middles, directions, 0.5 * length - np.minimum(0.2 * length, 450.0), 0.5 * length,
         params.radii_mm, params.rough_points, params.threads,
     )  # fmt: skip
-    least_cos, off = least_cosine(start, params.incidence_tolerance_mm), station_sd(start)
+    least_cos, off = least_cosine(start, params.incidence_tolerance_mm), station_variance(start)
     fits = refined(
         points, source.scanners, start, 0.5 * length, params.radii_mm, params.bow_share, least_cos, off, params.threads
     )
-    return _nodes(fits, off, starts, pairs, params)
+    return _nodes(fits, starts, pairs, params)
 
 
-def _nodes(fits: Fits, off: float, starts: Floats, pairs: Ints, params: Params) -> tuple[Nodes, Tubes]:
+def _nodes(fits: Fits, starts: Floats, pairs: Ints, params: Params) -> tuple[Nodes, Tubes]:
     rows = np.flatnonzero(fits.ok)
     tube = np.concatenate([rows, rows])
     node = np.concatenate([pairs[rows, 0], pairs[rows, 1]])
@@ -111,10 +111,10 @@ def _nodes(fits: Fits, off: float, starts: Floats, pairs: Ints, params: Params) 
     )
     met = axes.meet(ends, starts, params.eccentricity_floor_mm)
     # What is wrong with a station moves all axes at a node alike: their scatter does not show it.
-    share = np.zeros((len(starts), fits.station_share.shape[1]))
-    np.add.at(share, node[met.used], fits.station_share[tube[met.used]])
-    common = (share**2).sum(axis=1) / np.maximum(met.axes, 1) ** 2
-    covariance = met.covariance + (off**2 * common)[:, None, None] * np.eye(3)
+    part = np.zeros((len(starts), fits.station_part.shape[1]))
+    np.add.at(part, node[met.used], fits.station_part[tube[met.used]])
+    common = (part**2).sum(axis=1) / np.maximum(met.axes, 1) ** 2
+    covariance = met.covariance + common[:, None, None] * np.eye(3)
     nodes = Nodes(met.positions, covariance, met.axes, met.scatter)
     tubes = Tubes(
         points=fits.points[rows],

@@ -22,6 +22,7 @@ CUTS_MM = (30.0, 15.0)
 CUT_SIGMAS = 3.5
 LEAST_CUT_MM = 4.0  # of rough fits, where stations may be off each other
 ROUGH_MM = 2.0  # by which a straight axis and what is wrong with stations may be off, beside the noise
+NEAR_M = 20.0  # of a station; what is wrong with its attitude shows in the others
 FINE_MM = 0.7  # and a bowed axis
 TRIM_MM = 8.0  # taken off each end: where a cone begins is not seen that sharply
 LEAST_SIGMA_MM = 0.05
@@ -34,8 +35,8 @@ class Rough:
     """Straight axes (m,) through ``points`` along ``directions``, with ``radii``, ``sigma`` and ``lengths``.
 
     ``ok`` marks those that could be fitted. ``by_incidence`` (m, 8, 3) are number, sum and sum of squares of
-    distances from the surface, by the cosine of incidence in steps of 0.1 from 0.2. ``scatter`` (m, 2) says how far
-    stations are off each other: their squares of sd a mm^2 are the sums of the first over those of the second.
+    distances from the surface, by the cosine of incidence in steps of 0.1 from 0.2. ``scatter`` (m, 2, 3) says how far
+    stations are off each other, see :func:`tell`.
     """
 
     ok: npt.NDArray[np.bool_]
@@ -53,8 +54,8 @@ class Fits:
     """Tubes (m,): middle of the cylinder ``points``, ``directions``, ``side`` across; see :class:`Tubes`.
 
     ``ok`` marks the tubes that could be fitted; ``sigma`` is the standard deviation of a residual. ``noise`` is the
-    part of ``covariance`` that comes from noise alone, without that of the stations; ``station_share`` (m, s) is
-    what each station counts for in the fit, 1 in all.
+    part of ``covariance`` that comes from noise alone, without that of the stations; ``station_part`` (m, s) is
+    what each station counts for in the fit times the standard deviation by which it may be off, mm.
     """
 
     ok: npt.NDArray[np.bool_]
@@ -66,7 +67,7 @@ class Fits:
     bow: Floats
     covariance: Floats  # (m, 5, 5)
     noise: Floats  # (m, 5, 5)
-    station_share: Floats
+    station_part: Floats
     count: Ints
     sigma: Floats
 
@@ -167,12 +168,26 @@ def moved(p, h, point, direction, side, other):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def tell(p, h, P, U, seen, bounds, sigma, cut, inverse, by_incidence, scatter):  # type: ignore[no-untyped-def]
+def distances(point, at, bounds, scanners):  # type: ignore[no-untyped-def]
+    """Distance in m of a point from the station of each group; 0 where it is unknown."""
+    away = np.zeros(len(bounds) - 1)
+    for g in range(len(away)):
+        s = at[bounds[g]]
+        if 0 <= s < len(scanners):
+            for i in range(3):
+                away[g] += (1e-3 * (point[i] - scanners[s, i])) ** 2
+        away[g] = np.sqrt(away[g])
+    return away
+
+
+@njit(cache=True, nogil=True)
+def tell(p, h, P, U, seen, bounds, away, sigma, cut, inverse, by_incidence, scatter):  # type: ignore[no-untyped-def]
     """Residuals by incidence, and what the stations' scatter says of how far they are off each other.
 
     Of the scores y_s of a movement of each station (two, across) after the fit, Q = sum of y_s' A_s^-1 y_s. It should be
-    E0 from noise alone, and E0 + t^2 E1 where stations are moved with standard deviation t (DerSimonian and Laird 1986,
-    with the parameters of the fit taken into account). ``scatter`` gets Q - E0 and E1.
+    E0 from noise alone, and E0 + a E1 + b E2 where stations at distances d (m) are moved with variances a + b d^2
+    (DerSimonian and Laird 1986, with the parameters of the fit taken into account). ``scatter`` gets Q - E0, E1 and E2
+    of the stations nearer than NEAR_M, and of the others.
     """
     groups = len(bounds) - 1
     A, y, J = np.zeros((groups, 5, 5)), np.zeros((groups, 5)), np.zeros(NP)
@@ -202,15 +217,15 @@ def tell(p, h, P, U, seen, bounds, sigma, cut, inverse, by_incidence, scatter): 
     use = np.flatnonzero(count >= 12)
     if len(use) < 2:
         return
-    Q = E0 = E1 = 0.0
     for s in use:
+        side = 0 if away[s] < NEAR_M else 1
         B = A[s, :2, :2]
         det = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
         if not det > 1e-3 * B[0, 0] * B[1, 1]:
             continue
         B1 = np.empty((2, 2))
         B1[0, 0], B1[1, 1], B1[0, 1], B1[1, 0] = B[1, 1] / det, B[0, 0] / det, -B[0, 1] / det, -B[1, 0] / det
-        Q += B1[0, 0] * y[s, 0] ** 2 + 2.0 * B1[0, 1] * y[s, 0] * y[s, 1] + B1[1, 1] * y[s, 1] ** 2
+        scatter[side, 0] += B1[0, 0] * y[s, 0] ** 2 + 2.0 * B1[0, 1] * y[s, 0] * y[s, 1] + B1[1, 1] * y[s, 1] ** 2
         for k in range(groups):
             H = np.zeros((2, 2))
             for a in range(2):
@@ -223,10 +238,11 @@ def tell(p, h, P, U, seen, bounds, sigma, cut, inverse, by_incidence, scatter): 
             for a in range(2):
                 for b in range(2):
                     if k == s:
-                        E0 += sigma * sigma * B1[a, b] * H[b, a]
+                        scatter[side, 0] -= sigma * sigma * B1[a, b] * H[b, a]
                     for c in range(2):
-                        E1 += B1[a, b] * H[b, c] * H[a, c]
-    scatter[0], scatter[1] = Q - E0, E1
+                        told = B1[a, b] * H[b, c] * H[a, c]
+                        scatter[side, 1] += told
+                        scatter[side, 2] += told * away[k] ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -250,7 +266,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
         h = inner[m]
         if not roughly(P, -h, h, 1e9, p, h) or not 0.7 * least_radius < p[4] < 1.3 * most_radius:
             continue
-        none, shares = np.zeros((len(bounds) - 1, 2)), np.empty(len(bounds) - 1)
+        none, unmoved, shares = np.zeros((len(bounds) - 1, 2)), np.zeros(len(bounds) - 1), np.empty(len(bounds) - 1)
         good, sigma, cut, count, total = True, 2.0, 0.0, 0, 0.0
         for turn in range(4):
             if turn < 2:
@@ -259,7 +275,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
                 sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
                 cut = max(CUT_SIGMAS * sigma, LEAST_CUT_MM)
             count, total, _, good = step(
-                p, h, P, U, seen, bounds, none, 5, ROUGH_COS, cut, sigma, 1.0, 0.0, sizes, inverse, inverse, shares
+                p, h, P, U, seen, bounds, none, 5, ROUGH_COS, cut, sigma, 1.0, unmoved, sizes, inverse, inverse, shares
             )
             if not good or not 0.7 * least_radius < p[4] < 1.3 * most_radius:
                 good = False
@@ -267,7 +283,8 @@ def fit_roughly(  # type: ignore[no-untyped-def]
         if not good:
             continue
         sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
-        tell(p, h, P, U, seen, bounds, np.sqrt(total / max(count - 5, 1)), cut, inverse, by_incidence[m], scatter[m])
+        away = distances(point, at, bounds, scanners)
+        tell(p, h, P, U, seen, bounds, away, np.sqrt(total / max(count - 5, 1)), cut, inverse, by_incidence[m], scatter[m])
         bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
         slack = np.sqrt(sigma**2 + ROUGH_MM**2)
         low, high = reach_of(p, h, P, U, seen, bounds, none, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
@@ -282,7 +299,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def refine(  # type: ignore[no-untyped-def]
     counts, room, places, stations, middles, scanners, points, directions, spans, least_radius, most_radius, bow_share,
-    least_cos, station_sd, ok, sides, lengths, radii, bows, covariances, noises, shares_out, used, sigmas, first, last,
+    least_cos, variance, variance_m2, ok, sides, lengths, radii, bows, covariances, noises, shares_out, used, sigmas, first, last,
 ):  # fmt: skip
     """Fit bowed tubes first..last to all their points, from a rough axis; changes points and directions in place."""
     for m in range(first, last):
@@ -301,12 +318,14 @@ def refine(  # type: ignore[no-untyped-def]
         h = max(0.5 * lengths[m] - ROUGH_TRIM_MM, 50.0)
         shifts, shares = np.zeros((len(bounds) - 1, 2)), np.empty(len(bounds) - 1)
         sigma = sigmas[m]
+        station_sd = np.sqrt(variance + variance_m2 * distances(point, at, bounds, scanners) ** 2)
+        off = station_sd.max()
         good, count, total = True, 0, 0.0
         for turn in range(6):
             if turn == 2:
                 # Now that the axis is known the cylinder's ends show, and all goes on about its middle.
                 bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
-                slack = np.sqrt(sigma**2 + station_sd**2 + FINE_MM**2)
+                slack = np.sqrt(sigma**2 + FINE_MM**2)
                 low, high = reach_of(p, h, P, U, seen, bounds, shifts, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
                 middle, half = 0.5 * (low + high), 0.5 * (high - low) - TRIM_MM
                 if half < 50.0:
@@ -325,7 +344,7 @@ def refine(  # type: ignore[no-untyped-def]
                 h = half
             cut = max(CUT_SIGMAS * sigma, 0.5)
             if turn < 2:
-                cut = CUT_SIGMAS * np.sqrt(sigma**2 + station_sd**2 + FINE_MM**2)
+                cut = CUT_SIGMAS * np.sqrt(sigma**2 + off**2 + FINE_MM**2)
             bow_sd = max(bow_share * h, 1e-3)
             count, total, shift, good = step(
                 p, h, P, U, seen, bounds, shifts, NP, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, own, shares
@@ -343,11 +362,14 @@ def refine(  # type: ignore[no-untyped-def]
         ok[m], lengths[m], radii[m], used[m], sigmas[m] = True, 2.0 * h, p[4], count, sigma
         bows[m, 0], bows[m, 1] = p[5], p[6]
         # What each station counts for, where it may be off as a whole.
+        all_weights = 0.0
         for g in range(len(bounds) - 1):
             if at[bounds[g]] >= 0 and shares[g] > 0.0:
-                shares_out[m, at[bounds[g]]] = 1.0 / (station_sd**2 + 1.0 / shares[g])
-        if shares_out[m].sum() > 0.0:
-            shares_out[m] /= shares_out[m].sum()
+                weight = 1.0 / (station_sd[g] ** 2 + 1.0 / shares[g])
+                shares_out[m, at[bounds[g]]] = weight * station_sd[g]
+                all_weights += weight
+        if all_weights > 0.0:
+            shares_out[m] /= all_weights
         scale = np.array([1.0, 1.0, 1.0 / h, 1.0 / h, 1.0])
         for i in range(5):
             for j in range(5):
@@ -374,7 +396,7 @@ def rough(
     m = len(points)
     points, directions = points.copy(), directions.copy()
     ok, lengths, radii, sigmas = np.zeros(m, bool), np.zeros(m), np.zeros(m), np.zeros(m)
-    by_incidence, scatter = np.zeros((m, COS_BINS, 3)), np.zeros((m, 2))
+    by_incidence, scatter = np.zeros((m, COS_BINS, 3)), np.zeros((m, 2, 3))
     kernel = partial(
         fit_roughly, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners,
         points, directions, inner_mm, span_mm, most, *radii_mm, ok, lengths, radii, sigmas, by_incidence, scatter,
@@ -391,13 +413,14 @@ def refined(
     radii_mm: tuple[float, float],
     bow_share: float,
     least_cos: float,
-    station_sd_mm: float,
+    station_variance: tuple[float, float],
     threads: int = 0,
 ) -> Fits:
     """Fit bowed tubes to all points gathered, from their rough axes.
 
     ``bow_share`` is the largest bow to expect, as a share of the length. ``least_cos`` bounds the incidence of rays,
-    and each station may be off by ``station_sd_mm`` (a standard deviation for each axis).
+    and each station may be off with ``station_variance``,
+    see :func:`station_variance`.
     """
     m = len(start.points)
     points, directions, sides = start.points.copy(), start.directions.copy(), np.zeros((m, 3))
@@ -406,7 +429,7 @@ def refined(
     used, sigmas = np.zeros(m, np.int64), start.sigma.copy()
     kernel = partial(
         refine, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners, points,
-        directions, span_mm, *radii_mm, bow_share, least_cos, station_sd_mm, ok, sides, lengths, radii, bows, covariances,
+        directions, span_mm, *radii_mm, bow_share, least_cos, *station_variance, ok, sides, lengths, radii, bows, covariances,
         noises, shares, used, sigmas,
     )  # fmt: skip
     over_ranges(kernel, m, threads)
@@ -426,7 +449,19 @@ def least_cosine(start: Rough, tolerance_mm: float) -> float:
     return GRAZING_COS + 0.1 * last
 
 
-def station_sd(start: Rough) -> float:
-    """Standard deviation in mm, for each axis, by which stations are off each other; 0 where noise explains it all."""
-    excess, told = start.scatter[start.ok].sum(axis=0)
-    return float(np.sqrt(excess / told)) if excess > 0.0 and told > 0.0 else 0.0
+def station_variance(start: Rough) -> tuple[float, float]:
+    """By how much stations are off each other, for each axis: a in mm^2 and b in mm^2/m^2 of a + b distance^2.
+
+    Both are 0 where noise explains all.
+    """
+    (near, near1, near2), (far, far1, far2) = start.scatter[start.ok].sum(axis=0).tolist()
+    if near <= 0.0 and far <= 0.0:
+        return 0.0, 0.0
+    det = near1 * far2 - near2 * far1
+    if det > 1e-6 * near1 * far2:
+        a, b = (near * far2 - far * near2) / det, (near1 * far - far1 * near) / det
+        if a >= 0.0 and b >= 0.0:
+            return a, b
+        if a < 0.0:
+            return 0.0, max((near + far) / (near2 + far2), 0.0)
+    return (max((near + far) / (near1 + far1), 0.0), 0.0) if near1 + far1 > 0.0 else (0.0, 0.0)
