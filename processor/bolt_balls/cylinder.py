@@ -97,14 +97,14 @@ def spread_of(values, n):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def step(  # type: ignore[no-untyped-def]
-    p, h, P, U, seen, bounds, shifts, free, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, own, shares
+    p, h, P, U, seen, bounds, shifts, free, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, response
 ):
     """One Gauss-Newton step of the first ``free`` parameters over points with |z| <= h and |residual| <= cut mm.
 
     Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where its ``station_sd`` (g,) is above 0 a
     station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard deviation;
-    they are eliminated, and the inverse of the normal equations knows of them. ``own`` gets the inverse without
-    them, ``shares`` (g,) what each station alone tells of an offset, as one over its variance, ``sizes`` the weighted residuals.
+    they are eliminated, and the inverse of the normal equations knows of them. ``response`` (g, 7, 2) gets how the
+    parameters move with a movement of each station, ``sizes`` the weighted residuals.
     Returns (points used, sum of squared weighted residuals, largest movement, whether it could be solved).
     """
     groups = len(bounds) - 1
@@ -135,21 +135,16 @@ def step(  # type: ignore[no-untyped-def]
         return n, total, 0.0, False
     N, right = np.zeros((NP, NP)), np.zeros(NP)
     for g in range(groups):
-        shares[g] = A[g, 0, 0] + A[g, 1, 1]
         for a in range(free):
             right[a] += y[g, a]
             for b in range(a + 1):
                 N[a, b] += A[g, a, b]
-    for g in range(groups):
-        shares[g] /= 2.0 * sigma * sigma
     if free == NP:
         for a in range(5, NP):
             N[a, a] += (sigma / bow_sd) ** 2
             right[a] -= (sigma / bow_sd) ** 2 * p[a]
     moving = station_sd.max() > 0.0
     if moving:
-        if not solve(N, right.copy(), free, x, own, True):
-            return n, total, 0.0, False
         for g in range(groups):
             ratio = (sigma / station_sd[g]) ** 2
             d00, d11, d10 = A[g, 0, 0] + ratio, A[g, 1, 1] + ratio, A[g, 1, 0]
@@ -174,8 +169,12 @@ def step(  # type: ignore[no-untyped-def]
                 r1 -= column(A[g], a, 1) * x[a]
             shifts[g, 0] += (d11 * r0 - d10 * r1) / det
             shifts[g, 1] += (d00 * r1 - d10 * r0) / det
-    else:
-        own[:] = inverse
+            for a in range(free):
+                response[g, a, 0] = response[g, a, 1] = 0.0
+                for b in range(free):
+                    b0, b1 = column(A[g], b, 0), column(A[g], b, 1)
+                    response[g, a, 0] += inverse[a, b] * ratio * (d11 * b0 - d10 * b1) / det
+                    response[g, a, 1] += inverse[a, b] * ratio * (d00 * b1 - d10 * b0) / det
     moved = 0.0
     for a in range(free):
         p[a] += x[a]

@@ -107,15 +107,16 @@ def _nodes(fits: Fits, starts: Floats, pairs: Ints, params: Params) -> tuple[Nod
     order = np.argsort(node, kind="stable")
     tube, node = tube[order], node[order]
     ends = axes.incidence(
-        node, starts, fits.points[tube], fits.directions[tube], fits.side[tube], fits.noise[tube]
+        node,
+        starts,
+        fits.points[tube],
+        fits.directions[tube],
+        fits.side[tube],
+        fits.covariance[tube],
+        fits.response[tube],
     )
     met = axes.meet(ends, starts, params.eccentricity_floor_mm)
-    # What is wrong with a station moves all axes at a node alike: their scatter does not show it.
-    part = np.zeros((len(starts), fits.station_part.shape[1]))
-    np.add.at(part, node[met.used], fits.station_part[tube[met.used]])
-    common = (part**2).sum(axis=1) / np.maximum(met.axes, 1) ** 2
-    covariance = met.covariance + common[:, None, None] * np.eye(3)
-    nodes = Nodes(met.positions, covariance, met.axes, met.scatter)
+    nodes = Nodes(met.positions, met.covariance, met.axes, met.scatter)
     tubes = Tubes(
         points=fits.points[rows],
         directions=fits.directions[rows],

@@ -53,9 +53,9 @@ class Rough:
 class Fits:
     """Tubes (m,): middle of the cylinder ``points``, ``directions``, ``side`` across; see :class:`Tubes`.
 
-    ``ok`` marks the tubes that could be fitted; ``sigma`` is the standard deviation of a residual. ``noise`` is the
-    part of ``covariance`` that comes from noise alone, without that of the stations; ``station_part`` (m, s) is
-    what each station counts for in the fit times the standard deviation by which it may be off, mm.
+    ``ok`` marks the tubes that could be fitted; ``sigma`` is the standard deviation of a residual. ``response``
+    (m, s, 4, 2) is how offsets and turns move with a movement of each station across the tube by one standard deviation;
+    s = 0 where stations are not off. The covariance includes it.
     """
 
     ok: npt.NDArray[np.bool_]
@@ -66,8 +66,7 @@ class Fits:
     radii: Floats
     bow: Floats
     covariance: Floats  # (m, 5, 5)
-    noise: Floats  # (m, 5, 5)
-    station_part: Floats
+    response: Floats
     count: Ints
     sigma: Floats
 
@@ -266,7 +265,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
         h = inner[m]
         if not roughly(P, -h, h, 1e9, p, h) or not 0.7 * least_radius < p[4] < 1.3 * most_radius:
             continue
-        none, unmoved, shares = np.zeros((len(bounds) - 1, 2)), np.zeros(len(bounds) - 1), np.empty(len(bounds) - 1)
+        none, unmoved, response = np.zeros((len(bounds) - 1, 2)), np.zeros(len(bounds) - 1), np.zeros((0, NP, 2))
         good, sigma, cut, count, total = True, 2.0, 0.0, 0, 0.0
         for turn in range(4):
             if turn < 2:
@@ -275,7 +274,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
                 sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
                 cut = max(CUT_SIGMAS * sigma, LEAST_CUT_MM)
             count, total, _, good = step(
-                p, h, P, U, seen, bounds, none, 5, ROUGH_COS, cut, sigma, 1.0, unmoved, sizes, inverse, inverse, shares
+                p, h, P, U, seen, bounds, none, 5, ROUGH_COS, cut, sigma, 1.0, unmoved, sizes, inverse, response
             )
             if not good or not 0.7 * least_radius < p[4] < 1.3 * most_radius:
                 good = False
@@ -284,7 +283,20 @@ def fit_roughly(  # type: ignore[no-untyped-def]
             continue
         sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
         away = distances(point, at, bounds, scanners)
-        tell(p, h, P, U, seen, bounds, away, np.sqrt(total / max(count - 5, 1)), cut, inverse, by_incidence[m], scatter[m])
+        tell(
+            p,
+            h,
+            P,
+            U,
+            seen,
+            bounds,
+            away,
+            np.sqrt(total / max(count - 5, 1)),
+            cut,
+            inverse,
+            by_incidence[m],
+            scatter[m],
+        )
         bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
         slack = np.sqrt(sigma**2 + ROUGH_MM**2)
         low, high = reach_of(p, h, P, U, seen, bounds, none, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
@@ -299,7 +311,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def refine(  # type: ignore[no-untyped-def]
     counts, room, places, stations, middles, scanners, points, directions, spans, least_radius, most_radius, bow_share,
-    least_cos, variance, variance_m2, ok, sides, lengths, radii, bows, covariances, noises, shares_out, used, sigmas, first, last,
+    least_cos, variance, variance_m2, ok, sides, lengths, radii, bows, covariances, responses, used, sigmas, first, last,
 ):  # fmt: skip
     """Fit bowed tubes first..last to all their points, from a rough axis; changes points and directions in place."""
     for m in range(first, last):
@@ -313,14 +325,14 @@ def refine(  # type: ignore[no-untyped-def]
         point, direction, side, other = points[m].copy(), directions[m].copy(), np.empty(3), np.empty(3)
         framed(direction, side, other)
         localised(own_places, at, middles[m], point, direction, side, other, scanners, P, U, seen)
-        p, inverse, own, sizes = np.zeros(NP), np.zeros((NP, NP)), np.zeros((NP, NP)), np.empty(n)
+        p, inverse, sizes = np.zeros(NP), np.zeros((NP, NP)), np.empty(n)
         p[4] = radii[m]
         h = max(0.5 * lengths[m] - ROUGH_TRIM_MM, 50.0)
-        shifts, shares = np.zeros((len(bounds) - 1, 2)), np.empty(len(bounds) - 1)
+        shifts, response = np.zeros((len(bounds) - 1, 2)), np.zeros((len(bounds) - 1, NP, 2))
         sigma = sigmas[m]
         station_sd = np.sqrt(variance + variance_m2 * distances(point, at, bounds, scanners) ** 2)
         off = station_sd.max()
-        good, count, total = True, 0, 0.0
+        good, count, total, assumed = True, 0, 0.0, sigma
         for turn in range(6):
             if turn == 2:
                 # Now that the axis is known the cylinder's ends show, and all goes on about its middle.
@@ -346,8 +358,24 @@ def refine(  # type: ignore[no-untyped-def]
             if turn < 2:
                 cut = CUT_SIGMAS * np.sqrt(sigma**2 + off**2 + FINE_MM**2)
             bow_sd = max(bow_share * h, 1e-3)
+            assumed = sigma
             count, total, shift, good = step(
-                p, h, P, U, seen, bounds, shifts, NP, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, own, shares
+                p,
+                h,
+                P,
+                U,
+                seen,
+                bounds,
+                shifts,
+                NP,
+                least_cos,
+                cut,
+                sigma,
+                bow_sd,
+                station_sd,
+                sizes,
+                inverse,
+                response,
             )
             if not good:
                 break
@@ -361,20 +389,14 @@ def refine(  # type: ignore[no-untyped-def]
             points[m, i], directions[m, i], sides[m, i] = point[i], direction[i], side[i]
         ok[m], lengths[m], radii[m], used[m], sigmas[m] = True, 2.0 * h, p[4], count, sigma
         bows[m, 0], bows[m, 1] = p[5], p[6]
-        # What each station counts for, where it may be off as a whole.
-        all_weights = 0.0
-        for g in range(len(bounds) - 1):
-            if at[bounds[g]] >= 0 and shares[g] > 0.0:
-                weight = 1.0 / (station_sd[g] ** 2 + 1.0 / shares[g])
-                shares_out[m, at[bounds[g]]] = weight * station_sd[g]
-                all_weights += weight
-        if all_weights > 0.0:
-            shares_out[m] /= all_weights
         scale = np.array([1.0, 1.0, 1.0 / h, 1.0 / h, 1.0])
         for i in range(5):
             for j in range(5):
-                covariances[m, i, j] = sigma * sigma * scale[i] * scale[j] * inverse[i, j]
-                noises[m, i, j] = sigma * sigma * scale[i] * scale[j] * own[i, j]
+                covariances[m, i, j] = assumed * assumed * scale[i] * scale[j] * inverse[i, j]
+        for g in range(len(bounds) - 1):
+            if 0 <= at[bounds[g]] < responses.shape[1]:
+                for i in range(4):
+                    responses[m, at[bounds[g]], i] = response[g, i] * scale[i] * station_sd[g]
 
 
 def rough(
@@ -425,15 +447,15 @@ def refined(
     m = len(start.points)
     points, directions, sides = start.points.copy(), start.directions.copy(), np.zeros((m, 3))
     ok, lengths, radii, bows = start.ok.copy(), start.lengths.copy(), start.radii.copy(), np.zeros((m, 2))
-    covariances, noises, shares = np.zeros((m, 5, 5)), np.zeros((m, 5, 5)), np.zeros((m, len(scanners)))
+    covariances, responses = np.zeros((m, 5, 5)), np.zeros((m, len(scanners) if any(station_variance) else 0, 4, 2))
     used, sigmas = np.zeros(m, np.int64), start.sigma.copy()
     kernel = partial(
         refine, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners, points,
         directions, span_mm, *radii_mm, bow_share, least_cos, *station_variance, ok, sides, lengths, radii, bows, covariances,
-        noises, shares, used, sigmas,
+        responses, used, sigmas,
     )  # fmt: skip
     over_ranges(kernel, m, threads)
-    return Fits(ok, points, directions, sides, lengths, radii, bows, covariances, noises, shares, used, sigmas)
+    return Fits(ok, points, directions, sides, lengths, radii, bows, covariances, responses, used, sigmas)
 
 
 def least_cosine(start: Rough, tolerance_mm: float) -> float:
