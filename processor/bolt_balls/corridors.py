@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -30,7 +31,7 @@ class Gathered:
     """Points near lines: of line i those in rows ``i * room`` to ``i * room + counts[i]``.
 
     ``places`` are points in whole steps less ``middles`` (m, 3), 21 bits a coordinate, ``stations`` where each was
-    seen from; ``shares`` (m,) of all points of the line are kept.
+    seen from; both are sorted, by station first. ``shares`` (m,) of all points of the line are kept.
     """
 
     room: int
@@ -205,6 +206,28 @@ def hash_of(place, middle):  # type: ignore[no-untyped-def]
     return hashed(np.int32(x), np.int32(y), np.int32(z))
 
 
+@njit(cache=True, nogil=True)
+def arrange(counts, room, places, stations, most_station, first, last):  # type: ignore[no-untyped-def]
+    """Sort the entries of lines first..last by station, then by place: sums over them never vary."""
+    heads = np.zeros(most_station + 3, np.int64)
+    for m in range(first, last):
+        base, n = m * room, counts[m]
+        heads[:] = 0
+        for i in range(base, base + n):
+            heads[stations[i] + 2] += 1
+        for s in range(1, len(heads)):
+            heads[s] += heads[s - 1]
+        starts = heads.copy()
+        own, at = places[base : base + n].copy(), stations[base : base + n].copy()
+        for i in range(n):
+            k = base + heads[at[i] + 1]
+            places[k], stations[k] = own[i], at[i]
+            heads[at[i] + 1] += 1
+        for s in range(len(starts) - 1):
+            if starts[s + 1] - starts[s] > 1:
+                places[base + starts[s] : base + starts[s + 1]].sort()
+
+
 def gather(
     stretches: Iterable[tuple[npt.NDArray[np.generic], Labels]],
     scale: float,
@@ -220,7 +243,7 @@ def gather(
     middles = np.rint(lines.points * STEPS_PER_MM).astype(np.int64)
     thresholds = np.full(count, WHOLE, np.uint64)
     counts = np.zeros(count, np.int64)
-    places, stations = np.empty(count * room, np.int64), np.empty(count * room, np.int16)
+    places, stations = np.empty(count * room, np.int64), np.full(count * room, -1, np.int16)
     fixed = (
         lines.points, lines.directions, lines.low, lines.high, lines.reach_mm, CELL_MM, lines.keys, lines.spans, lines.lines,
     )  # fmt: skip
@@ -241,4 +264,6 @@ def gather(
         over_ranges(run, len(coordinates), threads, least=20_000)
         for _, *entries in pieces:
             insert(*entries, middles, room, counts, thresholds, places, stations)
+    most_station = int(stations.max(initial=-1)) if count else -1
+    over_ranges(partial(arrange, counts, room, places, stations, most_station), count, threads)
     return Gathered(room, counts, places, stations, middles, thresholds / WHOLE)

@@ -95,7 +95,7 @@ def measure(source: Source, starts: Floats, pairs: Ints, params: Params | None =
     )  # fmt: skip
     least_cos, off = least_cosine(start, params.incidence_tolerance_mm), station_variance(start)
     fits = refined(
-        points, source.scanners, start, 0.5 * length, params.radii_mm, params.bow_share, least_cos, off, params.threads
+        points, source.scanners, start, 0.5 * length, params.radii_mm, params.rough_points, params.bow_share, least_cos, off, params.threads
     )
     return _nodes(fits, starts, pairs, params)
 

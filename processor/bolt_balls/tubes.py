@@ -24,6 +24,7 @@ LEAST_CUT_MM = 4.0  # of rough fits, where stations may be off each other
 ROUGH_MM = 2.0  # by which a straight axis and what is wrong with stations may be off, beside the noise
 NEAR_M = 20.0  # of a station; what is wrong with its attitude shows in the others
 FINE_MM = 0.7  # and a bowed axis
+SMALL_STEP_MM = 5e-3
 TRIM_MM = 8.0  # taken off each end: where a cone begins is not seen that sharply
 LEAST_SIGMA_MM = 0.05
 ROUGH_COS = 0.5  # of incidence, in rough fits
@@ -87,48 +88,28 @@ def framed(direction, side, other):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def ordered(places, stations):  # type: ignore[no-untyped-def]
-    """Places sorted by station, then by themselves, so that sums never vary; stations likewise, and their bounds."""
-    n = len(places)
-    order = np.argsort(stations, kind="mergesort")
-    own, at = np.empty(n, np.int64), np.empty(n, np.int64)
-    groups = 0
-    for i in range(n):
-        own[i], at[i] = places[order[i]], stations[order[i]]
-        if i == 0 or at[i] != at[i - 1]:
-            groups += 1
-    bounds = np.empty(groups + 1, np.int64)
-    groups = 0
-    for i in range(n):
-        if i == 0 or at[i] != at[i - 1]:
-            bounds[groups] = i
-            groups += 1
-    bounds[groups] = n
-    for g in range(groups):
-        own[bounds[g] : bounds[g + 1]] = np.sort(own[bounds[g] : bounds[g + 1]])
-    return own, at, bounds
+def thin(places, stations, most):  # type: ignore[no-untyped-def]
+    """Every k-th of ordered places, so that no more than ``most`` are left, with stations and their bounds."""
+    k = max(1, (len(places) + most - 1) // most)
+    fewer, where = places[::k], stations[::k]
+    return fewer, where, bounds_of(where)
 
 
 @njit(cache=True, nogil=True)
-def thin(own, at, most):  # type: ignore[no-untyped-def]
-    """Every k-th of ordered places, so that no more than ``most`` are left, with stations and bounds."""
-    n = len(own)
-    k = (n + most - 1) // most
-    count = (n + k - 1) // k
-    fewer, where = np.empty(count, np.int64), np.empty(count, np.int64)
+def bounds_of(stations):  # type: ignore[no-untyped-def]
+    """Bounds of the stretches of one station each."""
     groups = 0
-    for i in range(count):
-        fewer[i], where[i] = own[i * k], at[i * k]
-        if i == 0 or where[i] != where[i - 1]:
+    for i in range(len(stations)):
+        if i == 0 or stations[i] != stations[i - 1]:
             groups += 1
     bounds = np.empty(groups + 1, np.int64)
     groups = 0
-    for i in range(count):
-        if i == 0 or where[i] != where[i - 1]:
+    for i in range(len(stations)):
+        if i == 0 or stations[i] != stations[i - 1]:
             bounds[groups] = i
             groups += 1
-    bounds[groups] = count
-    return fewer, where, bounds
+    bounds[groups] = len(stations)
+    return bounds
 
 
 @njit(cache=True, nogil=True)
@@ -254,8 +235,7 @@ def fit_roughly(  # type: ignore[no-untyped-def]
         if counts[m] < 16:
             continue
         rows = slice(m * room, m * room + counts[m])
-        own, at, bounds = ordered(places[rows], stations[rows])
-        own, at, bounds = thin(own, at, most)
+        own, at, bounds = thin(places[rows], stations[rows], most)
         n = len(own)
         P, U, seen = np.empty((n, 3)), np.zeros((n, 3)), np.zeros(n, np.bool_)
         point, direction, side, other = points[m].copy(), directions[m].copy(), np.empty(3), np.empty(3)
@@ -309,79 +289,87 @@ def fit_roughly(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def improve(p, h, P, U, seen, bounds, shifts, station_sd, least_cos, sigma, slack, bow_share, turns, inverse, response):  # type: ignore[no-untyped-def]
+    """Gauss-Newton steps of a bowed tube; returns (worked, points used, sigma of the last normal equations, sigma).
+
+    ``slack`` is what the start may be off by, for the first step.
+    """
+    sizes = np.empty(len(P))
+    good, count, assumed = True, 0, sigma
+    for turn in range(turns):
+        cut = max(CUT_SIGMAS * (np.sqrt(sigma**2 + slack**2) if turn == 0 else sigma), 0.5)
+        assumed = sigma
+        count, total, shift, good = step(
+            p, h, P, U, seen, bounds, shifts, NP, least_cos, cut, sigma, max(bow_share * h, 1e-3), station_sd, sizes,
+            inverse, response,
+        )  # fmt: skip
+        if not good:
+            break
+        sigma = max(np.sqrt(total / max(count - NP, 1)), LEAST_SIGMA_MM)
+        if turn > 0 and shift < SMALL_STEP_MM:
+            break
+    return good, count, assumed, sigma
+
+
+@njit(cache=True, nogil=True)
 def refine(  # type: ignore[no-untyped-def]
-    counts, room, places, stations, middles, scanners, points, directions, spans, least_radius, most_radius, bow_share,
-    least_cos, variance, variance_m2, ok, sides, lengths, radii, bows, covariances, responses, used, sigmas, first, last,
+    counts, room, places, stations, middles, scanners, points, directions, spans, most, least_radius, most_radius,
+    bow_share, least_cos, variance, variance_m2, ok, sides, lengths, radii, bows, covariances, responses, used, sigmas,
+    first, last,
 ):  # fmt: skip
     """Fit bowed tubes first..last to all their points, from a rough axis; changes points and directions in place."""
     for m in range(first, last):
         if not ok[m]:
             continue
         ok[m] = False
-        rows = slice(m * room, m * room + counts[m])
-        own_places, at, bounds = ordered(places[rows], stations[rows])
-        n = len(own_places)
-        P, U, seen = np.empty((n, 3)), np.zeros((n, 3)), np.zeros(n, np.bool_)
         point, direction, side, other = points[m].copy(), directions[m].copy(), np.empty(3), np.empty(3)
         framed(direction, side, other)
-        localised(own_places, at, middles[m], point, direction, side, other, scanners, P, U, seen)
-        p, inverse, sizes = np.zeros(NP), np.zeros((NP, NP)), np.empty(n)
+        p, inverse = np.zeros(NP), np.zeros((NP, NP))
         p[4] = radii[m]
         h = max(0.5 * lengths[m] - ROUGH_TRIM_MM, 50.0)
+        rows = slice(m * room, m * room + counts[m])
+        # Some points tell where the axis is.
+        own, at, bounds = thin(places[rows], stations[rows], most)
+        P, U, seen = np.empty((len(own), 3)), np.zeros((len(own), 3)), np.zeros(len(own), np.bool_)
+        localised(own, at, middles[m], point, direction, side, other, scanners, P, U, seen)
         shifts, response = np.zeros((len(bounds) - 1, 2)), np.zeros((len(bounds) - 1, NP, 2))
-        sigma = sigmas[m]
         station_sd = np.sqrt(variance + variance_m2 * distances(point, at, bounds, scanners) ** 2)
-        off = station_sd.max()
-        good, count, total, assumed = True, 0, 0.0, sigma
-        for turn in range(6):
-            if turn == 2:
-                # Now that the axis is known the cylinder's ends show, and all goes on about its middle.
-                bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
-                slack = np.sqrt(sigma**2 + FINE_MM**2)
-                low, high = reach_of(p, h, P, U, seen, bounds, shifts, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
-                middle, half = 0.5 * (low + high), 0.5 * (high - low) - TRIM_MM
-                if half < 50.0:
-                    good = False
-                    break
-                p[0] += p[2] * middle / h
-                p[1] += p[3] * middle / h
-                p[2] *= half / h
-                p[3] *= half / h
-                p[5] *= (half / h) ** 2
-                p[6] *= (half / h) ** 2
-                for i in range(3):
-                    point[i] += middle * direction[i]
-                for i in range(n):
-                    P[i, 2] -= middle
-                h = half
-            cut = max(CUT_SIGMAS * sigma, 0.5)
-            if turn < 2:
-                cut = CUT_SIGMAS * np.sqrt(sigma**2 + off**2 + FINE_MM**2)
-            bow_sd = max(bow_share * h, 1e-3)
-            assumed = sigma
-            count, total, shift, good = step(
-                p,
-                h,
-                P,
-                U,
-                seen,
-                bounds,
-                shifts,
-                NP,
-                least_cos,
-                cut,
-                sigma,
-                bow_sd,
-                station_sd,
-                sizes,
-                inverse,
-                response,
-            )
-            if not good:
-                break
-            sigma = max(np.sqrt(total / max(count - NP, 1)), LEAST_SIGMA_MM)
-            if turn > 2 and shift < 2e-3:
-                break
+        slack = np.sqrt(station_sd.max() ** 2 + FINE_MM**2)
+        good, count, assumed, sigma = improve(
+            p, h, P, U, seen, bounds, shifts, station_sd, least_cos, sigmas[m], slack, bow_share, 2, inverse, response
+        )
+        if not good:
+            continue
+        # All points show the cylinder's ends, and then all goes on about its middle.
+        known, known_at = shifts, at[bounds[:-1]]
+        own, at, bounds = places[rows], stations[rows], bounds_of(stations[rows])
+        P, U, seen = np.empty((len(own), 3)), np.zeros((len(own), 3)), np.zeros(len(own), np.bool_)
+        localised(own, at, middles[m], point, direction, side, other, scanners, P, U, seen)
+        shifts, response = np.zeros((len(bounds) - 1, 2)), np.zeros((len(bounds) - 1, NP, 2))
+        for g in range(len(bounds) - 1):
+            for k in range(len(known)):
+                if known_at[k] == at[bounds[g]]:
+                    shifts[g] = known[k]
+        bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
+        low, high = reach_of(
+            p, h, P, U, seen, bounds, shifts, np.sqrt(sigma**2 + FINE_MM**2), bins, BIN_MM, 0.5 * BIN_MM * len(bins)
+        )
+        middle, half = 0.5 * (low + high), 0.5 * (high - low) - TRIM_MM
+        if half < 50.0:
+            continue
+        p[0] += p[2] * middle / h
+        p[1] += p[3] * middle / h
+        for a in range(2):
+            p[2 + a] *= half / h
+            p[5 + a] *= (half / h) ** 2
+        for i in range(3):
+            point[i] += middle * direction[i]
+        P[:, 2] -= middle
+        h = half
+        station_sd = np.sqrt(variance + variance_m2 * distances(point, at, bounds, scanners) ** 2)
+        good, count, assumed, sigma = improve(
+            p, h, P, U, seen, bounds, shifts, station_sd, least_cos, sigma, 0.0, bow_share, 4, inverse, response
+        )
         if not good or not least_radius < p[4] < most_radius:
             continue
         moved(p, h, point, direction, side, other)
@@ -433,6 +421,7 @@ def refined(
     start: Rough,
     span_mm: Floats,
     radii_mm: tuple[float, float],
+    most: int,
     bow_share: float,
     least_cos: float,
     station_variance: tuple[float, float],
@@ -440,7 +429,7 @@ def refined(
 ) -> Fits:
     """Fit bowed tubes to all points gathered, from their rough axes.
 
-    ``bow_share`` is the largest bow to expect, as a share of the length. ``least_cos`` bounds the incidence of rays,
+    ``most`` points tell where the axis is before all do. ``bow_share`` is the largest bow to expect, as a share of the length. ``least_cos`` bounds the incidence of rays,
     and each station may be off with ``station_variance``,
     see :func:`station_variance`.
     """
@@ -451,7 +440,7 @@ def refined(
     used, sigmas = np.zeros(m, np.int64), start.sigma.copy()
     kernel = partial(
         refine, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners, points,
-        directions, span_mm, *radii_mm, bow_share, least_cos, *station_variance, ok, sides, lengths, radii, bows, covariances,
+        directions, span_mm, most, *radii_mm, bow_share, least_cos, *station_variance, ok, sides, lengths, radii, bows, covariances,
         responses, used, sigmas,
     )  # fmt: skip
     over_ranges(kernel, m, threads)
