@@ -19,6 +19,7 @@ LEAST_SINE = 0.2  # of the angle between two lines whose crossing is looked for
 SAME_RAY_COS = np.cos(np.deg2rad(8.0))  # rays closer than this are parts of one tube
 ONE_NODE_MM = 120.0  # nodes are not closer than this
 LEAST_RAYS = 3
+UNSEEN_MM = 4000.0  # of a member of which a part alone was seen
 LEAST_COVER = 0.2  # of the way between two nodes that a line has to be seen on
 
 
@@ -133,11 +134,11 @@ def _apart(nodes: Floats, rays: Ints, order: Ints) -> tuple[Floats, Ints]:
     return nodes[rows], rays[rows]
 
 
-def _passing(lines: Lines, nodes: Floats) -> tuple[Ints, Ints, Floats]:
+def _passing(lines: Lines, nodes: Floats, beyond_mm: float = BEYOND_MM) -> tuple[Ints, Ints, Floats]:
     """Node, line and t of every line that passes a node closely, and ends near it or runs through it."""
     # Points along every line, so close to each other that one of them is near any node on it.
     reach = 500.0
-    low, high = lines.low - BEYOND_MM, lines.high + BEYOND_MM
+    low, high = lines.low - beyond_mm, lines.high + beyond_mm
     count = np.maximum(np.ceil((high - low) / (1.5 * reach)).astype(np.int64), 1) + 1
     line = np.repeat(np.arange(len(count)), count)
     step = np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)
@@ -175,7 +176,7 @@ def _rays(lines: Lines, nodes: Floats, node: Ints, line: Ints, t: Floats) -> tup
 
 def _pairs(lines: Lines, nodes: Floats) -> Ints:
     """Pairs (p, 2) of nodes that follow each other on a line which is seen on a good part of the way between them."""
-    node, line, t = _passing(lines, nodes)
+    node, line, t = _passing(lines, nodes, UNSEEN_MM)
     order = np.lexsort((t, line))
     node, line, t = node[order], line[order], t[order]
     if len(node) < 2:

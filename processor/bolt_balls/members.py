@@ -30,8 +30,8 @@ class Params:
     least_linearity: float = 0.72
     least_length_mm: float = 400.0  # of a stretch of tube
     rough_points: int = 256  # of a tube, at first
-    tube_points: int = 2048  # of a tube, at most
-    all_tube_points: int = 9_000_000  # of all tubes together, at most
+    tube_points: int = 1024  # of a tube, at most
+    all_tube_points: int = 8_000_000  # of all tubes together, at most
     reach_mm: float = 120.0  # from a rough axis
     radii_mm: tuple[float, float] = (15.0, 110.0)  # of tubes
     incidence_tolerance_mm: float = 0.2  # mean distance from the tube at which grazing rays are left out
