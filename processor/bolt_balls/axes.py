@@ -73,10 +73,11 @@ def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> M
     x, cov, chi2, freedom = _intersect(ends, used, e2, k)
     for _ in range(rounds):
         miss = _miss(ends, x)
-        size = np.einsum("ij,ijk,ik->i", miss, np.linalg.inv(_with(ends, e2)), miss)
+        size = np.einsum("ij,ijk,ik->i", miss, _inverse2(_with(ends, e2)), miss)
         count = np.bincount(ends.node[used], minlength=k)
         # The worst axis of a node goes first; the others may agree without it.
         own = np.where(used, size / np.maximum(_share_left(ends, cov, e2), 0.1), 0.0)
+        own = np.nan_to_num(own)
         worst = np.zeros(k)
         np.maximum.at(worst, ends.node, own)
         out = used & (own > CUT_SIGMAS**2) & (own == worst[ends.node]) & (count[ends.node] > 2)
@@ -94,53 +95,67 @@ def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> M
     return Meeting(starts + x, whole, count, scatter, used, float(np.sqrt(e2)))
 
 
+def _inverse2(M: Floats) -> Floats:
+    """Inverses of matrices (i, 2, 2)."""
+    det = M[:, 0, 0] * M[:, 1, 1] - M[:, 0, 1] * M[:, 1, 0]
+    found = np.stack([M[:, 1, 1], -M[:, 0, 1], -M[:, 1, 0], M[:, 0, 0]], axis=1) / det[:, None]
+    return found.reshape(-1, 2, 2)
+
+
 def _with(ends: Incidence, e2: float) -> Floats:
     found: Floats = ends.covariance + e2 * np.eye(2)
     return found
 
 
 def _by_stations(ends: Incidence, used: npt.NDArray[np.bool_], cov: Floats, e2: float, k: int) -> Floats:
-    """Covariance (k, 3, 3) of nodes from stations that are off: all axes at a node move with them, and do not scatter."""
-    W = np.linalg.inv(_with(ends, e2)) * used[:, None, None]
+    """Covariance (k, 3, 3) of nodes from stations that are off: axes that move with them do not scatter."""
+    W = _inverse2(_with(ends, e2)) * used[:, None, None]
     found = np.zeros((k, 3, 3))
+    weighed = ends.across.transpose(0, 2, 1) @ W
     for s in range(ends.response.shape[1]):
-        pulled = np.einsum("ijk,ijl,ilm,imn->ikn", ends.across, W, ends.response[:, s], ends.across)
-        total = np.zeros((k, 3, 3))
-        np.add.at(total, ends.node, pulled)
-        moved = cov @ total
+        moved = cov @ _sums(ends.node, weighed @ ends.response[:, s] @ ends.across, k)
         found += moved @ moved.transpose(0, 2, 1)
+    return found
+
+
+def _sums(node: Ints, values: Floats, k: int) -> Floats:
+    """Return the sums (k, ...) of the values of each node; rows are sorted by node."""
+    found = np.zeros((k, *values.shape[1:]))
+    if len(node):
+        first = np.flatnonzero(np.append(True, node[1:] != node[:-1]))
+        found[node[first]] = np.add.reduceat(values, first, axis=0)
     return found
 
 
 def _miss(ends: Incidence, x: Floats) -> Floats:
     """From nodes moved by x (k, 3) to the axes, across them (i, 2)."""
-    found: Floats = np.einsum("ijk,ik->ij", ends.across, ends.offsets - x[ends.node])
+    found: Floats = (ends.across @ (ends.offsets - x[ends.node])[..., None])[..., 0]
     return found
 
 
 def _share_left(ends: Incidence, cov: Floats, e2: float) -> Floats:
     """Part (i,) of an axis's variance that is left in its miss, for its node follows it."""
-    follows = np.einsum("ijk,ikl,iml->ijm", ends.across, cov[ends.node], ends.across)
-    share = 1.0 - 0.5 * np.einsum("ijk,ikj->i", np.linalg.inv(_with(ends, e2)), follows)
-    return np.nan_to_num(share, nan=1.0)
+    follows = ends.across @ cov[ends.node] @ ends.across.transpose(0, 2, 1)
+    share = 1.0 - 0.5 * np.einsum("ijk,ikj->i", _inverse2(_with(ends, e2)), follows)
+    found: Floats = np.nan_to_num(share, nan=1.0)
+    return found
 
 
 def _intersect(
     ends: Incidence, used: npt.NDArray[np.bool_], e2: float, k: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Movements (k, 3), covariances, chi squared and degrees of freedom (k,); NaN where axes fix no point."""
-    W = np.linalg.inv(_with(ends, e2)) * used[:, None, None]
-    AW = np.einsum("ijk,ijl->ikl", ends.across, W)
-    normal, right = np.zeros((k, 3, 3)), np.zeros((k, 3))
-    np.add.at(normal, ends.node, np.einsum("ikj,ijl->ikl", AW, ends.across))
-    np.add.at(right, ends.node, np.einsum("ikj,ijl,il->ik", AW, ends.across, ends.offsets))
+    W = _inverse2(_with(ends, e2)) * used[:, None, None]
+    AW = ends.across.transpose(0, 2, 1) @ W
+    normal = _sums(ends.node, AW @ ends.across, k)
+    right = _sums(ends.node, (AW @ (ends.across @ ends.offsets[..., None]))[..., 0], k)
     regular = np.linalg.eigvalsh(normal)[:, 0] > 1e-9
-    cov = np.full((k, 3, 3), np.nan)
+    cov: Floats = np.full((k, 3, 3), np.nan)
     cov[regular] = np.linalg.inv(normal[regular])
-    x = np.einsum("kij,kj->ki", cov, right)
+    x: Floats = np.einsum("kij,kj->ki", cov, right)
     miss = _miss(ends, x)
-    chi2 = np.bincount(ends.node, np.nan_to_num(np.einsum("ij,ijk,ik->i", miss, W, miss)), k)
-    freedom = 2.0 * np.bincount(ends.node[used], minlength=k) - 3.0
+    chi2 = _sums(ends.node, np.nan_to_num(np.einsum("ij,ij->i", miss, (W @ miss[..., None])[..., 0])), k)
+    freedom = 2.0 * np.bincount(ends.node[used], minlength=k).astype(np.float64) - 3.0
     return x, cov, chi2, freedom
 
 
@@ -162,7 +177,7 @@ def _eccentricity2(ends: Incidence, used: npt.NDArray[np.bool_], k: int, floor_m
 
     if excess(low) <= 0.0:
         return low
-    for _ in range(24):
+    for _ in range(14):
         middle = np.sqrt(low * high)
         low, high = (middle, high) if excess(middle) > 0.0 else (low, middle)
     return float(np.sqrt(low * high))

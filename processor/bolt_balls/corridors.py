@@ -44,7 +44,7 @@ class Gathered:
 
 @dataclass(frozen=True)
 class Corridors:
-    """Lines (m,) with what is near them: within ``reach_mm`` and from ``low`` to ``high`` along each; and their cells."""
+    """Lines (m,) and their cells: what is near is within ``reach_mm``, from ``low`` to ``high`` along the line."""
 
     points: Floats
     directions: Floats
@@ -78,18 +78,16 @@ def cells_near(points, directions, low, high, reach, cell, keys, lines, start, f
         dk = directions[m, k]
         for ck in range(int(np.floor(box_lo[k] / cell)), int(np.floor(box_hi[k] / cell)) + 1):
             t = ((ck + 0.5) * cell - points[m, k]) / dk
-            wide = slack + 0.5 * cell
             c1, c2 = points[m, i1] + t * directions[m, i1], points[m, i2] + t * directions[m, i2]
-            wide = (slack) / abs(dk)
+            wide = slack / abs(dk)
             for a in range(int(np.floor((c1 - wide) / cell)), int(np.floor((c1 + wide) / cell)) + 1):
                 if (a + 1) * cell < box_lo[i1] or a * cell > box_hi[i1]:
                     continue
                 for b in range(int(np.floor((c2 - wide) / cell)), int(np.floor((c2 + wide) / cell)) + 1):
                     if (b + 1) * cell < box_lo[i2] or b * cell > box_hi[i2]:
                         continue
-                    vk, v1, v2 = (
-                        (ck + 0.5) * cell - points[m, k], (a + 0.5) * cell - points[m, i1], (b + 0.5) * cell - points[m, i2],
-                    )  # fmt: skip
+                    vk = (ck + 0.5) * cell - points[m, k]
+                    v1, v2 = (a + 0.5) * cell - points[m, i1], (b + 0.5) * cell - points[m, i2]
                     along = vk * dk + v1 * directions[m, i1] + v2 * directions[m, i2]
                     if vk * vk + v1 * v1 + v2 * v2 - along * along > slack * slack:
                         continue
@@ -245,7 +243,8 @@ def gather(
     counts = np.zeros(count, np.int64)
     places, stations = np.empty(count * room, np.int64), np.full(count * room, -1, np.int16)
     fixed = (
-        lines.points, lines.directions, lines.low, lines.high, lines.reach_mm, CELL_MM, lines.keys, lines.spans, lines.lines,
+        lines.points, lines.directions, lines.low, lines.high, lines.reach_mm, CELL_MM, lines.keys, lines.spans,
+        lines.lines,
     )  # fmt: skip
     for coordinates, station in stretches:
         pieces: list[tuple[int, Labels, Ints, npt.NDArray[np.int16]]] = []
@@ -263,7 +262,7 @@ def gather(
 
         over_ranges(run, len(coordinates), threads, least=20_000)
         for _, *entries in pieces:
-            insert(*entries, middles, room, counts, thresholds, places, stations)
+            insert(*entries, middles, room, counts, thresholds, places, stations)  # type: ignore[call-arg]
     most_station = int(stations.max(initial=-1)) if count else -1
     over_ranges(partial(arrange, counts, room, places, stations, most_station), count, threads)
     return Gathered(room, counts, places, stations, middles, thresholds / WHOLE)

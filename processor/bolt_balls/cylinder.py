@@ -91,18 +91,18 @@ def solve(A, y, n, x, inverse, want_inverse):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def spread_of(values, n):  # type: ignore[no-untyped-def]
-    """Standard deviation of normal values by their median absolute size."""
+    """Estimate the standard deviation of normal values by their median absolute size."""
     return 1.4826 * np.median(np.abs(values[:n]))
 
 
 @njit(cache=True, nogil=True)
 def step(  # type: ignore[no-untyped-def]
-    p, h, P, U, seen, bounds, shifts, free, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, response
-):
+    p, h, P, U, seen, bounds, shifts, free, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, response,
+):  # fmt: skip
     """One Gauss-Newton step of the first ``free`` parameters over points with |z| <= h and |residual| <= cut mm.
 
-    Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where its ``station_sd`` (g,) is above 0 a
-    station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard deviation;
+    Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where its ``station_sd`` (g,) is
+    above 0 a station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard deviation;
     they are eliminated, and the inverse of the normal equations knows of them. ``response`` (g, 7, 2) gets how the
     parameters move with a movement of each station, ``sizes`` the weighted residuals.
     Returns (points used, sum of squared weighted residuals, largest movement, whether it could be solved).
@@ -227,7 +227,7 @@ def roughly(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def reach_of(p, h, P, U, seen, bounds, shifts, sigma, bins, width, span):  # type: ignore[no-untyped-def]
-    """Ends (low, high) of the stretch that lies on the cylinder, from bins of ``width`` over +-span about the middle.
+    """Find the ends of the stretch that lies on the cylinder, by bins of ``width`` over +-span about the middle.
 
     Stations are moved by ``shifts`` as in :func:`step`.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_matrix
@@ -81,7 +82,7 @@ def _crossings(lines: Lines) -> Floats:
     for own, t, end in ((i, ti, pairs[:, 0] >= m), (j, tj, pairs[:, 1] >= m)):
         past = np.where(end, t - lines.high[own], lines.low[own] - t)
         near &= (past > -INSIDE_MM) & (past < BEYOND_MM)
-    crossings = 0.5 * (on_i + on_j)[near]
+    crossings: Floats = 0.5 * (on_i + on_j)[near]
     if not len(crossings):
         return crossings
     joined = cKDTree(crossings).query_pairs(2.0 * MISS_MM, output_type="ndarray")
@@ -90,7 +91,7 @@ def _crossings(lines: Lines) -> Floats:
     count, label = connected_components(links, directed=False)
     order = np.argsort(label, kind="stable")
     bounds = np.searchsorted(label[order], np.arange(count + 1))
-    return np.array([np.median(crossings[order[a:b]], axis=0) for a, b in zip(bounds[:-1], bounds[1:], strict=True)])
+    return np.array([np.median(crossings[order[a:b]], axis=0) for a, b in pairwise(bounds.tolist())])
 
 
 def _supported(lines: Lines, starts: Floats) -> tuple[Floats, Ints]:

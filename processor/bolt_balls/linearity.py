@@ -11,7 +11,7 @@ from numba import njit
 
 from processor.bolt_balls.threads import over_ranges
 from processor.bolt_balls.voxels import SIDE, Voxels
-from processor.model import Floats
+from processor.model import Floats, Ints
 
 SMALL2, LARGE2 = 6, 17  # squared radii of the two windows, voxels
 HALO = 4
@@ -129,13 +129,14 @@ def measure(cells, means, blocks, starts, beside, ball, small, least, values, ax
                     break
 
 
-def ball(radius2: int) -> np.ndarray:
+def ball(radius2: int) -> Ints:
     """Offsets (k, 3) in voxels within a squared radius, nearest first."""
     reach = int(np.sqrt(radius2))
     every = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     square = (every**2).sum(axis=1)
     order = np.argsort(square, kind="stable")
-    return every[order[square[order] <= radius2]]
+    found: Ints = every[order[square[order] <= radius2]]
+    return found
 
 
 def linearity(voxels: Voxels, least: float, threads: int = 0) -> Linearity:

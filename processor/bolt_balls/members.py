@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -25,6 +26,8 @@ class Params:
     """How members are looked for (lengths in mm)."""
 
     kept_points: int = 2_000_000  # that members are looked for in
+    most_kept_points: int = 8_000_000  # where the first are fewer than ``per_voxel``
+    per_voxel: float = 6.0
     voxel_mm: float = 100.0
     least_in_voxel: int = 2
     least_linearity: float = 0.72
@@ -36,6 +39,7 @@ class Params:
     radii_mm: tuple[float, float] = (15.0, 110.0)  # of tubes
     incidence_tolerance_mm: float = 0.2  # mean distance from the tube at which grazing rays are left out
     bow_share: float = 0.001  # of its length that a tube may be bowed
+    largest_scatter_mm: float = 15.0  # of the axes about a node found blind
     eccentricity_floor_mm: float = 0.05
     threads: int = 0  # as many as there are
 
@@ -52,13 +56,31 @@ def find(source: Source, params: Params | None = None) -> tuple[Nodes, Tubes]:
     found = junctions.graph(lines)
     if not len(found.pairs):
         return Nodes(), Tubes()
-    return measure(source, found.nodes, found.pairs, params)
+    return _believed(*measure(source, found.nodes, found.pairs, params), params.largest_scatter_mm)
+
+
+def _believed(nodes: Nodes, tubes: Tubes, largest_scatter_mm: float) -> tuple[Nodes, Tubes]:
+    """Leave out what three axes once seemed to meet at, but do not; and tubes with neither of their nodes."""
+    kept = np.isfinite(nodes.positions).all(axis=1) & ~(nodes.scatter > largest_scatter_mm)
+    row = np.where(kept, np.cumsum(kept) - 1, -1)
+    a, b = row[tubes.node_a], row[tubes.node_b]
+    rows = np.flatnonzero((a >= 0) | (b >= 0))
+    columns = {field.name: getattr(tubes, field.name)[rows] for field in dataclasses.fields(tubes)}
+    columns |= {"node_a": a[rows], "node_b": b[rows]}
+    return Nodes(nodes.positions[kept], nodes.covariance[kept], nodes.axes[kept], nodes.scatter[kept]), Tubes(**columns)
 
 
 def rough_lines(source: Source, params: Params) -> junctions.Lines:
     """Axes of all that looks like a tube, to some mm, from a part of the points."""
-    steps = thinned(source, params.kept_points, params.threads)
-    voxels = gathered(steps, params.voxel_mm, params.least_in_voxel)
+    most = params.kept_points
+    while True:
+        steps = thinned(source, most, params.threads)
+        voxels = gathered(steps, params.voxel_mm, params.least_in_voxel)
+        # A large frame seen thinly needs more points, if there are more.
+        wanted = min(params.most_kept_points, round(3.0 * params.per_voxel * voxels.count))
+        if most >= source.count or len(steps) >= params.per_voxel * voxels.count or wanted <= most:
+            break
+        most = wanted
     linear = linearity(voxels, params.least_linearity, params.threads)
     seen = segments(voxels, linear, params.least_linearity, params.least_length_mm)
     margin = 400.0
@@ -95,7 +117,16 @@ def measure(source: Source, starts: Floats, pairs: Ints, params: Params | None =
     )  # fmt: skip
     least_cos, off = least_cosine(start, params.incidence_tolerance_mm), station_variance(start)
     fits = refined(
-        points, source.scanners, start, 0.5 * length, params.radii_mm, params.rough_points, params.bow_share, least_cos, off, params.threads
+        points,
+        source.scanners,
+        start,
+        0.5 * length,
+        params.radii_mm,
+        params.rough_points,
+        params.bow_share,
+        least_cos,
+        off,
+        params.threads,
     )
     return _nodes(fits, starts, pairs, params)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from processor.bolt_balls.linearity import HALO, SMALL2, WIDE, Linearity, ball, fill
+from processor.bolt_balls.linearity import HALO, SMALL2, WIDE, Linearity, ball, fill, principal
 from processor.bolt_balls.voxels import SIDE, Voxels
 from processor.model import Floats, Ints
 
@@ -91,24 +91,47 @@ def segments(voxels: Voxels, linear: Linearity, least: float, least_length_mm: f
     )  # fmt: skip
     rows = np.flatnonzero(linear.values >= least)
     order = rows[np.argsort(parent[rows], kind="stable")]
-    _, first, count = np.unique(parent[order], return_index=True, return_counts=True)
-    return _lines(voxels.means[order], linear.directions[order], first, count, least_length_mm)
+    _, first = np.unique(parent[order], return_index=True)
+    return _lines(voxels.means[order], np.append(first, len(order)), least_length_mm)
 
 
-def _lines(means: Floats, axes: Floats, first: Ints, count: Ints, least_length_mm: float) -> Segments:
-    enough = count >= 3
-    first, count = first[enough], count[enough]
-    points, directions = np.empty((len(first), 3)), np.empty((len(first), 3))
-    halves, spreads = np.empty(len(first)), np.empty(len(first))
-    for k, (a, n) in enumerate(zip(first.tolist(), count.tolist(), strict=True)):
-        own = means[a : a + n]
-        middle = own.mean(axis=0)
-        values, vectors = np.linalg.eigh((own - middle).T @ (own - middle) / n)
-        along = (own - middle) @ vectors[:, 2]
-        low, high = along.min(), along.max()
-        # Of both directions the one that its largest component makes positive: eigh leaves the sign open.
-        direction = vectors[:, 2] * np.sign(vectors[np.argmax(np.abs(vectors[:, 2])), 2])
-        points[k] = middle + 0.5 * (low + high) * vectors[:, 2]
-        directions[k], halves[k], spreads[k] = direction, 0.5 * (high - low), np.sqrt(values[0] + values[1])
+@njit(cache=True, nogil=True)
+def lines_of(means, starts, points, directions, halves, spreads):  # type: ignore[no-untyped-def]
+    """Fill in the line through each set of means, rows starts[k] to starts[k + 1]."""
+    for k in range(len(starts) - 1):
+        own = means[starts[k] : starts[k + 1]]
+        n = len(own)
+        middle = np.zeros(3)
+        for i in range(n):
+            for j in range(3):
+                middle[j] += own[i, j] / n
+        m = np.zeros(6)
+        for i in range(n):
+            x, y, z = own[i, 0] - middle[0], own[i, 1] - middle[1], own[i, 2] - middle[2]
+            m[0] += x * x / n
+            m[1] += y * y / n
+            m[2] += z * z / n
+            m[3] += x * y / n
+            m[4] += x * z / n
+            m[5] += y * z / n
+        l1, _, dx, dy, dz = principal(m[0], m[1], m[2], m[3], m[4], m[5])
+        low, high = np.inf, -np.inf
+        for i in range(n):
+            t = (own[i, 0] - middle[0]) * dx + (own[i, 1] - middle[1]) * dy + (own[i, 2] - middle[2]) * dz
+            low, high = min(low, t), max(high, t)
+        # Of both directions the one whose largest component is positive.
+        largest = dx if abs(dx) >= abs(dy) and abs(dx) >= abs(dz) else dy if abs(dy) >= abs(dz) else dz
+        sign = 1.0 if largest > 0.0 else -1.0
+        for j, d in enumerate((dx, dy, dz)):
+            points[k, j] = middle[j] + 0.5 * (low + high) * d
+            directions[k, j] = sign * d
+        halves[k] = 0.5 * (high - low)
+        spreads[k] = np.sqrt(max(m[0] + m[1] + m[2] - l1, 0.0))
+
+
+def _lines(means: Floats, starts: Ints, least_length_mm: float) -> Segments:
+    count = len(starts) - 1
+    points, directions, halves, spreads = np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count)
+    lines_of(means, starts, points, directions, halves, spreads)
     keep = 2.0 * halves >= least_length_mm
     return Segments(points[keep], directions[keep], halves[keep], spreads[keep])

@@ -47,11 +47,12 @@ def keep(points, threshold, kept, counts, piece, first, last):  # type: ignore[n
 
 def threshold_of(share: float) -> np.uint64:
     """Threshold below which the hashes of a share of all points lie."""
-    return np.uint64(min(max(round(share * WHOLE), 0), WHOLE))
+    found: np.uint64 = np.uint64(min(max(round(share * WHOLE), 0), WHOLE))
+    return found
 
 
 def thinned(source: Source, most: int, threads: int = 0) -> Steps:
-    """Steps (n, 3) of about ``most`` points of a source, or of all where there are fewer; in no certain order."""
+    """Return steps (n, 3) of about ``most`` points of a source, or of all if they are fewer; in no certain order."""
     threshold = threshold_of(most / max(source.count, 1))
     pieces: list[Steps] = []
     for chunk in source.chunks():

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
+from itertools import pairwise
 
 PIECES = 32  # ranges, more than threads: they do not all take the same time
 
@@ -34,5 +35,5 @@ def over_ranges(kernel: Callable[[int, int], object], count: int, threads: int =
     if threads == 1 or pieces == 1:
         kernel(0, count)
         return
-    for done in [_pool(threads).submit(kernel, a, b) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]:
+    for done in [_pool(threads).submit(kernel, a, b) for a, b in pairwise(bounds)]:
         done.result()

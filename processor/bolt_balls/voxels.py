@@ -88,13 +88,13 @@ def accumulate(steps, size, keys, sums):  # type: ignore[no-untyped-def]
 def gathered(steps: Steps, size_mm: float, least: int) -> Voxels:
     """Voxels of ``size_mm`` that hold at least ``least`` of the points given as steps (n, 3)."""
     size = round(size_mm * STEPS_PER_MM)
-    slots = 1 << 16
+    slots = 1 << max(14, int(len(steps) // 4).bit_length())
     while True:
         keys, sums = np.full(slots, EMPTY, np.int64), np.zeros((slots, 4), np.int64)
         done, _ = accumulate(steps, size, keys, sums)
         if done == len(steps):
             break
-        slots *= 4 if done * 4 < len(steps) else 2
+        slots *= 4
     rows = np.flatnonzero(sums[:, 0] >= least)
     rows = rows[np.argsort(keys[rows])]
     keys, sums = keys[rows], sums[rows]
