@@ -1,11 +1,14 @@
 """Where axes meet: nodes from the lines of their tubes, with what their scatter says of eccentric joints."""
 
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 
 from processor.model import Floats, Ints
 
@@ -68,24 +71,11 @@ def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> M
     its own axes' scatter; as far as their number tells.
     """
     k = len(starts)
-    used = np.ones(len(ends.node), bool)
-    e2 = floor_mm**2
+    e2 = _at_first(ends, k, floor_mm)
+    # Twice from the start: an axis that was left out while the eccentricity was not known yet may come back.
+    for _ in range(2):
+        used, e2 = _agreeing(ends, e2, k, floor_mm, rounds)
     x, cov, chi2, freedom = _intersect(ends, used, e2, k)
-    for _ in range(rounds):
-        miss = _miss(ends, x)
-        size = np.einsum("ij,ijk,ik->i", miss, _inverse2(_with(ends, e2)), miss)
-        count = np.bincount(ends.node[used], minlength=k)
-        # The worst axis of a node goes first; the others may agree without it.
-        own = np.where(used, size / np.maximum(_share_left(ends, cov, e2), 0.1), 0.0)
-        own = np.nan_to_num(own)
-        worst = np.zeros(k)
-        np.maximum.at(worst, ends.node, own)
-        out = used & (own > CUT_SIGMAS**2) & (own == worst[ends.node]) & (count[ends.node] > 2)
-        used &= ~out
-        e2 = max(_eccentricity2(ends, used, k, floor_mm), floor_mm**2)
-        x, cov, chi2, freedom = _intersect(ends, used, e2, k)
-        if not out.any():
-            break
     grown = (PRIOR_FREEDOM + chi2) / (PRIOR_FREEDOM + np.maximum(freedom, 0.0))
     count = np.bincount(ends.node[used], minlength=k)
     square = np.bincount(ends.node[used], (_miss(ends, x)[used] ** 2).sum(axis=1), k)
@@ -93,6 +83,45 @@ def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> M
         scatter = np.where(count > 1, np.sqrt(square / count), np.nan)
     whole = cov * grown[:, None, None] + _by_stations(ends, used, cov, e2, k)
     return Meeting(starts + x, whole, count, scatter, used, float(np.sqrt(e2)))
+
+
+def _agreeing(ends: Incidence, e2: float, k: int, floor_mm: float, rounds: int) -> tuple[npt.NDArray[np.bool_], float]:
+    """Which axes agree with the others of their node, and the eccentricity's variance by those."""
+    used = np.ones(len(ends.node), bool)
+    for _ in range(rounds):
+        x, cov, _, _ = _intersect(ends, used, e2, k)
+        miss = _miss(ends, x)
+        size = np.einsum("ij,ijk,ik->i", miss, _inverse2(_with(ends, e2)), miss)
+        count = np.bincount(ends.node[used], minlength=k)
+        # The worst axis of a node goes first; the others may agree without it.
+        own = np.nan_to_num(np.where(used, size / np.maximum(_share_left(ends, cov, e2), 0.1), 0.0))
+        worst = np.zeros(k)
+        np.maximum.at(worst, ends.node, own)
+        out = used & (own > CUT_SIGMAS**2) & (own == worst[ends.node]) & (count[ends.node] > 2)
+        used &= ~out
+        e2 = max(_eccentricity2(ends, used, k, floor_mm), floor_mm**2)
+        if not out.any():
+            break
+    return used, e2
+
+
+def _at_first(ends: Incidence, k: int, floor_mm: float) -> float:
+    """Variance of the eccentricity by the median miss, of nodes that heed strangers little."""
+    weight: Floats = np.ones(len(ends.node))
+    scale2 = 0.0
+    for _ in range(5):
+        x, _, _, _ = _intersect(ends, weight, floor_mm**2, k)
+        miss = _miss(ends, x)
+        size2 = np.nan_to_num((miss**2).sum(axis=1))
+        several = np.bincount(ends.node, minlength=k)[ends.node] > 2
+        if not several.any():
+            return floor_mm**2
+        # The median square of two normal numbers is 2 ln 2; and a node of n axes takes 3 of 2 n numbers with it.
+        count = np.bincount(ends.node, minlength=k)
+        left = 1.0 - 1.5 * (count > 2).sum() / count[count > 2].sum()
+        scale2 = max(float(np.median(size2[several])) / (2.0 * np.log(2.0) * left), floor_mm**2)
+        weight = 1.0 / (1.0 + size2 / (4.0 * scale2))
+    return scale2
 
 
 def _inverse2(M: Floats) -> Floats:
@@ -109,27 +138,32 @@ def _with(ends: Incidence, e2: float) -> Floats:
 
 def _by_stations(ends: Incidence, used: npt.NDArray[np.bool_], cov: Floats, e2: float, k: int) -> Floats:
     """Covariance (k, 3, 3) of nodes from stations that are off: axes that move with them do not scatter."""
-    W = _inverse2(_with(ends, e2)) * used[:, None, None]
+    weighed = ends.across.transpose(0, 2, 1) @ (_inverse2(_with(ends, e2)) * used[:, None, None])
     found = np.zeros((k, 3, 3))
-    weighed = ends.across.transpose(0, 2, 1) @ W
     for s in range(ends.response.shape[1]):
-        moved = cov @ _sums(ends.node, weighed @ ends.response[:, s] @ ends.across, k)
+        total = np.zeros((k, 3, 3))
+        add_responses(ends.node, weighed, ends.response[:, s], ends.across, total)
+        moved = cov @ total
         found += moved @ moved.transpose(0, 2, 1)
     return found
 
 
-def _sums(node: Ints, values: Floats, k: int) -> Floats:
-    """Return the sums (k, ...) of the values of each node; rows are sorted by node."""
-    found = np.zeros((k, *values.shape[1:]))
-    if len(node):
-        first = np.flatnonzero(np.append(True, node[1:] != node[:-1]))
-        found[node[first]] = np.add.reduceat(values, first, axis=0)
-    return found
+@njit(cache=True, nogil=True)
+def add_responses(node, weighed, response, across, total):  # type: ignore[no-untyped-def]
+    """Add weighed (i, 3, 2) @ response (i, 2, 2) @ across (i, 2, 3) of every end to its node's total (k, 3, 3)."""
+    for i in range(len(node)):
+        if not response[i].any():
+            continue
+        for a in range(3):
+            for c in range(2):
+                v = weighed[i, a, 0] * response[i, 0, c] + weighed[i, a, 1] * response[i, 1, c]
+                for b in range(3):
+                    total[node[i], a, b] += v * across[i, c, b]
 
 
 def _miss(ends: Incidence, x: Floats) -> Floats:
     """From nodes moved by x (k, 3) to the axes, across them (i, 2)."""
-    found: Floats = (ends.across @ (ends.offsets - x[ends.node])[..., None])[..., 0]
+    found: Floats = np.einsum("ijk,ik->ij", ends.across, ends.offsets - x[ends.node])
     return found
 
 
@@ -142,21 +176,46 @@ def _share_left(ends: Incidence, cov: Floats, e2: float) -> Floats:
 
 
 def _intersect(
-    ends: Incidence, used: npt.NDArray[np.bool_], e2: float, k: int
+    ends: Incidence, used: npt.NDArray[np.bool_] | Floats, e2: float, k: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Movements (k, 3), covariances, chi squared and degrees of freedom (k,); NaN where axes fix no point."""
     W = _inverse2(_with(ends, e2)) * used[:, None, None]
-    AW = ends.across.transpose(0, 2, 1) @ W
-    normal = _sums(ends.node, AW @ ends.across, k)
-    right = _sums(ends.node, (AW @ (ends.across @ ends.offsets[..., None]))[..., 0], k)
+    normal, right, chi2 = np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros(k)
+    add_ends(ends.node, ends.offsets, ends.across, W, normal, right)
     regular = np.linalg.eigvalsh(normal)[:, 0] > 1e-9
     cov: Floats = np.full((k, 3, 3), np.nan)
     cov[regular] = np.linalg.inv(normal[regular])
     x: Floats = np.einsum("kij,kj->ki", cov, right)
-    miss = _miss(ends, x)
-    chi2 = _sums(ends.node, np.nan_to_num(np.einsum("ij,ij->i", miss, (W @ miss[..., None])[..., 0])), k)
-    freedom = 2.0 * np.bincount(ends.node[used], minlength=k).astype(np.float64) - 3.0
+    add_squares(ends.node, _miss(ends, x), W, chi2)
+    freedom = 2.0 * np.bincount(ends.node[used > 0.0], minlength=k).astype(np.float64) - 3.0
     return x, cov, chi2, freedom
+
+
+@njit(cache=True, nogil=True)
+def add_ends(node, offsets, across, W, normal, right):  # type: ignore[no-untyped-def]
+    """Add what every end tells to the normal equations of its node; W (i, 2, 2) are the weights."""
+    for i in range(len(node)):
+        k = node[i]
+        for a in range(2):
+            along = 0.0
+            for c in range(3):
+                along += across[i, a, c] * offsets[i, c]
+            for b in range(2):
+                for c in range(3):
+                    v = W[i, b, a] * across[i, b, c]
+                    right[k, c] += v * along
+                    for d in range(3):
+                        normal[k, c, d] += v * across[i, a, d]
+
+
+@njit(cache=True, nogil=True)
+def add_squares(node, miss, W, chi2):  # type: ignore[no-untyped-def]
+    """Add the weighted square of every end's miss to that of its node; a miss that is not known counts for nothing."""
+    for i in range(len(node)):
+        x, y = miss[i, 0], miss[i, 1]
+        v = W[i, 0, 0] * x * x + 2.0 * W[i, 0, 1] * x * y + W[i, 1, 1] * y * y
+        if np.isfinite(v):
+            chi2[node[i]] += v
 
 
 def _eccentricity2(ends: Incidence, used: npt.NDArray[np.bool_], k: int, floor_mm: float) -> float:

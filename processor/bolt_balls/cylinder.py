@@ -102,9 +102,9 @@ def step(  # type: ignore[no-untyped-def]
     """One Gauss-Newton step of the first ``free`` parameters over points with |z| <= h and |residual| <= cut mm.
 
     Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where its ``station_sd`` (g,) is
-    above 0 a station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard deviation;
-    they are eliminated, and the inverse of the normal equations knows of them. ``response`` (g, 7, 2) gets how the
-    parameters move with a movement of each station, ``sizes`` the weighted residuals.
+    above 0 a station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard
+    deviation; they are eliminated, and the inverse of the normal equations knows of them. ``response`` (g, 7, 2) gets
+    how the parameters move with a movement of each station, ``sizes`` the weighted residuals.
     Returns (points used, sum of squared weighted residuals, largest movement, whether it could be solved).
     """
     groups = len(bounds) - 1

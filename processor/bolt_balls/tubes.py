@@ -120,10 +120,11 @@ def least_cosine(start: Rough, tolerance_mm: float) -> float:
 
     A beam as wide as a good part of a tube meets its edge with a part of itself, and such points lie off the tube.
     """
-    number, total, _ = start.by_incidence[start.ok].sum(axis=0).T
-    mean = np.abs(total / np.maximum(number, 1.0))
+    number, total, square = start.by_incidence[start.ok].sum(axis=0).T
+    number = np.maximum(number, 1.0)
+    mean, noise = np.abs(total / number), np.sqrt(square) / number
     last = round((ROUGH_COS - GRAZING_COS) * 10.0)
-    while last > 0 and mean[last - 1] < tolerance_mm:
+    while last > 0 and mean[last - 1] < tolerance_mm + 2.0 * noise[last - 1]:
         last -= 1
     return GRAZING_COS + 0.1 * last
 
