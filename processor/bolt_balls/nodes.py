@@ -1,0 +1,60 @@
+"""Records of what is known of a frame's members and nodes before any ball is fitted."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.model import Checked, Floats, Ints, column
+
+
+@dataclass(frozen=True)
+class Nodes(Checked):
+    """Nodes as the axes of their tubes give them: mm, less the origin of the source.
+
+    ``covariance`` is that of the point where the axes meet, with what the axes' scatter says of eccentric joints.
+    Fewer than three axes is weak evidence: such a node needs a ball to be believed.
+    """
+
+    positions: Floats = column("k", 3)
+    covariance: Floats = column("k", 3, 3)
+    axes: Ints = column("k", dtype=np.int64)  # that the position rests on
+    scatter: Floats = column("k")  # distance of the axes from the position, rms, mm; NaN for one axis
+
+    @property
+    def count(self) -> int:
+        """Nodes in all."""
+        return len(self.positions)
+
+
+@dataclass(frozen=True)
+class Tubes(Checked):
+    """Tubes of members: the straight line through the ends of each cylinder, and its bow beside it; mm.
+
+    ``points`` are the middles of that line, ``directions`` run from node a to node b, ``side`` is a unit vector across
+    and the other one is ``directions x side``. With t along the direction from the middle, the axis is at
+
+        point + t direction + (1 - (2 t / length)^2) (bow[0] side + bow[1] other).
+
+    ``covariance`` is of (offset along side, offset along other, turn along side, turn along other, radius): the line at
+    t moves across by offset + t turn, mm and rad.
+    """
+
+    points: Floats = column("m", 3)
+    directions: Floats = column("m", 3)
+    side: Floats = column("m", 3)
+    lengths: Floats = column("m")  # of the cylinder
+    radii: Floats = column("m")
+    bow: Floats = column("m", 2)
+    covariance: Floats = column("m", 5, 5)
+    node_a: Ints = column("m", dtype=np.int64)  # rows of Nodes; -1 = none
+    node_b: Ints = column("m", dtype=np.int64)
+    count: Ints = column("m", dtype=np.int64)  # points that the fit rests on
+    rms: Floats = column("m")  # of their residuals, along the ray where scanners are known, mm
+
+    @property
+    def other(self) -> Floats:
+        """The second unit vectors (m, 3) across."""
+        found: Floats = np.cross(self.directions, self.side)
+        return found
