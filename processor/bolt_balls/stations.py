@@ -29,6 +29,7 @@ ROUNDS = 3
 STEEPEST = 0.3  # cosine of incidence: beyond it the beam is split at the limb
 FIRST_CUT_MM, CUT = 15.0, 4.685  # Tukey's biweight: of the first round, then in scales
 BOW_SHARE = 0.6e-3  # of a tube's length: prior sd of its bow; uniform up to L/1000 has this one
+SCATTER = 0.661  # mean of psi squared over that of the weights, of the biweight under normal noise
 LOOSE_MM = 1e3  # prior sd of a tube's own axis and radius: next to none
 OFF_MM = 0.3  # an observation that lies off by so much is what the score looks for
 DOUBT = 3.0  # differences beyond this many times their mean lose weight
@@ -224,6 +225,7 @@ def _scales(seen: Floats, station: Ints, before: Floats, tubes: int) -> Floats:
 def _judged(differs: Floats, shared: Bools, weight: Floats, floor: float) -> tuple[Floats, float]:
     """Weights (q,) of observations, and the variance of what they lie off beyond noise, by their scores (q, 3)."""
     score, mean, growth = differs.T
+    mean = SCATTER * mean
     ratio = np.where(shared & (mean > 0.0), score / np.maximum(mean, 1e-300), 0.0)
     new = np.minimum(1.0, DOUBT / np.sqrt(np.maximum(ratio, 1e-300)))
     good = shared & (ratio < DOUBT**2) & (mean > 0.0)
