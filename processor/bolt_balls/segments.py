@@ -1,0 +1,110 @@
+"""Straight stretches: linear voxels that continue each other, joined, and the line through each such set."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from processor.bolt_balls.linearity import HALO, SMALL2, WIDE, Linearity, ball, fill
+from processor.bolt_balls.voxels import SIDE, Voxels
+from processor.model import Floats, Ints
+
+MOST_TURN = np.cos(np.deg2rad(12.0))  # between the axes of two windows of one tube
+MOST_APART = 0.45  # voxels, that the mean of one window may lie off the axis of another: they are both on the tube
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Lines (s,): ``points`` in the middle of what was seen, unit ``directions``, ``halves`` of the length seen, mm.
+
+    ``spreads`` are rms distances of the voxels from the line.
+    """
+
+    points: Floats
+    directions: Floats
+    halves: Floats
+    spreads: Floats
+
+    @property
+    def count(self) -> int:
+        """Segments in all."""
+        return len(self.points)
+
+
+@njit(cache=True, nogil=True)
+def root_of(parent, i):  # type: ignore[no-untyped-def]
+    """Root of a set, halving the path to it."""
+    while parent[i] != i:
+        parent[i] = parent[parent[i]]
+        i = parent[i]
+    return i
+
+
+@njit(cache=True, nogil=True)
+def join(cells, blocks, starts, beside, offsets, values, axes, centres, least, turn, apart, parent):  # type: ignore[no-untyped-def]
+    """Join linear voxels near each other whose windows lie on one line; a set's root is its first voxel."""
+    local = np.empty((WIDE, WIDE, WIDE), np.int32)
+    for block in range(len(blocks)):
+        fill(local, block, cells, blocks, starts, beside)
+        for i in range(starts[block], starts[block + 1]):
+            if values[i] < least:
+                continue
+            x = cells[i, 0] - blocks[block, 0] * SIDE + HALO
+            y = cells[i, 1] - blocks[block, 1] * SIDE + HALO
+            z = cells[i, 2] - blocks[block, 2] * SIDE + HALO
+            for k in range(len(offsets)):
+                j = local[x + offsets[k, 0], y + offsets[k, 1], z + offsets[k, 2]]
+                if j <= i or values[j] < least:
+                    continue
+                cos = axes[i, 0] * axes[j, 0] + axes[i, 1] * axes[j, 1] + axes[i, 2] * axes[j, 2]
+                if abs(cos) < turn:
+                    continue
+                sign = 1.0 if cos > 0.0 else -1.0
+                ux, uy, uz = axes[i, 0] + sign * axes[j, 0], axes[i, 1] + sign * axes[j, 1], axes[i, 2] + sign * axes[j, 2]
+                dx, dy, dz = centres[j, 0] - centres[i, 0], centres[j, 1] - centres[i, 1], centres[j, 2] - centres[i, 2]
+                along = dx * ux + dy * uy + dz * uz
+                off2 = dx * dx + dy * dy + dz * dz - along * along / (ux * ux + uy * uy + uz * uz)
+                if off2 > apart * apart:
+                    continue
+                a, b = root_of(parent, i), root_of(parent, j)
+                if a < b:
+                    parent[b] = a
+                elif b < a:
+                    parent[a] = b
+    for i in range(len(parent)):
+        parent[i] = root_of(parent, i)
+
+
+def segments(voxels: Voxels, linear: Linearity, least: float, least_length_mm: float) -> Segments:
+    """Join the voxels whose linearity is at least ``least``; lines shorter than ``least_length_mm`` are left out."""
+    parent = np.arange(voxels.count)
+    join(
+        voxels.cells, voxels.blocks, voxels.starts, voxels.beside, ball(SMALL2)[1:], linear.values, linear.directions,
+        linear.means, least, MOST_TURN, MOST_APART * voxels.size_mm, parent,
+    )  # fmt: skip
+    rows = np.flatnonzero(linear.values >= least)
+    order = rows[np.argsort(parent[rows], kind="stable")]
+    _, first, count = np.unique(parent[order], return_index=True, return_counts=True)
+    return _lines(voxels.means[order], linear.directions[order], first, count, least_length_mm)
+
+
+def _lines(means: Floats, axes: Floats, first: Ints, count: Ints, least_length_mm: float) -> Segments:
+    enough = count >= 3
+    first, count = first[enough], count[enough]
+    points, directions = np.empty((len(first), 3)), np.empty((len(first), 3))
+    halves, spreads = np.empty(len(first)), np.empty(len(first))
+    for k, (a, n) in enumerate(zip(first.tolist(), count.tolist(), strict=True)):
+        own = means[a : a + n]
+        middle = own.mean(axis=0)
+        values, vectors = np.linalg.eigh((own - middle).T @ (own - middle) / n)
+        along = (own - middle) @ vectors[:, 2]
+        low, high = along.min(), along.max()
+        # Of both directions the one that its largest component makes positive: eigh leaves the sign open.
+        direction = vectors[:, 2] * np.sign(vectors[np.argmax(np.abs(vectors[:, 2])), 2])
+        points[k] = middle + 0.5 * (low + high) * vectors[:, 2]
+        directions[k], halves[k], spreads[k] = direction, 0.5 * (high - low), np.sqrt(values[0] + values[1])
+    keep = 2.0 * halves >= least_length_mm
+    return Segments(points[keep], directions[keep], halves[keep], spreads[keep])
