@@ -1,9 +1,9 @@
 """Compiled kernels of the stations' self-registration: points of tubes against their axes, and the normal equations.
 
-A tube's unknowns, in this order: offsets of its axis along e1 and e2 at the middle of what is seen, how far the axis
-leaves it at the end of what is seen (zeta = 1), again along e1 and e2, its radius, and its bow along e1 and e2 as the
-factor of zeta^2 - 1/3; all mm. All sums run over one tube or one observation in the points' order: no answer depends
-on the threads.
+What an observation tells of, in this order: offsets of a tube's axis along e1 and e2 at the middle of what is seen, how
+far the axis leaves it at the end of what is seen (zeta = 1), again along e1 and e2, bow along e1 and e2 as the factor of
+zeta^2 - 1/3, radius, and the offset of the ranges; all mm. The last is the station's alone. All sums run over one tube
+or one observation in the points' order: no answer depends on the threads.
 """
 # Numba infers the types of the arguments: they stay without annotations.
 
@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numba import njit, prange
 
-TUBE = 7  # unknowns of a tube
-STATION = 6  # of a station: turn about its own place, translation
+TUBE = 8  # what an observation tells of; a tube has the first seven
+STATION = 7  # unknowns of a station: turn about its own place, translation, offset of its ranges
+MOVED = (0, 1, 2, 3, 7)  # of what an observation tells of, what follows the station
 ASIDE = 0.01  # variance of the noise across the ray over that along it
 
 
@@ -43,12 +44,12 @@ def grouped(tube_start, station, stations):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def residuals(points, start, tube, station, T, scanners, axis, e1, e2, half, radius, steepest):  # type: ignore[no-untyped-def]
+def residuals(points, start, tube, station, T, offset, scanners, axis, e1, e2, half, radius, steepest):  # type: ignore[no-untyped-def]
     """Residual, cosine, normal along e1 and e2, and zeta of each point of observations ``start`` (q + 1,).
 
     The residual is the measured range less the one at which the ray meets the tube, and cosine that of its incidence
     there; a ray that meets the tube more steeply than ``steepest``, or not at all, gets the cosine 0. Points and
-    scanners are moved by their station's T (s, 4, 4) before.
+    scanners are moved by their station's T (s, 4, 4) before, and ranges are less its offset (s,).
     """
     found = np.zeros((len(points), 5))
     for q in prange(len(start) - 1):
@@ -86,7 +87,7 @@ def residuals(points, start, tube, station, T, scanners, axis, e1, e2, half, rad
             cosine = -(n1 * u1 + n2 * u2)
             if cosine < steepest:
                 continue
-            found[i, 0], found[i, 1] = length - t, cosine
+            found[i, 0], found[i, 1] = length - offset[s] - t, cosine
             # zeta is the model's, too: the noise of the range must not enter the weights
             found[i, 2], found[i, 3] = n1, n2
             found[i, 4] = zeta + (t - length) / length * ((px - ox) * dx + (py - oy) * dy + (pz - oz) * dz) / half[j]
@@ -95,7 +96,7 @@ def residuals(points, start, tube, station, T, scanners, axis, e1, e2, half, rad
 
 @njit(cache=True, nogil=True, parallel=True)
 def observations(seen, start, station, scale, cut):  # type: ignore[no-untyped-def]
-    """Information N (q, 7, 7) and N y (q, 7) of a tube's unknowns from each observation, and its count of points.
+    """Information N (q, 8, 8) and N y (q, 8) from each observation, and its count of points.
 
     The normal distance -residual * cosine is a linear function of the unknowns. Noise along the ray moves it by cosine
     times ``scale`` (s,), its station's, and a little more: angles are not exact. Tukey's biweight with ``cut`` scales.
@@ -113,7 +114,9 @@ def observations(seen, start, station, scale, cut):  # type: ignore[no-untyped-d
             w = (1.0 - v * v) ** 2 / (sigma * sigma * (cosine * cosine + ASIDE))
             n1, n2, zeta = seen[i, 2], seen[i, 3], seen[i, 4]
             arch = zeta * zeta - 1.0 / 3.0
-            f[0], f[1], f[2], f[3], f[4], f[5], f[6] = n1, n2, zeta * n1, zeta * n2, 1.0, arch * n1, arch * n2
+            f[0], f[1], f[2], f[3], f[4], f[5], f[6], f[7] = (
+                n1, n2, zeta * n1, zeta * n2, arch * n1, arch * n2, 1.0, cosine,
+            )  # fmt: skip
             distance = -seen[i, 0] * cosine
             for a in range(TUBE):
                 b[q, a] += w * f[a] * distance
@@ -178,7 +181,7 @@ def product(A, B):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def arm(axis, e1, e2, half, place):  # type: ignore[no-untyped-def]
-    """How a tube's offsets and slopes (7, 6) change with a small motion about ``place`` of the points on it."""
+    """How what an observation tells of (8, 7) changes with its station's unknowns, turned about ``place``."""
     G = np.zeros((TUBE, STATION))
     mx, my, mz = axis[0] - place[0], axis[1] - place[1], axis[2] - place[2]
     for k in range(2):
@@ -188,6 +191,7 @@ def arm(axis, e1, e2, half, place):  # type: ignore[no-untyped-def]
         G[k, 3], G[k, 4], G[k, 5] = ex, ey, ez
         dx, dy, dz = half * axis[3], half * axis[4], half * axis[5]
         G[2 + k, 0], G[2 + k, 1], G[2 + k, 2] = dy * ez - dz * ey, dz * ex - dx * ez, dx * ey - dy * ex
+    G[7, 6] = 1.0
     return G
 
 
@@ -209,9 +213,9 @@ def with_floor(N, b, floor):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def reduced(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, prior):  # type: ignore[no-untyped-def]
-    """Normal matrix (6 s, 6 s) and right side (6 s,) of the stations, the tubes eliminated one after another.
+    """Normal matrix (7 s, 7 s) and right side (7 s,) of the stations, the tubes eliminated one after another.
 
-    An observation sees the tube's unknowns less the station's motion: y = a_j - G x_s. ``prior`` (m, 7) is the
+    An observation sees the tube's unknowns less the station's motion: y = a_j - G x_s. ``prior`` (m, 8) is the
     information on each tube's own unknowns.
     """
     size = STATION * len(places)
@@ -234,7 +238,7 @@ def reduced(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, 
             for a in range(TUBE):
                 for c in range(STATION):
                     value = 0.0
-                    for k in range(4):
+                    for k in MOVED:
                         value += M[a, k] * G[o, k, c]
                     K[a, STATION * o + c] = value
         L = cholesky(A)
@@ -247,14 +251,14 @@ def reduced(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, 
             at = STATION * station[first + o]
             for c in range(STATION):
                 value = 0.0
-                for k in range(4):
+                for k in MOVED:
                     value -= G[o, k, c] * own[o, k]
                 for k in range(TUBE):
                     value += K[k, STATION * o + c] * S[k, STATION * number]
                 g[at + c] += value
                 for d in range(STATION):
                     value = 0.0
-                    for k in range(4):
+                    for k in MOVED:
                         value += G[o, k, c] * K[k, STATION * o + d]
                     H[at + c, at + d] += value
             for p in range(number):
@@ -270,7 +274,7 @@ def reduced(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, 
 
 @njit(cache=True, nogil=True, parallel=True)
 def tubes(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, prior, x, off):  # type: ignore[no-untyped-def]
-    """Unknowns (m, 7) of the tubes given the stations' motions x (6 s,), and how each observation differs from them.
+    """Unknowns (m, 8) of the tubes given the stations' x (7 s,), and how each observation differs from them.
 
     The difference (q, 3) is the score statistic of an observation that lies off by ``off`` (variance, mm^2) along e1
     and e2, u' (N + 1/off)^-1 u of u = N (y - a + G x); what it is on average if none does; and how much this grows
@@ -287,11 +291,11 @@ def tubes(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, pr
             G = arm(axis[j], e1[j], e2[j], half[j], places[station[q]])
             A += weight[q] * M
             moved = np.zeros(TUBE)
-            for k in range(4):
+            for k in MOVED:
                 for c in range(STATION):
                     moved[k] += G[k, c] * x[STATION * station[q] + c]
             for a in range(TUBE):
-                for k in range(4):
+                for k in MOVED:
                     y[a] += M[a, k] * moved[k]
             total += weight[q] * y
         L = cholesky(A)
@@ -303,7 +307,7 @@ def tubes(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, pr
             M, y = with_floor(N[q], b[q], floor)
             G = arm(axis[j], e1[j], e2[j], half[j], places[station[q]])
             rest = -a
-            for k in range(4):
+            for k in MOVED:
                 for c in range(STATION):
                     rest[k] += G[k, c] * x[STATION * station[q] + c]
             u0, u1 = y[0], y[1]
@@ -344,6 +348,7 @@ def effect(points, influence, places, covariance):  # type: ignore[no-untyped-de
                 # a . (w x p) = w . (p x a)
                 rows[number, d, 0], rows[number, d, 1], rows[number, d, 2] = y * c - z * b, z * a - x * c, x * b - y * a
                 rows[number, d, 3], rows[number, d, 4], rows[number, d, 5] = a, b, c
+                rows[number, d, 6] = (x * a + y * b + z * c) / max(np.sqrt(x * x + y * y + z * z), 1e-300)
             stations[number] = s
             number += 1
         for p in range(number):
@@ -359,4 +364,20 @@ def effect(points, influence, places, covariance):  # type: ignore[no-untyped-de
                             for j in range(STATION):
                                 value += rows[p, d, i] * block[i, j] * rows[q, e, j]
                         found[k, d, e] += value
+    return found
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def corrected(points, station, places, offset, T):  # type: ignore[no-untyped-def]
+    """Points (n, 3) less their station's range offset, then moved by its T; in sums a coordinate, never as a product."""
+    found = points.copy()
+    for i in prange(len(points)):
+        s = station[i]
+        if s < 0 or s >= len(places):
+            continue
+        x, y, z = points[i, 0] - places[s, 0], points[i, 1] - places[s, 1], points[i, 2] - places[s, 2]
+        shorter = offset[s] / max(np.sqrt(x * x + y * y + z * z), 1e-300)
+        x, y, z = points[i, 0] - shorter * x, points[i, 1] - shorter * y, points[i, 2] - shorter * z
+        for k in range(3):
+            found[i, k] = T[s, k, 0] * x + T[s, k, 1] * y + T[s, k, 2] * z + T[s, k, 3]
     return found

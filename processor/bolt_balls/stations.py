@@ -30,6 +30,7 @@ STEEPEST = 0.3  # cosine of incidence: beyond it the beam is split at the limb
 FIRST_CUT_MM, CUT = 15.0, 4.685  # Tukey's biweight: of the first round, then in scales
 BOW_SHARE = 0.6e-3  # of a tube's length: prior sd of its bow; uniform up to L/1000 has this one
 SCATTER = 0.661  # mean of psi squared over that of the weights, of the biweight under normal noise
+FIXED = 1e12  # information on what a tube does not have
 LOOSE_MM = 1e3  # prior sd of a tube's own axis and radius: next to none
 OFF_MM = 0.3  # an observation that lies off by so much is what the score looks for
 DOUBT = 3.0  # differences beyond this many times their mean lose weight
@@ -55,10 +56,12 @@ class TubePoints:
 class Stations(Checked):
     """Corrections of all stations, and what remains uncertain after they are applied.
 
-    ``T_project_station`` (s, 4, 4) maps a point of a station, in the project's frame as registered less the origin, to
-    where it belongs. ``covariance`` (6 s, 6 s) is of (turn about x, y, z through ``places`` (s, 3), translation) of
-    each station in turn, rad and mm: T = exp(xi) T. It holds both what is left between the stations and the motion that
-    all have in common.
+    Off the ranges of a station goes its ``range_offset``; then ``T_project_station`` (s, 4, 4) maps its points, in the
+    project's frame as registered less the origin, to where they belong: see :meth:`corrected`.
+
+    ``covariance`` (7 s, 7 s) is of each station's (turn about x, y, z through ``places`` (s, 3), translation, range
+    offset) in turn; rad and mm, T = exp(xi) T. It holds both what is left between the stations and the motion that all
+    have in common; NaN where nothing tells of it.
     """
 
     status: str  # ok | weak | single | unknown
@@ -68,6 +71,8 @@ class Stations(Checked):
     covariance: Floats = column("p", "p")
     before_mm: float = float("nan")  # sd of a station's translation along an axis, as registered
     before_rad: float = float("nan")  # and of its turn
+    range_offset: Floats = column("s")  # of a station's ranges, mm
+    range_offset_sd: float = float("nan")  # of all stations, as scanned
     observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
     weak: tuple[str, ...] = names("s")  # which motions of a station the tubes do not tell; empty = all told
     range_sd: Floats = column("s")  # scale of the residuals along the ray, mm
@@ -75,19 +80,31 @@ class Stations(Checked):
     axis_points: Floats = column("m", 3)  # of the tubes after the corrections, and their directions and radii
     axis_directions: Floats = column("m", 3)
     axis_radii: Floats = column("m")
-    datum: str = ""
+    datum: str = ""  # what says where all stations together lie, and how well
 
-    def effect(self, points: Floats, influence: Floats) -> Floats:
+    def corrected(self, points: Floats, station: Labels) -> Floats:
+        """Return points (n, 3) of stations (n,), less the origin, where they belong; those of station -1 unmoved."""
+        return kernels.corrected(  # type: ignore[no-any-return]
+            np.ascontiguousarray(points), station, self.places, self.range_offset, self.T_project_station
+        )
+
+    def effect(self, points: Floats, influence: Floats, relative: bool = False) -> Floats:
         """Covariance (k, d, d) that the stations add to estimates near points (k, 3).
 
         ``influence`` is how an estimate follows the stations' points: (k, s) weights adding up to 1 for centres that
         move as the weighted mean of the stations does, or (k, s, d, 3) derivatives by a shift of a station's points at
-        the place, for d parameters each.
+        the place, for d parameters each. ``relative`` leaves out what all stations have in common (:meth:`common`).
         """
         if influence.ndim == 2:
             influence = influence[:, :, None, None] * np.eye(3)
+        covariance = self.covariance
+        if relative and np.isfinite(self.before_mm):
+            own = np.eye(len(covariance)) - kernels.product(
+                common_motion(self.places), mean_gain(common_motion(self.places), self._precision())
+            )
+            covariance = kernels.product(kernels.product(own, covariance), np.ascontiguousarray(own.T))
         found: Floats = kernels.effect(
-            np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, self.covariance
+            np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance
         )
         return found
 
@@ -98,10 +115,13 @@ class Stations(Checked):
         """
         if not np.isfinite(self.before_mm):
             return self.covariance[:6, :6].copy()
-        precision = np.tile(np.repeat([self.before_rad**-2, self.before_mm**-2], 3), len(self.places))
-        gain = mean_gain(common_motion(self.places - place), precision)
+        gain = mean_gain(common_motion(self.places - place), self._precision())
         found: Floats = kernels.product(kernels.product(gain, self.covariance), np.ascontiguousarray(gain.T))
         return found
+
+    def _precision(self) -> Floats:
+        one = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
+        return np.tile(one, len(self.places))
 
 
 @dataclass(frozen=True)
@@ -144,13 +164,13 @@ def register(
         )  # fmt: skip
     ordered = np.ascontiguousarray(points.points[order])
     tubes = _tubes(ordered, np.append(start[tube_obs[:-1]], start[-1]), axis_points, axis_directions, radii)
-    x, weight, floor = np.zeros(6 * count), np.ones(len(used)), 0.0
+    x, weight, floor = np.zeros(kernels.STATION * count), np.ones(len(used)), 0.0
     posterior = Posterior(scanners, control)
     scale = np.full(count, FIRST_CUT_MM / CUT)
     of_point = np.repeat(station, np.diff(start))
     for turn in range(ROUNDS):
         seen = kernels.residuals(
-            ordered, start, tube, station, corrections(x, scanners), scanners, tubes.axis, tubes.e1, tubes.e2,
+            ordered, start, tube, station, corrections(x, scanners), x[6 :: kernels.STATION], scanners, tubes.axis, tubes.e1, tubes.e2,
             tubes.half, tubes.radius, STEEPEST,
         )  # fmt: skip
         if turn:
@@ -199,12 +219,13 @@ def _moved(tubes: _Tubes, unknown: Floats) -> _Tubes:
     along = tubes.axis[:, 3:] + (s1 * tubes.e1 + s2 * tubes.e2) / tubes.half[:, None]
     along /= np.linalg.norm(along, axis=1)[:, None]
     e1, e2 = _across(along)
-    return _Tubes(np.hstack([middle, along]), e1, e2, tubes.half, tubes.radius + unknown[:, 4])
+    return _Tubes(np.hstack([middle, along]), e1, e2, tubes.half, tubes.radius + unknown[:, 6])
 
 
 def _prior(tubes: _Tubes) -> Floats:
     found = np.full((len(tubes.half), kernels.TUBE), LOOSE_MM**-2)
-    found[:, 5:] = (BOW_SHARE * 2.0 * tubes.half[:, None]) ** -2
+    found[:, 7] = FIXED
+    found[:, 4:6] = (BOW_SHARE * 2.0 * tubes.half[:, None]) ** -2
     return found
 
 
@@ -238,8 +259,8 @@ def _result(
     x: Floats, C: Floats, posterior: Posterior, seen_by: Ints, scale: Floats, floor: float, tubes: _Tubes
 ) -> Stations:
     places, count = posterior.places, len(posterior.places)
-    before_rad, before_mm = np.sqrt(posterior.variance).tolist()
-    left = np.diag(C).reshape(-1, 6) / np.repeat(posterior.variance, 3)
+    before_rad, before_mm, offset_mm = np.sqrt(posterior.variance).tolist()
+    left = np.diag(C).reshape(-1, kernels.STATION)[:, :6] / np.repeat(posterior.variance[:2], 3)
     # What all stations have in common is never told; its share of the variance is one station's in their number.
     bound = 1.0 / count + WEAK_SHARE * (1.0 - 1.0 / count)
     weak = tuple(", ".join(name for name, own in zip(MOTIONS, row, strict=True) if own > bound) for row in left)
@@ -259,6 +280,8 @@ def _result(
         C,
         before_mm,
         before_rad,
+        x[6 :: kernels.STATION],
+        offset_mm,
         seen_by,
         weak,
         scale,
@@ -277,7 +300,8 @@ def _unmoved(status: str, message: str, places: Floats, at: Floats, along: Float
         message,
         np.tile(np.eye(4), (count, 1, 1)),
         places,
-        np.full((6 * count, 6 * count), 0.0 if status == "single" else np.nan),
+        np.full((kernels.STATION * count, kernels.STATION * count), 0.0 if status == "single" else np.nan),
+        range_offset=np.zeros(count),
         observations=np.zeros(count, np.int64),
         weak=("",) * count if status == "single" else (", ".join(MOTIONS),) * count,
         range_sd=np.full(count, np.nan),

@@ -1,0 +1,82 @@
+"""Points on tubes for the stations' self-registration, out of those that the tubes were fitted to."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+
+from processor.bolt_balls.corridors import FIELD, HALF, Gathered, hash_of
+from processor.bolt_balls.nodes import Tubes
+from processor.bolt_balls.stations import TubePoints
+from processor.bolt_balls.thinning import STEPS_PER_MM
+from processor.model import Ints
+
+MOST = 192  # points of a tube: the stations are told by all tubes together
+NEAR_MM = 12.0  # from a tube's surface, stations lying apart by some mm
+END_SHARE = 0.95  # of a tube's length: near its ends cones begin
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def choose(counts, room, places, stations, middles, lines, axis, side, other, length, radius, bow, near, share, most):  # type: ignore[no-untyped-def]
+    """Choose by their hashes the points that lie on each tube's surface; in the order of their station and place."""
+    m = len(lines)
+    mask = (1 << FIELD) - 1
+    number = np.zeros(m, np.int64)
+    kept, seen_from = np.empty((m, most), np.int64), np.empty((m, most), np.int32)
+    for j in prange(m):
+        base, line = lines[j] * room, lines[j]
+        on, mixed = np.empty(counts[line], np.int64), np.empty(counts[line], np.uint64)
+        n = 0
+        for i in range(base, base + counts[line]):
+            if stations[i] < 0:
+                continue
+            w = places[i]
+            x = ((w >> (2 * FIELD)) - HALF + middles[line, 0]) / STEPS_PER_MM - axis[j, 0]
+            y = (((w >> FIELD) & mask) - HALF + middles[line, 1]) / STEPS_PER_MM - axis[j, 1]
+            z = ((w & mask) - HALF + middles[line, 2]) / STEPS_PER_MM - axis[j, 2]
+            t = 2.0 * (x * axis[j, 3] + y * axis[j, 4] + z * axis[j, 5]) / length[j]
+            if abs(t) > share:
+                continue
+            arch = 1.0 - t * t
+            a = x * side[j, 0] + y * side[j, 1] + z * side[j, 2] - arch * bow[j, 0]
+            b = x * other[j, 0] + y * other[j, 1] + z * other[j, 2] - arch * bow[j, 1]
+            if abs(np.sqrt(a * a + b * b) - radius[j]) > near:
+                continue
+            on[n], mixed[n] = i, hash_of(w, middles[line])
+            n += 1
+        limit = np.uint64(0xFFFFFFFFFFFFFFFF)
+        if n > most:
+            limit = np.sort(mixed[:n])[most]
+        chosen = np.empty(min(n, most), np.int64)
+        k = 0
+        for i in range(n):
+            if (n <= most or mixed[i] < limit) and k < most:
+                chosen[k] = on[i]
+                k += 1
+        key = np.empty(k, np.int64)
+        for i in range(k):
+            key[i] = places[chosen[i]]
+        order = np.argsort(key)
+        for i in range(k):
+            kept[j, i], seen_from[j, i] = key[order[i]], stations[chosen[order[i]]]
+        number[j] = k
+    return number, kept, seen_from
+
+
+def tube_points(gathered: Gathered, lines: Ints, tubes: Tubes, most: int = MOST) -> TubePoints:
+    """Take up to ``most`` points a tube out of those gathered near its line; ``lines`` (m,) are the tubes' rows there.
+
+    Which are taken depends on their coordinates alone, and so does their order.
+    """
+    axis = np.hstack([tubes.points, tubes.directions])
+    number, kept, station = choose(
+        gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, lines, axis, tubes.side,
+        np.ascontiguousarray(tubes.other), tubes.lengths, tubes.radii, tubes.bow, NEAR_MM, END_SHARE, most,
+    )  # fmt: skip
+    used = np.arange(most) < number[:, None]
+    places, owner = kept[used], np.repeat(lines, number)
+    mask = (1 << FIELD) - 1
+    steps = np.stack([places >> (2 * FIELD), (places >> FIELD) & mask, places & mask], axis=1) - HALF
+    points = (steps + gathered.middles[owner]) / STEPS_PER_MM
+    return TubePoints(points, station[used], np.concatenate([[0], np.cumsum(number)]))
