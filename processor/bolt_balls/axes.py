@@ -106,7 +106,9 @@ def _share_left(ends: Incidence, cov: Floats, e2: float) -> Floats:
     return np.nan_to_num(share, nan=1.0)
 
 
-def _intersect(ends: Incidence, used: npt.NDArray[np.bool_], e2: float, k: int) -> tuple[Floats, Floats, Floats, Floats]:
+def _intersect(
+    ends: Incidence, used: npt.NDArray[np.bool_], e2: float, k: int
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Movements (k, 3), covariances, chi squared and degrees of freedom (k,); NaN where axes fix no point."""
     W = np.linalg.inv(_with(ends, e2)) * used[:, None, None]
     AW = np.einsum("ijk,ijl->ikl", ends.across, W)

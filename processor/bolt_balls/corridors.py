@@ -206,7 +206,11 @@ def hash_of(place, middle):  # type: ignore[no-untyped-def]
 
 
 def gather(
-    stretches: Iterable[tuple[npt.NDArray[np.generic], Labels]], scale: float, lines: Corridors, room: int, threads: int = 0
+    stretches: Iterable[tuple[npt.NDArray[np.generic], Labels]],
+    scale: float,
+    lines: Corridors,
+    room: int,
+    threads: int = 0,
 ) -> Gathered:
     """Gather up to ``room`` points a line from stretches of (coordinates (n, 3), stations (n,) or empty).
 

@@ -63,7 +63,11 @@ def join(cells, blocks, starts, beside, offsets, values, axes, centres, least, t
                 if abs(cos) < turn:
                     continue
                 sign = 1.0 if cos > 0.0 else -1.0
-                ux, uy, uz = axes[i, 0] + sign * axes[j, 0], axes[i, 1] + sign * axes[j, 1], axes[i, 2] + sign * axes[j, 2]
+                ux, uy, uz = (
+                    axes[i, 0] + sign * axes[j, 0],
+                    axes[i, 1] + sign * axes[j, 1],
+                    axes[i, 2] + sign * axes[j, 2],
+                )
                 dx, dy, dz = centres[j, 0] - centres[i, 0], centres[j, 1] - centres[i, 1], centres[j, 2] - centres[i, 2]
                 along = dx * ux + dy * uy + dz * uz
                 off2 = dx * dx + dy * dy + dz * dz - along * along / (ux * ux + uy * uy + uz * uz)

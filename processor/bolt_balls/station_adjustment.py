@@ -212,9 +212,7 @@ class Posterior:
         best[kind] = np.exp(peak)
         return best, np.exp(peak + width * np.arange(-2.0, 2.5))
 
-    def _evidence(
-        self, L: Floats, g: Floats, change: Floats, x: Floats, variance: Floats, resolved: Floats
-    ) -> float:
+    def _evidence(self, L: Floats, g: Floats, change: Floats, x: Floats, variance: Floats, resolved: Floats) -> float:
         """Log density of log variances given the data, up to a constant."""
         P = self._prior(variance)
         Px = product(P, x[:, None])[:, 0]

@@ -15,12 +15,16 @@ from numba import njit, prange
 TUBE = 8  # what an observation tells of; a tube has the first seven
 STATION = 7  # unknowns of a station: turn about its own place, translation, offset of its ranges
 MOVED = (0, 1, 2, 3, 7)  # of what an observation tells of, what follows the station
+BLOCKS = 16  # of tubes, that are summed apart and then together
 ASIDE = 0.01  # variance of the noise across the ray over that along it
 
 
 @njit(cache=True, nogil=True)
-def grouped(tube_start, station, stations):  # type: ignore[no-untyped-def]
-    """Order of points (CSR by tube) by tube and station, stable, and where each pair's points start; -1 left out."""
+def grouped(tube_start, station, stations, most):  # type: ignore[no-untyped-def]
+    """Order of points (CSR by tube) by tube and station, stable, and where each pair's points start; -1 left out.
+
+    Of the stations that see a tube those ``most`` are taken that have the most points on it.
+    """
     tubes = len(tube_start) - 1
     order = np.empty(len(station), np.int64)
     pair_start = np.empty(tubes * stations + 1, np.int64)
@@ -31,16 +35,39 @@ def grouped(tube_start, station, stations):  # type: ignore[no-untyped-def]
         for i in range(tube_start[j], tube_start[j + 1]):
             if 0 <= station[i] < stations:
                 number[station[i] + 1] += 1
+        while np.count_nonzero(number) > most:
+            fewest = 0
+            for s in range(1, stations + 1):
+                if number[s] > 0 and (fewest == 0 or number[s] <= number[fewest]):
+                    fewest = s
+            number[fewest] = 0
+        taken = number[1:] > 0
         for s in range(stations):
             number[s + 1] += number[s]
             pair_start[j * stations + s] = at + number[s]
         for i in range(tube_start[j], tube_start[j + 1]):
-            if 0 <= station[i] < stations:
+            if 0 <= station[i] < stations and taken[station[i]]:
                 order[at + number[station[i]]] = i
                 number[station[i]] += 1
         at += number[stations - 1]  # shifted up by one place: now the end of the last station's
     pair_start[tubes * stations] = at
     return order[:at], pair_start
+
+
+@njit(cache=True, nogil=True)
+def extent(points, start, at, along):  # type: ignore[no-untyped-def]
+    """Where along each axis its points (CSR by tube) begin and end; -1 and 1 for a tube without."""
+    low, high = np.full(len(at), -1.0), np.full(len(at), 1.0)
+    for j in range(len(at)):
+        first, last = np.inf, -np.inf
+        for i in range(start[j], start[j + 1]):
+            t = 0.0
+            for k in range(3):
+                t += (points[i, k] - at[j, k]) * along[j, k]
+            first, last = min(first, t), max(last, t)
+        if last > first:
+            low[j], high[j] = first, last
+    return low, high
 
 
 @njit(cache=True, nogil=True, parallel=True)
@@ -211,65 +238,79 @@ def with_floor(N, b, floor):  # type: ignore[no-untyped-def]
     return M, y
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def reduced(N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, prior):  # type: ignore[no-untyped-def]
-    """Normal matrix (7 s, 7 s) and right side (7 s,) of the stations, the tubes eliminated one after another.
+    """Sum up the stations' normal matrix (7 s, 7 s) and right side (7 s,), tubes eliminated one after another.
 
     An observation sees the tube's unknowns less the station's motion: y = a_j - G x_s. ``prior`` (m, 8) is the
-    information on each tube's own unknowns.
+    information on each tube's own unknowns. The number of blocks is fixed, so that the sum does not vary with threads.
     """
-    size = STATION * len(places)
-    H, g = np.zeros((size, size)), np.zeros(size)
-    for j in range(len(tube_obs) - 1):
-        first, last = tube_obs[j], tube_obs[j + 1]
-        number = last - first
-        if number < 2:
-            continue
-        A, total = np.diag(prior[j]), np.zeros(TUBE)
-        K, G, own = np.zeros((TUBE, STATION * number)), np.zeros((number, TUBE, STATION)), np.zeros((number, TUBE))
-        for o in range(number):
-            q = first + o
-            M, y = with_floor(N[q], b[q], floor)
-            M, y = M * weight[q], y * weight[q]
-            G[o] = arm(axis[j], e1[j], e2[j], half[j], places[station[q]])
-            A += M
-            total += y
-            own[o] = y
-            for a in range(TUBE):
+    size, m = STATION * len(places), len(tube_obs) - 1
+    H, g = np.zeros((BLOCKS, size, size)), np.zeros((BLOCKS, size))
+    for block in prange(BLOCKS):
+        for j in range(block * m // BLOCKS, (block + 1) * m // BLOCKS):
+            if tube_obs[j + 1] - tube_obs[j] > 1:
+                add_tube(
+                    N, b, weight, floor, tube_obs[j], tube_obs[j + 1], station, axis[j], e1[j], e2[j], half[j], places,
+                    prior[j], H[block], g[block],
+                )  # fmt: skip
+    for block in range(1, BLOCKS):
+        H[0] += H[block]
+        g[0] += g[block]
+    for i in range(size):
+        for k in range(i):
+            H[0, i, k] = H[0, k, i]
+    return H[0], g[0]
+
+
+@njit(cache=True, nogil=True)
+def add_tube(N, b, weight, floor, first, last, station, axis, e1, e2, half, places, prior, H, g):  # type: ignore[no-untyped-def]
+    """Add to the upper half of H, and to g, what the observations first..last of one tube tell of their stations."""
+    number = last - first
+    width = STATION * number
+    A, total = np.diag(prior), np.zeros(TUBE)
+    K = np.zeros((TUBE, width))
+    local, right = np.zeros((width, width)), np.zeros(width)
+    for o in range(number):
+        q = first + o
+        M, y = with_floor(N[q], b[q], floor)
+        G = arm(axis, e1, e2, half, places[station[q]])
+        at = STATION * o
+        for a in range(TUBE):
+            y[a] *= weight[q]
+            total[a] += y[a]
+            for k in range(TUBE):
+                M[a, k] *= weight[q]
+                A[a, k] += M[a, k]
+            for k in MOVED:
                 for c in range(STATION):
-                    value = 0.0
-                    for k in MOVED:
-                        value += M[a, k] * G[o, k, c]
-                    K[a, STATION * o + c] = value
-        L = cholesky(A)
-        if np.isnan(L[0, 0]):
-            continue
-        S = np.empty((TUBE, STATION * number + 1))
-        S[:, :-1], S[:, -1] = K, total
-        S = solve(L, S)
-        for o in range(number):
-            at = STATION * station[first + o]
+                    K[a, at + c] += M[a, k] * G[k, c]
+        for k in MOVED:
             for c in range(STATION):
-                value = 0.0
-                for k in MOVED:
-                    value -= G[o, k, c] * own[o, k]
-                for k in range(TUBE):
-                    value += K[k, STATION * o + c] * S[k, STATION * number]
-                g[at + c] += value
+                right[at + c] -= G[k, c] * y[k]
                 for d in range(STATION):
-                    value = 0.0
-                    for k in MOVED:
-                        value += G[o, k, c] * K[k, STATION * o + d]
-                    H[at + c, at + d] += value
-            for p in range(number):
-                to = STATION * station[first + p]
-                for c in range(STATION):
-                    for d in range(STATION):
-                        value = 0.0
-                        for k in range(TUBE):
-                            value += K[k, STATION * o + c] * S[k, STATION * p + d]
-                        H[at + c, to + d] -= value
-    return H, g
+                    local[at + c, at + d] += G[k, c] * K[k, at + d]
+    L = cholesky(A)
+    if np.isnan(L[0, 0]):
+        return
+    S = np.empty((TUBE, width + 1))
+    S[:, :-1], S[:, -1] = K, total
+    S = solve(L, S)
+    for c in range(width):
+        for k in range(TUBE):
+            value = K[k, c]
+            right[c] += value * S[k, width]
+            for d in range(STATION * (c // STATION), width):
+                local[c, d] -= value * S[k, d]
+    for o in range(number):  # observations are in the order of their stations
+        at = STATION * station[first + o]
+        for c in range(STATION):
+            g[at + c] += right[STATION * o + c]
+        for p in range(o, number):
+            to = STATION * station[first + p]
+            for c in range(STATION):
+                for d in range(STATION):
+                    H[at + c, to + d] += local[STATION * o + c, STATION * p + d]
 
 
 @njit(cache=True, nogil=True, parallel=True)

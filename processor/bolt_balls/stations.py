@@ -25,6 +25,7 @@ from processor.model import Checked, Floats, Ints, Labels, column, names
 
 Bools = npt.NDArray[np.bool_]
 
+MOST_STATIONS = 10  # of those that see a tube: the others, far off, have few points on it
 ROUNDS = 3
 STEEPEST = 0.3  # cosine of incidence: beyond it the beam is split at the limb
 FIRST_CUT_MM, CUT = 15.0, 4.685  # Tukey's biweight: of the first round, then in scales
@@ -35,6 +36,7 @@ LOOSE_MM = 1e3  # prior sd of a tube's own axis and radius: next to none
 OFF_MM = 0.3  # an observation that lies off by so much is what the score looks for
 DOUBT = 3.0  # differences beyond this many times their mean lose weight
 TAKEN = 6.0  # unknowns of a tube: seven, of which the bow's are held a little
+LEAST_POINTS = 20  # of a station, for a scale of their own
 SMALLEST_MM = 1e-3  # scale of residuals
 WEAK_SHARE = 0.5  # of the prior variance left: what the tubes told is not worth the name
 MOTIONS = ("turn about x", "turn about y", "turn about z", "shift along x", "shift along y", "shift along z")
@@ -150,7 +152,7 @@ def register(
     count = len(scanners)
     if count < 2 and control is None:
         return _unmoved("single", "one station: its frame is the datum", scanners, axis_points, axis_directions, radii)
-    order, pair_start = kernels.grouped(points.start, points.station.astype(np.int64), count)
+    order, pair_start = kernels.grouped(points.start, points.station.astype(np.int64), count, MOST_STATIONS)
     used = np.flatnonzero(np.diff(pair_start))
     start = np.append(pair_start[used], pair_start[-1])
     tube, station = used // count, used % count
@@ -167,18 +169,18 @@ def register(
     x, weight, floor = np.zeros(kernels.STATION * count), np.ones(len(used)), 0.0
     posterior = Posterior(scanners, control)
     scale = np.full(count, FIRST_CUT_MM / CUT)
-    of_point = np.repeat(station, np.diff(start))
+    by_station, bounds = _by_station(station, start, count)
     for turn in range(ROUNDS):
         seen = kernels.residuals(
             ordered, start, tube, station, corrections(x, scanners), x[6 :: kernels.STATION], scanners, tubes.axis, tubes.e1, tubes.e2,
             tubes.half, tubes.radius, STEEPEST,
         )  # fmt: skip
         if turn:
-            scale = _scales(seen, of_point, scale, len(radii))
+            scale = _scales(seen, by_station, bounds, scale, len(radii))
         N, b, _ = kernels.observations(seen, start, station, scale, CUT)
         geometry = (tube_obs, station, tubes.axis, tubes.e1, tubes.e2, tubes.half, scanners, _prior(tubes))
         last = turn == ROUNDS - 1
-        for _ in range(3 if last else 1):
+        for _ in range(2 if last else 1):
             H, g = kernels.reduced(N, b, weight, floor, *geometry)
             step, C = posterior.step(H, g, x, 5)
             unknown, differs = kernels.tubes(N, b, weight, floor, *geometry, step, OFF_MM**2)
@@ -192,13 +194,7 @@ def register(
 
 def _tubes(points: Floats, start: Ints, at: Floats, along: Floats, radii: Floats) -> _Tubes:
     """Axes about the middle of what is seen of each tube: points (n, 3) are sorted by tube."""
-    owner = np.repeat(np.arange(len(at)), np.diff(start))
-    t = np.einsum("ni,ni->n", points - at[owner], along[owner])
-    low, high = np.full(len(at), np.inf), np.full(len(at), -np.inf)
-    np.minimum.at(low, owner, t)
-    np.maximum.at(high, owner, t)
-    empty = ~(high > low)
-    low[empty], high[empty] = -1.0, 1.0
+    low, high = kernels.extent(points, start, at, along)
     middle = at + (0.5 * (low + high))[:, None] * along
     e1, e2 = _across(along)
     return _Tubes(np.hstack([middle, along]), e1, e2, 0.5 * (high - low), radii.astype(np.float64))
@@ -229,16 +225,26 @@ def _prior(tubes: _Tubes) -> Floats:
     return found
 
 
-def _scales(seen: Floats, station: Ints, before: Floats, tubes: int) -> Floats:
+def _by_station(station: Ints, start: Ints, count: int) -> tuple[Ints, Ints]:
+    """Rows of points in the order of their stations, and where each station's begin (s + 1,)."""
+    of_point = np.repeat(station, np.diff(start)).astype(np.int16)
+    number = np.bincount(of_point, minlength=count)
+    return np.argsort(of_point, kind="stable"), np.concatenate([[0], np.cumsum(number)])
+
+
+def _scales(seen: Floats, by_station: Ints, bounds: Ints, before: Floats, tubes: int) -> Floats:
     """Scale (s,) of the residuals of each station's points, by their median; of few points the one before."""
     scale = before.copy()
+    residual = np.where((seen[:, 1] > 0.0) & (np.abs(seen[:, 0]) < FIRST_CUT_MM), np.abs(seen[:, 0]), np.nan)[
+        by_station
+    ]
     # what the tubes' own unknowns took up of the scatter
-    points = int(np.count_nonzero(seen[:, 1] > 0.0))
-    taken = np.sqrt(points / max(points - TAKEN * tubes, 0.25 * points))
-    good = (seen[:, 1] > 0.0) & (np.abs(seen[:, 0]) < FIRST_CUT_MM)
+    points = int(np.count_nonzero(np.isfinite(residual)))
+    taken = np.sqrt(points / max(points - TAKEN * tubes, 0.25 * points)) if points else 1.0
     for s in range(len(before)):
-        size = np.abs(seen[good & (station == s), 0])
-        if len(size) >= 20:
+        size = residual[bounds[s] : bounds[s + 1]]
+        size = size[np.isfinite(size)]
+        if len(size) >= LEAST_POINTS:
             scale[s] = max(1.4826 * taken * float(np.median(size)), SMALLEST_MM)
     return scale
 

@@ -9,17 +9,20 @@ from numba import njit, prange
 from processor.bolt_balls.corridors import FIELD, HALF, Gathered, hash_of
 from processor.bolt_balls.nodes import Tubes
 from processor.bolt_balls.stations import TubePoints
-from processor.bolt_balls.thinning import STEPS_PER_MM
+from processor.bolt_balls.thinning import STEPS_PER_MM, WHOLE
 from processor.model import Ints
 
 MOST = 192  # points of a tube: the stations are told by all tubes together
+PLENTY = 3.0  # times as many points are looked at as are wanted: not all lie on the tube
 NEAR_MM = 12.0  # from a tube's surface, stations lying apart by some mm
 END_SHARE = 0.95  # of a tube's length: near its ends cones begin
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def choose(counts, room, places, stations, middles, lines, axis, side, other, length, radius, bow, near, share, most):  # type: ignore[no-untyped-def]
-    """Choose by their hashes the points that lie on each tube's surface; in the order of their station and place."""
+def choose(  # type: ignore[no-untyped-def]
+    counts, room, places, stations, middles, shares, lines, axis, side, other, length, radius, bow, near, inner, most
+):
+    """Choose by their hashes the points that lie on each tube's surface, in the order of their places."""
     m = len(lines)
     mask = (1 << FIELD) - 1
     number = np.zeros(m, np.int64)
@@ -27,23 +30,28 @@ def choose(counts, room, places, stations, middles, lines, axis, side, other, le
     for j in prange(m):
         base, line = lines[j] * room, lines[j]
         on, mixed = np.empty(counts[line], np.int64), np.empty(counts[line], np.uint64)
+        # Hashes are even below the share that was gathered: a low part of them is enough, where points are many.
+        part = np.uint64(min(shares[line] * PLENTY * most / max(counts[line], 1), 1.0) * WHOLE)
         n = 0
         for i in range(base, base + counts[line]):
             if stations[i] < 0:
                 continue
             w = places[i]
+            h = hash_of(w, middles[line])
+            if h >= part:
+                continue
             x = ((w >> (2 * FIELD)) - HALF + middles[line, 0]) / STEPS_PER_MM - axis[j, 0]
             y = (((w >> FIELD) & mask) - HALF + middles[line, 1]) / STEPS_PER_MM - axis[j, 1]
             z = ((w & mask) - HALF + middles[line, 2]) / STEPS_PER_MM - axis[j, 2]
             t = 2.0 * (x * axis[j, 3] + y * axis[j, 4] + z * axis[j, 5]) / length[j]
-            if abs(t) > share:
+            if abs(t) > inner:
                 continue
             arch = 1.0 - t * t
             a = x * side[j, 0] + y * side[j, 1] + z * side[j, 2] - arch * bow[j, 0]
             b = x * other[j, 0] + y * other[j, 1] + z * other[j, 2] - arch * bow[j, 1]
             if abs(np.sqrt(a * a + b * b) - radius[j]) > near:
                 continue
-            on[n], mixed[n] = i, hash_of(w, middles[line])
+            on[n], mixed[n] = i, h
             n += 1
         limit = np.uint64(0xFFFFFFFFFFFFFFFF)
         if n > most:
@@ -71,7 +79,7 @@ def tube_points(gathered: Gathered, lines: Ints, tubes: Tubes, most: int = MOST)
     """
     axis = np.hstack([tubes.points, tubes.directions])
     number, kept, station = choose(
-        gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, lines, axis, tubes.side,
+        gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, gathered.shares, lines, axis, tubes.side,
         np.ascontiguousarray(tubes.other), tubes.lengths, tubes.radii, tubes.bow, NEAR_MM, END_SHARE, most,
     )  # fmt: skip
     used = np.arange(most) < number[:, None]

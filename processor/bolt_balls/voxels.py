@@ -62,9 +62,11 @@ def accumulate(steps, size, keys, sums):  # type: ignore[no-untyped-def]
     for i in range(len(steps)):
         if used >= room:
             return i, used
-        x, y, z = np.int64(steps[i, 0]) + (OFFSET * size), np.int64(steps[i, 1]) + (OFFSET * size), np.int64(
-            steps[i, 2]
-        ) + (OFFSET * size)
+        x, y, z = (
+            np.int64(steps[i, 0]) + (OFFSET * size),
+            np.int64(steps[i, 1]) + (OFFSET * size),
+            np.int64(steps[i, 2]) + (OFFSET * size),
+        )
         a, b, c = x // size, y // size, z // size
         key = (
             ((((a >> BITS) << (FIELD - BITS)) | (b >> BITS)) << (FIELD - BITS) | (c >> BITS)) << (3 * BITS)
@@ -99,7 +101,9 @@ def gathered(steps: Steps, size_mm: float, least: int) -> Voxels:
     inner, block_key = keys & ((1 << 3 * BITS) - 1), keys >> 3 * BITS
     block_keys, starts = np.unique(block_key, return_index=True)
     width = FIELD - BITS
-    blocks = np.stack([block_keys >> 2 * width, block_keys >> width & ((1 << width) - 1), block_keys & ((1 << width) - 1)], axis=1)
+    blocks = np.stack(
+        [block_keys >> 2 * width, block_keys >> width & ((1 << width) - 1), block_keys & ((1 << width) - 1)], axis=1
+    )
     within = np.stack([inner >> 2 * BITS, inner >> BITS & (SIDE - 1), inner & (SIDE - 1)], axis=1)
     sizes = np.diff(np.append(starts, len(keys)))
     cells = np.repeat(blocks, sizes, axis=0) * SIDE + within - OFFSET
