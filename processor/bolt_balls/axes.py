@@ -19,13 +19,15 @@ class Incidence:
     """Which tube ends at which node, a row an end, sorted by node.
 
     ``offsets`` (i, 3) lead from the node's start to the foot on the axis, ``across`` (i, 2, 3) are unit vectors across
-    the axis, ``covariance`` (i, 2, 2) is that of the axis along these, at the node.
+    the axis, ``covariance`` (i, 2, 2) is that of the axis along these, at the node, from noise alone. ``response``
+    (i, s, 2, 2) is how the axis moves there with a movement of each station along these, by one standard deviation.
     """
 
     node: Ints
     offsets: Floats
     across: Floats
     covariance: Floats
+    response: Floats
 
 
 @dataclass(frozen=True)
@@ -41,18 +43,21 @@ class Meeting:
 
 
 def incidence(
-    node: Ints, starts: Floats, points: Floats, directions: Floats, side: Floats, covariance: Floats
+    node: Ints, starts: Floats, points: Floats, directions: Floats, side: Floats, covariance: Floats, response: Floats
 ) -> Incidence:
     """Relate axes (i,) to the nodes (k, 3) they run to; one row an end, sorted by node.
 
-    ``covariance`` (i, 5, 5) as in :class:`processor.bolt_balls.nodes.Tubes`.
+    ``covariance`` (i, 5, 5) as in :class:`processor.bolt_balls.nodes.Tubes`, ``response`` (i, s, 4, 2) as in
+    :class:`processor.bolt_balls.tubes.Fits`.
     """
     away = starts[node] - points
     t = np.einsum("ij,ij->i", away, directions)
     across = np.stack([side, np.cross(directions, side)], axis=1)
-    C, turned = covariance[:, :2, :2], covariance[:, :2, 2:4]
-    at = C + t[:, None, None] * (turned + turned.transpose(0, 2, 1)) + (t * t)[:, None, None] * covariance[:, 2:4, 2:4]
-    return Incidence(node, t[:, None] * directions - away, across, at)
+    C = covariance[:, :4, :4] - np.einsum("isjk,islk->ijl", response, response)
+    turned = C[:, :2, 2:]
+    at = C[:, :2, :2] + t[:, None, None] * (turned + turned.transpose(0, 2, 1)) + (t * t)[:, None, None] * C[:, 2:, 2:]
+    moved = response[:, :, :2] + t[:, None, None, None] * response[:, :, 2:]
+    return Incidence(node, t[:, None] * directions - away, across, at, moved)
 
 
 def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> Meeting:
@@ -85,11 +90,25 @@ def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> M
     square = np.bincount(ends.node[used], (_miss(ends, x)[used] ** 2).sum(axis=1), k)
     with np.errstate(invalid="ignore", divide="ignore"):
         scatter = np.where(count > 1, np.sqrt(square / count), np.nan)
-    return Meeting(starts + x, cov * grown[:, None, None], count, scatter, used, float(np.sqrt(e2)))
+    whole = cov * grown[:, None, None] + _by_stations(ends, used, cov, e2, k)
+    return Meeting(starts + x, whole, count, scatter, used, float(np.sqrt(e2)))
 
 
 def _with(ends: Incidence, e2: float) -> Floats:
     found: Floats = ends.covariance + e2 * np.eye(2)
+    return found
+
+
+def _by_stations(ends: Incidence, used: npt.NDArray[np.bool_], cov: Floats, e2: float, k: int) -> Floats:
+    """Covariance (k, 3, 3) of nodes from stations that are off: all axes at a node move with them, and do not scatter."""
+    W = np.linalg.inv(_with(ends, e2)) * used[:, None, None]
+    found = np.zeros((k, 3, 3))
+    for s in range(ends.response.shape[1]):
+        pulled = np.einsum("ijk,ijl,ilm,imn->ikn", ends.across, W, ends.response[:, s], ends.across)
+        total = np.zeros((k, 3, 3))
+        np.add.at(total, ends.node, pulled)
+        moved = cov @ total
+        found += moved @ moved.transpose(0, 2, 1)
     return found
 
 

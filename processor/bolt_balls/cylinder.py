@@ -16,7 +16,7 @@ import numpy as np
 from numba import njit
 
 NP = 7  # a, b, c, d, r, e, f; mm
-LEAST_COS = 0.2  # of incidence by the model: rays that graze tell of mixed pixels, not of the tube
+GRAZING_COS = 0.2  # of incidence by the model: rays that graze more tell of mixed pixels, not of the tube
 ACROSS_MM = 0.4  # noise across the ray: angles and footprint of the beam
 
 
@@ -96,45 +96,96 @@ def spread_of(values, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def step(p, h, low, high, P, U, seen, free, cut, sigma, prior, sizes, inverse):  # type: ignore[no-untyped-def]
-    """One Gauss-Newton step of the first ``free`` parameters over points with z in low..high and |residual| <= cut.
+def step(  # type: ignore[no-untyped-def]
+    p, h, P, U, seen, bounds, shifts, free, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, response
+):
+    """One Gauss-Newton step of the first ``free`` parameters over points with |z| <= h and |residual| <= cut mm.
 
-    ``cut`` is in mm orthogonal to the surface; ``sizes`` gets the weighted residuals. ``prior`` is the variance of the
-    bow. Returns (points used, sum of squared weighted residuals, largest movement, whether it could be solved).
+    Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where its ``station_sd`` (g,) is above 0 a
+    station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard deviation;
+    they are eliminated, and the inverse of the normal equations knows of them. ``response`` (g, 7, 2) gets how the
+    parameters move with a movement of each station, ``sizes`` the weighted residuals.
+    Returns (points used, sum of squared weighted residuals, largest movement, whether it could be solved).
     """
-    A, y, J, x = np.zeros((NP, NP)), np.zeros(NP), np.zeros(NP), np.zeros(NP)
+    groups = len(bounds) - 1
+    A, y, J, x = np.zeros((groups, NP, NP)), np.zeros((groups, NP)), np.zeros(NP), np.zeros(NP)
     n, total = 0, 0.0
     k2 = (ACROSS_MM / sigma) ** 2
-    for i in range(len(P)):
-        if P[i, 2] < low or P[i, 2] > high:
-            continue
-        v, cos = residual(p, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
-        if cos < LEAST_COS or abs(v) * cos > cut:
-            continue
-        w = 1.0 / (1.0 + k2 * (1.0 - cos * cos) / (cos * cos)) if seen[i] else 1.0
-        if w * v * v > cut * cut:
-            continue
-        sizes[n] = np.sqrt(w) * v
-        n += 1
-        total += w * v * v
-        for a in range(free):
-            g = w * J[a]
-            y[a] -= g * v
-            for b in range(a + 1):
-                A[a, b] += g * J[b]
+    q = p.copy()
+    for g in range(groups):
+        q[0], q[1] = p[0] + shifts[g, 0], p[1] + shifts[g, 1]
+        for i in range(bounds[g], bounds[g + 1]):
+            if abs(P[i, 2]) > h:
+                continue
+            v, cos = residual(q, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
+            if cos < least_cos:
+                continue
+            w = 1.0 / (1.0 + k2 * (1.0 - cos * cos) / (cos * cos)) if seen[i] else 1.0
+            if w * v * v > cut * cut:
+                continue
+            sizes[n] = np.sqrt(w) * v
+            n += 1
+            total += w * v * v
+            for a in range(free):
+                weighted = w * J[a]
+                y[g, a] -= weighted * v
+                for b in range(a + 1):
+                    A[g, a, b] += weighted * J[b]
     if n < 2 * free:
         return n, total, 0.0, False
+    N, right = np.zeros((NP, NP)), np.zeros(NP)
+    for g in range(groups):
+        for a in range(free):
+            right[a] += y[g, a]
+            for b in range(a + 1):
+                N[a, b] += A[g, a, b]
     if free == NP:
         for a in range(5, NP):
-            A[a, a] += sigma * sigma / prior
-            y[a] -= sigma * sigma / prior * p[a]
-    if not solve(A, y, free, x, inverse, True):
+            N[a, a] += (sigma / bow_sd) ** 2
+            right[a] -= (sigma / bow_sd) ** 2 * p[a]
+    moving = station_sd.max() > 0.0
+    if moving:
+        for g in range(groups):
+            ratio = (sigma / station_sd[g]) ** 2
+            d00, d11, d10 = A[g, 0, 0] + ratio, A[g, 1, 1] + ratio, A[g, 1, 0]
+            det = d00 * d11 - d10 * d10
+            r0, r1 = y[g, 0] - ratio * shifts[g, 0], y[g, 1] - ratio * shifts[g, 1]
+            for a in range(free):
+                a0, a1 = column(A[g], a, 0), column(A[g], a, 1)
+                e0, e1 = (d11 * a0 - d10 * a1) / det, (d00 * a1 - d10 * a0) / det
+                right[a] -= e0 * r0 + e1 * r1
+                for b in range(a + 1):
+                    N[a, b] -= e0 * column(A[g], b, 0) + e1 * column(A[g], b, 1)
+    if not solve(N, right, free, x, inverse, True):
         return n, total, 0.0, False
+    if moving:
+        for g in range(groups):
+            ratio = (sigma / station_sd[g]) ** 2
+            d00, d11, d10 = A[g, 0, 0] + ratio, A[g, 1, 1] + ratio, A[g, 1, 0]
+            det = d00 * d11 - d10 * d10
+            r0, r1 = y[g, 0] - ratio * shifts[g, 0], y[g, 1] - ratio * shifts[g, 1]
+            for a in range(free):
+                r0 -= column(A[g], a, 0) * x[a]
+                r1 -= column(A[g], a, 1) * x[a]
+            shifts[g, 0] += (d11 * r0 - d10 * r1) / det
+            shifts[g, 1] += (d00 * r1 - d10 * r0) / det
+            for a in range(free):
+                response[g, a, 0] = response[g, a, 1] = 0.0
+                for b in range(free):
+                    b0, b1 = column(A[g], b, 0), column(A[g], b, 1)
+                    response[g, a, 0] += inverse[a, b] * ratio * (d11 * b0 - d10 * b1) / det
+                    response[g, a, 1] += inverse[a, b] * ratio * (d00 * b1 - d10 * b0) / det
     moved = 0.0
     for a in range(free):
         p[a] += x[a]
         moved = max(moved, abs(x[a]))
     return n, total, moved, True
+
+
+@njit(cache=True, nogil=True, inline="always")
+def column(A, a, k):  # type: ignore[no-untyped-def]
+    """Element (a, k) of a symmetric matrix whose lower half is filled."""
+    return A[a, k] if a >= k else A[k, a]
 
 
 @njit(cache=True, nogil=True)
@@ -175,29 +226,33 @@ def roughly(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def reach_of(p, h, P, U, seen, sigma, bins, width, span):  # type: ignore[no-untyped-def]
+def reach_of(p, h, P, U, seen, bounds, shifts, sigma, bins, width, span):  # type: ignore[no-untyped-def]
     """Ends (low, high) of the stretch that lies on the cylinder, from bins of ``width`` over +-span about the middle.
 
+    Stations are moved by ``shifts`` as in :func:`step`.
+
     Outward from the middle every point on the surface adds to a sum and every other one takes away from it: a point's
-    part is 2 less its squared residual in standard deviations, at most 9. The end is where the sum is largest.
+    part is 2 less its squared residual in standard deviations, which counts for 6 at most: one mixed pixel in five
+    points does no harm. The end is where the sum is largest.
     """
     J = np.zeros(NP)
     bins[:] = 0.0
     count = len(bins)
-    for i in range(len(P)):
-        at = int(np.floor((P[i, 2] + span) / width))
-        if at < 0 or at >= count:
-            continue
-        v, cos = residual(p, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
-        if cos == 0.0 or cos < LEAST_COS:
-            # A ray that grazes or passes by says something only of things that are far off the surface.
-            qx, qy = P[i, 0] - p[0] - p[2] * P[i, 2] / h, P[i, 1] - p[1] - p[3] * P[i, 2] / h
-            off = np.sqrt(qx * qx + qy * qy) - p[4]
-            if abs(off) > 5.0 * sigma:
-                bins[at] -= 7.0
-            continue
-        cos = max(cos, 0.35)
-        bins[at] += 2.0 - min(9.0, (v * cos / (sigma * max(cos, 0.5))) ** 2)
+    q = p.copy()
+    for g in range(len(bounds) - 1):
+        q[0], q[1] = p[0] + shifts[g, 0], p[1] + shifts[g, 1]
+        for i in range(bounds[g], bounds[g + 1]):
+            at = int(np.floor((P[i, 2] + span) / width))
+            if at < 0 or at >= count:
+                continue
+            v, cos = residual(q, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
+            if cos >= GRAZING_COS:
+                bins[at] += 2.0 - min(6.0, (v * cos / sigma) ** 2)
+                continue
+            # A ray that grazes or passes by says something only where its point is far off the surface.
+            dx, dy = P[i, 0] - q[0] - q[2] * P[i, 2] / h, P[i, 1] - q[1] - q[3] * P[i, 2] / h
+            if np.sqrt(dx * dx + dy * dy) - p[4] > max(5.0 * sigma, 12.0):
+                bins[at] -= 4.0
     middle = count // 2
     high, total, best = 0.0, 0.0, 0.0
     for k in range(middle, count):

@@ -13,7 +13,7 @@ from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.segments import segments
 from processor.bolt_balls.source import Source
 from processor.bolt_balls.thinning import STEPS_PER_MM, thinned
-from processor.bolt_balls.tubes import Fits, fitted
+from processor.bolt_balls.tubes import Fits, least_cosine, refined, rough, station_variance
 from processor.bolt_balls.voxels import gathered
 from processor.model import Floats, Ints
 
@@ -34,6 +34,7 @@ class Params:
     all_tube_points: int = 9_000_000  # of all tubes together, at most
     reach_mm: float = 120.0  # from a rough axis
     radii_mm: tuple[float, float] = (15.0, 110.0)  # of tubes
+    incidence_tolerance_mm: float = 0.2  # mean distance from the tube at which grazing rays are left out
     bow_share: float = 0.001  # of its length that a tube may be bowed
     eccentricity_floor_mm: float = 0.05
     threads: int = 0  # as many as there are
@@ -63,9 +64,9 @@ def rough_lines(source: Source, params: Params) -> junctions.Lines:
     margin = 400.0
     near = corridors(seen.points, seen.directions, -seen.halves - margin, seen.halves + margin, params.reach_mm)
     points = gather([(steps, NOTHING)], 1.0, near, params.rough_points, params.threads)
-    fits = fitted(
+    fits = rough(
         points, np.empty((0, 3)), seen.points, seen.directions, 0.8 * seen.halves, seen.halves + margin,
-        params.radii_mm, params.bow_share, False, params.threads,
+        params.radii_mm, params.rough_points, params.threads,
     )  # fmt: skip
     # What was seen of a line, from the middle of its cylinder: the longer of the voxels' stretch and the cylinder.
     shift = np.einsum("ij,ij->i", fits.points - seen.points, seen.directions)
@@ -88,10 +89,14 @@ def measure(source: Source, starts: Floats, pairs: Ints, params: Params | None =
     room = int(np.clip(params.all_tube_points // max(len(pairs), 1), 64, params.tube_points))
     chunks = ((chunk.points, chunk.station) for chunk in source.chunks())
     points = gather(chunks, STEPS_PER_MM, near, room, params.threads)
-    fits = fitted(
+    start = rough(
         points, source.scanners, middles, directions, 0.5 * length - np.minimum(0.2 * length, 450.0), 0.5 * length,
-        params.radii_mm, params.bow_share, True, params.threads,
+        params.radii_mm, params.rough_points, params.threads,
     )  # fmt: skip
+    least_cos, off = least_cosine(start, params.incidence_tolerance_mm), station_variance(start)
+    fits = refined(
+        points, source.scanners, start, 0.5 * length, params.radii_mm, params.bow_share, least_cos, off, params.threads
+    )
     return _nodes(fits, starts, pairs, params)
 
 
@@ -102,7 +107,13 @@ def _nodes(fits: Fits, starts: Floats, pairs: Ints, params: Params) -> tuple[Nod
     order = np.argsort(node, kind="stable")
     tube, node = tube[order], node[order]
     ends = axes.incidence(
-        node, starts, fits.points[tube], fits.directions[tube], fits.side[tube], fits.covariance[tube]
+        node,
+        starts,
+        fits.points[tube],
+        fits.directions[tube],
+        fits.side[tube],
+        fits.covariance[tube],
+        fits.response[tube],
     )
     met = axes.meet(ends, starts, params.eccentricity_floor_mm)
     nodes = Nodes(met.positions, met.covariance, met.axes, met.scatter)

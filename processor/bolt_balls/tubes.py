@@ -11,22 +11,51 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.bolt_balls.corridors import FIELD, HALF, Gathered
-from processor.bolt_balls.cylinder import NP, reach_of, roughly, spread_of, step
+from processor.bolt_balls.cylinder import ACROSS_MM, GRAZING_COS, NP, reach_of, residual, roughly, spread_of, step
 from processor.bolt_balls.thinning import STEPS_PER_MM
 from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats, Ints
 
 BIN_MM = 10.0
+ROUGH_TRIM_MM = 30.0  # off each rough end
 CUTS_MM = (30.0, 15.0)
 CUT_SIGMAS = 3.5
+LEAST_CUT_MM = 4.0  # of rough fits, where stations may be off each other
+ROUGH_MM = 2.0  # by which a straight axis and what is wrong with stations may be off, beside the noise
+NEAR_M = 20.0  # of a station; what is wrong with its attitude shows in the others
+FINE_MM = 0.7  # and a bowed axis
 TRIM_MM = 8.0  # taken off each end: where a cone begins is not seen that sharply
+LEAST_SIGMA_MM = 0.05
+ROUGH_COS = 0.5  # of incidence, in rough fits
+COS_BINS = 8  # of 0.1 from GRAZING_COS to 1
+
+
+@dataclass(frozen=True)
+class Rough:
+    """Straight axes (m,) through ``points`` along ``directions``, with ``radii``, ``sigma`` and ``lengths``.
+
+    ``ok`` marks those that could be fitted. ``by_incidence`` (m, 8, 3) are number, sum and sum of squares of
+    distances from the surface, by the cosine of incidence in steps of 0.1 from 0.2. ``scatter`` (m, 2, 3) says how far
+    stations are off each other, see :func:`tell`.
+    """
+
+    ok: npt.NDArray[np.bool_]
+    points: Floats
+    directions: Floats
+    lengths: Floats
+    radii: Floats
+    sigma: Floats
+    by_incidence: Floats
+    scatter: Floats
 
 
 @dataclass(frozen=True)
 class Fits:
     """Tubes (m,): middle of the cylinder ``points``, ``directions``, ``side`` across; see :class:`Tubes`.
 
-    ``ok`` marks the tubes that could be fitted; ``sigma`` is the standard deviation of a residual.
+    ``ok`` marks the tubes that could be fitted; ``sigma`` is the standard deviation of a residual. ``response``
+    (m, s, 4, 2) is how offsets and turns move with a movement of each station across the tube by one standard deviation;
+    s = 0 where stations are not off. The covariance includes it.
     """
 
     ok: npt.NDArray[np.bool_]
@@ -37,27 +66,69 @@ class Fits:
     radii: Floats
     bow: Floats
     covariance: Floats  # (m, 5, 5)
+    response: Floats
     count: Ints
     sigma: Floats
 
 
 @njit(cache=True, nogil=True, inline="always")
 def framed(direction, side, other):  # type: ignore[no-untyped-def]
-    """Unit vectors across a direction: the first is level, or along x where the direction is upright."""
+    """Unit vectors across a direction; the first is level, or of no certain heading where the direction is upright."""
     x, y, z = direction[0], direction[1], direction[2]
     n = np.sqrt(x * x + y * y)
     if n > 1e-3:
         side[0], side[1], side[2] = -y / n, x / n, 0.0
     else:
-        side[0], side[1], side[2] = 0.0, 1.0, 0.0
-        along = y
-        n = np.sqrt(x * x + (1.0 - y * along) ** 2 + z * z)
-        side[0], side[1], side[2] = -along * x, 1.0 - along * y, -along * z
-        n = np.sqrt(side[0] ** 2 + side[1] ** 2 + side[2] ** 2)
-        side[0], side[1], side[2] = side[0] / n, side[1] / n, side[2] / n
+        n = np.sqrt(y * y + z * z)
+        side[0], side[1], side[2] = 0.0, z / n, -y / n
     other[0] = direction[1] * side[2] - direction[2] * side[1]
     other[1] = direction[2] * side[0] - direction[0] * side[2]
     other[2] = direction[0] * side[1] - direction[1] * side[0]
+
+
+@njit(cache=True, nogil=True)
+def ordered(places, stations):  # type: ignore[no-untyped-def]
+    """Places sorted by station, then by themselves, so that sums never vary; stations likewise, and their bounds."""
+    n = len(places)
+    order = np.argsort(stations, kind="mergesort")
+    own, at = np.empty(n, np.int64), np.empty(n, np.int64)
+    groups = 0
+    for i in range(n):
+        own[i], at[i] = places[order[i]], stations[order[i]]
+        if i == 0 or at[i] != at[i - 1]:
+            groups += 1
+    bounds = np.empty(groups + 1, np.int64)
+    groups = 0
+    for i in range(n):
+        if i == 0 or at[i] != at[i - 1]:
+            bounds[groups] = i
+            groups += 1
+    bounds[groups] = n
+    for g in range(groups):
+        own[bounds[g] : bounds[g + 1]] = np.sort(own[bounds[g] : bounds[g + 1]])
+    return own, at, bounds
+
+
+@njit(cache=True, nogil=True)
+def thin(own, at, most):  # type: ignore[no-untyped-def]
+    """Every k-th of ordered places, so that no more than ``most`` are left, with stations and bounds."""
+    n = len(own)
+    k = (n + most - 1) // most
+    count = (n + k - 1) // k
+    fewer, where = np.empty(count, np.int64), np.empty(count, np.int64)
+    groups = 0
+    for i in range(count):
+        fewer[i], where[i] = own[i * k], at[i * k]
+        if i == 0 or where[i] != where[i - 1]:
+            groups += 1
+    bounds = np.empty(groups + 1, np.int64)
+    groups = 0
+    for i in range(count):
+        if i == 0 or where[i] != where[i - 1]:
+            bounds[groups] = i
+            groups += 1
+    bounds[groups] = count
+    return fewer, where, bounds
 
 
 @njit(cache=True, nogil=True)
@@ -96,72 +167,220 @@ def moved(p, h, point, direction, side, other):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def fit(  # type: ignore[no-untyped-def]
-    counts, room, places, stations, middles, scanners, points, directions, sides, inner, spans, least_radius, most_radius,
-    bow_share, fine, ok, lengths, radii, bows, covariances, used, sigmas, first, last,
-):  # fmt: skip
-    """Fit tubes first..last, changing ``points`` and ``directions`` in place; see :func:`fitted`."""
-    for m in range(first, last):
-        n = counts[m]
-        if n < 16:
+def distances(point, at, bounds, scanners):  # type: ignore[no-untyped-def]
+    """Distance in m of a point from the station of each group; 0 where it is unknown."""
+    away = np.zeros(len(bounds) - 1)
+    for g in range(len(away)):
+        s = at[bounds[g]]
+        if 0 <= s < len(scanners):
+            for i in range(3):
+                away[g] += (1e-3 * (point[i] - scanners[s, i])) ** 2
+        away[g] = np.sqrt(away[g])
+    return away
+
+
+@njit(cache=True, nogil=True)
+def tell(p, h, P, U, seen, bounds, away, sigma, cut, inverse, by_incidence, scatter):  # type: ignore[no-untyped-def]
+    """Residuals by incidence, and what the stations' scatter says of how far they are off each other.
+
+    Of the scores y_s of a movement of each station (two, across) after the fit, Q = sum of y_s' A_s^-1 y_s. It should be
+    E0 from noise alone, and E0 + a E1 + b E2 where stations at distances d (m) are moved with variances a + b d^2
+    (DerSimonian and Laird 1986, with the parameters of the fit taken into account). ``scatter`` gets Q - E0, E1 and E2
+    of the stations nearer than NEAR_M, and of the others.
+    """
+    groups = len(bounds) - 1
+    A, y, J = np.zeros((groups, 5, 5)), np.zeros((groups, 5)), np.zeros(NP)
+    count = np.zeros(groups, np.int64)
+    k2 = (ACROSS_MM / sigma) ** 2
+    for g in range(groups):
+        for i in range(bounds[g], bounds[g + 1]):
+            if abs(P[i, 2]) > h:
+                continue
+            v, cos = residual(p, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
+            if cos < GRAZING_COS or not seen[i]:
+                continue
+            w = 1.0 / (1.0 + k2 * (1.0 - cos * cos) / (cos * cos))
+            if w * v * v > cut * cut:
+                continue
+            k = min(int((cos - GRAZING_COS) * 10.0), COS_BINS - 1)
+            by_incidence[k, 0] += 1.0
+            by_incidence[k, 1] += v * cos
+            by_incidence[k, 2] += v * v * cos * cos
+            if cos < ROUGH_COS:
+                continue
+            count[g] += 1
+            for a in range(5):
+                y[g, a] -= w * J[a] * v
+                for b in range(5):
+                    A[g, a, b] += w * J[a] * J[b]
+    use = np.flatnonzero(count >= 12)
+    if len(use) < 2:
+        return
+    for s in use:
+        side = 0 if away[s] < NEAR_M else 1
+        B = A[s, :2, :2]
+        det = B[0, 0] * B[1, 1] - B[0, 1] * B[1, 0]
+        if not det > 1e-3 * B[0, 0] * B[1, 1]:
             continue
-        # Stations one after another, and the points of each in the order of their coordinates: sums never vary.
-        own = np.empty(n, np.int64)
-        at = np.empty(n, np.int16)
-        order = np.argsort(stations[m * room : m * room + n], kind="mergesort")
-        for i in range(n):
-            own[i], at[i] = places[m * room + order[i]], stations[m * room + order[i]]
-        start = 0
-        for i in range(1, n + 1):
-            if i == n or at[i] != at[start]:
-                own[start:i] = np.sort(own[start:i])
-                start = i
+        B1 = np.empty((2, 2))
+        B1[0, 0], B1[1, 1], B1[0, 1], B1[1, 0] = B[1, 1] / det, B[0, 0] / det, -B[0, 1] / det, -B[1, 0] / det
+        scatter[side, 0] += B1[0, 0] * y[s, 0] ** 2 + 2.0 * B1[0, 1] * y[s, 0] * y[s, 1] + B1[1, 1] * y[s, 1] ** 2
+        for k in range(groups):
+            H = np.zeros((2, 2))
+            for a in range(2):
+                for b in range(2):
+                    for c in range(5):
+                        for d in range(5):
+                            H[a, b] -= A[s, a, c] * inverse[c, d] * A[k, d, b]
+                    if k == s:
+                        H[a, b] += B[a, b]
+            for a in range(2):
+                for b in range(2):
+                    if k == s:
+                        scatter[side, 0] -= sigma * sigma * B1[a, b] * H[b, a]
+                    for c in range(2):
+                        told = B1[a, b] * H[b, c] * H[a, c]
+                        scatter[side, 1] += told
+                        scatter[side, 2] += told * away[k] ** 2
+
+
+@njit(cache=True, nogil=True)
+def fit_roughly(  # type: ignore[no-untyped-def]
+    counts, room, places, stations, middles, scanners, points, directions, inner, spans, most, least_radius, most_radius,
+    ok, lengths, radii, sigmas, by_incidence, scatter, first, last,
+):  # fmt: skip
+    """Fit straight tubes first..last to ``most`` points each, changing points and directions in place."""
+    for m in range(first, last):
+        if counts[m] < 16:
+            continue
+        rows = slice(m * room, m * room + counts[m])
+        own, at, bounds = ordered(places[rows], stations[rows])
+        own, at, bounds = thin(own, at, most)
+        n = len(own)
         P, U, seen = np.empty((n, 3)), np.zeros((n, 3)), np.zeros(n, np.bool_)
         point, direction, side, other = points[m].copy(), directions[m].copy(), np.empty(3), np.empty(3)
         framed(direction, side, other)
         localised(own, at, middles[m], point, direction, side, other, scanners, P, U, seen)
         p, inverse, sizes = np.zeros(NP), np.zeros((NP, NP)), np.empty(n)
         h = inner[m]
-        if not roughly(P, -h, h, 1e9, p, h) or not least_radius * 0.7 < p[4] < most_radius * 1.3:
+        if not roughly(P, -h, h, 1e9, p, h) or not 0.7 * least_radius < p[4] < 1.3 * most_radius:
             continue
-        good = True
-        sigma, count, total = 2.0, 0, 0.0
+        none, unmoved, response = np.zeros((len(bounds) - 1, 2)), np.zeros(len(bounds) - 1), np.zeros((0, NP, 2))
+        good, sigma, cut, count, total = True, 2.0, 0.0, 0, 0.0
         for turn in range(4):
             if turn < 2:
                 cut = CUTS_MM[turn]
             else:
-                sigma = max(spread_of(sizes, count), 0.05)
-                cut = max(CUT_SIGMAS * sigma, 0.5)
-            count, total, shift, good = step(p, h, -h, h, P, U, seen, 5, cut, sigma, 1.0, sizes, inverse)
-            if not good or not least_radius * 0.7 < p[4] < most_radius * 1.3:
+                sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
+                cut = max(CUT_SIGMAS * sigma, LEAST_CUT_MM)
+            count, total, _, good = step(
+                p, h, P, U, seen, bounds, none, 5, ROUGH_COS, cut, sigma, 1.0, unmoved, sizes, inverse, response
+            )
+            if not good or not 0.7 * least_radius < p[4] < 1.3 * most_radius:
                 good = False
                 break
         if not good:
             continue
-        sigma = max(spread_of(sizes, count), 0.05)
-        # The ends of the cylinder, and all again about its middle.
-        span = spans[m]
-        bins = np.empty(2 * int(span / BIN_MM) + 2)
-        half = 0.5 * BIN_MM * len(bins)
-        low, high = reach_of(p, h, P, U, seen, sigma, bins, BIN_MM, half)
-        low, high = low + TRIM_MM, high - TRIM_MM
+        sigma = max(spread_of(sizes, count), LEAST_SIGMA_MM)
+        away = distances(point, at, bounds, scanners)
+        tell(
+            p,
+            h,
+            P,
+            U,
+            seen,
+            bounds,
+            away,
+            np.sqrt(total / max(count - 5, 1)),
+            cut,
+            inverse,
+            by_incidence[m],
+            scatter[m],
+        )
+        bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
+        slack = np.sqrt(sigma**2 + ROUGH_MM**2)
+        low, high = reach_of(p, h, P, U, seen, bounds, none, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
         if high - low < 100.0:
             continue
         moved(p, h, point, direction, side, other)
         for i in range(3):
-            point[i] += 0.5 * (low + high) * direction[i]
-        h = 0.5 * (high - low)
-        localised(own, at, middles[m], point, direction, side, other, scanners, P, U, seen)
-        p[0] = p[1] = p[2] = p[3] = 0.0
-        free = NP if fine else 5
-        prior = (0.5 * bow_share * 2.0 * h) ** 2
-        for turn in range(5 if fine else 1):
+            points[m, i], directions[m, i] = point[i] + 0.5 * (low + high) * direction[i], direction[i]
+        ok[m], lengths[m], radii[m], sigmas[m] = True, high - low, p[4], sigma
+
+
+@njit(cache=True, nogil=True)
+def refine(  # type: ignore[no-untyped-def]
+    counts, room, places, stations, middles, scanners, points, directions, spans, least_radius, most_radius, bow_share,
+    least_cos, variance, variance_m2, ok, sides, lengths, radii, bows, covariances, responses, used, sigmas, first, last,
+):  # fmt: skip
+    """Fit bowed tubes first..last to all their points, from a rough axis; changes points and directions in place."""
+    for m in range(first, last):
+        if not ok[m]:
+            continue
+        ok[m] = False
+        rows = slice(m * room, m * room + counts[m])
+        own_places, at, bounds = ordered(places[rows], stations[rows])
+        n = len(own_places)
+        P, U, seen = np.empty((n, 3)), np.zeros((n, 3)), np.zeros(n, np.bool_)
+        point, direction, side, other = points[m].copy(), directions[m].copy(), np.empty(3), np.empty(3)
+        framed(direction, side, other)
+        localised(own_places, at, middles[m], point, direction, side, other, scanners, P, U, seen)
+        p, inverse, sizes = np.zeros(NP), np.zeros((NP, NP)), np.empty(n)
+        p[4] = radii[m]
+        h = max(0.5 * lengths[m] - ROUGH_TRIM_MM, 50.0)
+        shifts, response = np.zeros((len(bounds) - 1, 2)), np.zeros((len(bounds) - 1, NP, 2))
+        sigma = sigmas[m]
+        station_sd = np.sqrt(variance + variance_m2 * distances(point, at, bounds, scanners) ** 2)
+        off = station_sd.max()
+        good, count, total, assumed = True, 0, 0.0, sigma
+        for turn in range(6):
+            if turn == 2:
+                # Now that the axis is known the cylinder's ends show, and all goes on about its middle.
+                bins = np.empty(2 * int(spans[m] / BIN_MM) + 2)
+                slack = np.sqrt(sigma**2 + FINE_MM**2)
+                low, high = reach_of(p, h, P, U, seen, bounds, shifts, slack, bins, BIN_MM, 0.5 * BIN_MM * len(bins))
+                middle, half = 0.5 * (low + high), 0.5 * (high - low) - TRIM_MM
+                if half < 50.0:
+                    good = False
+                    break
+                p[0] += p[2] * middle / h
+                p[1] += p[3] * middle / h
+                p[2] *= half / h
+                p[3] *= half / h
+                p[5] *= (half / h) ** 2
+                p[6] *= (half / h) ** 2
+                for i in range(3):
+                    point[i] += middle * direction[i]
+                for i in range(n):
+                    P[i, 2] -= middle
+                h = half
             cut = max(CUT_SIGMAS * sigma, 0.5)
-            count, total, shift, good = step(p, h, -h, h, P, U, seen, free, cut, sigma, prior, sizes, inverse)
+            if turn < 2:
+                cut = CUT_SIGMAS * np.sqrt(sigma**2 + off**2 + FINE_MM**2)
+            bow_sd = max(bow_share * h, 1e-3)
+            assumed = sigma
+            count, total, shift, good = step(
+                p,
+                h,
+                P,
+                U,
+                seen,
+                bounds,
+                shifts,
+                NP,
+                least_cos,
+                cut,
+                sigma,
+                bow_sd,
+                station_sd,
+                sizes,
+                inverse,
+                response,
+            )
             if not good:
                 break
-            sigma = max(np.sqrt(total / max(count - free, 1)), 0.05)
-            if turn > 1 and shift < 1e-3:
+            sigma = max(np.sqrt(total / max(count - NP, 1)), LEAST_SIGMA_MM)
+            if turn > 2 and shift < 2e-3:
                 break
         if not good or not least_radius < p[4] < most_radius:
             continue
@@ -173,10 +392,14 @@ def fit(  # type: ignore[no-untyped-def]
         scale = np.array([1.0, 1.0, 1.0 / h, 1.0 / h, 1.0])
         for i in range(5):
             for j in range(5):
-                covariances[m, i, j] = sigma * sigma * scale[i] * scale[j] * inverse[i, j]
+                covariances[m, i, j] = assumed * assumed * scale[i] * scale[j] * inverse[i, j]
+        for g in range(len(bounds) - 1):
+            if 0 <= at[bounds[g]] < responses.shape[1]:
+                for i in range(4):
+                    responses[m, at[bounds[g]], i] = response[g, i] * scale[i] * station_sd[g]
 
 
-def fitted(
+def rough(
     gathered: Gathered,
     scanners: Floats,
     points: Floats,
@@ -184,23 +407,83 @@ def fitted(
     inner_mm: Floats,
     span_mm: Floats,
     radii_mm: tuple[float, float],
-    bow_share: float,
-    fine: bool,
+    most: int,
     threads: int = 0,
-) -> Fits:
-    """Fit a tube about each line through points (m, 3) along unit directions (m, 3), off the true axis by 40 mm at most.
+) -> Rough:
+    """Fit straight tubes about lines through points (m, 3) along unit directions (m, 3), off the axes by 40 mm at most.
 
     Points within ``inner_mm`` (m,) of the middle are believed to be on the tube, and its ends are looked for within
-    ``span_mm`` (m,). ``bow_share`` is the largest bow to expect as a share of the length; without ``fine`` tubes are
-    straight and ends rough. Radii outside of ``radii_mm`` are no tubes.
+    ``span_mm`` (m,). ``most`` points of each tube are looked at; radii outside of ``radii_mm`` are no tubes.
     """
     m = len(points)
-    points, directions, sides = points.copy(), directions.copy(), np.zeros((m, 3))
-    ok, lengths, radii, bows = np.zeros(m, bool), np.zeros(m), np.zeros(m), np.zeros((m, 2))
-    covariances, used, sigmas = np.zeros((m, 5, 5)), np.zeros(m, np.int64), np.zeros(m)
+    points, directions = points.copy(), directions.copy()
+    ok, lengths, radii, sigmas = np.zeros(m, bool), np.zeros(m), np.zeros(m), np.zeros(m)
+    by_incidence, scatter = np.zeros((m, COS_BINS, 3)), np.zeros((m, 2, 3))
     kernel = partial(
-        fit, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners, points,
-        directions, sides, inner_mm, span_mm, *radii_mm, bow_share, fine, ok, lengths, radii, bows, covariances, used, sigmas,
+        fit_roughly, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners,
+        points, directions, inner_mm, span_mm, most, *radii_mm, ok, lengths, radii, sigmas, by_incidence, scatter,
     )  # fmt: skip
     over_ranges(kernel, m, threads)
-    return Fits(ok, points, directions, sides, lengths, radii, bows, covariances, used, sigmas)
+    return Rough(ok, points, directions, lengths, radii, sigmas, by_incidence, scatter)
+
+
+def refined(
+    gathered: Gathered,
+    scanners: Floats,
+    start: Rough,
+    span_mm: Floats,
+    radii_mm: tuple[float, float],
+    bow_share: float,
+    least_cos: float,
+    station_variance: tuple[float, float],
+    threads: int = 0,
+) -> Fits:
+    """Fit bowed tubes to all points gathered, from their rough axes.
+
+    ``bow_share`` is the largest bow to expect, as a share of the length. ``least_cos`` bounds the incidence of rays,
+    and each station may be off with ``station_variance``,
+    see :func:`station_variance`.
+    """
+    m = len(start.points)
+    points, directions, sides = start.points.copy(), start.directions.copy(), np.zeros((m, 3))
+    ok, lengths, radii, bows = start.ok.copy(), start.lengths.copy(), start.radii.copy(), np.zeros((m, 2))
+    covariances, responses = np.zeros((m, 5, 5)), np.zeros((m, len(scanners) if any(station_variance) else 0, 4, 2))
+    used, sigmas = np.zeros(m, np.int64), start.sigma.copy()
+    kernel = partial(
+        refine, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, scanners, points,
+        directions, span_mm, *radii_mm, bow_share, least_cos, *station_variance, ok, sides, lengths, radii, bows, covariances,
+        responses, used, sigmas,
+    )  # fmt: skip
+    over_ranges(kernel, m, threads)
+    return Fits(ok, points, directions, sides, lengths, radii, bows, covariances, responses, used, sigmas)
+
+
+def least_cosine(start: Rough, tolerance_mm: float) -> float:
+    """Least cosine of incidence down to which points lie on their tubes on the average, to a tolerance.
+
+    A beam as wide as a good part of a tube meets its edge with a part of itself, and such points lie off the tube.
+    """
+    number, total, _ = start.by_incidence[start.ok].sum(axis=0).T
+    mean = np.abs(total / np.maximum(number, 1.0))
+    last = round((ROUGH_COS - GRAZING_COS) * 10.0)
+    while last > 0 and mean[last - 1] < tolerance_mm:
+        last -= 1
+    return GRAZING_COS + 0.1 * last
+
+
+def station_variance(start: Rough) -> tuple[float, float]:
+    """By how much stations are off each other, for each axis: a in mm^2 and b in mm^2/m^2 of a + b distance^2.
+
+    Both are 0 where noise explains all.
+    """
+    (near, near1, near2), (far, far1, far2) = start.scatter[start.ok].sum(axis=0).tolist()
+    if near <= 0.0 and far <= 0.0:
+        return 0.0, 0.0
+    det = near1 * far2 - near2 * far1
+    if det > 1e-6 * near1 * far2:
+        a, b = (near * far2 - far * near2) / det, (near1 * far - far1 * near) / det
+        if a >= 0.0 and b >= 0.0:
+            return a, b
+        if a < 0.0:
+            return 0.0, max((near + far) / (near2 + far2), 0.0)
+    return (max((near + far) / (near1 + far1), 0.0), 0.0) if near1 + far1 > 0.0 else (0.0, 0.0)
