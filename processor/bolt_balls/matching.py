@@ -58,9 +58,9 @@ class Found:
 class Matching(Checked):
     """Which found node is which of the design, and the pose that says so.
 
-    ``T_design_scan`` maps coordinates of the scan (the origin put back) to the design's frame; ``covariance`` (turn about
-    the design frame's axes, translation; T = exp(xi) T) takes the nodes' movements for random: it says how well the
-    nodes tell the frame. It is 0 where the frame was found to be the design's own, for then nothing was estimated.
+    ``T_design_scan`` maps coordinates of the scan (the origin put back) to the design's frame; ``covariance`` (turn
+    about the design frame's axes, translation; T = exp(xi) T) takes the nodes' movements for random: it says how well
+    the nodes tell the frame. It is 0 where the frame was found to be the design's own, for then nothing was estimated.
     ``T_best_fit`` is the best fit over all matched nodes in either case.
     """
 
@@ -320,7 +320,7 @@ def _full(T: Floats, origin: Floats, middle: Floats) -> Floats:
 
 
 def _covariance(placed: Floats, off: Floats, weight: Floats, middle: Floats) -> Floats:
-    """Covariance (6, 6) of a fit about the design frame's origin; nodes placed (n, 3) less ``middle``, off by ``off``."""
+    """Covariance (6, 6) of a fit, about the design frame's origin; ``placed`` (n, 3) nodes are less ``middle``."""
     J = rigid.motion(placed)
     A = np.einsum("n,nip,niq->pq", weight, J, J)
     scale = np.sqrt(np.diag(A))

@@ -1,9 +1,9 @@
 """How far every node is from its nominal place, and how sure that is.
 
 A movement is found minus nominal in the design's frame, after a datum. Where the scan is in the design's own frame the
-datum is this frame, and what is uncertain about it is part of every interval. Where it had to be registered the datum is
-the best fit over all matched nodes: a movement they have in common is gone, and the fit's own uncertainty, which comes
-from the nodes it rests on, is part of every interval (Teunissen 2000, S-transformations).
+datum is this frame, and what is uncertain about it is part of every interval. Where it had to be registered the datum
+is the best fit over all matched nodes: a movement they have in common is gone, and the fit's own uncertainty, which
+comes from the nodes it rests on, is part of every interval (Teunissen 2000, S-transformations).
 """
 
 from __future__ import annotations

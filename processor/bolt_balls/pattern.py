@@ -121,7 +121,7 @@ def fitted(source: Floats, target: Floats, weight: Floats) -> Floats:
 def _grown(
     T: Floats, found: Floats, near: Ints, spread: Ints, design: Floats, tree: cKDTree, tolerance_mm: float
 ) -> Floats:
-    """The poses among T (h, 4, 4) that ever more nodes follow, fitted to them; best first, MOST at most."""
+    """Return the poses among T (h, 4, 4) that ever more nodes follow, fitted to them; best first, MOST at most."""
     for count in (*STAGES, 0):
         rows = near[:count] if count else spread
         # A pose from few nodes, a node's place being off, swings: at first the gate is wider.

@@ -1,8 +1,8 @@
 """Compiled kernels of the stations' self-registration: points of tubes against their axes, and the normal equations.
 
-What an observation tells of, in this order: offsets of a tube's axis along e1 and e2 at the middle of what is seen, how
-far the axis leaves it at the end of what is seen (zeta = 1), again along e1 and e2, bow along e1 and e2 as the factor of
-zeta^2 - 1/3, radius, and the offset of the ranges; all mm. The last is the station's alone. All sums run over one tube
+What an observation tells of, in this order: offsets of a tube's axis along e1 and e2 at the middle of what is seen,
+how far the axis leaves it at the end of what is seen (zeta = 1), again along e1 and e2, bow along e1 and e2 as the
+factor of zeta^2 - 1/3, radius, and the offset of the ranges; all mm. The last is the station's alone. All sums run over one tube
 or one observation in the points' order: no answer depends on the threads.
 """
 # Numba infers the types of the arguments: they stay without annotations.
@@ -197,7 +197,7 @@ def solve(L, B):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def product(A, B):  # type: ignore[no-untyped-def]
-    """A B, summed in one order; that of a BLAS depends on its threads."""
+    """Multiply A by B, summed in one order; that of a BLAS depends on its threads."""
     found = np.zeros((A.shape[0], B.shape[1]))
     for i in range(A.shape[0]):
         for k in range(A.shape[1]):
@@ -410,7 +410,7 @@ def effect(points, influence, places, covariance):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True, parallel=True)
 def corrected(points, station, places, offset, T):  # type: ignore[no-untyped-def]
-    """Points (n, 3) less their station's range offset, then moved by its T; in sums a coordinate, never as a product."""
+    """Take their station's range offset off points (n, 3), and move them by its T; in sums a coordinate."""
     found = points.copy()
     for i in prange(len(points)):
         s = station[i]

@@ -21,6 +21,7 @@ import numpy.typing as npt
 
 from processor.bolt_balls import station_kernels as kernels
 from processor.bolt_balls.station_adjustment import ControlPoints, Posterior, common_motion, corrections, mean_gain
+from processor.geometry import rigid
 from processor.model import Checked, Floats, Ints, Labels, column, names
 
 Bools = npt.NDArray[np.bool_]
@@ -38,6 +39,7 @@ DOUBT = 3.0  # differences beyond this many times their mean lose weight
 TAKEN = 6.0  # unknowns of a tube: seven, of which the bow's are held a little
 LEAST_POINTS = 20  # of a station, for a scale of their own
 SMALLEST_MM = 1e-3  # scale of residuals
+WEAK_MM, WEAK_RAD = 0.1, 1e-5  # sd that is too small to be called weak
 WEAK_SHARE = 0.5  # of the prior variance left: what the tubes told is not worth the name
 MOTIONS = ("turn about x", "turn about y", "turn about z", "shift along x", "shift along y", "shift along z")
 
@@ -121,6 +123,19 @@ class Stations(Checked):
         found: Floats = kernels.product(kernels.product(gain, self.covariance), np.ascontiguousarray(gain.T))
         return found
 
+    def datum_at(self, points: Floats) -> Floats:
+        """Covariance (k, 3, 3) that the motion of all stations adds to anything at points (k, 3), the same for all."""
+        middle = points.mean(axis=0) if len(points) else np.zeros(3)
+        J = rigid.motion(points - middle)
+        found: Floats = np.einsum("kip,pq,kjq->kij", J, self.common(middle), J)
+        return found
+
+    @property
+    def between(self) -> Floats:
+        """Covariance (s, 3, 3) of each station's place against all the others': without what they have in common."""
+        alone = np.eye(len(self.places))
+        return self.effect(self.places, alone, relative=True)
+
     def _precision(self) -> Floats:
         one = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
         return np.tile(one, len(self.places))
@@ -172,8 +187,8 @@ def register(
     by_station, bounds = _by_station(station, start, count)
     for turn in range(ROUNDS):
         seen = kernels.residuals(
-            ordered, start, tube, station, corrections(x, scanners), x[6 :: kernels.STATION], scanners, tubes.axis, tubes.e1, tubes.e2,
-            tubes.half, tubes.radius, STEEPEST,
+            ordered, start, tube, station, corrections(x, scanners), x[6 :: kernels.STATION], scanners, tubes.axis,
+            tubes.e1, tubes.e2, tubes.half, tubes.radius, STEEPEST,
         )  # fmt: skip
         if turn:
             scale = _scales(seen, by_station, bounds, scale, len(radii))
@@ -269,7 +284,10 @@ def _result(
     left = np.diag(C).reshape(-1, kernels.STATION)[:, :6] / np.repeat(posterior.variance[:2], 3)
     # What all stations have in common is never told; its share of the variance is one station's in their number.
     bound = 1.0 / count + WEAK_SHARE * (1.0 - 1.0 / count)
-    weak = tuple(", ".join(name for name, own in zip(MOTIONS, row, strict=True) if own > bound) for row in left)
+    large = np.diag(C).reshape(-1, kernels.STATION)[:, :6] > np.repeat([WEAK_RAD**2, WEAK_MM**2], 3)
+    weak = tuple(
+        ", ".join(name for name, is_weak in zip(MOTIONS, row, strict=True) if is_weak) for row in (left > bound) & large
+    )
     said = [f"stations lay {before_mm:.2g} mm and {1e3 * before_rad:.2g} mrad (sd an axis) off before"]
     said += [f"station {i}: {what} hardly told by the tubes" for i, what in enumerate(weak) if what]
     if posterior.control is None:

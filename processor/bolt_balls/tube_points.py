@@ -79,8 +79,9 @@ def tube_points(gathered: Gathered, lines: Ints, tubes: Tubes, most: int = MOST)
     """
     axis = np.hstack([tubes.points, tubes.directions])
     number, kept, station = choose(
-        gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, gathered.shares, lines, axis, tubes.side,
-        np.ascontiguousarray(tubes.other), tubes.lengths, tubes.radii, tubes.bow, NEAR_MM, END_SHARE, most,
+        gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, gathered.shares, lines,
+        axis, tubes.side, np.ascontiguousarray(tubes.other), tubes.lengths, tubes.radii, tubes.bow, NEAR_MM, END_SHARE,
+        most,
     )  # fmt: skip
     used = np.arange(most) < number[:, None]
     places, owner = kept[used], np.repeat(lines, number)
