@@ -5,14 +5,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from processor.bolt_balls.corridors import FIELD, HALF, Gathered
 from processor.bolt_balls.source import Chunk, Source
 from processor.bolt_balls.stations import Stations
 from processor.bolt_balls.thinning import STEPS_PER_MM
+from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats
 
 
@@ -46,21 +48,24 @@ class Corrected:
             yield Chunk(self.stations.corrected(chunk.points, chunk.station), chunk.station)
 
 
-def corrected_gathered(gathered: Gathered, stations: Stations) -> Gathered:
+def corrected_gathered(gathered: Gathered, stations: Stations, threads: int = 0) -> Gathered:
     """Points gathered near lines, each moved as its station is; rounded to the same steps of 0.01 mm."""
-    places = moved(
-        gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, stations.places,
-        stations.range_offset, stations.T_project_station,
+    places = gathered.places.copy()
+    kernel = partial(
+        moved, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, stations.places,
+        stations.range_offset, stations.T_project_station, places,
     )  # fmt: skip
+    over_ranges(kernel, len(gathered.counts), threads)
     return replace(gathered, places=places)
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def moved(counts, room, places, stations, middles, scanners, offset, T):  # type: ignore[no-untyped-def]
-    """Places of gathered points after the corrections; what left a line's reach stays at its edge."""
-    found = places.copy()
+@njit(cache=True, nogil=True)
+def moved(  # type: ignore[no-untyped-def]
+    counts, room, places, stations, middles, scanners, offset, T, found, first, last
+):
+    """Write places of gathered points after the corrections; what left a line's reach stays at its edge."""
     mask, most = (1 << FIELD) - 1, 2 * HALF - 1
-    for m in prange(len(counts)):
+    for m in range(first, last):
         for i in range(m * room, m * room + counts[m]):
             s = stations[i]
             if s < 0 or s >= len(scanners):
@@ -78,4 +83,3 @@ def moved(counts, room, places, stations, middles, scanners, offset, T):  # type
                 step = np.int64(np.rint(value * STEPS_PER_MM)) - middles[m, k] + HALF
                 place = (place << FIELD) | min(max(step, 0), most)
             found[i] = place
-    return found

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.bolt_balls.station_kernels import STATION, cholesky, product, solve
+from processor.bolt_balls.station_kernels import STATION
+from processor.bolt_balls.station_normals import cholesky, product, solve
 from processor.geometry import rigid
 from processor.model import Checked, Floats, column, names
 

@@ -20,6 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.bolt_balls import station_kernels as kernels
+from processor.bolt_balls import station_normals as normals
 from processor.bolt_balls.station_adjustment import ControlPoints, Posterior, common_motion, corrections, mean_gain
 from processor.geometry import rigid
 from processor.model import Checked, Floats, Ints, Labels, column, names
@@ -88,7 +89,7 @@ class Stations(Checked):
 
     def corrected(self, points: Floats, station: Labels) -> Floats:
         """Return points (n, 3) of stations (n,), less the origin, where they belong; those of station -1 unmoved."""
-        return kernels.corrected(  # type: ignore[no-any-return]
+        return kernels.corrected(
             np.ascontiguousarray(points), station, self.places, self.range_offset, self.T_project_station
         )
 
@@ -103,14 +104,11 @@ class Stations(Checked):
             influence = influence[:, :, None, None] * np.eye(3)
         covariance = self.covariance
         if relative and np.isfinite(self.before_mm):
-            own = np.eye(len(covariance)) - kernels.product(
+            own = np.eye(len(covariance)) - normals.product(
                 common_motion(self.places), mean_gain(common_motion(self.places), self._precision())
             )
-            covariance = kernels.product(kernels.product(own, covariance), np.ascontiguousarray(own.T))
-        found: Floats = kernels.effect(
-            np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance
-        )
-        return found
+            covariance = normals.product(normals.product(own, covariance), np.ascontiguousarray(own.T))
+        return kernels.effect(np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance)
 
     def common(self, place: Floats) -> Floats:
         """Covariance (6, 6) of the motion all stations have in common: turn about ``place`` (3,), translation.
@@ -120,7 +118,7 @@ class Stations(Checked):
         if not np.isfinite(self.before_mm):
             return self.covariance[:6, :6].copy()
         gain = mean_gain(common_motion(self.places - place), self._precision())
-        found: Floats = kernels.product(kernels.product(gain, self.covariance), np.ascontiguousarray(gain.T))
+        found: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
         return found
 
     def datum_at(self, points: Floats) -> Floats:
@@ -196,9 +194,9 @@ def register(
         geometry = (tube_obs, station, tubes.axis, tubes.e1, tubes.e2, tubes.half, scanners, _prior(tubes))
         last = turn == ROUNDS - 1
         for _ in range(2 if last else 1):
-            H, g = kernels.reduced(N, b, weight, floor, *geometry)
+            H, g = normals.reduced(N, b, weight, floor, *geometry)
             step, C = posterior.step(H, g, x, 5)
-            unknown, differs = kernels.tubes(N, b, weight, floor, *geometry, step, OFF_MM**2)
+            unknown, differs = normals.tubes(N, b, weight, floor, *geometry, step, OFF_MM**2)
             if turn:
                 weight, floor = _judged(differs, shared, weight, floor)
         if last:

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from processor.bolt_balls.corridors import FIELD, HALF, Gathered, hash_of
 from processor.bolt_balls.nodes import Tubes
 from processor.bolt_balls.stations import TubePoints
 from processor.bolt_balls.thinning import STEPS_PER_MM, WHOLE
+from processor.bolt_balls.threads import over_ranges
 from processor.model import Ints
 
 MOST = 192  # points of a tube: the stations are told by all tubes together
@@ -18,16 +21,14 @@ NEAR_MM = 12.0  # from a tube's surface, stations lying apart by some mm
 END_SHARE = 0.95  # of a tube's length: near its ends cones begin
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True)
 def choose(  # type: ignore[no-untyped-def]
-    counts, room, places, stations, middles, shares, lines, axis, side, other, length, radius, bow, near, inner, most
-):
+    counts, room, places, stations, middles, shares, lines, axis, side, other, length, radius, bow, near, inner, most,
+    number, kept, seen_from, first, last,
+):  # fmt: skip
     """Choose by their hashes the points that lie on each tube's surface, in the order of their places."""
-    m = len(lines)
     mask = (1 << FIELD) - 1
-    number = np.zeros(m, np.int64)
-    kept, seen_from = np.empty((m, most), np.int64), np.empty((m, most), np.int32)
-    for j in prange(m):
+    for j in range(first, last):
         base, line = lines[j] * room, lines[j]
         on, mixed = np.empty(counts[line], np.int64), np.empty(counts[line], np.uint64)
         # Hashes are even below the share that was gathered: a low part of them is enough, where points are many.
@@ -69,20 +70,22 @@ def choose(  # type: ignore[no-untyped-def]
         for i in range(k):
             kept[j, i], seen_from[j, i] = key[order[i]], stations[chosen[order[i]]]
         number[j] = k
-    return number, kept, seen_from
 
 
-def tube_points(gathered: Gathered, lines: Ints, tubes: Tubes, most: int = MOST) -> TubePoints:
+def tube_points(gathered: Gathered, lines: Ints, tubes: Tubes, most: int = MOST, threads: int = 0) -> TubePoints:
     """Take up to ``most`` points a tube out of those gathered near its line; ``lines`` (m,) are the tubes' rows there.
 
     Which are taken depends on their coordinates alone, and so does their order.
     """
     axis = np.hstack([tubes.points, tubes.directions])
-    number, kept, station = choose(
-        gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, gathered.shares, lines,
-        axis, tubes.side, np.ascontiguousarray(tubes.other), tubes.lengths, tubes.radii, tubes.bow, NEAR_MM, END_SHARE,
-        most,
+    m = len(lines)
+    number, kept, station = np.zeros(m, np.int64), np.empty((m, most), np.int64), np.empty((m, most), np.int32)
+    kernel = partial(
+        choose, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, gathered.shares,
+        lines, axis, tubes.side, np.ascontiguousarray(tubes.other), tubes.lengths, tubes.radii, tubes.bow, NEAR_MM,
+        END_SHARE, most, number, kept, station,
     )  # fmt: skip
+    over_ranges(kernel, m, threads)
     used = np.arange(most) < number[:, None]
     places, owner = kept[used], np.repeat(lines, number)
     mask = (1 << FIELD) - 1
