@@ -141,7 +141,7 @@ def _better_nearby(T: Floats, matched: int, positions: Floats, nominal: Floats, 
     counts = [
         (tree.query(rigid.apply(one, moved), distance_upper_bound=tolerance_mm)[0] < np.inf).sum() for one in tried
     ]
-    return max(counts) > matched
+    return bool(max(counts) > matched)
 
 
 def _chosen(
@@ -229,7 +229,8 @@ def robust_fit(source: Floats, target: Floats) -> tuple[Floats, Floats]:
 
 
 def _weighted_fit(source: Floats, target: Floats, weight: Floats) -> Floats:
-    return pattern.fitted(source[None], target[None], weight[None])[0]
+    found: Floats = pattern.fitted(source[None], target[None], weight[None])[0]
+    return found
 
 
 def _radius_odds(found: Found, design: FrameDesign, assignment: Ints) -> float:
@@ -329,9 +330,11 @@ def _covariance(placed: Floats, off: Floats, weight: Floats, middle: Floats) -> 
     S = np.einsum("n,ni,nj->ij", weight**2, off, off) / float(np.sum(weight**2)) * count / max(count - 2.0, 1.0)
     meat = np.einsum("n,nip,ij,njq->pq", weight**2, J, S, J)
     about = np.eye(6)
-    about[3:, :3] = [[0.0, middle[2], -middle[1]], [-middle[2], 0.0, middle[0]], [middle[1], -middle[0], 0.0]]
-    found: Floats = about @ inverse @ meat @ inverse @ about.T
-    return 0.5 * (found + found.T)
+    # a turn about the middle is one about the origin and a translation by - w x middle
+    about[3:, :3] = [[0.0, -middle[2], middle[1]], [middle[2], 0.0, -middle[0]], [-middle[1], middle[0], 0.0]]
+    one = about @ inverse @ meat @ inverse @ about.T
+    found: Floats = 0.5 * (one + one.T)
+    return found
 
 
 def _failed(k: int, d: int, message: str) -> Matching:

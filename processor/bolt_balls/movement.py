@@ -93,7 +93,8 @@ def _relative(nodes: Floats, own: Floats, weight: Floats) -> Floats:
     gain = np.einsum("pq,niq,n->npi", inverse, J, weight)
     moved = np.einsum("npi,nij,nqj->pq", gain, own, gain)
     cross = np.einsum("nip,npj,njk->nik", J, gain, own)
-    return own - cross - np.swapaxes(cross, 1, 2) + np.einsum("nip,pq,njq->nij", J, moved, J)
+    found: Floats = own - cross - np.swapaxes(cross, 1, 2) + np.einsum("nip,pq,njq->nij", J, moved, J)
+    return found
 
 
 def _certain(vector: Floats, covariance: Floats) -> Ints:

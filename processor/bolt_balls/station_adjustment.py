@@ -157,9 +157,9 @@ class Posterior:
         off = own.target - np.einsum("cs,sci->ci", own.share, moved)
         J = np.zeros((len(own.ids), 3, len(self.places), STATION))
         J[..., :6] = np.stack([rigid.motion(own.measured - place) for place in self.places], axis=2)
-        J = (own.share[:, None, :, None] * J).reshape(3 * len(own.ids), -1)
-        weighted = np.ascontiguousarray(J.T) / own.sd.ravel() ** 2
-        return H + product(weighted, J), g + product(weighted, off.reshape(-1, 1))[:, 0]
+        A = (own.share[:, None, :, None] * J).reshape(3 * len(own.ids), -1)
+        weighted = np.ascontiguousarray(A.T) / own.sd.ravel() ** 2
+        return H + product(weighted, A), g + product(weighted, off.reshape(-1, 1))[:, 0]
 
     def _estimate(self, x: Floats, C: Floats) -> None:
         own, spread = x, np.diag(C)
