@@ -237,6 +237,6 @@ def _corrected(points, station, places, offset, T, found, first, last):  # type:
 
 def corrected(points: Floats, station: Labels, places: Floats, offset: Floats, T: Floats, threads: int = 0) -> Floats:
     """Take their station's range offset off points (n, 3), and move them by its T; in sums a coordinate."""
-    found = points.copy()
+    found: Floats = points.copy()
     over_ranges(partial(_corrected, points, station, places, offset, T, found), len(points), threads, 20_000)
     return found

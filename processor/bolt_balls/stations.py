@@ -116,7 +116,8 @@ class Stations(Checked):
         It is that of the rigid motion which fits the stations' own motions best, weighted as they scatter.
         """
         if not np.isfinite(self.before_mm):
-            return self.covariance[:6, :6].copy()
+            known: Floats = self.covariance[:6, :6].copy()
+            return known
         gain = mean_gain(common_motion(self.places - place), self._precision())
         found: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
         return found
@@ -247,7 +248,7 @@ def _by_station(station: Ints, start: Ints, count: int) -> tuple[Ints, Ints]:
 
 def _scales(seen: Floats, by_station: Ints, bounds: Ints, before: Floats, tubes: int) -> Floats:
     """Scale (s,) of the residuals of each station's points, by their median; of few points the one before."""
-    scale = before.copy()
+    scale: Floats = before.copy()
     residual = np.where((seen[:, 1] > 0.0) & (np.abs(seen[:, 0]) < FIRST_CUT_MM), np.abs(seen[:, 0]), np.nan)[
         by_station
     ]
