@@ -22,7 +22,9 @@ CORNERS = 24  # tried at most
 ENOUGH = 2  # corners that led to the best pose: more bring nothing new
 FLAT = 0.35  # sine of the angle of a corner that holds a turn about its sides
 STAGES = (12, 36, 108)  # found nodes about the corner that a pose is held against, one after another
-SPREAD = 128  # nodes all over the cloud, then
+FEW, SPREAD = 32, 128  # nodes all over the cloud, then
+MANY = 1000  # poses that agree with a neighbourhood
+BLOCK = 4096  # poses looked at together
 LEAST_SHARE = 0.5  # of the nodes that must lie on the design's at each stage
 KEPT_SHARE = 0.8  # of the best pose's
 MOST = 64  # poses that are looked at in full
@@ -122,28 +124,40 @@ def _grown(
     T: Floats, found: Floats, near: Ints, spread: Ints, design: Floats, tree: cKDTree, tolerance_mm: float
 ) -> Floats:
     """Return the poses among T (h, 4, 4) that ever more nodes follow, fitted to them; best first, MOST at most."""
-    for count in (*STAGES, 0):
-        rows = near[:count] if count else spread
-        # A pose from few nodes, a node's place being off, swings: at first the gate is wider.
-        gate = (1.5 if count else 2.0) * tolerance_mm
-        distance, number = np.empty((0, len(rows))), np.empty(0)
-        for turn in range(2):
-            moved = np.einsum("hij,nj->hni", T[:, :3, :3], found[rows]) + T[:, None, :3, 3]
-            distance, index = tree.query(moved, distance_upper_bound=gate, workers=-1)
-            number = np.isfinite(distance).sum(axis=1)
-            good = number >= LEAST_SHARE * len(rows)
-            if good.any():
-                good &= number >= KEPT_SHARE * number.max()
-            T, index, distance = T[good], index[good], distance[good]
-            if not len(T):
+    stages = [(near[:count], 1.5) for count in STAGES] + [(spread[:FEW], 2.5), (spread, 2.0)]
+    number, error = np.empty(0), np.empty(0)
+    for rows, wide in stages:
+        # Many poses that a neighbourhood cannot tell apart: more of it would not either.
+        if len(T) > MANY and len(rows) > STAGES[1] and rows is not spread:
+            continue
+        # A pose from few nodes, a node's place being off, swings: the gate is wider than a node may be off.
+        gate = wide * tolerance_mm
+        for refit in (True, False):
+            parts = [
+                _followed(T[first : first + BLOCK], found[rows], design, tree, gate, tolerance_mm, refit=refit)
+                for first in range(0, len(T), BLOCK)
+            ]
+            if not parts:
                 return T
-            on = np.isfinite(distance)
-            if turn == 0:
-                weight = on / (1.0 + (np.where(on, distance, 0.0) / (0.5 * tolerance_mm)) ** 2)
-                T = fitted(np.broadcast_to(found[rows], (len(T), len(rows), 3)), design[np.where(on, index, 0)], weight)
-    number = np.isfinite(distance).sum(axis=1)
-    error = np.where(np.isfinite(distance), distance, 0.0).sum(axis=1)
+            T, number, error = (np.concatenate([part[k] for part in parts]) for k in range(3))
+            good = number >= max(LEAST_SHARE * len(rows), KEPT_SHARE * number.max())
+            T, number, error = T[good], number[good], error[good]
     return T[np.lexsort((error, -number))][:MOST]
+
+
+def _followed(
+    T: Floats, nodes: Floats, design: Floats, tree: cKDTree, gate: float, tolerance_mm: float, *, refit: bool
+) -> tuple[Floats, Floats, Floats]:
+    """Poses (h, 4, 4), fitted anew if asked, how many (h,) of nodes (n, 3) followed them before, and how far off."""
+    moved = np.einsum("hij,nj->hni", T[:, :3, :3], nodes) + T[:, None, :3, 3]
+    distance, index = tree.query(moved, distance_upper_bound=gate, workers=-1)
+    on = np.isfinite(distance)
+    size = np.where(on, distance, 0.0)
+    number = on.sum(axis=1)
+    if refit:
+        weight = on / (1.0 + (size / (0.5 * tolerance_mm)) ** 2)
+        T = fitted(np.broadcast_to(nodes, moved.shape), design[np.where(on, index, 0)], weight)
+    return T, number.astype(np.float64), size.sum(axis=1)
 
 
 def _spread_out(points: Floats, count: int) -> Ints:
