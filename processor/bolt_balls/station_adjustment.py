@@ -1,0 +1,223 @@
+"""The motions of all stations a posteriori, the variances of their prior being estimated along the way."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.bolt_balls.station_kernels import STATION
+from processor.bolt_balls.station_normals import cholesky, product, solve
+from processor.geometry import rigid
+from processor.model import Checked, Floats, column, names
+
+# of turn (rad), translation and offset of the ranges (mm)
+START = (5e-5, 2.0, 0.5)  # sd: where the iteration starts, nothing more
+SMALLEST = (1e-8, 1e-3, 1e-3)
+LOOSE = (1e-2, 1e3, 1e2)
+LEAST_TOLD = 0.5  # motions the data must tell of before they say anything of a variance
+ALLOWED = 6.0  # in log density below the likeliest variance
+
+
+@dataclass(frozen=True)
+class ControlPoints(Checked):
+    """Points with known coordinates: where the cloud has them, and where they are; mm, less one origin.
+
+    ``share`` (c, s) is how much of the measurement comes from each station (rows add up to 1). ``sd`` (c, 3) is that of
+    measured minus target without the stations' errors.
+    """
+
+    ids: tuple[str, ...] = names("c")
+    measured: Floats = column("c", 3)
+    target: Floats = column("c", 3)
+    sd: Floats = column("c", 3)
+    share: Floats = column("c", "s")
+
+    @property
+    def hold_all(self) -> bool:
+        """Whether they alone say where the whole cloud lies: three of them, not on one line."""
+        if len(self.ids) < 3:
+            return False
+        extent = np.linalg.svd(self.target - self.target.mean(axis=0), compute_uv=False)
+        return bool(extent[1] > 0.05 * extent[0])
+
+
+def corrections(x: Floats, places: Floats) -> Floats:
+    """Return T (s, 4, 4) of the stations' unknowns x (7 s,): turns about places (s, 3), then translations."""
+    found = np.empty((len(places), 4, 4))
+    for i, (one, place) in enumerate(zip(x.reshape(-1, STATION), places, strict=True)):
+        R = rigid.rotation_from_vector(one[:3])
+        found[i] = rigid.transform(R, place - R @ place + one[3:6])
+    return found
+
+
+def common_motion(places: Floats) -> Floats:
+    """How the stations' unknowns (7 s,) follow a turn about the frame's origin and a translation (6,) of them all."""
+    found = np.zeros((len(places), STATION, 6))
+    found[:, :3, :3] = np.eye(3)
+    found[:, 3:6] = rigid.motion(places)
+    return found.reshape(-1, 6)
+
+
+def mean_gain(M: Floats, precision: Floats) -> Floats:
+    """How the common motion (6,) that fits the stations' unknowns best follows each of them (6, 7 s)."""
+    weighted = np.ascontiguousarray(M.T) * precision
+    found: Floats = solve(cholesky(product(weighted, M)), weighted)
+    return found
+
+
+class Posterior:
+    """The unknowns of stations at ``places`` (s, 3), x = (turn, translation, offset of the ranges) of each.
+
+    A priori they are normal about zero, or about a common motion where control points hold the whole cloud. The three
+    variances are those under which the unknowns' sum of squares is what the data make one expect (MacKay 1992).
+    """
+
+    def __init__(self, places: Floats, control: ControlPoints | None) -> None:
+        self.places, self.control = places, control
+        self.variance = np.array(START) ** 2
+        self.free = control is not None and control.hold_all
+        self.M = common_motion(places - places.mean(axis=0))
+        self.kind = np.tile(np.array([0, 0, 0, 1, 1, 1, 2]), len(places))
+        # of each kind, how many are not common to all stations where a common motion is free
+        self.number = np.array([3.0, 3.0, 1.0]) * len(places) - np.array([3.0, 3.0, 0.0]) * self.free
+
+    def step(self, H: Floats, g: Floats, x: Floats, rounds: int) -> tuple[Floats, Floats]:
+        """Return the change of x (7 s,) and the covariance a posteriori; H and g are the tubes' equations at x.
+
+        ``rounds`` is how often the variances are estimated anew.
+        """
+        H, g = self._with_control(H, g, x)
+        change, C = np.zeros(len(x)), np.zeros_like(H)
+        for turn in range(rounds + 1):
+            _, solved = self._solved(H, g, x, self.variance)
+            change, C = solved[:, 0], solved[:, 1:]
+            if turn < rounds:
+                self._estimate(x + change, C)
+        return change, C
+
+    def integrated(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
+        """Return change and covariance as :meth:`step` does, averaged over all variances that the data allow.
+
+        With few stations, or weak ties, the variances are known poorly: one guess of them would make the covariance
+        too small. Their prior is uniform in log sd above what the data can resolve and in the sd itself below
+        (Gelman 2006 on why not in the log there). The kinds are averaged over one by one, about the likeliest.
+        """
+        H, g = self._with_control(H, g, x)
+        resolved = self._resolution(H)
+        sd, nodes = np.sqrt(self.variance), [np.empty(0)] * len(START)
+        for kind in (1, 0, 2, 1, 0):
+            sd, nodes[kind] = self._allowed(H, g, x, sd, kind, resolved)
+        _, best = self._solved(H, g, x, sd**2)
+        change, C, variance = best[:, 0].copy(), best[:, 1:].copy(), np.zeros(len(START))
+        for kind, values in enumerate(nodes):
+            tried = np.tile(sd, (len(values), 1))
+            tried[:, kind] = values
+            found = [self._solved(H, g, x, one**2) for one in tried]
+            log = np.array([
+                self._evidence(L, g, solved[:, 0], x, one**2, resolved)
+                for (L, solved), one in zip(found, tried, strict=True)
+            ])  # fmt: skip
+            weight = np.exp(log - log.max())
+            weight /= weight.sum()
+            mean = np.sum(weight[:, None] * np.array([solved[:, 0] for _, solved in found]), axis=0)
+            change += mean - best[:, 0]
+            for w, (_, solved) in zip(weight, found, strict=True):
+                off = solved[:, 0] - mean
+                C += w * (solved[:, 1:] - best[:, 1:] + off[:, None] * off)
+            variance[kind] = float(np.sum(weight * values**2))
+        self.variance = variance
+        return change, 0.5 * (C + C.T)
+
+    def precision(self, variance: Floats) -> Floats:
+        """Information (7 s,) of the prior on each unknown."""
+        found: Floats = 1.0 / variance[self.kind]
+        return found
+
+    def _solved(self, H: Floats, g: Floats, x: Floats, variance: Floats) -> tuple[Floats, Floats]:
+        """Factor L of the matrix a posteriori, and the change (7 s,) beside the covariance, (7 s, 1 + 7 s)."""
+        P = self._prior(variance)
+        L = cholesky(H + P)
+        return L, solve(L, np.column_stack([g - product(P, x[:, None])[:, 0], np.eye(len(x))]))
+
+    def _prior(self, variance: Floats) -> Floats:
+        precision = self.precision(variance)
+        P = np.diag(precision)
+        if self.free:
+            P -= product(precision[:, None] * self.M, mean_gain(self.M, precision))
+            P = 0.5 * (P + P.T)
+        return P
+
+    def _with_control(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
+        if self.control is None:
+            return H, g
+        own = self.control
+        T = corrections(x, self.places)
+        moved = np.einsum("sij,cj->sci", T[:, :3, :3], own.measured) + T[:, None, :3, 3]
+        off = own.target - np.einsum("cs,sci->ci", own.share, moved)
+        J = np.zeros((len(own.ids), 3, len(self.places), STATION))
+        J[..., :6] = np.stack([rigid.motion(own.measured - place) for place in self.places], axis=2)
+        A = (own.share[:, None, :, None] * J).reshape(3 * len(own.ids), -1)
+        weighted = np.ascontiguousarray(A.T) / own.sd.ravel() ** 2
+        return H + product(weighted, A), g + product(weighted, off.reshape(-1, 1))[:, 0]
+
+    def _estimate(self, x: Floats, C: Floats) -> None:
+        own, spread = x, np.diag(C)
+        if self.free:
+            gain = np.eye(len(x)) - product(self.M, mean_gain(self.M, self.precision(self.variance)))
+            own, spread = product(gain, x[:, None])[:, 0], np.einsum("pq,pq->p", product(gain, C), gain)
+        for kind, least in enumerate(SMALLEST):
+            of_kind = self.kind == kind
+            told = self.number[kind] - float(spread[of_kind].sum()) / self.variance[kind]
+            if told > LEAST_TOLD:
+                self.variance[kind] = max(float(np.sum(own[of_kind] ** 2)) / told, least**2)
+
+    def _resolution(self, H: Floats) -> Floats:
+        """Sd (3,) with which the data tell a station's unknowns from the others', whatever they are."""
+        loose = np.array(LOOSE) ** 2
+        C = solve(cholesky(H + self._prior(loose)), np.eye(len(H)))
+        gain = np.eye(len(H)) - product(self.M, mean_gain(self.M, self.precision(loose)))
+        spread = np.einsum("pq,pq->p", product(gain, C), gain)
+        return np.array([float(np.sqrt(np.median(spread[self.kind == kind]))) for kind in range(len(START))])
+
+    def _allowed(
+        self, H: Floats, g: Floats, x: Floats, sd: Floats, kind: int, resolved: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the likeliest sd (3,) along one ``kind``, and those (n,) that the data allow, even in the log."""
+
+        def density(value: float) -> float:
+            tried = sd.copy()
+            tried[kind] = value
+            P = self._prior(tried**2)
+            L = cholesky(H + P)
+            right = g - product(P, x[:, None])[:, 0]
+            return self._evidence(L, g, solve(L, right[:, None])[:, 0], x, tried**2, resolved)
+
+        coarse = resolved[kind] * 2.0 ** np.arange(-5, 14)
+        value = np.array([density(one) for one in coarse])
+        best = sd.copy()
+        top = int(np.argmax(value))
+        best[kind] = coarse[top]
+        near = np.flatnonzero(value > value[top] - ALLOWED)
+        if len(near) > 4 or top in (0, len(coarse) - 1):
+            return best, coarse[near]
+        step = 0.25 * np.log(2.0)
+        peak, width = float(np.log(coarse[top])), step
+        for _ in range(2):  # the density is next to normal: two parabolas find its top and width
+            low, middle, high = (density(float(np.exp(peak + shift))) for shift in (-step, 0.0, step))
+            bend = low - 2.0 * middle + high
+            if not bend < 0.0:
+                return best, coarse[near]
+            width = step / np.sqrt(-bend)
+            peak += float(np.clip(0.5 * step * (low - high) / bend, -2.0 * step, 2.0 * step))
+        best[kind] = np.exp(peak)
+        return best, np.exp(peak + width * np.arange(-2.0, 2.5))
+
+    def _evidence(self, L: Floats, g: Floats, change: Floats, x: Floats, variance: Floats, resolved: Floats) -> float:
+        """Log density of log variances given the data, up to a constant."""
+        P = self._prior(variance)
+        Px = product(P, x[:, None])[:, 0]
+        fit = float(np.sum((g - Px) * change)) - float(np.sum(x * Px))
+        sd = np.sqrt(variance)
+        log_prior = -float(np.sum(self.number * np.log(sd))) + float(np.sum(np.log(sd / (sd + resolved))))
+        return log_prior - float(np.sum(np.log(np.diag(L)))) + 0.5 * fit
