@@ -1,0 +1,175 @@
+"""Balls at known nodes: size, centre, radius and lowest point from the points about each node, with the axes fused.
+
+Method ``ray`` of the spheres. Its steps: gather the points about all nodes; vote for sizes and fit those in question;
+learn from all balls together how large the sleeves are, how the noise grows and how radii scatter; choose and fit again.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit, prange
+
+from processor.bolt_balls import ball_ends, ball_flags, ball_noise
+from processor.bolt_balls.ball_choice import choose
+from processor.bolt_balls.ball_ends import AXIS_MM, FLAT_MM, Ends
+from processor.bolt_balls.ball_final import finish
+from processor.bolt_balls.ball_records import Balls, Fits
+from processor.bolt_balls.ball_residuals import LEAST_COSINE
+from processor.bolt_balls.catalogue import Catalogue
+from processor.bolt_balls.crops import Crops, gather
+from processor.bolt_balls.nodes import Nodes, Tubes
+from processor.bolt_balls.source import Source
+from processor.model import Floats
+
+NAN = float("nan")
+MARGIN_MM = 40.0  # of a crop beyond the largest ball: sleeves are measured there
+LARGEST_FREE_MM = 150.0
+FREE_SIZES = np.arange(20.0, LARGEST_FREE_MM + 1.0, 5.0)  # where a fit of a free radius starts
+MOST_BELIEVED = 60.0  # points that the noise model is worth for one ball
+VAGUE_MM = 50.0  # a node with a larger sd than this has no prior
+
+
+@dataclass(frozen=True)
+class Params:
+    """Parameters of the fit, mm. ``sigma_mm`` starts the estimate of the noise, which the balls then say themselves."""
+
+    sigma_mm: float = 2.0
+    process_hole_mm: float = 15.0  # radius of the cap about the lowest point that is not the ball's
+    least_cosine: float = LEAST_COSINE
+    surprise: float = 9.0  # by which the energy of a size other than the expected one is raised
+    catch_mm: float = 12.0  # how far off a point may be and still draw the first steps
+
+
+@dataclass(frozen=True)
+class _Rays:
+    """Unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,) of gathered points."""
+
+    directions: Floats
+    ranges: Floats
+
+
+def find_balls(
+    source: Source,
+    nodes: Nodes,
+    tubes: Tubes,
+    catalogue: Catalogue,
+    expected_mm: Floats | None = None,
+    station_covariance: Floats | None = None,
+    params: Params | None = None,
+) -> Balls:
+    """Fit a ball at every node; one pass over the source.
+
+    ``expected_mm`` (k,) are nominal radii, NaN = none: a prior on the size alone. ``station_covariance`` (s, 3, 3) is that
+    of each scanner's place as registered, mm^2; left out, stations stand where they are said to.
+    """
+    largest = float(catalogue.radii.max()) if len(catalogue.radii) else LARGEST_FREE_MM
+    if expected_mm is not None and np.isfinite(expected_mm).any():
+        largest = max(largest, float(np.nanmax(expected_mm)))
+    crops = gather(source, nodes.positions, largest + MARGIN_MM)
+    return fit_crops(crops, source.scanners, nodes, tubes, catalogue, expected_mm, station_covariance, params)
+
+
+def fit_crops(
+    crops: Crops,
+    scanners: Floats,
+    nodes: Nodes,
+    tubes: Tubes,
+    catalogue: Catalogue,
+    expected_mm: Floats | None = None,
+    station_covariance: Floats | None = None,
+    params: Params | None = None,
+) -> Balls:
+    """Fit a ball to each node's gathered points; see :func:`find_balls`."""
+    params = params or Params()
+    k = nodes.count
+    expected = np.full(k, NAN) if expected_mm is None else np.asarray(expected_mm, np.float64)
+    shift = (
+        np.zeros((len(scanners), 3, 3)) if station_covariance is None else np.asarray(station_covariance, np.float64)
+    )
+    directions, ranges = _rays(crops.start, crops.points, crops.station, nodes.positions, np.asarray(scanners))
+    rays = _Rays(directions, ranges)
+    found = ball_ends.ends(nodes, tubes)
+    weights = centre_weights(nodes.covariance)
+    noise = np.array([params.sigma_mm**2, 0.0, 0.0])
+    corner = ball_ends.first_guess(found)
+    radius_sd, believed = catalogue.sd_mm, 10.0
+    for last in (False, True):
+        fits, errors, cosines, on = _fit(
+            crops, rays, found, corner, weights, noise, believed, catalogue, radius_sd, expected, shift, params
+        )
+        if not last:
+            corner = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3])
+            noise, count = ball_noise.noise_model(errors, cosines, ranges, on, noise)
+            believed = min(count, MOST_BELIEVED)
+            sure = fits.clear
+            radius_sd = (
+                ball_noise.radius_scatter(
+                    fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], catalogue.sd_mm
+                )
+                if len(catalogue.radii)
+                else radius_sd
+            )
+    return ball_flags.judged(fits, nodes, expected, catalogue, bool(np.any(ranges > 0.0)), noise, radius_sd)
+
+
+def _fit(
+    crops: Crops,
+    rays: _Rays,
+    found: Ends,
+    corner: Floats,
+    weights: Floats,
+    noise: Floats,
+    believed: float,
+    catalogue: Catalogue,
+    radius_sd: float,
+    expected: Floats,
+    shift: Floats,
+    params: Params,
+) -> tuple[Fits, Floats, Floats, Floats]:
+    free = len(catalogue.radii) == 0
+    sigma = float(np.sqrt(noise[0] + noise[1] * float(np.median(rays.ranges)) ** 2)) if len(rays.ranges) else 1.0
+    keep_off = corner + FLAT_MM + AXIS_MM + 0.5 * sigma
+    tube_off = np.where(np.isfinite(found.tube_radii), found.tube_radii, 1.5 * corner) + 2.0 + 2.0 * sigma
+    size_weight = 0.0 if free else 1.0 / radius_sd**2
+    common = (crops.start, crops.points, rays.directions, rays.ranges, crops.station, found.start, found.points,
+              found.directions, keep_off, params.process_hole_mm, params.least_cosine, noise)  # fmt: skip
+    states, sizes, energy, second, second_energy = choose(
+        *common, tube_off, weights, FREE_SIZES if free else np.asarray(catalogue.radii), size_weight, expected, params.surprise, free,
+        2.5 * sigma + 1.0, params.catch_mm, shift,
+    )  # fmt: skip
+    size_weights = np.full(len(states), size_weight)
+    states, covariance, bound, numbers, errors, cosines, on = finish(
+        *common, believed, weights, sizes, size_weights, states, 4.5 * sigma, shift
+    )
+    fits = Fits(states, covariance, bound, sizes, energy, second, second_energy, numbers)
+    return fits, errors, cosines, on
+
+
+def centre_weights(covariance: Floats) -> Floats:
+    """Inverse covariances (k, 3, 3) of nodes; 0 where a node's position says nothing."""
+    weights = np.zeros_like(covariance)
+    known = np.isfinite(covariance).all(axis=(1, 2))
+    known[known] &= np.linalg.eigvalsh(covariance[known]).max(axis=1) < VAGUE_MM**2
+    weights[known] = np.linalg.inv(covariance[known])
+    return weights
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _rays(start, points, station, nodes, scanners):  # type: ignore[no-untyped-def]
+    """Unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
+    directions, ranges = np.zeros((len(points), 3)), np.zeros(len(points))
+    for k in prange(len(start) - 1):
+        for i in range(start[k], start[k + 1]):
+            s = station[i]
+            if s < 0 or s >= len(scanners):
+                continue
+            x = points[i, 0] + (nodes[k, 0] - scanners[s, 0])
+            y = points[i, 1] + (nodes[k, 1] - scanners[s, 1])
+            z = points[i, 2] + (nodes[k, 2] - scanners[s, 2])
+            d = np.sqrt(x * x + y * y + z * z)
+            if d > 0.0:
+                directions[i, 0], directions[i, 1], directions[i, 2] = x / d, y / d, z / d
+                ranges[i] = d
+    return directions, ranges
