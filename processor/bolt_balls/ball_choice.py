@@ -84,7 +84,7 @@ def energy(  # type: ignore[no-untyped-def]
             total += (state[i] - centre[i]) * centre_weight[i, j] * (state[j] - centre[j])
     segment = 0
     for i in range(len(points)):
-        if chosen[i]:
+        if chosen[i] == 1:
             e, cosine, _, _, _, _ = residual(
                 points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2],
                 state[0] + shifts[segment, 0], state[1] + shifts[segment, 1], state[2] + shifts[segment, 2], state[3],
@@ -102,7 +102,7 @@ def energy(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def segments(station):  # type: ignore[no-untyped-def]
-    """Runs of one station among points sorted by station, at least 1."""
+    """Count the runs of one station among points sorted by station, at least 1."""
     found = 1
     for i in range(1, len(station)):
         if station[i] != station[i - 1]:
@@ -136,13 +136,16 @@ def fit_one(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, parallel=True)
 def choose(  # type: ignore[no-untyped-def]
-    start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise, tube_off, centre_weight,
-    sizes, size_weight, expected, surprise, free, kernel, catch, shift_covariance,
+    start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise, tube_off,
+    centre_weight, sizes, size_weight, expected, surprise, free, kernel, catch, shift_covariance,
 ):  # fmt: skip
     """Best state (k, 4), its size (k,) and energy (k,), the runner-up's size (k,) and energy (k,) of every node.
 
-    ``sizes`` (m,) are tried with weight ``size_weight``, and where ``free`` only as starts; energies of sizes other than
-    the node's ``expected`` (k,) one (NaN = none) are raised by ``surprise``. NaN and infinite where nothing fits.
+    ``sizes`` (m,) are tried with weight ``size_weight``, and where ``free`` only as starts; energies of sizes other
+    than the node's ``expected`` (k,) one (NaN = none) are raised by ``surprise``. NaN and infinite where nothing fits.
+
+    Sleeves hide more of a small ball than of a large one: sizes near the best are compared by the points that are
+    kept off none of them, or the size with the most points would win.
     """
     nodes = len(start) - 1
     states = np.full((nodes, 4), np.nan)
@@ -152,64 +155,76 @@ def choose(  # type: ignore[no-untyped-def]
         p, u = points[start[k] : start[k + 1]], rays[start[k] : start[k + 1]]
         L, s = ranges[start[k] : start[k + 1]], station[start[k] : start[k + 1]]
         ap, ad = axis_points[end_start[k] : end_start[k + 1]], axes[end_start[k] : end_start[k + 1]]
-        off = keep_off[end_start[k] : end_start[k + 1]]
+        off, wide = keep_off[end_start[k] : end_start[k + 1]], tube_off[end_start[k] : end_start[k + 1]]
+        n = len(p)
         known = not np.isnan(expected[k])
-        tried = np.empty(len(sizes) + 1)
-        tried[: len(sizes)] = sizes
-        count = len(sizes)
-        if known:
-            held = False
-            for j in range(len(sizes)):
-                held = held or sizes[j] == expected[k]
-            if not held:
-                tried[count] = expected[k]
-                count += 1
-        tried = tried[:count]
-        vote = np.empty(count)
-        votes(p, u, ap, ad, off, tube_off[end_start[k] : end_start[k + 1]], hole, tried, kernel, vote)
-        best = 0
-        for j in range(1, count):
-            if vote[j] > vote[best]:
-                best = j
+        tried = with_expected(sizes, expected[k])
+        vote = np.empty(len(tried))
+        votes(p, u, ap, ad, off, wide, hole, tried, kernel, vote)
         order = np.argsort(-vote, kind="mergesort")
-        shifts = np.zeros((segments(s), 3))
-        chosen = np.zeros(len(p), np.uint8)
-        covariance = np.zeros((4, 4))
-        state = np.zeros(4)
+        most = vote[order[0]]
         origin = np.zeros(3)
+        all_shifts = np.zeros((TRIED + 1, segments(s), 3))
+        all_states, found, own = np.zeros((TRIED + 1, 4)), np.empty(TRIED + 1), np.empty(TRIED + 1)
+        codes, covariance = np.zeros((TRIED + 1, n), np.uint8), np.zeros((4, 4))
         done = 0
-        for position in range(count):
-            j = order[position]
-            near = abs(tried[j] - tried[best]) <= NEIGHBOURS_MM
+        w = 0.0 if free else size_weight
+        for j in order:
+            near = abs(tried[j] - tried[order[0]]) <= NEIGHBOURS_MM
             wanted = known and tried[j] == expected[k]
-            if not (near or wanted or (vote[j] >= SHARE * vote[best] and vote[j] >= 3.0)):
+            if not (near or wanted or (vote[j] >= SHARE * most and vote[j] >= 3.0)):
                 continue
-            if done >= TRIED and not wanted:
+            if done >= (TRIED + 1 if wanted else TRIED):
                 continue
-            done += 1
+            state, shifts, code = all_states[done], all_shifts[done], codes[done]
             state[0], state[1], state[2], state[3] = 0.0, 0.0, 0.0, tried[j]
             shifts[:, :] = 0.0
-            w = 0.0 if free else size_weight
             used = fit_one(
                 p, u, L, s, ap, ad, off, hole, least_cosine, noise, origin, centre_weight[k], tried[j], w,
-                shift_covariance, catch, state, shifts, chosen, covariance,
+                shift_covariance, catch, state, shifts, code, covariance,
             )  # fmt: skip
             if used < 1:
                 continue
-            select(p, u, ap, ad, off, hole, state, least_cosine, np.inf, chosen)
-            e = energy(p, u, L, s, chosen, noise, origin, centre_weight[k], tried[j], w, state, shifts)
+            again = False
+            for i in range(done):
+                again = again or (free and abs(all_states[i, 3] - state[3]) < 0.5)
+            if again:
+                continue
+            select(p, u, ap, ad, off, hole, state, least_cosine, np.inf, code)
+            own[done] = tried[j]
+            found[done] = energy(p, u, L, s, code, noise, origin, centre_weight[k], tried[j], w, state, shifts)
             if known and not wanted:
-                e += surprise
-            label = state[3] if free else tried[j]
-            if free and abs(label - size[k]) < 0.5:
-                if e < energies[k]:
-                    energies[k] = e
-                    size[k] = label
-                    states[k] = state
-            elif e < energies[k]:
-                second[k], second_energy[k] = size[k], energies[k]
-                size[k], energies[k] = label, e
-                states[k] = state
-            elif e < second_energy[k]:
-                second[k], second_energy[k] = label, e
+                found[done] += surprise
+            done += 1
+        if done == 0:
+            continue
+        best = np.argmin(found[:done])
+        fair = np.ones(n, np.uint8)
+        for j in range(done):
+            if abs(own[j] - own[best]) <= NEIGHBOURS_MM:
+                for i in range(n):
+                    if codes[j, i] == 2:
+                        fair[i] = 0
+        for j in range(done):
+            codes[j] *= fair
+            found[j] = energy(
+                p, u, L, s, codes[j], noise, origin, centre_weight[k], own[j], w, all_states[j], all_shifts[j]
+            )
+            if known and own[j] != expected[k]:
+                found[j] += surprise
+        best = np.argmin(found[:done])
+        energies[k], size[k] = found[best], all_states[best, 3] if free else own[best]
+        states[k] = all_states[best]
+        found[best] = np.inf
+        if done > 1:
+            then = np.argmin(found[:done])
+            second[k], second_energy[k] = all_states[then, 3] if free else own[then], found[then]
     return states, size, energies, second, second_energy
+
+
+@njit(cache=True, nogil=True)
+def with_expected(sizes, expected):  # type: ignore[no-untyped-def]
+    """Return the sizes, and the expected one if it is none of them."""
+    if np.isnan(expected) or np.any(sizes == expected):
+        return sizes.copy()
+    return np.append(sizes, expected)

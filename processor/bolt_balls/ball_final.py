@@ -29,7 +29,7 @@ def leftover(  # type: ignore[no-untyped-def]
     cells[:] = 0
     for i in range(len(points)):
         on[i] = 0.0
-        if chosen[i]:
+        if chosen[i] == 1:
             e, cosine, J[0], J[1], J[2], J[3] = residual(
                 points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2],
                 state[0] + shifts[segment, 0], state[1] + shifts[segment, 1], state[2] + shifts[segment, 2], state[3],

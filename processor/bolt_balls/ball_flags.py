@@ -51,7 +51,7 @@ def judged(
             continue
         has_prior = bool(axes_known[i]) and fits.numbers[i, 6] > 0.0
         evidence.append("fused" if has_prior else "ball")
-        n, cells = int(fits.numbers[i, 0]), int(fits.numbers[i, 1])
+        n = int(fits.numbers[i, 0])
         C = covariance[i]
         lowest_sd = float(np.sqrt(max(C[2, 2] + C[3, 3] - 2.0 * C[2, 3], 0.0)))
         if n < LEAST_POINTS:

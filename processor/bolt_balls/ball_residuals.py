@@ -57,10 +57,13 @@ def variance(noise, distance, cosine):  # type: ignore[no-untyped-def]
 def select(  # type: ignore[no-untyped-def]
     points, rays, axis_points, axes, keep_off, hole, state, least_cosine, gate, chosen
 ):
-    """Mark the points whose rays meet the model where the ball's own surface is to be seen; returns their number.
+    """Mark by 1 the points whose rays meet the model where the ball's own surface is to be seen; returns their number.
+
+    By 2 those that are kept off, by 0 those that miss the model or come in too slantwise.
 
     The choice looks at where the ray meets the model and never at the noisy point: it keeps off the flats and sleeves
-    (``keep_off`` from each member's axis), the process hole about the lowest point, and grazing incidence. ``gate`` only spares work: it is far beyond the noise.
+    (``keep_off`` from each member's axis), the process hole about the lowest point, and grazing incidence. ``gate`` only
+    spares work: it is far beyond the noise.
     """
     cx, cy, cz, r = state[0], state[1], state[2], state[3]
     total = 0
@@ -77,19 +80,16 @@ def select(  # type: ignore[no-untyped-def]
             qx = points[i, 0] - e * rays[i, 0] - cx
             qy = points[i, 1] - e * rays[i, 1] - cy
             qz = points[i, 2] - e * rays[i, 2] - cz
-        if qz < 0.0 and qx * qx + qy * qy < hole * hole:
-            continue
-        masked = False
+        masked = qz < 0.0 and qx * qx + qy * qy < hole * hole
         for m in range(len(axes)):
+            if masked:
+                break
             dx, dy, dz = axes[m, 0], axes[m, 1], axes[m, 2]
             sx = qx + cx - axis_points[m, 0]
             sy = qy + cy - axis_points[m, 1]
             sz = qz + cz - axis_points[m, 2]
             along = sx * dx + sy * dy + sz * dz
-            if along > 0.0 and sx * sx + sy * sy + sz * sz - along * along < keep_off[m] * keep_off[m]:
-                masked = True
-                break
-        if not masked:
-            chosen[i] = 1
-            total += 1
+            masked = along > 0.0 and sx * sx + sy * sy + sz * sz - along * along < keep_off[m] * keep_off[m]
+        chosen[i] = 2 if masked else 1
+        total += not masked
     return total

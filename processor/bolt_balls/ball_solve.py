@@ -68,11 +68,9 @@ def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
         for k in range(5):
             total = 0.0
             for j in range(3):
-                if k < 4:
-                    side = A[j, k]
-                else:
-                    side = b[j] + W[j, 0] * shift[0] + W[j, 1] * shift[1] + W[j, 2] * shift[2]
-                total += M[i, j] * side
+                total += M[i, j] * (
+                    A[j, k] if k < 4 else b[j] + W[j, 0] * shift[0] + W[j, 1] * shift[1] + W[j, 2] * shift[2]
+                )
             gain[i, k] = total
     for i in range(4):
         for j in range(4):
@@ -108,7 +106,7 @@ def normal_equations(  # type: ignore[no-untyped-def]
     n = len(points)
     used, segment, inside = 0, 0, 0
     for i in range(n):
-        if chosen[i]:
+        if chosen[i] == 1:
             cx = state[0] + shifts[segment, 0]
             cy = state[1] + shifts[segment, 1]
             cz = state[2] + shifts[segment, 2]

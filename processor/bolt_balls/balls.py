@@ -44,7 +44,7 @@ class Params:
 
 @dataclass(frozen=True)
 class _Rays:
-    """Unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,) of gathered points."""
+    """Return unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,) of gathered points."""
 
     directions: Floats
     ranges: Floats
@@ -158,7 +158,7 @@ def centre_weights(covariance: Floats) -> Floats:
 
 @njit(cache=True, nogil=True, parallel=True)
 def _rays(start, points, station, nodes, scanners):  # type: ignore[no-untyped-def]
-    """Unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
+    """Return unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
     directions, ranges = np.zeros((len(points), 3)), np.zeros(len(points))
     for k in prange(len(start) - 1):
         for i in range(start[k], start[k + 1]):
