@@ -20,7 +20,9 @@ GATE_MM = 40.0
 CATCH_MM = 12.0  # what the first steps of a fit reach
 NEIGHBOURS_MM = 12.0
 TRIED = 8
-SHARE = 0.4  # of the best vote, which makes a radius worth a fit
+AROUND_MM = 25.0  # points farther out than this from a ball's surface say nothing of it
+COARSE_MM = 1e-3
+SHARE, NEAR_SHARE = 0.4, 0.15  # of the best vote, which makes a radius worth a fit; next to the best
 
 
 @njit(cache=True, nogil=True)
@@ -34,13 +36,16 @@ def votes(  # type: ignore[no-untyped-def]
     """
     n = len(points)
     depth, slim = np.empty(n), np.empty(n, np.uint8)
-    widest = 0.0
+    widest, farthest = 0.0, radii.max() + kernel
     for m in range(len(axes)):
         widest = max(widest, tube_off[m])
     kept = 0
     for i in range(n):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        d = np.sqrt(x * x + y * y + z * z)
+        d2 = x * x + y * y + z * z
+        if d2 > farthest * farthest:
+            continue
+        d = np.sqrt(d2)
         facing = x * rays[i, 0] + y * rays[i, 1] + z * rays[i, 2]
         if facing > 0.0 or (z < 0.0 and x * x + y * y < hole * hole):
             continue
@@ -113,21 +118,21 @@ def segments(station):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def fit_one(  # type: ignore[no-untyped-def]
     points, rays, ranges, station, axis_points, axes, keep_off, hole, least_cosine, noise, centre, centre_weight,
-    radius, radius_weight, shift_covariance, catch, state, shifts, chosen, covariance,
+    radius, radius_weight, shift_covariance, catch, turns, settled, state, shifts, chosen, covariance,
 ):  # fmt: skip
     """Fit from ``state``: choose points, solve, and choose again as the cut closes in; returns points used or -1."""
     gains = np.zeros((len(shifts), 3, 5))
     typical = np.sqrt(noise[0] + noise[1] * (np.mean(ranges) ** 2 if len(ranges) else 0.0))
     first = max(1.0, catch / (4.5 * typical))
     used = -1
-    for turn in range(4):
+    for turn in range(turns):
         stretch = first if turn == 0 else np.sqrt(first) if turn == 1 else 1.0
         gate = GATE_MM if turn == 0 else max(GATE_MM * 0.5, 30.0 * typical)
         if select(points, rays, axis_points, axes, keep_off, hole, state, least_cosine, gate, chosen) == 0:
             return -1
         used = solve(
             points, rays, ranges, station, chosen, noise, stretch, centre, centre_weight, radius, radius_weight,
-            shift_covariance, state, shifts, gains, 6 if turn < 2 else 8, covariance,
+            shift_covariance, settled, state, shifts, gains, 6 if turn + 1 < turns else 12, covariance,
         )  # fmt: skip
         if used < 0:
             return -1
@@ -138,6 +143,7 @@ def fit_one(  # type: ignore[no-untyped-def]
 def choose(  # type: ignore[no-untyped-def]
     start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise, tube_off,
     centre_weight, sizes, size_weight, expected, surprise, free, kernel, catch, shift_covariance,
+    wanted_nodes,
 ):  # fmt: skip
     """Best state (k, 4), its size (k,) and energy (k,), the runner-up's size (k,) and energy (k,) of every node.
 
@@ -152,17 +158,29 @@ def choose(  # type: ignore[no-untyped-def]
     size, energies = np.full(nodes, np.nan), np.full(nodes, np.inf)
     second, second_energy = np.full(nodes, np.nan), np.full(nodes, np.inf)
     for k in prange(nodes):
+        if not wanted_nodes[k]:
+            continue
         p, u = points[start[k] : start[k + 1]], rays[start[k] : start[k + 1]]
         L, s = ranges[start[k] : start[k + 1]], station[start[k] : start[k + 1]]
         ap, ad = axis_points[end_start[k] : end_start[k + 1]], axes[end_start[k] : end_start[k + 1]]
         off, wide = keep_off[end_start[k] : end_start[k + 1]], tube_off[end_start[k] : end_start[k + 1]]
-        n = len(p)
         known = not np.isnan(expected[k])
         tried = with_expected(sizes, expected[k])
         vote = np.empty(len(tried))
         votes(p, u, ap, ad, off, wide, hole, tried, kernel, vote)
         order = np.argsort(-vote, kind="mergesort")
         most = vote[order[0]]
+        worth, widest = np.zeros(len(tried), np.uint8), 0.0
+        for j in order:
+            near = abs(tried[j] - tried[order[0]]) <= NEIGHBOURS_MM and vote[j] >= NEAR_SHARE * most
+            worth[j] = near or (vote[j] >= SHARE * most and vote[j] >= 3.0) or (known and tried[j] == expected[k])
+            if worth[j]:
+                widest = max(widest, tried[j])
+        rows = rows_within(p, 0.0, widest + AROUND_MM)
+        p, u, L, s = p[rows], u[rows], L[rows], s[rows]
+        n = len(p)
+        if n == 0:
+            continue
         origin = np.zeros(3)
         all_shifts = np.zeros((TRIED + 1, segments(s), 3))
         all_states, found, own = np.zeros((TRIED + 1, 4)), np.empty(TRIED + 1), np.empty(TRIED + 1)
@@ -170,9 +188,8 @@ def choose(  # type: ignore[no-untyped-def]
         done = 0
         w = 0.0 if free else size_weight
         for j in order:
-            near = abs(tried[j] - tried[order[0]]) <= NEIGHBOURS_MM
             wanted = known and tried[j] == expected[k]
-            if not (near or wanted or (vote[j] >= SHARE * most and vote[j] >= 3.0)):
+            if not worth[j]:
                 continue
             if done >= (TRIED + 1 if wanted else TRIED):
                 continue
@@ -181,7 +198,7 @@ def choose(  # type: ignore[no-untyped-def]
             shifts[:, :] = 0.0
             used = fit_one(
                 p, u, L, s, ap, ad, off, hole, least_cosine, noise, origin, centre_weight[k], tried[j], w,
-                shift_covariance, catch, state, shifts, code, covariance,
+                shift_covariance, catch, 3, COARSE_MM, state, shifts, code, covariance,
             )  # fmt: skip
             if used < 1:
                 continue
@@ -220,6 +237,19 @@ def choose(  # type: ignore[no-untyped-def]
             then = np.argmin(found[:done])
             second[k], second_energy[k] = all_states[then, 3] if free else own[then], found[then]
     return states, size, energies, second, second_energy
+
+
+@njit(cache=True, nogil=True)
+def rows_within(points, near, far):  # type: ignore[no-untyped-def]
+    """Rows of points whose distance from the origin is ``near`` to ``far``."""
+    rows = np.empty(len(points), np.int64)
+    kept = 0
+    for i in range(len(points)):
+        d2 = points[i, 0] ** 2 + points[i, 1] ** 2 + points[i, 2] ** 2
+        if near * near <= d2 <= far * far:
+            rows[kept] = i
+            kept += 1
+    return rows[:kept]
 
 
 @njit(cache=True, nogil=True)

@@ -8,10 +8,11 @@ import math
 import numpy as np
 from numba import njit, prange
 
-from processor.bolt_balls.ball_choice import fit_one, segments
+from processor.bolt_balls.ball_choice import AROUND_MM, fit_one, rows_within, segments
 from processor.bolt_balls.ball_residuals import residual, variance, weight
 from processor.bolt_balls.ball_solve import inverse_of, normal_equations, solve
 
+SETTLED_MM = 1e-6
 BANDS, SECTORS = 10, 20  # cells of equal area that the visible share is counted in
 
 
@@ -90,19 +91,24 @@ def finish(  # type: ignore[no-untyped-def]
     for k in prange(nodes):
         if np.isnan(states[k, 0]) or start[k + 1] == start[k]:
             continue
-        a, b = start[k], start[k + 1]
-        p, u, L, s = points[a:b], rays[a:b], ranges[a:b], station[a:b]
+        everything = points[start[k] : start[k + 1]]
+        rows = start[k] + rows_within(everything, states[k, 3] - AROUND_MM, states[k, 3] + AROUND_MM)
+        n = len(rows)
+        if n == 0:
+            continue
+        p, u, L, s = points[rows], rays[rows], ranges[rows], station[rows]
+        e, c, w = np.zeros(n), np.zeros(n), np.zeros(n)
         ap, ad = axis_points[end_start[k] : end_start[k + 1]], axes[end_start[k] : end_start[k + 1]]
         off = keep_off[end_start[k] : end_start[k + 1]]
         state = states[k].copy()
         origin = np.zeros(3)
         shifts = np.zeros((segments(s), 3))
         gains = np.zeros((len(shifts), 3, 5))
-        chosen = np.zeros(b - a, np.uint8)
+        chosen = np.zeros(n, np.uint8)
         covariance, cells = np.zeros((4, 4)), np.zeros(BANDS * SECTORS, np.int64)
         used = fit_one(
             p, u, L, s, ap, ad, off, hole, least_cosine, noise, origin, centre_weight[k], sizes[k], size_weights[k],
-            shift_covariance, catch, state, shifts, chosen, covariance,
+            shift_covariance, catch, 4, SETTLED_MM, state, shifts, chosen, covariance,
         )  # fmt: skip
         if used < 1:
             continue
@@ -111,8 +117,7 @@ def finish(  # type: ignore[no-untyped-def]
         free = 0.0
         for _ in range(4):
             weights, squares, leverages, plain, seen, stations = leftover(
-                p, u, L, s, chosen, local, shift_covariance, state, shifts, covariance, errors[a:b], cosines[a:b],
-                on[a:b], cells,
+                p, u, L, s, chosen, local, shift_covariance, state, shifts, covariance, e, c, w, cells,
             )  # fmt: skip
             free = max(weights - leverages, 0.0)
             scale2 = (believed + squares * scale * scale) / (believed + free) if believed + free > 0.0 else 1.0
@@ -120,7 +125,7 @@ def finish(  # type: ignore[no-untyped-def]
             local[:] = noise * scale2
             used = solve(
                 p, u, L, s, chosen, local, 1.0, origin, centre_weight[k], sizes[k], size_weights[k], shift_covariance,
-                state, shifts, gains, 10, covariance,
+                SETTLED_MM, state, shifts, gains, 10, covariance,
             )  # fmt: skip
             if used < 1:
                 break
@@ -134,8 +139,7 @@ def finish(  # type: ignore[no-untyped-def]
         if not inverse_of(H, covariance):
             continue
         weights, squares, leverages, plain, seen, stations = leftover(
-            p, u, L, s, chosen, local, shift_covariance, state, shifts, covariance, errors[a:b], cosines[a:b], on[a:b],
-            cells,
+            p, u, L, s, chosen, local, shift_covariance, state, shifts, covariance, e, c, w, cells,
         )  # fmt: skip
         bound = np.empty((4, 4))
         used = normal_equations(
@@ -148,6 +152,8 @@ def finish(  # type: ignore[no-untyped-def]
         for i in range(3):
             for j in range(3):
                 chi2 += state[i] * centre_weight[k, i, j] * state[j]
+        for i in range(n):
+            errors[rows[i]], cosines[rows[i]], on[rows[i]] = e[i], c[i], w[i]
         found[k] = state
         covariances[k] = covariance
         bounds[k] = bound

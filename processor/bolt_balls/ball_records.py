@@ -37,6 +37,12 @@ class Fits:
         return found
 
     @property
+    def beyond_doubt(self) -> npt.NDArray[np.bool_]:
+        """Balls (k,) whose size no better knowledge of the noise will change."""
+        found: npt.NDArray[np.bool_] = self.clear & (self.margin > 5.0 * AMBIGUOUS)
+        return found
+
+    @property
     def clear(self) -> npt.NDArray[np.bool_]:
         """Balls (k,) that are well seen and of no doubtful size."""
         found: npt.NDArray[np.bool_] = (self.numbers[:, 7] > 0) & (self.numbers[:, 0] >= 30) & (self.margin > AMBIGUOUS)

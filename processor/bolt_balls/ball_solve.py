@@ -12,8 +12,6 @@ from numba import njit
 
 from processor.bolt_balls.ball_residuals import residual, variance, weight
 
-SETTLED_MM = 1e-7
-
 
 @njit(cache=True, nogil=True)
 def inverse_of(A, out):  # type: ignore[no-untyped-def]
@@ -148,11 +146,11 @@ def normal_equations(  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def solve(  # type: ignore[no-untyped-def]
     points, rays, ranges, station, chosen, noise, stretch, centre, centre_weight, radius, radius_weight,
-    shift_covariance, state, shifts, gains, steps, covariance,
+    shift_covariance, settled, state, shifts, gains, steps, covariance,
 ):  # fmt: skip
     """Move ``state`` (x, y, z, r) and ``shifts`` by at most ``steps`` Gauss-Newton steps; returns points used, or -1.
 
-    ``covariance`` (4, 4) is the inverse of the information at the last but one state. -1: nothing determines the ball.
+    A step below ``settled`` mm is the last. ``covariance`` (4, 4) is the inverse of the information at the last but one state. -1: nothing determines the ball.
     """
     H, g = np.empty((4, 4)), np.empty(4)
     used = 0
@@ -180,6 +178,6 @@ def solve(  # type: ignore[no-untyped-def]
                 for j in range(4):
                     move += gains[k, i, j] * scale * step[j]
                 shifts[k, i] -= move
-        if size < SETTLED_MM:
+        if size < settled:
             break
     return used

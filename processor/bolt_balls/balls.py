@@ -24,7 +24,7 @@ from processor.bolt_balls.source import Source
 from processor.model import Floats
 
 NAN = float("nan")
-MARGIN_MM = 40.0  # of a crop beyond the largest ball: sleeves are measured there
+MARGIN_MM = 26.0  # of a crop beyond the largest ball: sleeves are measured there
 LARGEST_FREE_MM = 150.0
 FREE_SIZES = np.arange(20.0, LARGEST_FREE_MM + 1.0, 5.0)  # where a fit of a free radius starts
 MOST_BELIEVED = 60.0  # points that the noise model is worth for one ball
@@ -95,56 +95,80 @@ def fit_crops(
     noise = np.array([params.sigma_mm**2, 0.0, 0.0])
     corner = ball_ends.first_guess(found)
     radius_sd, believed = catalogue.sd_mm, 10.0
+    fits: Fits | None = None
     for last in (False, True):
-        fits, errors, cosines, on = _fit(
-            crops, rays, found, corner, weights, noise, believed, catalogue, radius_sd, expected, shift, params
-        )
+        setting = _Setting(noise, believed, corner, radius_sd)
+        fits, errors, cosines, on = _fit(crops, rays, found, weights, setting, catalogue, expected, shift, params, fits)
         if not last:
-            corner = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3])
+            larger = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3])
+            # sleeves that were larger than guessed may have spoilt any choice
+            spoilt = bool((larger > corner + AXIS_MM).any())
+            was, corner = float(noise.sum()), larger
             noise, count = ball_noise.noise_model(errors, cosines, ranges, on, noise)
             believed = min(count, MOST_BELIEVED)
             sure = fits.clear
-            radius_sd = (
-                ball_noise.radius_scatter(
+            if len(catalogue.radii):
+                radius_sd = ball_noise.radius_scatter(
                     fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], catalogue.sd_mm
                 )
-                if len(catalogue.radii)
-                else radius_sd
-            )
+            typical = typical_variance(noise, ranges)
+            if spoilt or typical > 2.0 * was:
+                fits = None
+    assert fits is not None
     return ball_flags.judged(fits, nodes, expected, catalogue, bool(np.any(ranges > 0.0)), noise, radius_sd)
+
+
+@dataclass(frozen=True)
+class _Setting:
+    """What is held of the scan for one round of fits: noise (3,), the points it is worth, sleeves (m,), radii's scatter."""
+
+    noise: Floats
+    believed: float
+    corner: Floats
+    radius_sd: float
 
 
 def _fit(
     crops: Crops,
     rays: _Rays,
     found: Ends,
-    corner: Floats,
     weights: Floats,
-    noise: Floats,
-    believed: float,
+    setting: _Setting,
     catalogue: Catalogue,
-    radius_sd: float,
     expected: Floats,
     shift: Floats,
     params: Params,
+    before: Fits | None,
 ) -> tuple[Fits, Floats, Floats, Floats]:
+    """One round: choose sizes, except where ``before`` leaves no doubt of them, and fit."""
     free = len(catalogue.radii) == 0
-    sigma = float(np.sqrt(noise[0] + noise[1] * float(np.median(rays.ranges)) ** 2)) if len(rays.ranges) else 1.0
-    keep_off = corner + FLAT_MM + AXIS_MM + 0.5 * sigma
-    tube_off = np.where(np.isfinite(found.tube_radii), found.tube_radii, 1.5 * corner) + 2.0 + 2.0 * sigma
-    size_weight = 0.0 if free else 1.0 / radius_sd**2
+    noise = setting.noise
+    sigma = float(np.sqrt(typical_variance(noise, rays.ranges)))
+    keep_off = setting.corner + FLAT_MM + AXIS_MM + 0.5 * sigma
+    tube_off = np.where(np.isfinite(found.tube_radii), found.tube_radii, 1.5 * setting.corner) + 2.0 + 2.0 * sigma
+    size_weight = 0.0 if free else 1.0 / setting.radius_sd**2
     common = (crops.start, crops.points, rays.directions, rays.ranges, crops.station, found.start, found.points,
               found.directions, keep_off, params.process_hole_mm, params.least_cosine, noise)  # fmt: skip
-    states, sizes, energy, second, second_energy = choose(
-        *common, tube_off, weights, FREE_SIZES if free else np.asarray(catalogue.radii), size_weight, expected, params.surprise, free,
-        2.5 * sigma + 1.0, params.catch_mm, shift,
+    doubtful = np.ones(len(weights), bool) if before is None else ~before.beyond_doubt
+    chosen = choose(
+        *common, tube_off, weights, FREE_SIZES if free else np.asarray(catalogue.radii), size_weight, expected,
+        params.surprise, free, 2.5 * sigma + 1.0, params.catch_mm, shift, doubtful,
     )  # fmt: skip
-    size_weights = np.full(len(states), size_weight)
+    if before is not None:
+        kept = (before.states, before.sizes, before.energy, before.second, before.second_energy)
+        for new, old in zip(chosen, kept, strict=True):
+            new[~doubtful] = old[~doubtful]
+    states, sizes, energy, second, second_energy = chosen
     states, covariance, bound, numbers, errors, cosines, on = finish(
-        *common, believed, weights, sizes, size_weights, states, 4.5 * sigma, shift
+        *common, setting.believed, weights, sizes, np.full(len(states), size_weight), states, 4.5 * sigma, shift
     )
-    fits = Fits(states, covariance, bound, sizes, energy, second, second_energy, numbers)
-    return fits, errors, cosines, on
+    return Fits(states, covariance, bound, sizes, energy, second, second_energy, numbers), errors, cosines, on
+
+
+def typical_variance(noise: Floats, ranges: Floats) -> float:
+    """Variance of a range seen square on at the median range, mm^2."""
+    known = ranges[ranges > 0.0]
+    return float(noise[0] + noise[1] * (float(np.median(known)) ** 2 if len(known) else 0.0))
 
 
 def centre_weights(covariance: Floats) -> Floats:
