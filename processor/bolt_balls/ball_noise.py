@@ -17,7 +17,16 @@ NEAREST_MM, RATIO = 1000.0, 1.4  # of the bins of the range
 COSINES = np.array([0.15, 0.22, 0.3, 0.4, 0.55, 0.7, 0.85, 1.0 + 1e-9])
 MAD = 1.482602218505602
 LEAST_MM = 0.02
+LIMB_STEP, LIMB_POINTS = 0.05, 40
+LIMB = np.arange(0.15, 0.451, LIMB_STEP)
 RADII = 10  # a stated scatter of radii is worth as many balls
+
+
+def variances_of(noise: Floats, cosines: Floats, ranges: Floats) -> Floats:
+    """Variances (n,) of ranges by the model's parts (3,)."""
+    c2 = np.maximum(cosines, 0.1) ** 2
+    found: Floats = noise[0] + noise[1] * ranges**2 / np.sqrt(c2) + noise[2] * (1.0 - c2) / c2
+    return found
 
 
 def noise_model(
@@ -61,6 +70,26 @@ def noise_model(
         return np.array([whole**2, 0.0, 0.0]), float(len(e))
     parts[0] = max(parts[0], LEAST_MM**2)
     return parts, float(len(e))
+
+
+def limb_cosine(errors: Floats, cosines: Floats, variances: Floats, weights: Floats, least: float) -> float:
+    """Return the cosine of incidence from which on residuals have no bias: ``least`` or more, 0.5 at most.
+
+    Near the limb a wide beam is cut and its mean range is not that of its middle. Bands of the cosine whose median
+    residual is off by more than a tenth of the noise, and by more than chance, are left out, and one band beyond them.
+    """
+    on = weights > 0.0
+    u, c = errors[on] / np.sqrt(variances[on]), cosines[on]
+    limb = least
+    for low, high in zip(LIMB[:-1], LIMB[1:], strict=True):
+        here = np.sort(u[(c >= low) & (c < high)])
+        if len(here) < LIMB_POINTS:
+            continue
+        middle = abs(float(np.median(here)))
+        spread = MAD * float(np.median(np.abs(here)))
+        if middle > max(0.1, 3.0 * 1.2533 / np.sqrt(len(here))) * spread:
+            limb = high + LIMB_STEP
+    return max(least, min(limb, 0.5))
 
 
 def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, stated_sd: float) -> float:

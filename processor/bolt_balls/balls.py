@@ -94,10 +94,10 @@ def fit_crops(
     weights = centre_weights(nodes.covariance)
     noise = np.array([params.sigma_mm**2, 0.0, 0.0])
     corner = ball_ends.first_guess(found)
-    radius_sd, believed = catalogue.sd_mm, 10.0
+    radius_sd, believed, limb = catalogue.sd_mm, 10.0, params.least_cosine
     fits: Fits | None = None
     for last in (False, True):
-        setting = _Setting(noise, believed, corner, radius_sd)
+        setting = _Setting(noise, believed, corner, radius_sd, limb)
         fits, errors, cosines, on = _fit(crops, rays, found, weights, setting, catalogue, expected, shift, params, fits)
         if not last:
             larger = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3])
@@ -105,6 +105,9 @@ def fit_crops(
             spoilt = bool((larger > corner + AXIS_MM).any())
             was, corner = float(noise.sum()), larger
             noise, count = ball_noise.noise_model(errors, cosines, ranges, on, noise)
+            limb = ball_noise.limb_cosine(
+                errors, cosines, ball_noise.variances_of(noise, cosines, ranges), on, params.least_cosine
+            )
             believed = min(count, MOST_BELIEVED)
             sure = fits.clear
             if len(catalogue.radii):
@@ -120,12 +123,13 @@ def fit_crops(
 
 @dataclass(frozen=True)
 class _Setting:
-    """What is held of the scan for one round of fits: noise (3,), the points it is worth, sleeves (m,), radii's scatter."""
+    """What is held of the scan in one round: noise (3,), the points it is worth, sleeves (m,), radii's scatter, limb."""
 
     noise: Floats
     believed: float
     corner: Floats
     radius_sd: float
+    least_cosine: float
 
 
 def _fit(
@@ -148,10 +152,10 @@ def _fit(
     tube_off = np.where(np.isfinite(found.tube_radii), found.tube_radii, 1.5 * setting.corner) + 2.0 + 2.0 * sigma
     size_weight = 0.0 if free else 1.0 / setting.radius_sd**2
     common = (crops.start, crops.points, rays.directions, rays.ranges, crops.station, found.start, found.points,
-              found.directions, keep_off, params.process_hole_mm, params.least_cosine, noise)  # fmt: skip
+              found.directions, keep_off, params.process_hole_mm, setting.least_cosine, noise)  # fmt: skip
     doubtful = np.ones(len(weights), bool) if before is None else ~before.beyond_doubt
     chosen = choose(
-        *common, tube_off, weights, FREE_SIZES if free else np.asarray(catalogue.radii), size_weight, expected,
+        *common, tube_off, weights, FREE_SIZES if free else np.array(catalogue.radii), size_weight, expected,
         params.surprise, free, 2.5 * sigma + 1.0, params.catch_mm, shift, doubtful,
     )  # fmt: skip
     if before is not None:

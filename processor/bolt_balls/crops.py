@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from numba import njit, prange
 
 from processor.bolt_balls.source import Source
@@ -45,7 +47,7 @@ def gather(source: Source, nodes: Floats, reach_mm: float) -> Crops:
     owners, steps, stations = [np.empty(0, np.int32)], [np.empty((0, 3), np.int32)], [np.empty(0, np.int32)]
     for chunk in source.chunks():
         found = _near(
-            np.ascontiguousarray(chunk.points), np.ascontiguousarray(chunk.station, dtype=np.int32), nodes, lower,
+            _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32), nodes, lower,
             reach_mm, *table, cell_start, cell_nodes,
         )  # fmt: skip
         for kept, new in zip((owners, steps, stations), found, strict=True):
@@ -54,6 +56,13 @@ def gather(source: Source, nodes: Floats, reach_mm: float) -> Crops:
         np.concatenate(owners), np.concatenate(steps), np.concatenate(stations), len(nodes)
     )
     return Crops(start, points, station)
+
+
+def _frozen(values: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
+    """View values as a read-only array, whatever they were: the kernel is compiled for one kind alone."""
+    found = np.ascontiguousarray(values, dtype=dtype).view()
+    found.flags.writeable = False
+    return found
 
 
 def _cells(nodes: Floats, lower: Floats, reach: float) -> tuple[tuple[Ints, Labels], Ints, Labels]:
