@@ -121,7 +121,7 @@ def fit_one(  # type: ignore[no-untyped-def]
     radius, radius_weight, shift_covariance, catch, turns, settled, state, shifts, chosen, covariance,
 ):  # fmt: skip
     """Fit from ``state``: choose points, solve, and choose again as the cut closes in; returns points used or -1."""
-    gains = np.zeros((len(shifts), 3, 5))
+    gains = np.zeros((len(shifts), 3, 8))
     typical = np.sqrt(noise[0] + noise[1] * (np.mean(ranges) ** 2 if len(ranges) else 0.0))
     first = max(1.0, catch / (4.5 * typical))
     used = -1

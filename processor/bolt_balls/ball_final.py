@@ -18,13 +18,13 @@ BANDS, SECTORS = 10, 20  # cells of equal area that the visible share is counted
 
 @njit(cache=True, nogil=True)
 def leftover(  # type: ignore[no-untyped-def]
-    points, rays, ranges, station, chosen, noise, shift_covariance, state, shifts, covariance, errors, cosines, on, cells
+    points, rays, ranges, station, chosen, noise, state, shifts, gains, covariance, errors, cosines, on, cells
 ):  # fmt: skip
     """Fill each chosen point's residual, cosine and weight; returns (sum of w, of w u^2, of w leverage, of w e^2, cells, stations).
 
     Residuals are divided by sqrt(1 - leverage), so that their spread is the noise itself however few there are.
     """
-    J = np.empty(4)
+    J, K = np.empty(4), np.empty(4)
     weights, squares, leverages, plain = 0.0, 0.0, 0.0, 0.0
     segment, inside, stations = 0, False, 0
     cells[:] = 0
@@ -40,8 +40,14 @@ def leftover(  # type: ignore[no-untyped-def]
                 w = weight(e / np.sqrt(v))
                 h = 0.0
                 for p in range(4):
+                    K[p] = J[p]
+                    for q in range(3):
+                        K[p] -= J[q] * gains[segment, q, p]
+                for p in range(4):
                     for q in range(4):
-                        h += J[p] * covariance[p, q] * J[q]
+                        h += K[p] * covariance[p, q] * K[q]
+                        if p < 3 and q < 3:
+                            h += J[p] * gains[segment, p, 5 + q] * J[q]
                 h = min(h / v, 0.9)
                 errors[i] = e / np.sqrt(1.0 - h)
                 cosines[i] = cosine
@@ -103,7 +109,7 @@ def finish(  # type: ignore[no-untyped-def]
         state = states[k].copy()
         origin = np.zeros(3)
         shifts = np.zeros((segments(s), 3))
-        gains = np.zeros((len(shifts), 3, 5))
+        gains = np.zeros((len(shifts), 3, 8))
         chosen = np.zeros(n, np.uint8)
         covariance, cells = np.zeros((4, 4)), np.zeros(BANDS * SECTORS, np.int64)
         used = fit_one(
@@ -117,7 +123,7 @@ def finish(  # type: ignore[no-untyped-def]
         free = 0.0
         for _ in range(4):
             weights, squares, leverages, plain, seen, stations = leftover(
-                p, u, L, s, chosen, local, shift_covariance, state, shifts, covariance, e, c, w, cells,
+                p, u, L, s, chosen, local, state, shifts, gains, covariance, e, c, w, cells,
             )  # fmt: skip
             free = max(weights - leverages, 0.0)
             scale2 = (believed + squares * scale * scale) / (believed + free) if believed + free > 0.0 else 1.0
@@ -139,7 +145,7 @@ def finish(  # type: ignore[no-untyped-def]
         if not inverse_of(H, covariance):
             continue
         weights, squares, leverages, plain, seen, stations = leftover(
-            p, u, L, s, chosen, local, shift_covariance, state, shifts, covariance, e, c, w, cells,
+            p, u, L, s, chosen, local, state, shifts, gains, covariance, e, c, w, cells,
         )  # fmt: skip
         bound = np.empty((4, 4))
         used = normal_equations(

@@ -19,7 +19,14 @@ TENSION = 3.5  # sd that a radius may be off its size
 
 
 def judged(
-    fits: Fits, nodes: Nodes, expected: Floats, catalogue: Catalogue, rays: bool, noise: Floats, radius_sd: float
+    fits: Fits,
+    nodes: Nodes,
+    expected: Floats,
+    catalogue: Catalogue,
+    rays: bool,
+    noise: Floats,
+    radius_sd: float,
+    station_sd: float,
 ) -> Balls:
     """Give every node its numbers, evidence, flag and reason."""
     k = nodes.count
@@ -91,6 +98,8 @@ def judged(
         if rays
         else "orthogonal distances, for the scanners are unknown: the bias of range noise stands, it is not corrected"
     )
+    if station_sd > 0.0:
+        message += f"; stations disagree by {station_sd:.1f} mm an axis (sd), which every covariance holds"
     if len(catalogue.radii) and not catalogue.verified:
         message += f"; the catalogue of radii ({catalogue.name}) was not held against a published one"
     return Balls(
@@ -119,5 +128,6 @@ def judged(
         reason=tuple(reasons),
         noise=noise,
         radius_sd=radius_sd,
+        station_sd=station_sd,
         message=message,
     )

@@ -92,13 +92,13 @@ def limb_cosine(errors: Floats, cosines: Floats, variances: Floats, weights: Flo
     return max(least, min(limb, 0.5))
 
 
-def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, stated_sd: float) -> float:
-    """Return the standard deviation of radii about their sizes: likeliest for balls fitted with the stated one as prior.
+def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float) -> float:
+    """Return the likeliest standard deviation of radii about their sizes, mm.
 
-    ``radii`` (k,) and ``variances`` (k,) are of those fits. The prior is taken out again, so that each ball says what
-    its points alone do; the stated scatter counts as ten balls. Balls that know little of their radius are left out.
+    ``radii`` (k,) and ``variances`` (k,) are of fits with ``used_sd`` as prior. It is taken out again, so that each ball
+    says what its points alone do; the stated scatter counts as ten balls. Balls that know little are left out.
     """
-    prior = 1.0 / stated_sd**2
+    prior = 1.0 / used_sd**2
     weight = 1.0 / variances - prior
     good = np.isfinite(weight) & (weight > 0.1 * prior)
     if not good.any():

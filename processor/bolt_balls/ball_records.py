@@ -83,4 +83,7 @@ class Balls(Checked):
     reason: tuple[str, ...] = names("k")
     noise: Floats = column(3)  # variance of a range: constant, by range^2 / cosine, by tangent^2
     radius_sd: float = float("nan")  # scatter of radii about their sizes
+    station_sd: float = float(
+        "nan"
+    )  # of each station's place along each axis, as the balls show it; NaN = it was given
     message: str = ""

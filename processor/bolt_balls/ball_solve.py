@@ -51,7 +51,8 @@ def inverse_of(A, out):  # type: ignore[no-untyped-def]
 def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
     """Add one station's information A (4, 4) and gradient b (4,) to the ball's, its unknown shift eliminated.
 
-    ``gain`` (3, 5) is left so that the shift's own step is -(gain[:, :4] . step of the ball + gain[:, 4]).
+    ``gain`` (3, 8) is left so that the shift's own step is -(gain[:, :4] . step of the ball + gain[:, 4]), and that the
+    shift's covariance, were the ball known, is gain[:, 5:].
     """
     W, S = np.empty((3, 3)), np.empty((3, 3))
     if not inverse_of(T, W):
@@ -62,6 +63,7 @@ def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
     M = np.empty((3, 3))
     if not inverse_of(S, M):
         return False
+    gain[:, 5:] = M
     for i in range(3):
         for k in range(5):
             total = 0.0

@@ -6,7 +6,7 @@ learn from all balls together how large the sleeves are, how the noise grows and
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numba import njit, prange
@@ -17,6 +17,7 @@ from processor.bolt_balls.ball_ends import AXIS_MM, FLAT_MM, Ends
 from processor.bolt_balls.ball_final import finish
 from processor.bolt_balls.ball_records import Balls, Fits
 from processor.bolt_balls.ball_residuals import LEAST_COSINE
+from processor.bolt_balls.ball_stations import shift_sd
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.crops import Crops, gather
 from processor.bolt_balls.nodes import Nodes, Tubes
@@ -28,6 +29,7 @@ MARGIN_MM = 26.0  # of a crop beyond the largest ball: sleeves are measured ther
 LARGEST_FREE_MM = 150.0
 FREE_SIZES = np.arange(20.0, LARGEST_FREE_MM + 1.0, 5.0)  # where a fit of a free radius starts
 MOST_BELIEVED = 60.0  # points that the noise model is worth for one ball
+ROUNDS = 3
 VAGUE_MM = 50.0  # a node with a larger sd than this has no prior
 
 
@@ -62,7 +64,7 @@ def find_balls(
     """Fit a ball at every node; one pass over the source.
 
     ``expected_mm`` (k,) are nominal radii, NaN = none: a prior on the size alone. ``station_covariance`` (s, 3, 3) is that
-    of each scanner's place as registered, mm^2; left out, stations stand where they are said to.
+    of each scanner's place as registered, mm^2; left out, it is estimated from balls that several stations saw.
     """
     largest = float(catalogue.radii.max()) if len(catalogue.radii) else LARGEST_FREE_MM
     if expected_mm is not None and np.isfinite(expected_mm).any():
@@ -85,51 +87,77 @@ def fit_crops(
     params = params or Params()
     k = nodes.count
     expected = np.full(k, NAN) if expected_mm is None else np.asarray(expected_mm, np.float64)
-    shift = (
-        np.zeros((len(scanners), 3, 3)) if station_covariance is None else np.asarray(station_covariance, np.float64)
-    )
     directions, ranges = _rays(crops.start, crops.points, crops.station, nodes.positions, np.asarray(scanners))
     rays = _Rays(directions, ranges)
     found = ball_ends.ends(nodes, tubes)
     weights = centre_weights(nodes.covariance)
     noise = np.array([params.sigma_mm**2, 0.0, 0.0])
-    corner = ball_ends.first_guess(found)
-    radius_sd, believed, limb = catalogue.sd_mm, 10.0, params.least_cosine
+    setting = _Setting(noise, 10.0, ball_ends.first_guess(found), catalogue.sd_mm, params.least_cosine, 0.0)
+    shift = np.zeros((len(scanners), 3, 3)) if station_covariance is None else np.array(station_covariance, np.float64)
     fits: Fits | None = None
-    for last in (False, True):
-        setting = _Setting(noise, believed, corner, radius_sd, limb)
+    for turn in range(ROUNDS):
         fits, errors, cosines, on = _fit(crops, rays, found, weights, setting, catalogue, expected, shift, params, fits)
-        if not last:
-            larger = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3])
-            # sleeves that were larger than guessed may have spoilt any choice
-            spoilt = bool((larger > corner + AXIS_MM).any())
-            was, corner = float(noise.sum()), larger
-            noise, count = ball_noise.noise_model(errors, cosines, ranges, on, noise)
-            limb = ball_noise.limb_cosine(
-                errors, cosines, ball_noise.variances_of(noise, cosines, ranges), on, params.least_cosine
-            )
-            believed = min(count, MOST_BELIEVED)
-            sure = fits.clear
-            if len(catalogue.radii):
-                radius_sd = ball_noise.radius_scatter(
-                    fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], catalogue.sd_mm
-                )
-            typical = typical_variance(noise, ranges)
-            if spoilt or typical > 2.0 * was:
-                fits = None
+        if turn == ROUNDS - 1 or (turn == 1 and setting.station_sd == 0.0):
+            break
+        learnt = _learnt(crops, rays, found, weights, setting, catalogue, params, fits, (errors, cosines, on))
+        if station_covariance is None:
+            shift = np.tile(learnt.station_sd**2 * np.eye(3), (len(scanners), 1, 1))
+        else:
+            learnt = replace(learnt, station_sd=0.0)
+        noisier = typical_variance(learnt.noise, ranges) > 2.0 * typical_variance(setting.noise, ranges)
+        # sleeves larger than guessed, or stations that moved, may have spoilt any choice of a size
+        spoilt = bool((learnt.corner > setting.corner + AXIS_MM).any())
+        if noisier or spoilt or learnt.station_sd > 1.2 * setting.station_sd:
+            fits = None
+        setting = learnt
     assert fits is not None
-    return ball_flags.judged(fits, nodes, expected, catalogue, bool(np.any(ranges > 0.0)), noise, radius_sd)
+    stations = setting.station_sd if station_covariance is None else NAN
+    return ball_flags.judged(
+        fits, nodes, expected, catalogue, bool(np.any(ranges > 0.0)), setting.noise, setting.radius_sd, stations
+    )
+
+
+def _learnt(
+    crops: Crops,
+    rays: _Rays,
+    found: Ends,
+    weights: Floats,
+    setting: _Setting,
+    catalogue: Catalogue,
+    params: Params,
+    fits: Fits,
+    left: tuple[Floats, Floats, Floats],
+) -> _Setting:
+    """Learn from one round, over all balls, what the next one holds; ``left``: residuals, cosines, weights (n,)."""
+    errors, cosines, on = left
+    corner = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3])
+    noise, count = ball_noise.noise_model(errors, cosines, rays.ranges, on, setting.noise)
+    variances = ball_noise.variances_of(noise, cosines, rays.ranges)
+    limb = ball_noise.limb_cosine(errors, cosines, variances, on, setting.least_cosine)
+    sure, radius_sd, size_weight = fits.clear, setting.radius_sd, 0.0
+    if len(catalogue.radii):
+        size_weight = 1.0 / setting.radius_sd**2
+        radius_sd = ball_noise.radius_scatter(
+            fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
+        )
+    # once stations are known to move, their residuals no longer say by how much
+    station_sd = setting.station_sd or shift_sd(
+        crops.start, crops.points, rays.directions, rays.ranges, crops.station, on, fits.states, sure, noise, weights,
+        fits.sizes, size_weight,
+    )  # fmt: skip
+    return _Setting(noise, min(count, MOST_BELIEVED), corner, radius_sd, limb, station_sd)
 
 
 @dataclass(frozen=True)
 class _Setting:
-    """What is held of the scan in one round: noise (3,), the points it is worth, sleeves (m,), radii's scatter, limb."""
+    """What is held of the scan in one round: noise (3,), the points it is worth, sleeves (m,), and the rest."""
 
     noise: Floats
     believed: float
     corner: Floats
     radius_sd: float
     least_cosine: float
+    station_sd: float
 
 
 def _fit(
