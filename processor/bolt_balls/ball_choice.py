@@ -20,6 +20,7 @@ GATE_MM = 40.0
 CATCH_MM = 12.0  # what the first steps of a fit reach
 NEIGHBOURS_MM = 12.0
 TRIED = 8
+MANY = 30.0  # votes from which on a neighbour that has next to none is out of the question
 AROUND_MM = 25.0  # points farther out than this from a ball's surface say nothing of it
 COARSE_MM = 1e-3
 SHARE, NEAR_SHARE = 0.4, 0.15  # of the best vote, which makes a radius worth a fit; next to the best
@@ -172,7 +173,7 @@ def choose(  # type: ignore[no-untyped-def]
         most = vote[order[0]]
         worth, widest = np.zeros(len(tried), np.uint8), 0.0
         for j in order:
-            near = abs(tried[j] - tried[order[0]]) <= NEIGHBOURS_MM and vote[j] >= NEAR_SHARE * most
+            near = abs(tried[j] - tried[order[0]]) <= NEIGHBOURS_MM and (most < MANY or vote[j] >= NEAR_SHARE * most)
             worth[j] = near or (vote[j] >= SHARE * most and vote[j] >= 3.0) or (known and tried[j] == expected[k])
             if worth[j]:
                 widest = max(widest, tried[j])
@@ -201,7 +202,11 @@ def choose(  # type: ignore[no-untyped-def]
                 shift_covariance, catch, 3, COARSE_MM, state, shifts, code, covariance,
             )  # fmt: skip
             if used < 1:
-                continue
+                if free:
+                    continue
+                # all of it may be hidden: as a size it stands until points that are not hidden speak against it
+                state[0], state[1], state[2], state[3] = 0.0, 0.0, 0.0, tried[j]
+                shifts[:, :] = 0.0
             again = False
             for i in range(done):
                 again = again or (free and abs(all_states[i, 3] - state[3]) < 0.5)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import chdtrc
 
 from processor.bolt_balls.ball_records import AMBIGUOUS, Balls, Fits
 from processor.bolt_balls.catalogue import Catalogue
@@ -14,8 +15,10 @@ LEAST_POINTS = 8
 LARGEST_LOWEST_SD_MM = 0.8  # 3 mm off is then nearly four standard deviations
 LARGEST_RADIUS_SD = 0.05
 LARGEST_SCALE = 1.6
-LARGEST_CHI2 = 16.27  # of three numbers: one in a thousand
-TENSION = 3.5  # sd that a radius may be off its size
+UNLIKELY = 1e-3  # probability below which ball and priors are said to disagree
+LEAST_NEWS = 0.02  # share of a prior's variance that points must take away to be heard against it
+FEW = 30
+FEW_MARGIN = 10.0  # more that the runner-up must lose by where points are few
 
 
 def judged(
@@ -39,6 +42,7 @@ def judged(
     axes_known = np.isfinite(nodes.covariance).all(axis=(1, 2))
     evidence, flags, reasons = [], [], []
     margin = fits.margin
+    agreement = agreements(fits, nodes, radius_sd if len(catalogue.radii) else np.inf)
     for i in range(k):
         doubts: list[str] = []
         flag = "ok"
@@ -67,17 +71,14 @@ def judged(
             doubts.append(f"ill-conditioned: sd of the lowest point {lowest_sd:.1f} mm")
         if not np.sqrt(C[3, 3]) <= LARGEST_RADIUS_SD * state[i, 3]:
             doubts.append(f"ill-conditioned: sd of the radius {np.sqrt(C[3, 3]):.1f} mm")
-        if margin[i] < AMBIGUOUS:
+        if margin[i] < AMBIGUOUS + (FEW_MARGIN if n < FEW else 0.0):
             doubts.append(f"size ambiguous: {fits.second[i]:.0f} mm fits nearly as well ({margin[i]:.0f})")
         if fits.numbers[i, 4] > LARGEST_SCALE:
             doubts.append(f"not round: residuals {fits.numbers[i, 4]:.1f} times the noise of all balls")
-        if fits.numbers[i, 6] > LARGEST_CHI2:
-            away = float(np.linalg.norm(state[i, :3]))
-            doubts.append(f"ball and axes disagree by {away:.1f} mm")
-        if len(catalogue.radii):
-            tension = abs(state[i, 3] - fits.sizes[i]) / radius_sd
-            if tension > TENSION:
-                doubts.append(f"radius {state[i, 3]:.1f} mm is of no size of the catalogue")
+        if agreement[i] < UNLIKELY:
+            away, off = float(np.linalg.norm(state[i, :3])), float(state[i, 3] - fits.sizes[i])
+            sized = f" and its radius off the size by {off:+.1f} mm" if len(catalogue.radii) else ""
+            doubts.append(f"ball and axes disagree: centres {away:.1f} mm apart{sized}")
         if doubts:
             flag = "low-confidence"
         elif np.isfinite(expected[i]) and len(catalogue.radii) and fits.sizes[i] != expected[i]:
@@ -131,3 +132,26 @@ def judged(
         station_sd=station_sd,
         message=message,
     )
+
+
+def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:
+    """Probabilities (k,) that points and priors of one ball differ as much as they do or more; 1 without both.
+
+    What the points move an estimate by has the covariance that they take away from the prior.
+    """
+    found = np.ones(nodes.count)
+    for i in np.flatnonzero(fits.numbers[:, 7] > 0):
+        prior = np.zeros((4, 4))
+        held = np.zeros(4, bool)
+        if np.isfinite(nodes.covariance[i]).all() and fits.numbers[i, 6] > 0.0:
+            prior[:3, :3], held[:3] = nodes.covariance[i], True
+        if np.isfinite(radius_sd):
+            prior[3, 3], held[3] = radius_sd**2, True
+        if not held.any():
+            continue
+        off = (fits.states[i] - [0.0, 0.0, 0.0, fits.sizes[i]])[held]
+        L = np.linalg.inv(np.linalg.cholesky(prior[np.ix_(held, held)]))
+        taken, axes = np.linalg.eigh(np.eye(len(L)) - L @ fits.covariance[i][np.ix_(held, held)] @ L.T)
+        chi2 = float(np.sum((axes.T @ (L @ off)) ** 2 / np.maximum(taken, LEAST_NEWS)))
+        found[i] = float(chdtrc(len(L), chi2))
+    return found
