@@ -1,0 +1,170 @@
+"""Compiled final fit of every ball whose size is chosen: state, covariance, bound and what it rests on."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit, prange
+
+from processor.bolt_balls.ball_choice import AROUND_MM, fit_one, rows_within, segments
+from processor.bolt_balls.ball_residuals import residual, variance, weight
+from processor.bolt_balls.ball_solve import inverse_of, normal_equations, solve
+
+SETTLED_MM = 1e-6
+BANDS, SECTORS = 10, 20  # cells of equal area that the visible share is counted in
+
+
+@njit(cache=True, nogil=True)
+def leftover(  # type: ignore[no-untyped-def]
+    points, rays, ranges, station, chosen, noise, state, shifts, gains, covariance, errors, cosines, on, cells
+):  # fmt: skip
+    """Fill each chosen point's residual, cosine and weight; returns (sum of w, of w u^2, of w leverage, of w e^2, cells, stations).
+
+    Residuals are divided by sqrt(1 - leverage), so that their spread is the noise itself however few there are.
+    """
+    J, K = np.empty(4), np.empty(4)
+    weights, squares, leverages, plain = 0.0, 0.0, 0.0, 0.0
+    segment, inside, stations = 0, False, 0
+    cells[:] = 0
+    for i in range(len(points)):
+        on[i] = 0.0
+        if chosen[i] == 1:
+            e, cosine, J[0], J[1], J[2], J[3] = residual(
+                points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2],
+                state[0] + shifts[segment, 0], state[1] + shifts[segment, 1], state[2] + shifts[segment, 2], state[3],
+            )  # fmt: skip
+            if cosine > 0.02:
+                v = variance(noise, ranges[i], max(cosine, 0.1))
+                w = weight(e / np.sqrt(v))
+                h = 0.0
+                for p in range(4):
+                    K[p] = J[p]
+                    for q in range(3):
+                        K[p] -= J[q] * gains[segment, q, p]
+                for p in range(4):
+                    for q in range(4):
+                        h += K[p] * covariance[p, q] * K[q]
+                        if p < 3 and q < 3:
+                            h += J[p] * gains[segment, p, 5 + q] * J[q]
+                h = min(h / v, 0.9)
+                errors[i] = e / np.sqrt(1.0 - h)
+                cosines[i] = cosine
+                on[i] = w
+                weights += w
+                squares += w * e * e / v
+                plain += w * e * e
+                leverages += w * h
+                if w > 0.0:
+                    inside = True
+                    sphere_x = points[i, 0] - state[0] - shifts[segment, 0]
+                    sphere_y = points[i, 1] - state[1] - shifts[segment, 1]
+                    sphere_z = points[i, 2] - state[2] - shifts[segment, 2]
+                    d = np.sqrt(sphere_x**2 + sphere_y**2 + sphere_z**2)
+                    band = min(max(int(np.floor((sphere_z / d + 1.0) * (BANDS / 2.0))), 0), BANDS - 1)
+                    turn = math.atan2(sphere_y, sphere_x) / (2.0 * np.pi) + 0.5
+                    sector = min(max(int(np.floor(turn * SECTORS)), 0), SECTORS - 1)
+                    cells[band * SECTORS + sector] = 1
+        if i + 1 == len(points) or station[i + 1] != station[i]:
+            segment += 1
+            if inside:
+                stations += 1
+            inside = False
+    return weights, squares, leverages, plain, cells.sum(), stations
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def finish(  # type: ignore[no-untyped-def]
+    start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise, believed,
+    centre_weight, sizes, size_weights, states, catch, shift_covariance,
+):  # fmt: skip
+    """Fit every node whose state (k, 4) is finite, with its size's prior, and say how well.
+
+    ``believed`` is how many points the noise model is worth: the scale about it is estimated ball by ball, its squares
+    with as many degrees of freedom as points, and the model's own beside them. The bounds are those of the noise and the
+    priors with every point at its full weight and stations that stand still.
+
+    Returns states (k, 4), covariances (k, 4, 4), bounds (k, 4, 4), numbers (k, 8) = points, cells, stations, rms, scale
+    about the noise model, degrees of freedom, chi-square of the centre's prior, whether it fitted; and of every point
+    residual, cosine and weight.
+    """
+    nodes = len(start) - 1
+    found = np.full((nodes, 4), np.nan)
+    covariances, bounds = np.full((nodes, 4, 4), np.nan), np.full((nodes, 4, 4), np.nan)
+    numbers = np.zeros((nodes, 8))
+    errors, cosines, on = np.zeros(len(points)), np.zeros(len(points)), np.zeros(len(points))
+    for k in prange(nodes):
+        if np.isnan(states[k, 0]) or start[k + 1] == start[k]:
+            continue
+        everything = points[start[k] : start[k + 1]]
+        rows = start[k] + rows_within(everything, states[k, 3] - AROUND_MM, states[k, 3] + AROUND_MM)
+        n = len(rows)
+        if n == 0:
+            continue
+        p, u, L, s = points[rows], rays[rows], ranges[rows], station[rows]
+        e, c, w = np.zeros(n), np.zeros(n), np.zeros(n)
+        ap, ad = axis_points[end_start[k] : end_start[k + 1]], axes[end_start[k] : end_start[k + 1]]
+        off = keep_off[end_start[k] : end_start[k + 1]]
+        state = states[k].copy()
+        origin = np.zeros(3)
+        shifts = np.zeros((segments(s), 3))
+        gains = np.zeros((len(shifts), 3, 8))
+        chosen = np.zeros(n, np.uint8)
+        covariance, cells = np.zeros((4, 4)), np.zeros(BANDS * SECTORS, np.int64)
+        used = fit_one(
+            p, u, L, s, ap, ad, off, hole, least_cosine, noise, origin, centre_weight[k], sizes[k], size_weights[k],
+            shift_covariance, catch, 4, SETTLED_MM, state, shifts, chosen, covariance,
+        )  # fmt: skip
+        if used < 1:
+            continue
+        scale = 1.0
+        local = noise.copy()
+        free = 0.0
+        for _ in range(4):
+            weights, squares, leverages, plain, seen, stations = leftover(
+                p, u, L, s, chosen, local, state, shifts, gains, covariance, e, c, w, cells,
+            )  # fmt: skip
+            free = max(weights - leverages, 0.0)
+            scale2 = (believed + squares * scale * scale) / (believed + free) if believed + free > 0.0 else 1.0
+            scale = np.sqrt(scale2)
+            local[:] = noise * scale2
+            used = solve(
+                p, u, L, s, chosen, local, 1.0, origin, centre_weight[k], sizes[k], size_weights[k], shift_covariance,
+                SETTLED_MM, state, shifts, gains, 10, covariance,
+            )  # fmt: skip
+            if used < 1:
+                break
+        if used < 1:
+            continue
+        H, g = np.empty((4, 4)), np.empty(4)
+        normal_equations(
+            p, u, L, s, chosen, local, 1.0, False, origin, centre_weight[k], sizes[k], size_weights[k],
+            shift_covariance, state, shifts, gains, H, g,
+        )  # fmt: skip
+        if not inverse_of(H, covariance):
+            continue
+        weights, squares, leverages, plain, seen, stations = leftover(
+            p, u, L, s, chosen, local, state, shifts, gains, covariance, e, c, w, cells,
+        )  # fmt: skip
+        bound = np.empty((4, 4))
+        used = normal_equations(
+            p, u, L, s, chosen, local, 1.0, True, origin, centre_weight[k], sizes[k], size_weights[k],
+            shift_covariance[:0], state, shifts, gains, H, g,
+        )  # fmt: skip
+        if not inverse_of(H, bound):
+            continue
+        chi2 = 0.0
+        for i in range(3):
+            for j in range(3):
+                chi2 += state[i] * centre_weight[k, i, j] * state[j]
+        for i in range(n):
+            errors[rows[i]], cosines[rows[i]], on[rows[i]] = e[i], c[i], w[i]
+        found[k] = state
+        covariances[k] = covariance
+        bounds[k] = bound
+        numbers[k, 0], numbers[k, 1], numbers[k, 2] = used, seen, stations
+        numbers[k, 3] = np.sqrt(plain / max(weights, 1e-9))
+        numbers[k, 4], numbers[k, 5] = scale, believed + free
+        numbers[k, 6], numbers[k, 7] = chi2, 1.0
+    return found, covariances, bounds, numbers, errors, cosines, on

@@ -1,0 +1,157 @@
+"""What each fitted ball is worth: evidence, flag and every reason for it."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import chdtrc
+
+from processor.bolt_balls.ball_records import AMBIGUOUS, Balls, Fits
+from processor.bolt_balls.catalogue import Catalogue
+from processor.bolt_balls.nodes import Nodes
+from processor.model import Floats
+
+CELLS = 200
+LEAST_POINTS = 8
+LARGEST_LOWEST_SD_MM = 0.8  # 3 mm off is then nearly four standard deviations
+LARGEST_RADIUS_SD = 0.05
+LARGEST_SCALE = 1.6
+UNLIKELY = 1e-3  # probability below which ball and priors are said to disagree
+LEAST_NEWS = 0.02  # share of a prior's variance that points must take away to be heard against it
+FEW = 30
+FEW_MARGIN = 10.0  # more that the runner-up must lose by where points are few
+
+
+def judged(
+    fits: Fits,
+    nodes: Nodes,
+    expected: Floats,
+    catalogue: Catalogue,
+    rays: bool,
+    noise: Floats,
+    radius_sd: float,
+    station_sd: float,
+) -> Balls:
+    """Give every node its numbers, evidence, flag and reason."""
+    k = nodes.count
+    fitted = fits.numbers[:, 7] > 0
+    state = fits.states.copy()
+    degrees = fits.numbers[:, 5]
+    # The scale is estimated: the variance of Student's t is wider than the normal one.
+    wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
+    covariance = fits.covariance * wider[:, None, None]
+    axes_known = np.isfinite(nodes.covariance).all(axis=(1, 2))
+    evidence, flags, reasons = [], [], []
+    margin = fits.margin
+    agreement = agreements(fits, nodes, radius_sd if len(catalogue.radii) else np.inf)
+    for i in range(k):
+        doubts: list[str] = []
+        flag = "ok"
+        if not fitted[i]:
+            state[i, :3] = 0.0
+            state[i, 3] = expected[i]
+            covariance[i] = np.nan
+            covariance[i, :3, :3] = nodes.covariance[i]
+            if np.isfinite(expected[i]):
+                covariance[i, 3, :], covariance[i, :, 3] = 0.0, 0.0
+                covariance[i, 3, 3] = radius_sd**2
+            evidence.append("axes")
+            enough = axes_known[i] and nodes.axes[i] >= 2
+            flags.append("low-confidence" if enough else "not-found")
+            source = "the radius is the design's" if np.isfinite(expected[i]) else "the radius is unknown"
+            reasons.append(f"no ball seen, known from {nodes.axes[i]} axes alone; {source}")
+            continue
+        has_prior = bool(axes_known[i]) and fits.numbers[i, 6] > 0.0
+        evidence.append("fused" if has_prior else "ball")
+        n = int(fits.numbers[i, 0])
+        C = covariance[i]
+        lowest_sd = float(np.sqrt(max(C[2, 2] + C[3, 3] - 2.0 * C[2, 3], 0.0)))
+        if n < LEAST_POINTS:
+            doubts.append(f"{n} points, fewer than {LEAST_POINTS}")
+        if not lowest_sd <= LARGEST_LOWEST_SD_MM:
+            doubts.append(f"ill-conditioned: sd of the lowest point {lowest_sd:.1f} mm")
+        if not np.sqrt(C[3, 3]) <= LARGEST_RADIUS_SD * state[i, 3]:
+            doubts.append(f"ill-conditioned: sd of the radius {np.sqrt(C[3, 3]):.1f} mm")
+        if margin[i] < AMBIGUOUS + (FEW_MARGIN if n < FEW else 0.0):
+            doubts.append(f"size ambiguous: {fits.second[i]:.0f} mm fits nearly as well ({margin[i]:.0f})")
+        if fits.numbers[i, 4] > LARGEST_SCALE:
+            doubts.append(f"not round: residuals {fits.numbers[i, 4]:.1f} times the noise of all balls")
+        if agreement[i] < UNLIKELY:
+            away, off = float(np.linalg.norm(state[i, :3])), float(state[i, 3] - fits.sizes[i])
+            sized = f" and its radius off the size by {off:+.1f} mm" if len(catalogue.radii) else ""
+            doubts.append(f"ball and axes disagree: centres {away:.1f} mm apart{sized}")
+        if doubts:
+            flag = "low-confidence"
+        elif np.isfinite(expected[i]) and len(catalogue.radii) and fits.sizes[i] != expected[i]:
+            flag = "wrong-size"
+            doubts.append(f"size {fits.sizes[i]:g} mm instead of {expected[i]:g} mm")
+        flags.append(flag)
+        reasons.append("; ".join(doubts))
+    centres = nodes.positions + state[:, :3]
+    bound = fits.bound
+    down = np.array([0.0, 0.0, 1.0, -1.0])
+    lowest_sd = np.sqrt(np.einsum("i,kij,j->k", down, covariance, down))
+    bound_lowest = np.sqrt(np.einsum("i,kij,j->k", down, bound, down))
+    with np.errstate(invalid="ignore"):
+        trace = np.sqrt(np.einsum("kii->k", bound[:, :3, :3]) / np.einsum("kii->k", covariance[:, :3, :3]))
+        by_radius = np.sqrt(bound[:, 3, 3] / covariance[:, 3, 3])
+    message = (
+        "ranges from the known scanners"
+        if rays
+        else "orthogonal distances, for the scanners are unknown: the bias of range noise stands, it is not corrected"
+    )
+    if station_sd > 0.0:
+        message += f"; stations disagree by {station_sd:.1f} mm an axis (sd), which every covariance holds"
+    if len(catalogue.radii) and not catalogue.verified:
+        message += f"; the catalogue of radii ({catalogue.name}) was not held against a published one"
+    return Balls(
+        centres=centres,
+        radii=state[:, 3],
+        lowest=centres - state[:, 3:] * np.array([0.0, 0.0, 1.0]),
+        covariance=covariance,
+        lowest_sd=lowest_sd,
+        bound=bound,
+        bound_lowest_sd=bound_lowest,
+        efficiency_centre=trace,
+        efficiency_radius=by_radius,
+        efficiency_lowest=bound_lowest / lowest_sd,
+        points=fits.numbers[:, 0].astype(np.int64),
+        visible_fraction=fits.numbers[:, 1] / CELLS,
+        stations=fits.numbers[:, 2].astype(np.int64),
+        axes=nodes.axes,
+        rms=fits.numbers[:, 3],
+        scale=fits.numbers[:, 4],
+        sizes=fits.sizes,
+        second_sizes=fits.second,
+        margin=margin,
+        expected=expected,
+        evidence=tuple(evidence),
+        flag=tuple(flags),
+        reason=tuple(reasons),
+        noise=noise,
+        radius_sd=radius_sd,
+        station_sd=station_sd,
+        message=message,
+    )
+
+
+def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:
+    """Probabilities (k,) that points and priors of one ball differ as much as they do or more; 1 without both.
+
+    What the points move an estimate by has the covariance that they take away from the prior.
+    """
+    found = np.ones(nodes.count)
+    for i in np.flatnonzero(fits.numbers[:, 7] > 0):
+        prior = np.zeros((4, 4))
+        held = np.zeros(4, bool)
+        if np.isfinite(nodes.covariance[i]).all() and fits.numbers[i, 6] > 0.0:
+            prior[:3, :3], held[:3] = nodes.covariance[i], True
+        if np.isfinite(radius_sd):
+            prior[3, 3], held[3] = radius_sd**2, True
+        if not held.any():
+            continue
+        off = (fits.states[i] - [0.0, 0.0, 0.0, fits.sizes[i]])[held]
+        L = np.linalg.inv(np.linalg.cholesky(prior[np.ix_(held, held)]))
+        taken, axes = np.linalg.eigh(np.eye(len(L)) - L @ fits.covariance[i][np.ix_(held, held)] @ L.T)
+        chi2 = float(np.sum((axes.T @ (L @ off)) ** 2 / np.maximum(taken, LEAST_NEWS)))
+        found[i] = float(chdtrc(len(L), chi2))
+    return found

@@ -1,0 +1,185 @@
+"""Compiled Gauss-Newton solution of one ball: centre and radius by robust residuals along the ray, with priors.
+
+Each station may have moved as a whole by an unknown shift of known covariance (its registration): it is estimated with
+the ball and so enters the ball's covariance.
+"""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from processor.bolt_balls.ball_residuals import residual, variance, weight
+
+
+@njit(cache=True, nogil=True)
+def inverse_of(A, out):  # type: ignore[no-untyped-def]
+    """Inverse of a positive definite matrix by Cholesky's factors; False where it has none."""
+    n = len(A)
+    L = np.zeros((n, n))
+    for i in range(n):
+        for j in range(i + 1):
+            s = A[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                if not s > 1e-12 * A[i, i]:
+                    return False
+                L[i, i] = np.sqrt(s)
+            else:
+                L[i, j] = s / L[j, j]
+    M = np.zeros((n, n))  # inverse of L
+    for i in range(n):
+        M[i, i] = 1.0 / L[i, i]
+        for j in range(i):
+            s = 0.0
+            for k in range(j, i):
+                s -= L[i, k] * M[k, j]
+            M[i, j] = s / L[i, i]
+    for i in range(n):
+        for j in range(i + 1):
+            s = 0.0
+            for k in range(i, n):
+                s += M[k, i] * M[k, j]
+            out[i, j] = s
+            out[j, i] = s
+    return True
+
+
+@njit(cache=True, nogil=True)
+def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
+    """Add one station's information A (4, 4) and gradient b (4,) to the ball's, its unknown shift eliminated.
+
+    ``gain`` (3, 8) is left so that the shift's own step is -(gain[:, :4] . step of the ball + gain[:, 4]), and that the
+    shift's covariance, were the ball known, is gain[:, 5:].
+    """
+    W, S = np.empty((3, 3)), np.empty((3, 3))
+    if not inverse_of(T, W):
+        return False
+    for i in range(3):
+        for j in range(3):
+            S[i, j] = A[i, j] + W[i, j]
+    M = np.empty((3, 3))
+    if not inverse_of(S, M):
+        return False
+    gain[:, 5:] = M
+    for i in range(3):
+        for k in range(5):
+            total = 0.0
+            for j in range(3):
+                total += M[i, j] * (
+                    A[j, k] if k < 4 else b[j] + W[j, 0] * shift[0] + W[j, 1] * shift[1] + W[j, 2] * shift[2]
+                )
+            gain[i, k] = total
+    for i in range(4):
+        for j in range(4):
+            H[i, j] += A[i, j]
+            for k in range(3):
+                H[i, j] -= A[i, k] * gain[k, j]
+        g[i] += b[i]
+        for k in range(3):
+            g[i] -= A[i, k] * gain[k, 4]
+    return True
+
+
+@njit(cache=True, nogil=True)
+def normal_equations(  # type: ignore[no-untyped-def]
+    points, rays, ranges, station, chosen, noise, stretch, whole, centre, centre_weight, radius, radius_weight,
+    shift_covariance, state, shifts, gains, H, g,
+):  # fmt: skip
+    """Fill H (4, 4) and gradient g (4,) at ``state``; returns the number of points of weight above 0.
+
+    ``stretch`` widens the robust cut; ``whole`` gives all these points their full weight. Points are sorted by station.
+    """
+    for i in range(4):
+        g[i] = 0.0
+        for j in range(4):
+            H[i, j] = 0.0
+    for i in range(3):
+        for j in range(3):
+            H[i, j] = centre_weight[i, j]
+            g[i] += centre_weight[i, j] * (state[j] - centre[j])
+    H[3, 3] = radius_weight
+    g[3] = radius_weight * (state[3] - radius)
+    A, b, J = np.zeros((4, 4)), np.zeros(4), np.empty(4)
+    n = len(points)
+    used, segment, inside = 0, 0, 0
+    for i in range(n):
+        if chosen[i] == 1:
+            cx = state[0] + shifts[segment, 0]
+            cy = state[1] + shifts[segment, 1]
+            cz = state[2] + shifts[segment, 2]
+            e, cosine, J[0], J[1], J[2], J[3] = residual(
+                points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], cx, cy, cz, state[3]
+            )
+            if cosine > 0.02:
+                v = variance(noise, ranges[i], max(cosine, 0.1))
+                w = weight(e / (stretch * np.sqrt(v)))
+                if w > 0.0:
+                    used += 1
+                    inside += 1
+                    w = (1.0 if whole else w) / v
+                    for p in range(4):
+                        b[p] += w * J[p] * e
+                        for q in range(p + 1):
+                            A[p, q] += w * J[p] * J[q]
+        if i + 1 == n or station[i + 1] != station[i]:
+            for p in range(4):
+                for q in range(p):
+                    A[q, p] = A[p, q]
+            s = station[i]
+            moved = False
+            if inside > 0 and s >= 0 and s < len(shift_covariance) and shift_covariance[s, 0, 0] > 0.0:
+                moved = _add_station(A, b, shift_covariance[s], shifts[segment], H, g, gains[segment])
+            if not moved:
+                for p in range(4):
+                    g[p] += b[p]
+                    for q in range(4):
+                        H[p, q] += A[p, q]
+                gains[segment, :, :] = 0.0
+            A[:, :] = 0.0
+            b[:] = 0.0
+            segment += 1
+            inside = 0
+    return used
+
+
+@njit(cache=True, nogil=True)
+def solve(  # type: ignore[no-untyped-def]
+    points, rays, ranges, station, chosen, noise, stretch, centre, centre_weight, radius, radius_weight,
+    shift_covariance, settled, state, shifts, gains, steps, covariance,
+):  # fmt: skip
+    """Move ``state`` (x, y, z, r) and ``shifts`` by at most ``steps`` Gauss-Newton steps; returns points used, or -1.
+
+    A step below ``settled`` mm is the last. ``covariance`` (4, 4) is the inverse of the information at the last but one state. -1: nothing determines the ball.
+    """
+    H, g = np.empty((4, 4)), np.empty(4)
+    used = 0
+    for _ in range(steps):
+        used = normal_equations(
+            points, rays, ranges, station, chosen, noise, stretch, False, centre, centre_weight, radius, radius_weight,
+            shift_covariance, state, shifts, gains, H, g,
+        )  # fmt: skip
+        if not inverse_of(H, covariance):
+            return -1
+        step = np.zeros(4)
+        size = 0.0
+        for i in range(4):
+            for j in range(4):
+                step[i] -= covariance[i, j] * g[j]
+            size = max(size, abs(step[i]))
+        scale = 1.0 if size <= 0.2 * state[3] else 0.2 * state[3] / size
+        for i in range(4):
+            state[i] += scale * step[i]
+        if not (state[3] > 1.0 and state[3] < 2000.0):
+            return -1
+        for k in range(len(shifts)):
+            for i in range(3):
+                move = gains[k, i, 4]
+                for j in range(4):
+                    move += gains[k, i, j] * scale * step[j]
+                shifts[k, i] -= move
+        if size < settled:
+            break
+    return used

@@ -1,0 +1,214 @@
+"""The points about every node, gathered from the whole source in one pass."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, prange
+
+from processor.bolt_balls.source import Source
+from processor.model import Floats, Ints, Labels, UsageError
+
+STEPS_PER_MM = 1000.0  # gathered coordinates are whole micrometres: sorting them is exact
+GREATEST_REACH_MM = 1000.0  # 21 bits an axis
+BLOCK = 1 << 14
+EMPTY = -1
+
+
+@dataclass(frozen=True)
+class Crops:
+    """Points about k nodes, those of node i in rows ``start[i]`` to ``start[i + 1]``.
+
+    ``points`` (n, 3) mm less the node's own position, in steps of 0.001 mm; ``station`` (n,) rows of the source's
+    scanners, -1 = unknown. A node's points are sorted by station, x, y and z: their order in the source is lost.
+    """
+
+    start: Ints
+    points: Floats
+    station: Labels
+
+
+def gather(source: Source, nodes: Floats, reach_mm: float) -> Crops:
+    """Gather the points within ``reach_mm`` of nodes (k, 3), given less the source's origin; one pass over the source.
+
+    A point near two nodes is gathered for both. The answer does not depend on chunks, order of points or threads.
+    """
+    if not 0.0 < reach_mm <= GREATEST_REACH_MM:
+        raise UsageError(f"reach of a crop: expected above 0 to {GREATEST_REACH_MM:g} mm, got {reach_mm!r}")
+    nodes = np.ascontiguousarray(nodes, dtype=np.float64)
+    if not len(nodes):
+        return Crops(np.zeros(1, np.int64), np.empty((0, 3)), np.empty(0, np.int32))
+    lower = nodes.min(axis=0) - reach_mm
+    table, cell_start, cell_nodes = _cells(nodes, lower, reach_mm)
+    owners, steps, stations = [np.empty(0, np.int32)], [np.empty((0, 3), np.int32)], [np.empty(0, np.int32)]
+    for chunk in source.chunks():
+        found = _near(
+            _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32), nodes, lower,
+            reach_mm, *table, cell_start, cell_nodes,
+        )  # fmt: skip
+        for kept, new in zip((owners, steps, stations), found, strict=True):
+            kept.append(new)
+    start, points, station = _sorted(
+        np.concatenate(owners), np.concatenate(steps), np.concatenate(stations), len(nodes)
+    )
+    return Crops(start, points, station)
+
+
+def _frozen(values: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
+    """View values as a read-only array, whatever they were: the kernel is compiled for one kind alone."""
+    found = np.ascontiguousarray(values, dtype=dtype).view()
+    found.flags.writeable = False
+    return found
+
+
+def _cells(nodes: Floats, lower: Floats, reach: float) -> tuple[tuple[Ints, Labels], Ints, Labels]:
+    """Hash table of the cells that spheres about the nodes touch, and the nodes of each cell.
+
+    A cell's edge is the spheres' diameter, so a sphere touches eight cells at most, and a point lies in one.
+    """
+    edge = 2.0 * reach
+    first = np.floor((nodes - reach - lower) / edge).astype(np.int64)
+    last = np.floor((nodes + reach - lower) / edge).astype(np.int64)
+    keys, owners = [], []
+    for corner in np.ndindex(2, 2, 2):
+        cell = first + np.array(corner)
+        held = np.flatnonzero((cell <= last).all(axis=1))
+        keys.append((cell[held, 0] << 42) | (cell[held, 1] << 21) | cell[held, 2])
+        owners.append(held)
+    if int(last.max()) >= 1 << 21:
+        raise UsageError("the nodes are too far apart for one run: more than two million crops in a row")
+    key, owner = np.concatenate(keys), np.concatenate(owners)
+    order = np.lexsort((owner, key))
+    unique, begin = np.unique(key[order], return_index=True)
+    bits = max(4, int(4 * len(unique) - 1).bit_length())
+    table = np.full(1 << bits, EMPTY, np.int64)
+    row = np.full(1 << bits, EMPTY, np.int32)
+    _fill(unique, table, row)
+    return (table, row), np.append(begin, len(key)).astype(np.int64), owner[order].astype(np.int32)
+
+
+@njit(cache=True, nogil=True)
+def _slot(key, mask):  # type: ignore[no-untyped-def]
+    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    return np.int64((h >> np.uint64(29)) & np.uint64(mask))
+
+
+@njit(cache=True, nogil=True)
+def _fill(keys, table, row):  # type: ignore[no-untyped-def]
+    mask = len(table) - 1
+    for i in range(len(keys)):
+        at = _slot(keys[i], mask)
+        while table[at] != EMPTY:
+            at = (at + 1) & mask
+        table[at] = keys[i]
+        row[at] = i
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _near(points, station, nodes, lower, reach, table, row, cell_start, cell_nodes):  # type: ignore[no-untyped-def]
+    """Owner (m,), offset from it in steps (m, 3) and station (m,) of every pair of a node and a point near it."""
+    n = len(points)
+    blocks = (n + BLOCK - 1) // BLOCK
+    mask = len(table) - 1
+    inverse = 1.0 / (2.0 * reach)
+    reach2 = reach * reach
+    upper = np.empty(3)
+    for axis in range(3):
+        upper[axis] = nodes[:, axis].max() + reach
+    cell = np.empty(n, np.int32)
+    candidate = np.empty(n, np.int32)
+    candidates = np.zeros(blocks, np.int64)
+    pairs = np.zeros(blocks + 1, np.int64)
+    for block in prange(blocks):
+        kept, total = 0, 0
+        base = block * BLOCK
+        for i in range(base, min(n, base + BLOCK)):
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            # written so that a coordinate that is not a number is left out too
+            if not (lower[0] <= x <= upper[0] and lower[1] <= y <= upper[1] and lower[2] <= z <= upper[2]):
+                continue
+            ix = np.int64((x - lower[0]) * inverse)
+            iy = np.int64((y - lower[1]) * inverse)
+            iz = np.int64((z - lower[2]) * inverse)
+            key = (ix << 42) | (iy << 21) | iz
+            at = _slot(key, mask)
+            while table[at] != EMPTY and table[at] != key:
+                at = (at + 1) & mask
+            if table[at] == EMPTY:
+                continue
+            here = row[at]
+            near = 0
+            for j in range(cell_start[here], cell_start[here + 1]):
+                node = cell_nodes[j]
+                dx, dy, dz = x - nodes[node, 0], y - nodes[node, 1], z - nodes[node, 2]
+                if dx * dx + dy * dy + dz * dz <= reach2:
+                    near += 1
+            if near > 0:
+                candidate[base + kept] = i
+                cell[base + kept] = here
+                kept += 1
+                total += near
+        candidates[block] = kept
+        pairs[block + 1] = total
+    for block in range(blocks):
+        pairs[block + 1] += pairs[block]
+    count = pairs[blocks]
+    owner, steps, seen = np.empty(count, np.int32), np.empty((count, 3), np.int32), np.empty(count, np.int32)
+    for block in prange(blocks):
+        to = pairs[block]
+        base = block * BLOCK
+        for k in range(base, base + candidates[block]):
+            i, here = candidate[k], cell[k]
+            for j in range(cell_start[here], cell_start[here + 1]):
+                node = cell_nodes[j]
+                dx = points[i, 0] - nodes[node, 0]
+                dy = points[i, 1] - nodes[node, 1]
+                dz = points[i, 2] - nodes[node, 2]
+                if dx * dx + dy * dy + dz * dz <= reach2:
+                    owner[to] = node
+                    steps[to, 0] = np.int32(np.rint(dx * STEPS_PER_MM))
+                    steps[to, 1] = np.int32(np.rint(dy * STEPS_PER_MM))
+                    steps[to, 2] = np.int32(np.rint(dz * STEPS_PER_MM))
+                    seen[to] = station[i]
+                    to += 1
+    return owner, steps, seen
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _sorted(owner, steps, station, nodes):  # type: ignore[no-untyped-def]
+    """Start (k + 1,) of each node's points, and points (n, 3) mm and station (n,) in canonical order."""
+    n = len(owner)
+    start = np.zeros(nodes + 1, np.int64)
+    for i in range(n):
+        start[owner[i] + 1] += 1
+    for k in range(nodes):
+        start[k + 1] += start[k]
+    place = start[:-1].copy()
+    by_node = np.empty(n, np.int64)
+    for i in range(n):
+        by_node[place[owner[i]]] = i
+        place[owner[i]] += 1
+    points, seen = np.empty((n, 3)), np.empty(n, np.int32)
+    for k in prange(nodes):
+        first, last = start[k], start[k + 1]
+        key = np.empty(last - first, np.int64)
+        for j in range(first, last):
+            i = by_node[j]
+            x, y, z = np.int64(steps[i, 0]), np.int64(steps[i, 1]), np.int64(steps[i, 2])
+            key[j - first] = ((x + (1 << 20)) << 42) | ((y + (1 << 20)) << 21) | (z + (1 << 20))
+        by_place = np.argsort(key)
+        at = np.empty(last - first, np.int32)
+        for j in range(last - first):
+            at[j] = station[by_node[first + by_place[j]]]
+        # stable: within a station the points keep their order by place, and what is equal in both is the same
+        by_station = np.argsort(at, kind="mergesort")
+        for j in range(last - first):
+            i = by_node[first + by_place[by_station[j]]]
+            for axis in range(3):
+                points[first + j, axis] = steps[i, axis] / STEPS_PER_MM
+            seen[first + j] = station[i]
+    return start, points, seen
