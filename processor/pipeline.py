@@ -137,6 +137,10 @@ def fill(cls: type, table: Any, where: str) -> Any:
         if dataclasses.is_dataclass(known[key]):
             values[key] = fill(type(known[key]), value, f"{where}.{key}")
             continue
+        if isinstance(known[key], tuple) and isinstance(value, list):
+            if not all(type(item) in (int, float) for item in value):
+                raise UsageError(f"{where}.{key}: expected a list of numbers, got {value!r}")
+            value = tuple(float(item) for item in value)
         if isinstance(known[key], float) and type(value) is int and abs(value) < 2**53:
             value = float(value)
         if type(value) is not type(known[key]):

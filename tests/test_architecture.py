@@ -51,8 +51,8 @@ def test_arrows_run_one_way(path):
         assert not own
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
-    if name.startswith(("processor.steps.", "processor.preassembly")):
-        lower = within(own, "processor.geometry", "processor.model", "processor.preassembly")
+    if name.startswith(("processor.steps.", "processor.preassembly", "processor.bolt_balls")):
+        lower = within(own, "processor.geometry", "processor.model", "processor.preassembly", "processor.bolt_balls")
         assert not own - lower - {"processor"}, "a step sees records and geometry, not files"
 
 

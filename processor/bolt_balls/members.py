@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from processor.bolt_balls import axes, junctions
-from processor.bolt_balls.corridors import corridors, gather
+from processor.bolt_balls.corridors import Gathered, corridors, gather
 from processor.bolt_balls.linearity import linearity
 from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.segments import segments
@@ -44,30 +44,33 @@ class Params:
     threads: int = 0  # as many as there are
 
 
-def find(source: Source, params: Params | None = None) -> tuple[Nodes, Tubes]:
+def find(source: Source, params: Params) -> Measured | None:
     """Find the tubes and the nodes where they meet in a whole cloud, with no design, crop or size given.
 
-    A cloud without members has none, and that is known at once.
+    None for a cloud without members, and that is known at once.
     """
-    params = params or Params()
     lines = rough_lines(source, params)
     if len(lines.points) < 2:
-        return Nodes(), Tubes()
+        return None
     found = junctions.graph(lines)
     if not len(found.pairs):
-        return Nodes(), Tubes()
-    return _believed(*measure(source, found.nodes, found.pairs, params), params.largest_scatter_mm)
+        return None
+    points = points_near(source, found.nodes, found.pairs, params)
+    measured = measure(points, source.scanners, found.nodes, found.pairs, params)
+    return believed(measured, params.largest_scatter_mm)
 
 
-def _believed(nodes: Nodes, tubes: Tubes, largest_scatter_mm: float) -> tuple[Nodes, Tubes]:
+def believed(measured: Measured, largest_scatter_mm: float) -> Measured:
     """Leave out what three axes once seemed to meet at, but do not; and tubes with neither of their nodes."""
+    nodes, tubes = measured.nodes, measured.tubes
     kept = np.isfinite(nodes.positions).all(axis=1) & ~(nodes.scatter > largest_scatter_mm)
     row = np.where(kept, np.cumsum(kept) - 1, -1)
     a, b = row[tubes.node_a], row[tubes.node_b]
     rows = np.flatnonzero((a >= 0) | (b >= 0))
     columns = {field.name: getattr(tubes, field.name)[rows] for field in dataclasses.fields(tubes)}
     columns |= {"node_a": a[rows], "node_b": b[rows]}
-    return Nodes(nodes.positions[kept], nodes.covariance[kept], nodes.axes[kept], nodes.scatter[kept]), Tubes(**columns)
+    left = Nodes(nodes.positions[kept], nodes.covariance[kept], nodes.axes[kept], nodes.scatter[kept])
+    return replace(measured, nodes=left, tubes=Tubes(**columns), lines=measured.lines[rows])
 
 
 def rough_lines(source: Source, params: Params) -> junctions.Lines:
@@ -97,38 +100,57 @@ def rough_lines(source: Source, params: Params) -> junctions.Lines:
     return junctions.Lines(fits.points[fits.ok], fits.directions[fits.ok], low[fits.ok], high[fits.ok])
 
 
-def measure(source: Source, starts: Floats, pairs: Ints, params: Params | None = None) -> tuple[Nodes, Tubes]:
-    """Fit the tubes between pairs (p, 2) of nodes that are known to 20 mm, starts (k, 3) less the source's origin.
+@dataclass(frozen=True)
+class Measured:
+    """Nodes and tubes between known places, with what they rest on: points gathered near lines, a line (m,) a tube.
 
-    All starts become nodes, in their order. A node that no two axes fix has NaN for its position, and a tube that
-    could not be fitted is left out.
+    ``apart_mm`` is the standard deviation by which stations seem off each other at the tubes; 0 where noise explains
+    all.
     """
-    params = params or Params()
-    a, b = starts[pairs[:, 0]], starts[pairs[:, 1]]
-    length = np.linalg.norm(b - a, axis=1)
-    middles, directions = 0.5 * (a + b), (b - a) / length[:, None]
-    near = corridors(middles, directions, -0.5 * length, 0.5 * length, params.reach_mm)
+
+    nodes: Nodes
+    tubes: Tubes
+    points: Gathered
+    lines: Ints
+    apart_mm: float
+
+
+def points_near(source: Source, starts: Floats, pairs: Ints, params: Params) -> Gathered:
+    """Gather the points near the lines between pairs (p, 2) of nodes ``starts`` (k, 3), less the source's origin."""
+    middles, directions, length = _lines(starts, pairs)
+    lines = corridors(middles, directions, -0.5 * length, 0.5 * length, params.reach_mm)
     room = int(np.clip(params.all_tube_points // max(len(pairs), 1), 64, params.tube_points))
     chunks = ((chunk.points, chunk.station) for chunk in source.chunks())
-    points = gather(chunks, STEPS_PER_MM, near, room, params.threads)
+    return gather(chunks, STEPS_PER_MM, lines, room, params.threads)
+
+
+def measure(points: Gathered, scanners: Floats, starts: Floats, pairs: Ints, params: Params) -> Measured:
+    """Fit the tubes between pairs (p, 2) of nodes that are known to 20 mm, starts (k, 3), to the points near them.
+
+    All starts become nodes, in their order. A node that no two axes fix has NaN for its position, and a tube that
+    could not be fitted is left out. ``scanners`` (s, 3) are empty where unknown.
+    """
+    middles, directions, length = _lines(starts, pairs)
     start = rough(
-        points, source.scanners, middles, directions, 0.5 * length - np.minimum(0.2 * length, 450.0), 0.5 * length,
+        points, scanners, middles, directions, 0.5 * length - np.minimum(0.2 * length, 450.0), 0.5 * length,
         params.radii_mm, params.rough_points, params.threads,
     )  # fmt: skip
     least_cos, off = least_cosine(start, params.incidence_tolerance_mm), station_variance(start)
     fits = refined(
-        points,
-        source.scanners,
-        start,
-        0.5 * length,
-        params.radii_mm,
-        params.rough_points,
-        params.bow_share,
-        least_cos,
-        off,
+        points, scanners, start, 0.5 * length, params.radii_mm, params.rough_points, params.bow_share, least_cos, off,
         params.threads,
-    )
-    return _nodes(fits, starts, pairs, params)
+    )  # fmt: skip
+    nodes, tubes = _nodes(fits, starts, pairs, params)
+    seen = np.linalg.norm(start.points[start.ok, None] - scanners[None], axis=2).mean() if len(scanners) else 0.0
+    apart = float(np.sqrt(off[0] + off[1] * (1e-3 * float(seen)) ** 2))
+    return Measured(nodes, tubes, points, np.flatnonzero(fits.ok), apart)
+
+
+def _lines(starts: Floats, pairs: Ints) -> tuple[Floats, Floats, Floats]:
+    """Return middles (p, 3), unit directions (p, 3) and lengths (p,) of the lines between pairs of nodes."""
+    a, b = starts[pairs[:, 0]], starts[pairs[:, 1]]
+    length = np.linalg.norm(b - a, axis=1)
+    return 0.5 * (a + b), (b - a) / length[:, None], length
 
 
 def _nodes(fits: Fits, starts: Floats, pairs: Ints, params: Params) -> tuple[Nodes, Tubes]:

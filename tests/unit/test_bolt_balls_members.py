@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from processor.bolt_balls import members
+from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.source import InMemory
 from tests import frame_clouds
 from tests.frame_clouds import STATIONS
@@ -12,6 +13,20 @@ PARAMS = members.Params()
 
 
 @pytest.fixture(scope="module")
+def find(source, params=None):
+    """Nodes and tubes found blind."""
+    found = members.find(source, params or members.Params())
+    return (Nodes(), Tubes()) if found is None else (found.nodes, found.tubes)
+
+
+def measure(source, starts, pairs, params=None):
+    """Nodes and tubes at known places."""
+    params = params or members.Params()
+    points = members.points_near(source, starts, pairs, params)
+    found = members.measure(points, source.scanners, starts, pairs, params)
+    return found.nodes, found.tubes
+
+
 def frame():
     return frame_clouds.grid(rng=np.random.default_rng(1))
 
@@ -41,7 +56,7 @@ def bytes_of(record):
 
 
 def test_all_nodes_and_members_are_found_blind(frame, source):
-    nodes, tubes = members.find(source)
+    nodes, tubes = find(source)
     rows = matched(nodes, frame.nodes)
     assert nodes.count == len(frame.nodes)
     joined = {tuple(sorted(pair)) for pair in zip(tubes.node_a.tolist(), tubes.node_b.tolist(), strict=True)}
@@ -59,7 +74,7 @@ def test_errors_are_as_large_as_said():
         rng = np.random.default_rng(100 + seed)
         frame = frame_clouds.grid(rng=rng)
         points, station = frame_clouds.scanned(frame, rng, per_tube=250, bow_share=0.001)
-        nodes, _ = members.measure(InMemory(points, station, STATIONS), frame.nodes, frame.members)
+        nodes, _ = measure(InMemory(points, station, STATIONS), frame.nodes, frame.members)
         found.append(pull(nodes, np.arange(len(frame.nodes)), frame.nodes))
     # 72 nodes of 3 numbers each: the rms of pulls scatters by 5 %, and nodes share their tubes.
     assert 0.85 < np.sqrt(np.mean(found) / 3.0) < 1.15
@@ -69,7 +84,7 @@ def test_a_design_20_mm_off_gives_the_same_nodes(frame, source):
     rng = np.random.default_rng(3)
     off = rng.standard_normal(frame.nodes.shape)
     starts = frame.nodes + 20.0 * off / np.linalg.norm(off, axis=1)[:, None]
-    nodes, tubes = members.measure(source, starts, frame.members)
+    nodes, tubes = measure(source, starts, frame.members)
     assert len(tubes.radii) == len(frame.members)
     sd = np.sqrt(nodes.covariance.trace(axis1=1, axis2=2))
     assert (np.linalg.norm(nodes.positions - frame.nodes, axis=1) < 4.0 * sd).all()
@@ -78,21 +93,21 @@ def test_a_design_20_mm_off_gives_the_same_nodes(frame, source):
 @pytest.mark.parametrize("how", ["order", "chunks", "threads"])
 def test_same_bytes_whatever_the_order_the_chunks_and_the_threads(source, how):
     few = members.Params(kept_points=15_000, tube_points=128, threads=1)  # so that points have to be chosen
-    expected = members.find(source, few)
+    expected = find(source, few)
     assert expected[0].count > 0
     if how == "order":
         order = np.random.default_rng(4).permutation(source.count)
-        other = members.find(InMemory(source.points[order], source.station[order], STATIONS), few)
+        other = find(InMemory(source.points[order], source.station[order], STATIONS), few)
     elif how == "chunks":
-        other = members.find(InMemory(source.points, source.station, STATIONS, chunk_size=7_001), few)
+        other = find(InMemory(source.points, source.station, STATIONS, chunk_size=7_001), few)
     else:
-        other = members.find(source, members.Params(kept_points=15_000, tube_points=128, threads=3))
+        other = find(source, members.Params(kept_points=15_000, tube_points=128, threads=3))
     for one, two in zip(expected, other, strict=True):
         assert bytes_of(one) == bytes_of(two)
 
 
 def test_scanners_unknown(frame, source):
-    nodes, _ = members.find(InMemory(source.points))
+    nodes, _ = find(InMemory(source.points))
     rows = matched(nodes, frame.nodes)
     assert np.median(np.linalg.norm(nodes.positions[rows] - frame.nodes, axis=1)) < 1.0
 
@@ -111,7 +126,7 @@ def test_lamps_pipes_and_strays_are_no_nodes(frame, source):
     parts.append(np.array([[np.nan, 0.0, 0.0], [np.inf, 0.0, 0.0], [1e9, 0.0, 0.0]]))
     points = np.concatenate(parts)
     station = np.concatenate([source.station, np.full(len(points) - source.count, -1, np.int32)])
-    nodes, _ = members.find(InMemory(points, station, STATIONS))
+    nodes, _ = find(InMemory(points, station, STATIONS))
     matched(nodes, frame.nodes)
 
 
@@ -124,17 +139,17 @@ def test_nothing_is_found_where_there_is_nothing():
     )
     wall = np.stack([np.full(20_000, 4000.0), *rng.uniform(-2000.0, 2000.0, (2, 20_000))], axis=1)
     for points in (np.empty((0, 3)), sphere, np.concatenate([sphere, mount]), np.concatenate([sphere, wall])):
-        nodes, tubes = members.find(InMemory(points, np.zeros(len(points), np.int32), scanner))
+        nodes, tubes = find(InMemory(points, np.zeros(len(points), np.int32), scanner))
         assert nodes.count == 0
         assert len(tubes.radii) == 0
 
 
 def test_a_member_that_is_not_there_is_left_out(frame, source):
     extra = np.array([[0, 7]])  # across two bays: no tube
-    nodes, tubes = members.measure(source, frame.nodes, np.concatenate([frame.members, extra]))
+    nodes, tubes = measure(source, frame.nodes, np.concatenate([frame.members, extra]))
     assert len(tubes.radii) == len(frame.members)
     far = np.concatenate([frame.nodes, [[0.0, 0.0, 20_000.0]]])
-    nodes, _ = members.measure(source, far, frame.members)
+    nodes, _ = measure(source, far, frame.members)
     assert np.isnan(nodes.positions[-1]).all()
     assert nodes.axes[-1] == 0
 
@@ -145,7 +160,7 @@ def test_stations_that_are_off_are_seen_and_told(frame):
     for _ in range(6):
         moved = rng.standard_normal((len(STATIONS), 3))  # 1 mm each axis
         points, station = frame_clouds.scanned(frame, rng, sigma=0.5, per_tube=250, moved=moved)
-        nodes, _ = members.measure(InMemory(points, station, STATIONS), frame.nodes, frame.members)
+        nodes, _ = measure(InMemory(points, station, STATIONS), frame.nodes, frame.members)
         pulls.append(pull(nodes, np.arange(len(frame.nodes)), frame.nodes))
         formal.append(np.sqrt(nodes.covariance.trace(axis1=1, axis2=2) / 3.0))
     # All nodes of a scene share its four stations: six scenes tell the rms to about 15 %.
@@ -158,6 +173,6 @@ def test_other_tubes(radius):
     rng = np.random.default_rng(8)
     frame = frame_clouds.grid(3, 3, spacing=3500.0, depth=2400.0, rng=rng)
     points, station = frame_clouds.scanned(frame, rng, radius=radius, ball_radius=110.0, per_tube=600)
-    nodes, tubes = members.find(InMemory(points, station, STATIONS))
+    nodes, tubes = find(InMemory(points, station, STATIONS))
     matched(nodes, frame.nodes)
     assert np.median(tubes.radii) == pytest.approx(radius, abs=0.3)

@@ -1,0 +1,110 @@
+"""What method ``ray`` found of a frame, as the result of step ``spheres``."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.bolt_balls import catalogue, frame
+from processor.bolt_balls.catalogue import Catalogue
+from processor.bolt_balls.frame import Extracted
+from processor.bolt_balls.params import Params
+from processor.bolt_balls.result import Result
+from processor.bolt_balls.scene_source import SceneSource, of_scene
+from processor.model import Floats, FrameDesign, Ints, Scene
+
+REFERENCE_C = 20.0
+EXPANSION_PER_K = 12e-6
+NOWHERE = "not in the design"
+
+
+def of_frame(scene: Scene, params: Params) -> Result | None:
+    """Find every ball of a frame's scene; None where the cloud has no members that meet."""
+    source = of_scene(scene)
+    degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
+    found = frame.extract(
+        source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
+        register_stations=params.register_stations,
+    )  # fmt: skip
+    return None if found is None else _result(found, source, scene)
+
+
+def _catalogue(params: Params) -> Catalogue:
+    if params.radii_mm:
+        return catalogue.of_radii(params.radii_mm)
+    return catalogue.of_radii(()) if params.catalogue == "none" else catalogue.load(params.catalogue)
+
+
+def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
+    balls, k = found.balls, len(found.balls.radii)
+    covariance = balls.covariance.copy()
+    covariance[:, :3, :3] += found.datum
+    ids = _ids(found.design_row, scene.frame)
+    flag, reason = list(balls.flag), list(balls.reason)
+    for i in np.flatnonzero(found.design_row < 0).tolist() if scene.frame is not None else ():
+        reason[i] = "; ".join(filter(None, (reason[i], NOWHERE)))
+    matched, moved = found.matching, found.movement
+    movement, movement_ci95 = np.full((k, 3), np.nan), np.full((k, 3), np.nan)
+    if moved is not None:
+        movement[moved.found], movement_ci95[moved.found] = moved.vector, moved.ci95
+    lost = sum(one == "not-found" for one in flag)
+    tubes, stations = found.tubes, found.stations
+    half = 0.5 * tubes.lengths[:, None] * tubes.directions
+    said = [*found.said, balls.message]
+    said += [] if matched is None else [matched.message]
+    sure = matched is None or matched.status == "ok"
+    return Result(
+        status="failed" if lost == k else "ok" if not lost and sure else "partial",
+        method="ray",
+        message="; ".join(filter(None, said)),
+        ids=ids,
+        centres=balls.centres + source.origin,
+        radii=balls.radii,
+        lowest=balls.lowest + source.origin,
+        covariance=covariance,
+        lowest_sd=np.sqrt(balls.lowest_sd**2 + found.datum[:, 2, 2]),
+        points=balls.points,
+        visible_fraction=balls.visible_fraction,
+        rms=balls.rms,
+        nominal_radii=balls.expected,
+        evidence=balls.evidence,
+        flag=tuple(flag),
+        reason=tuple(reason),
+        sizes=balls.sizes,
+        axes=balls.axes,
+        stations=balls.stations,
+        bound_sd=np.hstack([np.sqrt(np.einsum("kii->ki", balls.bound)), balls.bound_lowest_sd[:, None]]),
+        efficiency=np.stack([balls.efficiency_centre, balls.efficiency_radius, balls.efficiency_lowest], axis=1),
+        movement=movement,
+        movement_ci95=movement_ci95,
+        gauge="" if moved is None else moved.gauge,
+        matching="" if matched is None else matched.status,
+        T_design_scan=np.empty(0) if matched is None else matched.T_design_scan,
+        T_design_scan_covariance=np.empty(0) if matched is None else matched.covariance,
+        T_rivals=np.empty((0, 4, 4)) if matched is None else matched.rivals,
+        tube_start=tubes.points - half + source.origin,
+        tube_end=tubes.points + half + source.origin,
+        tube_radii=tubes.radii,
+        tube_bow=np.hypot(*tubes.bow.T),
+        tube_a=np.where(tubes.node_a >= 0, ids[tubes.node_a], -1),
+        tube_b=np.where(tubes.node_b >= 0, ids[tubes.node_b], -1),
+        station_names=() if stations is None else source.names,
+        T_station=np.empty((0, 4, 4)) if stations is None else _in_place(stations.T_project_station, source.origin),
+        station_said=() if stations is None else stations.weak,
+    )
+
+
+def _ids(design_row: Ints, design: FrameDesign | None) -> Ints:
+    """Ids of the design's nodes, and numbers after the largest of them for others."""
+    if design is None:
+        return np.arange(len(design_row), dtype=np.int64)
+    other = design_row < 0
+    found: Ints = np.where(other, 0, design.ids[np.maximum(design_row, 0)])
+    found[other] = int(design.ids.max(initial=-1)) + 1 + np.arange(int(other.sum()))
+    return found
+
+
+def _in_place(T: Floats, origin: Floats) -> Floats:
+    """Return transforms (s, 4, 4) of places less an origin as those of places with it."""
+    found = T.copy()
+    found[:, :3, 3] += origin - T[:, :3, :3] @ origin
+    return found
