@@ -51,15 +51,25 @@ class Graph:
 
 
 def graph(lines: Lines) -> Graph:
-    """Find the nodes where three lines or more end, and the pairs of nodes that one line joins."""
+    """Find the nodes where three lines or more end, and the pairs of nodes that one line joins.
+
+    Where two lines alone end is a node too, a corner, if both lead to nodes and one of these has three lines.
+    """
     none = Graph(np.empty((0, 3)), np.empty(0, np.int64), np.empty((0, 2), np.int64))
     starts = _crossings(lines)
     if not len(starts):
         return none
     nodes, rays = _supported(lines, starts)
-    if not len(nodes):
-        return none
-    return Graph(nodes, rays, _pairs(lines, nodes))
+    while len(nodes):
+        pairs = _pairs(lines, nodes)
+        strong = rays >= LEAST_RAYS
+        leads = np.bincount(pairs.ravel(), minlength=len(nodes))
+        to_strong = np.bincount(pairs.ravel(), strong[pairs[:, ::-1]].ravel(), len(nodes))
+        kept = strong | ((leads >= 2) & (to_strong >= 1))
+        if kept.all():
+            return Graph(nodes, rays, pairs)
+        nodes, rays = nodes[kept], rays[kept]
+    return none
 
 
 def _crossings(lines: Lines) -> Floats:
@@ -95,7 +105,7 @@ def _crossings(lines: Lines) -> Floats:
 
 
 def _supported(lines: Lines, starts: Floats) -> tuple[Floats, Ints]:
-    """Nodes with the rays they need, moved to where these meet; of nodes too close the best supported stays."""
+    """Nodes of two rays and more, moved to where these meet; of nodes too close the best supported stays."""
     nodes = starts
     for _ in range(3):
         node, line, t = _passing(lines, nodes)
@@ -114,7 +124,7 @@ def _supported(lines: Lines, starts: Floats) -> tuple[Floats, Ints]:
             return nodes, np.empty(0, np.int64)
     node, line, t = _passing(lines, nodes)
     rays, ends = _rays(lines, nodes, node, line, t)
-    good = np.flatnonzero((rays >= LEAST_RAYS) & (ends >= 2))
+    good = np.flatnonzero((rays >= 2) & (ends >= 2))
     # Most rays first; equals by where they are, for their order must come from the points alone.
     order = good[np.lexsort((*nodes[good].T, -rays[good]))]
     return _apart(nodes, rays, order)

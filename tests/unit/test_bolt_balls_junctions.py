@@ -71,6 +71,19 @@ def test_a_member_seen_in_two_parts_is_one():
     assert len(found.pairs) == 6
 
 
+def test_a_corner_of_two_members_is_a_node_where_both_lead_to_nodes():
+    corners = [ORIGIN, X, Y, [3000, 3000, 0], [6000, 0, 0], [6000, 3000, 0]]  # a ladder of two bays
+    ladder = [(0, 1), (1, 4), (2, 3), (3, 5), (0, 2), (1, 3), (4, 5)]
+    found = graph(lines_of(*[toward(corners[i], corners[j]) for i, j in ladder]))
+    assert sorted(found.rays.tolist()) == [2, 2, 2, 2, 3, 3]
+    assert len(found.pairs) == len(ladder)
+    # A square alone has no node of three members, and a corner that leads nowhere is none.
+    square = [(0, 1), (1, 3), (3, 2), (2, 0)]
+    assert len(graph(lines_of(*[toward(corners[i], corners[j]) for i, j in square])).nodes) == 0
+    loose = [toward([9000, 0, 0], [9000, 3000, 0]), toward([9000, 0, 0], [12000, 0, 0])]
+    assert len(graph(lines_of(*[toward(corners[i], corners[j]) for i, j in ladder], *loose)).nodes) == 6
+
+
 def test_nothing():
     assert len(graph(Lines(np.empty((0, 3)), np.empty((0, 3)), np.empty(0), np.empty(0))).nodes) == 0
     assert len(graph(lines_of(toward(ORIGIN, X))).nodes) == 0
