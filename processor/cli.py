@@ -70,10 +70,14 @@ def run(
     parameters = pipeline.read_params(params)
     if steps:
         pipeline.plan("", steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
-    scene = pipeline.read(input_, units)
+    piecewise = pipeline.is_large(input_)
+    scene = pipeline.read(input_, units, piecewise)
     jobs = pipeline.plan(scene.kind, steps, methods, parameters, seed)
+    if piecewise and not pipeline.streams(jobs):
+        piecewise = False
+        scene = pipeline.read(input_, units)
     say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
-    execution = pipeline.execute(input_, scene, jobs, log=say)
+    execution = pipeline.execute(input_, scene, jobs, say, piecewise)
     report = evaluate(input_, execution)
     writing.write(output, execution, report)
     _show(context, output, execution, report, as_json)

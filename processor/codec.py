@@ -202,6 +202,11 @@ def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
     return _dataset(group, name, stored, ndim)[()]
 
 
+def column(group: Any, name: str, dtype: type) -> Any:
+    """Return a column as it lies in the file, to be read in slices; an absent one is empty."""
+    return _dataset(group, name, np.dtype(dtype).str[1:], 1)
+
+
 def read_text(group: Any, name: str) -> str:
     """Read one text."""
     return _decoded(_dataset(group, name, "S", 0)[()], f"{group.name}/{name}")

@@ -10,6 +10,7 @@ import pkgutil
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -24,6 +25,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+PIECEWISE_POINTS = 5_000_000
 SOFTWARE = ("numpy", "scipy", "h5py")
 
 
@@ -55,14 +57,17 @@ def result_classes() -> dict[str, type]:
     return {name: module.Result for name, module in step_modules().items()}
 
 
-def read(path: Path, units: str | None) -> Scene:
-    """Read a scan folder, a scene file or one scan file; InputError where it cannot be used."""
+def read(path: Path, units: str | None, piecewise: bool = False) -> Scene:
+    """Read a scan folder, a scene file or one scan file; InputError where it cannot be used.
+
+    ``piecewise`` leaves the points of a scene file where they are, for steps that take them piece by piece.
+    """
     from processor import folder, store
 
     if path.is_file() and path.suffix.lower() == ".h5":
         if units is not None:
             raise UsageError(f"--units {units}: {path.name} is a scene file, which knows its units; leave --units out")
-        scene = store.read_scene(path)
+        scene = store.read_scene(path, not piecewise)
     else:
         scene = folder.read_input(path, units)
     for name in (path.name, scene.name, *(scan.name for scan in scene.scans)):
@@ -71,6 +76,21 @@ def read(path: Path, units: str | None) -> Scene:
         except UnicodeEncodeError:
             raise InputError(f"{name!a}: a file name that is not UTF-8; rename the file") from None
     return scene
+
+
+def is_large(path: Path) -> bool:
+    """Whether a scene file holds more points than are read into memory at once where that is not needed."""
+    from processor.stored_points import points_of
+
+    if not (path.is_file() and path.suffix.lower() == ".h5"):
+        return False
+    with points_of(path) as points:
+        return sum(points.counts()) > PIECEWISE_POINTS
+
+
+def streams(jobs: Sequence[Job]) -> bool:
+    """Whether all jobs take points piece by piece."""
+    return all(job.params.method in getattr(job.module, "STREAMS", ()) for job in jobs)
 
 
 def read_params(path: Path | None) -> dict[str, Any]:
@@ -149,35 +169,47 @@ def fill(cls: type, table: Any, where: str) -> Any:
     return dataclasses.replace(default, **values)
 
 
-def execute(path: Path, scene: Scene, jobs: Sequence[Job], log: Callable[[str], None] = lambda _: None) -> Execution:
-    """Run the jobs on a scene read from ``path``.
+def execute(
+    path: Path,
+    scene: Scene,
+    jobs: Sequence[Job],
+    log: Callable[[str], None] = lambda _: None,
+    piecewise: bool = False,
+) -> Execution:
+    """Run the jobs on a scene read from ``path``, ``piecewise`` on one whose points are still there.
 
     Raises InputError and UsageError as the steps do, and InputError for whatever else goes wrong within one.
     """
     from processor import store
+    from processor.stored_points import points_of
 
-    runs = []
-    for job in jobs:
-        started = time.monotonic()
-        try:
-            result = job.module.run(scene, job.params)
-        except (InputError, UsageError):
-            raise
-        except Exception as error:
-            # No input may end in a traceback: what a step did not foresee is the input's error until proved otherwise.
-            raise InputError(
-                f"{path.name}: internal error in step {job.step} ({job.params.method}): {error!r}; --debug shows where"
-            ) from error
-        log(f"{job.step} ({job.params.method}): {result.status}, {time.monotonic() - started:.1f} s")
-        runs.append(StepRun(job.step, job.params.method, as_json(dataclasses.asdict(job.params)), result))
+    with points_of(path) if piecewise else nullcontext() as points:
+        given = {} if points is None else {"points": points}
+        runs = [_run(path, scene, job, given, log) for job in jobs]
+        digest = store.scene_hash(scene, None if points is None else points.pieces)
     provenance = {
         "input": path.name,
-        "input_sha256": store.scene_hash(scene),
+        "input_sha256": digest,
         "seed": jobs[0].params.seed if jobs else 0,
         "software": software(),
         "parameters": _parameters(runs),
     }
     return Execution(scene, tuple(runs), provenance)
+
+
+def _run(path: Path, scene: Scene, job: Job, given: Mapping[str, Any], log: Callable[[str], None]) -> StepRun:
+    started = time.monotonic()
+    try:
+        result = job.module.run(scene, job.params, **given)
+    except (InputError, UsageError):
+        raise
+    except Exception as error:
+        # No input may end in a traceback: what a step did not foresee is the input's error until proved otherwise.
+        raise InputError(
+            f"{path.name}: internal error in step {job.step} ({job.params.method}): {error!r}; --debug shows where"
+        ) from error
+    log(f"{job.step} ({job.params.method}): {result.status}, {time.monotonic() - started:.1f} s")
+    return StepRun(job.step, job.params.method, as_json(dataclasses.asdict(job.params)), result)
 
 
 def _parameters(runs: Sequence[StepRun]) -> list[dict[str, Any]]:
@@ -187,6 +219,7 @@ def _parameters(runs: Sequence[StepRun]) -> list[dict[str, Any]]:
 def read_execution(results: Path, path: Path, units: str | None) -> Execution:
     """Read what was run on ``path`` earlier. Raises InputError where the results are those of another input."""
     from processor import store
+    from processor.stored_points import points_of
 
     runs = store.read_results(results, result_classes())
     provenance = store.read_provenance(results)
@@ -194,8 +227,11 @@ def read_execution(results: Path, path: Path, units: str | None) -> Execution:
     if missing:
         raise InputError(f"{results}: does not say its {', '.join(sorted(missing))}; run processor run again")
     provenance["parameters"] = _parameters(runs)  # the store sorts names, a run's parameters keep their order
-    scene = read(path, units)
-    if store.scene_hash(scene) != provenance["input_sha256"]:
+    piecewise = is_large(path)
+    scene = read(path, units, piecewise)
+    with points_of(path) if piecewise else nullcontext() as points:
+        digest = store.scene_hash(scene, None if points is None else points.pieces)
+    if digest != provenance["input_sha256"]:
         raise InputError(f"{results}: was made from {provenance['input']!r} as it was then, not from {path} as it is")
     return Execution(scene, runs, provenance)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any
 
 import h5py
@@ -13,6 +14,7 @@ from processor.codec import DecodeError
 from processor.model import Floats, Ints, Scan
 
 AXES = ("x", "y", "z")
+NO_STATIONS = np.empty(0, np.int32)
 
 
 def write_scan(group: Any, scan: Scan) -> Ints:
@@ -49,6 +51,48 @@ def read_scan(group: Any) -> Scan:
     if not np.isfinite(scan.origin).all():
         raise DecodeError([f"{group.name}/origin: is not finite"])
     return scan
+
+
+PER_POINT = tuple(f.name for f in dataclasses.fields(Scan) if f.metadata.get("shape", ("",))[0] == "n")
+
+
+def read_scan_alone(group: Any) -> Scan:
+    """Read a scan without its points and what stands beside them."""
+    _read_tiles(group)
+    none = {f.name: np.empty(0, f.metadata["dtype"]) for f in dataclasses.fields(Scan) if f.name in PER_POINT}
+    return codec.read_record(group, Scan, given=none)
+
+
+def count(group: Any) -> int:
+    """Points of a scan's group."""
+    return int(sum(_read_tiles(group)[3].tolist()))
+
+
+def shape(group: Any, name: str) -> tuple[int, ...]:
+    """Shape of a per-point column of a scan's group."""
+    if name == "points":
+        return (count(group), 3)
+    return (len(_column(group, name)),)
+
+
+def _column(group: Any, name: str) -> Any:
+    return codec.column(group, name, next(f.metadata["dtype"] for f in dataclasses.fields(Scan) if f.name == name))
+
+
+def pieces(group: Any, name: str, size: int) -> Iterator[Any]:
+    """Yield a per-point column of a scan's group, ``size`` points at a time. DecodeError for what is not finite."""
+    if name == "points":
+        grid, _, _, _, columns = _read_tiles(group)
+        for start in range(0, len(columns[0]), size):
+            x, y, z = (column[start : start + size] for column in columns)
+            points = grid.millimetres((x, y, z))
+            if not np.isfinite(points).all():
+                raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
+            yield points
+        return
+    column = _column(group, name)
+    for start in range(0, len(column), size):
+        yield column[start : start + size]
 
 
 def _read_tiles(group: Any) -> tuple[tiles.Grid, Ints, Ints, Ints, list[Any]]:

@@ -40,6 +40,7 @@ HISTORY = [
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 T = TypeVar("T")
+Pieces = Callable[[int, str], tuple[tuple[int, ...], Iterator[Any]]]
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
@@ -159,7 +160,7 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
 
 
 @contextmanager
-def _opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
+def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
     """Open a file of one of ``kinds`` that passes vetting. Raises InputError for any other and for damage."""
     try:
         with h5py.File(path, "r", locking=False) as file:
@@ -213,14 +214,18 @@ def _group(file: Any, name: str) -> Any:
     return file[name]
 
 
-def read_scene(path: Path) -> Scene:
-    """Read a scene; its points come in the order of their tiles. Raises InputError with all that is wrong."""
-    with _opened(path, ["scene"]) as file:
-        return _decode_scene(file)
+def read_scene(path: Path, points: bool = True) -> Scene:
+    """Read a scene; its points come in the order of their tiles. Raises InputError with all that is wrong.
+
+    Without ``points`` the scans have none, nor anything else that stands beside them; see
+    :mod:`processor.stored_points`.
+    """
+    with opened(path, ["scene"]) as file:
+        return _decode_scene(file, scan_tiles.read_scan if points else scan_tiles.read_scan_alone)
 
 
-def _decode_scene(file: Any) -> Scene:
-    scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: scan_tiles.read_scan})
+def _decode_scene(file: Any, read_scan: Callable[[Any], Scan]) -> Scene:
+    scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
     names = [scan.name for scan in scene.scans]
     if len(set(names)) != len(names):
         raise DecodeError(["/scene/scans: two scans have one name"])
@@ -233,7 +238,7 @@ def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats)
     Reads the tiles that the box touches and no others. Raises InputError where the file has no such scan.
     """
     lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-    with _opened(path, ["scene"]) as file:
+    with opened(path, ["scene"]) as file:
         scans = _group(file, "scene").get("scans")
         members = list(scans.values()) if isinstance(scans, h5py.Group) else []
         names = [codec.read_text(group, "name") for group in members]
@@ -244,7 +249,7 @@ def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats)
 
 def read_truth(path: Path) -> Truth | None:
     """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone."""
-    with _opened(path, ["scene", "truth"]) as file:
+    with opened(path, ["scene", "truth"]) as file:
         if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
             return None
         return codec.read_record(_group(file, "truth"), Truth)
@@ -265,7 +270,7 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
         result: object = codec.read_record(group["result"], result_classes[step])
         return codec.read_record(group, StepRun, given={"result": result})
 
-    with _opened(path, ["results"]) as file:
+    with opened(path, ["results"]) as file:
         runs = _group(file, "results")
         expected = [f"{i:04d}" for i in range(len(runs))]
         if list(runs) != expected or not all(isinstance(runs[name], h5py.Group) for name in expected):
@@ -275,7 +280,7 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
 
 def read_provenance(path: Path) -> dict[str, Any]:
     """Read what a file says of how it was made."""
-    with _opened(path, list(FORMATS)) as file:
+    with opened(path, list(FORMATS)) as file:
         try:
             found = json.loads(codec.read_text(file, "provenance"))
         except json.JSONDecodeError:
@@ -297,7 +302,7 @@ def problems(path: Path) -> list[str]:
         return []
 
     def read_kind(path: Path) -> str:
-        with _opened(path, list(FORMATS)) as file:
+        with opened(path, list(FORMATS)) as file:
             return _attribute(file, "format")
 
     found = attempt(read_kind)
@@ -314,7 +319,7 @@ def problems(path: Path) -> list[str]:
 
 def _read_runs_plainly(path: Path) -> None:
     """Read the parts of each run that are the same for all steps."""
-    with _opened(path, ["results"]) as file:
+    with opened(path, ["results"]) as file:
         for group in _group(file, "results").values():
             codec.read_record(group, StepRun, given={"result": None}) if isinstance(group, h5py.Group) else None
 
@@ -322,17 +327,19 @@ def _read_runs_plainly(path: Path) -> None:
 # --- identity --------------------------------------------------------------------------------------------------------
 
 
-def scene_hash(scene: Scene) -> str:
+def scene_hash(scene: Scene, pieces: Pieces | None = None) -> str:
     """SHA-256 (hex) of all that a scene holds: names, types, shapes and bytes of its fields, in their order.
 
-    It depends on nothing else: not on the truth, the file's name, or the versions of the software.
+    It depends on nothing else: not on the truth, the file's name, or the versions of the software. ``pieces`` gives
+    the columns of points that a scene was read without, piece by piece: by the scan's number and the column's name its
+    shape, and its parts in turn.
     """
     digest = hashlib.sha256()
-    _feed(digest, "scene", scene)
+    _feed(digest, "scene", scene, pieces)
     return digest.hexdigest()
 
 
-def _feed(digest: Any, name: str, value: Any) -> None:
+def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int = 0) -> None:
     if isinstance(value, np.ndarray):
         little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
         digest.update(f"{name}:{little.dtype.str}{value.shape};".encode())
@@ -340,12 +347,19 @@ def _feed(digest: Any, name: str, value: Any) -> None:
     elif dataclasses.is_dataclass(value):
         digest.update(f"{name}:{type(value).__name__}(".encode())
         for field in dataclasses.fields(value):
-            _feed(digest, field.name, getattr(value, field.name))
+            if pieces is not None and isinstance(value, Scan) and field.metadata.get("shape", ("",))[0] == "n":
+                shape, parts = pieces(scan, field.name)
+                kind = np.dtype(field.metadata["dtype"]).newbyteorder("<")
+                digest.update(f"{field.name}:{kind.str}{shape};".encode())
+                for part in parts:
+                    digest.update(np.ascontiguousarray(part, kind).data)
+                continue
+            _feed(digest, field.name, getattr(value, field.name), pieces)
         digest.update(b")")
     elif isinstance(value, tuple):
         digest.update(f"{name}:tuple{len(value)}(".encode())
-        for item in value:
-            _feed(digest, "", item)
+        for i, item in enumerate(value):
+            _feed(digest, "", item, pieces, i)
         digest.update(b")")
     else:
         text = value.hex() if isinstance(value, float) else str(value)

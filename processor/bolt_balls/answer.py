@@ -9,7 +9,7 @@ from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.frame import Extracted
 from processor.bolt_balls.params import Params
 from processor.bolt_balls.result import Result
-from processor.bolt_balls.scene_source import SceneSource, of_scene
+from processor.bolt_balls.scene_source import PointReader, SceneSource, of_scene
 from processor.model import Floats, FrameDesign, Ints, Scene
 
 REFERENCE_C = 20.0
@@ -17,9 +17,9 @@ EXPANSION_PER_K = 12e-6
 NOWHERE = "not in the design"
 
 
-def of_frame(scene: Scene, params: Params) -> Result | None:
+def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
     """Find every ball of a frame's scene; None where the cloud has no members that meet."""
-    source = of_scene(scene)
+    source = of_scene(scene, points)
     degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
     found = frame.extract(
         source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
@@ -105,6 +105,6 @@ def _ids(design_row: Ints, design: FrameDesign | None) -> Ints:
 
 def _in_place(T: Floats, origin: Floats) -> Floats:
     """Return transforms (s, 4, 4) of places less an origin as those of places with it."""
-    found = T.copy()
+    found: Floats = T.copy()
     found[:, :3, 3] += origin - T[:, :3, :3] @ origin
     return found

@@ -4,12 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from processor.bolt_balls.source import CHUNK_POINTS, UNKNOWN_STATION, Chunk
 from processor.geometry import rigid
 from processor.model import Floats, Labels, Scan, Scene
+
+
+class PointReader(Protocol):
+    """Points of a scene's scans, piece by piece, where the scene was read without them."""
+
+    def counts(self) -> tuple[int, ...]:
+        """Points of all scans."""
+
+    def read(self, scan: int, size: int) -> Iterator[tuple[Floats, Labels]]:
+        """Yield points (n, 3) of a scan, less its origin, and the station (n,) of each, or an empty one."""
+
+
+@dataclass(frozen=True)
+class InScans:
+    """The points that the scans hold themselves."""
+
+    scans: tuple[Scan, ...]
+
+    def counts(self) -> tuple[int, ...]:
+        """Points of all scans."""
+        return tuple(len(scan.points) for scan in self.scans)
+
+    def read(self, scan: int, size: int) -> Iterator[tuple[Floats, Labels]]:
+        """Yield the points of a scan and their stations."""
+        one = self.scans[scan]
+        for start in range(0, len(one.points), size):
+            yield one.points[start : start + size], one.point_station[start : start + size]
 
 
 @dataclass(frozen=True)
@@ -24,43 +52,40 @@ class SceneSource:
     scanners: Floats
     names: tuple[str, ...]
     scanner_of: tuple[int, ...]  # of each scan; -1 = unknown, or its points say it
+    points: PointReader
     chunk_size: int = CHUNK_POINTS
 
     @property
     def count(self) -> int:
         """Points in all."""
-        return sum(len(scan.points) for scan in self.scans)
+        return sum(self.points.counts())
 
     def chunks(self) -> Iterator[Chunk]:
         """Pass over all points."""
-        for scan, scanner in zip(self.scans, self.scanner_of, strict=True):
+        for number, (scan, scanner) in enumerate(zip(self.scans, self.scanner_of, strict=True)):
             T = _pose(scan)
             R = T[:3, :3]
             # offset less offset first: added to the points either would cost them their digits
             shift = R @ scan.origin + (T[:3, 3] - self.origin)
-            still = np.array_equal(T, np.eye(4)) and not shift.any()
-            for start in range(0, len(scan.points), self.chunk_size):
-                part = slice(start, start + self.chunk_size)
-                points = scan.points[part]
-                yield Chunk(points if still else _moved(points, R, shift), self._stations(scan, scanner, part))
-
-    def _stations(self, scan: Scan, scanner: int, part: slice) -> Labels:
-        if scanner == UNKNOWN_STATION and len(scan.point_station) and len(self.scanners):
-            return scan.point_station[part]
-        return np.full(len(scan.points[part]), scanner, np.int32)
+            still = np.array_equal(R, np.eye(3)) and not shift.any()
+            for points, own in self.points.read(number, self.chunk_size):
+                known = scanner == UNKNOWN_STATION and len(own) > 0 and len(self.scanners) > 0
+                station = own if known else np.full(len(points), scanner, np.int32)
+                yield Chunk(points if still else _moved(points, R, shift), station)
 
 
-def of_scene(scene: Scene) -> SceneSource:
-    """Make the source of a scene's points."""
+def of_scene(scene: Scene, points: PointReader | None = None) -> SceneSource:
+    """Make the source of a scene's points, or of those that ``points`` reads of it."""
     first = scene.scans[0] if scene.scans else None
     origin = np.zeros(3) if first is None else rigid.apply(_pose(first), first.origin[None])[0]
     names: list[str] = []
     places: list[Floats] = []
-    if scene.stations is not None and any(len(scan.point_station) for scan in scene.scans):
+    # A scan of one station has a position of its own; the points of a merged one name their stations.
+    if scene.stations is not None and any(not scan.position.size for scan in scene.scans):
         names, places = list(scene.stations.ids), list(scene.stations.positions - origin)
     scanner_of = []
     for scan in scene.scans:
-        if len(scan.point_station) or not scan.position.size:
+        if not scan.position.size:
             scanner_of.append(UNKNOWN_STATION)
             continue
         T = _pose(scan)
@@ -68,7 +93,7 @@ def of_scene(scene: Scene) -> SceneSource:
         names.append(scan.station or scan.name)
         places.append(T[:3, :3] @ scan.position + (T[:3, 3] - origin))
     scanners = np.array(places, np.float64).reshape(-1, 3)
-    return SceneSource(scene.scans, origin, scanners, tuple(names), tuple(scanner_of))
+    return SceneSource(scene.scans, origin, scanners, tuple(names), tuple(scanner_of), points or InScans(scene.scans))
 
 
 def _pose(scan: Scan) -> Floats:

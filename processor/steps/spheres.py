@@ -14,13 +14,15 @@ from scipy.spatial import cKDTree
 from processor.bolt_balls import answer, single
 from processor.bolt_balls.params import METHODS, Params
 from processor.bolt_balls.result import Result
+from processor.bolt_balls.scene_source import PointReader
 from processor.geometry.merging import merged
-from processor.model import Floats, FrameTruth, Ints, Metric, Scene, Truth
+from processor.model import Floats, FrameTruth, InputError, Ints, Metric, Scene, Truth
 from processor.preassembly import tolerance
 
-__all__ = ["KIND", "METHODS", "NEEDS", "Params", "Result", "check", "run"]
+__all__ = ["KIND", "METHODS", "NEEDS", "STREAMS", "Params", "Result", "check", "run"]
 
 NEEDS: tuple[str, ...] = ()
+STREAMS = ("ray",)  # methods that take points piece by piece
 KIND = "space-frame"
 NAN = float("nan")
 WRONG_MM = 10.0  # a centre farther off than this is another thing
@@ -28,11 +30,12 @@ FOUND_MM = 3.0  # a node this near to the true one is found
 LOWEST_MM = 3.0  # an unflagged lowest point farther off is a wrong answer
 
 
-def run(scene: Scene, params: Params) -> Result:
+def run(scene: Scene, params: Params, points: PointReader | None = None) -> Result:
     """Find the balls of a scene: those of its design and what else there is, or those that are in the cloud.
 
     ``status``: ok = an answer for every ball, partial = for some or ``max_balls`` reached, failed = for none; the flag
-    of each ball says what its answer is worth. Raises UsageError for parameters that make no sense.
+    of each ball says what its answer is worth. ``points`` reads the points of a scene that is larger than memory.
+    Raises UsageError for parameters that make no sense, InputError for a cloud without members larger than memory.
     """
     params.check(scene.frame is not None)
     limits = tolerance.default_for(scene.tolerance)
@@ -40,7 +43,11 @@ def run(scene: Scene, params: Params) -> Result:
         if scene.frame is None:
             return single.search(merged(scene, with_scanner=True), params)
         return single.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits)
-    found = answer.of_frame(scene, params)
+    found = answer.of_frame(scene, params, points)
+    if found is None and points is not None:
+        raise InputError(
+            f"{scene.name}: no members that meet were found, and the cloud is too large to search otherwise"
+        )
     return single.search(merged(scene, with_scanner=True), params) if found is None else found
 
 

@@ -12,7 +12,6 @@ from tests.frame_clouds import STATIONS
 PARAMS = members.Params()
 
 
-@pytest.fixture(scope="module")
 def find(source, params=None):
     """Nodes and tubes found blind."""
     found = members.find(source, params or members.Params())
@@ -27,6 +26,7 @@ def measure(source, starts, pairs, params=None):
     return found.nodes, found.tubes
 
 
+@pytest.fixture(scope="module")
 def frame():
     return frame_clouds.grid(rng=np.random.default_rng(1))
 
