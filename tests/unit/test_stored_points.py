@@ -1,0 +1,80 @@
+"""Points of a scene file piece by piece."""
+
+import numpy as np
+import pytest
+
+from processor import store
+from processor.bolt_balls.scene_source import of_scene
+from processor.model import InputError, Scan, Scene, Stations
+from processor.stored_points import points_of
+
+
+@pytest.fixture
+def path(tmp_path):
+    rng = np.random.default_rng(1)
+    turn = np.eye(4)
+    turn[:3, :3], turn[:3, 3] = [[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], [10.0, 20.0, 30.0]
+    scans = (
+        Scan(
+            "a",
+            rng.uniform(-5e3, 5e3, (70_000, 3)),
+            origin=np.array([5e8, 4e9, 0.0]),
+            intensity=rng.uniform(size=70_000),
+            position=np.zeros(3),
+            T_project_scan=turn,
+        ),
+        Scan(
+            "b",
+            rng.uniform(-5e3, 5e3, (30_000, 3)),
+            origin=np.array([5e8, 4e9, 0.0]),
+            point_station=rng.integers(-1, 2, 30_000).astype(np.int32),
+        ),
+        Scan("empty"),
+    )
+    stations = Stations(("S1", "S2"), np.array([[5e8, 4e9, 1.0], [5e8, 4e9, 2.0]]), np.tile(np.eye(4), (2, 1, 1)))
+    scene = Scene("s", "space-frame", scans, stations=stations)
+    store.write_scene(tmp_path / "s.h5", scene, None, {})
+    return tmp_path / "s.h5"
+
+
+def test_the_same_points_as_in_memory(path):
+    whole, alone = store.read_scene(path), store.read_scene(path, points=False)
+    assert [len(scan.points) for scan in alone.scans] == [0, 0, 0]
+    in_memory = list(of_scene(whole).chunks())
+    with points_of(path) as points:
+        source = of_scene(alone, points)
+        assert source.count == 100_000
+        for _ in range(2):
+            assert b"".join(c.points.tobytes() for c in source.chunks()) == b"".join(
+                c.points.tobytes() for c in in_memory
+            )
+            assert np.array_equal(
+                np.concatenate([c.station for c in source.chunks()]), np.concatenate([c.station for c in in_memory])
+            )
+    # Scan a has a scanner of its own after the two stations; points of scan b name theirs.
+    assert set(np.concatenate([c.station for c in in_memory])[:70_000]) == {2}
+    assert set(np.concatenate([c.station for c in in_memory])[70_000:]) == {-1, 0, 1}
+
+
+def test_points_are_moved_into_the_project(path):
+    whole = store.read_scene(path)
+    source = of_scene(whole)
+    first = next(iter(source.chunks())).points
+    scan = whole.scans[0]
+    true = (scan.points[:100] @ scan.T_project_scan[:3, :3].T) + (
+        scan.T_project_scan[:3, :3] @ scan.origin + scan.T_project_scan[:3, 3] - source.origin
+    )
+    assert np.abs(first[:100] - true).max() < 1e-6
+
+
+def test_a_scene_read_without_points_has_the_same_hash(path):
+    with points_of(path) as points:
+        assert store.scene_hash(store.read_scene(path, points=False), points.pieces) == store.scene_hash(
+            store.read_scene(path)
+        )
+
+
+def test_a_file_of_another_kind(tmp_path):
+    (tmp_path / "x.h5").write_bytes(b"nothing")
+    with pytest.raises(InputError, match="expected a processor-scene file"), points_of(tmp_path / "x.h5"):
+        pass
