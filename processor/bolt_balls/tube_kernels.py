@@ -70,7 +70,7 @@ def tell(p, h, P, U, seen, bounds, away, sigma, cut, inverse, by_incidence, scat
         B1 = np.empty((2, 2))
         B1[0, 0], B1[1, 1], B1[0, 1], B1[1, 0] = B[1, 1] / det, B[0, 0] / det, -B[0, 1] / det, -B[1, 0] / det
         scatter[side, 0] += B1[0, 0] * y[s, 0] ** 2 + 2.0 * B1[0, 1] * y[s, 0] * y[s, 1] + B1[1, 1] * y[s, 1] ** 2
-        pulled = A[s, :2] @ inverse[:5, :5]
+        pulled = A[s, :2] @ inverse[:5, :5].copy()
         for k in range(groups):
             H = -(pulled @ A[k, :, :2].copy())
             if k == s:
