@@ -11,6 +11,7 @@ from processor.bolt_balls.params import Params
 from processor.bolt_balls.result import Result
 from processor.bolt_balls.scene_source import PointReader, SceneSource, of_scene
 from processor.model import Floats, FrameDesign, Ints, Scene
+from processor.preassembly import tolerance
 
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
@@ -44,8 +45,11 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         reason[i] = "; ".join(filter(None, (reason[i], NOWHERE)))
     matched, moved = found.matching, found.movement
     movement, movement_ci95 = np.full((k, 3), np.nan), np.full((k, 3), np.nan)
+    movement_covariance = np.full((k, 3, 3), np.nan)
     if moved is not None:
         movement[moved.found], movement_ci95[moved.found] = moved.vector, moved.ci95
+        movement_covariance[moved.found] = moved.covariance
+    limit = tolerance.find(tolerance.default_for(scene.tolerance), tolerance.NODE_PLACE)
     lost = sum(one == "not-found" for one in flag)
     tubes, stations = found.tubes, found.stations
     half = 0.5 * tubes.lengths[:, None] * tubes.directions
@@ -76,6 +80,9 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         efficiency=np.stack([balls.efficiency_centre, balls.efficiency_radius, balls.efficiency_lowest], axis=1),
         movement=movement,
         movement_ci95=movement_ci95,
+        movement_covariance=movement_covariance,
+        movement_limit=np.nan if limit is None else limit.high,
+        movement_limit_source="" if limit is None else limit.source,
         gauge="" if moved is None else moved.gauge,
         matching="" if matched is None else matched.status,
         T_design_scan=np.empty(0) if matched is None else matched.T_design_scan,
