@@ -14,13 +14,12 @@ import numpy as np
 from processor.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report import tables, view
+from processor.report import figures_balls, tables, view
 from processor.report.printing import headings, numeric, shown
 from processor.steps import preassemble, spheres
 
 TITLES = {"preassemble": "Preassembly", "spheres": "Bolt balls"}
 GOOD = "ok"
-BALLS = ("plan.png", "radius-errors.png")
 LEAD = ("what-to-do", "limits")  # tables above the figures
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
@@ -141,7 +140,7 @@ def _sections(execution: Execution, report: ErrorReport, figures: dict[str, tupl
     ]
     sections = []
     for run, others in tables.grouped(execution.runs):
-        own = BALLS if run.step == "spheres" else [name for name in figures if name not in BALLS]
+        own = [name for name in figures if figures_balls.is_own(name) == (run.step == "spheres")]
         shown_tables = [one for one in tables.of_step(run, others, report) if one.on_page]
         sections.append(
             {

@@ -168,7 +168,7 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
 
 
 def _sd(result: Result) -> Floats:
-    """Standard deviations (k, 4) of centre and radius; NaN where a variance is none."""
+    """Return standard deviations (k, 4) of centre and radius; NaN where a variance is none."""
     variance = np.einsum("kii->ki", result.covariance)
     found: Floats = np.sqrt(np.where(variance >= 0.0, variance, NAN))
     return found
@@ -193,7 +193,7 @@ def _lowest(result: Result) -> Table:
 
 
 def _summary(result: Result, method: str) -> Table:
-    """The whole frame in a few lines."""
+    """Sum up the whole frame in a few lines."""
     flags, evidence = collections.Counter(result.flag), collections.Counter(result.evidence)
     rows: list[tuple[Any, ...]] = [("balls", len(result.ids), "")]
     rows += [(f"flag {name}", flags[name], "") for name in ("ok", "low-confidence", "wrong-size", "not-found")]
