@@ -124,7 +124,7 @@ def test_what_a_step_did_not_foresee_is_said_in_one_line(frame, tmp_path, monkey
         assert end.value.code == 3
         out, err = capsys.readouterr()
         assert out == ""
-        assert "s.h5: internal error in step spheres (ransac): IndexError" in err
+        assert "s.h5: internal error in step spheres (ray): IndexError" in err
         assert ("Traceback" in err) == debug
     assert not (tmp_path / "out").exists()
 

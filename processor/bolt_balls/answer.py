@@ -50,22 +50,24 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         movement[moved.found], movement_ci95[moved.found] = moved.vector, moved.ci95
         movement_covariance[moved.found] = moved.covariance
     limit = tolerance.find(tolerance.default_for(scene.tolerance), tolerance.NODE_PLACE)
-    lost = sum(one == "not-found" for one in flag)
+    missing = np.array([one == "not-found" for one in flag], bool)
+    lost = int(missing.sum())
     tubes, stations = found.tubes, found.stations
     half = 0.5 * tubes.lengths[:, None] * tubes.directions
     said = [*found.said, balls.message]
     said += [] if matched is None else [matched.message]
     sure = matched is None or matched.status == "ok"
+    found_only = np.where(missing, np.nan, 1.0)  # of a ball that is not there the design's numbers are no answer
     return Result(
         status="failed" if lost == k else "ok" if not lost and sure else "partial",
         method="ray",
         message="; ".join(filter(None, said)),
         ids=ids,
-        centres=balls.centres + source.origin,
-        radii=balls.radii,
-        lowest=balls.lowest + source.origin,
-        covariance=covariance,
-        lowest_sd=np.sqrt(balls.lowest_sd**2 + found.datum[:, 2, 2]),
+        centres=(balls.centres + source.origin) * found_only[:, None],
+        radii=balls.radii * found_only,
+        lowest=(balls.lowest + source.origin) * found_only[:, None],
+        covariance=covariance * found_only[:, None, None],
+        lowest_sd=np.sqrt(balls.lowest_sd**2 + found.datum[:, 2, 2]) * found_only,
         points=balls.points,
         visible_fraction=balls.visible_fraction,
         rms=balls.rms,

@@ -81,8 +81,8 @@ def crops_about(scene: Scene, centres: Floats, reach: Floats) -> list[Floats]:
 
 def _middles(scene: Scene, result: spheres.Result) -> Floats:
     """Where to look for each ball: where it was found, else where the design has it."""
-    lost = ~np.isfinite(result.centres).all(axis=1)
-    return np.where(lost[:, None], designed_places(scene, result), result.centres)
+    lost = ~np.isfinite(result.centres)
+    return np.where(lost, designed_places(scene, result), result.centres)
 
 
 def _radius(result: spheres.Result, i: int) -> float:

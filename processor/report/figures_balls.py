@@ -169,12 +169,11 @@ def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[str, bytes]:
         off = (result.radii - radii)[found], (result.centres - centres)[found]
         _errors(panels[0], off[0], sd[:, 3], bound[:, 3], "radius error, mm", "balls")
         _errors(panels[1], off[1], sd[:, :3], bound[:, :3], "centre error along x, y and z, mm", "coordinates")
-        said = (
-            "Errors of radius and centre, estimate minus truth, and how they would spread by the sd stated and at best"
-        )
+        said = "Errors of radius and centre, estimate minus truth, and how they would spread as stated and at best"
     for axes in panels:
         axes.grid(alpha=0.3)
-        axes.legend(fontsize=8)
+        axes.set_ylim(0.0, 1.3 * max(axes.get_ylim()[1], 1.0))  # room for the legend
+        axes.legend(fontsize=8, loc="upper left")
     return f"{said}; the outermost bars hold all beyond", png(figure)
 
 
