@@ -207,7 +207,7 @@ def test_a_missed_limit_exits_with_4(frame, tmp_path):
     scene, truth = frame
     wrong = dataclasses.replace(truth.frame, radii=truth.frame.radii + 10.0)
     store.write_scene(tmp_path / "s.h5", scene, dataclasses.replace(truth, frame=wrong), {})
-    done = processor("run", tmp_path / "s.h5", "-o", tmp_path / "out")
+    done = processor("run", tmp_path / "s.h5", "-o", tmp_path / "out", "--method", "ransac")
     assert done.returncode == 4
     again = processor("check", tmp_path / "out", "--json")
     assert again.returncode == 4

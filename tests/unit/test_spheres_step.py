@@ -102,6 +102,20 @@ def test_a_ball_without_points_is_data_and_no_exception():
     assert spheres.run(nothing, Params(method="least-squares")).status == "failed"
 
 
+def test_a_cloud_without_members_is_still_held_against_its_design():
+    scene, truth = frame(k=4)
+    gone = np.linalg.norm(scene.scans[0].points - scene.frame.centres[2], axis=1) < 200.0
+    fewer = replace(scene, scans=(Scan("all", scene.scans[0].points[~gone]),))
+    result = spheres.run(fewer, Params())
+    assert (result.status, result.method) == ("partial", "ray")
+    assert "no members that meet" in result.message
+    np.testing.assert_array_equal(result.ids, scene.frame.ids)
+    assert result.flag[2] == "not-found"
+    assert metrics(fewer, result, truth)["balls not found"].value == 1.0
+    small = replace(scene, frame=replace(scene.frame, radii=np.full(4, 60.0)))
+    assert set(spheres.run(small, Params()).flag) == {"wrong-size"}
+
+
 def test_four_points_give_a_sphere_of_low_confidence():
     scene, _ = frame(k=1)
     quad = scene.frame.centres[0] + 45.0 * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])
