@@ -21,11 +21,15 @@ lint: $(VENV)/.test
 	$(BIN)/mypy
 
 bench: $(VENV)/.test
+	$(BIN)/python -m pip install --quiet --editable ".[designgen,test,bench]"
+	$(BIN)/python -m tests.bench.peers_spheres --output $(OUT)/bench-peers-spheres.json
+	$(BIN)/python -m tests.bench.bolt_balls --cases frame-1040 --seeds 1 --output $(OUT)/bench-frame-1040.json
 	$(BIN)/python -m tests.bench.paper_comparison --output $(OUT)/bench.json
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
 
 nightly: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m tests.bench.bolt_balls --output $(OUT)/nightly-bolt-balls.json
 	$(BIN)/python -m tests.bench.paper_comparison --seeds 5 --sets D1,D2,D3 --output $(OUT)/nightly.json
 
 system:

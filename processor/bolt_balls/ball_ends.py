@@ -25,7 +25,7 @@ CLASS_MM = 4.0  # tubes within this are of one class, and have sleeves alike
 class Ends:
     """Members at nodes: those of node i in rows ``start[i]`` to ``start[i + 1]``.
 
-    ``points`` (m, 3) on the axis less the node's position, ``directions`` (m, 3) away from the node, ``tube_radii`` (m,).
+    ``points`` (m, 3) on the axis less the node's position, ``directions`` (m, 3) away from it, ``tube_radii`` (m,).
     """
 
     start: Ints
@@ -78,7 +78,7 @@ def measured(found: Ends, start: Ints, points: Floats, centres: Floats, radii: F
     return result
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def _medians(start, points, end_start, foot, directions, widest, centres, radii):  # type: ignore[no-untyped-def]
     """Median distance from the axis and number of points 4 to 25 mm beyond each end's ball."""
     found, counts = np.full(len(foot), np.nan), np.zeros(len(foot), np.int64)

@@ -33,13 +33,13 @@ def judged(
 ) -> Balls:
     """Give every node its numbers, evidence, flag and reason."""
     k = nodes.count
-    fitted = fits.numbers[:, 7] > 0
+    fitted = np.asarray(fits.numbers[:, 7] > 0)
     state = fits.states.copy()
     degrees = fits.numbers[:, 5]
     # The scale is estimated: the variance of Student's t is wider than the normal one.
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
     covariance = fits.covariance * wider[:, None, None]
-    axes_known = np.isfinite(nodes.covariance).all(axis=(1, 2))
+    axes_known = np.asarray(np.isfinite(nodes.covariance).all(axis=(1, 2)))
     evidence, flags, reasons = [], [], []
     margin = fits.margin
     agreement = agreements(fits, nodes, radius_sd if len(catalogue.radii) else np.inf)

@@ -6,6 +6,8 @@ starts the estimate.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.optimize import nnls
 
@@ -81,7 +83,7 @@ def limb_cosine(errors: Floats, cosines: Floats, variances: Floats, weights: Flo
     on = weights > 0.0
     u, c = errors[on] / np.sqrt(variances[on]), cosines[on]
     limb = least
-    for low, high in zip(LIMB[:-1], LIMB[1:], strict=True):
+    for low, high in pairwise(LIMB.tolist()):
         here = np.sort(u[(c >= low) & (c < high)])
         if len(here) < LIMB_POINTS:
             continue
@@ -95,8 +97,8 @@ def limb_cosine(errors: Floats, cosines: Floats, variances: Floats, weights: Flo
 def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float) -> float:
     """Return the likeliest standard deviation of radii about their sizes, mm.
 
-    ``radii`` (k,) and ``variances`` (k,) are of fits with ``used_sd`` as prior. It is taken out again, so that each ball
-    says what its points alone do; the stated scatter counts as ten balls. Balls that know little are left out.
+    ``radii`` (k,) and ``variances`` (k,) are of fits with ``used_sd`` as prior. It is taken out again, so that each
+    ball says what its points alone do; the stated scatter counts as ten balls. Balls that know little are left out.
     """
     prior = 1.0 / used_sd**2
     weight = 1.0 / variances - prior

@@ -16,7 +16,7 @@ LEAST_COSINE = 0.15
 WHOLE, NOTHING = 3.0, 4.5  # in sd: residuals up to the first count whole, beyond the second not at all
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def residual(px, py, pz, ux, uy, uz, cx, cy, cz, r):  # type: ignore[no-untyped-def]
     """Residual, cosine of incidence on the model (0 = missed), and the residual's derivatives by centre and radius."""
     wx, wy, wz = cx - px, cy - py, cz - pz
@@ -34,7 +34,7 @@ def residual(px, py, pz, ux, uy, uz, cx, cy, cz, r):  # type: ignore[no-untyped-
     return root - a, root / r, -ux - vx / root, -uy - vy / root, -uz - vz / root, r / root
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def weight(t):  # type: ignore[no-untyped-def]
     """Weight of a residual of t sd: it redescends, and is all but fully efficient for normal noise."""
     t = abs(t)
@@ -46,14 +46,14 @@ def weight(t):  # type: ignore[no-untyped-def]
     return (1.0 - q * q) ** 2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def variance(noise, distance, cosine):  # type: ignore[no-untyped-def]
     """Variance of a range: constant, signal (R^2 / cosine) and footprint (tangent^2) parts, mm^2."""
     c2 = cosine * cosine
     return noise[0] + noise[1] * distance * distance / cosine + noise[2] * (1.0 - c2) / c2
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def select(  # type: ignore[no-untyped-def]
     points, rays, axis_points, axes, keep_off, hole, state, least_cosine, gate, chosen
 ):
@@ -62,8 +62,8 @@ def select(  # type: ignore[no-untyped-def]
     By 2 those that are kept off, by 0 those that miss the model or come in too slantwise.
 
     The choice looks at where the ray meets the model and never at the noisy point: it keeps off the flats and sleeves
-    (``keep_off`` from each member's axis), the process hole about the lowest point, and grazing incidence. ``gate`` only
-    spares work: it is far beyond the noise.
+    (``keep_off`` from each member's axis), the process hole about the lowest point, and grazing incidence. ``gate``
+    only spares work: it is far beyond the noise.
     """
     cx, cy, cz, r = state[0], state[1], state[2], state[3]
     total = 0

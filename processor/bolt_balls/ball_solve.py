@@ -13,7 +13,7 @@ from numba import njit
 from processor.bolt_balls.ball_residuals import residual, variance, weight
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def inverse_of(A, out):  # type: ignore[no-untyped-def]
     """Inverse of a positive definite matrix by Cholesky's factors; False where it has none."""
     n = len(A)
@@ -47,7 +47,7 @@ def inverse_of(A, out):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
     """Add one station's information A (4, 4) and gradient b (4,) to the ball's, its unknown shift eliminated.
 
@@ -63,7 +63,9 @@ def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
     M = np.empty((3, 3))
     if not inverse_of(S, M):
         return False
-    gain[:, 5:] = M
+    for i in range(3):
+        for k in range(3):
+            gain[i, 5 + k] = M[i, k]
     for i in range(3):
         for k in range(5):
             total = 0.0
@@ -83,7 +85,7 @@ def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def normal_equations(  # type: ignore[no-untyped-def]
     points, rays, ranges, station, chosen, noise, stretch, whole, centre, centre_weight, radius, radius_weight,
     shift_covariance, state, shifts, gains, H, g,
@@ -137,28 +139,34 @@ def normal_equations(  # type: ignore[no-untyped-def]
                     g[p] += b[p]
                     for q in range(4):
                         H[p, q] += A[p, q]
-                gains[segment, :, :] = 0.0
-            A[:, :] = 0.0
-            b[:] = 0.0
+                for p in range(3):
+                    for q in range(8):
+                        gains[segment, p, q] = 0.0
+            for p in range(4):
+                b[p] = 0.0
+                for q in range(4):
+                    A[p, q] = 0.0
             segment += 1
             inside = 0
     return used
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def solve(  # type: ignore[no-untyped-def]
     points, rays, ranges, station, chosen, noise, stretch, centre, centre_weight, radius, radius_weight,
     shift_covariance, settled, state, shifts, gains, steps, covariance,
 ):  # fmt: skip
     """Move ``state`` (x, y, z, r) and ``shifts`` by at most ``steps`` Gauss-Newton steps; returns points used, or -1.
 
-    A step below ``settled`` mm is the last. ``covariance`` (4, 4) is the inverse of the information at the last but one state. -1: nothing determines the ball.
+    A step below ``settled`` mm is the last. ``covariance`` (4, 4) is the inverse of the information at the last but one
+    state. -1: nothing determines the ball.
     """
     H, g = np.empty((4, 4)), np.empty(4)
     used = 0
     for _ in range(steps):
         used = normal_equations(
-            points, rays, ranges, station, chosen, noise, stretch, False, centre, centre_weight, radius, radius_weight,
+            points, rays, ranges, station, chosen, noise, stretch, steps < 0, centre, centre_weight,
+            radius, radius_weight,
             shift_covariance, state, shifts, gains, H, g,
         )  # fmt: skip
         if not inverse_of(H, covariance):

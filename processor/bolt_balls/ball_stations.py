@@ -55,7 +55,116 @@ def shift_sd(
     return float(GRID[best])
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy")
+def log_det(A):  # type: ignore[no-untyped-def]
+    """Return the logarithm of the determinant of a positive definite matrix, by Cholesky's factor."""
+    n = len(A)
+    L = np.zeros((n, n))
+    total = 0.0
+    for i in range(n):
+        for j in range(i + 1):
+            s = A[i, j]
+            for k in range(j):
+                s -= L[i, k] * L[j, k]
+            if i == j:
+                L[i, i] = np.sqrt(s)
+                total += np.log(s)
+            else:
+                L[i, j] = s / L[j, j]
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cost_at(  # type: ignore[no-untyped-def]
+    k, start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight, grid,
+    costs, several,
+):  # fmt: skip
+    """Fill the costs of node ``k``; see :func:`_costs`."""
+    if not usable[k]:
+        return
+    x, y, z, r = states[k, 0], states[k, 1], states[k, 2], states[k, 3]
+    first, last = start[k], start[k + 1]
+    runs = 1
+    for i in range(first + 1, last):
+        runs += station[i] != station[i - 1]
+    A, b, J = np.zeros((runs, 4, 4)), np.zeros((runs, 4)), np.empty(4)
+    held = np.zeros(runs, np.int64)
+    run = 0
+    for i in range(first, last):
+        if i > first and station[i] != station[i - 1]:
+            run += 1
+        if on[i] <= 0.0 or station[i] < 0:
+            continue
+        e, cosine, J[0], J[1], J[2], J[3] = residual(
+            points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], x, y, z, r
+        )
+        if cosine <= 0.02:
+            continue
+        w = on[i] / variance(noise, ranges[i], max(cosine, 0.1))
+        held[run] += 1
+        for p in range(4):
+            b[run, p] += w * J[p] * e
+            for q in range(4):
+                A[run, p, q] += w * J[p] * J[q]
+    stations = 0
+    for run in range(runs):
+        stations += held[run] > 0
+    if stations < 2:
+        return
+    several[k] = 1
+    inverse, M, S, gain = np.empty((4, 4)), np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 5))
+    H, g = np.empty((4, 4)), np.empty(4)
+    for t in range(len(grid)):
+        for p in range(4):
+            g[p] = size_weight * (r - sizes[k]) if p == 3 else 0.0
+            for q in range(4):
+                H[p, q] = 0.0
+                if p < 3 and q < 3:
+                    H[p, q] = centre_weights[k, p, q]
+                    g[p] += centre_weights[k, p, q] * states[k, q]
+        H[3, 3] = size_weight
+        cost = 0.0
+        for run in range(runs):
+            if held[run] == 0:
+                continue
+            for p in range(4):
+                g[p] += b[run, p]
+                for q in range(4):
+                    H[p, q] += A[run, p, q]
+            if grid[t] == 0.0:
+                continue
+            for p in range(3):
+                for q in range(3):
+                    S[p, q] = A[run, p, q]
+                S[p, p] += 1.0 / grid[t] ** 2
+            if not inverse_of(S, M):
+                continue
+            for p in range(3):
+                for q in range(5):
+                    gain[p, q] = 0.0
+                    for i in range(3):
+                        gain[p, q] += M[p, i] * (A[run, i, q] if q < 4 else b[run, i])
+            for p in range(4):
+                for i in range(3):
+                    g[p] -= A[run, p, i] * gain[i, 4]
+                    for q in range(4):
+                        H[p, q] -= A[run, p, i] * gain[i, q]
+            for i in range(3):
+                cost -= b[run, i] * gain[i, 4]
+            cost += log_det(S) + 6.0 * np.log(grid[t])
+        if not inverse_of(H, inverse):
+            several[k] = 0
+            break
+        for p in range(4):
+            for q in range(4):
+                cost -= g[p] * inverse[p, q] * g[q]
+        costs[k, t] = cost + log_det(H)
+    if several[k] == 0:
+        for t in range(len(grid)):
+            costs[k, t] = 0.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def _costs(  # type: ignore[no-untyped-def]
     start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight, grid
 ):
@@ -63,69 +172,9 @@ def _costs(  # type: ignore[no-untyped-def]
     nodes = len(start) - 1
     costs, several = np.zeros((nodes, len(grid))), np.zeros(nodes, np.uint8)
     for k in prange(nodes):
-        if not usable[k]:
-            continue
-        x, y, z, r = states[k, 0], states[k, 1], states[k, 2], states[k, 3]
-        first, last = start[k], start[k + 1]
-        runs = 1
-        for i in range(first + 1, last):
-            runs += station[i] != station[i - 1]
-        A, b, J = np.zeros((runs, 4, 4)), np.zeros((runs, 4)), np.empty(4)
-        held = np.zeros(runs, np.int64)
-        run = 0
-        for i in range(first, last):
-            if i > first and station[i] != station[i - 1]:
-                run += 1
-            if on[i] <= 0.0 or station[i] < 0:
-                continue
-            e, cosine, J[0], J[1], J[2], J[3] = residual(
-                points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], x, y, z, r
-            )
-            if cosine <= 0.02:
-                continue
-            w = on[i] / variance(noise, ranges[i], max(cosine, 0.1))
-            held[run] += 1
-            for p in range(4):
-                b[run, p] += w * J[p] * e
-                for q in range(4):
-                    A[run, p, q] += w * J[p] * J[q]
-        if np.sum(held > 0) < 2:
-            continue
-        several[k] = 1
-        inverse, M, S = np.empty((4, 4)), np.empty((3, 3)), np.empty((3, 3))
-        for t in range(len(grid)):
-            H, g = np.zeros((4, 4)), np.zeros(4)
-            for p in range(3):
-                for q in range(3):
-                    H[p, q] = centre_weights[k, p, q]
-                    g[p] += centre_weights[k, p, q] * states[k, q]
-            H[3, 3] = size_weight
-            g[3] = size_weight * (r - sizes[k])
-            cost = 0.0
-            for run in range(runs):
-                if held[run] == 0:
-                    continue
-                H += A[run]
-                g += b[run]
-                if grid[t] == 0.0:
-                    continue
-                S[:, :] = A[run, :3, :3]
-                for p in range(3):
-                    S[p, p] += 1.0 / grid[t] ** 2
-                if not inverse_of(S, M):
-                    continue
-                gain = M @ np.ascontiguousarray(A[run, :3, :])
-                H -= A[run, :, :3].copy() @ gain
-                Mb = M @ b[run, :3]
-                g -= A[run, :, :3].copy() @ Mb
-                cost -= b[run, :3] @ Mb
-                cost += np.log(np.linalg.det(S)) + 6.0 * np.log(grid[t])
-            if not inverse_of(H, inverse):
-                several[k] = 0
-                break
-            cost -= g @ (inverse @ g)
-            cost += np.log(np.linalg.det(H))
-            costs[k, t] = cost
-        if several[k] == 0:
-            costs[k] = 0.0
+        _cost_at(
+            np.int64(k), start, points, rays,
+            ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight,
+            grid, costs, several,
+        )  # fmt: skip
     return costs, several

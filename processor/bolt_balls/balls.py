@@ -1,7 +1,7 @@
 """Balls at known nodes: size, centre, radius and lowest point from the points about each node, with the axes fused.
 
 Method ``ray`` of the spheres. Its steps: gather the points about all nodes; vote for sizes and fit those in question;
-learn from all balls together how large the sleeves are, how the noise grows and how radii scatter; choose and fit again.
+learn from all balls together how large sleeves are, how noise grows and how radii scatter; choose and fit again.
 """
 
 from __future__ import annotations
@@ -63,8 +63,8 @@ def find_balls(
 ) -> Balls:
     """Fit a ball at every node; one pass over the source.
 
-    ``expected_mm`` (k,) are nominal radii, NaN = none: a prior on the size alone. ``station_covariance`` (s, 3, 3) is that
-    of each scanner's place as registered, mm^2; left out, it is estimated from balls that several stations saw.
+    ``expected_mm`` (k,) are nominal radii, NaN = none: a prior on the size alone. ``station_covariance`` (s, 3, 3) is
+    that of each scanner's place as registered, mm^2; left out, it is estimated from balls that several stations saw.
     """
     largest = float(catalogue.radii.max()) if len(catalogue.radii) else LARGEST_FREE_MM
     if expected_mm is not None and np.isfinite(expected_mm).any():
@@ -206,13 +206,13 @@ def typical_variance(noise: Floats, ranges: Floats) -> float:
 def centre_weights(covariance: Floats) -> Floats:
     """Inverse covariances (k, 3, 3) of nodes; 0 where a node's position says nothing."""
     weights = np.zeros_like(covariance)
-    known = np.isfinite(covariance).all(axis=(1, 2))
+    known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
     known[known] &= np.linalg.eigvalsh(covariance[known]).max(axis=1) < VAGUE_MM**2
     weights[known] = np.linalg.inv(covariance[known])
     return weights
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def _rays(start, points, station, nodes, scanners):  # type: ignore[no-untyped-def]
     """Return unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
     directions, ranges = np.zeros((len(points), 3)), np.zeros(len(points))

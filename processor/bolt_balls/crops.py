@@ -44,14 +44,17 @@ def gather(source: Source, nodes: Floats, reach_mm: float) -> Crops:
         return Crops(np.zeros(1, np.int64), np.empty((0, 3)), np.empty(0, np.int32))
     lower = nodes.min(axis=0) - reach_mm
     table, cell_start, cell_nodes = _cells(nodes, lower, reach_mm)
-    owners, steps, stations = [np.empty(0, np.int32)], [np.empty((0, 3), np.int32)], [np.empty(0, np.int32)]
+    owners: list[Labels] = [np.empty(0, np.int32)]
+    steps: list[Labels] = [np.empty((0, 3), np.int32)]
+    stations: list[Labels] = [np.empty(0, np.int32)]
     for chunk in source.chunks():
         found = _near(
             _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32), nodes, lower,
             reach_mm, *table, cell_start, cell_nodes,
         )  # fmt: skip
-        for kept, new in zip((owners, steps, stations), found, strict=True):
-            kept.append(new)
+        owners.append(found[0])
+        steps.append(found[1])
+        stations.append(found[2])
     start, points, station = _sorted(
         np.concatenate(owners), np.concatenate(steps), np.concatenate(stations), len(nodes)
     )
@@ -60,7 +63,7 @@ def gather(source: Source, nodes: Floats, reach_mm: float) -> Crops:
 
 def _frozen(values: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
     """View values as a read-only array, whatever they were: the kernel is compiled for one kind alone."""
-    found = np.ascontiguousarray(values, dtype=dtype).view()
+    found: npt.NDArray[Any] = np.ascontiguousarray(values, dtype=dtype).view()
     found.flags.writeable = False
     return found
 
@@ -91,13 +94,13 @@ def _cells(nodes: Floats, lower: Floats, reach: float) -> tuple[tuple[Ints, Labe
     return (table, row), np.append(begin, len(key)).astype(np.int64), owner[order].astype(np.int32)
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _slot(key, mask):  # type: ignore[no-untyped-def]
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     return np.int64((h >> np.uint64(29)) & np.uint64(mask))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _fill(keys, table, row):  # type: ignore[no-untyped-def]
     mask = len(table) - 1
     for i in range(len(keys)):
@@ -108,7 +111,7 @@ def _fill(keys, table, row):  # type: ignore[no-untyped-def]
         row[at] = i
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def _near(points, station, nodes, lower, reach, table, row, cell_start, cell_nodes):  # type: ignore[no-untyped-def]
     """Owner (m,), offset from it in steps (m, 3) and station (m,) of every pair of a node and a point near it."""
     n = len(points)
@@ -178,7 +181,7 @@ def _near(points, station, nodes, lower, reach, table, row, cell_start, cell_nod
     return owner, steps, seen
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
 def _sorted(owner, steps, station, nodes):  # type: ignore[no-untyped-def]
     """Start (k + 1,) of each node's points, and points (n, 3) mm and station (n,) in canonical order."""
     n = len(owner)

@@ -1,0 +1,195 @@
+"""Balls at nodes from whole clouds: sizes, flags, evidence, and the same bytes for any order, chunks and threads."""
+
+import dataclasses
+
+import numba
+import numpy as np
+import pytest
+
+from processor.bolt_balls import catalogue, crops
+from processor.bolt_balls.ball_baselines import paper_estimates
+from processor.bolt_balls.balls import find_balls
+from processor.bolt_balls.nodes import Nodes, Tubes
+from processor.bolt_balls.source import InMemory
+from processor.model import UsageError
+from tests.ball_clouds import frame, grid_of_balls
+
+STATIONS = np.array([[1000.0, 500.0, 0.0], [9000.0, 1000.0, 0.0], [5000.0, 7000.0, 0.0]])
+SIZES = (45.0, 50.0, 60.0, 80.0)
+
+
+@pytest.fixture(scope="module")
+def roof():
+    rng = np.random.default_rng(5)
+    centres, sizes = grid_of_balls(12, SIZES)
+    radii = sizes + rng.normal(0.0, 0.3, 12)
+    return centres, radii, sizes, *frame(rng, centres, radii, STATIONS)
+
+
+@pytest.fixture(scope="module")
+def found(roof):
+    _, _, _, source, nodes, tubes = roof
+    return find_balls(source, nodes, tubes, catalogue.load())
+
+
+def same_bytes(a, b):
+    fields = [f.name for f in dataclasses.fields(a)]
+    return all(
+        getattr(a, f).tobytes() == getattr(b, f).tobytes() if hasattr(getattr(a, f), "tobytes") else
+        repr(getattr(a, f)) == repr(getattr(b, f)) for f in fields
+    )  # fmt: skip
+
+
+def test_every_ball_has_its_size_and_its_place(roof, found):
+    centres, radii, sizes, *_ = roof
+    assert found.flag == ("ok",) * 12, found.reason
+    assert found.evidence == ("fused",) * 12
+    assert found.sizes.tolist() == sizes.tolist()
+    lowest = found.lowest[:, 2] - (centres[:, 2] - radii)
+    assert np.abs(lowest).max() < 2.0
+    assert np.abs(lowest / found.lowest_sd).max() < 3.5
+    assert np.sqrt(np.mean((lowest / found.lowest_sd) ** 2)) < 1.6  # of twelve: one in a thousand
+    assert np.linalg.norm(found.centres - centres, axis=1).max() < 2.0
+    assert (found.stations >= 2).all()
+    assert (found.efficiency_lowest > 0.9).all()
+    assert (found.efficiency_centre <= 1.0).all()
+    assert found.noise[0] + found.noise[2] == pytest.approx(4.0, rel=0.2)
+
+
+def test_order_chunks_and_threads_change_nothing(roof, found):
+    _, _, _, source, nodes, tubes = roof
+    order = np.random.default_rng(1).permutation(source.count)
+    mixed = InMemory(source.points[order], source.station[order], source.scanners, chunk_size=3001)
+    assert same_bytes(found, find_balls(mixed, nodes, tubes, catalogue.load()))
+    threads = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        assert same_bytes(found, find_balls(source, nodes, tubes, catalogue.load()))
+    finally:
+        numba.set_num_threads(threads)
+
+
+def test_moving_all_by_the_map_grid_moves_nothing(roof, found):
+    """Coordinates travel less an origin: what that origin is does not enter."""
+    _, _, _, source, nodes, tubes = roof
+    moved = dataclasses.replace(source, origin=np.array([5e8, 4.3e9, 1e5]))
+    assert same_bytes(found, find_balls(moved, nodes, tubes, catalogue.load()))
+
+
+def test_a_free_radius_is_found_too(roof):
+    centres, radii, _, source, nodes, tubes = roof
+    found = find_balls(source, nodes, tubes, catalogue.of_radii([]))
+    good = np.array(found.flag) == "ok"
+    assert good.sum() >= 9
+    assert np.abs((found.radii - radii) / np.sqrt(found.covariance[:, 3, 3]))[good].max() < 4.0
+    assert np.abs(found.lowest[:, 2] - centres[:, 2] + radii)[good].max() < 3.0
+
+
+def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
+    _centres, _, sizes, source, nodes, tubes = roof
+    nominal = sizes.copy()
+    nominal[[2, 7]] += 10.0
+    found = find_balls(source, nodes, tubes, catalogue.load(), expected_mm=nominal)
+    assert np.flatnonzero(np.array(found.flag) == "wrong-size").tolist() == [2, 7]
+    assert "60 mm instead of 70 mm" in found.reason[2]
+    assert np.array(found.flag)[np.delete(np.arange(12), [2, 7])].tolist() == ["ok"] * 10
+
+
+def test_without_scanners_the_bias_is_said_to_stand(roof):
+    centres, radii, _, source, nodes, tubes = roof
+    unknown = InMemory(source.points)
+    found = find_balls(unknown, nodes, tubes, catalogue.load())
+    assert "bias" in found.message
+    assert "not corrected" in found.message
+    good = np.array(found.flag) == "ok"
+    assert good.sum() >= 10
+    assert np.abs(found.lowest[:, 2] - centres[:, 2] + radii)[good].max() < 3.0
+
+
+def test_a_node_without_points_is_known_from_its_axes_alone(roof):
+    _, _, _, source, nodes, tubes = roof
+    away = dataclasses.replace(
+        nodes,
+        positions=np.vstack([nodes.positions, [50000.0, 0.0, 6000.0]]),
+        covariance=np.concatenate([nodes.covariance, nodes.covariance[:1]]),
+        axes=np.append(nodes.axes, 4),
+        scatter=np.append(nodes.scatter, 0.5),
+    )
+    found = find_balls(source, away, tubes, catalogue.load())
+    assert (found.evidence[-1], found.flag[-1]) == ("axes", "low-confidence")
+    assert np.isnan(found.radii[-1])
+    assert "axes alone" in found.reason[-1]
+    known = find_balls(source, away, tubes, catalogue.load(), expected_mm=np.append(np.full(12, np.nan), 60.0))
+    assert known.radii[-1] == 60.0
+    assert known.lowest[-1, 2] == pytest.approx(6000.0 - 60.0)
+    assert known.lowest_sd[-1] > 0.5
+
+
+def test_a_target_on_a_mount_needs_no_member_and_no_catalogue():
+    rng = np.random.default_rng(6)
+    centre = np.array([[0.0, 0.0, 1500.0]])
+    source, _, _ = frame(
+        rng, centre, [70.0], np.array([[0.0, -5000.0, 1500.0]]), 0.8, 1.0, members=np.empty((0, 3)), hole=0.0
+    )
+    start = Nodes(centre + np.array([3.0, -4.0, 2.0]), np.full((1, 3, 3), np.nan), np.zeros(1, int), np.full(1, np.nan))
+    found = find_balls(source, start, Tubes(), catalogue.of_radii([]))
+    assert found.evidence == ("ball",)
+    assert found.flag == ("ok",)
+    error = np.append(found.centres[0] - centre[0], found.radii[0] - 70.0)
+    assert (np.abs(error) < 4.0 * np.sqrt(np.diag(found.covariance[0])) + 1e-9).all()
+    assert np.abs(error).max() < 1.0
+
+
+def test_stations_that_moved_are_noticed_and_enter_the_covariance():
+    rng = np.random.default_rng(7)
+    centres, radii = grid_of_balls(12, SIZES)
+    stations = np.vstack([STATIONS, [[0.0, 8000.0, 0.0]]])
+    shifts = rng.normal(0.0, 2.0, (4, 3))
+    source, nodes, tubes = frame(rng, centres, radii, stations, shifts=shifts)
+    found = find_balls(source, nodes, tubes, catalogue.load())
+    assert 0.7 < found.station_sd < 4.0
+    assert "stations disagree" in found.message
+    pull = (found.lowest[:, 2] - centres[:, 2] + radii) / found.lowest_sd
+    still = find_balls(source, nodes, tubes, catalogue.load(), station_covariance=np.zeros((4, 3, 3)))
+    assert (still.lowest_sd < 0.6 * found.lowest_sd).mean() > 0.7
+    assert np.sqrt(np.mean(pull**2)) < 1.6
+
+
+def test_crops_hold_what_is_near_and_nothing_else(roof):
+    _, _, _, source, nodes, _ = roof
+    positions = np.vstack([nodes.positions, nodes.positions[:1] + np.array([100.0, 0.0, 0.0])])  # two that share points
+    got = crops.gather(source, positions, 150.0)
+    for i, node in enumerate(positions):
+        near = np.linalg.norm(source.points - node, axis=1) <= 150.0
+        mine = slice(got.start[i], got.start[i + 1])
+        assert got.start[i + 1] - got.start[i] == near.sum()
+        expected = np.column_stack([source.station[near], np.rint((source.points[near] - node) * 1000.0)])
+        expected = expected[np.lexsort(expected.T[[3, 2, 1, 0]])]
+        assert np.column_stack([got.station[mine], got.points[mine] * 1000.0]).round(3).tolist() == expected.tolist()
+    with pytest.raises(UsageError, match="reach"):
+        crops.gather(source, positions, 0.0)
+    assert crops.gather(source, np.empty((0, 3)), 100.0).start.tolist() == [0]
+
+
+def test_the_papers_estimators_run_on_the_same_points(roof, found):
+    _, radii, _, source, nodes, tubes = roof
+    near = crops.gather(source, nodes.positions, 190.0)
+    plain = paper_estimates(near, nodes, tubes, found)
+    drawn = paper_estimates(near, nodes, tubes, found, "ransac", seed=1)
+    assert (plain.points == drawn.points).all()
+    assert (plain.points >= 0.8 * found.points).all()
+    ours = np.median(np.abs(found.radii - radii))
+    for other in (plain, drawn):
+        assert np.isfinite(other.radii).all()
+        assert ours < np.median(np.abs(other.radii - radii))
+    with pytest.raises(UsageError, match="ransac"):
+        paper_estimates(near, nodes, tubes, found, "magic")
+
+
+def test_catalogues_are_data_and_say_whether_they_were_checked():
+    assert catalogue.load().verified is False
+    assert catalogue.of_radii([60, 45.0, 60]).radii.tolist() == [45.0, 60.0]
+    with pytest.raises(UsageError, match="plausible"):
+        catalogue.load("nowhere")
+    with pytest.raises(UsageError, match="above 0"):
+        catalogue.of_radii([45.0, -1.0])
