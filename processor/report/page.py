@@ -32,13 +32,14 @@ def html(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str
     )
     environment.filters["shown"] = shown
     scene = execution.scene
+    points = sum(len(scan.points) for scan in scene.scans)
     live = _live(execution)
     script, digest = view.script() if live else ("", "'none'")
     text: str = environment.get_template("page.html").render(
         title=scene.name,
         kind=scene.kind,
         scans=len(scene.scans),
-        points=f"{sum(len(scan.points) for scan in scene.scans):,}",
+        points=f"{points:,} points" if points else "points left in the file",
         units=scene.units,
         units_reason=scene.units_reason,
         live=live,
