@@ -8,19 +8,24 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from processor import folder, pipeline, store
-from processor.model import Floats, FrameTruth, InputError, Metric, Scene
+from processor.model import Floats, FrameTruth, InputError, Ints, Metric, Scene
 from processor.pipeline import Execution
 from processor.steps import spheres
 
 
 @dataclass(frozen=True)
 class ErrorReport:
-    """The checks of a run; by method of spheres the true radius (k,) mm of each ball found, NaN where it is none."""
+    """The checks of a run; by method of spheres the true radius (k,) and centre (k, 3) of each ball found, mm.
+
+    NaN where it is none.
+    """
 
     metrics: tuple[Metric, ...] = ()
     true_radii: Mapping[str, Floats] = field(default_factory=dict)
+    true_centres: Mapping[str, Floats] = field(default_factory=dict)
 
     @property
     def passed(self) -> bool:
@@ -52,26 +57,34 @@ def evaluate(path: Path, execution: Execution) -> ErrorReport:
             found = [dataclasses.replace(metric, name=f"{run.method}: {metric.name}") for metric in found]
         answered.add(run.step)
         metrics += found
-    radii = {
-        run.method: true_radii(execution.scene, run.result, truth.frame)
+    true = truth.frame
+    if true is None:
+        return ErrorReport(tuple(metrics))
+    rows = {
+        run.method: true_rows(execution.scene, run.result, true)
         for run in execution.runs
-        if isinstance(run.result, spheres.Result) and truth.frame is not None
+        if isinstance(run.result, spheres.Result)
     }
-    return ErrorReport(tuple(metrics), radii)
+    radii, centres = np.append(true.radii, np.nan), np.vstack([true.centres, np.full(3, np.nan)])
+    return ErrorReport(
+        tuple(metrics),
+        {method: radii[row] for method, row in rows.items()},
+        {method: centres[row] for method, row in rows.items()},
+    )
 
 
-def true_radii(scene: Scene, result: spheres.Result, true: FrameTruth) -> Floats:
-    """Return the true radius (k,) in mm of each ball of a result, NaN where there is no such ball.
+def true_rows(scene: Scene, result: spheres.Result, true: FrameTruth) -> Ints:
+    """Return the row (k,) of the truth that each ball of a result is, -1 where there is no such ball.
 
     With a design a ball is known by its id. Without, ids mean nothing: it is the true ball that its centre lies in.
     """
     if scene.frame is not None:
-        known = dict(zip(true.ids.tolist(), true.radii.tolist(), strict=True))
-        return np.array([known.get(ball, np.nan) for ball in result.ids.tolist()], np.float64)
-    if not len(true.ids):
-        return np.full(len(result.ids), np.nan)
-    distance = np.linalg.norm(result.centres[:, None] - true.centres[None], axis=2)
-    distance[~np.isfinite(distance)] = np.inf
-    nearest = distance.argmin(axis=1)
-    inside = distance.min(axis=1) <= true.radii[nearest]
-    return np.where(inside, true.radii[nearest], np.nan)
+        known = {int(id_): row for row, id_ in enumerate(true.ids)}
+        return np.array([known.get(ball, -1) for ball in result.ids.tolist()], np.int64)
+    found = np.full(len(result.ids), -1, np.int64)
+    there = np.flatnonzero(np.isfinite(result.centres).all(axis=1))
+    if len(true.ids) and len(there):
+        distance, nearest = cKDTree(true.centres).query(result.centres[there])
+        inside = distance <= true.radii[nearest]
+        found[there[inside]] = nearest[inside]
+    return found

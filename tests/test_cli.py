@@ -124,7 +124,7 @@ def test_what_a_step_did_not_foresee_is_said_in_one_line(frame, tmp_path, monkey
         assert end.value.code == 3
         out, err = capsys.readouterr()
         assert out == ""
-        assert "s.h5: internal error in step spheres (ransac): IndexError" in err
+        assert "s.h5: internal error in step spheres (ray): IndexError" in err
         assert ("Traceback" in err) == debug
     assert not (tmp_path / "out").exists()
 
@@ -207,7 +207,7 @@ def test_a_missed_limit_exits_with_4(frame, tmp_path):
     scene, truth = frame
     wrong = dataclasses.replace(truth.frame, radii=truth.frame.radii + 10.0)
     store.write_scene(tmp_path / "s.h5", scene, dataclasses.replace(truth, frame=wrong), {})
-    done = processor("run", tmp_path / "s.h5", "-o", tmp_path / "out")
+    done = processor("run", tmp_path / "s.h5", "-o", tmp_path / "out", "--method", "ransac")
     assert done.returncode == 4
     again = processor("check", tmp_path / "out", "--json")
     assert again.returncode == 4

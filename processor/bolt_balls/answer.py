@@ -11,6 +11,7 @@ from processor.bolt_balls.params import Params
 from processor.bolt_balls.result import Result
 from processor.bolt_balls.scene_source import PointReader, SceneSource, of_scene
 from processor.model import Floats, FrameDesign, Ints, Scene
+from processor.preassembly import tolerance
 
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
@@ -44,24 +45,29 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         reason[i] = "; ".join(filter(None, (reason[i], NOWHERE)))
     matched, moved = found.matching, found.movement
     movement, movement_ci95 = np.full((k, 3), np.nan), np.full((k, 3), np.nan)
+    movement_covariance = np.full((k, 3, 3), np.nan)
     if moved is not None:
         movement[moved.found], movement_ci95[moved.found] = moved.vector, moved.ci95
-    lost = sum(one == "not-found" for one in flag)
+        movement_covariance[moved.found] = moved.covariance
+    limit = tolerance.find(tolerance.default_for(scene.tolerance), tolerance.NODE_PLACE)
+    missing = np.array([one == "not-found" for one in flag], bool)
+    lost = int(missing.sum())
     tubes, stations = found.tubes, found.stations
     half = 0.5 * tubes.lengths[:, None] * tubes.directions
     said = [*found.said, balls.message]
     said += [] if matched is None else [matched.message]
     sure = matched is None or matched.status == "ok"
+    found_only = np.where(missing, np.nan, 1.0)  # of a ball that is not there the design's numbers are no answer
     return Result(
         status="failed" if lost == k else "ok" if not lost and sure else "partial",
         method="ray",
         message="; ".join(filter(None, said)),
         ids=ids,
-        centres=balls.centres + source.origin,
-        radii=balls.radii,
-        lowest=balls.lowest + source.origin,
-        covariance=covariance,
-        lowest_sd=np.sqrt(balls.lowest_sd**2 + found.datum[:, 2, 2]),
+        centres=(balls.centres + source.origin) * found_only[:, None],
+        radii=balls.radii * found_only,
+        lowest=(balls.lowest + source.origin) * found_only[:, None],
+        covariance=covariance * found_only[:, None, None],
+        lowest_sd=np.sqrt(balls.lowest_sd**2 + found.datum[:, 2, 2]) * found_only,
         points=balls.points,
         visible_fraction=balls.visible_fraction,
         rms=balls.rms,
@@ -76,6 +82,9 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         efficiency=np.stack([balls.efficiency_centre, balls.efficiency_radius, balls.efficiency_lowest], axis=1),
         movement=movement,
         movement_ci95=movement_ci95,
+        movement_covariance=movement_covariance,
+        movement_limit=np.nan if limit is None else limit.high,
+        movement_limit_source="" if limit is None else limit.source,
         gauge="" if moved is None else moved.gauge,
         matching="" if matched is None else matched.status,
         T_design_scan=np.empty(0) if matched is None else matched.T_design_scan,

@@ -42,6 +42,9 @@ class Result(Checked):
     efficiency: Floats = column("k", 3)
     movement: Floats = column("k", 3)
     movement_ci95: Floats = column("k", 3)
+    movement_covariance: Floats = column("k", 3, 3)
+    movement_limit: float = float("nan")  # of its size; NaN = none
+    movement_limit_source: str = ""  # where that stands
     gauge: str = ""
     matching: str = ""  # ok | ambiguous | failed
     T_design_scan: Floats = optional(4, 4)

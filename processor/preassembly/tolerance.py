@@ -22,6 +22,9 @@ else:
 
 DEFAULT = "GB 50205-2020"
 NAN = float("nan")
+NODE_PLACE = "node_place_mm"
+# What no standard here limits, and a project may.
+OF_PROJECTS = (Limit(NODE_PLACE, "distance of a space frame's node from its nominal place"),)
 
 
 @lru_cache(maxsize=1)
@@ -64,8 +67,12 @@ def find(tolerance: Tolerance, key: str) -> Limit | None:
 
 
 def choice(base: Tolerance) -> dict[str, Limit]:
-    """Limits that a project can set by key: those of its standard, and without a standard those of any."""
+    """Limits that a project can set by key: those of its standard, and without a standard those of any.
+
+    Beside them stand OF_PROJECTS.
+    """
     limits = base.limits or tuple(limit for one in (load(DEFAULT), *standards().values()) for limit in one.limits)
+    limits = (*limits, *OF_PROJECTS)
     found: dict[str, Limit] = {}
     for limit in limits:
         found.setdefault(limit.key, limit)

@@ -14,13 +14,12 @@ import numpy as np
 from processor.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report import tables, view
+from processor.report import figures_balls, tables, view
 from processor.report.printing import headings, numeric, shown
 from processor.steps import preassemble, spheres
 
 TITLES = {"preassemble": "Preassembly", "spheres": "Bolt balls"}
 GOOD = "ok"
-BALLS = ("plan.png", "radius-errors.png")
 LEAD = ("what-to-do", "limits")  # tables above the figures
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
@@ -33,13 +32,14 @@ def html(execution: Execution, report: ErrorReport, figures: dict[str, tuple[str
     )
     environment.filters["shown"] = shown
     scene = execution.scene
+    points = sum(len(scan.points) for scan in scene.scans)
     live = _live(execution)
     script, digest = view.script() if live else ("", "'none'")
     text: str = environment.get_template("page.html").render(
         title=scene.name,
         kind=scene.kind,
         scans=len(scene.scans),
-        points=f"{sum(len(scan.points) for scan in scene.scans):,}",
+        points=f"{points:,} points" if points else "points left in the file",
         units=scene.units,
         units_reason=scene.units_reason,
         live=live,
@@ -141,7 +141,7 @@ def _sections(execution: Execution, report: ErrorReport, figures: dict[str, tupl
     ]
     sections = []
     for run, others in tables.grouped(execution.runs):
-        own = BALLS if run.step == "spheres" else [name for name in figures if name not in BALLS]
+        own = [name for name in figures if figures_balls.is_own(name) == (run.step == "spheres")]
         shown_tables = [one for one in tables.of_step(run, others, report) if one.on_page]
         sections.append(
             {

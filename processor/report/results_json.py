@@ -10,7 +10,8 @@ import numpy as np
 from processor.evaluate import ErrorReport
 from processor.model import ENDS, KEY_POINTS, Floats, StepRun
 from processor.pipeline import Execution
-from processor.steps import preassemble, spheres
+from processor.report import results_balls
+from processor.steps import preassemble
 
 TRADE_OFF = ("splicing_mean", "splicing_max", "linear_mean", "linear_max")
 FORMAT, FORMAT_VERSION = "processor-results", "1.0"
@@ -167,33 +168,7 @@ def _ends(points: Floats) -> dict[str, Any]:
     }
 
 
-def _spheres(result: spheres.Result) -> dict[str, Any]:
-    return {
-        "status": result.status,
-        "method": result.method,
-        "message": result.message,
-        "balls": [
-            {
-                "id": int(result.ids[i]),
-                "centre": result.centres[i],
-                "radius": result.radii[i],
-                "lowest": result.lowest[i],
-                "lowest_sd": result.lowest_sd[i],
-                "covariance": result.covariance[i],
-                "points": int(result.points[i]),
-                "visible_fraction": result.visible_fraction[i],
-                "rms": result.rms[i],
-                "nominal_radius": result.nominal_radii[i],
-                "evidence": result.evidence[i],
-                "flag": result.flag[i],
-                "reason": result.reason[i],
-            }
-            for i in range(len(result.ids))
-        ],
-    }
-
-
-WRITERS: dict[str, Any] = {"preassemble": _preassemble, "spheres": _spheres}
+WRITERS: dict[str, Any] = {"preassemble": _preassemble, "spheres": results_balls.written}
 
 
 def plain(value: Any) -> Any:

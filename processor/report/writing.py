@@ -12,12 +12,10 @@ from processor import store
 from processor.evaluate import ErrorReport
 from processor.model import UsageError
 from processor.pipeline import Execution
-from processor.report import figures, page, printing, results_json, tables
+from processor.report import dxf, figures, page, printing, results_json, tables, tables_balls
 
-RESULTS, RUNS = "results.json", "results.h5"
-
-
-OWN_NAMES = (RESULTS, RUNS, "report.html", "figures")  # and CSV tables
+RESULTS, RUNS, DRAWING = "results.json", "results.h5", "nodes.dxf"
+OWN_NAMES = (RESULTS, RUNS, DRAWING, "report.html", "figures")  # and CSV tables
 
 
 def check_output(out: Path, source: Path) -> None:
@@ -35,7 +33,7 @@ def check_output(out: Path, source: Path) -> None:
 
 
 def write(out: Path, execution: Execution, report: ErrorReport) -> None:
-    """Write results.h5, results.json, CSV tables, figures and report.html into ``out``, in place of earlier ones."""
+    """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others."""
     out = out.absolute()
     out.parent.mkdir(parents=True, exist_ok=True)
     making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
@@ -47,6 +45,9 @@ def write(out: Path, execution: Execution, report: ErrorReport) -> None:
         for table in tables.all_of(execution, report):
             if table.file:
                 _write_text(making / f"{table.file}.csv", printing.csv_text(table))
+        for run, _ in tables.grouped(execution.runs):
+            if run.step == "spheres" and tables_balls.has_bounds(run.result):
+                _write(making / DRAWING, dxf.drawing(run.result))
         drawn = figures.of_run(execution, report)
         if drawn:
             (making / "figures").mkdir()

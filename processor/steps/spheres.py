@@ -7,6 +7,8 @@ the source paper's (paper 001), fitted to a crop about every node of the design.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
@@ -16,7 +18,7 @@ from processor.bolt_balls.params import METHODS, Params
 from processor.bolt_balls.result import Result
 from processor.bolt_balls.scene_source import PointReader
 from processor.geometry.merging import merged
-from processor.model import Floats, FrameTruth, InputError, Ints, Metric, Scene, Truth
+from processor.model import Floats, FrameTruth, InputError, Ints, Metric, Scene, Tolerance, Truth
 from processor.preassembly import tolerance
 
 __all__ = ["KIND", "METHODS", "NEEDS", "STREAMS", "Params", "Result", "check", "run"]
@@ -48,7 +50,18 @@ def run(scene: Scene, params: Params, points: PointReader | None = None) -> Resu
         raise InputError(
             f"{scene.name}: no members that meet were found, and the cloud is too large to search otherwise"
         )
-    return single.search(merged(scene, with_scanner=True), params) if found is None else found
+    if found is None:
+        return _without_members(scene, params, limits)
+    return found
+
+
+def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
+    """Find balls of a cloud without members: those of the design at its nodes, without one those that stand out."""
+    if scene.frame is None:
+        return single.search(merged(scene, with_scanner=True), params)
+    found = single.fit_nodes(merged(scene, with_scanner=False), scene.frame, replace(params, method="ransac"), limits)
+    said = "no members that meet: each ball was fitted at the design's node, by ransac and without its axes"
+    return replace(found, method=params.method, message=f"{said}; {found.message}")
 
 
 # --- evaluation ----------------------------------------------------------------------------------------------------
@@ -103,7 +116,9 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
 
 def _matched(scene: Scene, result: Result, true: FrameTruth) -> tuple[Ints, Ints]:
     """Rows of the result, and of the truth: the ball of the same id, or without a design that whose inside it is in."""
-    got = np.flatnonzero(np.isfinite(result.centres).all(axis=1) & np.array([f != "not-found" for f in result.flag]))
+    got = np.flatnonzero(
+        np.isfinite(result.centres).all(axis=1) & np.array([f != "not-found" for f in result.flag], bool)
+    )
     if scene.frame is not None:
         row_of = {int(id_): row for row, id_ in enumerate(true.ids)}
         pairs = [(row, row_of[int(result.ids[row])]) for row in got.tolist() if int(result.ids[row]) in row_of]

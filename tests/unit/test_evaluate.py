@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processor import pipeline, store
-from processor.evaluate import ErrorReport, evaluate, true_radii
+from processor.evaluate import ErrorReport, evaluate, true_rows
 from processor.model import ArchTruth, FrameDesign, FrameTruth, InputError, Metric, Scan, Scene, StepRun, Truth
 from processor.steps import preassemble, spheres
 
@@ -46,16 +46,16 @@ def execution(made_of, *runs):
 
 def test_with_a_design_a_ball_is_known_by_its_id():
     found = result([8, 3, 99], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]], [1.0, 1.0, 1.0])
-    np.testing.assert_array_equal(true_radii(scene(), found, TRUE), [60.0, 45.0, NAN])
+    np.testing.assert_array_equal(true_rows(scene(), found, TRUE), [2, 0, -1])
 
 
 def test_without_a_design_a_ball_is_known_by_its_place():
     found = result([3, 5, 8], [[1990.0, 0, 10], [1049, 0, 0], [500, 0, 0]], [60.0, 50.0, 45.0])
-    np.testing.assert_array_equal(true_radii(scene(False), found, TRUE), [60.0, 50.0, NAN])
+    np.testing.assert_array_equal(true_rows(scene(False), found, TRUE), [2, 1, -1])
     lost = result([0], [[NAN] * 3], [NAN])
-    np.testing.assert_array_equal(true_radii(scene(False), lost, TRUE), [NAN])
-    np.testing.assert_array_equal(true_radii(scene(False), found, FrameTruth()), [NAN] * 3)
-    assert true_radii(scene(False), result([], [], []), TRUE).shape == (0,)
+    np.testing.assert_array_equal(true_rows(scene(False), lost, TRUE), [-1])
+    np.testing.assert_array_equal(true_rows(scene(False), found, FrameTruth()), [-1] * 3)
+    assert true_rows(scene(False), result([], [], []), TRUE).shape == (0,)
 
 
 def test_checks_of_comparison_runs_bear_the_methods_name(tmp_path):
@@ -66,7 +66,12 @@ def test_checks_of_comparison_runs_bear_the_methods_name(tmp_path):
     values = {metric.name: metric.value for metric in report.metrics}
     assert values["radius error, median"] == 0.0
     assert values["least-squares: radius error, median"] == 2.0
-    assert set(report.true_radii) == {"ransac", "least-squares"}
+    assert set(report.true_radii) == set(report.true_centres) == {"ransac", "least-squares"}
+    np.testing.assert_array_equal(report.true_radii["ransac"], TRUE.radii)
+    np.testing.assert_array_equal(report.true_centres["ransac"], TRUE.centres)
+    one = evaluate(tmp_path / "f.h5", execution(scene(), result([99, 5], TRUE.centres[:2], [1.0, 1.0])))
+    np.testing.assert_array_equal(one.true_radii["ransac"], [NAN, 50.0])
+    np.testing.assert_array_equal(one.true_centres["ransac"], [[NAN] * 3, [1000.0, 0.0, 0.0]])
     assert len(values) == len(report.metrics)
 
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from processor import folder, store
+from processor.bolt_balls import single
 from processor.model import InputError, Limit, Scan, Scene, Tolerance
 from processor.preassembly import tolerance
-from processor.steps import spheres
 
 MEASURES = ("", "misalignment", "groove_gap", "eccentricity")
 
@@ -118,6 +118,15 @@ def test_limits_without_a_standard_are_all_there_is(tmp_path):
     assert tolerance.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
 
 
+def test_a_project_may_limit_what_no_standard_does(tmp_path):
+    for name in tolerance.standards():
+        assert tolerance.find(tolerance.load(name), tolerance.NODE_PLACE) is None
+    for text in ("", 'standard = "JGJ 7-2010"\n'):
+        scene = folder.read_input(write_project(tmp_path, f"[tolerance]\n{text}node_place_mm = 15\n"))
+        own = tolerance.find(scene.tolerance, tolerance.NODE_PLACE)
+        assert (own.high, own.verified, own.source) == (15.0, True, "project.toml")
+
+
 def test_nothing_said_is_nothing_held(tmp_path):
     assert folder.read_input(write_project(tmp_path, "[tolerance]\n")).tolerance is None
     assert tolerance.default_for(None).standard == "GB 50205-2020"
@@ -130,8 +139,8 @@ def test_blanks_of_balls():
     # Half of +2/-1 up to a diameter of 120 and of +3/-1.5 above.
     gb = tolerance.load("GB 50205-2020")
     for limits in (gb, Tolerance(), tolerance.load("JGJ 7-2010")):
-        assert spheres._blank_tolerance(60.0, limits) == (0.5, 1.0)
-        assert spheres._blank_tolerance(60.001, limits) == (0.75, 1.5)
+        assert single._blank_tolerance(60.0, limits) == (0.5, 1.0)
+        assert single._blank_tolerance(60.001, limits) == (0.75, 1.5)
     own = Tolerance(limits=(Limit("ball_blank_diameter_small_mm", "x", low=-4.0, high=6.0, up_to_mm=120.0),))
-    assert spheres._blank_tolerance(50.0, own) == (2.0, 3.0)
-    assert spheres._blank_tolerance(75.0, own) == (0.75, 1.5)
+    assert single._blank_tolerance(50.0, own) == (2.0, 3.0)
+    assert single._blank_tolerance(75.0, own) == (0.75, 1.5)

@@ -1,0 +1,146 @@
+"""A figure a ball to look at: the points about it from the side and from above, what was fitted, what was designed."""
+
+from __future__ import annotations
+
+import textwrap
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+
+from processor.bolt_balls.scene_source import of_scene
+from processor.geometry import rigid
+from processor.model import Floats, Scene
+from processor.report.drawing import COLOURS, Drawn, png
+from processor.report.dxf import nominal_places
+from processor.steps import spheres
+
+PREFIX = "ball-to-see-"
+MOST_BALLS = 12
+ORDER = ("wrong-size", "not-found", "low-confidence")  # of what is drawn first
+ROUND_MM = 60.0  # about the ball, that is shown
+SLICE_MM = 8.0  # on either side of the plane through the centre
+MOST_POINTS = 20_000  # of a panel; more are no more to see
+LEAST_RADIUS_MM = 30.0
+VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
+
+
+def of_result(scene: Scene, result: spheres.Result) -> Drawn:
+    """Draw the balls that are not ok, MOST_BALLS of them at most; none where the scene's points are not at hand."""
+    centres = _middles(scene, result)
+    there = np.flatnonzero(np.isfinite(centres).all(axis=1)).tolist()
+    doubtful = [i for flag in ORDER for i in there if result.flag[i] == flag]
+    shown = doubtful[:MOST_BALLS]
+    if not shown or not all(len(scan.points) for scan in scene.scans):
+        return {}
+    reach = [_radius(result, i) + ROUND_MM for i in shown]
+    crops = crops_about(scene, centres[shown], np.array(reach))
+    as_is = ", each station where it was registered" if result.station_names else ""
+    more = f" (the first {len(shown)} of {len(doubtful)} to look at)" if len(shown) < len(doubtful) else ""
+    return {
+        f"{PREFIX}{int(result.ids[i])}.png": (
+            f"Ball {int(result.ids[i])}, {result.flag[i]}: the points about it{as_is}; dark are those within "
+            f"{SLICE_MM:g} mm of the plane through its centre{more}",
+            _ball(result, i, centres[i], crops[k], reach[k]),
+        )
+        for k, i in enumerate(shown)
+    }
+
+
+def designed_places(scene: Scene, result: spheres.Result) -> Floats:
+    """Return where the design has each ball (k, 3), in the input's own frame; NaN where it has none.
+
+    Where the node was found that is its own place less its movement, else the design's by the pose that was found.
+    """
+    places = nominal_places(result)
+    if scene.frame is None:
+        return places
+    nodes = scene.frame.centres
+    if result.T_design_scan.size:
+        nodes = rigid.apply(rigid.invert(result.T_design_scan), nodes)
+    known = dict(zip(scene.frame.ids.tolist(), nodes, strict=True))
+    for i in np.flatnonzero(~np.isfinite(places).all(axis=1)).tolist():
+        places[i] = known.get(int(result.ids[i]), places[i])
+    return places
+
+
+def crops_about(scene: Scene, centres: Floats, reach: Floats) -> list[Floats]:
+    """Return the points (n, 3) within ``reach`` (k,) of each centre (k, 3), less the centre; one pass over all."""
+    source = of_scene(scene)
+    middles = centres - source.origin
+    found: list[list[Floats]] = [[] for _ in reach]
+    for chunk in source.chunks():
+        for k, (middle, far) in enumerate(zip(middles, reach, strict=True)):
+            # By one axis first: most of a roof is far away.
+            near = chunk.points[np.abs(chunk.points[:, 0] - middle[0]) <= far] - middle
+            found[k].append(near[np.einsum("ij,ij->i", near, near) <= far**2])
+    return [np.vstack(parts) if parts else np.empty((0, 3)) for parts in found]
+
+
+def _middles(scene: Scene, result: spheres.Result) -> Floats:
+    """Where to look for each ball: where it was found, else where the design has it."""
+    lost = ~np.isfinite(result.centres)
+    return np.where(lost, designed_places(scene, result), result.centres)
+
+
+def _radius(result: spheres.Result, i: int) -> float:
+    known = [float(one[i]) for one in (result.radii, result.nominal_radii) if np.isfinite(one[i])]
+    return max([LEAST_RADIUS_MM, *known])
+
+
+def _ball(result: spheres.Result, i: int, middle: Floats, points: Floats, reach: float) -> bytes:
+    figure = Figure(figsize=(9.4, 5.3), layout="constrained")
+    nominal = nominal_places(result)[i] - middle
+    if not np.isfinite(nominal).all():
+        nominal = np.zeros(3) if not np.isfinite(result.centres[i]).all() else np.full(3, np.nan)
+    for axes, (name, across) in zip(figure.subplots(1, 2), VIEWS, strict=True):
+        _points(axes, points, across)
+        _members(axes, result, i, middle, across, reach)
+        if np.isfinite(nominal).all() and np.isfinite(result.nominal_radii[i]):
+            _circle(axes, nominal, float(result.nominal_radii[i]), across, COLOURS[1], "--")
+        if np.isfinite(result.radii[i]) and result.flag[i] != "not-found":
+            _circle(axes, np.zeros(3), float(result.radii[i]), across, COLOURS[0], "-")
+        axes.set(
+            xlim=(-reach, reach), ylim=(-reach, reach), title=name,
+            xlabel="x less the centre's, mm", ylabel=f"{'xyz'[across[1]]} less the centre's, mm",
+        )  # fmt: skip
+        axes.set_aspect("equal")
+        axes.grid(alpha=0.3)
+    heading = f"Ball {int(result.ids[i])}: {result.flag[i]}. {result.reason[i]}"
+    figure.suptitle("\n".join(textwrap.wrap(heading, 105)[:3]), fontsize=11)
+    handles = [
+        Line2D([], [], marker=".", linestyle="", color="black", label=f"points within {SLICE_MM:g} mm of the plane"),
+        Line2D([], [], marker=".", linestyle="", color="0.72", label="points before and behind it"),
+        Line2D([], [], color=COLOURS[0], marker="+", label="fitted"),
+        Line2D([], [], color=COLOURS[1], linestyle="--", marker="+", label="nominal"),
+        Line2D([], [], color=COLOURS[2], linestyle="-.", label="axes of members"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8)
+    return png(figure)
+
+
+def _points(axes: Axes, points: Floats, across: tuple[int, int]) -> None:
+    depth = np.abs(points[:, 3 - sum(across)])
+    for chosen, colour, order in ((depth > SLICE_MM, "0.72", 1.0), (depth <= SLICE_MM, "black", 2.0)):
+        few = np.compress(chosen, points, axis=0)
+        few = few[:: max(1, -(-len(few) // MOST_POINTS))]
+        axes.plot(*few[:, across].T, ".", markersize=2.0, color=colour, zorder=order)
+
+
+def _members(axes: Axes, result: spheres.Result, i: int, middle: Floats, across: tuple[int, int], reach: float) -> None:
+    """Draw the axes of the members that meet at a ball, through it to where they end on the picture."""
+    for tube in np.flatnonzero((result.tube_a == result.ids[i]) | (result.tube_b == result.ids[i])).tolist():
+        start, end = (result.tube_start[tube] - middle, result.tube_end[tube] - middle)
+        away = end - start if result.tube_a[tube] == result.ids[i] else start - end
+        away = away / np.linalg.norm(away)
+        foot = start - (start @ away) * away
+        line = foot + np.array([[-0.25], [2.0]]) * reach * away
+        axes.plot(*line[:, across].T, "-.", color=COLOURS[2], linewidth=1.1, zorder=3.0)
+
+
+def _circle(axes: Axes, centre: Floats, radius: float, across: tuple[int, int], colour: str, dash: str) -> None:
+    x, y = float(centre[across[0]]), float(centre[across[1]])
+    axes.add_patch(Circle((x, y), radius, fill=False, edgecolor=colour, linestyle=dash, linewidth=1.6, zorder=4.0))
+    axes.plot(x, y, "+", color=colour, markersize=9.0, zorder=4.0)

@@ -1,0 +1,441 @@
+"""Balls of a whole frame as reported: results.json, tables, drawing and figures, from a result written by hand."""
+
+import csv
+import dataclasses
+import hashlib
+import io
+import json
+import math
+import os
+import subprocess
+import sys
+
+import ezdxf
+import matplotlib as mpl
+import numpy as np
+import pytest
+
+from processor import store
+from processor.bolt_balls import verdicts
+from processor.evaluate import ErrorReport
+from processor.model import FrameDesign, Scan, Scene, Stations, StepRun
+from processor.pipeline import Execution
+from processor.report import dxf, figures, figures_ball, figures_balls, page, printing, results_json, tables, writing
+from processor.steps import spheres
+from tests.unit.test_report import PROVENANCE, Page, balls
+
+NAN = float("nan")
+NOMINAL = np.array([[0.0, 0, 6000], [3000, 0, 6000], [0, 4000, 6000], [3000, 4000, 6000], [1500, 2000, 8000]])
+MOVED = np.array([[3.0, 4, 0], [0, 0, -12.0], [NAN] * 3, [0.3, 0, 0.4], [NAN] * 3])
+FLAG = ("ok", "wrong-size", "not-found", "low-confidence", "ok")
+TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])  # a quarter turn about z
+
+
+def pose(R=None, t=(0.0, 0.0, 0.0)):
+    T = np.eye(4)
+    T[:3, :3] = np.eye(3) if R is None else R
+    T[:3, 3] = t
+    return T
+
+
+def whole(limit=10.0, T=None, **changes):
+    """Four nodes of a design and one more; node 12 (the third) is missing. Movements have sd 0.5, 1 and 2 mm."""
+    T = pose() if T is None else T
+    there = NOMINAL + np.nan_to_num(MOVED)
+    centres = (there - T[:3, 3]) @ T[:3, :3]
+    radii = np.array([45.1, 60.2, NAN, 45.0, 50.0])
+    centres[2] = NAN
+    covariance = np.tile(np.diag([0.01, 0.04, 0.09, 0.0025]), (5, 1, 1))
+    covariance[2] = NAN
+    moved_covariance = np.tile(np.diag([0.25, 1.0, 4.0]), (5, 1, 1))
+    moved_covariance[[2, 4]] = NAN
+    made = spheres.Result(
+        status="partial",
+        method="ray",
+        message="one missing",
+        ids=np.array([10, 11, 12, 13, 14]),
+        centres=centres,
+        radii=radii,
+        lowest=centres - radii[:, None] * [0.0, 0.0, 1.0],
+        covariance=covariance,
+        lowest_sd=np.array([0.1, 0.2, NAN, 0.3, 0.4]),
+        points=np.array([500, 400, 0, 12, 300]),
+        visible_fraction=np.full(5, 0.3),
+        rms=np.full(5, 0.4),
+        nominal_radii=np.array([45.0, 50.0, 50.0, 45.0, NAN]),
+        evidence=("fused", "ball", "axes", "axes", "fused"),
+        flag=FLAG,
+        reason=("", "size 60 mm instead of 50 mm", "no ball seen", "12 points, fewer than 20", "not in the design"),
+        sizes=np.array([45.0, 60.0, NAN, 45.0, 50.0]),
+        axes=np.array([3, 3, 0, 3, 4]),
+        stations=np.array([2, 2, 0, 1, 2]),
+        bound_sd=np.array([[0.08, 0.16, 0.24, 0.04, 0.09]] * 5),
+        efficiency=np.array([[0.8, 0.9, 0.95]] * 5),
+        movement=MOVED,
+        movement_ci95=1.96 * np.sqrt(np.einsum("kii->ki", moved_covariance)),
+        movement_covariance=moved_covariance,
+        movement_limit=limit,
+        movement_limit_source="" if math.isnan(limit) else "project.toml",
+        gauge="design frame",
+        matching="ok",
+        T_design_scan=T,
+        T_design_scan_covariance=np.zeros((6, 6)),
+        tube_start=(np.array([[100.0, 0, 6000], [3000.0, 3900, 6000]]) - T[:3, 3]) @ T[:3, :3],
+        tube_end=(np.array([[2900.0, 0, 6000], [100.0, 4000, 6000]]) - T[:3, 3]) @ T[:3, :3],
+        tube_radii=np.array([30.0, 30.0]),
+        tube_bow=np.array([0.5, 1.5]),
+        tube_a=np.array([10, 13]),
+        tube_b=np.array([11, -1]),
+        station_names=("S1", "=S2"),
+        T_station=np.array([pose(), pose(t=(1.0, -2.0, 3.0))]),
+        station_said=("", "weak: seen by few tubes"),
+    )
+    return dataclasses.replace(made, **changes)
+
+
+def cloud(result, design=NOMINAL, rng=None):
+    """Points of spheres of 45 mm about all nodes."""
+    rng = np.random.default_rng(0) if rng is None else rng
+    unit = rng.normal(size=(5, 400, 3))
+    unit /= np.linalg.norm(unit, axis=2)[:, :, None]
+    T = result.T_design_scan
+    return (design[:, None] + 45.0 * unit).reshape(-1, 3) @ T[:3, :3] - T[:3, 3] @ T[:3, :3]
+
+
+def scene(result, points=None):
+    points = cloud(result) if points is None else points
+    design = FrameDesign([10, 11, 12, 13], NOMINAL[:4], [45.0, 50.0, 50.0, 45.0])
+    return Scene("frame", "space-frame", (Scan("s", points),), frame=design)
+
+
+def of_frame(result=None, report=None, points=None):
+    result = whole() if result is None else result
+    return (
+        Execution(scene(result, points), (StepRun("spheres", "ray", "{}", result),), PROVENANCE),
+        ErrorReport() if report is None else report,
+    )
+
+
+def with_truth():
+    result = whole()
+    radii = np.array([45.0, 60.0, 50.0, 45.2, NAN])
+    return ErrorReport((), {"ray": radii}, {"ray": np.where(np.isnan(radii)[:, None], NAN, NOMINAL + 0.0)}), result
+
+
+def by_file(file, *args):
+    (table,) = [one for one in tables.all_of(*of_frame(*args)) if one.file == file]
+    return list(csv.DictReader(io.StringIO(printing.csv_text(table))))
+
+
+# --- verdicts ------------------------------------------------------------------------------------------------------
+
+
+def test_verdicts_by_hand():
+    judged = verdicts.of_result(whole())
+    # 3-4-0: along (0.6, 0.8, 0) the variance is 0.36 * 0.25 + 0.64 * 1 = 0.73; 12 down: 4; 0.3-0-0.4: 0.36/4 + 0.64 * 4
+    np.testing.assert_allclose(judged.size[[0, 1, 3]], [5.0, 12.0, 0.5])
+    np.testing.assert_allclose(judged.ci95[[0, 1, 3]], 1.96 * np.sqrt([0.73, 4.0, 2.65]), rtol=1e-4)
+    assert np.isnan(judged.size[[2, 4]]).all()
+    assert judged.verdict == ("pass", "indeterminate", "", "pass", "")
+    assert verdicts.of_result(whole(limit=8.0)).verdict[1] == "fail"
+    assert verdicts.of_result(whole(limit=5.5)).verdict[0] == "indeterminate"
+    assert verdicts.of_result(whole(limit=2.0)).verdict == ("fail", "fail", "", "indeterminate", "")
+    assert verdicts.of_result(whole(limit=NAN)).verdict == ("no limit", "no limit", "", "no limit", "")
+
+
+@pytest.mark.parametrize("matching", ["ambiguous", "failed"])
+def test_nothing_passes_where_it_is_not_known_which_node_is_which(matching):
+    assert set(verdicts.of_result(whole(matching=matching)).verdict) == {"indeterminate", ""}
+
+
+def test_a_node_that_did_not_move_has_no_direction_but_a_verdict():
+    still = whole(movement=np.zeros((5, 3)))
+    judged = verdicts.of_result(still)
+    assert judged.verdict[0] == "pass"
+    assert judged.size[0] == 0.0
+
+
+# --- results.json --------------------------------------------------------------------------------------------------
+
+
+def written(result):
+    made = results_json.results_json(*of_frame(result))
+    return json.loads(json.dumps(made, allow_nan=False))["steps"]["spheres"]
+
+
+def test_results_json_of_a_whole_frame():
+    step = written(whole())
+    first, second, lost, _, extra = step["balls"]
+    assert first["size"] == 45.0
+    assert (first["axes"], first["stations"]) == (3, 2)
+    assert first["bound_sd"] == {"x": 0.08, "y": 0.16, "z": 0.24, "radius": 0.04, "lowest": 0.09}
+    assert first["efficiency"] == {"centre": 0.8, "radius": 0.9, "lowest": 0.95}
+    assert first["movement"]["vector"] == [3.0, 4.0, 0.0]
+    assert first["movement"]["ci95"] == pytest.approx([0.98, 1.96, 3.92])
+    assert first["movement"]["verdict"] == "pass"
+    assert second["movement"]["size"] == 12.0
+    assert "movement" not in lost
+    assert "movement" not in extra
+    assert step["gauge"] == "design frame"
+    assert step["movement_limit"] == {"mm": 10.0, "source": "project.toml"}
+    assert step["matching"]["status"] == "ok"
+    assert step["matching"]["T_design_scan"] == np.eye(4).tolist()
+    assert np.shape(step["matching"]["covariance"]) == (6, 6)
+    assert step["matching"]["rivals"] == []
+    assert [(one["a"], one["b"], one["bow"]) for one in step["tubes"]] == [(10, 11, 0.5), (13, -1, 1.5)]
+    assert step["tubes"][0]["start"] == [100.0, 0.0, 6000.0]
+    assert [(one["name"], one["said"]) for one in step["stations"]] == [("S1", ""), ("=S2", "weak: seen by few tubes")]
+    assert np.shape(step["stations"][1]["T"]) == (4, 4)
+
+
+def test_results_json_holds_only_what_there_is():
+    paper = balls()
+    execution = Execution(scene(whole()), (StepRun("spheres", "ransac", "{}", paper),), PROVENANCE)
+    step = results_json.results_json(execution, ErrorReport())["steps"]["spheres"]
+    assert set(step) == {"status", "method", "message", "balls"}
+    assert "size" not in step["balls"][0]
+    blind = written(whole(gauge="", matching="", movement=[], movement_ci95=[], movement_covariance=[]))
+    assert not {"gauge", "matching", "movement_limit"} & set(blind)
+    assert "tubes" in blind
+
+
+def test_the_result_goes_through_the_store_unchanged(tmp_path):
+    made = whole()
+    store.write_results(tmp_path / "r.h5", [StepRun("spheres", "ray", "{}", made)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", {"spheres": spheres.Result})
+    for field in dataclasses.fields(made):
+        np.testing.assert_array_equal(getattr(back.result, field.name), getattr(made, field.name))
+
+
+# --- tables --------------------------------------------------------------------------------------------------------
+
+
+def test_csv_of_balls_and_of_lowest_points():
+    first, second, lost, *_ = by_file("balls", None, with_truth()[0])
+    assert float(first["ci95_x_mm"]) == pytest.approx(0.196, abs=1e-4)
+    assert float(first["ci95_radius_mm"]) == pytest.approx(0.098, abs=1e-4)
+    assert (first["size_mm"], first["nominal_radius_mm"], first["radius_error_mm"]) == ("45.0", "45.0", "0.1")
+    assert (first["bound_sd_z_mm"], first["efficiency_lowest_z"], first["evidence"]) == ("0.24", "0.95", "fused")
+    assert (second["flag"], second["remark"]) == ("wrong-size", "size 60 mm instead of 50 mm")
+    assert not [name for name in first if "formal" in name]
+    assert lost["x_mm"] == lost["radius_mm"] == ""
+    crew = by_file("lowest")
+    assert list(crew[0]) == ["id", "x_mm", "y_mm", "z_mm", "ci95_z_mm", "radius_mm", "flag"]
+    assert (crew[0]["x_mm"], crew[0]["z_mm"], crew[0]["radius_mm"]) == ("3.0", "5954.9", "45.1")
+    assert float(crew[1]["ci95_z_mm"]) == pytest.approx(0.392, abs=1e-4)
+    assert (crew[2]["z_mm"], crew[2]["flag"]) == ("", "not-found")
+
+
+def test_csv_of_nodes_tubes_and_stations():
+    nodes = by_file("nodes")
+    assert (nodes[0]["dx_mm"], nodes[0]["dy_mm"], nodes[0]["movement_mm"]) == ("3.0", "4.0", "5.0")
+    assert [row["verdict"] for row in nodes] == ["pass", "indeterminate", "", "pass", ""]
+    assert {row["limit_mm"] for row in nodes} == {"10.0"}
+    one, open_end = by_file("tubes")
+    assert (one["ball_a"], one["ball_b"], one["length_mm"], one["bow_mm"]) == ("10", "11", "2800.0", "0.5")
+    assert (open_end["ball_b"], open_end["start_y_mm"]) == ("", "3900.0")
+    still, moved = by_file("stations")
+    assert (still["dx_mm"], still["turn_z_mrad"]) == ("0.0", "0.0")
+    assert (moved["station"], moved["dx_mm"], moved["dy_mm"], moved["dz_mm"]) == ("'=S2", "1.0", "-2.0", "3.0")
+
+
+def test_a_stations_shift_is_that_at_the_balls():
+    # Half a milliradian about z through a point 500 km away: the transform's translation is 250 m, the shift is none.
+    far = np.array([5e8, 4e9, 0.0])
+    R = np.array([[math.cos(5e-4), -math.sin(5e-4), 0.0], [math.sin(5e-4), math.cos(5e-4), 0.0], [0.0, 0.0, 1.0]])
+    made = whole()
+    centres = made.centres + far
+    middle = np.nanmean(centres, axis=0)
+    T = np.array([pose(), pose(R, middle - R @ middle + [0.0, 0.0, 2.0])])
+    _, moved = by_file("stations", dataclasses.replace(made, centres=centres, T_station=T))
+    assert [float(moved[name]) for name in ("dx_mm", "dy_mm", "dz_mm")] == pytest.approx([0.0, 0.0, 2.0], abs=2e-5)
+    assert float(moved["turn_z_mrad"]) == pytest.approx(0.5, abs=1e-6)
+
+
+def test_without_a_limit_the_table_says_so():
+    (table,) = [one for one in tables.all_of(*of_frame(whole(limit=NAN))) if one.file == "nodes"]
+    assert "node_place_mm" in table.note
+    (table,) = [one for one in tables.all_of(*of_frame(whole(matching="ambiguous"))) if one.file == "nodes"]
+    assert "10 mm by project.toml" in table.note
+    assert "not certain" in table.note
+
+
+def test_the_terminal_has_a_summary_what_to_look_at_and_the_stations():
+    shown = [one for one in tables.all_of(*of_frame()) if one.on_terminal]
+    assert [one.title.split(",")[0] for one in shown] == [
+        "Balls in short", "Balls to look at", "Stations against each other (mm"
+    ]  # fmt: skip
+    values = {row[0]: row[1] for row in shown[0].rows}
+    assert (values["balls"], values["flag ok"], values["flag not-found"]) == (5, 2, 1)
+    assert values["95 % half-width of the radius, median"] == pytest.approx(0.098, abs=1e-4)
+    assert (values["movement of a node, largest"], values["nodes, verdict pass"]) == (12.0, 2)
+    assert [row[0] for row in shown[1].rows] == [11, 12, 13]
+
+
+# --- drawing -------------------------------------------------------------------------------------------------------
+
+
+def opened(data):
+    return ezdxf.read(io.StringIO(data.decode("utf-8")))
+
+
+@pytest.mark.parametrize("T", [pose(), pose(TURN, (7e5, -2e5, 100.0))], ids=["same frame", "turned"])
+def test_a_drawing_read_back(T):
+    document = opened(dxf.drawing(whole(T=T)))
+    assert not document.audit().has_errors
+    assert document.header["$INSUNITS"] == 4  # millimetres
+    space = document.modelspace()
+    count = {
+        (kind, layer): len(space.query(f'{kind}[layer=="{layer}"]'))
+        for kind, layer in (
+            ("CIRCLE", "NODES"), ("POINT", "NODES"), ("LINE", "AXES"), ("LINE", "MOVEMENTS"), ("TEXT", "IDS"),
+        )
+    }  # fmt: skip
+    assert list(count.values()) == [4, 4, 2, 3, 4]
+    assert len(space) == sum(count.values())
+    assert {text.dxf.text for text in space.query("TEXT")} == {"10", "11", "13", "14"}
+    assert sorted(round(c.dxf.radius, 6) for c in space.query("CIRCLE")) == [45.0, 45.1, 50.0, 60.2]
+    moved = {
+        tuple(np.round(T[:3, :3] @ line.dxf.start + T[:3, 3], 4)) for line in space.query('LINE[layer=="MOVEMENTS"]')
+    }
+    assert moved == {tuple(NOMINAL[i]) for i in (0, 1, 3)}
+
+
+def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
+    code = (
+        "import hashlib; from tests.unit.test_report_balls import whole; from processor.report import dxf;"
+        "print(hashlib.sha256(dxf.drawing(whole())).hexdigest())"
+    )
+    data = dxf.drawing(whole())
+    assert not ezdxf.options.write_fixed_meta_data_for_testing
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONHASHSEED": "7"},
+    )
+    assert done.stdout.strip() == hashlib.sha256(data).hexdigest()
+    assert b"S2" not in data
+    assert b"weak" not in data
+
+
+def test_starting_the_program_loads_no_drawing_library():
+    code = "import sys, processor.cli, processor.report.writing; assert 'ezdxf' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
+    execution, report = of_frame()
+    writing.write(tmp_path / "out", execution, report)
+    found = {path.name for path in (tmp_path / "out").iterdir()}
+    assert {"nodes.dxf", "balls.csv", "lowest.csv", "nodes.csv", "tubes.csv", "stations.csv"} <= found
+    writing.check_output(tmp_path / "out", tmp_path / "b.h5")
+    writing.write(
+        tmp_path / "out", Execution(execution.scene, (StepRun("spheres", "ransac", "{}", balls()),), PROVENANCE), report
+    )
+    assert not {"nodes.dxf", "lowest.csv", "nodes.csv"} & {path.name for path in (tmp_path / "out").iterdir()}
+
+
+# --- figures and page ----------------------------------------------------------------------------------------------
+
+
+def test_figures_of_a_frame_and_those_of_balls_to_look_at():
+    report, result = with_truth()
+    found = figures.of_run(*of_frame(result, report))
+    assert set(found) == {
+        "plan.png", "radius-errors.png", "ball-errors.png", "ball-to-see-11.png", "ball-to-see-12.png",
+        "ball-to-see-13.png",
+    }  # fmt: skip
+    assert "times their size" in found["plan.png"][0]
+    assert "minus truth" in found["ball-errors.png"][0]
+    assert "sd" not in found["ball-errors.png"][0]
+    assert found["ball-to-see-11.png"][0].startswith("Ball 11, wrong-size")
+    with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
+        assert figures.of_run(*of_frame(result, report)) == found
+    assert all(figures_balls.is_own(name) for name in found)
+    assert not figures_balls.is_own("bridge.png")
+    untold = figures.of_run(*of_frame())
+    assert "Standard deviations" in untold["ball-errors.png"][0]
+
+
+def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
+    found = figures.of_run(*of_frame(points=np.empty((0, 3))))
+    assert set(found) == {"plan.png", "ball-errors.png"}
+
+
+def test_at_most_twelve_balls_have_a_picture_worst_first():
+    made = whole()
+    many = {
+        name: np.tile(value, (8,) + (1,) * (value.ndim - 1))
+        for name in (field.name for field in dataclasses.fields(made) if field.metadata.get("shape", ("",))[0] == "k")
+        if len(value := getattr(made, name))
+    }
+    many["ids"] = np.arange(40)
+    texts = {name: getattr(made, name) * 8 for name in ("evidence", "flag", "reason")}
+    drawn = figures_ball.of_result(scene(made), dataclasses.replace(made, **many, **texts))
+    assert len(drawn) == 12
+    assert [caption.split(",")[1].split(":")[0].strip() for caption, _ in drawn.values()][:8] == ["wrong-size"] * 8
+    assert "the first 12 of" in next(iter(drawn.values()))[0]
+
+
+def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-500.0, 500.0, (5000, 3))
+    origin = np.array([4e8, 3e9, 0.0])
+    T = pose(TURN, (100.0, 0.0, 0.0))
+    scans = (
+        Scan("a", points[:2000], origin),
+        Scan("b", (points[2000:] + origin - T[:3, 3]) @ T[:3, :3], T_project_scan=T),
+    )
+    made = Scene("s", "space-frame", scans, stations=Stations())
+    centres = origin + np.array([[0.0, 0.0, 0.0], [200.0, -100.0, 300.0]])
+    for crop, centre, far in zip(
+        figures_ball.crops_about(made, centres, np.array([90.0, 150.0])), centres, (90.0, 150.0), strict=True
+    ):
+        away = np.linalg.norm(points + origin - centre, axis=1)
+        assert len(crop) == (away <= far).sum() > 0
+        np.testing.assert_allclose(np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5)
+
+
+def test_the_expected_distribution_holds_as_many_errors_as_there_are():
+    x = np.linspace(-5.0, 5.0, 1001)
+    y = figures_balls._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
+    assert y.sum() * (x[1] - x[0]) / 0.1 == pytest.approx(2.0, abs=1e-6)
+    assert y[500] == pytest.approx(0.1 * (1 / 0.2 + 1 / 0.5) / math.sqrt(2.0 * math.pi))
+    assert figures_balls._mixture(x, np.array([NAN]), 0.1) is None
+
+
+def test_where_the_design_has_a_ball():
+    T = pose(TURN, (7e5, -2e5, 100.0))
+    made = whole(T=T)
+    np.testing.assert_allclose(
+        figures_ball.designed_places(scene(made), made)[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6
+    )
+    assert np.isnan(figures_ball.designed_places(scene(made), made)[4]).all()
+
+
+def test_the_page_of_a_frame():
+    execution, report = of_frame()
+    drawn = figures.of_run(execution, report)
+    text = page.html(execution, report, drawn)
+    found = Page(text)
+    assert {"Nodes against the design (mm)", "Balls to look at, method ray (mm)", "Balls, method ray (mm)"} <= set(
+        found.tables
+    )
+    assert found.tables["Nodes against the design (mm)"][1][-3] == "pass"
+    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == len(drawn)
+    assert "Nodes against the design" in text[text.index("<h2>") :]
+
+
+def test_a_roof_of_thirty_thousand_keeps_the_page_small():
+    made = whole()
+    n = 6000
+    many = {
+        name: np.tile(value, (n,) + (1,) * (value.ndim - 1))
+        for name in (field.name for field in dataclasses.fields(made) if field.metadata.get("shape", ("",))[0] == "k")
+        if len(value := getattr(made, name))
+    }
+    texts = {name: getattr(made, name) * n for name in ("evidence", "flag", "reason")}
+    execution, report = of_frame(dataclasses.replace(made, **many, **texts))
+    assert len(page.html(execution, report, {})) < 12_000_000
