@@ -43,6 +43,9 @@ def drawing(result: Result) -> bytes:
         _draw(document.modelspace(), result)
         low, high = _extent(result)
         document.header["$EXTMIN"], document.header["$EXTMAX"] = tuple(low), tuple(high)
+        # The library takes them from a set, whose order differs from run to run.
+        document.classes.add_required_classes(document.dxfversion)
+        document.classes.classes = dict(sorted(document.classes.classes.items()))
         out = io.StringIO(newline="\n")
         document.write(out)
     finally:

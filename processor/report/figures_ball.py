@@ -29,7 +29,8 @@ VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of e
 
 def of_result(scene: Scene, result: spheres.Result) -> Drawn:
     """Draw the balls that are not ok, MOST_BALLS of them at most; none where the scene's points are not at hand."""
-    centres = _middles(scene, result)
+    nominal = designed_places(scene, result)
+    centres = np.where(np.isfinite(result.centres), result.centres, nominal)
     there = np.flatnonzero(np.isfinite(centres).all(axis=1)).tolist()
     doubtful = [i for flag in ORDER for i in there if result.flag[i] == flag]
     shown = doubtful[:MOST_BALLS]
@@ -43,7 +44,7 @@ def of_result(scene: Scene, result: spheres.Result) -> Drawn:
         f"{PREFIX}{int(result.ids[i])}.png": (
             f"Ball {int(result.ids[i])}, {result.flag[i]}: the points about it{as_is}; dark are those within "
             f"{SLICE_MM:g} mm of the plane through its centre{more}",
-            _ball(result, i, centres[i], crops[k], reach[k]),
+            _ball(result, i, centres[i], nominal[i] - centres[i], crops[k], reach[k]),
         )
         for k, i in enumerate(shown)
     }
@@ -79,22 +80,14 @@ def crops_about(scene: Scene, centres: Floats, reach: Floats) -> list[Floats]:
     return [np.vstack(parts) if parts else np.empty((0, 3)) for parts in found]
 
 
-def _middles(scene: Scene, result: spheres.Result) -> Floats:
-    """Where to look for each ball: where it was found, else where the design has it."""
-    lost = ~np.isfinite(result.centres)
-    return np.where(lost, designed_places(scene, result), result.centres)
-
-
 def _radius(result: spheres.Result, i: int) -> float:
     known = [float(one[i]) for one in (result.radii, result.nominal_radii) if np.isfinite(one[i])]
     return max([LEAST_RADIUS_MM, *known])
 
 
-def _ball(result: spheres.Result, i: int, middle: Floats, points: Floats, reach: float) -> bytes:
+def _ball(result: spheres.Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float) -> bytes:
+    """Draw a ball about ``middle`` (3,); ``nominal`` (3,) is less it."""
     figure = Figure(figsize=(9.4, 5.3), layout="constrained")
-    nominal = nominal_places(result)[i] - middle
-    if not np.isfinite(nominal).all():
-        nominal = np.zeros(3) if not np.isfinite(result.centres[i]).all() else np.full(3, np.nan)
     for axes, (name, across) in zip(figure.subplots(1, 2), VIEWS, strict=True):
         _points(axes, points, across)
         _members(axes, result, i, middle, across, reach)
