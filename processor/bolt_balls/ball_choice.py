@@ -8,11 +8,16 @@ with that of its priors, less a reward for each point it explains.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+import numpy.typing as npt
+from numba import njit
 
 from processor.bolt_balls.ball_residuals import residual, select, variance
 from processor.bolt_balls.ball_solve import solve
 from processor.bolt_balls.ball_votes import by_votes, least_of, rows_within, taken, votes, with_expected
+from processor.bolt_balls.threads import over_ranges
+from processor.model import Floats, Ints, Labels
+
+Bools = npt.NDArray[np.bool_]
 
 REWARD = 9.0  # of a point on the ball, in chi-square: residuals of 3 sd are as likely stray as not
 THROUGH = 9.0  # for a ray that was measured beyond the ball it meets: steel cannot be seen through
@@ -188,32 +193,62 @@ def choose_at(  # type: ignore[no-untyped-def]
         second[k], second_energy[k] = all_states[then, 3] if free else own[then], found[then]
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def choose(  # type: ignore[no-untyped-def]
-    start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise, tube_off,
-    centre_weight, sizes, size_weight, expected, surprise, free, kernel, catch, shift_covariance,
-    wanted_nodes,
-):  # fmt: skip
+def choose(
+    crops: tuple[Ints, Floats, Floats, Floats, Labels],
+    ends: tuple[Ints, Floats, Floats, Floats, Floats],
+    limits: tuple[float, float],
+    noise: Floats,
+    centre_weight: Floats,
+    sizes: Floats,
+    size_weight: float,
+    expected: Floats,
+    surprise: float,
+    free: bool,
+    kernel: float,
+    catch: float,
+    shift_covariance: Floats,
+    wanted: Bools,
+    threads: int = 0,
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Best state (k, 4), its size (k,) and energy (k,), the runner-up's size (k,) and energy (k,) of every node.
 
+    ``crops``: start, points, rays, ranges and stations; ``ends``: start, points and directions of the members' axes,
+    and how far from them sleeves and tubes reach; ``limits``: radius of the process hole's cap and least cosine.
     ``sizes`` (m,) are tried with weight ``size_weight``, and where ``free`` only as starts; energies of sizes other
-    than the node's ``expected`` (k,) one (NaN = none) are raised by ``surprise``. NaN and infinite where nothing fits.
+    than the node's ``expected`` (k,) one (NaN = none) are raised by ``surprise``. NaN and infinite where nothing fits,
+    and where the answer is not ``wanted`` (k,).
 
     Sleeves hide more of a small ball than of a large one: sizes near the best are compared by the points that are
     kept off none of them, or the size with the most points would win.
     """
-    nodes = len(start) - 1
+    nodes = len(expected)
     states = np.full((nodes, 4), np.nan)
     size, energies = np.full(nodes, np.nan), np.full(nodes, np.inf)
     second, second_energy = np.full(nodes, np.nan), np.full(nodes, np.inf)
-    for k in prange(nodes):  # its number is turned into one kind of integer, or numba compiles two kernels
-        choose_at(
-            np.int64(k), start, points, rays,
-            ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine,
-            noise, tube_off, centre_weight, sizes, size_weight, expected, surprise, free, kernel, catch,
-            shift_covariance, wanted_nodes, states, size, energies, second, second_energy,
-        )  # fmt: skip
+    over_ranges(
+        lambda a, b: _choose_range(
+            a, b, *crops, *ends, *limits, noise, centre_weight, sizes, size_weight, expected, surprise, free, kernel,
+            catch, shift_covariance, wanted, states, size, energies, second, second_energy,
+        ),
+        nodes,
+        threads,
+    )  # fmt: skip
     return states, size, energies, second, second_energy
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _choose_range(  # type: ignore[no-untyped-def]
+    begin, end, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, tube_off, hole,
+    least_cosine, noise, centre_weight, sizes, size_weight, expected, surprise, free, kernel, catch, shift_covariance,
+    wanted_nodes, states, size, energies, second, second_energy,
+):  # fmt: skip
+    """Choose the sizes of nodes ``begin`` to ``end``; see :func:`choose`."""
+    for k in range(begin, end):
+        choose_at(
+            k, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise,
+            tube_off, centre_weight, sizes, size_weight, expected, surprise, free, kernel, catch, shift_covariance,
+            wanted_nodes, states, size, energies, second, second_energy,
+        )  # fmt: skip
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -6,9 +6,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from processor.bolt_balls.nodes import Nodes, Tubes
+from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats, Ints
 
 # Of a hexagon's corner radius: the median distance from its axis of a point on it is 0.901, of a round sleeve 1.
@@ -55,7 +56,7 @@ def first_guess(found: Ends) -> Floats:
     return guess
 
 
-def measured(found: Ends, start: Ints, points: Floats, centres: Floats, radii: Floats) -> Floats:
+def measured(found: Ends, start: Ints, points: Floats, centres: Floats, radii: Floats, threads: int = 0) -> Floats:
     """Corner radii (m,) of sleeves from the points just beyond the balls, mm.
 
     The larger of an end's own and the median of the ends with tubes alike: too much hidden costs a few points, too
@@ -64,7 +65,14 @@ def measured(found: Ends, start: Ints, points: Floats, centres: Floats, radii: F
     guess = first_guess(found)
     # NaN tubes look as far as the widest plausible sleeve
     widest = np.where(np.isfinite(found.tube_radii), found.tube_radii + 6.0, 50.0)
-    medians, counts = _medians(start, points, found.start, found.points, found.directions, widest, centres, radii)
+    medians, counts = np.full(len(guess), np.nan), np.zeros(len(guess), np.int64)
+    over_ranges(
+        lambda a, b: _medians(
+            a, b, start, points, found.start, found.points, found.directions, widest, centres, radii, medians, counts
+        ),
+        len(radii),
+        threads,
+    )
     own = np.where(counts >= LEAST_POINTS, medians / MEDIAN_OF_CORNER, np.nan)
     corner = guess.copy()
     classes = np.where(np.isfinite(found.tube_radii), np.rint(found.tube_radii / CLASS_MM), -1.0)
@@ -78,11 +86,10 @@ def measured(found: Ends, start: Ints, points: Floats, centres: Floats, radii: F
     return result
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _medians(start, points, end_start, foot, directions, widest, centres, radii):  # type: ignore[no-untyped-def]
-    """Median distance from the axis and number of points 4 to 25 mm beyond each end's ball."""
-    found, counts = np.full(len(foot), np.nan), np.zeros(len(foot), np.int64)
-    for k in prange(len(start) - 1):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _medians(begin, end, start, points, end_start, foot, directions, widest, centres, radii, found, counts):  # type: ignore[no-untyped-def]
+    """Fill median distance from the axis and number of points 4 to 25 mm beyond each end's ball."""
+    for k in range(begin, end):
         if np.isnan(radii[k]):
             continue
         off = np.empty(start[k + 1] - start[k])
@@ -104,4 +111,3 @@ def _medians(start, points, end_start, foot, directions, widest, centres, radii)
             counts[m] = kept
             if kept > 0:
                 found[m] = np.median(off[:kept])
-    return found, counts

@@ -6,12 +6,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from processor.bolt_balls.ball_choice import AROUND_MM, fit_one, segments
 from processor.bolt_balls.ball_residuals import residual, variance, weight
 from processor.bolt_balls.ball_solve import inverse_of, normal_equations, solve
 from processor.bolt_balls.ball_votes import rows_within, taken
+from processor.bolt_balls.threads import over_ranges
+from processor.model import Floats, Ints, Labels
 
 SETTLED_MM = 1e-6
 LARGEST_BIAS = 0.3  # sd
@@ -220,31 +222,56 @@ def finish_at(  # type: ignore[no-untyped-def]
     numbers[k, 6], numbers[k, 7] = chi2, 1.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def finish(  # type: ignore[no-untyped-def]
-    start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise, believed,
-    centre_weight, sizes, size_weights, states, catch, shift_covariance,
-):  # fmt: skip
+def finish(
+    crops: tuple[Ints, Floats, Floats, Floats, Labels],
+    ends: tuple[Ints, Floats, Floats, Floats],
+    limits: tuple[float, float],
+    noise: Floats,
+    believed: float,
+    centre_weight: Floats,
+    sizes: Floats,
+    size_weights: Floats,
+    states: Floats,
+    catch: float,
+    shift_covariance: Floats,
+    threads: int = 0,
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats]:
     """Fit every node whose state (k, 4) is finite, with its size's prior, and say how well.
 
     ``believed`` is how many points the noise model is worth: the scale about it is estimated ball by ball, its squares
     with as many degrees of freedom as points, and the model's own beside them. The bounds are those of the noise and
     the priors with every point at its full weight and stations that stand still.
 
+    ``crops``, ``ends`` and ``limits`` are those of :func:`processor.bolt_balls.ball_choice.choose`, without the tubes'.
     Returns states (k, 4), covariances (k, 4, 4), bounds (k, 4, 4), numbers (k, 8) = points, cells, stations, rms, scale
     about the noise model, degrees of freedom, chi-square of the centre's prior, whether it fitted; and of every point
     residual, cosine and weight.
     """
-    nodes = len(start) - 1
-    found = np.full((nodes, 4), np.nan)
+    nodes, count = len(states), len(crops[1])
+    found, numbers = np.full((nodes, 4), np.nan), np.zeros((nodes, 8))
     covariances, bounds = np.full((nodes, 4, 4), np.nan), np.full((nodes, 4, 4), np.nan)
-    numbers = np.zeros((nodes, 8))
-    errors, cosines, on = np.zeros(len(points)), np.zeros(len(points)), np.zeros(len(points))
-    for k in prange(nodes):
-        finish_at(
-            np.int64(k), start, points, rays,
-            ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine,
-            noise, believed, centre_weight, sizes, size_weights, states, catch, shift_covariance, found, covariances,
-            bounds, numbers, errors, cosines, on,
-        )  # fmt: skip
+    errors, cosines, on = np.zeros(count), np.zeros(count), np.zeros(count)
+    over_ranges(
+        lambda a, b: _finish_range(
+            a, b, *crops, *ends, *limits, noise, believed, centre_weight, sizes, size_weights, states, catch,
+            shift_covariance, found, covariances, bounds, numbers, errors, cosines, on,
+        ),
+        nodes,
+        threads,
+    )  # fmt: skip
     return found, covariances, bounds, numbers, errors, cosines, on
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _finish_range(  # type: ignore[no-untyped-def]
+    begin, end, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine,
+    noise, believed, centre_weight, sizes, size_weights, states, catch, shift_covariance, found, covariances, bounds,
+    numbers, errors, cosines, on,
+):  # fmt: skip
+    """Fit nodes ``begin`` to ``end``; see :func:`finish`."""
+    for k in range(begin, end):
+        finish_at(
+            k, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise,
+            believed, centre_weight, sizes, size_weights, states, catch, shift_covariance, found, covariances, bounds,
+            numbers, errors, cosines, on,
+        )  # fmt: skip

@@ -8,10 +8,11 @@ between stations, the balls' residuals would be as likely as computed here; the 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from processor.bolt_balls.ball_residuals import residual, variance
 from processor.bolt_balls.ball_solve import inverse_of
+from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats, Ints, Labels
 
 # In mm; the first is what the others must beat by EVIDENCE in chi-square.
@@ -33,14 +34,22 @@ def shift_sd(
     centre_weights: Floats,
     sizes: Floats,
     size_weight: float,
+    threads: int = 0,
 ) -> float:
     """Return the likeliest sd in mm of a station's shift along each axis; 0 where the balls do not ask for one.
 
     ``on`` (n,) are the weights and ``states`` (k, 4) the balls of fits with stations that stand still.
     """
-    costs, several = _costs(
-        start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight, GRID
-    )
+    nodes = len(states)
+    costs, several = np.zeros((nodes, len(GRID))), np.zeros(nodes, np.uint8)
+    over_ranges(
+        lambda a, b: _cost_range(
+            a, b, start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight,
+            GRID, costs, several,
+        ),
+        nodes,
+        threads,
+    )  # fmt: skip
     if int(several.sum()) < LEAST_BALLS:
         return 0.0
     total = costs.sum(axis=0)
@@ -79,7 +88,7 @@ def _cost_at(  # type: ignore[no-untyped-def]
     k, start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight, grid,
     costs, several,
 ):  # fmt: skip
-    """Fill the costs of node ``k``; see :func:`_costs`."""
+    """Fill the costs of node ``k``; see :func:`_cost_range`."""
     if not usable[k]:
         return
     x, y, z, r = states[k, 0], states[k, 1], states[k, 2], states[k, 3]
@@ -164,17 +173,14 @@ def _cost_at(  # type: ignore[no-untyped-def]
             costs[k, t] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _costs(  # type: ignore[no-untyped-def]
-    start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight, grid
-):
-    """Minus twice the logarithm of the likelihood (k, m) of each sd, and whether several stations saw the ball (k,)."""
-    nodes = len(start) - 1
-    costs, several = np.zeros((nodes, len(grid))), np.zeros(nodes, np.uint8)
-    for k in prange(nodes):
+@njit(cache=True, nogil=True, error_model="numpy")
+def _cost_range(  # type: ignore[no-untyped-def]
+    begin, end, start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight,
+    grid, costs, several,
+):  # fmt: skip
+    """Fill minus twice the logarithm of the likelihood (k, m) of each sd, and whether several stations saw the ball."""
+    for k in range(begin, end):
         _cost_at(
-            np.int64(k), start, points, rays,
-            ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight,
+            k, start, points, rays, ranges, station, on, states, usable, noise, centre_weights, sizes, size_weight,
             grid, costs, several,
         )  # fmt: skip
-    return costs, several

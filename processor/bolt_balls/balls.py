@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba import njit, prange
+from numba import njit
 
 from processor.bolt_balls import ball_ends, ball_flags, ball_noise
 from processor.bolt_balls.ball_choice import choose
@@ -22,6 +22,7 @@ from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.crops import Crops, gather
 from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.source import Source
+from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats
 
 NAN = float("nan")
@@ -42,6 +43,7 @@ class Params:
     least_cosine: float = LEAST_COSINE
     surprise: float = 9.0  # by which the energy of a size other than the expected one is raised
     catch_mm: float = 12.0  # how far off a point may be and still draw the first steps
+    threads: int = 0  # as many as there are
 
 
 @dataclass(frozen=True)
@@ -69,7 +71,8 @@ def find_balls(
     largest = float(catalogue.radii.max()) if len(catalogue.radii) else LARGEST_FREE_MM
     if expected_mm is not None and np.isfinite(expected_mm).any():
         largest = max(largest, float(np.nanmax(expected_mm)))
-    crops = gather(source, nodes.positions, largest + MARGIN_MM)
+    threads = params.threads if params else 0
+    crops = gather(source, nodes.positions, largest + MARGIN_MM, threads)
     return fit_crops(crops, source.scanners, nodes, tubes, catalogue, expected_mm, station_covariance, params)
 
 
@@ -87,8 +90,8 @@ def fit_crops(
     params = params or Params()
     k = nodes.count
     expected = np.full(k, NAN) if expected_mm is None else np.asarray(expected_mm, np.float64)
-    directions, ranges = _rays(crops.start, crops.points, crops.station, nodes.positions, np.asarray(scanners))
-    rays = _Rays(directions, ranges)
+    rays = _aimed(crops, np.array(nodes.positions), np.array(scanners, np.float64), params.threads)
+    ranges = rays.ranges
     found = ball_ends.ends(nodes, tubes)
     weights = centre_weights(nodes.covariance)
     noise = np.array([params.sigma_mm**2, 0.0, 0.0])
@@ -130,7 +133,7 @@ def _learnt(
 ) -> _Setting:
     """Learn from one round, over all balls, what the next one holds; ``left``: residuals, cosines, weights (n,)."""
     errors, cosines, on = left
-    corner = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3])
+    corner = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3], params.threads)
     noise, count = ball_noise.noise_model(errors, cosines, rays.ranges, on, setting.noise)
     variances = ball_noise.variances_of(noise, cosines, rays.ranges)
     limb = ball_noise.limb_cosine(errors, cosines, variances, on, setting.least_cosine)
@@ -143,7 +146,7 @@ def _learnt(
     # once stations are known to move, their residuals no longer say by how much
     station_sd = setting.station_sd or shift_sd(
         crops.start, crops.points, rays.directions, rays.ranges, crops.station, on, fits.states, sure, noise, weights,
-        fits.sizes, size_weight,
+        fits.sizes, size_weight, params.threads,
     )  # fmt: skip
     return _Setting(noise, min(count, MOST_BELIEVED), corner, radius_sd, limb, station_sd)
 
@@ -179,12 +182,14 @@ def _fit(
     keep_off = setting.corner + FLAT_MM + AXIS_MM + 0.5 * sigma
     tube_off = np.where(np.isfinite(found.tube_radii), found.tube_radii, 1.5 * setting.corner) + 2.0 + 2.0 * sigma
     size_weight = 0.0 if free else 1.0 / setting.radius_sd**2
-    common = (crops.start, crops.points, rays.directions, rays.ranges, crops.station, found.start, found.points,
-              found.directions, keep_off, params.process_hole_mm, setting.least_cosine, noise)  # fmt: skip
+    near = (crops.start, crops.points, rays.directions, rays.ranges, crops.station)
+    axes = (found.start, found.points, found.directions, keep_off)
+    limits = (params.process_hole_mm, setting.least_cosine)
     doubtful = np.ones(len(weights), bool) if before is None else ~before.beyond_doubt
     chosen = choose(
-        *common, tube_off, weights, FREE_SIZES if free else np.array(catalogue.radii), size_weight, expected,
-        params.surprise, free, 2.5 * sigma + 1.0, params.catch_mm, shift, doubtful,
+        near, (*axes, tube_off), limits, noise, weights, FREE_SIZES if free else np.array(catalogue.radii),
+        size_weight, expected, params.surprise, free, 2.5 * sigma + 1.0, params.catch_mm, shift, doubtful,
+        params.threads,
     )  # fmt: skip
     if before is not None:
         kept = (before.states, before.sizes, before.energy, before.second, before.second_energy)
@@ -192,7 +197,17 @@ def _fit(
             new[~doubtful] = old[~doubtful]
     states, sizes, energy, second, second_energy = chosen
     states, covariance, bound, numbers, errors, cosines, on = finish(
-        *common, setting.believed, weights, sizes, np.full(len(states), size_weight), states, 4.5 * sigma, shift
+        near,
+        axes,
+        limits,
+        noise,
+        setting.believed,
+        weights,
+        sizes,
+        np.full(len(states), size_weight),
+        states,
+        4.5 * sigma,
+        shift,
     )
     return Fits(states, covariance, bound, sizes, energy, second, second_energy, numbers), errors, cosines, on
 
@@ -212,11 +227,21 @@ def centre_weights(covariance: Floats) -> Floats:
     return weights
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _rays(start, points, station, nodes, scanners):  # type: ignore[no-untyped-def]
-    """Return unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
-    directions, ranges = np.zeros((len(points), 3)), np.zeros(len(points))
-    for k in prange(len(start) - 1):
+def _aimed(crops: Crops, nodes: Floats, scanners: Floats, threads: int) -> _Rays:
+    """Rays of the gathered points from the scanners (s, 3) that saw them."""
+    directions, ranges = np.zeros((len(crops.points), 3)), np.zeros(len(crops.points))
+    over_ranges(
+        lambda a, b: _aim(a, b, crops.start, crops.points, crops.station, nodes, scanners, directions, ranges),
+        len(nodes),
+        threads,
+    )
+    return _Rays(directions, ranges)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _aim(begin, end, start, points, station, nodes, scanners, directions, ranges):  # type: ignore[no-untyped-def]
+    """Fill unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
+    for k in range(begin, end):
         for i in range(start[k], start[k + 1]):
             s = station[i]
             if s < 0 or s >= len(scanners):
@@ -228,4 +253,3 @@ def _rays(start, points, station, nodes, scanners):  # type: ignore[no-untyped-d
             if d > 0.0:
                 directions[i, 0], directions[i, 1], directions[i, 2] = x / d, y / d, z / d
                 ranges[i] = d
-    return directions, ranges

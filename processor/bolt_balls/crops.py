@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import njit, prange
+from numba import njit
 
 from processor.bolt_balls.source import Source
+from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats, Ints, Labels, UsageError
 
 STEPS_PER_MM = 1000.0  # gathered coordinates are whole micrometres: sorting them is exact
@@ -32,33 +33,31 @@ class Crops:
     station: Labels
 
 
-def gather(source: Source, nodes: Floats, reach_mm: float) -> Crops:
+def gather(source: Source, nodes: Floats, reach_mm: float, threads: int = 0) -> Crops:
     """Gather the points within ``reach_mm`` of nodes (k, 3), given less the source's origin; one pass over the source.
 
     A point near two nodes is gathered for both. The answer does not depend on chunks, order of points or threads.
     """
     if not 0.0 < reach_mm <= GREATEST_REACH_MM:
         raise UsageError(f"reach of a crop: expected above 0 to {GREATEST_REACH_MM:g} mm, got {reach_mm!r}")
-    nodes = np.ascontiguousarray(nodes, dtype=np.float64)
+    nodes = np.array(nodes, dtype=np.float64)
     if not len(nodes):
         return Crops(np.zeros(1, np.int64), np.empty((0, 3)), np.empty(0, np.int32))
     lower = nodes.min(axis=0) - reach_mm
-    table, cell_start, cell_nodes = _cells(nodes, lower, reach_mm)
+    upper = nodes.max(axis=0) + reach_mm
+    table, cells = _cells(nodes, lower, reach_mm)
     owners: list[Labels] = [np.empty(0, np.int32)]
     steps: list[Labels] = [np.empty((0, 3), np.int32)]
     stations: list[Labels] = [np.empty(0, np.int32)]
     for chunk in source.chunks():
         found = _near(
-            _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32), nodes, lower,
-            reach_mm, *table, cell_start, cell_nodes,
+            _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32), nodes, lower, upper, reach_mm, table,
+            cells, threads,
         )  # fmt: skip
         owners.append(found[0])
         steps.append(found[1])
         stations.append(found[2])
-    start, points, station = _sorted(
-        np.concatenate(owners), np.concatenate(steps), np.concatenate(stations), len(nodes)
-    )
-    return Crops(start, points, station)
+    return _sorted(np.concatenate(owners), np.concatenate(steps), np.concatenate(stations), len(nodes), threads)
 
 
 def _frozen(values: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
@@ -68,7 +67,7 @@ def _frozen(values: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
     return found
 
 
-def _cells(nodes: Floats, lower: Floats, reach: float) -> tuple[tuple[Ints, Labels], Ints, Labels]:
+def _cells(nodes: Floats, lower: Floats, reach: float) -> tuple[tuple[Ints, Labels], tuple[Ints, Labels]]:
     """Hash table of the cells that spheres about the nodes touch, and the nodes of each cell.
 
     A cell's edge is the spheres' diameter, so a sphere touches eight cells at most, and a point lies in one.
@@ -91,7 +90,7 @@ def _cells(nodes: Floats, lower: Floats, reach: float) -> tuple[tuple[Ints, Labe
     table = np.full(1 << bits, EMPTY, np.int64)
     row = np.full(1 << bits, EMPTY, np.int32)
     _fill(unique, table, row)
-    return (table, row), np.append(begin, len(key)).astype(np.int64), owner[order].astype(np.int32)
+    return (table, row), (np.append(begin, len(key)).astype(np.int64), owner[order].astype(np.int32))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -111,22 +110,53 @@ def _fill(keys, table, row):  # type: ignore[no-untyped-def]
         row[at] = i
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _near(points, station, nodes, lower, reach, table, row, cell_start, cell_nodes):  # type: ignore[no-untyped-def]
+def _near(
+    points: Floats,
+    station: Labels,
+    nodes: Floats,
+    lower: Floats,
+    upper: Floats,
+    reach: float,
+    table: tuple[Ints, Labels],
+    cells: tuple[Ints, Labels],
+    threads: int,
+) -> tuple[Labels, Labels, Labels]:
     """Owner (m,), offset from it in steps (m, 3) and station (m,) of every pair of a node and a point near it."""
     n = len(points)
     blocks = (n + BLOCK - 1) // BLOCK
+    cell, candidate = np.empty(n, np.int32), np.empty(n, np.int32)
+    candidates, pairs = np.zeros(blocks, np.int64), np.zeros(blocks, np.int64)
+    over_ranges(
+        lambda a, b: _look(
+            a, b, points, nodes, lower, upper, reach, *table, *cells, candidate, cell, candidates, pairs
+        ),
+        blocks,
+        threads,
+    )
+    place = np.concatenate([np.zeros(1, np.int64), np.cumsum(pairs)])
+    count = int(place[-1])
+    owner, steps, seen = np.empty(count, np.int32), np.empty((count, 3), np.int32), np.empty(count, np.int32)
+    over_ranges(
+        lambda a, b: _take(
+            a, b, points, station, nodes, reach, *cells, candidate, cell, candidates, place, owner, steps, seen
+        ),
+        blocks,
+        threads,
+    )
+    return owner, steps, seen
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _look(  # type: ignore[no-untyped-def]
+    begin, end, points, nodes, lower, upper, reach, table, row, cell_start, cell_nodes, candidate, cell, candidates,
+    pairs,
+):  # fmt: skip
+    """Fill, by blocks, which points are near a node, the cells they are in, and how many they and the pairs are."""
+    n = len(points)
     mask = len(table) - 1
     inverse = 1.0 / (2.0 * reach)
     reach2 = reach * reach
-    upper = np.empty(3)
-    for axis in range(3):
-        upper[axis] = nodes[:, axis].max() + reach
-    cell = np.empty(n, np.int32)
-    candidate = np.empty(n, np.int32)
-    candidates = np.zeros(blocks, np.int64)
-    pairs = np.zeros(blocks + 1, np.int64)
-    for block in prange(blocks):
+    for block in range(begin, end):
         kept, total = 0, 0
         base = block * BLOCK
         for i in range(base, min(n, base + BLOCK)):
@@ -156,13 +186,17 @@ def _near(points, station, nodes, lower, reach, table, row, cell_start, cell_nod
                 kept += 1
                 total += near
         candidates[block] = kept
-        pairs[block + 1] = total
-    for block in range(blocks):
-        pairs[block + 1] += pairs[block]
-    count = pairs[blocks]
-    owner, steps, seen = np.empty(count, np.int32), np.empty((count, 3), np.int32), np.empty(count, np.int32)
-    for block in prange(blocks):
-        to = pairs[block]
+        pairs[block] = total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _take(  # type: ignore[no-untyped-def]
+    begin, end, points, station, nodes, reach, cell_start, cell_nodes, candidate, cell, candidates, place, owner,
+    steps, seen,
+):  # fmt: skip
+    """Fill the pairs of blocks from their places on."""
+    for block in range(begin, end):
+        to = place[block]
         base = block * BLOCK
         for k in range(base, base + candidates[block]):
             i, here = candidate[k], cell[k]
@@ -171,32 +205,39 @@ def _near(points, station, nodes, lower, reach, table, row, cell_start, cell_nod
                 dx = points[i, 0] - nodes[node, 0]
                 dy = points[i, 1] - nodes[node, 1]
                 dz = points[i, 2] - nodes[node, 2]
-                if dx * dx + dy * dy + dz * dz <= reach2:
+                if dx * dx + dy * dy + dz * dz <= reach * reach:
                     owner[to] = node
                     steps[to, 0] = np.int32(np.rint(dx * STEPS_PER_MM))
                     steps[to, 1] = np.int32(np.rint(dy * STEPS_PER_MM))
                     steps[to, 2] = np.int32(np.rint(dz * STEPS_PER_MM))
                     seen[to] = station[i]
                     to += 1
-    return owner, steps, seen
 
 
-@njit(cache=True, nogil=True, error_model="numpy", parallel=True)
-def _sorted(owner, steps, station, nodes):  # type: ignore[no-untyped-def]
-    """Start (k + 1,) of each node's points, and points (n, 3) mm and station (n,) in canonical order."""
-    n = len(owner)
-    start = np.zeros(nodes + 1, np.int64)
-    for i in range(n):
-        start[owner[i] + 1] += 1
-    for k in range(nodes):
-        start[k + 1] += start[k]
+def _sorted(owner: Labels, steps: Labels, station: Labels, nodes: int, threads: int) -> Crops:
+    """Crops of the pairs, every node's in canonical order."""
+    start = np.concatenate([np.zeros(1, np.int64), np.cumsum(np.bincount(owner, minlength=nodes))])
+    by_node = _by_node(owner, start)
+    points, seen = np.empty((len(owner), 3)), np.empty(len(owner), np.int32)
+    over_ranges(lambda a, b: _sort(a, b, start, by_node, steps, station, points, seen), nodes, threads)
+    return Crops(start, points, seen)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _by_node(owner, start):  # type: ignore[no-untyped-def]
+    """Return the rows of pairs, node by node."""
     place = start[:-1].copy()
-    by_node = np.empty(n, np.int64)
-    for i in range(n):
-        by_node[place[owner[i]]] = i
+    rows = np.empty(len(owner), np.int64)
+    for i in range(len(owner)):
+        rows[place[owner[i]]] = i
         place[owner[i]] += 1
-    points, seen = np.empty((n, 3)), np.empty(n, np.int32)
-    for k in prange(nodes):
+    return rows
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sort(begin, end, start, by_node, steps, station, points, seen):  # type: ignore[no-untyped-def]
+    """Fill points (n, 3) mm and station (n,) of nodes in canonical order."""
+    for k in range(begin, end):
         first, last = start[k], start[k + 1]
         key = np.empty(last - first, np.int64)
         for j in range(first, last):
@@ -204,14 +245,23 @@ def _sorted(owner, steps, station, nodes):  # type: ignore[no-untyped-def]
             x, y, z = np.int64(steps[i, 0]), np.int64(steps[i, 1]), np.int64(steps[i, 2])
             key[j - first] = ((x + (1 << 20)) << 42) | ((y + (1 << 20)) << 21) | (z + (1 << 20))
         by_place = np.argsort(key)
-        at = np.empty(last - first, np.int32)
+        # stable, by counting: within a station the points keep their order by place, and what is equal in both is the
+        # same; stations are few
+        lowest, highest = 1 << 30, -1
+        for j in range(first, last):
+            lowest = min(lowest, np.int64(station[by_node[j]]))
+            highest = max(highest, np.int64(station[by_node[j]]))
+        if last == first:
+            continue
+        to = np.zeros(highest - lowest + 2, np.int64)
+        for j in range(first, last):
+            to[station[by_node[j]] - lowest + 1] += 1
+        for s in range(1, len(to)):
+            to[s] += to[s - 1]
         for j in range(last - first):
-            at[j] = station[by_node[first + by_place[j]]]
-        # stable: within a station the points keep their order by place, and what is equal in both is the same
-        by_station = np.argsort(at, kind="mergesort")
-        for j in range(last - first):
-            i = by_node[first + by_place[by_station[j]]]
+            i = by_node[first + by_place[j]]
+            s = station[i] - lowest
             for axis in range(3):
-                points[first + j, axis] = steps[i, axis] / STEPS_PER_MM
-            seen[first + j] = station[i]
-    return start, points, seen
+                points[first + to[s], axis] = steps[i, axis] / STEPS_PER_MM
+            seen[first + to[s]] = station[i]
+            to[s] += 1

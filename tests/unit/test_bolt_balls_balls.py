@@ -2,13 +2,12 @@
 
 import dataclasses
 
-import numba
 import numpy as np
 import pytest
 
 from processor.bolt_balls import catalogue, crops
 from processor.bolt_balls.ball_baselines import paper_estimates
-from processor.bolt_balls.balls import find_balls
+from processor.bolt_balls.balls import Params, find_balls
 from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.source import InMemory
 from processor.model import UsageError
@@ -61,12 +60,8 @@ def test_order_chunks_and_threads_change_nothing(roof, found):
     order = np.random.default_rng(1).permutation(source.count)
     mixed = InMemory(source.points[order], source.station[order], source.scanners, chunk_size=3001)
     assert same_bytes(found, find_balls(mixed, nodes, tubes, catalogue.load()))
-    threads = numba.get_num_threads()
-    try:
-        numba.set_num_threads(1)
-        assert same_bytes(found, find_balls(source, nodes, tubes, catalogue.load()))
-    finally:
-        numba.set_num_threads(threads)
+    alone = find_balls(source, nodes, tubes, catalogue.load(), params=Params(threads=1))
+    assert same_bytes(found, alone)
 
 
 def test_moving_all_by_the_map_grid_moves_nothing(roof, found):
