@@ -4,11 +4,10 @@ Every part i, registered to its design, is moved by a small motion x_i (turn abo
 
     sum of squared gaps + lambda sum of squared departures of the bottom edges
 
-is least: gaps of eight pairs a joint along three axes, departures sideways and up at stations of both edges. A part
-whose joint is not known could slide along itself: the square of every part's movement along its chord counts too, by a
-weight of HOLD, too small to move a gap by a thousandth of a millimetre. The gap of parts that are not perfect depends
-on lambda, so it is stated, and the curve over lambda is part of the answer. All is linear in what was measured; its
-covariance goes through.
+is least: gaps of eight pairs a joint along three axes, departures sideways and up at stations of both edges. Where a
+joint is not known its parts could slide along themselves: then the square of every part's movement along its chord
+counts too, by a weight of HOLD. The gap of parts that are not perfect depends on lambda, so it is stated, and the curve
+over lambda is part of the answer. All is linear in what was measured; its covariance goes through.
 """
 
 from __future__ import annotations
@@ -75,7 +74,8 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
     seen = _observations(members, joint_points, joint_frames)
     root = np.ones(len(seen.value))
     root[24 * int((seen.gap_row >= 0).sum()) : -len(members)] = np.sqrt(weight)
-    root[-len(members) :] = np.sqrt(HOLD)
+    # A chain that hangs together slides as the objective says: to hold it would move its gaps by hundredths.
+    root[-len(members) :] = np.sqrt(HOLD) if (seen.gap_row < 0).any() or not len(seen.gap_row) else 0.0
     weighted = seen.A * root[:, None]
     # Lengths about their own middle and turns differ by thousands: unit columns keep the solution's digits.
     size = np.linalg.norm(weighted, axis=0)
