@@ -303,14 +303,15 @@ def mutations(content, rng, count):
         yield bytes(data)
 
 
-def test_damaged_files_end_in_a_result_or_an_input_error(tmp_path, capfd):
-    """Forty files, a process each, two at a time; sixty take longer than a unit test may."""
+@pytest.mark.parametrize("each", [10, pytest.param(20, marks=pytest.mark.slow)])
+def test_damaged_files_end_in_a_result_or_an_input_error(tmp_path, capfd, each):
+    """A process a file, two at a time."""
     shapes = {"a": cq.Workplane().box(30, 20, 10).edges("|Z").fillet(2).faces(">Z").hole(4).val()}
     cad_files.write_step(tmp_path / "whole.step", shapes)
     wall(tmp_path / "whole.ifc", "MILLI", (4000, 200, 2700))
     rng, files = random.Random(7), []
     for whole in (tmp_path / "whole.step", tmp_path / "whole.ifc"):
-        for number, data in enumerate(mutations(whole.read_bytes(), rng, 20)):
+        for number, data in enumerate(mutations(whole.read_bytes(), rng, each)):
             files.append(tmp_path / f"{number}{whole.suffix}")
             files[-1].write_bytes(data)
     capfd.readouterr()
@@ -326,8 +327,8 @@ def test_damaged_files_end_in_a_result_or_an_input_error(tmp_path, capfd):
     with ThreadPoolExecutor(2) as pool:
         outcomes = list(pool.map(outcome, files))
     assert capfd.readouterr() == ("", "")
-    assert len(outcomes) == 40
-    for kind in (outcomes[:20], outcomes[20:]):
+    assert len(outcomes) == 2 * each
+    for kind in (outcomes[:each], outcomes[each:]):
         assert {"refused", "said"} <= set(kind) <= {"refused", "said", "read"}
 
 

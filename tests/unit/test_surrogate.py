@@ -229,6 +229,7 @@ def test_a_wrong_part_is_not_called_ok(without_meshes):
         assert found.status != "ok", (asked, came, found.message)
 
 
+@pytest.mark.slow
 def test_poses_of_any_kind_are_right_or_not_called_ok(without_meshes):
     scene, truth = without_meshes
     rng = np.random.default_rng(8)
