@@ -159,7 +159,7 @@ def _designed(source: Source, design: FrameDesign, expansion: float, params: mem
     rows = np.concatenate([rows, np.full(int(other.sum()), -1)])
     points = members.points_near(source, starts, every, params)
     measured = members.measure(points, source.scanners, starts, every, params)
-    return _Start(starts, every, rows, measured, pose, (pose.message,) if pose.message else ())
+    return _Start(starts, every, rows, measured, pose)
 
 
 def _registered(

@@ -141,8 +141,8 @@ def measure(points: Gathered, scanners: Floats, starts: Floats, pairs: Ints, par
         params.threads,
     )  # fmt: skip
     nodes, tubes = _nodes(fits, starts, pairs, params)
-    seen = np.linalg.norm(start.points[start.ok, None] - scanners[None], axis=2).mean() if len(scanners) else 0.0
-    apart = float(np.sqrt(off[0] + off[1] * (1e-3 * float(seen)) ** 2))
+    away = np.linalg.norm(start.points[start.ok, None] - scanners[None], axis=2)
+    apart = float(np.sqrt(off[0] + off[1] * (1e-3 * float(away.mean() if away.size else 0.0)) ** 2))
     return Measured(nodes, tubes, points, np.flatnonzero(fits.ok), apart)
 
 
