@@ -117,7 +117,10 @@ def control_points(
     seen = [one for one in measured if one.scan]
     if not seen:
         raise InputError(f"{known[0].where}: no control point is seen in a scan; say where one has it ('scan', 'seen')")
-    point, scan, station, place = [], [], [], []
+    point: list[int] = []
+    scan: list[int] = []
+    station: list[int] = []
+    place: list[Floats] = []
     for one in seen:
         if one.name not in row:
             raise InputError(f"{one.where}: {one.name!r} is seen in {one.scan!r}, but has no coordinates of its own")

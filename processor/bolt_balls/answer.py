@@ -16,7 +16,7 @@ from processor.preassembly import tolerance
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
 NOWHERE = "not in the design"
-UNUSED = "control points were not used: that takes scanner positions, and stations that may be moved"
+UNUSED = "control points were not used: that takes members that meet, scanner positions, and stations that may be moved"
 
 
 def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
@@ -105,7 +105,7 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         datum="" if stations is None else stations.datum,
         control_names=() if stations is None else stations.control,
         control_off=np.empty((0, 3)) if stations is None else stations.control_off,
-        control_used=np.empty(0) if stations is None else stations.control_used,
+        control_used=np.empty(0, np.int64) if stations is None else stations.control_used,
     )
 
 

@@ -149,7 +149,8 @@ class Posterior:
             weighted = precision[:, None] * self.M[:, 3:]
             inner = product(np.ascontiguousarray(self.M[:, 3:].T), weighted) + np.eye(3) / self.datum_mm**2
             P -= product(weighted, solve(cholesky(inner), np.ascontiguousarray(weighted.T)))
-        return 0.5 * (P + P.T)
+        found: Floats = 0.5 * (P + P.T)
+        return found
 
     def _with_control(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
         return (H, g) if self.control is None else self.control.added(H, g, x, self.places)

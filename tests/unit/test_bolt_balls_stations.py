@@ -208,7 +208,7 @@ def test_covariances_with_control_points_are_honest_over_many_seeds():
 
 
 def test_a_wrong_control_point_is_left_out_and_named():
-    nodes, seen, _ = frame(4, 5, 5, per_pair=40)
+    _, seen, _ = frame(4, 5, 5, per_pair=40)
     for size in (15.0, 400.0):
         off = np.zeros((5, 3))
         off[2] = [0.6 * size, 0.0, 0.8 * size]
