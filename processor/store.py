@@ -250,12 +250,15 @@ def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats)
         return scan_tiles.read_box(members[names.index(scan_name)], lower, upper)
 
 
-def read_truth(path: Path) -> Truth | None:
-    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone."""
+def read_truth(path: Path, labels: bool = True) -> Truth | None:
+    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone.
+
+    Without ``labels`` what each point really is stays in the file.
+    """
     with opened(path, ["scene", "truth"]) as file:
         if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
             return None
-        return codec.read_record(_group(file, "truth"), Truth)
+        return codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()})
 
 
 def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:

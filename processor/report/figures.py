@@ -22,5 +22,5 @@ def of_run(execution: Execution, report: ErrorReport) -> Drawn:
             if run.step == "preassemble":
                 found |= figures_preassembly.of_runs(execution.scene, runs)
             if run.step == "spheres":
-                found |= figures_balls.of_runs(execution.scene, runs, report)
+                found |= figures_balls.of_runs(execution.scene, runs, report, execution.stored)
     return found
