@@ -57,8 +57,9 @@ def judged(
             evidence.append("axes")
             enough = axes_known[i] and nodes.axes[i] >= 2
             flags.append("low-confidence" if enough else "not-found")
+            seen = f"known from {nodes.axes[i]} axes alone" if enough else "and no two axes that fix the node"
             source = "the radius is the design's" if np.isfinite(expected[i]) else "the radius is unknown"
-            reasons.append(f"no ball seen, known from {nodes.axes[i]} axes alone; {source}")
+            reasons.append(f"no ball seen, {seen}" + (f"; {source}" if enough else ""))
             continue
         has_prior = bool(axes_known[i]) and fits.numbers[i, 6] > 0.0
         evidence.append("fused" if has_prior else "ball")
@@ -140,18 +141,23 @@ def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:
     What the points move an estimate by has the covariance that they take away from the prior.
     """
     found = np.ones(nodes.count)
-    for i in np.flatnonzero(fits.numbers[:, 7] > 0):
-        prior = np.zeros((4, 4))
-        held = np.zeros(4, bool)
-        if np.isfinite(nodes.covariance[i]).all() and fits.numbers[i, 6] > 0.0:
-            prior[:3, :3], held[:3] = nodes.covariance[i], True
-        if np.isfinite(radius_sd):
-            prior[3, 3], held[3] = radius_sd**2, True
-        if not held.any():
+    fitted = np.asarray(fits.numbers[:, 7] > 0)
+    placed = np.isfinite(nodes.covariance).all(axis=(1, 2)) & np.asarray(fits.numbers[:, 6] > 0.0)
+    sized = bool(np.isfinite(radius_sd))
+    every = fits.states - fits.sizes[:, None] * np.array([0.0, 0.0, 0.0, 1.0])
+    for has_place in (True, False):
+        held = np.flatnonzero([has_place] * 3 + [sized])
+        rows = np.flatnonzero(fitted & (placed == has_place))
+        if not len(held) or not len(rows):
             continue
-        off = (fits.states[i] - [0.0, 0.0, 0.0, fits.sizes[i]])[held]
-        L = np.linalg.inv(np.linalg.cholesky(prior[np.ix_(held, held)]))
-        taken, axes = np.linalg.eigh(np.eye(len(L)) - L @ fits.covariance[i][np.ix_(held, held)] @ L.T)
-        chi2 = float(np.sum((axes.T @ (L @ off)) ** 2 / np.maximum(taken, LEAST_NEWS)))
-        found[i] = float(chdtrc(len(L), chi2))
+        prior = np.zeros((len(rows), 4, 4))
+        if has_place:
+            prior[:, :3, :3] = nodes.covariance[rows]
+        if sized:
+            prior[:, 3, 3] = radius_sd**2
+        L = np.linalg.inv(np.linalg.cholesky(prior[:, held[:, None], held]))
+        C = fits.covariance[rows][:, held[:, None], held]
+        taken, axes = np.linalg.eigh(np.eye(len(held)) - L @ C @ np.swapaxes(L, 1, 2))
+        along = np.einsum("kji,kjl,kl->ki", axes, L, every[rows][:, held])
+        found[rows] = chdtrc(len(held), np.sum(along**2 / np.maximum(taken, LEAST_NEWS), axis=1))
     return found

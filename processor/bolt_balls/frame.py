@@ -14,7 +14,8 @@ from processor.bolt_balls import balls, junctions, matching, members, movement, 
 from processor.bolt_balls.ball_records import Balls
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.corrected import Corrected, corrected_gathered
-from processor.bolt_balls.matching import Found, Matching
+from processor.bolt_balls.match_odds import Found
+from processor.bolt_balls.matching import Matching
 from processor.bolt_balls.members import Measured
 from processor.bolt_balls.movement import Movement
 from processor.bolt_balls.nodes import Nodes, Tubes
