@@ -17,6 +17,7 @@ LARGEST_RADIUS_SD = 0.05
 LARGEST_SCALE = 1.6
 UNLIKELY = 1e-3  # probability below which ball and priors are said to disagree
 LEAST_NEWS = 0.02  # share of a prior's variance that points must take away to be heard against it
+SURE = 3.0  # standard deviations beyond which an offset of all radii is spoken of
 FEW = 30
 FEW_MARGIN = 10.0  # more that the runner-up must lose by where points are few
 
@@ -30,15 +31,21 @@ def judged(
     noise: Floats,
     radius_sd: float,
     station_sd: float,
+    offset: tuple[float, float],
 ) -> Balls:
-    """Give every node its numbers, evidence, flag and reason."""
+    """Give every node its numbers, evidence, flag and reason.
+
+    ``offset`` is what radii lie off their sizes on the whole and its standard deviation, mm: it may come from an offset
+    of all ranges, so it stays in the radii, and in their covariances. Seen from below the surface stays where it is.
+    """
     k = nodes.count
     fitted = np.asarray(fits.numbers[:, 7] > 0)
     state = fits.states.copy()
     degrees = fits.numbers[:, 5]
     # The scale is estimated: the variance of Student's t is wider than the normal one.
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
-    covariance = fits.covariance * wider[:, None, None]
+    common = np.array([0.0, 0.0, 1.0, 1.0]) * np.sqrt(max(offset[0] ** 2 - offset[1] ** 2, 0.0))
+    covariance = fits.covariance * wider[:, None, None] + np.outer(common, common)
     axes_known = np.asarray(np.isfinite(nodes.covariance).all(axis=(1, 2)))
     evidence, flags, reasons = [], [], []
     margin = fits.margin
@@ -102,6 +109,9 @@ def judged(
     )
     if station_sd > 0.0:
         message += f"; stations disagree by {station_sd:.1f} mm an axis (sd), which every covariance holds"
+    if abs(offset[0]) > SURE * offset[1]:
+        message += f"; radii lie {offset[0]:+.2f} mm off their sizes on the whole, as where all ranges are off: their "
+        message += "intervals hold that"
     if len(catalogue.radii) and not catalogue.verified:
         message += f"; the catalogue of radii ({catalogue.name}) was not held against a published one"
     return Balls(
