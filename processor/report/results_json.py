@@ -118,7 +118,9 @@ def _adjusted(result: preassemble.Result) -> dict[str, Any]:
     for joint, measures, verdict, proposal in zip(
         result.joints, result.measures, result.judged, result.proposals, strict=True
     ):
-        rows = zip(measures.name, measures.value, measures.ci95, measures.unit, strict=True)
+        rows = zip(
+            measures.name, measures.value, measures.ci95, measures.low, measures.high, measures.unit, strict=True
+        )
         limits = zip(
             verdict.key, verdict.what, verdict.value, verdict.ci95, verdict.low, verdict.high, verdict.each,
             verdict.each_probability, verdict.clause, verdict.verified, strict=True,
@@ -128,7 +130,10 @@ def _adjusted(result: preassemble.Result) -> dict[str, Any]:
             {
                 "name": joint,
                 "gaps_joint_axes": dict(zip(KEY_POINTS, measures.gaps, strict=True)),
-                "measures": {name: {"value": v, "ci95": ci, "unit": unit} for name, v, ci, unit in rows},
+                "measures": {
+                    name: {"value": value, "ci95": ci95, "low": low, "high": high, "unit": unit}
+                    for name, value, ci95, low, high, unit in rows
+                },
                 "limits": [{**dict(zip(keys, row[:-1], strict=True)), "verified": bool(row[-1])} for row in limits],
                 "probability": verdict.probability,
                 "proposal": {
