@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import jinja2
@@ -31,8 +31,12 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
     environment.filters["shown"] = shown
     scene = execution.scene
     points = sum(len(scan.points) for scan in scene.scans)
-    live_step, live = _live(execution)
-    script, digest = view.script() if live else ("", "'none'")
+    live = {
+        run.step: data
+        for run, others in tables.grouped(execution.runs)
+        if (data := step_report.of(run.step).live(scene, [run, *others])) is not None
+    }
+    script, digest = view.script()
     text: str = environment.get_template("page.html").render(
         title=scene.name,
         kind=scene.kind,
@@ -40,23 +44,14 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         points=f"{points:,} points" if points else "points left in the file",
         units=scene.units,
         units_reason=scene.units_reason,
-        live=live,
+        live=view.embedded({"words": {}, "steps": live}),
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),
-        sections=_sections(execution, report, figures, live_step),
+        sections=_sections(execution, report, figures, set(live)),
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
     return text
-
-
-def _live(execution: Execution) -> tuple[str, str]:
-    """Return what the page's script draws, as JSON, with the step that it is of; empty where there is nothing."""
-    for run, others in tables.grouped(execution.runs):
-        data = step_report.of(run.step).live(execution.scene, [run, *others])
-        if data is not None:
-            return run.step, view.embedded(data)
-    return "", ""
 
 
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]:
@@ -89,7 +84,7 @@ def _tone(run: StepRun) -> str:
 
 
 def _sections(
-    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live_step: str
+    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str]
 ) -> list[dict[str, Any]]:
     sections = []
     for run, others in tables.grouped(execution.runs):
@@ -100,7 +95,8 @@ def _sections(
                 "message": run.result.message,
                 "lead": [_table(one) for one in shown_tables if one.file in LEAD],
                 "tables": [_table(one) for one in shown_tables if one.file not in LEAD],
-                "live": run.step == live_step,
+                "step": run.step,
+                "live": run.step in live,
                 "figures": [
                     {"caption": caption, "data": base64.b64encode(png).decode("ascii")}
                     for caption, png in figures.get(run.step, {}).values()
@@ -109,7 +105,9 @@ def _sections(
         )
     if report.metrics:
         checks = _table(tables.of_checks(report))
-        sections.append({"title": "Truth", "message": "", "lead": [], "tables": [checks], "figures": [], "live": False})
+        sections.append(
+            {"title": "Truth", "message": "", "lead": [], "tables": [checks], "figures": [], "live": False, "step": ""}
+        )
     return sections
 
 
