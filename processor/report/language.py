@@ -73,7 +73,7 @@ class Language:
 
 
 def _pattern(key: str) -> re.Pattern[str]:
-    return re.compile("(.+?)".join(re.escape(part) for part in key.split("{}")), re.DOTALL)
+    return re.compile("((?:(?!; ).)+?)".join(re.escape(part) for part in key.split("{}")), re.DOTALL)
 
 
 @cache

@@ -5,7 +5,7 @@ import pytest
 from processor.report import language
 
 
-@pytest.fixture()
+@pytest.fixture
 def spoken(monkeypatch):
     found = language.Language("en")
     found.words = {"pass": "合格", "fail": "不合格", "gap": "间隙"}
