@@ -10,6 +10,7 @@ import click
 
 from processor import __version__
 from processor.model import InputError, Metric
+from processor.progress import stage
 
 if TYPE_CHECKING:
     from processor.evaluate import ErrorReport
@@ -73,7 +74,8 @@ def run(
     if steps:
         pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
     piecewise = pipeline.is_large(input_)
-    scene = pipeline.read(input_, units, piecewise)
+    with stage(f"reading {input_.name}"):
+        scene = pipeline.read(input_, units, piecewise)
     jobs = pipeline.plan(steps or pipeline.steps_for(scene), methods, parameters, seed)
     if piecewise and not pipeline.streams(jobs):
         piecewise = False
@@ -81,7 +83,8 @@ def run(
     say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
     execution = pipeline.execute(input_, scene, jobs, say, piecewise)
     report = evaluate(input_, execution)
-    writing.write(output, execution, report, lang)
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, report, lang)
     _show(context, output, execution, report, as_json)
 
 
@@ -116,7 +119,8 @@ def report(context: click.Context, output: Path, input_: Path, units: str | None
     writing.check_output(output, input_)
     execution = pipeline.read_execution(output / writing.RUNS, input_, units)
     found = evaluate(input_, execution)
-    writing.write(output, execution, found, lang)
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, found, lang)
     _show(context, output, execution, found, as_json)
 
 
