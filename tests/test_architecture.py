@@ -1,9 +1,9 @@
 """The arrows of the README's picture, read from the imports."""
 
 import ast
+import os
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -75,9 +75,10 @@ def test_help_comes_at_once(package):
     )
     took = []
     for _ in range(2):
-        started = time.monotonic()
+        before = os.times()
         subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, cwd=ROOT)
-        took.append(time.monotonic() - started)
+        after = os.times()  # of processors: other work on the machine does not count
+        took.append(after.children_user + after.children_system - before.children_user - before.children_system)
     assert min(took) < 1.0
 
 
