@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from processor import readers, store
+from processor.control_files import CONTROL, Measured, control_points, read_control
 from processor.design_files import read_design, read_json, read_mesh
 from processor.fields import Table, inside
 from processor.model import (
@@ -40,8 +42,8 @@ PROJECT = "project.toml"
 TRUTH = "truth.h5"
 STATIONS = "stations.json"
 DESIGNS = ("design.json", "design.csv")
-NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv")
-KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance")
+NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv", CONTROL)
+KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance", "control")
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
 
@@ -72,6 +74,7 @@ class _Project:
     temperature_C: float
     entries: tuple[_Entry, ...]
     tolerance: Tolerance | None = None
+    control: tuple[Measured, ...] = ()
 
 
 def truth_file(path: Path) -> Path | None:
@@ -143,14 +146,16 @@ def _read_project(folder: Path) -> _Project:
     named = table.text("design", "") or next((name for name in DESIGNS if (folder / name).exists()), "")
     design = inside(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
+    control, apart = read_control(folder, table)
     return _Project(
         table.text("name", folder.resolve().name),
         kind,
         table.unit("units", ""),
         design,
         table.number("temperature_C", float("nan")),
-        tuple(entries or [_Entry(found) for found in _found(folder, design)]),
+        tuple(entries or [_Entry(found) for found in _found(folder, {design, apart})]),
         _tolerance(table),
+        control,
     )
 
 
@@ -196,11 +201,12 @@ def _entry(folder: Path, scan: Table) -> _Entry:
     )
 
 
-def _found(folder: Path, design: Path | None) -> list[Path]:
+def _found(folder: Path, others: Collection[Path | None]) -> list[Path]:
+    """Find the scans of a folder: all files of their formats but those of a name, and ``others``."""
     found = []
     for place in (folder, folder / "scans"):
         for path in sorted(place.iterdir()) if place.is_dir() else []:
-            scan = path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS and path != design
+            scan = path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS and path not in others
             if ((scan and path.is_file()) or readers.is_closed(path)) and not path.name.startswith("."):
                 found.append(inside(folder, str(path.relative_to(folder)), str(folder)))
     if not found:
@@ -223,6 +229,7 @@ def _scene(
         raise InputError(f"{project.design}: the design is of kind {kind}, but {PROJECT} says {project.kind}")
     parts = {part.name for part in arch.parts} if arch else set()
     scans: list[Scan] = []
+    units: list[str] = []
     reasons: dict[str, str] = {}
     for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
@@ -242,18 +249,21 @@ def _scene(
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
             _check_size(entry.path, scan, unit, reason, arch, frame)
             scans.append(scan)
+            units.append(unit)
+    where = places or _stations(scans)
     return Scene(
         project.name,
         kind,
         tuple(scans),
         arch,
         frame,
-        places or _stations(scans),
+        where,
         project.temperature_C,
         ", ".join(reasons),
         "; ".join(dict.fromkeys(reasons.values())),
         design if isinstance(design, StructureDesign) else None,
         project.tolerance,
+        control_points(project.control, scans, units, where, project.units or asked or "m"),
     )
 
 

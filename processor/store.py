@@ -28,12 +28,14 @@ from processor.codec import DecodeError
 from processor.model import Floats, InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.2"
+FORMAT_VERSION = "1.3"
+READABLE = ("1.2", FORMAT_VERSION)  # of scenes and truths: what is newer in a record may be absent there
 HISTORY = [
     "1.0: first",
     "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
     "1.2: bottom edges as built, in the truth of arch bridges; limits that the project names; "
     "what a part's mesh is made from",
+    "1.3: control points",
 ]
 
 # All that HDF5 and h5py raise for a damaged file; none of it names the file or helps its user.
@@ -196,8 +198,9 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
     if header["format"] not in wanted:
         return [f"expected format {' or '.join(wanted)}, found {header['format'] or 'none'}"]
     found = []
-    if header["format_version"] != FORMAT_VERSION:
-        found.append(f"expected format_version {FORMAT_VERSION}, found {header['format_version'] or 'none'}")
+    readable = (FORMAT_VERSION,) if header["format"] == FORMATS["results"] else READABLE
+    if header["format_version"] not in readable:
+        found.append(f"expected format_version {' or '.join(readable)}, found {header['format_version'] or 'none'}")
     if header["units"] != "mm":
         found.append(f"expected units mm, found {header['units'] or 'none'}")
     return found
@@ -247,12 +250,15 @@ def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats)
         return scan_tiles.read_box(members[names.index(scan_name)], lower, upper)
 
 
-def read_truth(path: Path) -> Truth | None:
-    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone."""
+def read_truth(path: Path, labels: bool = True) -> Truth | None:
+    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone.
+
+    Without ``labels`` what each point really is stays in the file.
+    """
     with opened(path, ["scene", "truth"]) as file:
         if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
             return None
-        return codec.read_record(_group(file, "truth"), Truth)
+        return codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()})
 
 
 def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:
@@ -354,7 +360,9 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
                 for part in parts:
                     digest.update(np.ascontiguousarray(part, kind).data)
                 continue
-            _feed(digest, field.name, getattr(value, field.name), pieces)
+            item = getattr(value, field.name)
+            if item is not None or not field.metadata.get("newer"):
+                _feed(digest, field.name, item, pieces)
         digest.update(b")")
     elif isinstance(value, tuple):
         digest.update(f"{name}:tuple{len(value)}(".encode())
