@@ -252,7 +252,7 @@ def test_spherical_points_by_hand():
 
 SCANS = [path for path in sorted(DATA.rglob("*")) if path.suffix in readers.SUFFIXES] if DATA.is_dir() else []
 REFUSED = {
-    "bunny_8.pts": "declares 8 points, but 9 follow",
+    "bunny_8.pts": "declares 8 points, but more follow",
     "multiple-and-transform.ptx": "not a rotation and a translation",
 }
 COUNTS = {  # as the files' headers or line counts say
