@@ -69,10 +69,10 @@ def run(
     writing.check_output(output, input_)
     parameters = pipeline.read_params(params)
     if steps:
-        pipeline.plan("", steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
+        pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
     piecewise = pipeline.is_large(input_)
     scene = pipeline.read(input_, units, piecewise)
-    jobs = pipeline.plan(scene.kind, steps, methods, parameters, seed)
+    jobs = pipeline.plan(steps or pipeline.steps_for(scene), methods, parameters, seed)
     if piecewise and not pipeline.streams(jobs):
         piecewise = False
         scene = pipeline.read(input_, units)

@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from graphlib import TopologicalSorter
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
@@ -104,23 +105,37 @@ def read_params(path: Path | None) -> dict[str, Any]:
     return found
 
 
-def plan(
-    kind: str, wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None
-) -> tuple[Job, ...]:
-    """Choose the steps for a kind of scene, or those wanted, with their methods; every name and type is checked.
+def steps_for(scene: Scene) -> tuple[str, ...]:
+    """Name the steps that run by themselves on a scene: those whose module ``applies``, or whose KIND is the scene's.
+
+    Raises UsageError where there are none.
+    """
+    modules = step_modules()
+    found = tuple(name for name, module in modules.items() if _applies(module, scene))
+    if not found:
+        raise UsageError(
+            f"no step runs by itself on a scene of kind {scene.kind}; name one with --steps: {', '.join(modules)}"
+        )
+    return found
+
+
+def _applies(module: ModuleType, scene: Scene) -> bool:
+    says: Callable[[Scene], bool] | None = getattr(module, "applies", None)
+    return scene.kind == module.KIND if says is None else says(scene)
+
+
+def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None) -> tuple[Job, ...]:
+    """Put steps in the order of their needs, with their methods; every name and type is checked.
 
     The first method named for a step gives the answer; further ones are run for comparison. Without a ``seed`` that
     of the parameters holds. Raises UsageError for whatever is not known, saying what is.
     """
     modules = step_modules()
-    chosen = list(dict.fromkeys(wanted)) or [name for name, module in modules.items() if kind == module.KIND]
-    if not chosen:
-        raise UsageError(
-            f"no step runs by itself on a scene of kind {kind}; name one with --steps: {', '.join(modules)}"
-        )
+    chosen = list(dict.fromkeys(wanted))
     for name in (*chosen, *params):
         if name not in modules:
             raise UsageError(f"no step {name!r}; there are {', '.join(modules)}")
+    chosen = _in_order(chosen, modules)
     offered = {name: [m for m in methods if m in modules[name].METHODS] for name in chosen}
     for method in methods:
         if not any(method in named for named in offered.values()):
@@ -142,6 +157,12 @@ def plan(
     # Answers before comparisons, in the order of the steps.
     firsts = [next(job for job in jobs if job.step == name) for name in chosen]
     return (*firsts, *(job for job in jobs if job not in firsts))
+
+
+def _in_order(chosen: Sequence[str], modules: Mapping[str, ModuleType]) -> list[str]:
+    """Sort names so that a step comes after those it needs, else as they are."""
+    needs = {name: [other for other in modules[name].NEEDS if other in chosen] for name in chosen}
+    return list(TopologicalSorter(needs).static_order())
 
 
 def fill(cls: type, table: Any, where: str) -> Any:
@@ -185,7 +206,12 @@ def execute(
 
     with points_of(path) if piecewise else nullcontext() as points:
         given = {} if points is None else {"points": points}
-        runs = [_run(path, scene, job, given, log) for job in jobs]
+        runs: list[StepRun] = []
+        answers: dict[str, Any] = {}
+        for job in jobs:
+            needs = {"earlier": {name: answers[name] for name in job.module.NEEDS if name in answers}}
+            runs.append(_run(path, scene, job, {**given, **needs} if job.module.NEEDS else given, log))
+            answers.setdefault(job.step, runs[-1].result)
         digest = store.scene_hash(scene, None if points is None else points.pieces)
     provenance = {
         "input": path.name,

@@ -100,15 +100,15 @@ def test_results_are_replaced_but_nothing_else(sphere_run, tmp_path):
 
 def test_the_command_lines_seed_goes_before_the_parameters(tmp_path):
     params = {"spheres": {"seed": 5}}
-    assert pipeline.plan("space-frame", (), (), params, None)[0].params.seed == 5
-    assert pipeline.plan("space-frame", (), (), params, 0)[0].params.seed == 0
-    assert pipeline.plan("space-frame", (), (), {}, None)[0].params.seed == 0
+    assert pipeline.plan(("spheres",), (), params, None)[0].params.seed == 5
+    assert pipeline.plan(("spheres",), (), params, 0)[0].params.seed == 0
+    assert pipeline.plan(("spheres",), (), {}, None)[0].params.seed == 0
     with pytest.raises(UsageError, match=r"preassemble\.seed"):  # a slip in the table of a step that does not run
-        pipeline.plan("space-frame", (), (), {"preassemble": {"seed": "x"}}, None)
+        pipeline.plan(("spheres",), (), {"preassemble": {"seed": "x"}}, None)
 
 
 def test_a_step_named_twice_runs_once():
-    assert len(pipeline.plan("", ("spheres", "spheres"), ("ransac", "ransac"), {}, 0)) == 1
+    assert len(pipeline.plan(("spheres", "spheres"), ("ransac", "ransac"), {}, 0)) == 1
 
 
 def test_what_a_step_did_not_foresee_is_said_in_one_line(frame, tmp_path, monkeypatch, capsys):
@@ -168,7 +168,7 @@ def test_a_report_is_made_again_without_running_the_steps(frame, tmp_path):
 
 def run_in_process(path, out, methods=()):
     scene = pipeline.read(path, None)
-    execution = pipeline.execute(path, scene, pipeline.plan(scene.kind, (), methods, {}, 0))
+    execution = pipeline.execute(path, scene, pipeline.plan(pipeline.steps_for(scene), methods, {}, 0))
     report = evaluate(path, execution)
     writing.write(out, execution, report)
     return json.loads((out / "results.json").read_text("utf-8")), report

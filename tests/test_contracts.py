@@ -3,6 +3,7 @@
 import dataclasses
 import importlib
 import pkgutil
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from designgen import recipes
 from designgen.scene import make
 from processor import pipeline, readers, store
-from processor.model import Metric, StepRun, UsageError
+from processor.model import Metric, Scene, StepRun, UsageError
+from processor.report import step_report
 
 STEPS = pipeline.step_modules()
 
@@ -25,6 +27,7 @@ def test_a_step_has_its_names(name):
         assert record.__dataclass_params__.frozen
     assert callable(module.run)
     assert callable(module.check)
+    assert step_report.of(name).title
 
 
 @pytest.mark.parametrize("name", STEPS)
@@ -61,11 +64,11 @@ def test_every_recipe_makes_a_scene_that_goes_through_the_store(name, tmp_path):
     assert back.kind == scene.kind
     assert sum(len(s.points) for s in back.scans) == sum(len(s.points) for s in scene.scans)
     if back.kind != "structure":  # no step takes these yet
-        assert pipeline.plan(back.kind, (), (), {}, 0)
+        assert pipeline.plan(pipeline.steps_for(back), (), {}, 0)
 
 
 def test_parameters_are_checked_by_name_and_type():
-    filled = pipeline.plan("arch-bridge", (), (), {"preassemble": {"boxes": {"edge_box_mm": 42}}}, 3)
+    filled = pipeline.plan(("preassemble",), (), {"preassemble": {"boxes": {"edge_box_mm": 42}}}, 3)
     assert filled[0].params.boxes.edge_box_mm == 42.0
     assert filled[0].params.seed == 3
     for table, said in [
@@ -76,11 +79,37 @@ def test_parameters_are_checked_by_name_and_type():
         ({"magic": {}}, "no step 'magic'"),
     ]:
         with pytest.raises(UsageError, match=said):
-            pipeline.plan("arch-bridge", (), (), table, 0)
+            pipeline.plan(("preassemble",), (), table, 0)
     with pytest.raises(UsageError, match="no method 'magic'"):
-        pipeline.plan("arch-bridge", (), ("magic",), {}, 0)
+        pipeline.plan(("preassemble",), ("magic",), {}, 0)
     with pytest.raises(UsageError, match="--steps"):
-        pipeline.plan("structure", (), (), {}, 0)
+        pipeline.steps_for(Scene(name="x", kind=""))
+
+
+@dataclasses.dataclass(frozen=True)
+class OneMethod:
+    method: str = "only"
+    seed: int = 0
+
+
+def test_steps_run_after_those_they_need_and_are_given_what_these_found(monkeypatch, tmp_path):
+    given = {}
+
+    def step(name, *needs):
+        def run(scene, params, earlier=None):
+            given[name] = earlier
+            return SimpleNamespace(status="ok", said=name)
+
+        return SimpleNamespace(NEEDS=needs, METHODS=("only",), Params=OneMethod, run=run, KIND="space-frame")
+
+    modules = {"a": step("a", "c", "b"), "b": step("b"), "c": step("c", "b")}
+    monkeypatch.setattr(pipeline, "step_modules", lambda: modules)
+    jobs = pipeline.plan(("a", "b", "c"), (), {}, 0)
+    assert [job.step for job in jobs] == ["b", "c", "a"]
+    pipeline.execute(tmp_path / "s.h5", Scene(name="x", kind="space-frame"), jobs)
+    assert given["b"] is None
+    assert {name: result.said for name, result in given["a"].items()} == {"c": "c", "b": "b"}
+    assert [job.step for job in pipeline.plan(("a", "b"), (), {}, 0)] == ["b", "a"]
 
 
 def test_a_metric_passes_only_within_its_limit():
