@@ -1,0 +1,114 @@
+"""Reads damaged files in watched processes: what crashes, hangs, takes memory or raises is counted, not suffered."""
+
+from __future__ import annotations
+
+import json
+import os
+import resource
+import select
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+
+from tests.damage import damaged
+
+MEMORY_BYTES = 2 << 30
+HANG_S = 10.0
+FAULTS = ("crash", "hang", "memory", "traceback", "empty", "unnamed")
+
+
+class Watched:
+    """A process that reads files one after another, within limits of memory and time."""
+
+    def __init__(self):
+        self._start()
+
+    def _start(self):
+        command = [sys.executable, "-m", "tests.watched"]
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL)
+        self._line(120.0)
+
+    def _line(self, limit_s):
+        ready, _, _ = select.select([self.process.stdout], [], [], limit_s)
+        return self.process.stdout.readline() if ready else None
+
+    def read(self, path):
+        """What became of a file: one of FAULTS, or "read" or "refused", and what was said."""
+        self.process.stdin.write(os.fsencode(path) + b"\n")
+        self.process.stdin.flush()
+        line = self._line(HANG_S)
+        if line:
+            return tuple(json.loads(line))
+        self.process.kill()
+        code = self.process.wait()
+        self._start()
+        return ("hang", "") if line is None else ("crash", f"exit code {code}")
+
+    def close(self):
+        self.process.stdin.close()
+        self.process.wait()
+
+
+def run(format_, count, keep=None, say=lambda _: None):
+    """Read ``count`` damaged files of a format: how many came to what, and the faults, each with its number."""
+    found, faults, slowest = Counter(), [], 0.0
+    watched = Watched()
+    with tempfile.TemporaryDirectory() as folder:
+        for number in range(count):
+            name, content = damaged(format_, number)
+            path = Path(folder) / name
+            path.write_bytes(content)
+            began = time.monotonic()
+            what, said = watched.read(path)
+            slowest = max(slowest, time.monotonic() - began)
+            found[what] += 1
+            for sign in ("crashed", "took more than", "was killed"):
+                if sign in said:
+                    found[f"library {sign}"] += 1
+            if what in FAULTS:
+                faults.append((number, what, said))
+                say(f"{format_} {number}: {what} {said[:300]}")
+                if keep is not None:
+                    (keep / f"{format_}-{number}-{name}").write_bytes(content)
+            path.unlink()
+    watched.close()
+    return found, faults, slowest
+
+
+def _attempt(path):
+    from processor import folder
+    from processor.model import InputError
+
+    try:
+        scene = folder.read_input(path)
+    except InputError as error:
+        said = str(error)
+        if any(sign in said for sign in ("MemoryError", "bad_alloc", "Unable to allocate", "memory")):
+            return "memory", said
+        return ("refused" if said.startswith(str(path)) else "unnamed"), said
+    except BaseException as error:
+        return "traceback", repr(error)
+    if not scene.scans or not all(len(scan.points) for scan in scene.scans):
+        return "empty", ""
+    return "read", ""
+
+
+def _serve():
+    import numba  # noqa: F401  is there before the limit is set, as in a run
+
+    from processor import folder, store  # noqa: F401
+    from processor.readers import decimal  # noqa: F401
+
+    mapped = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    resource.setrlimit(resource.RLIMIT_AS, (mapped + MEMORY_BYTES,) * 2)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    print(flush=True)
+    for line in sys.stdin.buffer:
+        print(json.dumps(_attempt(Path(os.fsdecode(line.rstrip(b"\n"))))), flush=True)
+
+
+if __name__ == "__main__":
+    _serve()
