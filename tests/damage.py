@@ -256,6 +256,8 @@ def _crc_table():
 def with_check_sums(content: bytes) -> bytes:
     """Give each page of 1024 bytes of an E57 file the check sum (CRC-32C) that its content asks for."""
     table, out = _crc_table(), bytearray(content)
+    if len(out) >= 24:
+        struct.pack_into("<Q", out, 16, len(out))  # the length, which a reader looks at first
     for start in range(0, len(content) - 1023, 1024):
         crc = 0xFFFFFFFF
         for byte in content[start : start + 1020]:

@@ -32,6 +32,19 @@ HIGH, LOW = _powers()
 
 
 @njit(cache=True, nogil=True)
+def count_ends(text: npt.NDArray[np.uint8], start: int, stop: int) -> int:
+    """Count the lines that end in a part of a text, by LF, CR or both."""
+    found = 0
+    for at in range(start, stop):
+        found += text[at] == 10
+    for at in range(start, stop - 1):
+        found += (text[at] == 13) & (text[at + 1] != 10)
+    if stop > start:
+        found += text[stop - 1] == 13
+    return found
+
+
+@njit(cache=True, nogil=True)
 def _times_power(digits: int, power: int, high: Floats, low: Floats) -> float:
     if digits < 9007199254740992 and -22 <= power <= 22:  # both exact, so one rounding
         near = float(digits)
@@ -88,28 +101,32 @@ def parse(
             first = at
             # Digits first: most tokens are plain numbers.
             slot = slots[column] if column < columns else -1
-            plain, digits, count, power, seen_point = slot >= 0, np.uint64(0), 0, 0, False
+            plain, digits, count, power = slot >= 0, np.uint64(0), 0, 0
             negative = False
-            if plain and at < size and (text[at] == 45 or text[at] == 43):
-                negative = text[at] == 45
-                at += 1
-            number = at
             if plain:
-                while at < size:
-                    c = text[at]
-                    if 48 <= c <= 57:
-                        if digits != 0 or c != 48:
-                            count += 1
-                        if count <= 19:
-                            digits = digits * np.uint64(10) + np.uint64(c - 48)
-                        if seen_point:
-                            power -= 1
-                    elif (c == 46 or (commas and c == 44)) and not seen_point:
-                        seen_point = True
-                    else:
-                        break
+                if at < size and (text[at] == 45 or text[at] == 43):
+                    negative = text[at] == 45
                     at += 1
-                plain = at - number > (1 if seen_point else 0)
+                number = at
+                while at < size:
+                    digit = np.uint64(text[at]) - np.uint64(48)
+                    if digit > 9:
+                        break
+                    digits = digits * np.uint64(10) + digit
+                    at += 1
+                count = at - number
+                if at < size and (text[at] == 46 or (commas and text[at] == 44)):
+                    at += 1
+                    number = at
+                    while at < size:
+                        digit = np.uint64(text[at]) - np.uint64(48)
+                        if digit > 9:
+                            break
+                        digits = digits * np.uint64(10) + digit
+                        at += 1
+                    power = number - at
+                    count -= power
+                plain = count > 0
                 if plain and at + 1 < size and (text[at] == 101 or text[at] == 69):
                     sign, exponent, mark = 1, 0, at
                     at += 1

@@ -5,6 +5,7 @@ VIEWPOINT is not used: programs differ on whether the points are to be moved by 
 
 from __future__ import annotations
 
+import os
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -99,7 +100,10 @@ def read_header(path: Path) -> Header:
         words = line.split()
         if words and not words[0].startswith("#"):
             said[words[0]] = words[1:]
-    names = said.get("FIELDS", [])
+    lost = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT") if not said.get(key)]
+    if lost:
+        raise InputError(f"{path}: not a readable PCD file: its header has no {lost[0]} line; copy or export it again")
+    names = said["FIELDS"]
     with parsing(path, "PCD"):
         sizes, kinds = said["SIZE"], said["TYPE"]
         counts = [int(one) for one in said.get("COUNT", ["1"] * len(names))]
@@ -129,9 +133,10 @@ def _unpacked(file: BinaryIO, header: Header, fields: Sequence[int]) -> Iterator
 
     packed_size, size = struct.unpack("<II", file.read(8))
     sizes = [int(t[2]) * n * header.points for t, n in zip(header.types, header.counts, strict=True)]
+    room = os.fstat(file.fileno()).st_size - header.start - 8
+    if size != sum(sizes) or packed_size > room:
+        raise ValueError(f"{size} bytes in {packed_size} are declared, expected {sum(sizes)} in {room} or fewer")
     packed = file.read(packed_size)
-    if size != sum(sizes) or len(packed) != packed_size:
-        raise ValueError(f"{size} and {packed_size} bytes are declared, expected {sum(sizes)} and {len(packed)}")
     unpacked = lzf.decompress(packed, size) if size else b""
     if unpacked is None or len(unpacked) != size:
         raise ValueError("the compressed data are damaged")

@@ -85,14 +85,14 @@ def make(
     """
     if not len(points):
         raise InputError(f"{path}: scan {name!r} holds no points")
-    low, high = points.min(axis=0), points.max(axis=0)
-    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+    low, high = float(points.min()), float(points.max())  # NaN where there is one
+    if not (np.isfinite(low) and np.isfinite(high)):
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise InputError(
             f"{path}: {len(bad)} of {len(points)} points of {name!r} have coordinates that are not finite, "
             f"the first in row {bad[0] + 1}; remove them or export the scan again"
         )
-    farthest = float(max(-low.min(), high.max()))
+    farthest = max(-low, high)
     origin = np.zeros(3)
     if farthest > FAR:
         # The middle of a sample: the first point may be a stray one.

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from processor.model import Floats
 
-PIECE_BYTES = 8 << 20
+PIECE_BYTES = 4 << 20
 LONGEST_LINE = 1 << 20
 NUMBERS = frozenset(b"+-0123456789.eE")
 WORDS = ("nan", "inf", "infinity")
@@ -63,23 +63,31 @@ class Rows:
 
     def most_left(self) -> int:
         """Return how many rows there can be at most to the end of the file."""
-        found = int(np.count_nonzero(_ends(self._text[self._at :]))) + 1
+        from processor.readers.decimal import count_ends
+
+        found = int(count_ends(self._text, self._at, len(self._text))) + 1
         place = self._file.tell()
         while piece := self._file.read(PIECE_BYTES):
-            found += int(np.count_nonzero(_ends(np.frombuffer(piece, np.uint8))))
+            found += int(count_ends(np.frombuffer(piece, np.uint8), 0, len(piece)))
         self._file.seek(place)
         return found
 
     def pieces(self, columns: Sequence[int], most: int = 2**62) -> Iterator[Floats]:
-        """Give the numbers (n, k) of some columns of the next rows, at most ``most`` of them, piece by piece."""
+        """Give the numbers (n, k) of some columns of the next rows, at most ``most`` of them, piece by piece.
+
+        Each piece is good until the next one is asked for.
+        """
         from processor.readers import decimal
 
         slots = np.full(max(columns) + 1, -1, np.int64)
         slots[list(columns)] = np.arange(len(columns))
         odd = np.empty((decimal.ODD_LIMIT, 4), np.int64)
+        out = np.empty((0, len(columns)))
         while most > 0 and self._fill():
             text = self._text
-            out = np.empty((min(most, int(np.count_nonzero(_ends(text[self._at :]))) + 1), len(columns)))
+            ends = decimal.count_ends(text, self._at, len(text)) + 1
+            if len(out) < min(most, ends):
+                out = np.empty((min(most, ends), len(columns)))
             kinds = (slots, self._separator, self._commas, self._remarks, out, odd, decimal.HIGH, decimal.LOW)
             why, rows, end, odds, column = decimal.parse(text, self._at, min(most, len(out)), *kinds)
             for row, slot, first, last in odd[:odds].tolist():
@@ -103,9 +111,9 @@ class Rows:
             raise ValueError(f"line {self._at_line(place)}: expected a number, found {text[:40]!r}") from None
 
     def _at_line(self, place: int) -> int:
-        part = self._text[self._at : place]
-        pairs = int(np.count_nonzero((part[:-1] == 13) & (part[1:] == 10)))
-        return self._line + int(np.count_nonzero(_ends(part))) - pairs
+        from processor.readers.decimal import count_ends
+
+        return self._line + int(count_ends(self._text, self._at, place))
 
     def _fill(self) -> bool:
         """Have whole lines from ``_at`` on. False at the end of the file."""
