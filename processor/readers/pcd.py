@@ -26,12 +26,13 @@ from processor.readers.raw import (
     room_for,
     stem,
 )
-from processor.readers.records import PIECE, fill, of_records
+from processor.readers.records import fill, of_records
 from processor.readers.rows import Rows
 
 SUFFIXES = (".pcd",)
 UNIT = ""
 HEADER_LIMIT = 65_536
+PIECE = 1 << 15  # points
 LZF_LIMIT = 100  # a match of LZF turns 3 bytes into at most 264
 
 
@@ -151,6 +152,8 @@ def _unpacked(file: BinaryIO, header: Header, fields: Sequence[int]) -> Iterator
 def _without_nan(columns: Sequence[Floats]) -> int:
     """Move the rows that have no NaN coordinate to the front, in their order, and return their count."""
     found, count = 0, len(columns[0])
+    if count and not np.isnan(columns[0].min()):
+        return count
     for start in range(0, count, PIECE):
         rows = slice(start, min(start + PIECE, count))
         valid = np.atleast_1d(~np.isnan(columns[0][rows]).any(axis=1))

@@ -9,14 +9,22 @@ import numpy as np
 
 from processor.model import Floats
 
-PIECE = 1 << 18  # records
+PIECE_BYTES = 1 << 19  # small enough to stay in a processor's own cache between the passes over it
 
 
 def of_records(file: BinaryIO, dtype: Any, wanted: Sequence[str], count: int) -> Iterator[Sequence[Any]]:
-    """Give the wanted fields, as columns, of the next ``count`` records of a file, piece by piece."""
+    """Give the wanted fields, as columns, of the next ``count`` records of a file, piece by piece.
+
+    Each piece is good until the next one is asked for.
+    """
+    size = dtype.itemsize
+    text = bytearray(max(1, min(count, PIECE_BYTES // size)) * size)
+    view = memoryview(text)
     while count > 0:
-        data = file.read(min(count, PIECE) * dtype.itemsize)
-        records = np.frombuffer(data, dtype, len(data) // dtype.itemsize)
+        filled = 0
+        while filled < len(view) and (got := file.readinto(view[filled:])):  # type: ignore[attr-defined]
+            filled += got
+        records = np.frombuffer(text, dtype, min(filled // size, count))
         if not len(records):
             return
         count -= len(records)
@@ -30,10 +38,15 @@ def fill(columns: Sequence[Floats], pieces: Iterable[Any]) -> None:
     """
     found, count = 0, len(columns[0])
     for piece in pieces:
-        parts = list(piece.T) if isinstance(piece, np.ndarray) else piece
-        rows = slice(found, found + len(parts[0]))
-        for axis in range(3):
-            columns[0][rows, axis] = parts[axis]
+        if isinstance(piece, np.ndarray):
+            rows = slice(found, found + len(piece))
+            columns[0][rows] = piece[:, :3]
+            parts = list(piece.T)
+        else:
+            parts = piece
+            rows = slice(found, found + len(parts[0]))
+            for axis in range(3):
+                columns[0][rows, axis] = parts[axis]
         for column, part in zip(columns[1:], parts[3:], strict=True):
             column[rows] = part
         found += len(parts[0])

@@ -138,10 +138,11 @@ def sniff(path: Path) -> Layout:
             continue
         separator, comma = _separator(stripped)
         cells = _cells(stripped, separator, comma)
-        if stripped and not comment and all(map(_is_number, cells)) and len(cells) >= 3:
-            names = tuple(_cells(header, *_separator(header))) if header else ()
+        names = tuple(_cells(header, *_separator(header))) if header else ()
+        if stripped and not comment and len(cells) >= 3 and _is_row(cells, names):
             later = any(mark in one for one in lines[number:] for mark in COMMENTS[1:])
-            following = [one.strip() for one in lines[number:-1][:SAMPLED] if one.strip()] or [stripped]
+            whole = lines[number:-1] if len(head) == SNIFFED else lines[number:]
+            following = [one.strip() for one in whole[:SAMPLED] if one.strip()] or [stripped]
             # Whole numbers do not show how others are written.
             comma = comma or (
                 separator in (None, ";") and any(_separator(one) == (separator, True) for one in following)
@@ -177,6 +178,23 @@ def _cells(line: str, separator: str | None, decimal_comma: bool) -> list[str]:
     return [cell.replace(",", ".") for cell in cells] if decimal_comma else cells
 
 
+def _is_row(cells: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether cells are all numbers, or those are that a header names as coordinates: others may be names of points."""
+    axes = _axes(names) if len(names) == len(cells) else []
+    return all(map(_is_number, [cells[one] for one in axes] or cells))
+
+
+def _axes(header: Sequence[str]) -> list[int]:
+    """Columns that a header calls x, y and z; none where it does not call all three so."""
+    names = [_bare(name) for name in header]
+    found = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
+    return [names.index(name) for name in found if name is not None] if all(found) else []
+
+
+def _bare(name: str) -> str:
+    return re.sub(r'["\']', "", name).strip()
+
+
 def _is_number(cell: str) -> bool:
     try:
         float(cell)
@@ -195,7 +213,7 @@ class _Columns:
 
 def _columns(path: Path, layout: Layout) -> _Columns:
     """Columns of x, y, z, of the intensity and of the station, and the unit that a header names."""
-    names = [re.sub(r'["\']', "", name).strip() for name in layout.header]
+    names = [_bare(name) for name in layout.header]
     found = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
     if len(names) == layout.columns and all(found):
         intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
