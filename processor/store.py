@@ -165,8 +165,11 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
 def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
     """Open a file of one of ``kinds`` that passes vetting. Raises InputError for any other and for damage."""
     try:
-        with h5py.File(path, "r", locking=False) as file:
-            found = vetting.problems(file, path)
+        with vetting.limited_memory():
+            file = h5py.File(path, "r", locking=False)
+        with file:
+            with vetting.limited_memory():
+                found = vetting.problems(file, path)
             found = found or _header_problems(file, kinds)
             if found:
                 raise DecodeError(found)
