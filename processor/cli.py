@@ -63,7 +63,7 @@ def run(
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
-    from processor import pipeline
+    from processor import inputs, pipeline
     from processor.evaluate import evaluate
     from processor.report import writing
 
@@ -73,6 +73,7 @@ def run(
     parameters = pipeline.read_params(params)
     if steps:
         pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
+    before = inputs.signature(input_.resolve(), output.resolve())
     piecewise = pipeline.is_large(input_)
     scene = pipeline.read(input_, units, piecewise)
     jobs = pipeline.plan(steps or pipeline.steps_for(scene), methods, parameters, seed)
@@ -82,6 +83,7 @@ def run(
     say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
     execution = pipeline.execute(input_, scene, jobs, say, piecewise)
     report = evaluate(input_, execution)
+    inputs.check_unchanged(input_.resolve(), before, output.resolve())
     writing.write(output, execution, report)
     _show(context, output, execution, report, as_json)
 

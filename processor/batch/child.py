@@ -24,9 +24,8 @@ def _end_with_parent() -> None:
     os.killpg(0, signal.SIGKILL)
 
 
-def main() -> None:
-    """Run the command line of the arguments."""
-    memory_mb = int(sys.argv[1])
+def guard(memory_mb: int) -> None:
+    """Limit this process's memory, and let it end with the process that started it."""
     limit = (ASKED_PER_USED * memory_mb + ASKED_BEYOND_MB) * 2**20
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
     limit = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
@@ -34,6 +33,11 @@ def main() -> None:
         resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def main() -> None:
+    """Run the command line of the arguments."""
+    guard(int(sys.argv[1]))
     sys.argv[:] = ["processor", *sys.argv[2:]]
     from processor.__main__ import main as processor
 
