@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from processor import readers, store
-from processor.design_files import read_design, read_json, read_mesh
+from processor import cad, readers, store
+from processor.design_files import MESH_SUFFIXES, read_design, read_json, read_surface
 from processor.fields import Table, inside
 from processor.model import (
     KINDS,
@@ -40,7 +40,7 @@ TRUTH = "truth.h5"
 STATIONS = "stations.json"
 DESIGNS = ("design.json", "design.csv")
 NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv")
-KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance")
+KEYS = ("name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance")
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
 
@@ -68,6 +68,7 @@ class _Project:
     kind: str
     units: str
     design: Path | None
+    design_units: str
     temperature_C: float
     entries: tuple[_Entry, ...]
     tolerance: Tolerance | None = None
@@ -95,17 +96,19 @@ def read_input(path: Path, units: str | None = None) -> Scene:
         return _read_folder(path, asked)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return _scene(_Project(path.stem, "", "", None, float("nan"), (_Entry(path),)), None, asked)
+    return _scene(_Project(path.stem, "", "", None, "", float("nan"), (_Entry(path),)), None, asked)
 
 
 def _read_folder(folder: Path, asked: str) -> Scene:
     project = _read_project(folder)
     design: ArchDesign | FrameDesign | StructureDesign | None = None
-    if project.design is not None and project.kind == "structure":
-        vertices, faces = read_mesh(project.design)
-        design = StructureDesign(project.design.stem, vertices * MM_PER_UNIT[project.units or asked or "m"], faces)
-    elif project.design is not None:
-        design = read_design(folder, project.design, asked or project.units or "m")
+    if project.design is not None:
+        unit = project.design_units or project.units or asked or "m"
+        surface = project.design.suffix.lower() in (*MESH_SUFFIXES, *cad.SUFFIXES)
+        if surface and project.kind in ("", "structure"):
+            design = StructureDesign(project.design.stem, *read_surface(project.design, unit))
+        else:
+            design = read_design(folder, project.design, project.design_units or asked or project.units or "m")
     return _scene(project, design, asked, _places(folder, project.units or asked or "m"))
 
 
@@ -147,6 +150,7 @@ def _read_project(folder: Path) -> _Project:
         kind,
         table.unit("units", ""),
         design,
+        table.unit("design_units", ""),
         table.number("temperature_C", float("nan")),
         tuple(entries or [_Entry(found) for found in _found(folder, design)]),
         _tolerance(table),
@@ -239,7 +243,7 @@ def _scene(
             scan = _scan(raw, entry, unit, parts, places)
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
-            _check_size(entry.path, scan, unit, reason, arch, frame)
+            _check_size(entry.path, scan, unit, reason, design)
             scans.append(scan)
     return Scene(
         project.name,
@@ -307,18 +311,21 @@ def _stations(scans: list[Scan]) -> Stations | None:
 
 
 def _check_size(
-    path: Path, scan: Scan, unit: str, reason: str, arch: ArchDesign | None, frame: FrameDesign | None
+    path: Path, scan: Scan, unit: str, reason: str, design: ArchDesign | FrameDesign | StructureDesign | None
 ) -> None:
     """Raise InputError where a scan is larger or smaller than its design by what a mistaken unit would make it.
 
-    Sizes are distances from the middle, which hardly change when a part is turned. Of a space frame often a piece is
-    scanned, and within a hall, so only the clear cases count there.
+    Sizes are distances from the middle, which hardly change when a part is turned. Of a space frame or a
+    structure often a piece is scanned, and within a hall, so only the clear cases count there.
     """
-    part = next((one for one in arch.parts if one.name == scan.component), None) if arch else None
+    parts = design.parts if isinstance(design, ArchDesign) else ()
+    part = next((one for one in parts if one.name == scan.component), None)
     if part is not None:
         nominal, slips = part.vertices, UNIT_SLIPS
-    elif frame is not None and len(frame.centres) > 2:
-        nominal, slips = frame.centres, CLEAR_UNIT_SLIPS
+    elif isinstance(design, FrameDesign) and len(design.centres) > 2:
+        nominal, slips = design.centres, CLEAR_UNIT_SLIPS
+    elif isinstance(design, StructureDesign):
+        nominal, slips = design.vertices, CLEAR_UNIT_SLIPS
     else:
         return
     middle = (nominal.min(axis=0) + nominal.max(axis=0)) / 2.0
