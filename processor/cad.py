@@ -90,7 +90,7 @@ def _designgen(path: Path) -> list[str]:
     if found:
         return [found]
     raise InputError(
-        f"{path}: turning a {path.suffix[1:].upper()} file into meshes needs designgen with its CAD kernel: "
+        f"{path}: to be turned into a mesh it needs designgen with its CAD kernel: "
         "pip install 'steel-scan-check[designgen]'"
     )
 

@@ -1,15 +1,18 @@
 """A job's process that fails as the file ``plant`` in its input says, and is done in no time where it says nothing.
 
-As ``python -m tests.planted_job batch ...`` the command line of processor, its jobs done so.
+As ``planted_job.py batch ...`` it is the command line of processor, whose jobs are done so.
 """
 
 import json
 import os
 import signal
+import subprocess
 import sys
 import time
 from functools import partial
 from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from processor.batch import child
 
@@ -41,6 +44,10 @@ def plant(source):
         held = []
         while True:
             held.append(b"x" * 2**24)
+    elif what == "memory elsewhere":
+        code = "held = []\nwhile True: held.append(b'x' * 2**24)"
+        subprocess.run([sys.executable, "-c", code], check=False)
+        time.sleep(60)
     elif what == "panic":
         raise BaseException("panicked at src/lib.rs")
     elif what == "talk":
@@ -62,7 +69,7 @@ def main():
         from processor import __main__
         from processor.batch import batch
 
-        batch.Settings = partial(batch.Settings, program=(sys.executable, "-m", "tests.planted_job"))
+        batch.Settings = partial(batch.Settings, program=(sys.executable, __file__))
         __main__.main()
         return
     child.guard(int(sys.argv[1]))

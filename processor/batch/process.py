@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO
 
 PERIOD_S = 0.05
-LOOK_S = 1.0  # between two looks at what may stop the job
+LOOK_S = 0.5  # between two looks at what may stop the job, and at the processes that it has started
 LOG_BYTES = 1 << 18  # of one process, from its beginning
 TAIL_BYTES = 1 << 14
 MB = 2**20
@@ -56,19 +56,21 @@ def run(
         assert process.stdin
         assert process.stderr
         said = _Said(process.stderr, file)
-        why, peak = "exit", 0.0
+        why, peak, others = "exit", 0.0, 0.0
         look = started
         try:
             while os.waitid(os.P_PID, process.pid, os.WEXITED | os.WNOWAIT | os.WNOHANG) is None:
                 now = time.monotonic()
-                peak = max(peak, used := _used_mb(process.pid))
-                if now - started > timeout_s:
-                    why = "time"
-                elif used > memory_mb:
-                    why = "memory"
-                elif now >= look:
+                if now >= look:
                     look = now + LOOK_S
                     why = "stopped" if stopped() else why
+                    others = sum(_used_mb(one) for one in _descendants(process.pid))
+                used = _used_mb(process.pid) + others
+                peak = max(peak, used)
+                if why == "exit" and now - started > timeout_s:
+                    why = "time"
+                elif why == "exit" and used > memory_mb:
+                    why = "memory"
                 if why != "exit":
                     break
                 if said.ended.wait(PERIOD_S):
@@ -97,6 +99,23 @@ def _used_mb(pid: int) -> float:
         return (int(fields[1]) - int(fields[2])) * os.sysconf("SC_PAGE_SIZE") / MB
     except (OSError, IndexError, ValueError):
         return 0.0
+
+
+def _descendants(pid: int) -> list[int]:
+    """Return the processes that a process has started, and those that these have; none where the system is silent."""
+    found: list[int] = []
+    waiting = [pid]
+    while waiting:
+        try:
+            tasks = os.listdir(f"/proc/{(one := waiting.pop())}/task")
+            for task in tasks:
+                with open(f"/proc/{one}/task/{task}/children", "rb") as file:
+                    children = [int(child) for child in file.read().split()]
+                found += children
+                waiting += children
+        except (OSError, ValueError):
+            continue
+    return found
 
 
 class _Said:
