@@ -11,6 +11,7 @@ import click
 
 from processor import __version__
 from processor.model import InputError, Metric, UsageError
+from processor.progress import stage
 
 if TYPE_CHECKING:
     from processor.batch.record import Record
@@ -48,6 +49,7 @@ def _named(_: click.Context, __: click.Parameter, value: str | None) -> tuple[st
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
 @click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
 @click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
@@ -60,6 +62,7 @@ def run(
     params: Path | None,
     units: str | None,
     seed: int | None,
+    lang: str,
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
@@ -75,7 +78,8 @@ def run(
         pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
     before = inputs.signature(input_.resolve(), output.resolve())
     piecewise = pipeline.is_large(input_)
-    scene = pipeline.read(input_, units, piecewise)
+    with stage(f"reading {input_.name}"):
+        scene = pipeline.read(input_, units, piecewise)
     jobs = pipeline.plan(steps or pipeline.steps_for(scene), methods, parameters, seed)
     if piecewise and not pipeline.streams(jobs):
         piecewise = False
@@ -84,7 +88,8 @@ def run(
     execution = pipeline.execute(input_, scene, jobs, say, piecewise)
     report = evaluate(input_, execution)
     inputs.check_unchanged(input_.resolve(), before, output.resolve())
-    writing.write(output, execution, report)
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, report, lang)
     _show(context, output, execution, report, as_json)
 
 
@@ -107,9 +112,10 @@ def _show(context: click.Context, output: Path, execution: Execution, report: Er
 @click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
 @click.option("--units", type=click.Choice(UNITS), help="as given to the run")
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.pass_context
-def report(context: click.Context, output: Path, input_: Path, units: str | None, as_json: bool) -> None:
+def report(context: click.Context, output: Path, input_: Path, units: str | None, lang: str, as_json: bool) -> None:
     """Check and report again what is in OUT, without running its steps on INPUT anew."""
     from processor import pipeline
     from processor.evaluate import evaluate
@@ -118,7 +124,8 @@ def report(context: click.Context, output: Path, input_: Path, units: str | None
     writing.check_output(output, input_)
     execution = pipeline.read_execution(output / writing.RUNS, input_, units)
     found = evaluate(input_, execution)
-    writing.write(output, execution, found)
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, found, lang)
     _show(context, output, execution, found, as_json)
 
 
@@ -158,6 +165,7 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--units", type=click.Choice(UNITS), help="of scans; scene files know theirs")
 @click.option("--seed", type=click.IntRange(min=0))
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True)
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
@@ -175,6 +183,7 @@ def batch(
     params: Path | None,
     units: str | None,
     seed: int | None,
+    lang: str,
     as_json: bool,
 ) -> None:
     """Process every scan folder, scene file and scan file below ROOT, each in a process of its own.
@@ -192,12 +201,19 @@ def batch(
     if steps or methods or parameters:  # what is wrong with them is said once, not by every input
         pipeline.plan(steps or tuple(pipeline.step_modules()), methods, parameters, seed)
     given = {"--steps": ",".join(steps), "--method": ",".join(methods), "--seed": "" if seed is None else str(seed)}
+    given["--lang"] = lang
     settings = whole.Settings(
         root,
         output,
         tuple(text for name, value in given.items() if value for text in (name, value)),
         params.read_bytes() if params else b"",
-        {"steps": steps, "methods": methods, "seed": seed, "params": json.loads(json.dumps(parameters, default=str))},
+        {
+            "steps": steps,
+            "methods": methods,
+            "seed": seed,
+            "lang": lang,
+            "params": json.loads(json.dumps(parameters, default=str)),
+        },
         units,
         jobs or 1,
         cluster,

@@ -15,6 +15,7 @@ from processor.model import StepRun
 from processor.pipeline import Execution
 from processor.report import step_report, tables, view
 from processor.report.drawing import Drawn
+from processor.report.language import language
 from processor.report.printing import headings, numeric, shown
 
 GOOD = "ok"
@@ -23,12 +24,13 @@ PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 
-def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]) -> str:
-    """Render the page, with the figures of each step; every text is escaped."""
+def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], lang: str = "en") -> str:
+    """Render the page, with the figures of each step, in a language of CODES; every text is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("processor", "report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
     environment.filters["shown"] = shown
+    environment.filters["say"] = language(lang).say
     scene = execution.scene
     points = sum(len(scan.points) for scan in scene.scans)
     live = {
@@ -39,12 +41,13 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
     script, digest = view.script()
     text: str = environment.get_template("page.html").render(
         title=scene.name,
-        kind=scene.kind,
-        scans=len(scene.scans),
-        points=f"{points:,} points" if points else "points left in the file",
-        units=scene.units,
-        units_reason=scene.units_reason,
-        live=view.embedded({"words": {}, "steps": live}),
+        input_said=(
+            f"{scene.kind}, {len(scene.scans)} scan{'' if len(scene.scans) == 1 else 's'}, "
+            f"{f'{points:,} points' if points else 'points left in the file'}. "
+            f"Coordinates read as {scene.units} ({scene.units_reason}). All lengths in mm."
+        ),
+        lang=lang,
+        live=view.embedded({"words": language(lang).of_scripts(script), "steps": live}),
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),

@@ -15,7 +15,7 @@ from processor.pipeline import Execution
 from processor.report import figures, page, printing, results_json, step_report, tables
 
 RESULTS, RUNS = "results.json", "results.h5"
-OWN_NAMES = (RESULTS, RUNS, "report.html", "figures")
+OWN_NAMES = (RESULTS, RUNS, "report.html", "figures", "job.json")  # the last is a batch's; gone, it does the job again
 OWN_ENDINGS = (".csv", ".dxf")
 
 
@@ -33,10 +33,11 @@ def check_output(out: Path, source: Path) -> None:
         raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
 
 
-def write(out: Path, execution: Execution, report: ErrorReport) -> None:
+def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
     """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others.
 
-    Raises InputError where they cannot be written; then ``out`` is as it was.
+    The page alone is in the language ``lang``; tables and numbers for other programs are not. Raises InputError where
+    they cannot be written; then ``out`` is as it was.
     """
     out = out.absolute()
     try:
@@ -61,7 +62,7 @@ def write(out: Path, execution: Execution, report: ErrorReport) -> None:
         for of_step in drawn.values():
             for name, (_, png) in of_step.items():
                 _write(making / "figures" / name, png)
-        _write_text(making / "report.html", page.html(execution, report, drawn))
+        _write_text(making / "report.html", page.html(execution, report, drawn, lang))
         _replace(making, out)
     except BaseException as error:
         shutil.rmtree(making, ignore_errors=True)
