@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from processor import readers, store
+from processor import cad, readers, store
 from processor.control_files import CONTROL, Measured, control_points, read_control
-from processor.design_files import read_design, read_json, read_mesh
+from processor.design_files import MESH_SUFFIXES, read_design, read_json, read_surface
 from processor.fields import Table, inside
 from processor.model import (
     KINDS,
@@ -43,7 +43,7 @@ TRUTH = "truth.h5"
 STATIONS = "stations.json"
 DESIGNS = ("design.json", "design.csv")
 NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv", CONTROL)
-KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance", "control")
+KEYS = ("name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control")
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
 FLOAT_STEP_MM = 1.0
@@ -75,6 +75,7 @@ class _Project:
     kind: str
     units: str
     design: Path | None
+    design_units: str
     temperature_C: float
     entries: tuple[_Entry, ...]
     tolerance: Tolerance | None = None
@@ -103,17 +104,19 @@ def read_input(path: Path, units: str | None = None) -> Scene:
         return _read_folder(path, asked)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return _scene(_Project(stem(path), "", "", None, float("nan"), (_Entry(path),)), None, asked)
+    return _scene(_Project(stem(path), "", "", None, "", float("nan"), (_Entry(path),)), None, asked)
 
 
 def _read_folder(folder: Path, asked: str) -> Scene:
     project = _read_project(folder)
     design: ArchDesign | FrameDesign | StructureDesign | None = None
-    if project.design is not None and project.kind == "structure":
-        vertices, faces = read_mesh(project.design)
-        design = StructureDesign(stem(project.design), vertices * MM_PER_UNIT[project.units or asked or "m"], faces)
-    elif project.design is not None:
-        design = read_design(folder, project.design, asked or project.units or "m")
+    if project.design is not None:
+        unit = project.design_units or project.units or asked or "m"
+        surface = project.design.suffix.lower() in (*MESH_SUFFIXES, *cad.SUFFIXES)
+        if surface and project.kind in ("", "structure"):
+            design = StructureDesign(stem(project.design), *read_surface(project.design, unit))
+        else:
+            design = read_design(folder, project.design, project.design_units or asked or project.units or "m")
     return _scene(project, design, asked, _places(folder, project.units or asked or "m"))
 
 
@@ -156,6 +159,7 @@ def _read_project(folder: Path) -> _Project:
         kind,
         table.unit("units", ""),
         design,
+        table.unit("design_units", ""),
         table.number("temperature_C", float("nan")),
         tuple(entries or [_Entry(found) for found in _found(folder, {design, apart})]),
         _tolerance(table),
