@@ -114,7 +114,7 @@ def lines(record: dict[str, Any]) -> list[str]:
     if known:
         low, high = (f"{100.0 * one:.1f}" for one in summary["significant_share_ci95"])
         found += [
-            f"beyond it: {summary['significant']}, {100.0 * summary['significant_share']:.1f} % (95 %: {low} to {high})",
+            f"beyond it: {summary['significant']}, {100.0 * summary['significant_share']:.1f} % (95 %: {low}-{high})",
             f"distance: mean {number('mean')}, median {number('median')}, sd {number('sd')}, "
             f"from {number('min')} to {number('max')}",
             f"median level of detection {number('lod95_median')}",
