@@ -15,7 +15,8 @@ from processor.model import KEY_POINTS, Floats, Scene, StepRun
 from processor.report.drawing import DIVERGING_STOPS, LEAST_SHOWN_MM
 from processor.report.figures_preassembly import linear_band
 from processor.report.printing import shown
-from processor.report.results_json import TRADE_OFF, plain
+from processor.report.results_json import plain
+from processor.report.results_preassembly import TRADE_OFF
 from processor.steps import preassemble
 
 MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page

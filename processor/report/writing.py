@@ -14,10 +14,11 @@ from processor import store
 from processor.evaluate import ErrorReport
 from processor.model import UsageError
 from processor.pipeline import Execution
-from processor.report import dxf, figures, page, printing, results_json, tables, tables_balls
+from processor.report import figures, page, printing, results_json, step_report, tables
 
-RESULTS, RUNS, DRAWING = "results.json", "results.h5", "nodes.dxf"
-OWN_NAMES = (RESULTS, RUNS, DRAWING, "report.html", "figures")  # and CSV tables
+RESULTS, RUNS = "results.json", "results.h5"
+OWN_NAMES = (RESULTS, RUNS, "report.html", "figures")
+OWN_ENDINGS = (".csv", ".dxf")
 
 
 def check_output(out: Path, source: Path, mark: str = RESULTS, own: Collection[str] = OWN_NAMES) -> None:
@@ -32,7 +33,7 @@ def check_output(out: Path, source: Path, mark: str = RESULTS, own: Collection[s
     inside = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
     if inside and mark not in inside:
         raise UsageError(f"{out}: is not empty and holds no earlier results; name another folder")
-    others = [name for name in inside if name not in own and not name.endswith(".csv")]
+    others = [name for name in inside if name not in own and not name.endswith(OWN_ENDINGS)]
     if others:
         raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
 
@@ -47,13 +48,14 @@ def write(out: Path, execution: Execution, report: ErrorReport) -> None:
             if table.file:
                 write_text(making / f"{table.file}.csv", printing.csv_text(table))
         for run, _ in tables.grouped(execution.runs):
-            if run.step == "spheres" and tables_balls.has_bounds(run.result):
-                write_bytes(making / DRAWING, dxf.drawing(run.result))
+            for name, data in step_report.of(run.step).files(run.result).items():
+                write_bytes(making / name, data)
         drawn = figures.of_run(execution, report)
-        if drawn:
+        if any(drawn.values()):
             (making / "figures").mkdir()
-        for name, (_, png) in drawn.items():
-            write_bytes(making / "figures" / name, png)
+        for of_step in drawn.values():
+            for name, (_, png) in of_step.items():
+                write_bytes(making / "figures" / name, png)
         write_text(making / "report.html", page.html(execution, report, drawn))
 
 
