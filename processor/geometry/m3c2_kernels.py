@@ -127,7 +127,7 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
         A[0, 1] = A[1, 0] = suv / n - mu * mv
         A[0, 2] = A[2, 0] = suw / n - mu * mw
         A[1, 2] = A[2, 1] = svw / n - mv * mw
-        _eigen(A, V)
+        eigen(A, V)
         least, most = 0, 0
         for k in range(1, 3):
             least = k if A[k, k] < A[least, least] else least
@@ -142,7 +142,7 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
 
 
 @njit(cache=True, nogil=True)
-def _eigen(A, V):  # type: ignore[no-untyped-def]
+def eigen(A, V):  # type: ignore[no-untyped-def]
     """Turn a symmetric A (3, 3) into its eigenvalues on the diagonal, V into its vectors as columns (Jacobi)."""
     for i in range(3):
         for j in range(3):
