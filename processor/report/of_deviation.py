@@ -24,10 +24,12 @@ def _summary(result: Result) -> tuple[str, str]:
         return result.status, result.message
     found = results_deviation.figures(result)
     head = f"{result.status}, {_percent(result.significant_share)} % of the surface measured is beyond its LOD95"
+    low, high, near = (
+        _percent(one) for one in (result.significant_low, result.significant_high, found["within_10mm_share"])
+    )
     said = (
-        f"95 %: {_percent(result.significant_low)} to {_percent(result.significant_high)} %. "
-        f"From {shown(found['min'])} to {shown(found['max'])} mm, {_percent(found['within_10mm_share'])} % within 10 mm; median LOD95 "
-        f"{shown(found['lod95_median'])} mm, of which registration {shown(1.96 * result.registration_error)} mm. "
+        f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; median "
+        f"LOD95 {shown(found['lod95_median'])} mm, of which registration {shown(1.96 * result.registration_error)} mm. "
         f"{found['measured']:.0f} of {len(result.core)} core points were measured."
     )
     return head, said
