@@ -28,8 +28,8 @@ def _summary(result: Result) -> tuple[str, str]:
         _percent(one) for one in (result.significant_low, result.significant_high, found["within_10mm_share"])
     )
     said = (
-        f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; median "
-        f"LOD95 {shown(found['lod95_median'])} mm, of which registration {shown(1.96 * result.registration_error)} mm. "
+        f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; "
+        f"median LOD95 {shown(found['lod95_median'])} mm, {shown(1.96 * result.registration_error)} mm of it registration. "
         f"{found['measured']:.0f} of {len(result.core)} core points were measured."
     )
     return head, said
