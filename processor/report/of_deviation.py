@@ -27,9 +27,10 @@ def _summary(result: Result) -> tuple[str, str]:
     low, high, near = (
         _percent(one) for one in (result.significant_low, result.significant_high, found["within_10mm_share"])
     )
+    registration = shown(1.96 * result.registration_error)
     said = (
         f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; "
-        f"median LOD95 {shown(found['lod95_median'])} mm, {shown(1.96 * result.registration_error)} mm of it registration. "
+        f"median LOD95 {shown(found['lod95_median'])} mm, {registration} mm of it registration. "
         f"{found['measured']:.0f} of {len(result.core)} core points were measured."
     )
     return head, said

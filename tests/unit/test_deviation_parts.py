@@ -44,7 +44,7 @@ def test_scales_hold_the_points_they_promise():
     found = scales.derived(*grids, cloud)
     assert found.compared_spacing_mm > 1.8 * found.reference_spacing_mm
     held = 5000 / 1e6 * np.pi / 4.0 * found.projection_diameter_mm**2
-    assert 35.0 < held < 48.0  # of the sparser cloud
+    assert 45.0 < held < 60.0  # of the sparser cloud
     assert 60.0 <= found.max_depth_mm <= 10.0 * found.projection_diameter_mm
     given = scales.derived(*grids, cloud, 7.0, 8.0, 9.0)
     assert (given.normal_diameter_mm, given.projection_diameter_mm, given.max_depth_mm) == (7.0, 8.0, 9.0)
@@ -80,7 +80,7 @@ def planes_compared(seed, off=0.0, error=0.0):
     """Share beyond LOD95 of two noisy scans of one plane, the second ``off`` by so much; scales by density."""
     rng = np.random.default_rng(seed)
     pair = [np.column_stack([*rng.uniform(0.0, 3000.0, (2, 60_000)), rng.normal(0.0, 2.0, 60_000)]) for _ in range(2)]
-    grids = [point_neighbors.of_spacing(one + [0.0, 0.0, k * off]) for k, one in enumerate(pair)]
+    grids = [point_neighbors.of_spacing(one + k * off * UP) for k, one in enumerate(pair)]
     x, y = (one.ravel() for one in np.meshgrid(*[np.arange(100.0, 2901.0, 40.0)] * 2))
     core = np.column_stack([x, y, 0.0 * x])
     used = scales.derived(*grids, core)
