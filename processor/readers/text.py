@@ -14,6 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+import numpy as np
+
 from processor.model import Floats, InputError
 from processor.readers.raw import (
     INTENSITY_NAMES,
@@ -104,6 +106,15 @@ def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, F
     if found < declared:
         raise ValueError(f"it declares {declared} points, but {found} follow")
     return points[:found], others[:found]
+
+
+def rows(path: Path, layout: Layout, columns: Sequence[int]) -> Floats:
+    """Return columns (n, k) of a table; ValueError where a row is not of numbers."""
+    with _opened(path, layout) as file:
+        found = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
+        for _ in range(layout.skip):
+            found.skip_line()
+        return np.vstack([np.empty((0, len(columns))), *found.pieces(columns, found.most_left())])
 
 
 @contextmanager
