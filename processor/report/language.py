@@ -4,7 +4,7 @@ A catalogue is a TOML file beside this one, in sections, one for each subject. `
 ``[section.sentences]`` texts with places in them, the first that fits is taken. A place is ``{}`` for anything without
 "; ", ``{;}`` for anything, ``{#}`` for a number; in the other language they are ``{0}``, ``{1}`` ... in whatever order.
 What stands in a place is translated in turn where it can be. A text that is not known is taken apart at full stops,
-semicolons, colons and commas; what is left of it stays as it is, and so do names from files.
+semicolons, colons, commas and "and"; what is left of it stays as it is, and so do names from files.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ else:
     import tomli as tomllib
 
 CODES = ("en", "zh")
-SEPARATORS = (". ", "; ", ": ", ", ")
-FULL_WIDTH = {". ": "。", "; ": "；", ": ": "：", ", ": "，"}
+SEPARATORS = (". ", "; ", ": ", ", ", " and ")
+FULL_WIDTH = {". ": "。", "; ": "；", ": ": "：", ", ": "，", " and ": "、"}
 PLACES = {
     "{}": "((?:(?!; ).)+?)",
     "{;}": "(.+?)",
@@ -69,10 +69,11 @@ class Language:
             known = self.say(text[:-1])
             return text if known == text[:-1] else known + "。"
         for separator in SEPARATORS:
-            parts = text.split(separator)
+            parts = text.split(separator, 1 if separator == ": " else -1)  # what follows a name may hold another
             if len(parts) > 1:
                 said = [self.say(part) for part in parts]
-                if said != parts:
+                changed = [new != old for new, old in zip(said, parts, strict=True)]
+                if all(changed) or (any(changed) and separator != " and "):  # names may be joined by it, too
                     return FULL_WIDTH[separator].join(said)
         return text
 
@@ -92,7 +93,9 @@ class Language:
 
 def catalogue(code: str) -> dict[str, dict[str, dict[str, str]]]:
     """Read a catalogue: words and sentences by section."""
-    return tomllib.loads((importlib.resources.files("processor.report") / f"{code}.toml").read_text("utf-8"))
+    text = (importlib.resources.files("processor.report") / f"{code}.toml").read_text("utf-8")
+    found: dict[str, dict[str, dict[str, str]]] = tomllib.loads(text)
+    return found
 
 
 def _pattern(key: str) -> re.Pattern[str]:
