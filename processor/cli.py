@@ -10,6 +10,7 @@ import click
 
 from processor import __version__
 from processor.model import InputError, Metric
+from processor.progress import stage
 
 if TYPE_CHECKING:
     from processor.evaluate import ErrorReport
@@ -45,6 +46,7 @@ def _named(_: click.Context, __: click.Parameter, value: str | None) -> tuple[st
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
 @click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
 @click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
@@ -57,6 +59,7 @@ def run(
     params: Path | None,
     units: str | None,
     seed: int | None,
+    lang: str,
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
@@ -71,7 +74,8 @@ def run(
     if steps:
         pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
     piecewise = pipeline.is_large(input_)
-    scene = pipeline.read(input_, units, piecewise)
+    with stage(f"reading {input_.name}"):
+        scene = pipeline.read(input_, units, piecewise)
     jobs = pipeline.plan(steps or pipeline.steps_for(scene), methods, parameters, seed)
     if piecewise and not pipeline.streams(jobs):
         piecewise = False
@@ -79,7 +83,8 @@ def run(
     say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
     execution = pipeline.execute(input_, scene, jobs, say, piecewise)
     report = evaluate(input_, execution)
-    writing.write(output, execution, report)
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, report, lang)
     _show(context, output, execution, report, as_json)
 
 
@@ -102,9 +107,10 @@ def _show(context: click.Context, output: Path, execution: Execution, report: Er
 @click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
 @click.option("--units", type=click.Choice(UNITS), help="as given to the run")
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.pass_context
-def report(context: click.Context, output: Path, input_: Path, units: str | None, as_json: bool) -> None:
+def report(context: click.Context, output: Path, input_: Path, units: str | None, lang: str, as_json: bool) -> None:
     """Check and report again what is in OUT, without running its steps on INPUT anew."""
     from processor import pipeline
     from processor.evaluate import evaluate
@@ -113,7 +119,8 @@ def report(context: click.Context, output: Path, input_: Path, units: str | None
     writing.check_output(output, input_)
     execution = pipeline.read_execution(output / writing.RUNS, input_, units)
     found = evaluate(input_, execution)
-    writing.write(output, execution, found)
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, found, lang)
     _show(context, output, execution, found, as_json)
 
 

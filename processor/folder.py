@@ -26,6 +26,7 @@ from processor.model import (
     Tolerance,
 )
 from processor.preassembly import tolerance
+from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.raw import decoded
 from processor.units import MM_PER_UNIT, known_unit
@@ -223,7 +224,7 @@ def _scene(
     parts = {part.name for part in arch.parts} if arch else set()
     scans: list[Scan] = []
     reasons: dict[str, str] = {}
-    for entry in project.entries:
+    for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
             raise InputError(
                 f"{entry.path}: the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 
-from processor.report import dxf, figures_balls, results_balls, tables_balls
+from processor.report import dxf, figures_balls, results_balls, tables_balls, view_balls
 from processor.report.step_report import StepReport
 from processor.steps import spheres
 
@@ -27,4 +27,5 @@ REPORT = StepReport(
     tables=tables_balls.of_runs,
     figures=figures_balls.of_runs,
     files=_files,
+    live=view_balls.of_runs,
 )

@@ -33,8 +33,11 @@ def check_output(out: Path, source: Path) -> None:
         raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
 
 
-def write(out: Path, execution: Execution, report: ErrorReport) -> None:
-    """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others."""
+def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
+    """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others.
+
+    The page alone is in the language ``lang``; tables and numbers for other programs are not.
+    """
     out = out.absolute()
     out.parent.mkdir(parents=True, exist_ok=True)
     making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
@@ -55,7 +58,7 @@ def write(out: Path, execution: Execution, report: ErrorReport) -> None:
         for of_step in drawn.values():
             for name, (_, png) in of_step.items():
                 _write(making / "figures" / name, png)
-        _write_text(making / "report.html", page.html(execution, report, drawn))
+        _write_text(making / "report.html", page.html(execution, report, drawn, lang))
         _replace(making, out)
     except BaseException:
         shutil.rmtree(making, ignore_errors=True)
