@@ -27,12 +27,11 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy import stats
+from scipy import special, stats
 
-from processor.model import Floats
 from processor.validation.aims import Badness, badness
 from processor.validation.history import Name, Row
 
@@ -80,6 +79,7 @@ class Found:
     paired: int = 0  # tests made
     fresh: int = 0
     moved_scenes: int = 0  # fixed cells whose scene is another than before
+    first: bool = False  # there is nothing to compare with
 
     def of(self, *kinds: str) -> list[Change]:
         """Return the changes of these kinds, the surest first."""
@@ -96,6 +96,28 @@ class _Test:
     cases: int
 
 
+_ByCase = dict[str, dict[str, list[float]]]  # values of the seeds of a night, by case and night
+
+
+@dataclass
+class _Series:
+    """All rows of one figure: fixed cells of this night and the last before it, seeds of this night and the earlier."""
+
+    unit: str = ""
+    last: dict[tuple[str, int], Row] = field(default_factory=dict)
+    mine: dict[tuple[str, int], Row] = field(default_factory=dict)
+    earlier: _ByCase = field(default_factory=dict)
+    fresh: _ByCase = field(default_factory=dict)
+
+    def add(self, row: Row, tonight: bool) -> None:
+        self.unit = row.unit
+        if row.fixed:
+            (self.mine if tonight else self.last)[row.case, row.seed] = row
+        else:
+            of_case = (self.fresh if tonight else self.earlier).setdefault(row.case, {})
+            of_case.setdefault(row.night, []).append(row.value)
+
+
 def find(
     rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]], aims: Mapping[str, str | float] | None = None
 ) -> Found:
@@ -104,29 +126,31 @@ def find(
     ``worse`` names the nights in which a figure was worse and not accepted: they are no level to go by. So an alarm is
     raised every night until the figure is back or accepted.
     """
-    series: dict[Name, list[Row]] = defaultdict(list)
-    for row in rows:
-        series[row.name].append(row)
-    there = {(row.case, row.seed, row.name[:2]) for row in rows if row.night == night}
+    series: dict[Name, _Series] = defaultdict(_Series)
+    there: set[tuple[str, int, tuple[str, str]]] = set()
+    for row in rows:  # by night, the earliest first
+        tonight = row.night == night
+        if not tonight and (row.night > night or row.night in worse.get(row.name, ())):
+            continue
+        series[row.name].add(row, tonight)
+        if tonight:
+            there.add((row.case, row.seed, row.name[:2]))
     tests: list[_Test] = []
     changes: list[Change] = []
     moved: dict[Name, _Test] = {}
     other_scenes: set[tuple[str, int]] = set()
     judged: dict[Name, tuple[Badness, str]] = {}
     for name, own in series.items():
-        unit = own[-1].unit
-        measure = badness(name[2], unit, aims or {})
-        judged[name] = measure, unit
-        old = [row for row in own if row.night < night and row.night not in worse.get(name, ())]
-        now = [row for row in own if row.night == night]
-        pairs, lost, scenes = _pairs(old, now, there, name, measure)
+        measure = badness(name[2], own.unit, aims or {})
+        judged[name] = measure, own.unit
+        pairs, lost, scenes = _pairs(own, there, name, measure)
         other_scenes |= scenes
         if lost:
-            changes.append(Change(name, LOST, "", math.inf, False, unit, 0.0, lost))
+            changes.append(Change(name, LOST, "", math.inf, False, own.unit, 0.0, lost))
         if any(difference != 0.0 for _, difference, _ in pairs):
             moved[name] = _paired(name, pairs, measure)
             tests += [moved[name]] if moved[name].p_worse == moved[name].p_worse else []
-        fresh = _fresh(name, old, now, measure)
+        fresh = _fresh(name, own.fresh, own.earlier, measure)
         tests += [] if fresh is None else [fresh]
     for kind, side in ((REGRESSION, "p_worse"), (IMPROVEMENT, "p_better")):
         for test in _holm(tests, side):
@@ -141,8 +165,9 @@ def find(
         if name not in told
     ]
     count = sum(one.test == "paired" for one in tests)
-    tonight = {row.name for row in rows if row.night == night}
-    return Found(tuple(changes), len(tonight), count, len(tests) - count, len(other_scenes))
+    figures = sum(bool(own.mine or own.fresh) for own in series.values())
+    first = not any(own.last or own.earlier for own in series.values())
+    return Found(tuple(changes), figures, count, len(tests) - count, len(other_scenes), first)
 
 
 # --- on the fixed seeds ---------------------------------------------------------------------------------------------
@@ -151,16 +176,14 @@ _Pair = tuple[tuple[str, int], float, float]  # recipe and seed, the difference 
 
 
 def _pairs(
-    old: Sequence[Row], now: Sequence[Row], there: set[tuple[str, int, tuple[str, str]]], name: Name, measure: Badness
+    own: _Series, there: set[tuple[str, int, tuple[str, str]]], name: Name, measure: Badness
 ) -> tuple[list[_Pair], int, set[tuple[str, int]]]:
     """Pair fixed cells with the last night's; also how many lost their figure, and whose scene is another."""
-    last = {(row.case, row.seed): row for row in old if row.fixed}  # rows come by night: the last one stays
-    mine = {(row.case, row.seed): row for row in now if row.fixed}
     pairs: list[_Pair] = []
     lost = 0
     scenes: set[tuple[str, int]] = set()
-    for key, before in last.items():
-        row = mine.get(key)
+    for key, before in own.last.items():
+        row = own.mine.get(key)
         if row is None:
             lost += (*key, name[:2]) in there
         elif row.input_sha256 != before.input_sha256:
@@ -194,22 +217,20 @@ def _paired(name: Name, pairs: Sequence[_Pair], measure: Badness) -> _Test:
 # --- on the seeds of the night --------------------------------------------------------------------------------------
 
 
-def _fresh(name: Name, old: Sequence[Row], now: Sequence[Row], measure: Badness) -> _Test | None:
+def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Badness) -> _Test | None:
     """Test this night's ranks among the earlier nights', over all cases; None where there is nothing to rank."""
-    mine = _by_night(now)
-    before = _by_night(old)
     total, null = 0, np.ones(1)
     offset = 0
     sizes = []
-    for case, nights in mine.items():
-        ((_, values),) = nights.items()
+    for case, tonight in now.items():
+        ((_, values),) = tonight.items()
         earlier = sorted((night, found) for night, found in before.get(case, {}).items() if len(found) == len(values))[
             -MOST_NIGHTS:
         ]
         if len(earlier) < LEAST_NIGHTS:
             continue
         levels = np.array([_mean(measure, found) for found in [values, *(found for _, found in earlier)]])
-        scores = np.rint(GRID * stats.norm.ppf(stats.rankdata(levels) / (len(levels) + 1))).astype(np.int64)
+        scores = np.rint(GRID * special.ndtri(stats.rankdata(levels) / (len(levels) + 1))).astype(np.int64)
         if (scores == scores[0]).all():
             continue
         low = int(scores.min())
@@ -227,18 +248,10 @@ def _fresh(name: Name, old: Sequence[Row], now: Sequence[Row], measure: Badness)
     return _Test(name, "fresh", size, worse, better, len(sizes))
 
 
-def _by_night(rows: Sequence[Row]) -> dict[str, dict[str, list[float]]]:
-    found: dict[str, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    for row in rows:
-        if not row.fixed:
-            found[row.case][row.night].append(row.value)
-    return found
-
-
 def _mean(measure: Badness, values: Sequence[float]) -> float:
     """Mean badness of a night's seeds; what could not be measured is worse than all else."""
-    found: Floats = np.array([measure.of(value) for value in values])
-    return float(found.mean()) if np.isfinite(found).all() else math.inf
+    mean = sum(map(measure.of, values)) / len(values)
+    return mean if math.isfinite(mean) else math.inf
 
 
 def _holm(tests: Sequence[_Test], side: str) -> list[_Test]:

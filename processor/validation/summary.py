@@ -65,7 +65,10 @@ class Summary:
                 parts.append(f"{len(some)} {word}: {'; '.join(map(_named, some[:MOST_NAMED]))}{_more(some)}")
         moved = len(self.found.of(CHANGED))
         parts += [f"{moved} moved, neither worse nor better"] if moved else []
-        parts += [] if self.found.of(*ALARMS, IMPROVEMENT, CHANGED) else ["nothing changed"]
+        if self.found.first:
+            parts.append("nothing to compare with yet")
+        elif not self.found.changes:
+            parts.append("nothing changed")
         parts += [f"scenes of {self.found.moved_scenes} cells are others"] if self.found.moved_scenes else []
         return " | ".join(parts)
 

@@ -107,7 +107,10 @@ def test_the_rank_test_is_exact():
     table = np.round(rng.lognormal(size=(3, 6)), 1)  # three cases, this night and five before it; with ties
     given = [row for n in range(1, 6) for row in rows(night_name(n), table[:, n], fixed=False)]
     given += rows(night_name(6), table[:, 0], fixed=False)
-    test = changes._fresh(NAME, given[:-3], given[-3:], badness(NAME[2], "mm", {}))
+    series = changes._Series()
+    for row in given:
+        series.add(row, row.night == night_name(6))
+    test = changes._fresh(NAME, series.fresh, series.earlier, badness(NAME[2], "mm", {}))
     scores = [np.rint(64 * stats.norm.ppf(stats.rankdata(own) / 7)) for own in table]
     seen = sum(own[0] for own in scores)
     sums = np.array([sum(one) for one in itertools.product(*scores)])
@@ -189,7 +192,7 @@ def test_an_estimator_20_percent_worse_is_reported_the_first_night(earlier, monk
 # --- nights drawn from stored cells ---------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [1, 2])
+@pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_sixty_undisturbed_nights_raise_at_most_one_alarm(seed):
     simulated = nights.Simulated(seed)
     for number in range(60):
@@ -197,7 +200,7 @@ def test_sixty_undisturbed_nights_raise_at_most_one_alarm(seed):
     assert len({night for night, _ in simulated.alarms}) <= 1
 
 
-@pytest.mark.parametrize("method", ["ray", "ransac", "adjustment"])
+@pytest.mark.parametrize("method", ["ray", "ransac"])
 def test_a_worse_figure_of_stored_cells_is_reported_the_first_night(method):
     simulated = nights.Simulated(3)
     for number in range(10):
