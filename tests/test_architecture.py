@@ -49,6 +49,11 @@ def test_arrows_run_one_way(path):
         assert not within(used, "h5py")
     if name == "processor.model":
         assert not own
+    if name.startswith("processor.validation"):
+        allowed = within(own, "processor.validation", "processor.model", "processor.pipeline")
+        assert not own - allowed - {"processor"}, "a night runs programs and reads what they wrote"
+    elif name != "processor.cli":
+        assert not within(used, "processor.validation")
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
     methods = ("processor.preassembly", "processor.bolt_balls", "processor.deviation")
