@@ -7,12 +7,9 @@ import pytest
 import trimesh
 
 from processor import pipeline
-from processor.deviation import measuring
 from processor.evaluate import ErrorReport
 from processor.geometry import rigid
-from processor.model import (
-    InputError, Scan, Scene, Stations, StructureDesign, StructureTruth, Truth, UsageError,
-)  # fmt: skip
+from processor.model import InputError, Scan, Scene, Stations, StructureDesign, StructureTruth, Truth, UsageError
 from processor.pipeline import Execution
 from processor.report import results_json, writing
 from processor.steps import deviation
@@ -32,8 +29,6 @@ def scene_of(seed, move=field, T_design_scan=None, origin=0.0, count=60_000):
     mesh = bracket()
     rng = np.random.default_rng(seed)
     points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
-    inside = np.any([body.contains(points) for body in mesh.split()], axis=0) if len(mesh.split()) > 1 else False
-    points = points[~inside] if np.ndim(inside) else points
     points = points + move(points) + rng.normal(0.0, SIGMA, points.shape)
     if T_design_scan is not None:
         points = rigid.apply(rigid.invert(T_design_scan), points)
@@ -112,7 +107,7 @@ def test_a_scanner_tells_the_sides_of_a_plate_apart():
     result = deviation.run(scene, deviation.Params())
     front = np.isfinite(result.lod95) & (result.normals[:, 1] > 0.9)
     assert front.sum() > 100
-    assert np.nanmedian(result.distance[front]) == pytest.approx(-3.0, abs=0.1)
+    assert np.nanmedian(result.distance[front]) == pytest.approx(-7.0, abs=0.1)
     assert not np.isfinite(result.lod95[result.normals[:, 1] < -0.9]).any()
 
 
@@ -178,4 +173,3 @@ def test_it_is_written_as_the_interface_says(tmp_path):
     np.testing.assert_array_equal(data[:, 5], np.abs(data[:, 3]) > data[:, 4])
     assert (tmp_path / "out" / "figures" / "deviation-map.png").exists()
     assert results_json.step_json(found.runs[0])["status"] == "ok"
-    assert measuring.REACH_MM > 0.0
