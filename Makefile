@@ -43,8 +43,9 @@ $(VENV)/.demo: pyproject.toml .ci/system-libraries | $(BIN)/python
 	$(BIN)/python -m pip install --quiet --editable ".[designgen]"
 	@touch $@
 
-$(VENV)/.test: pyproject.toml .ci/system-libraries | $(BIN)/python
+$(VENV)/.test: pyproject.toml .ci/system-libraries .ci/browser | $(BIN)/python
 	@sh .ci/system-libraries
+	@sh .ci/browser
 	$(BIN)/python -m pip install --quiet --editable ".[designgen,test]"
 	@touch $@ $(VENV)/.demo
 
