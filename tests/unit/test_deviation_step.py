@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from designgen import recipes
+from designgen.scene import make
 from processor import pipeline
 from processor.evaluate import ErrorReport
 from processor.geometry import rigid
@@ -98,7 +100,7 @@ def test_a_scanner_tells_the_sides_of_a_plate_apart():
     mesh = trimesh.creation.box((1500.0, 10.0, 1000.0))
     rng = np.random.default_rng(6)
     points = np.column_stack(
-        [rng.uniform(-740, 740, 40_000), rng.normal(2.0, 0.5, 40_000), rng.uniform(-490, 490, 40_000)]
+        [rng.uniform(-740, 740, 40_000), rng.normal(-2.0, 0.5, 40_000), rng.uniform(-490, 490, 40_000)]
     )
     scan = Scan("scan", points, position=np.array([0.0, 5000.0, 0.0]))
     design = StructureDesign("plate", np.asarray(mesh.vertices), np.asarray(mesh.faces))
@@ -173,3 +175,13 @@ def test_it_is_written_as_the_interface_says(tmp_path):
     np.testing.assert_array_equal(data[:, 5], np.abs(data[:, 3]) > data[:, 4])
     assert (tmp_path / "out" / "figures" / "deviation-map.png").exists()
     assert results_json.step_json(found.runs[0])["status"] == "ok"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
+    scene, truth = make("roof", recipes.overridden(recipes.load("stadium-roof")[1], [f"seed={seed}"]))
+    result = deviation.run(scene, deviation.Params())
+    assert all(one.passed for one in deviation.check(scene, result, truth))
+    assert np.isfinite(result.lod95).mean() > 0.95
+    assert np.nanmedian(result.lod95) < 2.0
