@@ -56,8 +56,7 @@ def _of_ply(path: Path) -> tuple[Floats | None, Floats]:
 
 def _of_text(path: Path) -> tuple[Floats | None, Floats]:
     layout = text.sniff(path)
-    with parsing(path, "text"):
-        data = text.rows(path, layout, list(range(layout.columns)))
+    data = text.numbers(path, layout)
     names = [name.strip("\"' ") for name in layout.header]
     if len(names) == layout.columns and any(first_named(names, one) for one in NAMES):
         return _picked(path, names, lambda name: data[:, names.index(name)])

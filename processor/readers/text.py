@@ -108,13 +108,14 @@ def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, F
     return points[:found], others[:found]
 
 
-def rows(path: Path, layout: Layout, columns: Sequence[int]) -> Floats:
-    """Return columns (n, k) of a table; ValueError where a row is not of numbers."""
-    with _opened(path, layout) as file:
-        found = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
+def numbers(path: Path, layout: Layout) -> Floats:
+    """Return all columns (n, k) of a table. Raises InputError for what is no number."""
+    with parsing(path, "text"), _opened(path, layout) as file:
+        rows = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
         for _ in range(layout.skip):
-            found.skip_line()
-        return np.vstack([np.empty((0, len(columns))), *found.pieces(columns, found.most_left())])
+            rows.skip_line()
+        pieces = [piece.copy() for piece in rows.pieces(range(layout.columns), rows.most_left())]
+    return np.concatenate(pieces) if pieces else np.empty((0, layout.columns))
 
 
 @contextmanager

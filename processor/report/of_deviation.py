@@ -9,7 +9,8 @@ import numpy as np
 
 from processor.deviation.result import Result
 from processor.evaluate import ErrorReport
-from processor.model import Scene, StepRun
+from processor.model import StepRun
+from processor.pipeline import Execution
 from processor.report import core_points, figures_deviation, results_deviation
 from processor.report.drawing import Drawn
 from processor.report.printing import shown
@@ -77,7 +78,7 @@ def _column(result: Result) -> dict[str, tuple[Any, str]]:
     }
 
 
-def _figures(scene: Scene, runs: Sequence[StepRun], _: ErrorReport) -> Drawn:
+def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
     result: Result = runs[0].result
     if not np.isfinite(result.lod95).any():
         return {}
@@ -97,6 +98,6 @@ REPORT = StepReport(
     summary=_summary,
     written=results_deviation.written,
     tables=_tables,
-    figures=lambda execution, runs, report: _figures(execution.scene, runs, report),
+    figures=_figures,
     files=_files,
 )

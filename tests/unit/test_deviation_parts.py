@@ -93,9 +93,9 @@ def planes_compared(seed, off=0.0, error=0.0):
 
 def test_where_its_assumptions_hold_a_twentieth_is_beyond_the_level_of_detection():
     """Normal noise, no registration error: 5 %, and a little more as sd of few points are a little small."""
-    shares = [planes_compared(seed) for seed in range(6)]
-    assert 0.04 < np.median(shares) < 0.06
-    assert 0.03 < min(shares) < max(shares) < 0.08  # 1250 cylinders that share no point: sd 0.6 %
+    shares = [planes_compared(seed) for seed in range(12)]
+    assert 0.04 < np.mean(shares) < 0.06
+    assert 0.025 < min(shares) < max(shares) < 0.085  # some 1000 cylinders that share no point: sd 0.7 %
 
 
 def test_a_registration_that_is_off_shows_unless_it_is_said():
