@@ -20,6 +20,7 @@ from typing import Any
 
 from processor import __version__, steps
 from processor.model import InputError, Scene, StepRun, UsageError
+from processor.progress import stage
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -227,7 +228,8 @@ def execute(
 def _run(path: Path, scene: Scene, job: Job, given: Mapping[str, Any], log: Callable[[str], None]) -> StepRun:
     started = time.monotonic()
     try:
-        result = job.module.run(scene, job.params, **given)
+        with stage(f"{job.step} ({job.params.method})"):
+            result = job.module.run(scene, job.params, **given)
     except (InputError, UsageError):
         raise
     except Exception as error:

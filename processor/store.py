@@ -14,6 +14,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -61,8 +62,13 @@ def replacing(path: Path) -> Iterator[Path]:
         sync(temporary)
         os.replace(temporary, path)
         sync(path.parent)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    except (OSError, RuntimeError) as error:
+        # Of a full disk HDF5 says so within a text of its own, and not always as an OSError.
+        said = re.search(r"error message = '([^']*)'", str(error))
+        if isinstance(error, RuntimeError) and not said:
+            raise
+        why = said[1] if said else getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be written ({why})") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -78,13 +84,19 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterator[Any]:
-    with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest") as file:
+    # HDF5 can end the process at once when the disk is full. What is small is made in memory and written as bytes.
+    small = kind != "scene"
+    driver: dict[str, Any] = {"driver": "core", "backing_store": False} if small else {}
+    with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest", **driver) as file:
         header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "units": "mm"}
         header["history"] = json.dumps(HISTORY)
         for name, text in header.items():
             file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
         codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
         yield file
+        if small:
+            file.flush()
+            temporary.write_bytes(file.id.get_file_image())
 
 
 def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mapping[str, object]) -> None:
@@ -165,8 +177,11 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
 def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
     """Open a file of one of ``kinds`` that passes vetting. Raises InputError for any other and for damage."""
     try:
-        with h5py.File(path, "r", locking=False) as file:
-            found = vetting.problems(file, path)
+        with vetting.limited_memory():
+            file = h5py.File(path, "r", locking=False)
+        with file:
+            with vetting.limited_memory():
+                found = vetting.problems(file, path)
             found = found or _header_problems(file, kinds)
             if found:
                 raise DecodeError(found)

@@ -12,6 +12,7 @@ from designgen import recipes
 from designgen.scene import make
 from processor import pipeline, readers, store
 from processor.model import Metric, Scene, StepRun, UsageError
+from processor.report import step_report
 
 STEPS = pipeline.step_modules()
 
@@ -26,6 +27,7 @@ def test_a_step_has_its_names(name):
         assert record.__dataclass_params__.frozen
     assert callable(module.run)
     assert callable(module.check)
+    assert step_report.of(name).title
 
 
 @pytest.mark.parametrize("name", STEPS)

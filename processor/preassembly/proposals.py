@@ -28,7 +28,7 @@ from processor.preassembly.joint_measures import ACROSS, SEED, Measures, draws
 from processor.preassembly.joint_verdicts import NO_SIZES, Marks, held, judge, keeps
 
 PLACES = ("bottom left", "bottom right", "top right", "top left", "bottom", "right", "top", "left")
-LEAST_MM = 0.05  # less is not worth a cut
+SHOWN_MM = 0.1  # amounts are said to this
 ALIKE = 0.01  # probabilities that differ by less are alike
 CUT_GAIN, BUILD_UP_GAIN = 0.05, 0.1  # of probability, for which a cut, and for which build-up is worth its while
 SIDES = {(1, False): "to the left", (1, True): "to the right", (2, False): "up", (2, True): "down"}
@@ -40,10 +40,12 @@ class TrimParams:
 
     cut_sd_mm: float = 1.0  # of a cut or build-up, at the corners of the section
     aim_mm: float = 0.0  # wanted gap after it, less the design's root gap
+    least_mm: float = 0.5  # less, at its deepest, is not worth a cut or build-up
 
     def __post_init__(self) -> None:
-        if not (0.0 <= self.cut_sd_mm < math.inf and math.isfinite(self.aim_mm)):
-            raise UsageError(f"preassemble.trim: expected numbers, cut_sd_mm of 0 or more, got {self}")
+        amounts = self.cut_sd_mm, self.least_mm
+        if not (all(0.0 <= one < math.inf for one in amounts) and math.isfinite(self.aim_mm)):
+            raise UsageError(f"preassemble.trim: expected numbers, cut_sd_mm and least_mm of 0 or more, got {self}")
 
 
 @dataclass(frozen=True)
@@ -129,7 +131,7 @@ def propose(
         error = _cut_errors(measures.points, params.cut_sd_mm, len(drawn))
         works = [nothing]
         if _verdict(measures, tolerance, groove, sizes_mm) != "pass":
-            works += _works(measures, wanted)
+            works += _works(measures, wanted, max(params.least_mm, SHOWN_MM))
         marks = [kept(groove, work.on(drawn, error)) for work in works]
         chosen = _chosen(works, [_share([one]) for one in marks])
         best, before, after = works[chosen], marks[:1], [marks[chosen]]
@@ -181,7 +183,7 @@ def _chosen(works: Sequence[_Work], shares: Sequence[float]) -> int:
     return best
 
 
-def _works(measures: Measures, wanted: float) -> Iterator[_Work]:
+def _works(measures: Measures, wanted: float, least_mm: float) -> Iterator[_Work]:
     """Yield what could be done: the three cuts, build-up after the third, and build-up alone."""
     A = np.column_stack([np.ones(8), measures.points[:, 1:]])
     lacking = wanted - measures.gaps[:, 0]
@@ -194,10 +196,10 @@ def _works(measures: Measures, wanted: float) -> Iterator[_Work]:
         (nothing, True),
     ):
         cut = np.maximum(A @ plane, 0.0)
-        if cut.max() < LEAST_MM:
+        if cut.max() < least_mm:
             plane, cut = nothing, np.zeros(8)
         put = np.maximum(cut - lacking, 0.0) if fill else np.zeros(8)
-        if put.max() >= LEAST_MM or (cut.any() and not fill):
+        if put.max() >= least_mm or (cut.any() and not fill):
             yield _Work(plane, cut, put)
 
 
@@ -281,7 +283,7 @@ def _works_in_words(found: Proposal) -> Iterator[str]:
         if by.max() <= 0.0:
             continue
         least, most = int(np.argmin(by)), int(np.argmax(by))
-        if by[most] - by[least] < 2.0 * LEAST_MM:
+        if by[most] - by[least] < SHOWN_MM:
             yield f"{what} {by.mean():.1f} mm all round"
         else:
             yield (

@@ -6,21 +6,17 @@ import matplotlib as mpl
 
 from processor.evaluate import ErrorReport
 from processor.pipeline import Execution
-from processor.report import figures_balls, figures_preassembly
+from processor.report import step_report
 from processor.report.drawing import Drawn
 from processor.report.tables import grouped
 
 
-def of_run(execution: Execution, report: ErrorReport) -> Drawn:
-    """Draw all figures of a run: file name -> (caption, PNG)."""
-    found: Drawn = {}
+def of_run(execution: Execution, report: ErrorReport) -> dict[str, Drawn]:
+    """Draw all figures of a run, by step: file name -> (caption, PNG)."""
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams["text.parse_math"] = False  # a name from outside may hold dollar signs
-        for run, others in grouped(execution.runs):
-            runs = [run, *others]
-            if run.step == "preassemble":
-                found |= figures_preassembly.of_runs(execution.scene, runs)
-            if run.step == "spheres":
-                found |= figures_balls.of_runs(execution.scene, runs, report, execution.stored)
-    return found
+        return {
+            run.step: step_report.of(run.step).figures(execution, [run, *others], report)
+            for run, others in grouped(execution.runs)
+        }

@@ -43,11 +43,6 @@ def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: 
     return found
 
 
-def is_own(name: str) -> bool:
-    """Whether a figure of that name is one of balls."""
-    return name in (PLAN, RADIUS_ERRORS, BALL_ERRORS) or name.startswith(figures_ball.PREFIX)
-
-
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 

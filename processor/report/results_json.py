@@ -8,12 +8,10 @@ from typing import Any
 import numpy as np
 
 from processor.evaluate import ErrorReport
-from processor.model import ENDS, KEY_POINTS, Floats, StepRun
+from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report import results_balls
-from processor.steps import preassemble
+from processor.report import step_report
 
-TRADE_OFF = ("splicing_mean", "splicing_max", "linear_mean", "linear_max")
 FORMAT, FORMAT_VERSION = "processor-results", "1.0"
 
 
@@ -56,119 +54,7 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
 
 def step_json(run: StepRun) -> dict[str, Any]:
     """Write one step's result."""
-    found: dict[str, Any] = WRITERS[run.step](run.result)
-    return found
-
-
-def _preassemble(result: preassemble.Result) -> dict[str, Any]:
-    found = {
-        "status": result.status,
-        "method": result.method,
-        "message": result.message,
-        "components": [
-            {
-                "name": name,
-                "status": result.component_status[i],
-                "message": result.component_message[i],
-                "scans": result.component_scans[i] if result.component_scans else "",
-                "T_bridge_scan": result.T_bridge_scan[i],
-                "covariance": result.covariance[i],
-                "key_points_scan": _ends(result.key_points_scan[i]),
-                "key_points_sd": _ends(result.key_points_sd[i]),
-            }
-            for i, name in enumerate(result.components)
-        ],
-        "joints": [
-            {
-                "name": name,
-                "left": result.joint_left[j],
-                "right": result.joint_right[j],
-                "points": {
-                    key: {"gap": result.gaps[j, k], "ci95": result.gap_ci95[j, k]} for k, key in enumerate(KEY_POINTS)
-                },
-                "verdict": result.verdict[j],
-            }
-            for j, name in enumerate(result.joints)
-        ],
-        "splicing_error": {"mean": result.splicing_mean, "max": result.splicing_max},
-        "linear_error": {
-            "mean": result.linear_mean,
-            "max": result.linear_max,
-            "gauge": result.gauge,
-            "stations": result.linear_station,
-            "edge": list(result.linear_edge),
-            "deviation": result.linear_deviation,
-            "foot1_best_fit": {
-                "mean": result.best_fit_linear_mean,
-                "max": result.best_fit_linear_max,
-                "deviation": result.best_fit_linear_deviation,
-            },
-        },
-        "trade_off": [
-            {"lambda": weight, **dict(zip(TRADE_OFF, figures, strict=True))}
-            for weight, figures in zip(result.trade_lambda, result.trade_figures, strict=True)
-        ],
-    }
-    return found | _adjusted(result) if result.measures else found
-
-
-def _adjusted(result: preassemble.Result) -> dict[str, Any]:
-    """Write what the adjustment alone says; the records of measures, verdicts and proposals as they are."""
-    judged = []
-    for joint, measures, verdict, proposal in zip(
-        result.joints, result.measures, result.judged, result.proposals, strict=True
-    ):
-        rows = zip(measures.name, measures.value, measures.ci95, measures.unit, strict=True)
-        limits = zip(
-            verdict.key, verdict.what, verdict.value, verdict.ci95, verdict.low, verdict.high, verdict.each,
-            verdict.each_probability, verdict.clause, verdict.verified, strict=True,
-        )  # fmt: skip
-        keys = ("limit", "what", "value", "ci95", "low", "high", "verdict", "probability", "clause")
-        judged.append(
-            {
-                "name": joint,
-                "gaps_joint_axes": dict(zip(KEY_POINTS, measures.gaps, strict=True)),
-                "measures": {name: {"value": v, "ci95": ci, "unit": unit} for name, v, ci, unit in rows},
-                "limits": [{**dict(zip(keys, row[:-1], strict=True)), "verified": bool(row[-1])} for row in limits],
-                "probability": verdict.probability,
-                "proposal": {
-                    "action": proposal.action,
-                    "cut": dict(zip(KEY_POINTS, proposal.cut, strict=True)),
-                    "build_up": dict(zip(KEY_POINTS, proposal.build_up, strict=True)),
-                    "probability": proposal.probability,
-                    "probability_as_is": proposal.probability_as_is,
-                    "sentence": proposal.sentence,
-                },
-            }
-        )
-    ambiguous = [i for i in range(len(result.components)) if np.isfinite(result.T_rival_scan[i]).all()]
-    return {
-        "lambda": result.weight,
-        "joint_measures": judged,
-        "span": {"departure": result.span_departure, "ci95": result.span_ci95},
-        "closure": {
-            "mm": result.closure[:3],
-            "mrad": result.closure[3:],
-            "ci95_mm": result.closure_ci95[:3],
-            "ci95_mrad": result.closure_ci95[3:],
-        },
-        "linear_offset": {"left_up": result.linear_offset, "ci95": result.linear_offset_ci95},
-        "ambiguous": {result.components[i]: {"T_rival_scan": result.T_rival_scan[i]} for i in ambiguous},
-        "limiting": result.limiting,
-        "advice": result.advice,
-        "budget_sd": dict(zip(result.budget_source, result.budget_sd, strict=True)),
-    }
-
-
-def _ends(points: Floats) -> dict[str, Any]:
-    """Name the points (2, 8, 3) of both ends; an end without any is empty."""
-    return {
-        end: dict(zip(KEY_POINTS, points[i], strict=True)) if np.isfinite(points[i]).any() else {}
-        for i, end in enumerate(ENDS)
-    }
-
-
-WRITERS: dict[str, Any] = {"preassemble": _preassemble, "spheres": results_balls.written}
+    return step_report.of(run.step).written(run.result)
 
 
 def plain(value: Any) -> Any:

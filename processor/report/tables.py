@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from processor.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report import tables_balls, tables_preassembly
+from processor.report import step_report
 from processor.report.table import Table
 
 __all__ = ["Table", "all_of", "grouped", "of_checks", "of_step"]
@@ -16,9 +16,7 @@ __all__ = ["Table", "all_of", "grouped", "of_checks", "of_step"]
 
 def of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tables of a step's answer, beside other methods on the same scene."""
-    return {"preassemble": tables_preassembly.of_runs, "spheres": tables_balls.of_runs}[run.step](
-        (run, *others), report
-    )
+    return step_report.of(run.step).tables((run, *others), report)
 
 
 def of_checks(report: ErrorReport) -> Table:

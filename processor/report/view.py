@@ -15,7 +15,8 @@ from processor.model import KEY_POINTS, Floats, Scene, StepRun
 from processor.report.drawing import DIVERGING_STOPS, LEAST_SHOWN_MM
 from processor.report.figures_preassembly import linear_band
 from processor.report.printing import shown
-from processor.report.results_json import TRADE_OFF, plain
+from processor.report.results_json import plain
+from processor.report.results_preassembly import TRADE_OFF
 from processor.steps import preassemble
 
 MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page
@@ -30,6 +31,9 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
         return None
     result: preassemble.Result = runs[0].result
     found = {
+        "title": "Gaps and residuals in space" if len(result.residual) else "Gaps in space",
+        "arrows": "gaps as arrows",
+        "values": "residuals",
         "method": runs[0].method,
         "keys": KEY_POINTS,
         "stops": DIVERGING_STOPS,

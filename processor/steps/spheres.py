@@ -17,6 +17,7 @@ from processor.bolt_balls import answer, single
 from processor.bolt_balls.params import METHODS, Params
 from processor.bolt_balls.result import Result
 from processor.bolt_balls.scene_source import PointReader
+from processor.geometry.error_figures import signed
 from processor.geometry.merging import merged
 from processor.model import Floats, FrameTruth, InputError, Ints, Metric, Scene, Tolerance, Truth
 from processor.preassembly import tolerance
@@ -117,6 +118,12 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *_honesty("centres", off, sd[:, :3], ok),
         *_honesty("radii", radius, sd[:, 3], ok),
         *_honesty("lowest points", lowest, result.lowest_sd[rows], ok),
+    ]
+    bound = result.bound_sd[rows] if len(result.bound_sd) else np.full((len(rows), 5), NAN)
+    metrics += [
+        *signed("spheres", "centres", off[ok], bound[ok, :3]),
+        *signed("spheres", "radii", radius[ok], bound[ok, 3]),
+        *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
     ]
     return metrics
 

@@ -1,6 +1,7 @@
 """The adjustment's accuracy on bridges of D1's size: median and worst over seeds, and whether its intervals are honest.
 
     python -m tests.bench.adjustment --seeds 10 --cases 0:5,1:5,1:10,2:5,2:10 --output out.json [--jobs 2]
+    python -m tests.bench.adjustment --seeds 10 --recipe arch-s1-rays --with asbuilt.dents=0 --output out.json
 
 A case is sigma:spacing in mm. Perfect parts give key points, splicing and linear error; imperfect ones the gaps' error
 against those that the same objective has on the truth. Splicing and linear error are those of the true key points and
@@ -70,6 +71,14 @@ def _job(task):
     return figures(recipe, settings, seed)
 
 
+def _case(bridge, kind, case):
+    """What a row is of: its name, recipe and settings."""
+    sigma, spacing = map(float, case.split(":"))
+    recipe = f"arch-{bridge}" + ("-as-built" if kind == "imperfect" else "")
+    row = {"kind": kind, "sigma_mm": sigma, "spacing_mm": spacing}
+    return row, recipe, [f"scan.sigma_mm={sigma}", f"scan.spacing_mm={spacing}"]
+
+
 def main():
     """Run, print a table and write JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -77,25 +86,28 @@ def main():
     parser.add_argument("--seeds", type=int, default=10)
     parser.add_argument("--cases", default="0:5,1:5,1:10,2:5,2:10")
     parser.add_argument("--kinds", default="perfect,imperfect")
+    parser.add_argument("--recipe", help="instead of the cases, one row of this recipe")
+    parser.add_argument("--with", dest="settings", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--jobs", type=int, default=1)
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
+    cases = [
+        _case(arguments.set, kind, case) for kind in arguments.kinds.split(",") for case in arguments.cases.split(",")
+    ]
+    if arguments.recipe:
+        cases = [({"kind": arguments.recipe}, arguments.recipe, arguments.settings)]
     rows = []
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-        for kind in arguments.kinds.split(","):
-            recipe = f"arch-{arguments.set}" + ("-as-built" if kind == "imperfect" else "")
-            for case in arguments.cases.split(","):
-                sigma, spacing = map(float, case.split(":"))
-                settings = [f"scan.sigma_mm={sigma}", f"scan.spacing_mm={spacing}"]
-                tasks = [(recipe, settings, seed) for seed in range(1, arguments.seeds + 1)]
-                every = list(pool.map(_job, tasks))
-                table = {name: [one[name] for one in every] for name in every[0]}
-                row = {"kind": kind, "sigma_mm": sigma, "spacing_mm": spacing, "all": table}
-                row["median"] = {name: float(np.median(values)) for name, values in table.items()}
-                row["worst"] = {name: float(np.max(values)) for name, values in table.items()}
-                rows.append(row)
-                said = "  ".join(f"{n} {row['median'][n]:.3f} ({row['worst'][n]:.3f})" for n in table if n != "points")
-                print(f"{kind} sigma {sigma:g} d {spacing:g}: {said}", flush=True)
+        for row, recipe, settings in cases:
+            tasks = [(recipe, settings, seed) for seed in range(1, arguments.seeds + 1)]
+            every = list(pool.map(_job, tasks))
+            table = {name: [one[name] for one in every] for name in every[0]}
+            row |= {"settings": settings, "all": table}
+            row["median"] = {name: float(np.median(values)) for name, values in table.items()}
+            row["worst"] = {name: float(np.max(values)) for name, values in table.items()}
+            rows.append(row)
+            said = "  ".join(f"{n} {row['median'][n]:.3f} ({row['worst'][n]:.3f})" for n in table if n != "points")
+            print(f"{row['kind']} {' '.join(settings)}: {said}", flush=True)
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
     arguments.output.write_text(json.dumps(rows, indent=1) + "\n", encoding="utf-8")
 

@@ -287,11 +287,15 @@ def test_a_joint_without_an_answer_is_not_a_perfect_one():
 # --- figures and page ----------------------------------------------------------------------------------------------
 
 
+def figures_of_both():
+    drawn = figures.of_run(of_bridge(), ErrorReport()) | figures.of_run(*of_frame())
+    return drawn["preassemble"] | drawn["spheres"]
+
+
 def test_figures_are_the_same_bytes_whatever_the_users_settings():
-    execution, report = of_frame()
-    first = {**figures.of_run(of_bridge(), ErrorReport()), **figures.of_run(execution, report)}
+    first = figures_of_both()
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0, "savefig.facecolor": "black"}):
-        again = {**figures.of_run(of_bridge(), ErrorReport()), **figures.of_run(execution, report)}
+        again = figures_of_both()
         assert mpl.rcParams["font.size"] == 20.0
     assert set(first) == {"bridge.png", "linear-error.png", "gaps-by-axis.png", "plan.png", "radius-errors.png"}
     assert first == again

@@ -200,7 +200,7 @@ def test_methods_without_intervals_have_none_of_these():
     execution = Execution(arch_scene(), runs, PROVENANCE)
     files = {table.file for table in tables.all_of(execution, ErrorReport())}
     assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
-    assert not set(figures.of_run(execution, ErrorReport())) & OWN
+    assert not set(figures.of_run(execution, ErrorReport())["preassemble"]) & OWN
     assert "What limits the accuracy" not in rendered(execution)
 
 
@@ -244,7 +244,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
     execution = of_bridge()
     result = unknown(execution.runs[0].result, list(joints), parts)
     execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
-    found = figures.of_run(execution, ErrorReport())
+    found = figures.of_run(execution, ErrorReport())["preassemble"]
     assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == drawn
     parsed = Page(rendered(execution))
     last = parsed.tables["Joints: what to do, method adjustment"][-1]
@@ -252,7 +252,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
     assert "scan both ends" in last[2]
     assert set(last[3:]) <= {"–", ""}
     assert "Closure by" not in parsed.text
-    data = json.loads(parsed.scripts[0][1])
+    data = json.loads(parsed.scripts[0][1])["steps"]["preassemble"]
     assert data["joints"][1]["gap"] == [[None] * 3] * 8
 
 
@@ -260,7 +260,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
 
 
 def test_every_picture_shows_something():
-    found = figures.of_run(of_bridge(), ErrorReport())
+    found = figures.of_run(of_bridge(), ErrorReport())["preassemble"]
     assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
     for name, (caption, png) in found.items():
         pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
@@ -272,13 +272,13 @@ def test_every_picture_shows_something():
 
 def test_pictures_follow_what_they_show():
     """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
-    before = figures.of_run(of_bridge(), ErrorReport())
+    before = figures.of_run(of_bridge(), ErrorReport())["preassemble"]
     execution = of_bridge()
     run = execution.runs[0]
     other = dataclasses.replace(run.result, residual=-3.0 * np.abs(run.result.residual), weight=1.0)
     after = figures.of_run(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
-    )
+    )["preassemble"]
     assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
 
 

@@ -343,7 +343,7 @@ def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
 
 def test_figures_of_a_frame_and_those_of_balls_to_look_at():
     report, result = with_truth()
-    found = figures.of_run(*of_frame(result, report))
+    found = figures.of_run(*of_frame(result, report))["spheres"]
     assert set(found) == {
         "plan.png", "radius-errors.png", "ball-errors.png", "ball-to-see-11.png", "ball-to-see-12.png",
         "ball-to-see-13.png",
@@ -353,15 +353,13 @@ def test_figures_of_a_frame_and_those_of_balls_to_look_at():
     assert "sd" not in found["ball-errors.png"][0]
     assert found["ball-to-see-11.png"][0].startswith("Ball 11, wrong-size")
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
-        assert figures.of_run(*of_frame(result, report)) == found
-    assert all(figures_balls.is_own(name) for name in found)
-    assert not figures_balls.is_own("bridge.png")
-    untold = figures.of_run(*of_frame())
+        assert figures.of_run(*of_frame(result, report))["spheres"] == found
+    untold = figures.of_run(*of_frame())["spheres"]
     assert "Standard deviations" in untold["ball-errors.png"][0]
 
 
 def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
-    found = figures.of_run(*of_frame(points=np.empty((0, 3))))
+    found = figures.of_run(*of_frame(points=np.empty((0, 3))))["spheres"]
     assert set(found) == {"plan.png", "ball-errors.png"}
 
 
@@ -447,7 +445,7 @@ def test_the_page_of_a_frame():
         found.tables
     )
     assert found.tables["Nodes against the design (mm)"][1][-3] == "pass"
-    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == len(drawn)
+    assert len([one for one in found.addresses if one.startswith("data:image/png")]) == len(drawn["spheres"])
     assert "Nodes against the design" in text[text.index("<h2>") :]
 
 

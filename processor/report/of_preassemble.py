@@ -1,0 +1,56 @@
+"""How preassembly reports."""
+
+from __future__ import annotations
+
+import collections
+
+import numpy as np
+
+from processor.report import figures_preassembly, results_preassembly, tables_preassembly, view
+from processor.report.printing import shown
+from processor.report.step_report import StepReport
+from processor.steps import preassemble
+
+
+def _summary(result: preassemble.Result) -> tuple[str, str]:
+    placed = sum(status != "failed" for status in result.component_status)
+    verdicts = collections.Counter(result.verdict)
+    judged = ", ".join(f"{verdicts[name]} {name}" for name in ("pass", "fail", "indeterminate") if verdicts[name])
+    splicing = f"{shown(result.splicing_mean)} mm mean, {shown(result.splicing_max)} mm at most"
+    linear = f"{shown(result.linear_mean)} mm mean, {shown(result.linear_max)} mm at most"
+    head = f"{result.status}, {placed} of {len(result.components)} parts placed"
+    if result.judged:
+        head = f"of {len(result.joints)} joints {judged}; assembly {head}"
+    unverified = any((one.verified == 0).any() for one in result.judged)
+    said = f"Splicing error {splicing}. Linear error {linear}. Joints: {judged or 'none'}."
+    return head, said + (" The limits are NOT VERIFIED against the standard's text." if unverified else "")
+
+
+def _further(result: preassemble.Result) -> list[tuple[str, str]]:
+    """Say beside the verdict what the adjustment knows of the whole bridge."""
+    if not result.measures:
+        return []
+    span = f"{shown(result.span_departure)} ± {shown(result.span_ci95)} mm against the design"
+    shift = " / ".join(
+        f"{shown(value)} ± {shown(half)}"
+        for value, half in zip(result.closure[:3].tolist(), result.closure_ci95[:3].tolist(), strict=True)
+    )
+    known = np.isfinite(result.closure).any()
+    closure = f" Closure by the joints alone, along / across / up: {shift} mm." if known else ""
+    rows = (
+        ("Span", f"{span}.{closure}" if np.isfinite(result.span_departure) else ""),
+        ("What limits the accuracy", result.limiting),
+        ("Which scan would help", result.advice),
+    )
+    return [(head, text) for head, text in rows if text]
+
+
+REPORT = StepReport(
+    title="Preassembly",
+    summary=_summary,
+    written=results_preassembly.written,
+    tables=tables_preassembly.of_runs,
+    figures=lambda execution, runs, _: figures_preassembly.of_runs(execution.scene, runs),
+    further=_further,
+    live=view.of_runs,
+)
