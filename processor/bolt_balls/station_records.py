@@ -37,7 +37,7 @@ class Stations(Checked):
     have in common; NaN where nothing tells of it.
     """
 
-    status: str  # ok | weak | single | unknown
+    status: str  # ok | weak | single | unknown | doubtful: what stations seem off may be the beam's width
     message: str
     T_project_station: Floats = column("s", 4, 4)
     places: Floats = column("s", 3)

@@ -43,6 +43,7 @@ LEAST_POINTS = 20  # of a station, for a scale of their own
 SMALLEST_MM = 1e-3  # scale of residuals
 WEAK_MM, WEAK_RAD = 0.1, 1e-5  # sd that is too small to be called weak
 TOLD_MM = 0.3  # an offset of all ranges that is spoken of
+WIDE_MM = 0.5  # one that, where stations seem off by no more, speaks against moving them
 WEAK_SHARE = 0.5  # of the prior variance left: what the tubes told is not worth the name
 MOTIONS = ("turn about x", "turn about y", "turn about z", "shift along x", "shift along y", "shift along z")
 
@@ -229,8 +230,13 @@ def _result(
         datum = f"{posterior.control.count} control points"
     else:
         datum = f"mean of {count} stations and {posterior.control.count} control points, too few to hold it alone"
+    spread = float(np.std(x[6 :: kernels.STATION], ddof=1)) / np.sqrt(count) if count > 1 else 0.0
+    # What a wide beam does to thin tubes grows with the range, and over many stations that looks like a bend of all.
+    beam = posterior.control is None and abs(shared) > WIDE_MM + 3.0 * spread and abs(shared) > before_mm
+    if beam:
+        said.append("which explains as much as the stations seem off: they were left where they are")
     return Stations(
-        "weak" if any(weak) else "ok",
+        "doubtful" if beam else "weak" if any(weak) else "ok",
         "; ".join(said),
         corrections(x, places),
         places,
@@ -239,7 +245,7 @@ def _result(
         before_rad,
         x[6 :: kernels.STATION],
         offset_mm,
-        float(np.std(x[6 :: kernels.STATION], ddof=1)) / np.sqrt(count) if count > 1 else 0.0,
+        spread,
         seen_by,
         weak,
         scale,
