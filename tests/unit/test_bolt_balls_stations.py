@@ -155,6 +155,17 @@ def test_of_range_offsets_only_what_stations_differ_by_is_corrected():
     np.testing.assert_allclose(along, found.shared_offset_sd**2 * np.diag([0.0, 0.0, 1.0]), atol=1e-2 * along[2, 2])
 
 
+def test_stations_are_left_where_a_wide_beam_explains_as_much_as_they_seem_off():
+    for shift_mm, status in ((0.1, "doubtful"), (4.0, "ok")):
+        _, seen, rng = frame(8, 5, 5, per_pair=60, shift_mm=shift_mm, turn_rad=0.0)
+        ray = seen.points.points - seen.scanners[seen.points.station]
+        longer = seen.points.points + 1.5 * ray / np.linalg.norm(ray, axis=1)[:, None]
+        points = TubePoints(longer, seen.points.station, seen.points.start)
+        found = registered(tube_clouds.Seen(points, seen.ends, seen.scanners, seen.motions, seen.places, 30.0), rng)
+        assert found.status == status
+        assert ("left where they are" in found.message) == (status == "doubtful")
+
+
 def test_without_control_the_datum_is_the_mean_of_the_stations():
     """The common translation is known to sd / sqrt(s) of the stations' own, whatever the tubes say."""
     _, seen, rng = frame(2, 5, 5, grid=(3, 3), per_pair=30)
