@@ -26,10 +26,12 @@ bench: $(VENV)/.test
 	$(BIN)/python -m tests.bench.bolt_balls --cases frame-1040 --seeds 1 --output $(OUT)/bench-frame-1040.json
 	$(BIN)/python -m tests.bench.paper_comparison --output $(OUT)/bench.json
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
+	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
 
 nightly: $(VENV)/.test
 	$(BIN)/python -m pytest -n 2
 	$(BIN)/python -m tests.bench.bolt_balls --output $(OUT)/nightly-bolt-balls.json
+	$(BIN)/python -m tests.bench.readers --mutations 2000 --output $(OUT)/nightly-damaged-files.json
 	$(BIN)/python -m tests.bench.paper_comparison --seeds 5 --sets D1,D2,D3 --output $(OUT)/nightly.json
 
 system:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 from processor.model import Floats
 
 PIECE_BYTES = 4 << 20
+PIECE_ROWS = 1 << 15
 LONGEST_LINE = 1 << 20
 NUMBERS = frozenset(b"+-0123456789.eE")
 WORDS = ("nan", "inf", "infinity")
@@ -24,14 +25,13 @@ class Rows:
     """
 
     def __init__(
-        self, file: BinaryIO, separator: str | None = None, commas: bool = False, remarks: bool = False, line: int = 1
+        self, file: BinaryIO, separator: str | None = None, commas: bool = False, remarks: bool = False
     ) -> None:
         self._file = file
         self._separator = ord(separator) if separator else 0
         self._commas, self._remarks = commas, remarks
         self._text = np.empty(0, np.uint8)
         self._at = 0
-        self._line = line  # number of the line that begins at _at
 
     def line(self) -> str | None:
         """Return the next line that is not blank; None at the end."""
@@ -39,7 +39,6 @@ class Rows:
             rest = self._text[self._at : self._at + LONGEST_LINE].tobytes()
             text = rest.replace(b"\r\n", b"\n ").replace(b"\r", b"\n").split(b"\n", 1)[0]
             self._at = min(self._at + len(text) + 1, len(self._text))
-            self._line += 1
             if text.strip():
                 return text.decode("utf-8-sig", "replace").strip()
         return None
@@ -59,7 +58,7 @@ class Rows:
             ends = np.flatnonzero(_ends(self._text[self._at : self._at + LONGEST_LINE]))
             end = self._at + int(ends[0]) if len(ends) else len(self._text)
             pair = self._text[end : end + 2].tobytes() == b"\r\n"
-            self._at, self._line = min(end + 1 + pair, len(self._text)), self._line + 1
+            self._at = min(end + 1 + pair, len(self._text))
 
     def most_left(self) -> int:
         """Return how many rows there can be at most to the end of the file."""
@@ -82,19 +81,15 @@ class Rows:
         slots = np.full(max(columns) + 1, -1, np.int64)
         slots[list(columns)] = np.arange(len(columns))
         odd = np.empty((decimal.ODD_LIMIT, 4), np.int64)
-        out = np.empty((0, len(columns)))
+        out = np.empty((min(most, PIECE_ROWS), len(columns)))
         while most > 0 and self._fill():
             text = self._text
-            ends = decimal.count_ends(text, self._at, len(text)) + 1
-            if len(out) < min(most, ends):
-                out = np.empty((min(most, ends), len(columns)))
             kinds = (slots, self._separator, self._commas, self._remarks, out, odd, decimal.HIGH, decimal.LOW)
             why, rows, end, odds, column = decimal.parse(text, self._at, min(most, len(out)), *kinds)
             for row, slot, first, last in odd[:odds].tolist():
                 out[row, slot] = self._number(text[first:last].tobytes(), first)
             if why == decimal.SHORT_ROW:
                 raise ValueError(f"line {self._at_line(end)}: expected {len(slots)} columns or more, found {column}")
-            self._line = self._at_line(end)
             self._at = end
             most -= rows
             if rows:
@@ -111,9 +106,18 @@ class Rows:
             raise ValueError(f"line {self._at_line(place)}: expected a number, found {text[:40]!r}") from None
 
     def _at_line(self, place: int) -> int:
+        """Return the number in the file of the line with a place in ``_text``: counted only when asked for."""
         from processor.readers.decimal import count_ends
 
-        return self._line + int(count_ends(self._text, self._at, place))
+        left = self._file.tell() - len(self._text) + place
+        self._file.seek(0)
+        lines = 1
+        while left > 0 and (piece := self._file.read(min(left, PIECE_BYTES))):
+            if piece.endswith(b"\r") and left > len(piece):
+                piece += self._file.read(1)  # both bytes of an end at once
+            lines += int(count_ends(np.frombuffer(piece, np.uint8), 0, len(piece)))
+            left -= len(piece)
+        return lines
 
     def _fill(self) -> bool:
         """Have whole lines from ``_at`` on. False at the end of the file."""
@@ -124,7 +128,8 @@ class Rows:
             return False
         tail = self._file.readline(LONGEST_LINE + 1)
         if len(tail) > LONGEST_LINE:
-            raise ValueError(f"line {self._line} or one after it is longer than {LONGEST_LINE} bytes")
+            line = self._at_line(len(self._text))
+            raise ValueError(f"line {line} or one after it is longer than {LONGEST_LINE} bytes")
         self._text, self._at = np.frombuffer(piece + tail, np.uint8), 0
         return True
 

@@ -1,4 +1,4 @@
-"""Numbers in text: rounding against float(), tables against NumPy's reader, and tables that could be read in two ways."""
+"""Numbers in text: rounding against float(), tables against NumPy, and tables that could be read in two ways."""
 
 from __future__ import annotations
 
