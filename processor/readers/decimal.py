@@ -14,11 +14,9 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.model import Floats
+from processor.readers.rows import ENDED, FULL, ODD, SHORT_ROW
 
 REACH = 60  # largest power of ten in the table
-ODD_LIMIT = 4096  # numbers left to float(), before a piece ends
-
-ENDED, FULL, ODD, SHORT_ROW = 0, 1, 2, 3
 
 
 def _powers() -> tuple[Floats, Floats]:

@@ -2,19 +2,35 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import pairwise
 from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Floats
+from processor.model import Floats, Ints
 
 PIECE_BYTES = 4 << 20
-PIECE_ROWS = 1 << 15
+PIECE_ROWS = 1 << 17  # more than a worker's part of a piece has
+MOST_WORKERS = 4
+LEAST_PART = 1 << 16
+ODD_LIMIT = 4096  # numbers left to float() before a piece ends
+ENDED, FULL, ODD, SHORT_ROW = range(4)  # why parsing stopped
 LONGEST_LINE = 1 << 20
 NUMBERS = frozenset(b"+-0123456789.eE")
 WORDS = ("nan", "inf", "infinity")
+
+
+class _Room:
+    """What one worker parses into."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self.out = np.empty((rows, columns))
+        self.odd = np.empty((ODD_LIMIT, 4), np.int64)
 
 
 class Rows:
@@ -76,24 +92,66 @@ class Rows:
 
         Each piece is good until the next one is asked for.
         """
-        from processor.readers import decimal
-
         slots = np.full(max(columns) + 1, -1, np.int64)
         slots[list(columns)] = np.arange(len(columns))
-        odd = np.empty((decimal.ODD_LIMIT, 4), np.int64)
-        out = np.empty((min(most, PIECE_ROWS), len(columns)))
-        while most > 0 and self._fill():
-            text = self._text
-            kinds = (slots, self._separator, self._commas, self._remarks, out, odd, decimal.HIGH, decimal.LOW)
-            why, rows, end, odds, column = decimal.parse(text, self._at, min(most, len(out)), *kinds)
-            for row, slot, first, last in odd[:odds].tolist():
-                out[row, slot] = self._number(text[first:last].tobytes(), first)
-            if why == decimal.SHORT_ROW:
-                raise ValueError(f"line {self._at_line(end)}: expected {len(slots)} columns or more, found {column}")
-            self._at = end
-            most -= rows
-            if rows:
-                yield out[:rows]
+        workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1))
+        rooms = [_Room(min(most, PIECE_ROWS), len(columns)) for _ in range(workers)]
+        with ThreadPoolExecutor(workers) as pool:
+            while most > 0 and self._fill():
+                parts = self._parts(workers)
+                parse = partial(self._parse, slots, most)
+                jobs = [pool.submit(parse, room, *part) for room, part in zip(rooms[1:], parts[1:], strict=False)]
+                for i, part in enumerate(parts):
+                    why, rows, end, odds, column = jobs[i - 1].result() if i else parse(rooms[0], *part)
+                    if i and rows > most:
+                        break  # it was not known before how many rows the parts before it have
+                    self._settle(rooms[i], odds)
+                    if why == SHORT_ROW:
+                        line = self._at_line(end)
+                        raise ValueError(f"line {line}: expected {len(slots)} columns or more, found {column}")
+                    self._at = end
+                    most -= rows
+                    if rows:
+                        yield rooms[i].out[:rows]
+                    if why != ENDED:
+                        break  # the rest of it comes next
+                for job in jobs:
+                    job.result()
+
+    def _parts(self, workers: int) -> list[tuple[int, int]]:
+        """Cut the text at ends of lines, into one part a worker where there is enough of it."""
+        size = len(self._text) - self._at
+        if size < workers * LEAST_PART:
+            return [(self._at, len(self._text))]
+        cuts = [self._at]
+        for i in range(1, workers):
+            start = max(cuts[-1], self._at + i * size // workers)
+            ends = np.flatnonzero(self._text[start : start + LEAST_PART] == 10)
+            if len(ends):
+                cuts.append(start + int(ends[0]) + 1)
+        return list(pairwise([*cuts, len(self._text)]))
+
+    def _parse(self, slots: Ints, most: int, room: _Room, start: int, stop: int) -> tuple[int, int, int, int, int]:
+        from processor.readers import decimal
+
+        found: tuple[int, int, int, int, int] = decimal.parse(
+            self._text[:stop],
+            start,
+            min(most, len(room.out)),
+            slots,
+            self._separator,
+            self._commas,
+            self._remarks,
+            room.out,
+            room.odd,
+            decimal.HIGH,
+            decimal.LOW,
+        )
+        return found
+
+    def _settle(self, room: _Room, odds: int) -> None:
+        for row, slot, first, last in room.odd[:odds].tolist():
+            room.out[row, slot] = self._number(self._text[first:last].tobytes(), first)
 
     def _number(self, token: bytes, place: int) -> float:
         text = token.decode("latin-1").strip()

@@ -44,8 +44,11 @@ def test_every_number_is_rounded_as_by_float():
 
 
 @pytest.mark.parametrize("separator", [None, ",", ";", "\t"])
-def test_tables_against_numpy(monkeypatch, separator):
-    monkeypatch.setattr(rows_module, "PIECE_BYTES", 1_000)  # many pieces, each ends within a line
+@pytest.mark.parametrize(("pieces", "workers"), [(1_000, 1), (20_000, 3), (1 << 20, 4)])
+def test_tables_against_numpy(monkeypatch, separator, pieces, workers):
+    monkeypatch.setattr(rows_module, "PIECE_BYTES", pieces)  # the smallest end within a line
+    monkeypatch.setattr(rows_module, "LEAST_PART", 200)
+    monkeypatch.setattr(rows_module.os, "cpu_count", lambda: workers)
     rng = random.Random(7)
     join, lines = (separator or " "), []
     for _ in range(2_000):
