@@ -95,15 +95,24 @@ def read(path: Path) -> list[RawScan]:
 
 def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, Floats]:
     """Return the coordinates (n, 3) of the rows that are declared, of all for -1, and what else is wanted (n, k)."""
-    most, found = declared if declared >= 0 else rows.most_left(), 0
-    points, others = room_for(most, 3), room_for(most, len(wanted) - 3)
-    for piece in rows.pieces(wanted, most):
+    room, found = declared if declared >= 0 else rows.likely_left(), 0
+    points, others = room_for(room, 3), room_for(room, len(wanted) - 3)
+    for piece in rows.pieces(wanted, declared if declared >= 0 else 2**62):
+        if found + len(piece) > room:
+            room = room + room // 4 + len(piece)
+            points, others = (_grown(column[:found], room) for column in (points, others))
         points[found : found + len(piece)] = piece[:, :3]
         others[found : found + len(piece)] = piece[:, 3:]
         found += len(piece)
     if found < declared:
         raise ValueError(f"it declares {declared} points, but {found} follow")
     return points[:found], others[:found]
+
+
+def _grown(column: Floats, room: int) -> Floats:
+    larger = room_for(room, column.shape[1])
+    larger[: len(column)] = column
+    return larger
 
 
 @contextmanager

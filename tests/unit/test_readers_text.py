@@ -134,3 +134,12 @@ def test_utf16_and_old_line_ends(tmp_path):
         [4, 5, 6],
     ]
     assert read(tmp_path, "b.txt", "1 2 3\r4 5 6\r")[0].points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_short_lines_after_long_ones(tmp_path, monkeypatch):
+    """The room for rows is guessed from the first of them."""
+    monkeypatch.setattr(rows_module, "PIECE_BYTES", 1_000)
+    text = "".join(f"{i}.00000000 2.0000000000000 3.000000000000\n" for i in range(50)) + "1 2 3\n" * 5_000
+    (scan,) = read(tmp_path, "a.xyz", text)
+    assert len(scan.points) == 5_050
+    assert scan.points[:, 0].tolist() == [*range(50), *[1] * 5_000]
