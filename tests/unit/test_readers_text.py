@@ -1,4 +1,4 @@
-"""Numbers in text: rounding against float(), tables against NumPy's reader, and tables that could be read in two ways."""
+"""Numbers in text: rounding against float(), tables against NumPy, and tables that could be read in two ways."""
 
 from __future__ import annotations
 
@@ -44,8 +44,11 @@ def test_every_number_is_rounded_as_by_float():
 
 
 @pytest.mark.parametrize("separator", [None, ",", ";", "\t"])
-def test_tables_against_numpy(monkeypatch, separator):
-    monkeypatch.setattr(rows_module, "PIECE_BYTES", 1_000)  # many pieces, each ends within a line
+@pytest.mark.parametrize(("pieces", "workers"), [(1_000, 1), (20_000, 3), (1 << 20, 4)])
+def test_tables_against_numpy(monkeypatch, separator, pieces, workers):
+    monkeypatch.setattr(rows_module, "PIECE_BYTES", pieces)  # the smallest end within a line
+    monkeypatch.setattr(rows_module, "LEAST_PART", 200)
+    monkeypatch.setattr(rows_module.os, "cpu_count", lambda: workers)
     rng = random.Random(7)
     join, lines = (separator or " "), []
     for _ in range(2_000):
@@ -131,3 +134,12 @@ def test_utf16_and_old_line_ends(tmp_path):
         [4, 5, 6],
     ]
     assert read(tmp_path, "b.txt", "1 2 3\r4 5 6\r")[0].points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_short_lines_after_long_ones(tmp_path, monkeypatch):
+    """The room for rows is guessed from the first of them."""
+    monkeypatch.setattr(rows_module, "PIECE_BYTES", 1_000)
+    text = "".join(f"{i}.00000000 2.0000000000000 3.000000000000\n" for i in range(50)) + "1 2 3\n" * 5_000
+    (scan,) = read(tmp_path, "a.xyz", text)
+    assert len(scan.points) == 5_050
+    assert scan.points[:, 0].tolist() == [*range(50), *[1] * 5_000]
