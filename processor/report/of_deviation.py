@@ -83,7 +83,7 @@ def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
     if not np.isfinite(result.lod95).any():
         return {}
     return {
-        MAP: figures_deviation.deviation_map(result.core + result.origin, result.distances, "mm"),
+        MAP: figures_deviation.deviation_map(result.core + result.origin, result.normals, result.distances, "mm"),
         HISTOGRAM: figures_deviation.histogram(result.distances, "mm"),
     }
 
