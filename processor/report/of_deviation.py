@@ -9,7 +9,7 @@ import numpy as np
 
 from processor.deviation.result import Result
 from processor.evaluate import ErrorReport
-from processor.model import Scene, StepRun
+from processor.model import Ints, Scene, StepRun
 from processor.pipeline import Execution
 from processor.report import core_points, figures_deviation, results_deviation, view_points
 from processor.report.drawing import Drawn
@@ -96,7 +96,7 @@ def _files(result: Result) -> dict[str, bytes]:
 def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     result: Result = runs[0].result
     points = result.core + result.origin
-    everything = np.arange(len(points))
+    everything: Ints = np.arange(len(points), dtype=np.int64)
     return view_points.of_points(
         "Deviation in space", runs[0].method, points, result.distances.distance, [("surface", everything)]
     )
