@@ -86,9 +86,11 @@ def test_cells_on_a_cluster(monkeypatch):
 
     monkeypatch.setattr(running, "do", do)
     cells = [Cell(nights.case(), seed, True) for seed in (1, 2, 3)]
-    with distributed.LocalCluster(1, processes=False, threads_per_worker=2, dashboard_address=None) as cluster:
-        with running.over_cluster(cluster.scheduler_address) as run:
-            found = {cell.seed: outcome for cell, outcome in run(cells)}
+    with (
+        distributed.LocalCluster(1, processes=False, threads_per_worker=2, dashboard_address=None) as cluster,
+        running.over_cluster(cluster.scheduler_address) as run,
+    ):
+        found = {cell.seed: outcome for cell, outcome in run(cells)}
     assert {seed: outcome.results.get("seed") for seed, outcome in found.items()} == {1: 1, 2: None, 3: 3}
     assert found[2].failed == "a worker could not run it (MemoryError: none left)"
 
