@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -9,14 +10,16 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from processor import __version__
-from processor.model import InputError, Metric
+from processor.model import InputError, Metric, UsageError
 from processor.progress import stage
 
 if TYPE_CHECKING:
+    from processor.batch.record import Record
     from processor.evaluate import ErrorReport
     from processor.pipeline import Execution
 
 DONE, IN_PART, LIMIT_MISSED = 0, 1, 4
+STOPPED = IN_PART
 UNITS = ("m", "mm", "cm", "inch", "ft")
 
 
@@ -63,7 +66,7 @@ def run(
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
-    from processor import pipeline
+    from processor import inputs, pipeline
     from processor.evaluate import evaluate
     from processor.report import writing
 
@@ -73,6 +76,7 @@ def run(
     parameters = pipeline.read_params(params)
     if steps:
         pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
+    before = inputs.signature(input_.resolve(), output.resolve())
     piecewise = pipeline.is_large(input_)
     with stage(f"reading {input_.name}"):
         scene = pipeline.read(input_, units, piecewise)
@@ -83,6 +87,7 @@ def run(
     say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
     execution = pipeline.execute(input_, scene, jobs, say, piecewise)
     report = evaluate(input_, execution)
+    inputs.check_unchanged(input_.resolve(), before, output.resolve())
     with stage("drawing and writing the report"):
         writing.write(output, execution, report, lang)
     _show(context, output, execution, report, as_json)
@@ -101,6 +106,55 @@ def _show(context: click.Context, output: Path, execution: Execution, report: Er
         click.echo(f"report: {output / 'report.html'}")
     complete = all(one.result.status == "ok" for one, _ in tables.grouped(execution.runs))
     context.exit(LIMIT_MISSED if not report.passed else DONE if complete else IN_PART)
+
+
+LENGTH = click.FloatRange(min=0.0, min_open=True)
+FILE = click.Path(path_type=Path)
+
+
+@commands.command()
+@click.argument("reference", type=FILE)
+@click.argument("compared", type=FILE)
+@click.option("-o", "--output", required=True, type=FILE, help="folder of the results")
+@click.option("--core", type=FILE, help="cloud of core points  [default: every point of REFERENCE]")
+@click.option("--normal-diameter", type=LENGTH, help="of the sphere that a normal is fitted in")
+@click.option("--projection-diameter", type=LENGTH, help="of the cylinder along the normal")
+@click.option("--max-depth", type=LENGTH, help="of the cylinder, to either side of the core point")
+@click.option("--registration-error", type=click.FloatRange(min=0.0), default=0.0, help="a length, part of the LOD95")
+@click.option("--normals", type=FILE, help="nx, ny, nz of every core point, PLY or text, instead of fitted ones")
+@click.option("--json", "as_json", is_flag=True, help="print compare.json")
+@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+def compare(
+    reference: Path,
+    compared: Path,
+    output: Path,
+    core: Path | None,
+    normal_diameter: float | None,
+    projection_diameter: float | None,
+    max_depth: float | None,
+    registration_error: float,
+    normals: Path | None,
+    as_json: bool,
+) -> None:
+    """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
+
+    All lengths are in the clouds' own unit; what is not given is made from their density.
+    """
+    from processor import compare as comparing
+    from processor.report import comparison
+
+    comparison.check_output(output, (reference, compared, core, normals))
+    request = comparing.Request(
+        reference, compared, core, normals, normal_diameter or 0.0, projection_diameter or 0.0, max_depth or 0.0,
+        registration_error,
+    )  # fmt: skip
+    record = comparison.write(output, comparing.compare(request, say))
+    if as_json:
+        click.echo(json.dumps(record, ensure_ascii=False))
+        return
+    for line in comparison.lines(record):
+        click.echo(line)
+    click.echo(f"report: {output / comparison.PAGE}")
 
 
 @commands.command()
@@ -145,6 +199,130 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
     else:
         click.echo("no checks: the input held no truth")
     context.exit(DONE if report.passed else LIMIT_MISSED)
+
+
+@commands.command()
+@click.argument("root", metavar="ROOT", type=click.Path(path_type=Path))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of all results")
+@click.option("--jobs", type=click.IntRange(min=1), help="inputs processed at a time  [default: 1]")
+@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers do it, e.g. tcp://10.0.0.1:8786")
+@click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), default=3600.0, show_default=True)
+@click.option("--memory-mb", type=click.IntRange(min=64), help="of a job  [default: its share of 80 % of the machine]")
+@click.option("--retry", is_flag=True, help="try again what failed, though nothing has changed")
+@click.option("--steps", callback=_named, metavar="A,B", help="as of run; so are the options below")
+@click.option("--method", "methods", callback=_named, metavar="NAME[,NAME]")
+@click.option("--params", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("--units", type=click.Choice(UNITS), help="of scans; scene files know theirs")
+@click.option("--seed", type=click.IntRange(min=0))
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True)
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")
+@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+@click.pass_context
+def batch(
+    context: click.Context,
+    root: Path,
+    output: Path,
+    jobs: int | None,
+    cluster: str | None,
+    timeout_s: float,
+    memory_mb: int | None,
+    retry: bool,
+    steps: tuple[str, ...],
+    methods: tuple[str, ...],
+    params: Path | None,
+    units: str | None,
+    seed: int | None,
+    lang: str,
+    as_json: bool,
+) -> None:
+    """Process every scan folder, scene file and scan file below ROOT, each in a process of its own.
+
+    Run again, it goes on where it was: what is done is kept while input, parameters and software are the same. Writes
+    a folder of results for each input, index.html, summary.csv and summary.json. Exit codes: 1 where an input failed
+    (it is listed), 4 where none did and an accuracy limit was missed.
+    """
+    from processor import pipeline
+    from processor.batch import batch as whole
+
+    if jobs is not None and cluster is not None:
+        raise UsageError("--jobs and --cluster exclude each other: a cluster does as many at a time as it has workers")
+    parameters = pipeline.read_params(params)
+    if steps or methods or parameters:  # what is wrong with them is said once, not by every input
+        pipeline.plan(steps or tuple(pipeline.step_modules()), methods, parameters, seed)
+    given = {"--steps": ",".join(steps), "--method": ",".join(methods), "--seed": "" if seed is None else str(seed)}
+    given["--lang"] = lang
+    settings = whole.Settings(
+        root,
+        output,
+        tuple(text for name, value in given.items() if value for text in (name, value)),
+        params.read_bytes() if params else b"",
+        {
+            "steps": steps,
+            "methods": methods,
+            "seed": seed,
+            "lang": lang,
+            "params": json.loads(json.dumps(parameters, default=str)),
+        },
+        units,
+        jobs or 1,
+        cluster,
+        timeout_s,
+        memory_mb,
+        retry,
+    )
+
+    def ended(one: Record) -> None:
+        if as_json:
+            click.echo(json.dumps({"event": "input", **dataclasses.asdict(one)}))
+        elif one.status == "failed":
+            say(f"{one.input}: failed: {one.reason}")
+
+    try:
+        found = whole.run(settings, say, ended)
+    except whole.StoppedError:
+        context.exit(STOPPED)
+    counts = {name: count for name, count in found.counts.items() if count}
+    if as_json:
+        click.echo(json.dumps({"event": "summary", "counts": found.counts, "page": str(found.page)}))
+    else:
+        click.echo(f"{found.page}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
+    context.exit(
+        IN_PART
+        if found.failed
+        else LIMIT_MISSED
+        if "limit-missed" in counts
+        else IN_PART
+        if "in-part" in counts
+        else DONE
+    )
+
+
+@commands.command()
+@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
+@click.option("--force", is_flag=True, help="replace the project.toml that is there")
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+def init(folder: Path, force: bool, as_json: bool) -> None:
+    """Write FOLDER/project.toml as its files suggest: kind, units, design, and which scan is which component.
+
+    Components are told by their names and by their shape against the design. What was unsure is said, and marked in
+    the file: look at it before the first run.
+    """
+    from processor import project_guess, project_text, store
+
+    path = folder / project_guess.PROJECT
+    if path.exists() and not force:
+        raise UsageError(f"{path}: is there already; --force replaces it")
+    found = project_guess.guess(folder)
+    text = project_text.written(found)
+    with store.replacing(path) as temporary:
+        temporary.write_text(text, "utf-8")
+    if as_json:
+        click.echo(json.dumps(project_text.as_json(found), ensure_ascii=False))
+        return
+    click.echo(f"{path}: kind {found.kind}, {len(found.scans)} file(s) of scans")
+    for one in found.unsure:
+        click.echo(f"? {one}")
 
 
 def _number(value: float | None) -> float:

@@ -65,6 +65,11 @@ def names(axis: str) -> Any:
     return dataclasses.field(default=(), metadata={"axis": axis})
 
 
+def newer() -> Any:
+    """Declare a record that came to the schema later: absent, it changes no scene's hash."""
+    return dataclasses.field(default=None, metadata={"newer": True})
+
+
 class Checked:
     """Checks the declared fields of a frozen dataclass when it is made; holds no data and no behaviour."""
 
@@ -236,6 +241,25 @@ class Tolerance(Checked):
 
 
 @dataclass(frozen=True)
+class Control(Checked):
+    """Control points: targets whose coordinates are known, and where the scans have them; mm.
+
+    ``positions`` are in the project's frame, that of the design. ``seen`` (m, 3) is where target ``point`` (m,), a row
+    of ``ids``, was measured in scan ``scan`` (m,), a row of Scene.scans, in that scan's own frame. Of a cloud of
+    several stations ``station`` (m,), a row of Scene.stations, says which one saw it; -1 = the scan's own.
+    """
+
+    ids: tuple[str, ...] = names("k")
+    positions: Floats = column("k", 3)
+    sd: Floats = column("k")  # of each coordinate of a position
+    point: Ints = column("m", dtype=np.int64)
+    scan: Ints = column("m", dtype=np.int64)
+    station: Ints = column("m", dtype=np.int64)
+    seen: Floats = column("m", 3)
+    seen_sd: Floats = column("m")  # of each coordinate as seen
+
+
+@dataclass(frozen=True)
 class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
 
@@ -250,6 +274,7 @@ class Scene(Checked):
     units_reason: str = ""
     structure: StructureDesign | None = None
     tolerance: Tolerance | None = None  # None: nothing was said
+    control: Control | None = newer()
 
 
 # --- the truth: evaluation alone reads it --------------------------------------------------------------------------

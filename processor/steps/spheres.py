@@ -44,16 +44,23 @@ def run(scene: Scene, params: Params, points: PointReader | None = None) -> Resu
     limits = tolerance.default_for(scene.tolerance)
     if params.method != "ray":
         if scene.frame is None:
-            return single.search(merged(scene, with_scanner=True), params)
-        return single.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits)
+            return _told(scene, single.search(merged(scene, with_scanner=True), params))
+        return _told(scene, single.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits))
     found = answer.of_frame(scene, params, points)
     if found is None and points is not None:
         raise InputError(
             f"{scene.name}: no members that meet were found, and the cloud is too large to search otherwise"
         )
     if found is None:
-        return _without_members(scene, params, limits)
+        return _told(scene, _without_members(scene, params, limits))
     return found
+
+
+def _told(scene: Scene, result: Result) -> Result:
+    """Say of control points that nothing was held by them."""
+    if scene.control is None:
+        return result
+    return replace(result, message="; ".join(filter(None, (result.message, answer.UNUSED))))
 
 
 def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:

@@ -397,6 +397,28 @@ def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
         np.testing.assert_allclose(np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5)
 
 
+def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
+    """The same bytes, though of the file only the tiles about each ball are read."""
+    rng = np.random.default_rng(4)
+    made = whole()
+    T = pose(TURN, (100.0, 0.0, 0.0))
+    near = np.repeat(made.centres[np.isfinite(made.centres).all(axis=1)], 300, axis=0)
+    far = rng.uniform(-5e3, 5e3, (60_000, 3)) + near.mean(axis=0)
+    points = np.vstack([near + rng.uniform(-150.0, 150.0, near.shape), far])
+    origin = np.array([500.0, -300.0, 0.0])
+    scans = (
+        Scan("a", (points - T[:3, 3]) @ T[:3, :3] - origin, origin, T_project_scan=T),
+        Scan("b", points[:5000], point_station=np.zeros(5000, np.int32)),
+    )
+    one = dataclasses.replace(scene(made), scans=scans, stations=Stations(("S1",), np.zeros((1, 3))))
+    store.write_scene(tmp_path / "s.h5", one, None, {})
+    in_memory = figures_ball.of_result(store.read_scene(tmp_path / "s.h5"), made)
+    alone = store.read_scene(tmp_path / "s.h5", points=False)
+    assert len(in_memory) > 1
+    assert figures_ball.of_result(alone, made) == {}
+    assert figures_ball.of_result(alone, made, tmp_path / "s.h5") == in_memory
+
+
 def test_the_expected_distribution_holds_as_many_errors_as_there_are():
     x = np.linspace(-5.0, 5.0, 1001)
     y = figures_balls._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
