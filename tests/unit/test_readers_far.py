@@ -165,6 +165,7 @@ def test_reading_takes_little_more_than_the_points(tmp_path, monkeypatch, suffix
     from tests.bench import readers as bench
 
     monkeypatch.setattr(rows, "PIECE_BYTES", 1 << 18)
+    monkeypatch.setattr(rows, "PIECE_ROWS", 1 << 13)
     points, intensity = bench.cloud(100_000)
     path = tmp_path / f"a.{suffix}"
     {"pcd": bench.write_packed_pcd}.get(suffix, getattr(bench, f"write_{suffix}"))(path, points, intensity)
