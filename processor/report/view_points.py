@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import Floats
+from processor.model import Floats, Ints
 from processor.report.drawing import DIVERGING_STOPS, LEAST_SHOWN_MM
 from processor.report.results_json import plain
 
@@ -20,7 +20,7 @@ def of_points(
     method: str,
     points: Floats,
     values: Floats,
-    parts: Sequence[tuple[str, Floats]],
+    parts: Sequence[tuple[str, Ints]],
     marks: Sequence[Any] = (),
 ) -> dict[str, Any] | None:
     """Return what the page draws of points (n, 3) with values (n,), mm; None where there are no values.
