@@ -42,6 +42,8 @@ def rows(night, values, fixed=True, name=NAME, unit="mm", recipe=None, digest=No
         ("centres, rms of error by standard deviation", "", 1.1, 0.8),
         ("radii, bias", "mm", -0.1, 0.2),
         ("radii, efficiency", "", 0.9, 0.8),
+        ("core points farther from the truth than their LOD95", "%", 3.0, 5.0),
+        ("deviation error, mean", "mm", -0.1, 0.2),
         ("radii, number", "", 100.0, 90.0),
         ("defects recalled: recall", "", 0.9, 0.8),
         ("pose, largest turn", "mrad", 0.1, 0.3),
