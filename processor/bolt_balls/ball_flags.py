@@ -36,7 +36,8 @@ def judged(
     """Give every node its numbers, evidence, flag and reason.
 
     ``offset`` is what radii lie off their sizes on the whole and its standard deviation, mm: it may come from an offset
-    of all ranges, so it stays in the radii, and in their covariances. Seen from below the surface stays where it is.
+    of all ranges or from the beam's width, so it stays in the radii, and in their covariances. Seen from below the
+    surface stays where it is.
     """
     k = nodes.count
     fitted = np.asarray(fits.numbers[:, 7] > 0)
@@ -44,7 +45,7 @@ def judged(
     degrees = fits.numbers[:, 5]
     # The scale is estimated: the variance of Student's t is wider than the normal one.
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
-    common = np.array([0.0, 0.0, 1.0, 1.0]) * np.sqrt(max(offset[0] ** 2 - offset[1] ** 2, 0.0))
+    common = np.array([0.0, 0.0, 1.0, 1.0]) * offset[0]
     covariance = fits.covariance * wider[:, None, None] + np.outer(common, common)
     axes_known = np.asarray(np.isfinite(nodes.covariance).all(axis=(1, 2)))
     evidence, flags, reasons = [], [], []
@@ -110,8 +111,8 @@ def judged(
     if station_sd > 0.0:
         message += f"; stations disagree by {station_sd:.1f} mm an axis (sd), which every covariance holds"
     if abs(offset[0]) > SURE * offset[1]:
-        message += f"; radii lie {offset[0]:+.2f} mm off their sizes on the whole, as where all ranges are off: their "
-        message += "intervals hold that"
+        message += f"; radii lie {offset[0]:+.2f} mm off their sizes on the whole, as where all ranges err alike or "
+        message += "the beam is wide: their intervals hold that"
     if len(catalogue.radii) and not catalogue.verified:
         message += f"; the catalogue of radii ({catalogue.name}) was not held against a published one"
     return Balls(

@@ -115,7 +115,8 @@ def radius_offset(
 ) -> tuple[float, float]:
     """Return what radii lie off their sizes in the mean of all balls, mm, and its standard deviation.
 
-    Ranges that are wrong alike at all stations make every ball too small or too large, and no ball alone shows it.
+    Ranges that are wrong alike at all stations, or means over a wide beam, make every ball too small or too large, and
+    no ball alone shows it.
     Arguments are those of :func:`radius_scatter`; ``used_sd`` is also what radii scatter by.
     """
     off, own = _off_sizes(radii, variances, sizes, used_sd, stated_sd)

@@ -20,7 +20,19 @@ from processor.bolt_balls import verdicts
 from processor.evaluate import ErrorReport
 from processor.model import FrameDesign, Scan, Scene, Stations, StepRun
 from processor.pipeline import Execution
-from processor.report import dxf, figures, figures_ball, figures_balls, page, printing, results_json, tables, writing
+from processor.report import (
+    dxf,
+    figures,
+    figures_ball,
+    figures_balls,
+    page,
+    printing,
+    results_balls,
+    results_json,
+    tables,
+    tables_balls,
+    writing,
+)
 from processor.steps import spheres
 from tests.unit.test_report import PROVENANCE, Page, balls
 
@@ -417,6 +429,22 @@ def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
     assert len(in_memory) > 1
     assert figures_ball.of_result(alone, made) == {}
     assert figures_ball.of_result(alone, made, tmp_path / "s.h5") == in_memory
+
+
+def test_control_points_have_a_table_and_their_place_in_results_json():
+    made = whole(
+        datum="2 control points", control_names=("T1", "T2"), control_off=[[0.3, 0.0, -0.4], [30.0, 0.0, 0.0]],
+        control_used=[1, 0],
+    )  # fmt: skip
+    (table,) = (one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+                if one.file == "control")  # fmt: skip
+    assert table.columns[0] == "control_point"
+    assert table.rows[0] == ("T1", 0.3, 0.0, -0.4, pytest.approx(0.5), "yes")
+    assert table.rows[1][-1].startswith("no, ")
+    written = results_balls.written(made)
+    assert written["datum"] == "2 control points"
+    assert [(one["name"], one["used"]) for one in written["control"]] == [("T1", True), ("T2", False)]
+    assert not {"datum", "control"} & set(results_balls.written(whole()))
 
 
 def test_the_expected_distribution_holds_as_many_errors_as_there_are():
