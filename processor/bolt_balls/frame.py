@@ -104,15 +104,25 @@ def extract(
     trusted = registered is not None and registered.status in ("ok", "weak")
     between = registered.between if registered is not None and trusted else None
     found = balls.find_balls(source, nodes, measured.tubes, catalogue, expected, between)
+    beside = np.zeros((len(found.radii), 3, 3))
     datum = np.tile(datum_mm**2 * np.eye(3), (len(found.radii), 1, 1))
     if registered is not None and trusted:
         datum = registered.datum_at(found.centres)
+        beside = registered.shared_offset_at(found.centres)
     matched = moved = None
     if design is not None and known.any():
         matched, moved = _moved(
-            source, measured.tubes, found, design, start.pose, registered if trusted else None, expansion, datum_mm
+            source,
+            measured.tubes,
+            found,
+            beside,
+            design,
+            start.pose,
+            registered if trusted else None,
+            expansion,
+            datum_mm,
         )
-    return Extracted(nodes, measured.tubes, found, design_row, datum, registered, matched, moved, tuple(said))
+    return Extracted(nodes, measured.tubes, found, design_row, datum + beside, registered, matched, moved, tuple(said))
 
 
 def _blind(source: Source, params: members.Params) -> _Start | None:
@@ -193,6 +203,7 @@ def _moved(
     source: Source,
     tubes: Tubes,
     found: Balls,
+    beside: Floats,
     design: FrameDesign,
     pose: Matching | None,
     registered: Stations | None,
@@ -218,7 +229,9 @@ def _moved(
         matched = matching.match(nodes, design, expansion=expansion)
     at = nodes.positions.mean(axis=0)
     common = np.diag([0.0, 0.0, 0.0, *3 * [datum_mm**2]]) if registered is None else registered.common(at)
-    moved = movement.movement(matched, nodes, found.covariance[rows, :3, :3], design, common, at, expansion=expansion)
+    moved = movement.movement(
+        matched, nodes, found.covariance[rows, :3, :3] + beside[rows], design, common, at, expansion=expansion
+    )
     return replace(
         matched,
         assignment=_spread(matched.assignment, rows, len(place), -1),

@@ -65,7 +65,8 @@ class ControlPoints(Checked):
     def off(self, x: Floats, places: Floats) -> Floats:
         """Target minus sighting (c, 3) where the stations' unknowns x (7 s,) put it."""
         R, t = motions(x, places)
-        seen = self.measured[:, None] - x[STATION - 1 :: STATION, None] * self._rays(places)
+        offset = x[STATION - 1 :: STATION]
+        seen = self.measured[:, None] - (offset - offset.mean())[:, None] * self._rays(places)
         moved = np.einsum("sij,csj->sci", R, seen - places) + (places + t)[:, None]
         found: Floats = self.target - np.einsum("cs,sci->ci", self.share, moved)
         return found
@@ -75,7 +76,9 @@ class ControlPoints(Checked):
         J = np.zeros((len(self.ids), 3, len(places), STATION))
         J[..., :6] = np.stack([rigid.motion(self.measured - place) for place in places], axis=2)
         J[..., 6] = -self._rays(places).transpose(0, 2, 1)
-        found: Floats = (self.share[:, None, :, None] * J).reshape(3 * len(self.ids), -1)
+        J *= self.share[:, None, :, None]
+        J[..., 6] -= J[..., 6].mean(axis=2, keepdims=True)  # of the offsets, what a station's is off their mean
+        found: Floats = J.reshape(3 * len(self.ids), -1)
         return found
 
     def covariance(self) -> Floats:

@@ -44,8 +44,9 @@ class Stations(Checked):
     covariance: Floats = column("p", "p")
     before_mm: float = float("nan")  # sd of a station's translation along an axis, as registered
     before_rad: float = float("nan")  # and of its turn
-    range_offset: Floats = column("s")  # of a station's ranges, mm
+    range_offset: Floats = column("s")  # of a station's ranges less the mean of all, mm
     range_offset_sd: float = float("nan")  # of all stations, as scanned
+    shared_offset_sd: float = 0.0  # of what all ranges may be off alike, by how they differ; it is in no covariance
     observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
     weak: tuple[str, ...] = names("s")  # which motions of a station the tubes do not tell; empty = all told
     range_sd: Floats = column("s")  # scale of the residuals along the ray, mm
@@ -91,6 +92,14 @@ class Stations(Checked):
             return known
         gain = mean_gain(common_motion(self.places - place), self._precision())
         found: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
+        return found
+
+    def shared_offset_at(self, points: Floats) -> Floats:
+        """Covariance (k, 3, 3) that an offset all ranges share adds at points (k, 3): along the mean of their rays."""
+        ray = points[:, None] - self.places
+        squared = np.maximum(np.sum(ray**2, axis=2, keepdims=True), 1e-300)
+        near = np.sum(ray / squared**1.5, axis=1) / np.sum(1.0 / squared, axis=1)  # points a station as it is near
+        found: Floats = self.shared_offset_sd**2 * near[:, :, None] * near[:, None]
         return found
 
     def datum_at(self, points: Floats) -> Floats:

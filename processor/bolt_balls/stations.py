@@ -42,6 +42,7 @@ TAKEN = 6.0  # unknowns of a tube: seven, of which the bow's are held a little
 LEAST_POINTS = 20  # of a station, for a scale of their own
 SMALLEST_MM = 1e-3  # scale of residuals
 WEAK_MM, WEAK_RAD = 0.1, 1e-5  # sd that is too small to be called weak
+TOLD_MM = 0.3  # an offset of all ranges that is spoken of
 WEAK_SHARE = 0.5  # of the prior variance left: what the tubes told is not worth the name
 MOTIONS = ("turn about x", "turn about y", "turn about z", "shift along x", "shift along y", "shift along z")
 
@@ -115,8 +116,23 @@ def register(
         if last:
             step, C = posterior.integrated(H, g, x)
         x, tubes = x + step, _moved(tubes, unknown)
-    found = _result(x, C, posterior, seen_by, scale, floor, tubes)
+    x, C, mean_offset = _apart(x, C)
+    found = _result(x, C, posterior, seen_by, scale, floor, tubes, mean_offset)
     return found if control is None or doubt is None else _controlled(found, x, control, doubt)
+
+
+def _apart(x: Floats, C: Floats) -> tuple[Floats, Floats, float]:
+    """Take the mean of all range offsets out of the unknowns (7 s,) and their covariance; returns it as well.
+
+    How residuals follow the incidence tells of an offset that all ranges share, but a beam that is wide on thin tubes
+    looks the same: only differences between stations are corrected. What the tubes make of the mean is left behind.
+    """
+    of_range = np.zeros(len(x))
+    of_range[kernels.STATION - 1 :: kernels.STATION] = 1.0
+    count = len(x) // kernels.STATION
+    shared = float(x[of_range > 0.0].mean())
+    own = np.eye(len(x)) - np.outer(of_range, of_range) / count
+    return x - shared * of_range, normals.product(normals.product(own, C), np.ascontiguousarray(own.T)), shared
 
 
 def _tubes(points: Floats, start: Ints, at: Floats, along: Floats, radii: Floats) -> _Tubes:
@@ -189,7 +205,7 @@ def _judged(differs: Floats, shared: Bools, weight: Floats, floor: float) -> tup
 
 
 def _result(
-    x: Floats, C: Floats, posterior: Posterior, seen_by: Ints, scale: Floats, floor: float, tubes: _Tubes
+    x: Floats, C: Floats, posterior: Posterior, seen_by: Ints, scale: Floats, floor: float, tubes: _Tubes, shared: float
 ) -> Stations:
     places, count = posterior.places, len(posterior.places)
     before_rad, before_mm, offset_mm = np.sqrt(posterior.variance).tolist()
@@ -201,6 +217,10 @@ def _result(
         ", ".join(name for name, is_weak in zip(MOTIONS, row, strict=True) if is_weak) for row in (left > bound) & large
     )
     said = [f"stations lay {before_mm:.2g} mm and {1e3 * before_rad:.2g} mrad (sd an axis) off before"]
+    if abs(shared) > TOLD_MM:
+        said.append(
+            f"an offset of {shared:+.1f} mm that all ranges seem to share is not applied: a wide beam looks alike"
+        )
     said += [f"station {i}: {what} hardly told by the tubes" for i, what in enumerate(weak) if what]
     common = np.hypot(before_mm / np.sqrt(count), posterior.datum_mm)
     if posterior.control is None:
@@ -219,6 +239,7 @@ def _result(
         before_rad,
         x[6 :: kernels.STATION],
         offset_mm,
+        float(np.std(x[6 :: kernels.STATION], ddof=1)) / np.sqrt(count) if count > 1 else 0.0,
         seen_by,
         weak,
         scale,

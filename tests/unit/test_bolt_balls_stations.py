@@ -134,6 +134,27 @@ def test_range_offsets_are_found():
     np.testing.assert_allclose(before - after, found.range_offset[station], atol=1e-6)
 
 
+def test_of_range_offsets_only_what_stations_differ_by_is_corrected():
+    """A wide beam on thin tubes looks like an offset of all ranges: balls must not be moved by that."""
+    _, seen, rng = frame(8, 5, 5, per_pair=60)
+    offset = np.array([1.8, 0.5, 1.2, 0.4])
+    station = seen.points.station
+    ray = seen.points.points - seen.scanners[station]
+    away = np.linalg.norm(ray, axis=1)[:, None]
+    shifted = TubePoints(seen.points.points + offset[station][:, None] * ray / away, station, seen.points.start)
+    found = registered(tube_clouds.Seen(shifted, seen.ends, seen.scanners, seen.motions, seen.places, 30.0), rng)
+    assert np.abs(found.range_offset.mean()) < 1e-9
+    sd = np.sqrt(np.diag(found.covariance)[6::7])
+    assert np.abs((found.range_offset - (offset - offset.mean())) / sd).max() < 4.0
+    assert "not applied" in found.message
+    # what all share may be the mean of four that scatter so, along the mean ray
+    scatter = np.std(offset, ddof=1) / 2.0
+    assert found.shared_offset_sd == pytest.approx(scatter, rel=0.3)
+    above = found.places.mean(axis=0) + np.array([0.0, 0.0, 1e6])
+    along = found.shared_offset_at(above[None])[0]
+    np.testing.assert_allclose(along, found.shared_offset_sd**2 * np.diag([0.0, 0.0, 1.0]), atol=1e-2 * along[2, 2])
+
+
 def test_without_control_the_datum_is_the_mean_of_the_stations():
     """The common translation is known to sd / sqrt(s) of the stations' own, whatever the tubes say."""
     _, seen, rng = frame(2, 5, 5, grid=(3, 3), per_pair=30)
