@@ -236,6 +236,17 @@ class Tolerance(Checked):
 
 
 @dataclass(frozen=True)
+class Picks(Checked):
+    """Common points that were picked in two scans each, in these scans' frames (mm)."""
+
+    scan_a: tuple[str, ...] = names("q")
+    scan_b: tuple[str, ...] = names("q")
+    points: tuple[str, ...] = names("q")
+    in_a: Floats = column("q", 3)
+    in_b: Floats = column("q", 3)
+
+
+@dataclass(frozen=True)
 class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
 
@@ -250,6 +261,7 @@ class Scene(Checked):
     units_reason: str = ""
     structure: StructureDesign | None = None
     tolerance: Tolerance | None = None  # None: nothing was said
+    picks: Picks | None = None
 
 
 # --- the truth: evaluation alone reads it --------------------------------------------------------------------------

@@ -51,8 +51,9 @@ def test_arrows_run_one_way(path):
         assert not own
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
-    if name.startswith(("processor.steps.", "processor.preassembly", "processor.bolt_balls")):
-        lower = within(own, "processor.geometry", "processor.model", "processor.preassembly", "processor.bolt_balls")
+    if name.startswith(("processor.steps.", "processor.preassembly", "processor.bolt_balls", "processor.stitching")):
+        packages = ("processor.preassembly", "processor.bolt_balls", "processor.stitching")
+        lower = within(own, "processor.geometry", "processor.model", *packages)
         assert not own - lower - within(own, "processor.progress") - {"processor"}, (
             "a step sees records and geometry, not files"
         )
