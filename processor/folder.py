@@ -25,6 +25,7 @@ from processor.model import (
     StructureDesign,
     Tolerance,
 )
+from processor.picks_file import PICKS, read_picks
 from processor.preassembly import tolerance
 from processor.progress import tracked
 from processor.readers import RawScan
@@ -40,7 +41,7 @@ PROJECT = "project.toml"
 TRUTH = "truth.h5"
 STATIONS = "stations.json"
 DESIGNS = ("design.json", "design.csv")
-NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv")
+NOT_SCANS = ("design.csv", PICKS, "deviation.csv")
 KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance")
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
@@ -107,7 +108,16 @@ def _read_folder(folder: Path, asked: str) -> Scene:
         design = StructureDesign(project.design.stem, vertices * MM_PER_UNIT[project.units or asked or "m"], faces)
     elif project.design is not None:
         design = read_design(folder, project.design, asked or project.units or "m")
-    return _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+    scene = _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+    if not (folder / PICKS).exists():
+        return scene
+    # Picks are in their scans' own units; where formats differ in these, --units says what all are in.
+    unit = scene.units if scene.units in MM_PER_UNIT else ""
+    if not unit:
+        raise InputError(f"{folder / PICKS}: the scans are in {scene.units}; say one unit for all by --units")
+    inside(folder, PICKS, str(folder))
+    picks = read_picks(folder / PICKS, scene.scans, unit)
+    return dataclasses.replace(scene, picks=picks)
 
 
 def _places(folder: Path, unit: str) -> Stations | None:

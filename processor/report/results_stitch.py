@@ -62,7 +62,7 @@ def written(result: Result) -> dict[str, Any]:
         ],
         "noise_mm": result.noise_mm,
         "patch_mm": result.patch_mm,
-        "ends_mm": result.ends_mm,
+        "ends_share": result.ends_share,
     }
 
 

@@ -14,7 +14,7 @@ from processor.stitching.result import Result
 NORMAL_95 = 1.96
 FRAMES_NOTE = (
     "SOCS: the scanner's own coordinate system, that of a scan's file. PRCS: the project's, in which all scans are put "
-    "together: that of the reference scan, or the one its given pose leads to. GLCS: a global one, as of a map: nothing "
+    "together: that of the reference scan, or the one its given pose leads to. GLCS: a global one: nothing "
     "leads there without control points, so PRCS stands for it. Each matrix maps SOCS to PRCS, mm."
 )
 

@@ -40,7 +40,7 @@ def run(scene: Scene, params: Params) -> Result:
     for scan in scene.scans:
         if len(scan.points) < LEAST_POINTS:
             raise InputError(
-                f"{scene.name}: scan {scan.name!r} has {len(scan.points)} points; stitching takes {LEAST_POINTS} or more"
+                f"{scene.name}: scan {scan.name!r} has {len(scan.points)} points; expected {LEAST_POINTS} or more"
             )
     if params.reference and params.reference not in names:
         raise UsageError(f"stitch.reference: no scan {params.reference!r}; there are {', '.join(names)}")
@@ -61,9 +61,10 @@ def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, pa
         for bad, other in zip(found.gross, found.elsewhere, strict=True)
     ]
     network = answer.Network(
-        found.solution.T, found.solution.covariance, origins, found.placed.rivalry, found.placed.T_rival, found.pairs,
+        found.solution.T, found.solution.covariance, origins, found.placed.rivalry, found.placed.T_rival,
+        found.placed.contrary, found.placed.overlap, found.pairs,
         np.array(found.overlap), [not bad for bad in found.gross], messages,
-        spread=(float(np.median([cloud.sigma_mm for cloud in found.clouds])), *found.solution.tau),
+        spread=(float(np.median([cloud.sigma_mm for cloud in found.clouds])), *found.solution.tau[:2]),
     )  # fmt: skip
     return answer.result(scans, network, reference, params)
 
@@ -77,7 +78,7 @@ def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Par
     for (a, b), (in_a, in_b, _) in picked.items():
         try:
             one = three_point.tie(in_a - origins[a], in_b - origins[b], params.scale == "free")
-        except three_point.TooFew as error:
+        except three_point.TooFewError as error:
             said.append(f"pair {scans[a].name}, {scans[b].name} not used: {error}, three that span a plane are needed")
             continue
         warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm)
@@ -90,7 +91,8 @@ def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Par
     none = np.full((len(scans), 4, 4), np.nan)
     scale = np.array(scales).reshape(-1, 2)
     network = answer.Network(
-        T, covariance, origins, np.zeros(len(scans)), none, found, np.full(len(found), np.nan), [True] * len(found),
+        T, covariance, origins, np.zeros(len(scans)), none, np.zeros(len(scans)), np.ones(len(scans)), found,
+        np.full(len(found), np.nan), [True] * len(found),
         messages, scale[:, 0], scale[:, 1],
     )  # fmt: skip
     return answer.result(scans, network, reference, params, said)

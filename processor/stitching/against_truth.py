@@ -33,7 +33,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     """Compare poses with the stations' of the truth; the limits are those asked of scans with 2 mm of noise."""
     if truth.stations is None:
         return []
-    known = {name: T for name, T in zip(truth.stations.ids, truth.stations.T_project_station, strict=True)}
+    known = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
     rows = [i for i, name in enumerate(result.scans) if name in known and np.isfinite(result.T_project_scan[i]).all()]
     failed = sum(not np.isfinite(T).all() for T in result.T_project_scan)
     metrics = [Metric("stitch", "scans not placed", float(failed), NAN, "")]

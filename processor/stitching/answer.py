@@ -15,6 +15,9 @@ from processor.stitching.params import Params
 from processor.stitching.placing import AMBIGUOUS
 from processor.stitching.result import Result
 
+CONTRARY = 0.25  # of what speaks for a pose; people and cars that moved make some
+LITTLE = 0.1  # of both scans' faces
+
 
 @dataclass(frozen=True)
 class Network:
@@ -25,13 +28,15 @@ class Network:
     origins: Floats
     rivalry: Floats
     T_rival: Floats
+    contrary: Floats  # (k,) what speaks against a scan's pose by what speaks for it
+    shared: Floats  # (k,) its largest overlap with another scan
     pairs: list[Pair]
     overlap: Floats
     used: list[bool]
     messages: list[str]
     scale: Floats = field(default_factory=lambda: np.empty(0))
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
-    spread: tuple[float, float, float] = (float("nan"),) * 3  # noise, patches, ends
+    spread: tuple[float, ...] = (float("nan"),) * 3  # noise, patches, ends
 
 
 def result(scans: Sequence[Scan], network: Network, reference: int, params: Params, said: Sequence[str] = ()) -> Result:
@@ -59,7 +64,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
         turn_sd[s], place_sd[s] = np.sqrt(np.diag(own)[:3]), np.sqrt(np.diag(own)[3:])
         if np.isfinite(network.T_rival[s]).all():
             rival[s] = frames.of_file(base @ network.T_rival[s], network.origins[s])
-        state, why = _judged(network.rivalry[s], place_sd[s], turn_sd[s], params)
+        state, why = _judged(network, s, place_sd[s], turn_sd[s], params)
         status.append(state)
         message.append(why)
     names = [scan.name for scan in scans]
@@ -90,7 +95,12 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
     )  # fmt: skip
 
 
-def _judged(rivalry: float, place_sd: Floats, turn_sd: Floats, params: Params) -> tuple[str, str]:
+def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params: Params) -> tuple[str, str]:
+    rivalry = float(network.rivalry[s])
+    if network.contrary[s] > CONTRARY:
+        return "weak", f"much speaks against its pose ({100.0 * network.contrary[s]:.0f} % of what speaks for it)"
+    if network.shared[s] < LITTLE:
+        return "weak", f"it shares little with any other scan ({100.0 * network.shared[s]:.0f} %)"
     if rivalry > AMBIGUOUS:
         return "ambiguous", f"another pose speaks for itself as well ({100.0 * rivalry:.0f} % of this one's score)"
     if not np.isfinite(place_sd).all():

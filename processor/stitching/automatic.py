@@ -19,8 +19,9 @@ from processor.stitching.joint import Blocks
 from processor.stitching.pairs import Pair
 from processor.stitching.params import Params
 
-GATES_MM = (0.8, 0.4, 0.2, 0.1, 0.05)  # of a cell, then none: how far scans may still be apart
-END_GATE = 4.0  # the same for ends of faces, by the gate of faces: sides seen by one scan alone start worse
+# How far scans may still be apart, by cells' side: across faces, and for ends of faces, as what only these tell starts
+# worse.
+GATES = ((0.25, 3.2), (0.2, 1.6), (0.15, 0.8), (0.1, 0.4), (0.05, 0.2))
 LAST = 2  # adjustments without a gate
 STILL_MM = 0.02
 
@@ -75,11 +76,11 @@ def _usable() -> int:
 def _candidates(views: list[View], key: tuple[int, int], tilt: float, picked: picks.Picked) -> list[Placing]:
     a, b = views[key[0]], views[key[1]]
     found = coarse.placings(a, b, tilt)
-    if key in picked:
+    if key in picked and len(a.fine.points) and len(b.fine.points):
         in_a, in_b, _ = picked[key]
         try:
             T = three_point.tie(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b
-        except three_point.TooFew:
+        except three_point.TooFewError:
             return found
         found.append(coarse.held(a, b, coarse.refine(a, b, T)[0], coarse.NEAR * a.side_mm, coarse.MARGIN * a.side_mm))
         found.sort(key=lambda one: -one.score)
@@ -89,11 +90,15 @@ def _candidates(views: list[View], key: tuple[int, int], tilt: float, picked: pi
 def _adjusted(own: list[Cloud], T: Floats, reference: int) -> tuple[Solution, Blocks]:
     """Adjust all poses, with narrowing gates for what is one face."""
     cells = joint.gather(own)
-    for gate in (*(share * cells.size_mm for share in GATES_MM), *[0.0] * LAST):
-        pieces = joint.pieces(cells, T, gate)
-        blocks = joint.shared(bounding.bounded(own, pieces, T, END_GATE * gate))
+    if not len(cells.sums):
+        empty = np.empty(0, np.int64)
+        blocks = Blocks(empty, empty, np.empty((0, 10)), np.empty(0), empty, 0)
+        return bundle.solve(blocks, T, reference), blocks
+    for gate, end_gate in (*GATES, *[(0.0, 0.0)] * LAST):
+        pieces = joint.pieces(cells, T, gate * cells.size_mm)
+        blocks = joint.shared(bounding.bounded(own, pieces, T, end_gate * cells.size_mm))
         before = T
-        solution = bundle.solve(blocks, T, reference)
+        solution = bundle.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
         T = solution.T
         if gate == 0.0 and joint.moved_apart(T, before) < STILL_MM:
             break

@@ -16,6 +16,8 @@ POINTS_A_CELL = 5.0
 LEVELS = 6
 KEPT_BELOW = 2  # cells are kept this many levels finer than the piece they belong to
 LIMIT_SIGMAS = 2.5
+NARROW = ((0.004, 0.1), (0.01, 0.15), (0.03, 0.25))  # widths of directions, and how many may hold two depths
+APART = 0.05  # of the range
 
 
 @dataclass(frozen=True)
@@ -121,9 +123,11 @@ def _seen_from_origin(scan: Scan) -> bool:
         return False
     # What lies behind something in the same narrow direction was not seen from there.
     u = points / R[:, None]
-    key = octree.packed(octree.cells_of(u, 0.004))
-    order = np.lexsort([R, key])
-    same = key[order][1:] == key[order][:-1]
-    apart = np.log(R[order][1:] / R[order][:-1]) > 0.05
-    shared = int(same.sum())
-    return shared > 0.05 * len(R) and float((same & apart).sum()) < 0.10 * shared
+    for width, most in NARROW:
+        key = octree.packed(octree.cells_of(u, width))
+        order = np.lexsort([R, key])
+        same = key[order][1:] == key[order][:-1]
+        if same.sum() > 0.2 * len(R):
+            apart = np.log(R[order][1:] / R[order][:-1]) > APART
+            return float((same & apart).sum()) < most * float(same.sum())
+    return False

@@ -17,6 +17,7 @@ from processor.stitching.sight import Sight
 
 SIDES = 48.0  # a view's coarse cubes: so many along the reach of the points
 LIKE_COS = float(np.cos(np.radians(15.0)))
+FEWEST = 6  # faces
 REFINED = 8  # poses of a pair that are refined
 GATES = (0.7, 0.35, 0.2, 0.12)  # of the cubes' side
 STEPS = 4
@@ -74,9 +75,11 @@ class Placing:
 def side_of(clouds: list[Cloud]) -> float:
     """Side of coarse cubes, mm, for clouds that are to be placed together."""
     reach = [
-        float(np.quantile(np.linalg.norm(c.cells.mean - np.median(c.cells.mean, axis=0), axis=1), 0.8)) for c in clouds
+        float(np.quantile(np.linalg.norm(c.cells.mean - np.median(c.cells.mean, axis=0), axis=1), 0.8))
+        for c in clouds
+        if len(c.sums)
     ]
-    return float(np.median(reach)) / SIDES * 2.0
+    return float(np.median(reach)) / SIDES * 2.0 if reach else 1.0
 
 
 def view(cloud: Cloud, side_mm: float) -> View:
@@ -91,6 +94,8 @@ def view(cloud: Cloud, side_mm: float) -> View:
 
 def placings(a: View, b: View, most_tilt_rad: float, most: int = 4) -> list[Placing]:
     """Poses of b to a, the best first; none where nothing is alike."""
+    if min(len(a.coarse.points), len(b.coarse.points)) < FEWEST:
+        return []
     tried: list[tuple[float, Floats]] = []
     for R in directions.turns(a.modes, b.modes, most_tilt_rad):
         for t, score in zip(*votes.shifts(a.coarse, a.weight, b.coarse, b.weight, R, a.side_mm), strict=True):

@@ -82,7 +82,7 @@ def turns(a: tuple[Floats, Floats], b: tuple[Floats, Floats], most_tilt_rad: flo
 
 
 def _apart(angle: float) -> bool:
-    return abs(np.cos(angle)) < LEAST_ANGLE_COS
+    return bool(abs(np.cos(angle)) < LEAST_ANGLE_COS)
 
 
 def _frames(first: Floats, second: Floats) -> Floats:

@@ -1,4 +1,4 @@
-"""The places of a scan that votes and checks are taken at: one a coarse cube and direction, however dense the points."""
+"""The places of a scan that votes and checks are taken at: one a coarse cube and direction."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ WIDEST = 0.02  # of the range: a step between rays, along the face, beyond which
 
 @dataclass(frozen=True)
 class Ends:
-    """Ends (n, 3) in the cloud's frame, the way across each from the last ray to the next (n, 3), the faces' normals."""
+    """Ends (n, 3) in the cloud's frame, the way across each from ray to ray (n, 3), and the faces' normals (n, 3)."""
 
     points: Floats = field(default_factory=lambda: np.empty((0, 3)))
     across: Floats = field(default_factory=lambda: np.empty((0, 3)))

@@ -9,7 +9,7 @@ from processor.model import Floats
 
 
 def about_origin(covariance: Floats, position: Floats) -> Floats:
-    """Covariance (6, 6) of turns about ``position`` (3,) and its shift, as turns about the frame's origin and a shift."""
+    """Covariance (6, 6) of turns about ``position`` (3,) and its shift, as of turns about the frame's origin."""
     J = np.eye(6)
     J[3:, :3] = cross_matrix(position)
     found: Floats = J @ covariance @ J.T

@@ -7,13 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
+from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
-from processor.stitching import octree
+from processor.stitching import directions, octree
 from processor.stitching.clouds import LIMIT_SIGMAS, Cloud
 from processor.stitching.elements import facing
 
 LEVELS = 7
+SAME_COS = float(np.cos(np.radians(8.0)))
+MOST_NORMALS = 1500
 LEAST_POINTS = 6.0  # of a scan on a piece
+ACROSS_SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the noise that does not run along the ray
 LEAST_WEIGHT_SHARE = 0.05  # noise across a face seen at grazing incidence, of the range noise
 
 
@@ -39,26 +43,23 @@ class Blocks:
 
 
 def noise(cloud: Cloud) -> tuple[float, float]:
-    """Variances (across the face, along the ray), mm^2, of the scatter a + b cos^2(incidence) of a cloud's pieces."""
+    """Find variances (across the face, along the ray), mm^2, of the scatter a + b cos^2(incidence) of a cloud's pieces.
+
+    By medians: pieces that are not quite flat are no noise.
+    """
     free = cloud.planes.count - 3.0
     keep = free >= 10.0
     v = cloud.planes.variance[keep, 0] * cloud.planes.count[keep] / free[keep]
     c2 = incidence_cos(cloud.planes.mean[keep], cloud.planes.normal[keep], cloud.has_position) ** 2
     if len(v) < 10 or not cloud.has_position:
         return 0.0, max(float(np.median(v)) if len(v) else cloud.sigma_mm**2, 1e-8)
-    x = np.array([0.0, max(float(np.median(v / np.maximum(c2, 0.05))), 1e-8)])
-    weight = np.minimum(free[keep], 200.0)
-    A = np.stack([np.ones_like(c2), c2], axis=1)
-    for _ in range(15):
-        model = np.maximum(A @ x, 1e-12)
-        w = weight / model**2 * np.minimum(1.0, 3.0 / np.maximum(np.abs(v / model - 1.0) * np.sqrt(weight / 2.0), 1e-9))
-        H, g = A.T @ (w[:, None] * A), A.T @ (w * v)
-        x = np.linalg.solve(H + 1e-12 * np.trace(H) * np.eye(2), g)
-        if x[0] < 0.0:
-            x = np.array([0.0, g[1] / H[1, 1]])
-        if x[1] < 0.0:
-            x = np.array([g[0] / H[0, 0], 0.0])
-    return float(max(x[0], 0.0)), float(max(x[1], 1e-10))
+    best = (np.inf, 0.0, 1.0)
+    for share in ACROSS_SHARES:
+        model = share + (1.0 - share) * c2 + LEAST_WEIGHT_SHARE**2
+        size = float(np.median(v / model))
+        spread = float(np.median(np.abs(np.log(np.maximum(v, 1e-12) / max(size, 1e-12) / model))))
+        best = min(best, (spread, share, size))
+    return best[1] * best[2], max((1.0 - best[1]) * best[2], 1e-10)
 
 
 def incidence_cos(points: Floats, normals: Floats, known: bool) -> Floats:
@@ -114,18 +115,37 @@ def pieces(cells: Gathered, T: Floats, gate_mm: float) -> Blocks:
     sums = octree.moved(cells.sums[rows], world)
     where = octree.cells_of(mean - origin, cells.size_mm)
     limit = float(np.hypot(cells.limit_mm, gate_mm))
-    piece, _ = octree.flat_pieces(where, sums, cells.size_mm, limit, LEVELS, 2.0 * LEAST_POINTS, facing(normal))
+    piece, _ = octree.flat_pieces(where, sums, cells.size_mm, limit, LEVELS, 2.0 * LEAST_POINTS, looking(normal))
     keep = piece >= 0
+    # A cell's own plane must be the piece's: across a wide gate, cubes may hold two faces.
+    there = np.flatnonzero(keep)
+    planes = octree.planes_of(octree.summed(sums[there], piece[there], int(piece.max(initial=-1)) + 1))
+    n = planes.normal[piece[there]]
+    off = np.einsum("ni,ni->n", mean[there] - origin - planes.mean[piece[there]], n)
+    same = (np.abs(np.einsum("ni,ni->n", n, normal[there])) > SAME_COS) & (np.abs(off) < 2.0 * limit)
+    keep[there[~same]] = False
     rows, scan, piece = rows[keep], scan[keep], piece[keep]
     key = piece * 4096 + scan
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
     weighted = octree.summed(cells.sums[rows] / cells.variance[rows][:, None], inverse.ravel(), len(first))
-    count = np.bincount(inverse.ravel(), cells.sums[rows, 9], len(first))
+    count: Floats = np.bincount(inverse.ravel(), cells.sums[rows, 9], len(first)).astype(np.float64)
     enough = count >= LEAST_POINTS
     _, piece = np.unique(piece[first][enough], return_inverse=True)
     piece = piece.ravel()
     return Blocks(piece, scan[first][enough], weighted[enough], count[enough], np.zeros(len(piece), np.int64),
                   int(piece.max()) + 1 if len(piece) else 0)  # fmt: skip
+
+
+def looking(normals: Floats) -> Ints:
+    """Sort normals (n, 3) by the way they look, the structure's main directions first: no border runs through one."""
+    axes, _ = directions.modes(thinned(normals, MOST_NORMALS))
+    found = directions.MOST_MODES + facing(normals)
+    if len(axes):
+        cosine = normals @ axes.T
+        nearest = np.argmax(cosine, axis=1)
+        near = np.take_along_axis(cosine, nearest[:, None], axis=1)[:, 0] > directions.APART_COS
+        found[near] = nearest[near]
+    return found
 
 
 def shared(blocks: Blocks) -> Blocks:

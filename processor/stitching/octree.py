@@ -29,7 +29,7 @@ def cells_of(points: Floats, size_mm: float) -> Ints:
 
 
 def packed(cells: Ints, group: Ints | None = None) -> Ints:
-    """Pack cell numbers (n, 3), and a group of 0 to 15 where given, in one number each (n,)."""
+    """Pack cell numbers (n, 3), and a group of 0 to 31 where given, in one number each (n,)."""
     c = cells + OFFSET
     key: Ints = (c[:, 0] << (2 * BITS)) | (c[:, 1] << BITS) | c[:, 2]
     return key if group is None else key | (group << (3 * BITS))
@@ -41,7 +41,7 @@ def summed(values: Floats, inverse: Ints, count: int) -> Floats:
 
 
 def sums_of(points: Floats) -> Floats:
-    """Sums (n, 10) of single points (n, 3)."""
+    """Write single points (n, 3) as sums (n, 10)."""
     x = np.hstack([points, np.ones((len(points), 1))])
     found: Floats = x[:, _I] * x[:, _J]
     return found
@@ -62,7 +62,7 @@ def triangle(M: Floats) -> Floats:
 
 
 def moved(sums: Floats, T: Floats) -> Floats:
-    """Sums (n, 10) of points moved by T (4, 4) or by one each (n, 4, 4)."""
+    """Return sums (n, 10) of points moved by T (4, 4) or by one each (n, 4, 4)."""
     return triangle(T @ square(sums) @ np.swapaxes(T, -1, -2))
 
 
@@ -111,7 +111,7 @@ def flat_pieces(
     n = sums[:, 9] if counts is None else counts
     up: list[Ints] = []  # from the nodes below to the nodes of a level
     flat: list[npt.NDArray[np.bool_]] = []
-    where, total, number, groups = cells, sums, n, group
+    where, total, number, groups = cells, sums, np.asarray(n, float), group
     for level in range(levels):
         key = packed(where, groups)
         _, first, inverse = np.unique(key, return_index=True, return_inverse=True)

@@ -20,11 +20,16 @@ Candidates = dict[tuple[int, int], list[Placing]]
 
 @dataclass(frozen=True)
 class Placed:
-    """Poses T_ref_scan (k, 4, 4), NaN of scans without one; a rival's share of the best score (k,) and pose."""
+    """Poses T_ref_scan (k, 4, 4), NaN of scans without one; a rival's share of the best score (k,) and pose.
+
+    ``contrary`` (k,) is what speaks against a scan's pose by what speaks for it, ``overlap`` (k,) its largest.
+    """
 
     T: Floats
     rivalry: Floats
     T_rival: Floats
+    contrary: Floats
+    overlap: Floats
 
 
 def towards(candidates: Candidates, i: int, j: int) -> list[tuple[Floats, float]]:
@@ -40,6 +45,7 @@ def place(views: list[View], candidates: Candidates, reference: int) -> Placed:
     T = np.full((k, 4, 4), np.nan)
     T[reference] = np.eye(4)
     rivalry, T_rival = np.zeros(k), np.full((k, 4, 4), np.nan)
+    contrary, overlap = np.zeros(k), np.ones(k)
     done = [reference]
     while len(done) < k:
         best: tuple[float, int, list[tuple[float, Floats]]] | None = None
@@ -65,7 +71,17 @@ def place(views: list[View], candidates: Candidates, reference: int) -> Placed:
         if rivals:
             rivalry[j] = rivals[0][0] / max(own, 1e-12)
             T_rival[j] = rivals[0][1]
-    return Placed(T, rivalry, T_rival)
+        all_held = [held(views, T, i, j, T[j]) for i in others]
+        agree = sum(one.agree for one in all_held if one.overlap > LEAST_OVERLAP)
+        contrary[j] = sum(one.against for one in all_held) / max(agree, 1e-12)
+        overlap[j] = max(one.overlap for one in all_held)
+    return Placed(T, rivalry, T_rival, contrary, overlap)
+
+
+def held(views: list[View], T: Floats, i: int, j: int, pose: Floats) -> Placing:
+    """Count what speaks for and against a pose (4, 4) of scan j, beside scan i at its pose in T (k, 4, 4)."""
+    side = views[i].side_mm
+    return coarse.held(views[i], views[j], rigid.invert(T[i]) @ pose, coarse.NEAR * side, coarse.MARGIN * side)
 
 
 def ranking(
@@ -87,10 +103,7 @@ def ranking(
     for pose, _ in poses[:MOST_TRIED]:
         agree, against, total = 0.0, 0.0, 0.0
         for i in done:
-            one = coarse.held(
-                views[i], views[j], rigid.invert(T[i]) @ pose, coarse.NEAR * views[i].side_mm,
-                coarse.MARGIN * views[i].side_mm,
-            )  # fmt: skip
+            one = held(views, T, i, j, pose)
             against += one.against
             if one.overlap > LEAST_OVERLAP:
                 agree += one.agree

@@ -50,4 +50,4 @@ class Result(Checked):
     closure_ratio: Floats = column("l")  # by what the pairs' covariances let expect: chi-square by its 6 freedoms
     noise_mm: float = float("nan")  # of single points along the ray, as found
     patch_mm: float = float("nan")  # of what neighbouring points have in common, as found
-    ends_mm: float = float("nan")  # the same of ends of faces
+    ends_share: float = float("nan")  # the same of ends of faces, by the standard deviation of a single one

@@ -16,6 +16,16 @@ from processor.stitching import frames
 from processor.stitching.pairs import Pair
 
 LEAST_POINTS = 3
+LEAST_SD_MM = 1e-6  # of picks without any error, as tests make them
+UNIT_SLIPS = (
+    (1000.0, "m and mm"),
+    (304.8, "feet and mm"),
+    (39.3701, "inches and m"),
+    (25.4, "inches and mm"),
+    (12.0, "inches and feet"),
+    (10.0, "cm and mm"),
+    (3.28084, "feet and m"),
+)
 LEAST_HEIGHT = 1e-3  # of a triangle, by its longest side: nearer to a line than that is a line
 
 
@@ -35,31 +45,31 @@ class Tie:
     covariance: Floats
 
 
-class TooFew(ValueError):
+class TooFewError(ValueError):
     """Fewer than three points, or all on a line: a pose cannot be told."""
 
 
 def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
-    """Fit a pair's picked points (n, 3) of each scan, least squares; raises TooFew.
+    """Fit a pair's picked points (n, 3) of each scan, least squares; raises TooFewError.
 
     With six parameters three points leave three freedoms, with seven two: the standard deviation of a pick comes from
     these. The scale is (sum of spreads in a) / (in b), the least-squares one by the moved points where it is free.
     """
     n = len(points_a)
     if n < LEAST_POINTS:
-        raise TooFew(f"{n} common points")
+        raise TooFewError(f"{n} common points")
     middle_a, middle_b = points_a.mean(axis=0), points_b.mean(axis=0)
     a, b = points_a - middle_a, points_b - middle_b
     widths = np.linalg.svd(b, compute_uv=False)
     if widths[0] <= 0.0 or widths[1] < LEAST_HEIGHT * widths[0]:
-        raise TooFew("all common points on a line")
+        raise TooFewError("all common points on a line")
     R = rigid.fit(b, a)[:3, :3]
     moved = b @ R.T
     scale = float((a * moved).sum() / (moved**2).sum())
     used = scale if scale_free else 1.0
     residuals = a - used * moved
     free = 3 * n - 6 - scale_free
-    both = float(np.sqrt((residuals**2).sum() / free))  # of a difference: both scans' picks are in it
+    both = max(float(np.sqrt((residuals**2).sum() / free)), LEAST_SD_MM)  # of a difference: both scans' picks are in it
     sd = both / np.sqrt(2.0)
     # The scale's own standard deviation by what six or seven parameters leave; with it free, 3n - 7 in any case.
     left = float(np.sqrt(((a - scale * moved) ** 2).sum() / max(3 * n - 7, 1)))
@@ -75,8 +85,7 @@ def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
 def verdict(scale: float, sd: float, limit_ppm: float) -> str:
     """Say what a scale other than 1 means, or nothing."""
     off = 1e6 * abs(scale - 1.0)
-    for factor, units in ((1000.0, "m and mm"), (25.4, "inches and mm"), (304.8, "feet and mm"), (39.3701, "inches and m"),
-                          (3.28084, "feet and m"), (10.0, "cm and mm"), (12.0, "inches and feet")):  # fmt: skip
+    for factor, units in UNIT_SLIPS:
         if min(abs(scale / factor - 1.0), abs(scale * factor - 1.0)) < 0.02:
             return f"scale {scale:.5g}: units mixed up ({units})?"
     if off <= 3.0 * 1e6 * sd:
@@ -142,7 +151,7 @@ def adjusted(pairs: list[Pair], count: int, reference: int) -> tuple[Floats, Flo
 
 
 def _equation(one: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
-    """Derivative (6, 12) by both scans' motions, misclosure (6,) in a's axes, and weight of a pair at poses T."""
+    """Return the derivative (6, 12) by both scans' motions, the misclosure (6,) in a's axes, and the weight."""
     R = T[one.a, :3, :3]
     now = rigid.invert(T[one.a]) @ T[one.b]
     r = frames.difference(now, one.T_a_b)
@@ -151,4 +160,5 @@ def _equation(one: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
     A[:3, :3], A[:3, 6:9] = -R.T, R.T
     A[3:, 3:6], A[3:, 9:] = -R.T, R.T
     A[3:, :3] = R.T @ frames.cross_matrix(arm)
-    return A, r, np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True)
+    weight: Floats = np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True)
+    return A, r, weight
