@@ -183,6 +183,17 @@ class Control(Checked):
 
 
 @dataclass(frozen=True)
+class Picks(Checked):
+    """Common points that were picked in two scans each, in these scans' frames (mm)."""
+
+    scan_a: tuple[str, ...] = names("q")
+    scan_b: tuple[str, ...] = names("q")
+    points: tuple[str, ...] = names("q")
+    in_a: Floats = column("q", 3)
+    in_b: Floats = column("q", 3)
+
+
+@dataclass(frozen=True)
 class Scene(Checked):
     """What was scanned, and what it was meant to be. Steps read this and nothing else."""
 
@@ -198,6 +209,7 @@ class Scene(Checked):
     structure: StructureDesign | None = None
     tolerance: Tolerance | None = None  # None: nothing was said
     control: Control | None = newer()
+    picks: Picks | None = newer()
 
 
 # --- the truth: evaluation alone reads it --------------------------------------------------------------------------
