@@ -1,0 +1,170 @@
+"""How large and how deep a region is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from processor.defects.alignment import Alignment
+from processor.defects.fields import Field
+from processor.defects.regions import Region, flat
+from processor.defects.surface import CYLINDER, DesignSurface
+from processor.model import Floats, Ints
+
+NORMAL_95 = 1.959964
+FIT_SHARE = 0.45  # of a region's radius, within which a paraboloid is fitted for its depth
+FEWEST_CELLS = 9
+BORDER_CELLS = 1.6
+
+
+@dataclass(frozen=True)
+class Measures:
+    """Of a region: see :class:`processor.defects.result.Result`; ``borders`` are the sides of its face it reaches."""
+
+    centre: Floats
+    axes: Floats
+    extent: Floats
+    area: float
+    depth: float
+    depth_ci95: float
+    mean: float
+    volume: float
+    volume_ci95: float
+    edge: float
+    curvature: float
+    lod95: float
+    diameter: float
+    borders: int
+
+
+def measure(
+    region: Region, field: Field, surface: DesignSurface, alignment: Alignment, inflation: float, thickness: float
+) -> Measures:
+    """Measure a region on its face; what is missing is as deep as the plate is thick (mm)."""
+    charts, cell = surface.charts, surface.charts.cell_mm
+    uv = flat(surface, region)
+    rows = region.cells
+    area = surface.share[rows] * cell**2
+    deviation, variance = field.deviation[rows], field.variance[rows]
+    weight = area if region.sign == 0 else area * np.abs(deviation)
+    middle = (uv * weight[:, None]).sum(axis=0) / max(weight.sum(), 1e-12)
+    _, turn = np.linalg.eigh((uv - middle).T @ ((uv - middle) * area[:, None]) + 1e-9 * np.diag([1.0, 0.0]))
+    along = (uv - middle) @ turn[:, ::-1]
+    extent = np.ptp(along, axis=0) + cell
+    # Width by area: a slim region that is not quite straight is not as wide as its box.
+    extent[1] = min(extent[1], 4.0 / np.pi * area.sum() / extent[0] if len(rows) > FEWEST_CELLS else extent[1])
+    nearest = int(rows[np.argmin(np.linalg.norm(uv - middle, axis=1))])
+    axes = np.zeros((3, 3))
+    out = surface.outward[nearest]
+    frame = charts.axes[region.chart]
+    side = np.cross(out, frame[0])
+    axes[0] = turn[0, 1] * frame[0] + turn[1, 1] * side
+    axes[1], axes[2] = np.cross(out, axes[0]), out
+    registration = float(alignment.sd(surface.centres[nearest][None], out[None])[0])
+    lod = NORMAL_95 * float(np.hypot(inflation / np.sqrt(np.sum(1.0 / np.maximum(variance, 1e-12))), registration))
+    volume_sd = float(np.sqrt((variance * area**2).sum())) * inflation
+    centre = surface.centres[nearest] + (middle - uv[np.argmin(np.linalg.norm(uv - middle, axis=1))]) @ np.stack(
+        [frame[0], side]
+    )
+    edge, borders = _borders(region, surface, middle)
+    diameter = float(2.0 * np.sqrt(area.sum() / np.pi))
+    if region.sign == 0:
+        lost = float(area.sum())
+        ring = cell * np.sqrt(np.pi * lost)  # of cells that are missing in part
+        return Measures(centre, axes, extent, lost, thickness, 0.0, thickness, lost * thickness,
+                        NORMAL_95 * ring * thickness, edge, float("nan"), lod, diameter, borders)  # fmt: skip
+    depth, depth_sd, curvature = _deepest(region, field, surface, inflation)
+    return Measures(
+        centre, axes, extent, float(area.sum()), depth, NORMAL_95 * float(np.hypot(depth_sd, registration)),
+        -float((deviation * area).sum() / area.sum()), -float((deviation * area).sum()),
+        NORMAL_95 * float(np.hypot(volume_sd, registration * area.sum())), edge, curvature, lod, diameter, borders,
+    )  # fmt: skip
+
+
+def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: float) -> tuple[float, float, float]:
+    """Depth at the deepest place, inward positive, its standard deviation, and the larger curvature there (1/m).
+
+    The vertex of a paraboloid fitted about it, with a term of the fourth order where there are cells enough.
+    """
+    uv, cell = flat(surface, region), surface.charts.cell_mm
+    d, variance = field.deviation[region.cells], field.variance[region.cells]
+    seen = field.seen[region.cells] > 0
+    if seen.sum() < FEWEST_CELLS:
+        use = seen if seen.any() else np.ones(len(d), bool)
+        k = int(np.argmax(np.where(use, region.sign * d / np.sqrt(variance), -np.inf)))
+        return -float(d[k]), float(np.sqrt(variance[k])) * inflation, float("nan")
+    radius = max(np.sqrt(len(d) / np.pi), 1.0) * cell
+    near = max(0.35 * radius, 1.01 * cell)
+    from scipy.spatial import cKDTree
+
+    tree = cKDTree(uv[seen])
+    value, w = d[seen], 1.0 / variance[seen]
+    smooth = np.array([np.sum(w[i] * value[i]) / np.sum(w[i]) for i in tree.query_ball_point(uv[seen], near)])
+    top = uv[seen][int(np.argmax(region.sign * smooth))]
+    for _ in range(2):
+        inside = tree.query_ball_point(top, max(FIT_SHARE * radius, 1.9 * cell))
+        if len(inside) < FEWEST_CELLS:
+            inside = tree.query(top, k=min(FEWEST_CELLS, len(value)))[1].tolist()
+        x, y = (uv[seen][inside] - top).T / radius
+        columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
+        if len(inside) >= 4 * FEWEST_CELLS:
+            columns = np.hstack([columns, ((x * x + y * y) ** 2)[:, None]])
+        A = columns.T @ (w[inside, None] * columns) + 1e-9 * np.eye(columns.shape[1])
+        inverse = np.linalg.inv(A)
+        c = inverse @ (columns.T @ (w[inside] * value[inside]))
+        H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
+        if region.sign * np.linalg.eigvalsh(H)[::-1][0 if region.sign > 0 else 1] >= 0.0:
+            break  # no vertex: the value at the place itself
+        move = -np.linalg.solve(H, c[1:3])
+        move *= min(1.0, 0.5 / max(float(np.linalg.norm(move)), 1e-12))
+        c0 = c[0] + c[1:3] @ move + 0.5 * move @ H @ move
+        if np.linalg.norm(move) < 0.02:
+            break
+        top = top + move * radius
+    else:
+        c0 = c[0]
+    sd = float(np.sqrt(inverse[0, 0])) * inflation
+    bend = float(np.abs(np.linalg.eigvalsh(H)).max()) / radius**2 * 1000.0
+    value_there = float(c0 if "c0" in locals() else c[0])
+    return -value_there, sd, bend
+
+
+def _borders(region: Region, surface: DesignSurface, middle: Floats) -> tuple[float, int]:
+    """Distance of a place from its face's border, and how many sides of the face the region reaches."""
+    charts, chart = surface.charts, region.chart
+    cell = charts.cell_mm
+    covered = charts.image(surface.share, chart) > 0.5
+    round_ = charts.kind[chart] == CYLINDER
+    pad = ((1, 1), (0, 0)) if round_ else ((1, 1), (1, 1))
+    away = ndimage.distance_transform_edt(np.pad(covered, pad), sampling=cell)
+    at = np.clip(((middle - charts.low[chart]) / cell).astype(np.int64), 0, charts.shape[chart] - 1)
+    edge = float(away[at[0] + 1, at[1] + (0 if round_ else 1)])
+    rows = region.cells - charts.first[chart]
+    i, j = rows // charts.shape[chart, 1], rows % charts.shape[chart, 1]
+    ij = np.argwhere(covered)
+    low, high = ij.min(axis=0), ij.max(axis=0)
+    reach = BORDER_CELLS
+    sides = [i.min() < low[0] + reach, i.max() > high[0] - reach]
+    if not round_:
+        sides += [j.min() < low[1] + reach, j.max() > high[1] - reach]
+    return edge, int(sum(sides))
+
+
+def thickness_at(surface: DesignSurface, point: Floats, outward: Floats, component: int, most: float = 500.0) -> float:
+    """Return how thick the design is behind a place (3,), mm; NaN where nothing lies behind within ``most``."""
+    rows: Ints = np.flatnonzero(surface.component_of == component)
+    corners = surface.vertices[surface.faces[rows]]
+    a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    way = -outward
+    cross = np.cross(np.broadcast_to(way, e2.shape), e2)
+    turn = np.einsum("ni,ni->n", e1, cross)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        arm = point - a
+        u = np.einsum("ni,ni->n", arm, cross) / turn
+        q = np.cross(arm, e1)
+        v = (q @ way) / turn
+        t = np.einsum("ni,ni->n", e2, q) / turn
+        hit = (np.abs(turn) > 1e-9) & (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1.0 + 1e-6) & (t > 0.5) & (t < most)
+    return float(t[hit].min()) if hit.any() else float("nan")

@@ -1,0 +1,303 @@
+"""Shapes of whole components: moved, bent, twisted, waved or stepped; and a local bump, that none of these be taken for.
+
+Along a component runs xi, across it eta, out of its largest face zeta, each from -1 to 1 (eta and zeta by the larger).
+A shape is a sum of displacements; what a scan sees of it is their part along each cell's normal.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.model import Floats
+
+PLATE_RATIO = 3.0  # of width to thickness, from which on a component bends across itself too
+STEPS = np.linspace(-0.9, 0.9, 37)
+FEWEST_PERIODS = 1.4
+WAVE_BLOCKS = 6.0  # in the shortest wave
+BUMP_RADII = 8
+REFINING = 3
+GOLDEN, GOLDEN_STEPS = 0.6180339887498949, 18
+WEAK = 1e-6  # of a column's weight: keeps what is not seen at nothing
+
+
+@dataclass(frozen=True)
+class Frame:
+    """A component's own axes: origin (3,), axes (3, 3, rows along, across, out) and half sizes (3,)."""
+
+    origin: Floats
+    axes: Floats
+    half: Floats
+
+    def local(self, points: Floats) -> Floats:
+        """Coordinates (n, 3) along, across and out, mm."""
+        found: Floats = (points - self.origin) @ self.axes.T
+        return found
+
+
+@dataclass(frozen=True)
+class Shape:
+    """One shape: its kind, where it depends on more than factors the ``at`` of these, and the factors (k,)."""
+
+    kind: str
+    at: tuple[float, ...]
+    factors: Floats
+
+    def values(self, frame: Frame, points: Floats, outward: Floats) -> Floats:
+        """Return what the shape adds to deviations (n,) at points (n, 3) with unit normals (n, 3), mm."""
+        columns = BASES[self.kind](frame.local(points), outward @ frame.axes.T, frame.half, self.at)
+        found: Floats = columns @ self.factors
+        return found
+
+
+Basis = Callable[[Floats, Floats, Floats, tuple[float, ...]], Floats]
+
+
+def _rigid(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
+    span = float(half.max())
+    return np.hstack([n, np.cross(p / span, n)])
+
+
+def _bend(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
+    axis, order = int(at[0]), int(at[1])
+    x = p[:, axis] / half[axis]
+    shape = x**2 if order == 2 else np.cos(0.5 * np.pi * x)
+    if axis == 1 or half[1] > PLATE_RATIO * half[2]:
+        return np.stack([shape * n[:, 2]], axis=1)
+    return np.stack([shape * n[:, 2], shape * n[:, 1]], axis=1)
+
+
+def _twist(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
+    x, span = p[:, 0] / half[0], max(half[1], half[2])
+    return (x * (p[:, 1] * n[:, 2] - p[:, 2] * n[:, 1]) / span)[:, None]
+
+
+def _step(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
+    axis = int(at[0])
+    beyond = (p[:, axis] / half[axis] > at[1]).astype(float)
+    if axis == 1 or half[1] > PLATE_RATIO * half[2]:
+        return (beyond * n[:, 2])[:, None]
+    return np.stack([beyond * n[:, 2], beyond * n[:, 1]], axis=1)
+
+
+def _wave(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
+    axis, length, fades = int(at[0]), at[1], at[2]
+    turn = 2.0 * np.pi * p[:, axis] / length
+    other = p[:, 1 - axis] / half[1 - axis]
+    high = (np.cos(0.5 * np.pi * np.clip(other, -1.0, 1.0)) ** 2 if fades else 1.0) * n[:, 2]
+    return np.stack([high * np.sin(turn), high * np.cos(turn)], axis=1)
+
+
+def _bump(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
+    away = ((p[:, 0] - at[0]) ** 2 + (p[:, 1] - at[1]) ** 2) / at[2] ** 2
+    return (np.maximum(1.0 - away, 0.0) ** 2 * n[:, 2])[:, None]
+
+
+BASES: dict[str, Basis] = {
+    "misalignment": _rigid, "bend": _bend, "twist": _twist, "step": _step, "waviness": _wave, "bump": _bump,
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Blocks:
+    """Deviations of a component's blocks: places (n, 3), normals, means, weights = 1 / variance, and a block's side."""
+
+    points: Floats
+    outward: Floats
+    mean: Floats
+    weight: Floats
+    side_mm: float
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """Shapes fitted together; ``gain`` is by how much each made the weighted sum of squares less when it was added.
+
+    ``gap`` is how much more the next best first shape of another kind leaves, as a factor.
+    """
+
+    shapes: tuple[Shape, ...]
+    gain: tuple[float, ...]
+    left: Floats  # (n,) of the blocks
+    gap: float
+
+
+def fit(blocks: Blocks, frame: Frame, most: int = 3, least_gain: float = 30.0) -> Fitted:
+    """Add the shape that explains most for its number of factors, again and again while it explains enough."""
+    p, n = frame.local(blocks.points), blocks.outward @ frame.axes.T
+    chosen: list[tuple[str, tuple[float, ...]]] = []
+    gains: list[float] = []
+    left, gap = blocks.mean, 1.0
+    before = float((blocks.weight * left**2).sum())
+    count = len(left)
+    while len(chosen) < most:
+        best: tuple[float, float, str, tuple[float, ...]] | None = None
+        squares: dict[str, float] = {}
+        base = _columns(chosen, p, n, frame)
+        for kind, at in _offers(blocks, frame, p, n, left):
+            if any(kind == one for one, _ in chosen) and kind != "bump":
+                continue
+            columns = np.hstack([base, BASES[kind](p, n, frame.half, at)])
+            if kind not in ("misalignment", "bump") and "misalignment" not in [one for one, _ in chosen]:
+                columns = np.hstack([columns, _rigid(p, n, frame.half, ())])
+            square = _left(columns, blocks)[1]
+            squares[kind] = min(square, squares.get(kind, np.inf))
+            factors = np.linalg.matrix_rank(columns) if columns.shape[1] < 3 else columns.shape[1]
+            score = count * np.log(max(square, 1e-9) / count + 1.0) + factors * np.log(count)
+            if best is None or score < best[0]:
+                best = (score, square, kind, at)
+        if best is None or before - best[1] < least_gain:
+            break
+        _, square, kind, at = best
+        if not [one for one, _ in chosen if one != "bump"]:
+            others = [value for one, value in squares.items() if one != kind]
+            gap = min(others, default=np.inf) / max(square, 1e-9)
+        if kind not in ("misalignment", "bump") and "misalignment" not in [one for one, _ in chosen]:
+            alone = _left(np.hstack([base, BASES[kind](p, n, frame.half, at)]), blocks)[1]
+            if alone - square > 0.02 * (before - square) + least_gain:
+                chosen.append(("misalignment", ()))
+                gains.append(alone - square)
+                most += 1
+            else:
+                square = alone
+        chosen.append((kind, at))
+        gains.append(before - square)
+        left, before = _left(_columns(chosen, p, n, frame), blocks)
+    factors = _solve(_columns(chosen, p, n, frame), blocks)
+    shapes, start = [], 0
+    for kind, at in chosen:
+        width = BASES[kind](p[:1], n[:1], frame.half, at).shape[1]
+        shapes.append(Shape(kind, at, factors[start : start + width]))
+        start += width
+    return Fitted(tuple(shapes), tuple(gains), left, gap)
+
+
+def _columns(chosen: list[tuple[str, tuple[float, ...]]], p: Floats, n: Floats, frame: Frame) -> Floats:
+    return np.hstack([np.empty((len(p), 0)), *(BASES[kind](p, n, frame.half, at) for kind, at in chosen)])
+
+
+def _solve(columns: Floats, blocks: Blocks) -> Floats:
+    if not columns.shape[1]:
+        return np.empty(0)
+    A = columns.T @ (blocks.weight[:, None] * columns)
+    ridge = WEAK * np.trace(A) / len(A) + 1e-12
+    found: Floats = np.linalg.solve(A + ridge * np.eye(len(A)), columns.T @ (blocks.weight * blocks.mean))
+    return found
+
+
+def _left(columns: Floats, blocks: Blocks) -> tuple[Floats, float]:
+    left = blocks.mean - columns @ _solve(columns, blocks)
+    return left, float((blocks.weight * left**2).sum())
+
+
+def _offers(
+    blocks: Blocks, frame: Frame, p: Floats, n: Floats, left: Floats
+) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Give the shapes to try, those with places at the best of them for what is left so far."""
+    half = frame.half
+    wide = half[1] > PLATE_RATIO * half[2]
+    axes = (0.0, 1.0) if wide else (0.0,)
+    yield "misalignment", ()
+    for axis in axes:
+        yield "bend", (axis, 2.0)
+        yield "bend", (axis, 1.0)
+    yield "twist", ()
+    yield from _best("step", [(axis, float(at)) for axis in axes for at in STEPS], blocks, frame, p, n, left)
+    waves = []
+    for axis in axes:
+        shortest, longest = WAVE_BLOCKS * blocks.side_mm, 2.0 * half[int(axis)] / FEWEST_PERIODS
+        if longest <= shortest:
+            continue
+        waves += [
+            (axis, float(length), fades)
+            for length in np.geomspace(shortest, longest, 2 + int(24 * np.log2(longest / shortest)))
+            for fades in ((0.0, 1.0) if wide else (0.0,))
+        ]
+    yield from _best("waviness", waves, blocks, frame, p, n, left)
+    if wide:
+        yield from _bumps(blocks, frame, p, n, left)
+
+
+def _best(
+    kind: str, places: list[tuple[float, ...]], blocks: Blocks, frame: Frame, p: Floats, n: Floats, left: Floats
+) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """Give the one of many places of a shape that explains most, the rigid motion of the component free beside it."""
+    if not places:
+        return
+    gain = _gains(kind, blocks, frame, p, n, left)
+    best = max(places, key=gain)
+    # Between the places tried: by golden sections of the number that is not an axis.
+    tried = sorted({one[1] for one in places})
+    where = tried.index(best[1])
+    low, high = tried[max(0, where - 1)], tried[min(len(tried) - 1, where + 1)]
+    for _ in range(GOLDEN_STEPS):
+        one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+        if gain((best[0], one, *best[2:])) > gain((best[0], two, *best[2:])):
+            high = two
+        else:
+            low = one
+    refined = (best[0], 0.5 * (low + high), *best[2:])
+    yield kind, refined if gain(refined) > gain(best) else best
+
+
+def _gains(
+    kind: str, blocks: Blocks, frame: Frame, p: Floats, n: Floats, left: Floats
+) -> Callable[[tuple[float, ...]], float]:
+    """Return a function: how much a shape at a place explains of what is left, a rigid motion free beside it."""
+    rigid = _rigid(p, n, frame.half, ())
+    w = blocks.weight
+    A = rigid.T @ (w[:, None] * rigid)
+    A += WEAK * np.trace(A) / len(A) * np.eye(len(A))
+    projected = np.linalg.solve(A, (w[:, None] * rigid).T)
+    rest = left - rigid @ (projected @ left)
+
+    def gain(at: tuple[float, ...]) -> float:
+        columns = BASES[kind](p, n, frame.half, at)
+        columns = columns - rigid @ (projected @ columns)
+        B = columns.T @ (w[:, None] * columns)
+        b = columns.T @ (w * rest)
+        return float(b @ np.linalg.solve(B + (WEAK * np.trace(B) + 1e-12) * np.eye(len(B)), b))
+
+    return gain
+
+
+def _bumps(
+    blocks: Blocks, frame: Frame, p: Floats, n: Floats, left: Floats
+) -> Iterator[tuple[str, tuple[float, ...]]]:
+    front = np.flatnonzero(np.abs(n[:, 2]) > 0.9)
+    if len(front) < 20:
+        return
+    w = blocks.weight
+    radii = np.geomspace(2.0 * blocks.side_mm, 1.2 * max(frame.half[1], 3.0 * blocks.side_mm), BUMP_RADII)
+    best, found = -1.0, None
+    candidates = front[:: max(1, len(front) // 400)]
+    strongest = front[np.argsort(-np.abs(left[front]), kind="stable")[:40]]
+    for radius in radii:
+        for row in np.concatenate([strongest, candidates]):
+            gain = _gain(p, n, w, left, (p[row, 0], p[row, 1], radius))
+            if gain > best:
+                best, found = gain, (float(p[row, 0]), float(p[row, 1]), float(radius))
+    if found is None:
+        return
+    step = blocks.side_mm
+    for _ in range(REFINING):
+        x, y, radius = found
+        for dx in (-step, 0.0, step):
+            for dy in (-step, 0.0, step):
+                for grow in (0.85, 1.0, 1.18):
+                    at = (x + dx, y + dy, radius * grow)
+                    gain = _gain(p, n, w, left, at)
+                    if gain > best:
+                        best, found = gain, at
+        step *= 0.6
+    yield "bump", found
+
+
+def _gain(p: Floats, n: Floats, w: Floats, left: Floats, at: tuple[float, ...]) -> float:
+    away = ((p[:, 0] - at[0]) ** 2 + (p[:, 1] - at[1]) ** 2) / at[2] ** 2
+    inside = away < 1.0
+    high = (1.0 - away[inside]) ** 2 * n[inside, 2]
+    top = float((w[inside] * high * left[inside]).sum())
+    return top * top / max(float((w[inside] * high * high).sum()), 1e-12)
