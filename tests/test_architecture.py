@@ -51,8 +51,9 @@ def test_arrows_run_one_way(path):
         assert not own
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
-    if name.startswith(("processor.steps.", "processor.preassembly", "processor.bolt_balls")):
-        lower = within(own, "processor.geometry", "processor.model", "processor.preassembly", "processor.bolt_balls")
+    methods = ("processor.preassembly", "processor.bolt_balls", "processor.deviation")
+    if name.startswith(("processor.steps.", *methods)):
+        lower = within(own, "processor.geometry", "processor.model", *methods)
         assert not own - lower - {"processor"}, "a step sees records and geometry, not files"
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.model import InputError
+from processor.model import Floats, InputError
 from processor.readers.raw import (
     INTENSITY_NAMES,
     STATION_NAMES,
@@ -54,17 +54,8 @@ def read(path: Path) -> list[RawScan]:
     axes, intensity, station, unit = _columns(path, layout)
     check_room(path, "text", max(layout.declared, 0), 6, path.stat().st_size)
     wanted = [*axes, *(one for one in (intensity, station) if one is not None)]
-    with parsing(path, "text"), warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of numpy, for a table without rows: seen below
-        data = np.loadtxt(
-            _normalised(path, layout) if layout.decimal_comma else path,
-            delimiter=None if layout.decimal_comma else layout.separator,
-            comments=list(COMMENTS) if layout.comments_between else "#",
-            skiprows=0 if layout.decimal_comma else layout.skip,
-            usecols=wanted,
-            ndmin=2,
-            encoding=layout.encoding,
-        )
+    with parsing(path, "text"):
+        data = rows(path, layout, wanted)
     if layout.declared >= 0 and len(data) != layout.declared:
         raise InputError(
             f"{path}: the first line declares {layout.declared} points, but {len(data)} follow; export it again"
@@ -79,6 +70,22 @@ def read(path: Path) -> list[RawScan]:
             station=data[:, -1] if station is not None else (),
         )
     ]
+
+
+def rows(path: Path, layout: Layout, columns: list[int]) -> Floats:
+    """Return columns (n, k) of a table; ValueError where a row is not of numbers."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of numpy, for a table without rows: seen by who asked
+        found: Floats = np.loadtxt(
+            _normalised(path, layout) if layout.decimal_comma else path,
+            delimiter=None if layout.decimal_comma else layout.separator,
+            comments=list(COMMENTS) if layout.comments_between else "#",
+            skiprows=0 if layout.decimal_comma else layout.skip,
+            usecols=columns,
+            ndmin=2,
+            encoding=layout.encoding,
+        )
+    return found
 
 
 def sniff(path: Path) -> Layout:
