@@ -51,7 +51,7 @@ def test_arrows_run_one_way(path):
         assert not own
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
-    methods = ("processor.preassembly", "processor.bolt_balls", "processor.deviation")
+    methods = ("processor.preassembly", "processor.bolt_balls", "processor.deviation", "processor.defects")
     if name.startswith(("processor.steps.", *methods)):
         lower = within(own, "processor.geometry", "processor.model", *methods)
         assert not own - lower - {"processor"}, "a step sees records and geometry, not files"

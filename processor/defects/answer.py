@@ -165,6 +165,7 @@ def _curvature(judged: Judged, half: Floats) -> float:
 def _places(found: Found) -> Iterator[Row]:
     """Give a row for every place that deviates or is missing."""
     surface = found.surface
+    peaks = {number: max(abs(one.peak) for one in own) for number, own in found.judged.items()}
     for group in found.places:
         main = group[0]
         component = int(surface.charts.component[main.chart])
@@ -179,8 +180,7 @@ def _places(found: Found) -> Iterator[Row]:
         if main.sign == 0:
             named = classes.of_missing(got.borders, length, width, known, main.z)
         else:
-            shape = float(np.abs(found.shape_values[main.cells]).max())
-            if abs(got.depth) < max(SHALLOW_SHARE * shape, 0.0):
+            if abs(got.depth) < SHALLOW_SHARE * peaks.get(component, 0.0):
                 continue
             named = classes.of_deviation(main.sign, got.diameter, length, width, known, main.z)
         depth, remark = got.depth, ""

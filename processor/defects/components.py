@@ -16,6 +16,7 @@ from processor.model import Floats, Ints
 
 BLOCKS_ALONG = 36  # of a component's larger face
 FEWEST_BLOCKS = 24
+FINER = 3  # times smaller blocks for the last fit
 FLOOR_MM = 0.02
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
 NORMAL_95 = 1.959964
@@ -78,7 +79,10 @@ def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[
         side = max(1, round(2.0 * frame.half[0] / BLOCKS_ALONG / surface.charts.cell_mm))
         blocks = blocks_of(field, surface, own, side)
         if len(blocks.mean) >= FEWEST_BLOCKS:
-            found.append(ComponentShape(number, frame, blocks, shapes.fit(blocks, frame)))
+            fitted = shapes.fit(blocks, frame)
+            if fitted.shapes and side >= FINER:
+                fitted = shapes.refitted(fitted, blocks_of(field, surface, own, side // FINER), frame)
+            found.append(ComponentShape(number, frame, blocks, fitted))
     return found
 
 

@@ -21,6 +21,8 @@ from processor.defects import (
 )
 from processor.defects.params import Params
 from processor.defects.result import Result
+from processor.deviation import clouds
+from processor.geometry import rigid
 from processor.model import Floats, InputError, Scene
 
 CELL_POINTS = 12.0  # in a cell, on the median
@@ -29,7 +31,6 @@ FIRST_CELL_MM = 50.0
 MOST_CELLS = 4_000_000
 AGAIN_MM = 2.0  # a movement of the whole beyond which points are put to the design once more
 ROUNDS = 3
-UNKNOWN_ERROR_MM = 1.0
 
 
 def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
@@ -37,10 +38,13 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     design = scene.structure
     if design is None or not len(design.faces):
         raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP in project.toml)")
-    T, error, said = placing.pose(scene, earlier, params)
-    base = surface.of_mesh(design.vertices, design.faces, _coarse(design.vertices, design.faces))
-    if T is None:
-        return Result("failed", params.method, said)
+    vertices, origin = clouds.local_design(design)
+    scene = placing.stitched(scene, earlier)
+    placed = placing.pose(scene, earlier, params)
+    if placed.T_design_project is None:
+        return Result("failed", params.method, placed.said)
+    T = rigid.transform(np.eye(3), -origin) @ placed.T_design_project
+    base = surface.of_mesh(vertices, design.faces, _coarse(vertices, design.faces))
     for _ in range(ROUNDS):
         seen = observed.observe(scene, T, base, params.reach_mm)
         if not len(seen.chart):
@@ -50,9 +54,9 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         whole = surface.gridded(base, cell)
         pairs = observed.paired(seen, whole)
         if not params.align:
-            fitted = alignment.none(whole, len(seen.stations.names), error)
+            fitted = alignment.none(whole, len(seen.stations.names), placed.error_mm)
             break
-        fitted = alignment.align(pairs, whole, seen.stations, error)
+        fitted = alignment.align(pairs, whole, seen.stations, placed.error_mm)
         if _largest(fitted, whole) < AGAIN_MM:
             break
         T = alignment.moved(T, fitted)
@@ -76,12 +80,16 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     )
     found = answer.Found(whole, field, left, fitted, levels, shaped, judged, places, hoped, shape_values)
     result = answer.result_of(found, params, scene.name)
+    moved = rigid.transform(np.eye(3), origin) @ alignment.moved(T, fitted)
+    said = f"{placed.said}; {result.message}" if placed.said else result.message
     return dataclasses.replace(
         result,
-        T_design_project=alignment.moved(T, fitted),
+        status=placed.status if result.status == "ok" else result.status,
+        T_design_project=moved,
+        centres=result.centres + origin,
         points=offered,
         used=near,
-        message=f"{said}; {result.message}" if said else result.message,
+        message=said,
     )
 
 

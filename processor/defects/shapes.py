@@ -152,7 +152,8 @@ def fit(blocks: Blocks, frame: Frame, most: int = 3, least_gain: float = 30.0) -
             break
         _, square, kind, at = best
         if not [one for one, _ in chosen if one != "bump"]:
-            others = [value for one, value in squares.items() if one != kind]
+            # Every other whole shape was tried with a rigid motion beside it: against that alone a bump stands.
+            others = [value for one, value in squares.items() if one == "bump" or kind not in (one, "misalignment")]
             gap = min(others, default=np.inf) / max(square, 1e-9)
         if kind not in ("misalignment", "bump") and "misalignment" not in [one for one, _ in chosen]:
             alone = _left(np.hstack([base, BASES[kind](p, n, frame.half, at)]), blocks)[1]
@@ -166,12 +167,43 @@ def fit(blocks: Blocks, frame: Frame, most: int = 3, least_gain: float = 30.0) -
         gains.append(before - square)
         left, before = _left(_columns(chosen, p, n, frame), blocks)
     factors = _solve(_columns(chosen, p, n, frame), blocks)
+    shapes = _split(chosen, factors, p, n, frame)
+    return Fitted(shapes, tuple(gains), left, gap)
+
+
+def refitted(fitted: Fitted, fine: Blocks, frame: Frame) -> Fitted:
+    """Fit the shapes again to finer blocks: a wave is less high when averaged over a large share of its length."""
+    if not fitted.shapes:
+        return fitted
+    p, n = frame.local(fine.points), fine.outward @ frame.axes.T
+    chosen = [(shape.kind, shape.at) for shape in fitted.shapes]
+    for row, (kind, at) in enumerate(chosen):
+        if kind not in ("waviness", "step"):
+            continue
+        others = [one for k, one in enumerate(chosen) if k != row]
+        left = fine.mean - _columns(others, p, n, frame) @ _solve(_columns(others, p, n, frame), fine)
+        gain = _gains(kind, fine, frame, p, n, left)
+        around = 0.1 * at[1] if kind == "waviness" else 0.05
+        low, high = at[1] - around, at[1] + around
+        for _ in range(GOLDEN_STEPS):
+            one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+            low, high = (low, two) if gain((at[0], one, *at[2:])) > gain((at[0], two, *at[2:])) else (one, high)
+        refined = (at[0], 0.5 * (low + high), *at[2:])
+        if gain(refined) > gain(at):
+            chosen[row] = (kind, refined)
+    factors = _solve(_columns(chosen, p, n, frame), fine)
+    return Fitted(_split(chosen, factors, p, n, frame), fitted.gain, fitted.left, fitted.gap)
+
+
+def _split(
+    chosen: list[tuple[str, tuple[float, ...]]], factors: Floats, p: Floats, n: Floats, frame: Frame
+) -> tuple[Shape, ...]:
     shapes, start = [], 0
     for kind, at in chosen:
         width = BASES[kind](p[:1], n[:1], frame.half, at).shape[1]
         shapes.append(Shape(kind, at, factors[start : start + width]))
         start += width
-    return Fitted(tuple(shapes), tuple(gains), left, gap)
+    return tuple(shapes)
 
 
 def _columns(chosen: list[tuple[str, tuple[float, ...]]], p: Floats, n: Floats, frame: Frame) -> Floats:
