@@ -105,7 +105,7 @@ def result_of(found: Found, params: Params, name: str) -> Result:
         curve_mm=np.concatenate([[], *(c[1] for _, c in curves)]),
         curve_ci95=np.concatenate([[], *(c[2] for _, c in curves)]),
         **pictures.of_rows(
-            [(row.columns["centres"], row.columns["axes"], row.cells, row.field, row.component) for row in rows],
+            [(row.columns["centres"], row.cells, row.field, row.component) for row in rows],
             surface, params.pictures,
         ),
     )  # fmt: skip

@@ -14,7 +14,8 @@ from processor.defects.scan_statistic import Levels
 from processor.defects.surface import DesignSurface
 from processor.model import Floats, Ints
 
-BLOCKS_ALONG = 36  # of a component's larger face
+BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at the least
+MOST_BLOCKS = 3000
 FEWEST_BLOCKS = 24
 FINER = 3  # times smaller blocks for the last fit
 FLOOR_MM = 0.02
@@ -76,7 +77,9 @@ def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[
             continue
         number = int(component[own[0]])
         frame = frame_of(surface, number)
-        side = max(1, round(2.0 * frame.half[0] / BLOCKS_ALONG / surface.charts.cell_mm))
+        wanted = min(2.0 * frame.half[0] / BLOCKS_ALONG, 2.0 * frame.half[1] / BLOCKS_ACROSS)
+        most = np.sqrt(len(own) / MOST_BLOCKS)
+        side = max(1, round(max(wanted / surface.charts.cell_mm, most)))
         blocks = blocks_of(field, surface, own, side)
         if len(blocks.mean) >= FEWEST_BLOCKS:
             fitted = shapes.fit(blocks, frame)

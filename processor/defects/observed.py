@@ -12,6 +12,7 @@ from processor.geometry import rigid
 from processor.model import Floats, InputError, Ints, Scene
 
 CHUNK = 500_000
+LEAST_COS = 0.2  # of incidence: what is seen more from its edge is mostly beams that hit two things
 
 
 @dataclass(frozen=True)
@@ -81,6 +82,10 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
             station = np.where(known[own[rows]], own[rows], -1)
             facet, deviation = facets.nearest(grid, points, np.nan_to_num(np.array(positions)), station)
             on = facet >= 0
+            known_ray = station[on] >= 0
+            arm = np.nan_to_num(np.array(positions))[own[rows][on]] - points[on]
+            cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[on]]) / np.linalg.norm(arm, axis=1)
+            on[on] = ~known_ray | (cosine > LEAST_COS)
             chart = surface.chart_of[facet[on]]
             parts.append((chart, layout(surface.charts, chart, points[on]), own[rows][on], deviation[on]))
     chart, uv, own, deviation = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -18,24 +18,30 @@ SAME_WAY = 0.5
 
 
 def of_rows(
-    rows: list[tuple[Floats, Floats, Ints, Field, int]], surface: DesignSurface, most: int
+    rows: list[tuple[Floats, Ints, Field, int]], surface: DesignSurface, most: int
 ) -> dict[str, Any]:
-    """Return the columns of pictures of the first ``most`` defects: centre, axes, cells, field and component of each."""
+    """Return the columns of pictures of the first ``most`` defects: centre, cells, field and component of each."""
     shapes, lows, cells, values, parts = [], [], [], [], []
-    component = surface.charts.component[chart_of_cells(surface)]
-    for centre, axes, own, field, number in rows[:most]:
+    chart = chart_of_cells(surface)
+    component = surface.charts.component[chart]
+    for centre, own, field, number in rows[:most]:
         out = surface.outward[own].mean(axis=0)
         near = np.flatnonzero((component == number) & (surface.outward @ out > SAME_WAY) & (surface.share > 0.3))
-        here = (surface.centres[own] - centre) @ axes[:2].T
+        # Along the cells of the face that it lies on: a turned grid would leave gaps.
+        frame = surface.charts.axes[chart[own[len(own) // 2]]]
+        side = np.cross(out / np.linalg.norm(out), frame[0])
+        axes = np.stack([frame[0], side])
+        here = (surface.centres[own] - centre) @ axes.T
         low, high = here.min(axis=0), here.max(axis=0)
         margin = np.maximum(MARGIN * (high - low), LEAST_CELLS * surface.charts.cell_mm)
         low, high = low - margin, high + margin
-        uv = (surface.centres[near] - centre) @ axes[:2].T
+        uv = (surface.centres[near] - centre) @ axes.T
         shown = ((uv >= low) & (uv <= high)).all(axis=1)
         near, uv = near[shown], uv[shown]
+        cell = surface.charts.cell_mm
         low, high = np.maximum(low, uv.min(axis=0)), np.minimum(high, uv.max(axis=0))
-        size = max(surface.charts.cell_mm, float((high - low).max()) / MOST_SIDE)
-        low = low - 0.5 * size
+        size = cell * max(1.0, np.ceil(float((high - low).max()) / MOST_SIDE / cell))
+        low = uv.min(axis=0) - 0.5 * cell
         shape = np.maximum(np.ceil((high - low) / size).astype(np.int64) + 1, 1)
         at = np.clip(((uv - low) / size).astype(np.int64), 0, shape - 1)
         flat = at[:, 0] * shape[1] + at[:, 1]

@@ -16,7 +16,7 @@ from processor.model import Floats
 PLATE_RATIO = 3.0  # of width to thickness, from which on a component bends across itself too
 STEPS = np.linspace(-0.9, 0.9, 37)
 FEWEST_PERIODS = 1.4
-WAVE_BLOCKS = 6.0  # in the shortest wave
+WAVE_BLOCKS = 5.0  # in the shortest wave
 BUMP_RADII = 8
 REFINING = 3
 GOLDEN, GOLDEN_STEPS = 0.6180339887498949, 18

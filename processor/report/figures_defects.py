@@ -44,8 +44,8 @@ def _maps(result: Result) -> tuple[str, bytes]:
         axes.set_visible(False)
     more = f"; the {count} largest of {len(result.ids)}" if count < len(result.ids) else ""
     return (
-        "Deviation from the design about each defect, outward positive (blue), inward negative (orange), mm; along the "
-        f"defect's longest axis to the right. Thin line: the defect. Hatched: nothing seen{more}",
+        "Deviation from the design about each defect, outward positive (blue), inward negative (orange), mm, on the "
+        f"face it lies on. Thin line: the defect. Hatched: nothing seen{more}",
         png(figure),
     )
 
