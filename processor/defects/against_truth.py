@@ -67,17 +67,21 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     likely = area + 3.0 * np.sqrt(area) + 1.0 if np.isfinite(area) else NAN
     error, allowed = depth_errors(result, true, rows)
     got = rows >= 0
+    # Of a crack that no beam sees the ground of, a depth is a bound and says so.
+    bound = np.array([row >= 0 and result.remarks[row].startswith("at least") for row in rows], bool)
+    judged = got & ~bound
     metrics += [
         Metric("defects", "false alarms", float(false), float(np.floor(likely)) if np.isfinite(area) else NAN, ""),
         Metric("defects", "surface examined", result.examined_mm2 / 1e6, NAN, "m2"),
     ]
     if got.any():
         wrong = float((named[rows[got]] != kinds[got]).mean())
-        off = np.abs(error[got]) - allowed[got]
+        off = np.abs(error[judged]) - allowed[judged]
         metrics += [
             Metric("defects", "class wrong", 100.0 * wrong, 100.0 * (1.0 - CLASS_SHARE) + 1e-9, "%"),
             Metric("defects", "depths off by more than a tenth and 2 LOD95", float((off > 0.0).sum()), 0.0, ""),
-            Metric("defects", "depth error, median", float(np.median(np.abs(error[got]))), NAN, "mm"),
-            Metric("defects", "depth error, max", float(np.abs(error[got]).max()), NAN, "mm"),
+            Metric("defects", "depth error, median", float(np.median(np.abs(error[judged]))) if judged.any() else NAN, NAN, "mm"),
+            Metric("defects", "depth error, max", float(np.abs(error[judged]).max(initial=0.0)), NAN, "mm"),
+            Metric("defects", "depths that are bounds alone", float(bound.sum()), NAN, ""),
         ]
     return metrics

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.defects import classes, deflection, measures, pictures
+from processor.defects import classes, deflection, measures, pictures, small
 from processor.defects.absence import Expected
 from processor.defects.alignment import Alignment
 from processor.defects.classes import Named
@@ -18,12 +18,14 @@ from processor.defects.params import Params
 from processor.defects.regions import Region
 from processor.defects.result import Result
 from processor.defects.scan_statistic import Levels
+from processor.defects.small import Near
 from processor.defects.surface import DesignSurface
 from processor.model import Floats, Ints
 
 NORMAL_95 = 1.959964
 CURVE_STRIPS = 40
-SHALLOW_SHARE = 0.05  # of a component's shape that a model of it may be wrong by
+SMALL_CELLS = 8.0  # of diameter, below which points are fitted and not cells
+SHALLOW_SHARE = 0.1  # of a component's shape that a model of it may be wrong by
 THROUGH_SHARE = 0.7  # of the points expected on a crack, below which rays went through
 
 
@@ -41,6 +43,7 @@ class Found:
     places: list[list[Region]]
     hoped: Expected
     shape_values: Floats
+    near: Near
 
 
 @dataclass(frozen=True)
@@ -134,7 +137,7 @@ def _shapes(found: Found) -> Iterator[Row]:
             extent = 2.0 * frame.half[:2] * ([0.5 * (1.0 - judged.shape.at[1]), 1.0]
                                              if judged.shape.kind == "step" else [1.0, 1.0])  # fmt: skip
             axes = frame.axes.copy()
-            named = classes.of_shape(judged.shape.kind, judged.gap)
+            named = classes.of_shape(judged.shape.kind, judged.margin)
             lod = judged.ci95
             curve = None
             if judged.shape.kind == "bend" and len(seen):
@@ -184,13 +187,16 @@ def _places(found: Found) -> Iterator[Row]:
                 continue
             named = classes.of_deviation(main.sign, got.diameter, length, width, known, main.z)
         depth, remark = got.depth, ""
+        if main.sign != 0 and got.diameter < SMALL_CELLS * surface.charts.cell_mm and named.kind != "crack":
+            got = small.refined(got, main, found.near, found.field, found.shape_values)
+            depth = got.depth
         if named.kind == "crack" and main.sign != 0:
             there = (found.field.count + found.field.stray)[main.cells].sum()
             hoped = found.hoped.points[main.cells].sum()
             if hoped > 0.0 and there < THROUGH_SHARE * hoped and np.isfinite(thick):
                 depth, remark = thick, "rays went through: as deep as the plate is thick"
             else:
-                remark = "narrower than a beam sees to the ground of: it may be deeper"
+                remark = "at least so deep: too narrow for a beam to see its ground"
         if main.sign == 0 and not np.isfinite(thick):
             remark = "the design says no thickness here"
         columns = {

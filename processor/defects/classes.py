@@ -50,9 +50,10 @@ def of_missing(borders: int, length: float, width: float, thickness: float, stre
     return Named("missing-part", 0.95 * sure, "edge-loss")
 
 
-def of_shape(kind: str, gap: float) -> Named:
-    """Name the shape of a component; ``gap`` is by what factor it leaves less than the next best shape would."""
-    return Named(kind, float(1.0 - 0.5 / max(gap, 1.0)), "unknown")
+def of_shape(kind: str, margin: float) -> Named:
+    """Name the shape of a component; ``margin`` is how much more chi-square any other kind would leave."""
+    sure = float(1.0 - 0.5 * np.exp(-0.05 * max(margin, 0.0)))
+    return Named(kind if sure >= UNKNOWN else "unknown", sure, "unknown" if sure >= UNKNOWN else kind)
 
 
 def _beyond(value: float, border: float) -> float:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 from scipy.special import ndtri
 
 from processor.defects import shapes
@@ -19,6 +21,7 @@ MOST_BLOCKS = 3000
 FEWEST_BLOCKS = 24
 FINER = 3  # times smaller blocks for the last fit
 FLOOR_MM = 0.02
+LEAST_Z = 4.5  # of a shape: what stations share is known from few of them
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
 NORMAL_95 = 1.959964
 
@@ -38,11 +41,13 @@ def frame_of(surface: DesignSurface, component: int) -> shapes.Frame:
     charts = surface.charts
     own = np.flatnonzero(charts.component == component)
     areas = [float(surface.share[charts.cells(int(k))].sum()) for k in own]
-    axes = charts.axes[own[int(np.argmax(areas))]]
+    main = own[int(np.argmax(areas))]
+    axes = charts.axes[main]
     corners = surface.vertices[np.unique(surface.faces[surface.component_of == component])] @ axes.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     half = np.maximum(0.5 * (high - low), 1.0)
-    return shapes.Frame(0.5 * (low + high) @ axes, axes, half)
+    front = surface.vertices[np.unique(surface.faces[surface.chart_of == main])] @ axes[1]
+    return shapes.Frame(0.5 * (low + high) @ axes, axes, half, max(0.5 * float(np.ptp(front)), 1.0))
 
 
 def blocks_of(field: Field, surface: DesignSurface, rows: Ints, side: int) -> shapes.Blocks:
@@ -84,9 +89,20 @@ def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[
         if len(blocks.mean) >= FEWEST_BLOCKS:
             fitted = shapes.fit(blocks, frame)
             if fitted.shapes and side >= FINER:
-                fitted = shapes.refitted(fitted, blocks_of(field, surface, own, side // FINER), frame)
+                fitted = shapes.refitted(fitted, _unmasked(fitted, blocks, field, surface, own, side), frame)
             found.append(ComponentShape(number, frame, blocks, fitted))
     return found
+
+
+def _unmasked(
+    fitted: shapes.Fitted, blocks: shapes.Blocks, field: Field, surface: DesignSurface, own: Ints, side: int
+) -> shapes.Blocks:
+    """Return finer blocks, those that lie in blocks left out left out too."""
+    fine = blocks_of(field, surface, own, side // FINER)
+    if (fitted.weight < blocks.weight).any():
+        masked = cKDTree(blocks.points).query(fine.points)[1]
+        fine = dataclasses.replace(fine, weight=fine.weight * (fitted.weight / blocks.weight)[masked])
+    return fine
 
 
 def values(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int, list[shapes.Shape]]) -> Floats:
@@ -110,7 +126,7 @@ class Judged:
     cell: int  # row of the cell where it is largest
     ci95: float
     z: float
-    gap: float  # by what factor what is left is larger with the next best shape
+    margin: float  # how much more the best of other kinds leaves, in standard deviations squared
 
 
 def seen_front(surface: DesignSurface, component: int, field: Field) -> Ints:
@@ -154,7 +170,7 @@ def significant(
         rows = seen_front(surface, one.component, field)
         rows = rows[surface.share[rows] > 0.5]
         area = float(surface.share[rows].sum()) * surface.charts.cell_mm**2
-        threshold = float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shapes.BASES))))
+        threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shapes.BASES)))))
         inflation = float(levels.inflation[-1])
         registration = alignment.sd(surface.centres[rows], surface.outward[rows])
         for k, shape in real:
@@ -165,6 +181,6 @@ def significant(
             z = abs(float(value[top])) / sd
             if z > threshold:
                 found.setdefault(one.component, []).append(
-                    Judged(shape, float(value[top]), int(rows[top]), NORMAL_95 * sd, z, one.fitted.gap)
+                    Judged(shape, float(value[top]), int(rows[top]), NORMAL_95 * sd, z, one.fitted.margin / inflation**2)
                 )
     return found

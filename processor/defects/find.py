@@ -17,6 +17,7 @@ from processor.defects import (
     placing,
     regions,
     scan_statistic,
+    small,
     surface,
 )
 from processor.defects.params import Params
@@ -62,7 +63,6 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         T = alignment.moved(T, fitted)
     offered, near = seen.offered, len(seen.chart)
     stations = seen.stations
-    del seen
     field = fields.of_pairs(pairs, whole, stations, fitted, params.edge_mm)
     alarms = params.false_alarms / (1e6 * params.per_m2)
     shaped = components.fit_all(field, whole, fitted)
@@ -78,7 +78,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     places = regions.united(
         regions.missing(field, hoped, whole, alarms) + regions.of_finding(finding, whole), whole, max(3.0 * cell, 25.0)
     )
-    found = answer.Found(whole, field, left, fitted, levels, shaped, judged, places, hoped, shape_values)
+    found = answer.Found(whole, field, left, fitted, levels, shaped, judged, places, hoped, shape_values,
+                         small.near_of(seen, whole, fitted))  # fmt: skip
     result = answer.result_of(found, params, scene.name)
     moved = rigid.transform(np.eye(3), origin) @ alignment.moved(T, fitted)
     said = f"{placed.said}; {result.message}" if placed.said else result.message

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from processor.defects.alignment import Alignment
 from processor.defects.fields import Field
@@ -97,38 +98,33 @@ def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: fl
         return -float(d[k]), float(np.sqrt(variance[k])) * inflation, float("nan")
     radius = max(np.sqrt(len(d) / np.pi), 1.0) * cell
     near = max(0.35 * radius, 1.01 * cell)
-    from scipy.spatial import cKDTree
-
     tree = cKDTree(uv[seen])
-    value, w = d[seen], 1.0 / variance[seen]
-    smooth = np.array([np.sum(w[i] * value[i]) / np.sum(w[i]) for i in tree.query_ball_point(uv[seen], near)])
-    top = uv[seen][int(np.argmax(region.sign * smooth))]
-    for _ in range(2):
-        inside = tree.query_ball_point(top, max(FIT_SHARE * radius, 1.9 * cell))
-        if len(inside) < FEWEST_CELLS:
-            inside = tree.query(top, k=min(FEWEST_CELLS, len(value)))[1].tolist()
-        x, y = (uv[seen][inside] - top).T / radius
-        columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
-        if len(inside) >= 4 * FEWEST_CELLS:
-            columns = np.hstack([columns, ((x * x + y * y) ** 2)[:, None]])
-        A = columns.T @ (w[inside, None] * columns) + 1e-9 * np.eye(columns.shape[1])
-        inverse = np.linalg.inv(A)
-        c = inverse @ (columns.T @ (w[inside] * value[inside]))
-        H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
-        if region.sign * np.linalg.eigvalsh(H)[::-1][0 if region.sign > 0 else 1] >= 0.0:
-            break  # no vertex: the value at the place itself
-        move = -np.linalg.solve(H, c[1:3])
-        move *= min(1.0, 0.5 / max(float(np.linalg.norm(move)), 1e-12))
-        c0 = c[0] + c[1:3] @ move + 0.5 * move @ H @ move
-        if np.linalg.norm(move) < 0.02:
-            break
-        top = top + move * radius
-    else:
-        c0 = c[0]
-    sd = float(np.sqrt(inverse[0, 0])) * inflation
+    value, w, at = d[seen], 1.0 / variance[seen], uv[seen]
+    near_by = tree.query_ball_point(at, near)
+    smooth = np.array([np.sum(w[i] * value[i]) / np.sum(w[i]) for i in near_by])
+    k = int(np.argmax(region.sign * smooth))
+    plain, plain_sd = float(smooth[k]), float(1.0 / np.sqrt(w[near_by[k]].sum())) * inflation
+    inside = tree.query_ball_point(at[k], max(FIT_SHARE * radius, 1.9 * cell))
+    if len(inside) < FEWEST_CELLS:
+        inside = tree.query(at[k], k=FEWEST_CELLS)[1].tolist()
+    x, y = (at[inside] - at[k]).T / radius
+    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
+    if len(inside) >= 4 * FEWEST_CELLS:
+        columns = np.hstack([columns, ((x * x + y * y) ** 2)[:, None]])
+    A = columns.T @ (w[inside, None] * columns)
+    inverse = np.linalg.pinv(A)
+    c = inverse @ (columns.T @ (w[inside] * value[inside]))
+    H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
     bend = float(np.abs(np.linalg.eigvalsh(H)).max()) / radius**2 * 1000.0
-    value_there = float(c0 if "c0" in locals() else c[0])
-    return -value_there, sd, bend
+    if (region.sign * np.linalg.eigvalsh(H) >= 0.0).any():
+        return -plain, plain_sd, bend  # no vertex
+    move = -np.linalg.solve(H, c[1:3])
+    move *= min(1.0, 0.5 * FIT_SHARE / max(float(np.linalg.norm(move)), 1e-12))
+    row = np.array([1.0, *move, move[0] ** 2, move[0] * move[1], move[1] ** 2, (move @ move) ** 2])[: len(c)]
+    top, sd = float(row @ c), float(np.sqrt(row @ inverse @ row)) * inflation
+    if not abs(top - plain) < max(0.3 * abs(plain), 4.0 * sd) or sd > abs(plain):
+        return -plain, plain_sd, bend
+    return -top, sd, bend
 
 
 def _borders(region: Region, surface: DesignSurface, middle: Floats) -> tuple[float, int]:

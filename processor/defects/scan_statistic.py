@@ -24,7 +24,10 @@ SIDES = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128)  # of windows, in ce
 COVERED = 0.5  # share of a window that must have been seen
 FEWEST_WINDOWS = 60  # by which a spread is told
 GROWTH = 2.5  # standard deviations of a window of half the size that cells about a finding exceed
-GAP_CELLS = 1
+PIECE_SHARE = 0.3  # of the largest piece that is found in the same windows
+LINES_AFTER = 4  # the side of windows, after which lines are looked for
+LINE_CELLS, LINE_TURNS = (10, 25), 8
+LINE_GROWTH = 0.7  # standard deviations of a cell on such a line
 
 
 @dataclass(frozen=True)
@@ -38,6 +41,7 @@ class Levels:
     inflation: Floats
     threshold: Floats
     common_mm: float
+    line_threshold: float
 
 
 @dataclass(frozen=True)
@@ -71,8 +75,10 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float) -> Le
     inflation = np.maximum.accumulate(spread)
     cell = charts.cell_mm
     windows = np.array([1.0 / (max(1, side // 4) * cell) ** 2 for side in sides])  # of each size on one mm2
-    chance = np.minimum(alarms_per_mm2 / len(sides) / windows, 0.5)
-    return Levels(sides, np.asarray(inflation, float), -ndtri(0.5 * chance), common)
+    share = alarms_per_mm2 / (len(sides) + len(LINE_CELLS))
+    chance = np.minimum(share / windows, 0.5)
+    lines = min(share * cell**2 / LINE_TURNS, 0.5)
+    return Levels(sides, np.asarray(inflation, float), -ndtri(0.5 * chance), common, -float(ndtri(0.5 * lines)))
 
 
 def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
@@ -99,6 +105,8 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> t
         top, weight = _window_sums(field, charts, chart, side, sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = np.where(weight > 0.0, top / np.sqrt(weight), 0.0) / inflation
+        if side == LINES_AFTER:
+            _search_lines(field, charts, chart, levels, sign, score)
         if not (np.abs(z) > threshold).any():
             continue
         small_top, small_weight = _smoothed(field, charts, chart, max(1, side // 2), sign != 0)
@@ -109,10 +117,69 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> t
             if not hit.any():
                 continue
             covered, best = _spread(np.where(hit, way * z, 0.0), side, shape)
-            grown = covered & (way * near > GROWTH) & (sign == 0)
+            grown = _whole_pieces(covered & (way * near > GROWTH) & (sign == 0), covered)
             sign[grown] = way
             score[grown] = best[grown]
     return sign, score
+
+
+def _search_lines(
+    field: Field, charts: Charts, chart: int, levels: Levels, sign: npt.NDArray[np.int8], score: Floats
+) -> None:
+    """Find what is narrower than a window and long, in lines of cells in eight directions; fills sign and score."""
+    top, weight = _images(field, charts, chart, sign != 0)
+    inflation = float(levels.inflation[min(1, len(levels.inflation) - 1)])
+    for length in LINE_CELLS:
+        if length > max(top.shape):
+            continue
+        for turn in range(LINE_TURNS):
+            offsets = _line(length, np.pi * turn / LINE_TURNS)
+            sums = [sum(_shifted(x, i, j) for i, j in offsets) for x in (top, weight, (weight > 0.0).astype(float))]
+            with np.errstate(invalid="ignore", divide="ignore"):
+                z = np.where(sums[2] >= COVERED * length, sums[0] / np.sqrt(sums[1]), 0.0) / inflation
+            for way in (-1, 1):
+                for i, j in np.argwhere(way * z > levels.line_threshold):
+                    for di, dj in offsets:
+                        a, b = i + di, j + dj
+                        if 0 <= a < sign.shape[0] and 0 <= b < sign.shape[1] and weight[a, b] > 0.0:
+                            if way * top[a, b] > LINE_GROWTH * np.sqrt(weight[a, b]):
+                                sign[a, b] = way
+                                score[a, b] = max(score[a, b], way * z[i, j])
+
+
+def _line(length: int, angle: float) -> list[tuple[int, int]]:
+    """Return the cells of a line through a cell, as steps from it."""
+    at = np.arange(length) - length // 2
+    steep = max(abs(np.cos(angle)), abs(np.sin(angle)))
+    steps = np.stack([np.round(at * np.cos(angle) / steep), np.round(at * np.sin(angle) / steep)], axis=1)
+    return [(int(i), int(j)) for i, j in steps]
+
+
+def _shifted(image: Floats, i: int, j: int) -> Floats:
+    """Return the image whose cell (a, b) is the given one's (a + i, b + j); 0 beyond its border."""
+    found = np.zeros_like(image)
+    n, m = image.shape
+    if abs(i) < n and abs(j) < m:
+        found[max(0, -i) : n - max(0, i), max(0, -j) : m - max(0, j)] = image[
+            max(0, i) : n - max(0, -i), max(0, j) : m - max(0, -j)
+        ]
+    return found
+
+
+def _whole_pieces(cells: Bools, windows: Bools) -> Bools:
+    """Leave out the small pieces of what is found in windows that hang together: they are not places of their own."""
+    label, count = ndimage.label(cells, np.ones((3, 3)))
+    if count < 2:
+        return cells
+    sizes = np.bincount(label.ravel(), minlength=count + 1)
+    cluster = ndimage.label(windows, np.ones((3, 3)))[0]
+    first = np.zeros(count + 1, np.int64)
+    first[label.ravel()] = cluster.ravel()
+    largest = np.zeros(int(cluster.max()) + 1, np.int64)
+    np.maximum.at(largest, first[1:], sizes[1:])
+    kept = np.concatenate([[False], sizes[1:] >= PIECE_SHARE * largest[first[1:]]])
+    found: Bools = kept[label]
+    return found
 
 
 def _images(field: Field, charts: Charts, chart: int, without: Bools | None) -> tuple[Floats, Floats]:

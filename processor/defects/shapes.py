@@ -6,6 +6,7 @@ A shape is a sum of displacements; what a scan sees of it is their part along ea
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -19,17 +20,20 @@ FEWEST_PERIODS = 1.4
 WAVE_BLOCKS = 5.0  # in the shortest wave
 BUMP_RADII = 8
 REFINING = 3
+MOST_BUMPS, MASK_RADII, MOST_MASKED = 3, 1.15, 0.5
+RIGID_SHARE = 0.02  # of what a shape explains, from which on the component has moved as well
 GOLDEN, GOLDEN_STEPS = 0.6180339887498949, 18
 WEAK = 1e-6  # of a column's weight: keeps what is not seen at nothing
 
 
 @dataclass(frozen=True)
 class Frame:
-    """A component's own axes: origin (3,), axes (3, 3, rows along, across, out) and half sizes (3,)."""
+    """A component's own axes: origin (3,), axes (3, 3, rows along, across, out) and half sizes (3,), mm."""
 
     origin: Floats
     axes: Floats
     half: Floats
+    front: float  # half the height of the largest face
 
     def local(self, points: Floats) -> Floats:
         """Coordinates (n, 3) along, across and out, mm."""
@@ -83,10 +87,10 @@ def _step(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
 
 
 def _wave(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
-    axis, length, fades = int(at[0]), at[1], at[2]
+    axis, length, fading = int(at[0]), at[1], at[2]  # to nothing at ``fading`` to either side, 0 = nowhere
     turn = 2.0 * np.pi * p[:, axis] / length
-    other = p[:, 1 - axis] / half[1 - axis]
-    high = (np.cos(0.5 * np.pi * np.clip(other, -1.0, 1.0)) ** 2 if fades else 1.0) * n[:, 2]
+    other = np.clip(p[:, 1 - axis] / fading, -1.0, 1.0) if fading else np.zeros(len(p))
+    high = np.cos(0.5 * np.pi * other) ** 2 * n[:, 2]
     return np.stack([high * np.sin(turn), high * np.cos(turn)], axis=1)
 
 
@@ -115,49 +119,63 @@ class Blocks:
 class Fitted:
     """Shapes fitted together; ``gain`` is by how much each made the weighted sum of squares less when it was added.
 
-    ``gap`` is how much more the next best first shape of another kind leaves, as a factor.
+    ``weight`` (n,) is what counted of the blocks, next to nothing where a bump is; ``margin`` is by how much more the
+    best of all other kinds leaves of the weighted sum of squares.
     """
 
     shapes: tuple[Shape, ...]
     gain: tuple[float, ...]
-    left: Floats  # (n,) of the blocks
-    gap: float
+    weight: Floats
+    margin: float
 
 
-def fit(blocks: Blocks, frame: Frame, most: int = 3, least_gain: float = 30.0) -> Fitted:
-    """Add the shape that explains most for its number of factors, again and again while it explains enough."""
+def fit(blocks: Blocks, frame: Frame, most: int = 2, least_gain: float = 30.0) -> Fitted:
+    """Add the shape that explains most for its number of factors, again and again while it explains enough.
+
+    Where that is a bump, its place is local, and is left out from then on.
+    """
     p, n = frame.local(blocks.points), blocks.outward @ frame.axes.T
     chosen: list[tuple[str, tuple[float, ...]]] = []
     gains: list[float] = []
-    left, gap = blocks.mean, 1.0
-    before = float((blocks.weight * left**2).sum())
-    count = len(left)
-    while len(chosen) < most:
-        best: tuple[float, float, str, tuple[float, ...]] | None = None
+    margin, masked = np.inf, 0
+    left, before = blocks.mean, float((blocks.weight * blocks.mean**2).sum())
+    while len(chosen) < most and masked < MOST_BUMPS:
         squares: dict[str, float] = {}
+        best: tuple[float, str, tuple[float, ...]] | None = None
         base = _columns(chosen, p, n, frame)
+        free = "misalignment" in [kind for kind, _ in chosen]
+        used = np.count_nonzero(blocks.weight > WEAK * blocks.weight.max())
         for kind, at in _offers(blocks, frame, p, n, left):
-            if any(kind == one for one, _ in chosen) and kind != "bump":
+            if kind in [one for one, _ in chosen]:
                 continue
             columns = np.hstack([base, BASES[kind](p, n, frame.half, at)])
-            if kind not in ("misalignment", "bump") and "misalignment" not in [one for one, _ in chosen]:
+            if kind not in ("misalignment", "bump") and not free:
                 columns = np.hstack([columns, _rigid(p, n, frame.half, ())])
             square = _left(columns, blocks)[1]
             squares[kind] = min(square, squares.get(kind, np.inf))
-            factors = np.linalg.matrix_rank(columns) if columns.shape[1] < 3 else columns.shape[1]
-            score = count * np.log(max(square, 1e-9) / count + 1.0) + factors * np.log(count)
+            score = used * np.log(square / used + 1.0) + columns.shape[1] * np.log(used)
             if best is None or score < best[0]:
-                best = (score, square, kind, at)
-        if best is None or before - best[1] < least_gain:
+                best = (score, kind, at)
+        if best is None or before - squares[best[1]] < least_gain:
             break
-        _, square, kind, at = best
-        if not [one for one, _ in chosen if one != "bump"]:
+        _, kind, at = best
+        square = squares[kind]
+        if kind == "bump":
+            away = (p[:, 0] - at[0]) ** 2 + (p[:, 1] - at[1]) ** 2
+            near = away < (MASK_RADII * at[2] + blocks.side_mm) ** 2
+            if near.mean() > MOST_MASKED:
+                break
+            blocks = dataclasses.replace(blocks, weight=np.where(near, WEAK * blocks.weight, blocks.weight))
+            masked += 1
+            left, before = _left(base, blocks)
+            continue
+        if not chosen:
             # Every other whole shape was tried with a rigid motion beside it: against that alone a bump stands.
             others = [value for one, value in squares.items() if one == "bump" or kind not in (one, "misalignment")]
-            gap = min(others, default=np.inf) / max(square, 1e-9)
-        if kind not in ("misalignment", "bump") and "misalignment" not in [one for one, _ in chosen]:
+            margin = min(others, default=np.inf) - square
+        if kind != "misalignment" and not free:
             alone = _left(np.hstack([base, BASES[kind](p, n, frame.half, at)]), blocks)[1]
-            if alone - square > 0.02 * (before - square) + least_gain:
+            if alone - square > RIGID_SHARE * (before - square) + least_gain:
                 chosen.append(("misalignment", ()))
                 gains.append(alone - square)
                 most += 1
@@ -166,9 +184,8 @@ def fit(blocks: Blocks, frame: Frame, most: int = 3, least_gain: float = 30.0) -
         chosen.append((kind, at))
         gains.append(before - square)
         left, before = _left(_columns(chosen, p, n, frame), blocks)
-    factors = _solve(_columns(chosen, p, n, frame), blocks)
-    shapes = _split(chosen, factors, p, n, frame)
-    return Fitted(shapes, tuple(gains), left, gap)
+    shapes = _split(chosen, _solve(_columns(chosen, p, n, frame), blocks), p, n, frame)
+    return Fitted(shapes, tuple(gains), blocks.weight, margin)
 
 
 def refitted(fitted: Fitted, fine: Blocks, frame: Frame) -> Fitted:
@@ -192,7 +209,7 @@ def refitted(fitted: Fitted, fine: Blocks, frame: Frame) -> Fitted:
         if gain(refined) > gain(at):
             chosen[row] = (kind, refined)
     factors = _solve(_columns(chosen, p, n, frame), fine)
-    return Fitted(_split(chosen, factors, p, n, frame), fitted.gain, fitted.left, fitted.gap)
+    return dataclasses.replace(fitted, shapes=_split(chosen, factors, p, n, frame))
 
 
 def _split(
@@ -245,11 +262,10 @@ def _offers(
         waves += [
             (axis, float(length), fades)
             for length in np.geomspace(shortest, longest, 2 + int(24 * np.log2(longest / shortest)))
-            for fades in ((0.0, 1.0) if wide else (0.0,))
+            for fades in (0.0, half[1 - int(axis)] if axis else frame.front)
         ]
     yield from _best("waviness", waves, blocks, frame, p, n, left)
-    if wide:
-        yield from _bumps(blocks, frame, p, n, left)
+    yield from _bumps(blocks, frame, p, n, left)
 
 
 def _best(
