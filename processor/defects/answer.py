@@ -73,7 +73,8 @@ def result_of(found: Found, params: Params, name: str) -> Result:
     lod = NORMAL_95 * float(np.median(np.hypot(formal, registration))) if seen.any() else float("nan")
     sides = np.array(found.levels.sides) * cell
     points = float(np.median(field.count[seen])) if seen.any() else float("nan")
-    least = found.levels.threshold * found.levels.inflation * noise / np.sqrt(points) / np.array(found.levels.sides)
+    formal_sd = found.levels.inflation * noise / np.sqrt(points) / np.array(found.levels.sides)
+    least = found.levels.threshold * np.hypot(formal_sd, found.levels.systematic_mm)
     columns: dict[str, Any] = {
         key: [row.columns[key] for row in rows] for key in (rows[0].columns if rows else ())
     }

@@ -177,7 +177,7 @@ def significant(
             value = shape.values(one.frame, surface.centres[rows], surface.outward[rows])
             top = int(np.argmax(np.abs(value)))
             formal = abs(value[top]) / max(np.sqrt(max(one.fitted.gain[k], 1e-9)), 1e-9) * inflation
-            sd = float(np.sqrt(formal**2 + levels.common_mm**2 + (registration[top] ** 2)))
+            sd = float(np.sqrt(formal**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration[top] ** 2))
             z = abs(float(value[top])) / sd
             if z > threshold:
                 found.setdefault(one.component, []).append(

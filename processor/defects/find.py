@@ -68,7 +68,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     shaped = components.fit_all(field, whole, fitted)
     kept = {one.component: [s for s in one.fitted.shapes if s.kind != "bump"] for one in shaped}
     left = field.less(components.values(whole, shaped, kept))
-    levels = scan_statistic.levels_of(left, whole, alarms)
+    levels = scan_statistic.levels_of(left, whole, alarms, params.systematic_mm)
     judged = components.significant(shaped, whole, field, fitted, levels, alarms)
     kept = {number: [one.shape for one in own] for number, own in judged.items()}
     shape_values = components.values(whole, shaped, kept)

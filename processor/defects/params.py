@@ -43,6 +43,7 @@ class Params:
     cell_mm: float = 0.0
     false_alarms: float = 1.0
     per_m2: float = 100.0
+    systematic_mm: float = 0.02  # what scanners bend a surface by, one sd, however many points there are
     edge_mm: float = 8.0  # a border of every face where a beam sees more than the face
     align: bool = True  # fit stations and whole to the design before looking for defects
     registration_error_mm: float = math.nan  # one standard deviation; without it from the fit to the design
@@ -54,7 +55,7 @@ class Params:
         for key in ("reach_mm", "false_alarms", "per_m2"):
             if not getattr(self, key) > 0.0:
                 raise UsageError(f"defects.{key}: expected a number above 0, got {getattr(self, key)!r}")
-        for key in ("cell_mm", "edge_mm", "pictures"):
+        for key in ("cell_mm", "edge_mm", "pictures", "systematic_mm"):
             if not getattr(self, key) >= 0:
                 raise UsageError(f"defects.{key}: expected 0 or more, got {getattr(self, key)!r}")
         if self.registration_error_mm < 0.0:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy import ndimage
+from scipy.spatial import cKDTree
 
 from processor.defects.absence import Expected
 from processor.defects.fields import Field
@@ -88,28 +89,36 @@ def _connected(mask: np.ndarray, charts: Charts, chart: int) -> list[Ints]:
 
 
 def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> list[list[Region]]:
-    """Put together regions of one component that are parts of one defect: what is missing with what deviates beside it."""
+    """Put together the parts of one defect: of one component, near each other, and missing or to the same side.
+
+    What deviates right beside something missing is part of that: beams that hit its edge.
+    """
     groups: list[list[Region]] = []
-    for region in sorted(regions, key=lambda one: (one.sign != 0, -len(one.cells))):
-        home = None
-        for group in groups:
-            if surface.charts.component[group[0].chart] != surface.charts.component[region.chart]:
-                continue
-            if group[0].sign == 0 and _gap(group[0], region, surface) < near_mm:
-                home = group
+    trees: list[cKDTree] = []
+    for region in sorted(regions, key=lambda one: (one.sign != 0, -len(one.cells), int(one.cells[0]))):
+        places = surface.centres[region.cells]
+        component = surface.charts.component[region.chart]
+        for group, tree in zip(groups, trees, strict=True):
+            first = group[0]
+            same = first.sign in (0, region.sign) and surface.charts.component[first.chart] == component
+            if same and float(tree.query(places)[0].min()) < near_mm:
+                group.append(region)
                 break
-        if home is None:
-            groups.append([region])
         else:
-            home.append(region)
-    return groups
+            groups.append([region])
+            trees.append(cKDTree(places))
+    return [_joined(group) for group in groups]
 
 
-def _gap(one: Region, two: Region, surface: DesignSurface) -> float:
-    from scipy.spatial import cKDTree
-
-    distance = cKDTree(surface.centres[one.cells]).query(surface.centres[two.cells])[0]
-    return float(np.min(distance))
+def _joined(group: list[Region]) -> list[Region]:
+    """Make one region of those on the first one's face and to its side; the others stay beside it."""
+    first = group[0]
+    alike = [one for one in group if one.chart == first.chart and one.sign == first.sign]
+    if len(alike) == 1:
+        return group
+    cells = np.unique(np.concatenate([one.cells for one in alike]))
+    whole = Region(first.chart, cells, first.sign, max(one.z for one in alike))
+    return [whole, *(one for one in group if not any(one is other for other in alike))]
 
 
 def flat(surface: DesignSurface, region: Region) -> Floats:

@@ -42,6 +42,8 @@ class Levels:
     threshold: Floats
     common_mm: float
     line_threshold: float
+    line_inflation: float
+    systematic_mm: float
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Finding:
     z: Floats
 
 
-def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float) -> Levels:
+def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, systematic_mm: float) -> Levels:
     """Find the thresholds for a field, and how much its noise exceeds what is formal."""
     charts = surface.charts
     used = _used(field, charts)
@@ -78,7 +80,8 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float) -> Le
     share = alarms_per_mm2 / (len(sides) + len(LINE_CELLS))
     chance = np.minimum(share / windows, 0.5)
     lines = min(share * cell**2 / LINE_TURNS, 0.5)
-    return Levels(sides, np.asarray(inflation, float), -ndtri(0.5 * chance), common, -float(ndtri(0.5 * lines)))
+    return Levels(sides, np.asarray(inflation, float), -ndtri(0.5 * chance), common,
+                  -float(ndtri(0.5 * lines)), _line_inflation(field, charts, used), systematic_mm)  # fmt: skip
 
 
 def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
@@ -104,7 +107,7 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> t
             break
         top, weight = _window_sums(field, charts, chart, side, sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            z = np.where(weight > 0.0, top / np.sqrt(weight), 0.0) / inflation
+            z = np.where(weight > 0.0, top / weight / np.hypot(inflation / np.sqrt(weight), levels.systematic_mm), 0.0)
         if side == LINES_AFTER:
             _search_lines(field, charts, chart, levels, sign, score)
         if not (np.abs(z) > threshold).any():
@@ -128,7 +131,6 @@ def _search_lines(
 ) -> None:
     """Find what is narrower than a window and long, in lines of cells in eight directions; fills sign and score."""
     top, weight = _images(field, charts, chart, sign != 0)
-    inflation = float(levels.inflation[min(1, len(levels.inflation) - 1)])
     for length in LINE_CELLS:
         if length > max(top.shape):
             continue
@@ -136,7 +138,8 @@ def _search_lines(
             offsets = _line(length, np.pi * turn / LINE_TURNS)
             sums = [sum(_shifted(x, i, j) for i, j in offsets) for x in (top, weight, (weight > 0.0).astype(float))]
             with np.errstate(invalid="ignore", divide="ignore"):
-                z = np.where(sums[2] >= COVERED * length, sums[0] / np.sqrt(sums[1]), 0.0) / inflation
+                z = sums[0] / sums[1] / np.hypot(levels.line_inflation / np.sqrt(sums[1]), levels.systematic_mm)
+                z = np.where(sums[2] >= COVERED * length, z, 0.0)
             for way in (-1, 1):
                 for i, j in np.argwhere(way * z > levels.line_threshold):
                     for di, dj in offsets:
@@ -145,6 +148,21 @@ def _search_lines(
                             if way * top[a, b] > LINE_GROWTH * np.sqrt(weight[a, b]):
                                 sign[a, b] = way
                                 score[a, b] = max(score[a, b], way * z[i, j])
+
+
+def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:
+    """Return by how much the means of lines along the grid vary more than noise says."""
+    found = []
+    for chart in used:
+        top, weight = _images(field, charts, chart, None)
+        for axis in (0, 1):
+            length = min(LINE_CELLS[-1], top.shape[axis])
+            sums = [ndimage.uniform_filter1d(x, length, axis=axis, mode="constant") * length
+                    for x in (top, weight, (weight > 0.0).astype(float))]  # fmt: skip
+            enough = sums[2] >= COVERED * length
+            found.append(sums[0][enough] / np.sqrt(sums[1][enough]))
+    z = np.concatenate([np.empty(0), *found])
+    return max(1.0, 1.4826 * float(np.median(np.abs(z - np.median(z))))) if len(z) >= FEWEST_WINDOWS else 1.0
 
 
 def _line(length: int, angle: float) -> list[tuple[int, int]]:
