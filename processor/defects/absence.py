@@ -1,15 +1,18 @@
 """Places of the surface that a scanner should have seen and that are not there.
 
-A cell is expected from a station that looks at it squarely enough, that saw other parts of the same face, and whose rays
-in this direction met nothing on their way. How many points to expect follows from the points by solid angle of that
-station. Where far fewer are there, the surface is missing. Where rays were stopped before, nothing is said.
+A cell is expected from a station that looks at it squarely enough, that saw other parts of the same face, and whose
+rays in this direction met nothing on their way. How many points to expect follows from the points by solid angle of
+that station. Where far fewer are there, the surface is missing. Where rays were stopped before, nothing is said.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
+from scipy import ndimage
 
 from processor.defects.alignment import chart_of_cells
 from processor.defects.observed import CHUNK, Pairs, Stations
@@ -33,7 +36,9 @@ class Expected:
     passed: Floats
 
 
-def expected(scene: Scene, T_design_project: Floats, pairs: Pairs, surface: DesignSurface, stations: Stations) -> Expected:
+def expected(
+    scene: Scene, T_design_project: Floats, pairs: Pairs, surface: DesignSurface, stations: Stations
+) -> Expected:
     """Return how many points all stations together should have on every cell."""
     cells = len(surface.share)
     found, passed = np.zeros(cells), np.zeros(cells)
@@ -85,7 +90,7 @@ def directions(arm: Floats) -> tuple[Floats, Floats]:
 
 def _ranges(
     scene: Scene, T_design_project: Floats, station: int, stations: Stations, bin_: float, arm: Floats
-) -> tuple[Floats, Floats, np.ndarray]:
+) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
     """Return the nearest and farthest range about the directions arm (n, 3), and whether a station looked there."""
     wide, high = int(np.ceil(2.0 * np.pi / bin_)), int(np.ceil(np.pi / bin_))
     near, far = np.full(wide * high, np.inf), np.full(wide * high, -np.inf)
@@ -101,8 +106,6 @@ def _ranges(
         np.maximum.at(far, i * high + j, away)
         columns[i] = True
         low_high = [min(low_high[0], float(elevation.min())), max(low_high[1], float(elevation.max()))]
-    from scipy import ndimage
-
     near = ndimage.minimum_filter(near.reshape(wide, high), 3, mode=("wrap", "nearest"))
     far = ndimage.maximum_filter(far.reshape(wide, high), 3, mode=("wrap", "nearest"))
     azimuth, elevation = directions(arm)
@@ -115,7 +118,7 @@ def _ranges(
     return near[i, j], far[i, j], inside
 
 
-def points_of(scene: Scene, T_design_project: Floats, station: int):  # type: ignore[no-untyped-def]
+def points_of(scene: Scene, T_design_project: Floats, station: int) -> Iterator[Floats]:
     """Give the points of a station, in the design's frame, some at a time."""
     first = 0
     for scan in scene.scans:

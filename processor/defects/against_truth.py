@@ -62,7 +62,11 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     named = np.array(result.classes)
     for kind in dict.fromkeys(true.classes):
         own = kinds == kind
-        metrics.append(Metric("defects", f"{kind}: missed of {int(own.sum())}", float((rows[own] < 0).sum()), 0.0 if held else NAN, ""))
+        metrics.append(
+            Metric(
+                "defects", f"{kind}: missed of {int(own.sum())}", float((rows[own] < 0).sum()), 0.0 if held else NAN, ""
+            )
+        )
     false = len(result.ids) - int((rows >= 0).sum())
     area = result.examined_mm2 / 1e8
     likely = area + 3.0 * np.sqrt(area) + 1.0 if np.isfinite(area) else NAN
@@ -72,7 +76,9 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     bound = np.array([row >= 0 and result.remarks[row].startswith("at least") for row in rows], bool)
     judged = got & ~bound
     metrics += [
-        Metric("defects", "false alarms", float(false), float(np.floor(likely)) if np.isfinite(area) and held else NAN, ""),
+        Metric(
+            "defects", "false alarms", float(false), float(np.floor(likely)) if np.isfinite(area) and held else NAN, ""
+        ),
         Metric("defects", "surface examined", result.examined_mm2 / 1e6, NAN, "m2"),
     ]
     if got.any():
@@ -80,8 +86,20 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         off = np.abs(error[judged]) - allowed[judged]
         metrics += [
             Metric("defects", "class wrong", 100.0 * wrong, 100.0 * (1.0 - CLASS_SHARE) + 1e-9 if held else NAN, "%"),
-            Metric("defects", "depths off by more than a tenth and 2 LOD95", float((off > 0.0).sum()), 0.0 if held else NAN, ""),
-            Metric("defects", "depth error, median", float(np.median(np.abs(error[judged]))) if judged.any() else NAN, NAN, "mm"),
+            Metric(
+                "defects",
+                "depths off by more than a tenth and 2 LOD95",
+                float((off > 0.0).sum()),
+                0.0 if held else NAN,
+                "",
+            ),
+            Metric(
+                "defects",
+                "depth error, median",
+                float(np.median(np.abs(error[judged]))) if judged.any() else NAN,
+                NAN,
+                "mm",
+            ),
             Metric("defects", "depth error, max", float(np.abs(error[judged]).max(initial=0.0)), NAN, "mm"),
             Metric("defects", "depths that are bounds alone", float(bound.sum()), NAN, ""),
         ]

@@ -90,7 +90,7 @@ def rays_to(points: Floats, positions: Floats) -> Floats:
 
 
 def _derivative(arm: Floats, outward: Floats, rays: Floats) -> Floats:
-    """Derivative (n, 7) of deviations by a turn about the centre, a translation and a longer range."""
+    """Return the derivative (n, 7) of deviations by a turn about the centre, a translation and a longer range."""
     return np.hstack([np.cross(arm, outward), outward, np.einsum("ni,ni->n", rays, outward)[:, None]])
 
 
@@ -120,14 +120,14 @@ def _blocks(pairs: Pairs, surface: DesignSurface) -> tuple[Ints, Ints, Floats, F
     some = np.empty(len(key), np.int64)
     some[index] = own
     c = chart[some]
-    place = charts.first[c] + np.round(where[0]).astype(np.int64) * charts.shape[c, 1] + np.round(where[1]).astype(
-        np.int64
+    place = (
+        charts.first[c] + np.round(where[0]).astype(np.int64) * charts.shape[c, 1] + np.round(where[1]).astype(np.int64)
     )
     return key // stations, key % stations, mean, square / count + FLOOR_MM**2, place
 
 
 def _between(block: Ints, station: Ints, mean: Floats, variance: Floats, J: Floats, stations: int) -> Floats:
-    """Movements (k, 7) by which stations agree, least squares with Cauchy's weights; the place of each block is free."""
+    """Movements (k, 7) by which stations agree, with Cauchy's weights; the place of each block is free."""
     _, block = np.unique(block, return_inverse=True)
     block = block.reshape(-1)
     blocks = int(block.max()) + 1
@@ -156,7 +156,7 @@ def _between(block: Ints, station: Ints, mean: Floats, variance: Floats, J: Floa
             return x
         A -= mixed.T @ (mixed / total[:, None])
         right -= mixed.T @ (np.bincount(block, weight * mean, blocks) / total)
-        x = np.linalg.solve(A, right).reshape(stations, 7)
+        x = np.asarray(np.linalg.solve(A, right), np.float64).reshape(stations, 7)
     return x
 
 
@@ -184,8 +184,6 @@ def _whole(left: Floats, variance: Floats, J: Floats, component: Ints) -> tuple[
     count = len(np.unique(component))
     covariance = inverse @ (groups.T @ groups) @ inverse * count / max(count - 6.0, 1.0) + inverse
     return x, covariance
-
-
 
 
 def moved(T_design_project: Floats, alignment: Alignment) -> Floats:

@@ -75,9 +75,7 @@ def result_of(found: Found, params: Params, name: str) -> Result:
     points = float(np.median(field.count[seen])) if seen.any() else float("nan")
     formal_sd = found.levels.inflation * noise / np.sqrt(points) / np.array(found.levels.sides)
     least = found.levels.threshold * np.hypot(formal_sd, found.levels.systematic_mm)
-    columns: dict[str, Any] = {
-        key: [row.columns[key] for row in rows] for key in (rows[0].columns if rows else ())
-    }
+    columns: dict[str, Any] = {key: [row.columns[key] for row in rows] for key in (rows[0].columns if rows else ())}
     curves = [(k, row.curve) for k, row in enumerate(rows) if row.curve is not None]
     examined = float(surface.share[seen].sum()) * cell**2
     expected = float(surface.share[found.hoped.points > 0.0].sum()) * cell**2
@@ -160,7 +158,7 @@ def _curvature(judged: Judged, half: Floats) -> float:
     if judged.shape.kind == "bend":
         axis, order = int(judged.shape.at[0]), judged.shape.at[1]
         high = abs(float(judged.shape.factors[0]))
-        return 1000.0 * high * (2.0 if order == 2.0 else (0.5 * np.pi) ** 2) / half[axis] ** 2
+        return float(1000.0 * high * (2.0 if order == 2.0 else (0.5 * np.pi) ** 2) / half[axis] ** 2)
     if judged.shape.kind == "waviness":
         return 1000.0 * abs(judged.peak) * (2.0 * np.pi / judged.shape.at[1]) ** 2
     return 0.0
@@ -206,4 +204,6 @@ def _places(found: Found) -> Iterator[Row]:
             "volume_mm3": got.volume, "volume_ci95": got.volume_ci95, "edge_mm": got.edge,
             "curvature_per_m": got.curvature, "lod95": got.lod95, "z": main.z,
         }  # fmt: skip
-        yield Row(named, component, columns, np.unique(np.concatenate([one.cells for one in group])), found.left, remark)
+        yield Row(
+            named, component, columns, np.unique(np.concatenate([one.cells for one in group])), found.left, remark
+        )

@@ -1,7 +1,7 @@
 """What a place that deviates or is missing is called, and how sure that is.
 
-Each rule is one number held against a border, and by how much it is beyond says how sure the answer is: a border that is
-reached just so is as good as a coin.
+Each rule is one number held against a border, and by how much it is beyond says how sure the answer is: a border that
+is reached just so is as good as a coin.
 """
 
 from __future__ import annotations

@@ -55,9 +55,7 @@ def blocks_of(field: Field, surface: DesignSurface, rows: Ints, side: int) -> sh
     charts = surface.charts
     chart = chart_of_cells(surface)[rows]
     at = rows - charts.first[chart]
-    block = np.stack(
-        [chart, at // charts.shape[chart, 1] // side, at % charts.shape[chart, 1] // side], axis=1
-    )
+    block = np.stack([chart, at // charts.shape[chart, 1] // side, at % charts.shape[chart, 1] // side], axis=1)
     _, index = np.unique(block, axis=0, return_inverse=True)
     index = index.reshape(-1)
     w = 1.0 / field.variance[rows]
@@ -88,7 +86,7 @@ def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[
         blocks = blocks_of(field, surface, own, side)
         if len(blocks.mean) >= FEWEST_BLOCKS:
             fitted = shapes.fit(blocks, frame)
-            if fitted.shapes and side >= FINER:
+            if fitted.shapes and side > 1:
                 fitted = shapes.refitted(fitted, _unmasked(fitted, blocks, field, surface, own, side), frame)
             found.append(ComponentShape(number, frame, blocks, fitted))
     return found
@@ -98,7 +96,7 @@ def _unmasked(
     fitted: shapes.Fitted, blocks: shapes.Blocks, field: Field, surface: DesignSurface, own: Ints, side: int
 ) -> shapes.Blocks:
     """Return finer blocks, those that lie in blocks left out left out too."""
-    fine = blocks_of(field, surface, own, side // FINER)
+    fine = blocks_of(field, surface, own, max(1, side // FINER))
     if (fitted.weight < blocks.weight).any():
         masked = cKDTree(blocks.points).query(fine.points)[1]
         fine = dataclasses.replace(fine, weight=fine.weight * (fitted.weight / blocks.weight)[masked])
@@ -119,11 +117,10 @@ def values(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int,
 
 @dataclass(frozen=True)
 class Judged:
-    """A shape that is more than chance: its largest value (mm, signed, outward), where, and the 95 % interval."""
+    """A shape that is more than chance: its largest value (mm, signed, outward) and the 95 % interval."""
 
     shape: shapes.Shape
     peak: float
-    cell: int  # row of the cell where it is largest
     ci95: float
     z: float
     margin: float  # how much more the best of other kinds leaves, in standard deviations squared
@@ -149,6 +146,15 @@ def seen_front(surface: DesignSurface, component: int, field: Field) -> Ints:
     return found
 
 
+def with_corners(surface: DesignSurface, rows: Ints) -> tuple[Floats, Floats]:
+    """Places (n, 3) and normals (n, 3) of a face's cells and of its corners, where many shapes are largest."""
+    chart = np.unique(chart_of_cells(surface)[rows])
+    own = np.isin(surface.chart_of, chart)
+    corners = surface.vertices[surface.faces[own]].reshape(-1, 3)
+    normals = np.repeat(surface.normals[own], 3, axis=0)
+    return np.concatenate([surface.centres[rows], corners]), np.concatenate([surface.outward[rows], normals])
+
+
 def significant(
     shaped: list[ComponentShape],
     surface: DesignSurface,
@@ -172,15 +178,16 @@ def significant(
         area = float(surface.share[rows].sum()) * surface.charts.cell_mm**2
         threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shapes.BASES)))))
         inflation = float(levels.inflation[-1])
-        registration = alignment.sd(surface.centres[rows], surface.outward[rows])
+        points, outward = with_corners(surface, rows)
+        registration = alignment.sd(points, outward)
         for k, shape in real:
-            value = shape.values(one.frame, surface.centres[rows], surface.outward[rows])
+            value = shape.values(one.frame, points, outward)
             top = int(np.argmax(np.abs(value)))
             formal = abs(value[top]) / max(np.sqrt(max(one.fitted.gain[k], 1e-9)), 1e-9) * inflation
             sd = float(np.sqrt(formal**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration[top] ** 2))
             z = abs(float(value[top])) / sd
             if z > threshold:
                 found.setdefault(one.component, []).append(
-                    Judged(shape, float(value[top]), int(rows[top]), NORMAL_95 * sd, z, one.fitted.margin / inflation**2)
+                    Judged(shape, float(value[top]), NORMAL_95 * sd, z, one.fitted.margin / inflation**2)
                 )
     return found

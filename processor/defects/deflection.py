@@ -23,7 +23,7 @@ def by_strips(along: Floats, deviation: Floats, variance: Floats, strips: int) -
 
 
 def by_slopes(along: Floats, deviation: Floats, strips: int) -> tuple[Floats, Floats]:
-    """Ends of sub-regions (s + 1,) and displacement there (s + 1,), zero at the first (paper 004).
+    """Return ends of sub-regions (s + 1,) and displacement there (s + 1,), zero at the first (paper 004).
 
     Of each sub-region s the slope tan(theta) of a line through its points is taken, and integrated over its length h:
     mu_s(h) = int tan(theta) dh + mu_(s-1). A sub-region of fewer than two places keeps the slope before it.

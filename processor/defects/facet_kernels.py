@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import njit
 
@@ -46,8 +48,11 @@ def fill(
 
 
 @njit(cache=True, nogil=True)
-def square_to(corner: Floats, p: Floats) -> float:
-    """Return the squared distance of a point (3,) from a triangle (3, 3); after Ericson, Real-Time Collision Detection 5.1.5."""
+def square_to(corner: Floats, p: Floats) -> Any:
+    """Return the squared distance of a point (3,) from a triangle (3, 3).
+
+    After Ericson, Real-Time Collision Detection, 5.1.5.
+    """
     abx, aby, abz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     acx, acy, acz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     apx, apy, apz = p[0] - corner[0, 0], p[1] - corner[0, 1], p[2] - corner[0, 2]
@@ -108,9 +113,7 @@ def nearest(
         for at in range(start[voxel], start[voxel + 1]):
             f = facet[at]
             n = normals[f]
-            off = (
-                (p[0] - corners[f, 0, 0]) * n[0] + (p[1] - corners[f, 0, 1]) * n[1] + (p[2] - corners[f, 0, 2]) * n[2]
-            )
+            off = (p[0] - corners[f, 0, 0]) * n[0] + (p[1] - corners[f, 0, 1]) * n[1] + (p[2] - corners[f, 0, 2]) * n[2]
             if off * off >= best:
                 continue
             if k >= 0:

@@ -38,9 +38,7 @@ class Field:
         return dataclasses.replace(self, deviation=self.deviation - fitted)
 
 
-def of_pairs(
-    pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, edge_mm: float
-) -> Field:
+def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, edge_mm: float) -> Field:
     """Put together what the stations say of each cell, after what they are off was taken off."""
     cells = len(surface.share)
     points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
@@ -50,13 +48,14 @@ def of_pairs(
     mean = np.bincount(pairs.cell, pairs.count * (pairs.mean - off), cells) / some
     free = np.bincount(pairs.cell, np.maximum(pairs.count - 1, 0), cells)
     square = np.bincount(pairs.cell, pairs.square, cells)
+    sums: tuple[Floats, Floats] = (square.astype(np.float64), free.astype(np.float64))
     charts = surface.charts
     noise = np.zeros(cells)
     overall = float(square.sum() / max(free.sum(), 1.0))
     inner = np.zeros(cells)
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
-        pooled = [_box(charts.image(x, chart), charts, chart) for x in (square, free)]
+        pooled = [_box(charts.image(x, chart), charts, chart) for x in sums]
         known = pooled[1] * POOLED_CELLS**2 > FEWEST_FREE
         noise[rows] = np.where(known, pooled[0] / np.maximum(pooled[1], 1e-9), overall).ravel()
         inner[rows] = _inner(charts.image(surface.share, chart), charts, chart, edge_mm).ravel()

@@ -16,8 +16,10 @@ from processor.model import Floats, Ints
 
 NORMAL_95 = 1.959964
 FIT_SHARE = 0.45  # of a region's radius, within which a paraboloid is fitted for its depth
+CURVE_SHARE = 0.65  # of a region's radius, for its curvature
 FEWEST_CELLS = 9
 BORDER_CELLS = 1.6
+VOLUME_BORDER = 0.25  # of a region's radius, that belongs to its volume
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,8 @@ def measure(
     axes[1], axes[2] = np.cross(out, axes[0]), out
     registration = float(alignment.sd(surface.centres[nearest][None], out[None])[0])
     lod = NORMAL_95 * float(np.hypot(inflation / np.sqrt(np.sum(1.0 / np.maximum(variance, 1e-12))), registration))
-    volume_sd = float(np.sqrt((variance * area**2).sum())) * inflation
+    volume, volume_sd = _volume(region, field, surface)
+    volume_sd *= inflation
     centre = surface.centres[nearest] + (middle - uv[np.argmin(np.linalg.norm(uv - middle, axis=1))]) @ np.stack(
         [frame[0], side]
     )
@@ -76,16 +79,47 @@ def measure(
         ring = cell * np.sqrt(np.pi * lost)  # of cells that are missing in part
         return Measures(centre, axes, extent, lost, thickness, 0.0, thickness, lost * thickness,
                         NORMAL_95 * ring * thickness, edge, float("nan"), lod, diameter, borders)  # fmt: skip
-    depth, depth_sd, curvature = _deepest(region, field, surface, inflation)
+    depth, depth_sd, curvature, mean_sd = _deepest(region, field, surface, inflation)
+    lod = NORMAL_95 * float(np.hypot(mean_sd, registration))
     return Measures(
         centre, axes, extent, float(area.sum()), depth, NORMAL_95 * float(np.hypot(depth_sd, registration)),
-        -float((deviation * area).sum() / area.sum()), -float((deviation * area).sum()),
+        -float((deviation * area).sum() / area.sum()), volume,
         NORMAL_95 * float(np.hypot(volume_sd, registration * area.sum())), edge, curvature, lod, diameter, borders,
     )  # fmt: skip
 
 
-def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: float) -> tuple[float, float, float]:
-    """Depth at the deepest place, inward positive, its standard deviation, and the larger curvature there (1/m).
+def _curvature(at: Floats, value: Floats, w: Floats, inside: list[int], middle: Floats) -> float:
+    """Return the larger curvature (1/m) of a paraboloid fitted to places (n, 2) ``inside``."""
+    if len(inside) < 2 * FEWEST_CELLS:
+        return float("nan")
+    x, y = (at[inside] - middle).T
+    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
+    root = np.sqrt(w[inside])
+    c = np.linalg.lstsq(root[:, None] * columns, root * value[inside], rcond=None)[0]
+    H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
+    return float(np.abs(np.linalg.eigvalsh(H)).max()) * 1000.0
+
+
+def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float]:
+    """Volume inward and its standard deviation from noise, with a border about the region.
+
+    What is too shallow there to be told from noise cell by cell still adds up.
+    """
+    charts, chart = surface.charts, region.chart
+    mask = np.zeros(int(charts.shape[chart].prod()), bool)
+    mask[region.cells - charts.first[chart]] = True
+    wide = max(1, round(VOLUME_BORDER * float(np.sqrt(len(region.cells) / np.pi))))
+    grown = ndimage.distance_transform_edt(~mask.reshape(tuple(charts.shape[chart]))) <= wide
+    rows = charts.first[chart] + np.flatnonzero(grown.ravel())
+    rows = rows[(field.seen[rows] > 0) | mask[rows - charts.first[chart]]]
+    area = surface.share[rows] * charts.cell_mm**2
+    return -float(field.deviation[rows] @ area), float(np.sqrt((field.variance[rows] * area**2).sum()))
+
+
+def _deepest(
+    region: Region, field: Field, surface: DesignSurface, inflation: float
+) -> tuple[float, float, float, float]:
+    """Depth at the deepest place, inward positive, its sd, the larger curvature (1/m), and the sd of a mean there.
 
     The vertex of a paraboloid fitted about it, with a term of the fourth order where there are cells enough.
     """
@@ -95,7 +129,8 @@ def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: fl
     if seen.sum() < FEWEST_CELLS:
         use = seen if seen.any() else np.ones(len(d), bool)
         k = int(np.argmax(np.where(use, region.sign * d / np.sqrt(variance), -np.inf)))
-        return -float(d[k]), float(np.sqrt(variance[k])) * inflation, float("nan")
+        alone = float(np.sqrt(variance[k])) * inflation
+        return -float(d[k]), alone, float("nan"), alone
     radius = max(np.sqrt(len(d) / np.pi), 1.0) * cell
     near = max(0.35 * radius, 1.01 * cell)
     tree = cKDTree(uv[seen])
@@ -115,16 +150,16 @@ def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: fl
     inverse = np.linalg.pinv(A)
     c = inverse @ (columns.T @ (w[inside] * value[inside]))
     H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
-    bend = float(np.abs(np.linalg.eigvalsh(H)).max()) / radius**2 * 1000.0
+    bend = _curvature(at, value, w, tree.query_ball_point(at[k], CURVE_SHARE * radius), at[k])
     if (region.sign * np.linalg.eigvalsh(H) >= 0.0).any():
-        return -plain, plain_sd, bend  # no vertex
+        return -plain, plain_sd, bend, plain_sd  # no vertex
     move = -np.linalg.solve(H, c[1:3])
     move *= min(1.0, 0.5 * FIT_SHARE / max(float(np.linalg.norm(move)), 1e-12))
     row = np.array([1.0, *move, move[0] ** 2, move[0] * move[1], move[1] ** 2, (move @ move) ** 2])[: len(c)]
     top, sd = float(row @ c), float(np.sqrt(row @ inverse @ row)) * inflation
     if not abs(top - plain) < max(0.3 * abs(plain), 4.0 * sd) or sd > abs(plain):
-        return -plain, plain_sd, bend
-    return -top, sd, bend
+        return -plain, plain_sd, bend, plain_sd
+    return -top, sd, bend, plain_sd
 
 
 def _borders(region: Region, surface: DesignSurface, middle: Floats) -> tuple[float, int]:

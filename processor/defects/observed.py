@@ -75,17 +75,16 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
         else:
             names.append(scan.name)
             positions.append(np.full(3, np.nan))
-        known = np.isfinite(np.array(positions)).all(axis=1)
+        known = np.isfinite(np.array(positions).sum(axis=1))
         for start in range(0, len(own), CHUNK):
             rows = slice(start, start + CHUNK)
             points = rigid.apply(T, scan.points[rows])
             station = np.where(known[own[rows]], own[rows], -1)
             facet, deviation = facets.nearest(grid, points, np.nan_to_num(np.array(positions)), station)
-            on = facet >= 0
-            known_ray = station[on] >= 0
-            arm = np.nan_to_num(np.array(positions))[own[rows][on]] - points[on]
-            cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[on]]) / np.linalg.norm(arm, axis=1)
-            on[on] = ~known_ray | (cosine > LEAST_COS)
+            near = np.flatnonzero(facet >= 0)
+            arm = np.nan_to_num(np.array(positions))[own[rows][near]] - points[near]
+            cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[near]]) / np.linalg.norm(arm, axis=1)
+            on = near[(station[near] < 0) | (cosine > LEAST_COS)]
             chart = surface.chart_of[facet[on]]
             parts.append((chart, layout(surface.charts, chart, points[on]), own[rows][on], deviation[on]))
     chart, uv, own, deviation = (np.concatenate(column) for column in zip(*parts, strict=True))

@@ -1,9 +1,10 @@
 """Method ``paper``: the chain of paper 004 as far as its one page tells, as a baseline.
 
 Density clustering removes noise, histograms of point features pair places of the scan and the design, sample consensus
-with Huber's error of the distances gives a first pose, iterative closest point the last; what is farther from the design
-than a threshold is a defect, and its shape a curve integrated from the slopes of sub-regions. The page gives no numbers
-for any of it, and no classes: those here follow from the cloud's spacing, and every defect is ``unknown``.
+with Huber's error of the distances gives a first pose, iterative closest point the last; what is farther from the
+design than a threshold is a defect, and its shape a curve integrated from the slopes of sub-regions. The page gives no
+numbers for any of it, and no classes: those here follow from the cloud's spacing, and every defect is ``unknown``. A
+point is held against the nearest face, so that in a plate a depth beyond half its thickness is one from its back.
 """
 
 from __future__ import annotations
@@ -22,9 +23,10 @@ from processor.defects.surface import of_mesh
 from processor.deviation import clouds
 from processor.geometry import icp, pfh, rigid
 from processor.geometry.merging import merged
-from processor.geometry.neighbors import voxel_means
+from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import Floats, Ints, Scene
 
+VOXEL_SPACINGS = 1.5
 RADIUS_VOXELS = 2.5  # of a neighbourhood that density is told by
 FEATURE_VOXELS = 3.6
 CANDIDATES = 5  # places of the design with the nearest histograms, of which one is drawn
@@ -73,7 +75,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     own = np.full(len(placed), NOISE, np.int64)
     own[beyond] = density_clusters(placed[beyond], 1.5 * radius, DEFECT_POINTS)
     said = (
-        f"{len(points)} points {size:.1f} mm apart after density clustering, rms {rms:.2f} mm of {tree_share:.0%} paired; "
+        f"{len(points)} points {size:.1f} mm apart after density clustering; "
+        f"rms {rms:.2f} mm of {tree_share:.0%} paired; "
         f"a defect is what is farther than {threshold:.2f} mm from the design; the page names no classes"
     )
     return _result(
@@ -118,7 +121,7 @@ def huber(length: Floats, limit: float) -> float:
 
 def _thinned(points: Floats, paper: Paper) -> tuple[float, Floats]:
     """Thin to voxel means, in voxels as large as keep to the most points allowed."""
-    size = paper.voxel_mm or max(float(np.ptp(points, axis=0).max()) / 1500.0, 1.0)
+    size = paper.voxel_mm or max(VOXEL_SPACINGS * surface_spacing(points), 1.0)
     while True:
         found = voxel_means(points, size)
         if len(found) <= paper.points or paper.voxel_mm:
@@ -141,15 +144,13 @@ def _one(points: Floats, normals: Floats) -> Floats:
     first, second = np.triu_indices(len(points), 1)
     features = pfh.pair_features(points, normals, first, second)
     features = features[np.isfinite(features).all(axis=1)]
-    cell = np.clip(
-        np.floor((features - [-1.0, -1.0, -np.pi]) / [2.0, 2.0, 2.0 * np.pi] * 5).astype(np.int64), 0, 4
-    )
+    cell = np.clip(np.floor((features - [-1.0, -1.0, -np.pi]) / [2.0, 2.0, 2.0 * np.pi] * 5).astype(np.int64), 0, 4)
     found: Floats = np.bincount(cell @ [1, 5, 25], minlength=125) / max(len(features), 1)
     return found
 
 
 def _normals(points: Floats) -> Floats:
-    """Unit normals (n, 3) by the nearest dozen; a sign that features do not depend on is left as it falls."""
+    """Return unit normals (n, 3) by the nearest dozen; a sign that features do not depend on is left as it falls."""
     near = cKDTree(points).query(points, k=min(12, len(points)))[1]
     local = points[near] - points[near].mean(axis=1, keepdims=True)
     _, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", local, local))
@@ -220,7 +221,7 @@ def _result(
         curves.append(deflection.by_slopes(along, d, min(params.paper.strips, max(2, len(at) // 4))))
     order = sorted(range(len(rows)), key=lambda k: -abs(rows[k]["volume_mm3"]))
     rows, curves = [rows[k] for k in order], [curves[k] for k in order]
-    columns = {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
+    columns: dict[str, Any] = {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
     return Result(
         "ok", params.method, said, T_design_project=T, registration_error_mm=np.nan, cell_mm=size, noise_mm=cloud[1],
         lod95_mm=threshold, examined_mm2=len(placed) * size**2, points=cloud[0], used=len(placed),

@@ -59,9 +59,7 @@ class Params:
             if not getattr(self, key) >= 0:
                 raise UsageError(f"defects.{key}: expected 0 or more, got {getattr(self, key)!r}")
         if self.registration_error_mm < 0.0:
-            raise UsageError(
-                f"defects.registration_error_mm: expected 0 or more, got {self.registration_error_mm!r}"
-            )
+            raise UsageError(f"defects.registration_error_mm: expected 0 or more, got {self.registration_error_mm!r}")
         for key in ("points", "cluster_points", "feature_points", "trials", "strips"):
             if not getattr(self.paper, key) >= 3:
                 raise UsageError(f"defects.paper.{key}: expected 3 or more, got {getattr(self.paper, key)!r}")

@@ -17,9 +17,7 @@ LEAST_CELLS = 12
 SAME_WAY = 0.5
 
 
-def of_rows(
-    rows: list[tuple[Floats, Ints, Field, int]], surface: DesignSurface, most: int
-) -> dict[str, Any]:
+def of_rows(rows: list[tuple[Floats, Ints, Field, int]], surface: DesignSurface, most: int) -> dict[str, Any]:
     """Return the columns of pictures of the first ``most`` defects: centre, cells, field and component of each."""
     shapes, lows, cells, values, parts = [], [], [], [], []
     chart = chart_of_cells(surface)

@@ -74,4 +74,6 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> Placing:
     shift = rigid.transform(np.eye(3), origin) @ placed.T @ rigid.transform(np.eye(3), -cloud.origin)
     twice = placed.ambiguity < AMBIGUOUS
     said = "placed by principal axes and a best fit, which takes up what the whole was moved by"
-    return Placing(shift, error, said + ("; another attitude fits as well" if twice else ""), "ambiguous" if twice else "ok")
+    return Placing(
+        shift, error, said + ("; another attitude fits as well" if twice else ""), "ambiguous" if twice else "ok"
+    )

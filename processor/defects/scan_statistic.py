@@ -1,8 +1,8 @@
 """Places where deviations are more than chance, at every size of place, with a bound on how often chance does it.
 
 Square windows of many sizes are moved over every face in quarters of their side. Of each the weighted mean is held
-against its noise; the threshold of a size follows from the number of windows of that size on the surface by the bound of
-Bonferroni, so that all sizes together bring the false alarms that were asked for. Noise that is not independent from
+against its noise; the threshold of a size follows from the number of windows of that size on the surface by the bound
+of Bonferroni, so that all sizes together bring the false alarms that were asked for. Noise that is not independent from
 point to point shows in the spread of the windows' means, and widens the thresholds.
 """
 
@@ -144,10 +144,10 @@ def _search_lines(
                 for i, j in np.argwhere(way * z > levels.line_threshold):
                     for di, dj in offsets:
                         a, b = i + di, j + dj
-                        if 0 <= a < sign.shape[0] and 0 <= b < sign.shape[1] and weight[a, b] > 0.0:
-                            if way * top[a, b] > LINE_GROWTH * np.sqrt(weight[a, b]):
-                                sign[a, b] = way
-                                score[a, b] = max(score[a, b], way * z[i, j])
+                        inside = 0 <= a < sign.shape[0] and 0 <= b < sign.shape[1] and weight[a, b] > 0.0
+                        if inside and way * top[a, b] > LINE_GROWTH * np.sqrt(weight[a, b]):
+                            sign[a, b] = way
+                            score[a, b] = max(score[a, b], way * z[i, j])
 
 
 def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:
@@ -207,10 +207,8 @@ def _images(field: Field, charts: Charts, chart: int, without: Bools | None) -> 
     return weight * charts.image(field.deviation, chart), weight
 
 
-def _window_sums(
-    field: Field, charts: Charts, chart: int, side: int, without: Bools | None
-) -> tuple[Floats, Floats]:
-    """Sums of weighted deviations and of weights over the windows of a face; 0 where too little of one was seen."""
+def _window_sums(field: Field, charts: Charts, chart: int, side: int, without: Bools | None) -> tuple[Floats, Floats]:
+    """Return sums of weighted deviations and of weights over a face's windows; 0 where too little was seen."""
     step = max(1, side // 4)
     top, weight = _images(field, charts, chart, without)
     if min(top.shape) < side:
@@ -228,9 +226,7 @@ def _sums(image: Floats, side: int) -> Floats:
 
 def _smoothed(field: Field, charts: Charts, chart: int, side: int, without: Bools) -> tuple[Floats, Floats]:
     mode = ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
-    top, weight = (
-        ndimage.uniform_filter(x, side, mode=mode) * side**2 for x in _images(field, charts, chart, without)
-    )
+    top, weight = (ndimage.uniform_filter(x, side, mode=mode) * side**2 for x in _images(field, charts, chart, without))
     return top, np.where(weight > 1e-9, weight, 0.0)
 
 

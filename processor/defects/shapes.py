@@ -1,4 +1,4 @@
-"""Shapes of whole components: moved, bent, twisted, waved or stepped; and a local bump, that none of these be taken for.
+"""Shapes of whole components: moved, bent, twisted, waved or stepped; and a bump, that none of these be taken for.
 
 Along a component runs xi, across it eta, out of its largest face zeta, each from -1 to 1 (eta and zeta by the larger).
 A shape is a sum of displacements; what a scan sees of it is their part along each cell's normal.
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.defects import shape_kernels
 from processor.model import Floats
 
 PLATE_RATIO = 3.0  # of width to thickness, from which on a component bends across itself too
@@ -20,8 +21,9 @@ FEWEST_PERIODS = 1.4
 WAVE_BLOCKS = 5.0  # in the shortest wave
 BUMP_RADII = 8
 REFINING = 3
+STEP_REACH, STEP_PLACES = 0.07, 71  # about the best place so far, of half the component
 MOST_BUMPS, MASK_RADII, MOST_MASKED = 3, 1.15, 0.5
-RIGID_SHARE = 0.02  # of what a shape explains, from which on the component has moved as well
+RIGID_SHARE = 0.05  # of what a shape explains, from which on the component has moved as well
 GOLDEN, GOLDEN_STEPS = 0.6180339887498949, 18
 WEAK = 1e-6  # of a column's weight: keeps what is not seen at nothing
 
@@ -75,14 +77,15 @@ def _bend(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
 
 def _twist(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
     x, span = p[:, 0] / half[0], max(half[1], half[2])
-    return (x * (p[:, 1] * n[:, 2] - p[:, 2] * n[:, 1]) / span)[:, None]
+    found: Floats = (x * (p[:, 1] * n[:, 2] - p[:, 2] * n[:, 1]) / span)[:, None]
+    return found
 
 
 def _step(p: Floats, n: Floats, half: Floats, at: tuple[float, ...]) -> Floats:
     axis = int(at[0])
     beyond = (p[:, axis] / half[axis] > at[1]).astype(float)
     if axis == 1 or half[1] > PLATE_RATIO * half[2]:
-        return (beyond * n[:, 2])[:, None]
+        return np.stack([beyond * n[:, 2]], axis=1)
     return np.stack([beyond * n[:, 2], beyond * n[:, 1]], axis=1)
 
 
@@ -200,16 +203,28 @@ def refitted(fitted: Fitted, fine: Blocks, frame: Frame) -> Fitted:
         others = [one for k, one in enumerate(chosen) if k != row]
         left = fine.mean - _columns(others, p, n, frame) @ _solve(_columns(others, p, n, frame), fine)
         gain = _gains(kind, fine, frame, p, n, left)
-        around = 0.1 * at[1] if kind == "waviness" else 0.05
-        low, high = at[1] - around, at[1] + around
-        for _ in range(GOLDEN_STEPS):
-            one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
-            low, high = (low, two) if gain((at[0], one, *at[2:])) > gain((at[0], two, *at[2:])) else (one, high)
-        refined = (at[0], 0.5 * (low + high), *at[2:])
+        if kind == "step":  # jumps from block to block
+            places = [(at[0], float(x)) for x in at[1] + STEP_REACH * np.linspace(-1.0, 1.0, STEP_PLACES)]
+            refined: tuple[float, ...] = max(places, key=gain)
+        else:
+            low, high = 0.9 * at[1], 1.1 * at[1]
+            for _ in range(GOLDEN_STEPS):
+                one, two = high - GOLDEN * (high - low), low + GOLDEN * (high - low)
+                low, high = (low, two) if gain((at[0], one, *at[2:])) > gain((at[0], two, *at[2:])) else (one, high)
+            refined = (at[0], 0.5 * (low + high), *at[2:])
         if gain(refined) > gain(at):
             chosen[row] = (kind, refined)
+    gains = list(fitted.gain)
+    kinds = [kind for kind, _ in chosen]
+    if len(chosen) > 1 and "misalignment" in kinds:
+        # Where a shape was not at its best place yet, a motion of the whole made up for some of it.
+        row = kinds.index("misalignment")
+        others = [one for k, one in enumerate(chosen) if k != row]
+        without, with_ = (_left(_columns(some, p, n, frame), fine)[1] for some in (others, chosen))
+        if without - with_ < RIGID_SHARE * (float((fine.weight * fine.mean**2).sum()) - with_):
+            del chosen[row], gains[row]
     factors = _solve(_columns(chosen, p, n, frame), fine)
-    return dataclasses.replace(fitted, shapes=_split(chosen, factors, p, n, frame))
+    return dataclasses.replace(fitted, shapes=_split(chosen, factors, p, n, frame), gain=tuple(gains))
 
 
 def _split(
@@ -254,7 +269,7 @@ def _offers(
         yield "bend", (axis, 1.0)
     yield "twist", ()
     yield from _best("step", [(axis, float(at)) for axis in axes for at in STEPS], blocks, frame, p, n, left)
-    waves = []
+    waves: list[tuple[float, ...]] = []
     for axis in axes:
         shortest, longest = WAVE_BLOCKS * blocks.side_mm, 2.0 * half[int(axis)] / FEWEST_PERIODS
         if longest <= shortest:
@@ -311,41 +326,25 @@ def _gains(
     return gain
 
 
-def _bumps(
-    blocks: Blocks, frame: Frame, p: Floats, n: Floats, left: Floats
-) -> Iterator[tuple[str, tuple[float, ...]]]:
+def _bumps(blocks: Blocks, frame: Frame, p: Floats, n: Floats, left: Floats) -> Iterator[tuple[str, tuple[float, ...]]]:
     front = np.flatnonzero(np.abs(n[:, 2]) > 0.9)
     if len(front) < 20:
         return
     w = blocks.weight
     radii = np.geomspace(2.0 * blocks.side_mm, 1.2 * max(frame.half[1], 3.0 * blocks.side_mm), BUMP_RADII)
-    best, found = -1.0, None
     candidates = front[:: max(1, len(front) // 400)]
     strongest = front[np.argsort(-np.abs(left[front]), kind="stable")[:40]]
-    for radius in radii:
-        for row in np.concatenate([strongest, candidates]):
-            gain = _gain(p, n, w, left, (p[row, 0], p[row, 1], radius))
-            if gain > best:
-                best, found = gain, (float(p[row, 0]), float(p[row, 1]), float(radius))
-    if found is None:
-        return
+    rows = np.concatenate([strongest, candidates])
+    places = np.column_stack([np.repeat(p[rows, :2], len(radii), axis=0), np.tile(radii, len(rows))])
+    a, b, out, flat = (np.ascontiguousarray(x) for x in (p[:, 0], p[:, 1], n[:, 2], left))
+    gains = shape_kernels.bump_gains(a, b, out, w, flat, places)
+    found, best = places[int(np.argmax(gains))], float(gains.max())
     step = blocks.side_mm
+    around = np.array([(x, y, k) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0) for k in (0.85, 1.0, 1.18)])
     for _ in range(REFINING):
-        x, y, radius = found
-        for dx in (-step, 0.0, step):
-            for dy in (-step, 0.0, step):
-                for grow in (0.85, 1.0, 1.18):
-                    at = (x + dx, y + dy, radius * grow)
-                    gain = _gain(p, n, w, left, at)
-                    if gain > best:
-                        best, found = gain, at
+        places = np.column_stack([found[:2] + step * around[:, :2], found[2] * around[:, 2]])
+        gains = shape_kernels.bump_gains(a, b, out, w, flat, places)
+        if float(gains.max()) > best:
+            found, best = places[int(np.argmax(gains))], float(gains.max())
         step *= 0.6
-    yield "bump", found
-
-
-def _gain(p: Floats, n: Floats, w: Floats, left: Floats, at: tuple[float, ...]) -> float:
-    away = ((p[:, 0] - at[0]) ** 2 + (p[:, 1] - at[1]) ** 2) / at[2] ** 2
-    inside = away < 1.0
-    high = (1.0 - away[inside]) ** 2 * n[inside, 2]
-    top = float((w[inside] * high * left[inside]).sum())
-    return top * top / max(float((w[inside] * high * high).sum()), 1e-12)
+    yield "bump", (float(found[0]), float(found[1]), float(found[2]))

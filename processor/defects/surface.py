@@ -105,9 +105,7 @@ def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
         )
     surface_kernels.rasterise(a, b, c, chart_of, charts.low, charts.shape, charts.first, cell_mm, share)
     centres, outward = _cell_places(charts)
-    return dataclasses.replace(
-        surface, charts=charts, share=np.minimum(share, 1.0), centres=centres, outward=outward
-    )
+    return dataclasses.replace(surface, charts=charts, share=np.minimum(share, 1.0), centres=centres, outward=outward)
 
 
 def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:

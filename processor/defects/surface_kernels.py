@@ -11,7 +11,15 @@ PER_SIDE = 4  # samples of a cell along each axis
 
 @njit(cache=True, nogil=True)
 def rasterise(
-    a: Floats, b: Floats, c: Floats, chart_of: Ints, low: Floats, shape: Ints, first: Ints, cell_mm: float, share: Floats
+    a: Floats,
+    b: Floats,
+    c: Floats,
+    chart_of: Ints,
+    low: Floats,
+    shape: Ints,
+    first: Ints,
+    cell_mm: float,
+    share: Floats,
 ) -> None:
     """Add to ``share`` (cells,) what triangles with corners a, b, c (f, 2) cover of the cells of their charts."""
     step = cell_mm / PER_SIDE

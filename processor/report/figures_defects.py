@@ -86,7 +86,9 @@ def _curves(result: Result) -> tuple[str, bytes]:
         own = result.curve_defect == k
         at, value, half = result.curve_at_mm[own], result.curve_mm[own], result.curve_ci95[own]
         name = f"{result.ids[k]}: {label(result.components[k], k)}"
-        axes.plot(at, value, color=COLOURS[place], linestyle=DASHES[place], marker=MARKERS[place], markersize=3, label=name)
+        axes.plot(
+            at, value, color=COLOURS[place], linestyle=DASHES[place], marker=MARKERS[place], markersize=3, label=name
+        )
         if np.isfinite(half).all():
             axes.fill_between(at, value - half, value + half, color=COLOURS[place], alpha=0.25, linewidth=0)
     axes.axhline(0.0, color="0.5", linewidth=0.8)

@@ -21,8 +21,8 @@ def _summary(result: Result) -> tuple[str, str]:
     if len(result.scale_mm):
         middle = len(result.scale_mm) // 2
         said += (
-            f"; a place {result.scale_mm[middle]:.0f} mm wide is found from {shown(float(result.scale_least_mm[middle]))} "
-            "mm of mean depth"
+            f"; a place {result.scale_mm[middle]:.0f} mm wide is found from "
+            f"{shown(float(result.scale_least_mm[middle]))} mm of mean depth"
         )
     return head, said + "."
 

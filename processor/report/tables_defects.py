@@ -15,8 +15,8 @@ from processor.report.table import Table
 
 LIST_NOTE = (
     "Centres in the design's frame; a depth inward is positive. ci95 is the half-width of the 95 % interval. What is "
-    "missing is as deep as the design is thick. Confidence 0.5 is a coin's; below 0.6 a class is unknown, and otherwise "
-    "says what it would be. lod95 is the level of detection at the defect's own size."
+    "missing is as deep as the design is thick. Confidence 0.5 is a coin's; below 0.6 a class is unknown, and "
+    "otherwise says what it would be. lod95 is the level of detection of the means that a depth comes from."
 )
 LEAST_NOTE = (
     "What a place of this size has to deviate by, on the median of the surface, to be found at the false alarms asked "
@@ -88,7 +88,9 @@ def _list(run: StepRun, answer: bool) -> Table:
 
 
 def _least(result: Result) -> Table:
-    rows = tuple(zip(*(x.tolist() for x in (result.scale_mm, result.scale_least_mm, result.scale_inflation)), strict=True))
+    rows = tuple(
+        zip(*(x.tolist() for x in (result.scale_mm, result.scale_least_mm, result.scale_inflation)), strict=True)
+    )
     return Table(
         "Least depth found, by size of place (mm)", ("side_mm", "depth_mm", "noise"), rows, "defects-least", LEAST_NOTE,
         on_terminal=False,
@@ -97,9 +99,7 @@ def _least(result: Result) -> Table:
 
 def _curves(result: Result) -> Table:
     ids = result.ids[result.curve_defect]
-    rows = tuple(
-        zip(*(x.tolist() for x in (ids, result.curve_at_mm, result.curve_mm, result.curve_ci95)), strict=True)
-    )
+    rows = tuple(zip(*(x.tolist() for x in (ids, result.curve_at_mm, result.curve_mm, result.curve_ci95)), strict=True))
     known = np.isfinite(result.curve_ci95).all()
     note = "From the middle of the component; displacement outward of its largest face." if known else ""
     return Table(

@@ -1,8 +1,8 @@
 """Defects of a structure against its design: found, measured, named.
 
-``default`` puts the points on cells of the design's surface, fits the stations to each other and the whole to the design,
-and then looks for shapes of whole components, for places that deviate at every size and for places that are missing,
-with a bound on false alarms. ``paper`` follows paper 004 as far as its one page tells.
+``default`` puts the points on cells of the design's surface, fits the stations to each other and the whole to the
+design, and then looks for shapes of whole components, for places that deviate at every size and for places that are
+missing, with a bound on false alarms. ``paper`` follows paper 004 as far as its one page tells.
 """
 
 from __future__ import annotations
