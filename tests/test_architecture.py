@@ -60,7 +60,7 @@ def test_arrows_run_one_way(path):
         assert not within(used, "processor.validation")
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
-    methods = ("processor.preassembly", "processor.bolt_balls", "processor.defects", "processor.deviation", "processor.stitching")
+    methods = tuple(f"processor.{one}" for one in ("preassembly", "bolt_balls", "stitching", "deviation", "defects"))
     if name.startswith(("processor.steps.", *methods)):
         lower = within(own, "processor.geometry", "processor.model", "processor.progress", *methods)
         assert not own - lower - {"processor"}, "a step sees records and geometry, not files"
