@@ -47,16 +47,23 @@ def test_arrows_run_one_way(path):
         reached = {n for n in within(own, "processor") if not within({n}, *shared)}
         assert reached <= {"processor"}, "designgen shares records and store with processor, and no geometry"
         assert not within(used, "h5py")
-    if name == "processor.model":
+    if name == "processor.records":
         assert not own
+    if name == "processor.model":
+        assert not own - within(own, "processor.records") - {"processor"}
+    elif name != "processor":
+        assert not within(used, "processor.records"), "records are known by the model"
+    if name.startswith("processor.validation"):
+        allowed = within(own, "processor.validation", "processor.model", "processor.pipeline")
+        assert not own - allowed - {"processor"}, "a night runs programs and reads what they wrote"
+    elif name != "processor.cli":
+        assert not within(used, "processor.validation")
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
-    if name.startswith(("processor.steps.", "processor.preassembly", "processor.bolt_balls", "processor.stitching")):
-        packages = ("processor.preassembly", "processor.bolt_balls", "processor.stitching")
-        lower = within(own, "processor.geometry", "processor.model", *packages)
-        assert not own - lower - within(own, "processor.progress") - {"processor"}, (
-            "a step sees records and geometry, not files"
-        )
+    methods = ("processor.preassembly", "processor.bolt_balls", "processor.deviation", "processor.stitching")
+    if name.startswith(("processor.steps.", *methods)):
+        lower = within(own, "processor.geometry", "processor.model", "processor.progress", *methods)
+        assert not own - lower - {"processor"}, "a step sees records and geometry, not files"
 
 
 def test_only_evaluation_reads_the_truth():

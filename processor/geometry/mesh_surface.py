@@ -48,7 +48,7 @@ class MeshSurface:
             at = before[rows]
         active = np.arange(len(rows))
         for _ in range(WALK_STEPS):
-            share = self._barycentric(points[rows[active]], at[active])
+            share = self.barycentric(points[rows[active]], at[active])
             worst = np.argmin(share, axis=1)
             next_ = self.neighbours[at[active], worst]
             moves = (share[np.arange(len(active)), worst] < -1e-9) & (next_ >= 0)
@@ -57,7 +57,7 @@ class MeshSurface:
             active, next_ = active[moves], next_[moves]
             at[active] = next_
         face[rows] = at
-        share = self._barycentric(points[rows], at)
+        share = self.barycentric(points[rows], at)
         corner = self.vertices[self.faces[at, 0]]
         distance[rows] = np.einsum("ni,ni->n", points[rows] - corner, self.normals[at])
         lowest = np.minimum(share.min(axis=1), 0.0)
@@ -69,7 +69,7 @@ class MeshSurface:
         """Return the surface of the marked facets (f,) alone, for points up to a plate's thickness and more away."""
         return of_mesh(self.vertices, self.faces[facets], OUTER_SPACING_MM)
 
-    def _barycentric(self, points: Floats, face: Ints) -> Floats:
+    def barycentric(self, points: Floats, face: Ints) -> Floats:
         """Barycentric coordinates (n, 3) of the points' feet on their facets."""
         a, b, c = (self.vertices[self.faces[face, k]] for k in range(3))
         n = np.cross(b - a, c - a)

@@ -4,7 +4,7 @@ function lineChart(host, wanted) {
   let logY = wanted.logY;
   const canvas = make("canvas", { className: "chart" });
   canvas.setAttribute("role", "img");
-  canvas.setAttribute("aria-label", `${yLabel} against ${xLabel}`);
+  canvas.setAttribute("aria-label", `${yLabel} ${say("against")} ${xLabel}`);
   const said = make("output", { className: "said" }, say("Point at a line to read it; names switch lines on and off."));
   const context = canvas.getContext("2d");
   const lines = series.map((one) => ({ ...one, on: true }));

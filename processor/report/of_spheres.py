@@ -25,7 +25,7 @@ REPORT = StepReport(
     summary=_summary,
     written=results_balls.written,
     tables=tables_balls.of_runs,
-    figures=figures_balls.of_runs,
+    figures=lambda execution, runs, report: figures_balls.of_runs(execution.scene, runs, report, execution.stored),
     files=_files,
     live=view_balls.of_runs,
 )

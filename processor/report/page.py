@@ -21,6 +21,15 @@ from processor.report.printing import headings, numeric, shown
 GOOD = "ok"
 LEAD = ("what-to-do", "limits")  # tables above the figures
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
+NAMES = (
+    "method",
+    "joint",
+    "component",
+    "left_part",
+    "right_part",
+    "station",
+    "point",
+)  # columns that no language translates
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 
@@ -47,7 +56,7 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
             f"Coordinates read as {scene.units} ({scene.units_reason}). All lengths in mm."
         ),
         lang=lang,
-        live=view.embedded({"words": language(lang).of_scripts(script), "steps": live}),
+        live=view.embedded({"words": language(lang).of_scripts(script), "steps": language(lang).in_figures(live)}),
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),
@@ -63,7 +72,7 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]
         report_of = step_report.of(run.step)
         head, said = report_of.summary(run.result)
         title = f"{report_of.title}: {head}"
-        found.append({"tone": _tone(run), "head": title, "text": f"Method {run.method}. {said}"})
+        found.append({"tone": _tone(run), "head": title, "text": f"Method {run.method}. {said}".strip()})
         found += [{"tone": "", "head": head, "text": text} for head, text in report_of.further(run.result)]
     if report.metrics:
         limited = [m for m in report.metrics if m.limit == m.limit]
@@ -123,5 +132,6 @@ def _table(table: tables.Table) -> dict[str, Any]:
         "note": note,
         "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
         "columns": list(zip(headings(table), numeric(table), strict=True)),
+        "named": [column in NAMES for column in table.columns],
         "rows": table.rows[:MOST_ROWS],
     }

@@ -8,7 +8,7 @@ function start(box, data) {
     box.append(make("h3", {}, title), host);
     return host;
   };
-  spaceView(panel(`${say(data.title)}, ${say("method")} ${data.method}`), data);
+  spaceView(panel(`${say(data.title)}${say(", method")} ${data.method}`), data);
   if (!data.linear) return;
 
   const lines = (values, banded) => data.linear.flatMap((one, m) => ["left", "right"].map((edge) => {
@@ -20,7 +20,7 @@ function start(box, data) {
     return {
       name: `${one.method}, ${say(edge)}`, colour: colours[m % 4], style: m, thin: edge === "right", x, y,
       low: beyond(-1), high: beyond(1),
-      read: (i) => `${one.method}, ${say(`${edge} edge`)}, ${x[i].toFixed(2)} m: ${mm(y[i])}${half && half[i] !== null ? ` ± ${mm(half[i])}` : ""} mm`,
+      read: (i) => `${one.method}, ${say(edge === "left" ? "left edge" : "right edge")}, ${x[i].toFixed(2)} m: ${mm(y[i])}${half && half[i] !== null ? ` ± ${mm(half[i])}` : ""} mm`,
     };
   }));
   const known = (values) => data.linear.some((one) => one[values].some((value) => value !== null));

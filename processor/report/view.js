@@ -84,7 +84,7 @@ function spaceView(host, data) {
     ...(hasPoints ? [make("div", { className: "tools" }, tick(say(data.values), true, (on) => { state.points = on; }),
       make("label", {}, `${say("colours to")} `, limit), make("span", { className: "scale" }, least, bar, most))] : []),
     make("fieldset", { className: "tools" }, make("legend", {}, say("components")),
-      ...parts.map((part) => tick(part.name, true, (on) => { part.on = on; }))));
+      ...parts.map((part) => tick(part.text || part.name, true, (on) => { part.on = on; }))));
 
   function goTo(j) {
     const joint = joints[j];

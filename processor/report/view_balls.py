@@ -33,9 +33,15 @@ def of_runs(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     origin = np.round(result.centres[placed].mean(axis=0))
     used = [flag for flag in FLAGS if flag in {result.flag[i] for i in drawn}]
     tubes = np.stack([result.tube_start, result.tube_end], axis=1)[:MOST_TUBES] if len(result.tube_start) else ()
-    parts = [{"name": f"balls: {flag}", "edges": [], "points": [], "residual": []} for flag in used]
+    parts = [{"name": "", "text": f"balls: {flag}", "edges": [], "points": [], "residual": []} for flag in used]
     parts.append(
-        {"name": "tubes", "edges": [np.round(tube - origin, 1) for tube in tubes], "points": [], "residual": []}
+        {
+            "name": "",
+            "text": "tubes",
+            "edges": [np.round(tube - origin, 1) for tube in tubes],
+            "points": [],
+            "residual": [],
+        }
     )
     found = {
         "title": "Balls in space",

@@ -6,29 +6,34 @@ import json
 import os
 import shutil
 import tempfile
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from processor import store
 from processor.evaluate import ErrorReport
-from processor.model import UsageError
+from processor.model import InputError, UsageError
 from processor.pipeline import Execution
 from processor.report import figures, page, printing, results_json, step_report, tables
 
 RESULTS, RUNS = "results.json", "results.h5"
-OWN_NAMES = (RESULTS, RUNS, "report.html", "figures")
+OWN_NAMES = (RESULTS, RUNS, "report.html", "figures", "job.json")  # the last is a batch's; gone, it does the job again
 OWN_ENDINGS = (".csv", ".dxf")
 
 
-def check_output(out: Path, source: Path) -> None:
-    """Refuse a folder that holds anything but earlier results, for it will be replaced as a whole: UsageError."""
+def check_output(out: Path, source: Path, mark: str = RESULTS, own: Collection[str] = OWN_NAMES) -> None:
+    """Refuse a folder that holds anything but earlier results, for it will be replaced as a whole: UsageError.
+
+    Earlier results are known by the file ``mark`` among files of their ``own`` names.
+    """
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; name a folder for the results")
     if source.resolve().is_relative_to(out.resolve()):
         raise UsageError(f"{out}: holds the input {source}, which the results would replace; name another folder")
     inside = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
-    if inside and RESULTS not in inside:
+    if inside and mark not in inside:
         raise UsageError(f"{out}: is not empty and holds no earlier results; name another folder")
-    others = [name for name in inside if name not in OWN_NAMES and not name.endswith(OWN_ENDINGS)]
+    others = [name for name in inside if name not in own and not name.endswith(OWN_ENDINGS)]
     if others:
         raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
 
@@ -36,40 +41,64 @@ def check_output(out: Path, source: Path) -> None:
 def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
     """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others.
 
-    The page alone is in the language ``lang``; tables and numbers for other programs are not.
+    The page alone is in the language ``lang``; tables and numbers for other programs are not. Raises InputError where
+    they cannot be written; then ``out`` is as it was.
     """
-    out = out.absolute()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    try:
-        os.chmod(making, 0o755)
+    with whole(out) as making:
         store.write_results(making / RUNS, execution.runs, execution.provenance)
         found = results_json.results_json(execution, report)
-        _write_text(making / RESULTS, json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+        write_text(making / RESULTS, json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
         for table in tables.all_of(execution, report):
             if table.file:
-                _write_text(making / f"{table.file}.csv", printing.csv_text(table))
+                write_text(making / f"{table.file}.csv", printing.csv_text(table))
         for run, _ in tables.grouped(execution.runs):
             for name, data in step_report.of(run.step).files(run.result).items():
-                _write(making / name, data)
+                write_bytes(making / name, data)
         drawn = figures.of_run(execution, report)
         if any(drawn.values()):
             (making / "figures").mkdir()
         for of_step in drawn.values():
             for name, (_, png) in of_step.items():
-                _write(making / "figures" / name, png)
-        _write_text(making / "report.html", page.html(execution, report, drawn, lang))
+                write_bytes(making / "figures" / name, png)
+        write_text(making / "report.html", page.html(execution, report, drawn, lang))
+
+
+@contextmanager
+def whole(out: Path) -> Iterator[Path]:
+    """Give a folder to write into that takes the place of ``out`` when all is written, and is gone on any error.
+
+    Raises InputError where it cannot be written.
+    """
+    out = out.absolute()
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise _unwritable(out, error) from error
+    try:
+        os.chmod(making, 0o755)
+        yield making
         _replace(making, out)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(making, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise _unwritable(out, error) from error
+        if isinstance(error, InputError):  # of a file in the folder that is gone
+            raise InputError(str(error).replace(str(making), str(out))) from error
         raise
 
 
-def _write_text(path: Path, text: str) -> None:
-    _write(path, text.encode("utf-8"))
+def _unwritable(out: Path, error: OSError) -> InputError:
+    return InputError(f"{out}: cannot be written ({error.strerror or error}); nothing was changed there")
 
 
-def _write(path: Path, data: bytes) -> None:
+def write_text(path: Path, text: str) -> None:
+    """Write a text as UTF-8, onto the disk."""
+    write_bytes(path, text.encode("utf-8"))
+
+
+def write_bytes(path: Path, data: bytes) -> None:
+    """Write a file, onto the disk."""
     with path.open("wb") as file:
         file.write(data)
         file.flush()

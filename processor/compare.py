@@ -1,0 +1,216 @@
+"""Plain M3C2 between two clouds, in their own unit, for those who have no design."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from processor import normals_file, readers, store
+from processor.deviation import scales, summary
+from processor.deviation.scales import Scales
+from processor.deviation.summary import Summary
+from processor.geometry import m3c2, point_neighbors
+from processor.geometry.m3c2 import Distances
+from processor.geometry.point_grid import PointGrid
+from processor.model import Floats, InputError, UsageError
+from processor.readers import RawScan
+
+FAR = 10_000.0  # units; beyond this an origin is taken off before any algebra
+ORIGIN_STEP = 1_000.0
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True)
+class Request:
+    """What to compare, and how; lengths in the clouds' unit, 0 = derive it from their density."""
+
+    reference: Path
+    compared: Path
+    core: Path | None = None
+    normals: Path | None = None
+    normal_diameter: float = 0.0
+    projection_diameter: float = 0.0
+    max_depth: float = 0.0
+    registration_error: float = 0.0
+
+    def __post_init__(self) -> None:
+        for name in ("normal_diameter", "projection_diameter", "max_depth", "registration_error"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value >= 0.0):
+                raise UsageError(f"--{name.replace('_', '-')}: expected a length of 0 or more, got {value!r}")
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """Distances at core points (k, 3), coordinates less ``origin`` (3,), with normals (k, 3), and how they came."""
+
+    request: Request
+    origin: Floats
+    core: Floats
+    normals: Floats
+    distances: Distances
+    scales: Scales
+    summary: Summary
+    unit: str  # "" = the files do not say
+    points: dict[str, int]
+    hashes: dict[str, str]
+    normals_from: str
+
+
+@dataclass(frozen=True)
+class _Cloud:
+    """The scans of a file; placed by :meth:`less`."""
+
+    path: Path
+    scans: list[RawScan]
+    sha256: str
+
+    @property
+    def unit(self) -> str:
+        """Unit that the file says, or nothing."""
+        return next((scan.unit for scan in self.scans if scan.unit), "")
+
+    @property
+    def count(self) -> int:
+        """Points of all scans."""
+        return sum(len(scan.points) for scan in self.scans)
+
+    def lowest(self) -> Floats:
+        """Least coordinates (3,)."""
+        found: Floats = np.min([self._placed(scan, np.zeros(3)).min(axis=0) for scan in self.scans], axis=0)
+        return found
+
+    def less(self, origin: Floats) -> Floats:
+        """Points (n, 3) of all scans less an origin; offsets are taken from each other before they meet a point."""
+        return np.concatenate([self._placed(scan, origin) for scan in self.scans])
+
+    @staticmethod
+    def _placed(scan: RawScan, origin: Floats) -> Floats:
+        if not scan.T_project_scan.size:
+            return scan.points + (scan.origin - origin)
+        T = scan.T_project_scan
+        moved: Floats = scan.points @ T[:3, :3].T + (T[:3, :3] @ scan.origin + (T[:3, 3] - origin))
+        return moved
+
+
+def compare(request: Request, say: Callable[[str], None] = lambda _: None) -> Comparison:
+    """Measure from the reference to the compared cloud at every core point, in the core points' order.
+
+    Without a core file every point of the reference is one; without a file of normals they are those of the
+    reference's planes, turned to look up. Raises InputError for a file that cannot be used.
+    """
+    reference, compared = _read(request.reference), _read(request.compared)
+    core_cloud = reference if request.core is None else _read(request.core)
+    clouds = [reference, compared] if request.core is None else [reference, compared, core_cloud]
+    unit = _unit(clouds)
+    origin = _origin(reference)
+    core = np.ascontiguousarray(core_cloud.less(origin))
+    first, second = (point_neighbors.of_spacing(one.less(origin)) for one in (reference, compared))
+    used = scales.derived(first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth)
+    _say_scales(request, used, unit, say)
+    if request.normals is not None:
+        given = normals_file.read(request.normals, core, origin, used.projection_diameter_mm)
+        said, turned = f"file {request.normals.name}", given
+    else:
+        fitted = m3c2.normals(_sorted(first, used.normal_diameter_mm), core, used.normal_diameter_mm).normals
+        said, turned = "planes of the reference, turned towards +z", m3c2.oriented(fitted, UP)
+    found = m3c2.distances(
+        _sorted(first, used.projection_diameter_mm),
+        _sorted(second, used.projection_diameter_mm),
+        core,
+        turned,
+        projection_diameter_mm=used.projection_diameter_mm,
+        max_depth_mm=used.max_depth_mm,
+        registration_error_mm=request.registration_error,
+    )
+    total = summary.of_distances(found, core, turned, used.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER)
+    _say_doubts(total, used, say)
+    names = ("reference", "compared", "core")
+    hashes = {name: one.sha256 for name, one in zip(names, clouds, strict=False)}
+    if request.normals is not None:
+        hashes["normals"] = _sha256(request.normals)
+    points = {name: one.count for name, one in zip(names, clouds, strict=False)}
+    return Comparison(request, origin, core, turned, found, used, total, unit, points, hashes, said)
+
+
+def _sorted(grid: PointGrid, diameter: float) -> PointGrid:
+    """Return a grid of the same points for a diameter, the same one where its cells fit."""
+    ratio = diameter / m3c2.CELLS_PER_DIAMETER / grid.cells.size
+    return grid if 0.5 <= ratio <= 1.5 else m3c2.grid(grid.cells.points, diameter)
+
+
+def _read(path: Path) -> _Cloud:
+    if path.suffix.lower() == ".h5" and path.is_file():
+        scans = store.read_scene(path).scans
+        raws = [RawScan(s.name, s.points, s.origin, T_project_scan=s.T_project_scan, unit="mm") for s in scans]
+    else:
+        raws = readers.read(path)
+    if not sum(len(scan.points) for scan in raws):
+        raise InputError(f"{path}: holds no points")
+    return _Cloud(path, [scan for scan in raws if len(scan.points)], _sha256(path))
+
+
+def _sha256(path: Path) -> str:
+    digest = hashlib.sha256()
+    with path.open("rb") as file:
+        while chunk := file.read(1 << 20):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def _unit(clouds: list[_Cloud]) -> str:
+    """Return the unit that the files say, "" where none does. Raises InputError where they say different ones."""
+    said = {one.unit: one.path for one in clouds if one.unit}
+    if len(said) > 1:
+        (a, first), (b, second) = list(said.items())[:2]
+        raise InputError(
+            f"{second}: is in {b}, but {first} is in {a}; expected clouds in one unit: convert one of them"
+        )
+    return next(iter(said), "")
+
+
+def _origin(reference: _Cloud) -> Floats:
+    """Return whole thousands near to the reference where it is far from zero, however its points are ordered."""
+    lowest = reference.lowest()
+    far = np.abs(lowest).max() > FAR
+    found: Floats = np.floor(lowest / ORIGIN_STEP) * ORIGIN_STEP if far else np.zeros(3)
+    return found
+
+
+def _say_scales(request: Request, used: Scales, unit: str, say: Callable[[str], None]) -> None:
+    spacing = max(used.reference_spacing_mm, used.compared_spacing_mm)
+    say(
+        f"lengths are in the files' unit{f' ({unit})' if unit else ', which they do not say'}; "
+        f"spacing {used.reference_spacing_mm:.4g} (reference), {used.compared_spacing_mm:.4g} (compared)"
+    )
+    held = np.pi / 4.0 * (used.projection_diameter_mm / spacing) ** 2
+    for name, value, given, why in (
+        (
+            "normal diameter",
+            used.normal_diameter_mm,
+            request.normal_diameter or request.normals,
+            "of spacing and roughness",
+        ),
+        ("projection diameter", used.projection_diameter_mm, request.projection_diameter, "of the spacing"),
+        ("max depth to either side", used.max_depth_mm, request.max_depth, "of how far apart the clouds are"),
+    ):
+        say(f"{name} {value:.6g}, {'given' if given else f'made {why}'}")
+    say(f"a cylinder holds about {held:.3g} points of the sparser cloud")
+
+
+def _say_doubts(total: Summary, used: Scales, say: Callable[[str], None]) -> None:
+    if total.without_lod:
+        say(
+            f"{total.without_lod} of {total.core_points} core points have no level of detection: fewer than "
+            f"{m3c2.FEWEST_FOR_LOD} points of a cloud within {used.max_depth_mm:.6g} of them, or no normal; "
+            "a larger --max-depth or --projection-diameter may help"
+        )
+    if total.few_points > 0.1 * max(total.core_points - total.without_lod, 1):
+        say(
+            f"{total.few_points} core points have fewer than {scales.PAPER_POINTS_A_CYLINDER} points of a cloud in "
+            "their cylinder: their levels of detection are too small (a larger --projection-diameter helps)"
+        )

@@ -1,0 +1,1 @@
+"""Deviation of a scan from a design, or from another scan, with levels of detection."""

@@ -1,0 +1,147 @@
+"""A cloud sorted into the cells of a sparse grid: neighbours of any place lie in few runs of rows.
+
+Cells are gathered in blocks of 4 x 4 x 4, found by a hash; within a block, cells along z are one run of rows. Rows are
+sorted by block, cell and coordinates, so that nothing computed from them depends on the order the points came in.
+"""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from processor.geometry.threads import over_ranges
+from processor.model import Floats, Ints
+
+SIDE = 4  # cells along a block's edge
+FIELD = 19  # bits of a block's number for each axis
+EMPTY = -1
+ROOM_SHARE = 8  # cells of the table for each point at most: where a grid is finer, its cells are made larger
+
+
+class Cells(NamedTuple):
+    """What kernels take: points (n, 3) in the grid's order, and the table of its blocks.
+
+    Cell c of block b, c = 16 i + 4 j + k, holds the rows ``starts[b, c]`` to ``starts[b, c + 1]``.
+    """
+
+    points: Floats
+    keys: Ints  # (slots,), EMPTY = free
+    blocks: Ints  # (slots,) row of ``starts``
+    starts: Ints  # (b, 65)
+    lower: Floats  # (3,)
+    size: float  # of a cell
+    extent: Ints  # (3,) blocks along each axis
+
+
+@dataclass(frozen=True)
+class PointGrid:
+    """The cells, and the row (n,) that each of their points had in the cloud given."""
+
+    cells: Cells
+    order: Ints
+
+    @property
+    def count(self) -> int:
+        """Points in all."""
+        return len(self.order)
+
+    def beside(self, places: Floats) -> Ints:
+        """Sort places (m, 3): rows (m,) in the grid's own order, so that neighbours are looked for one after another.
+
+        Places beyond the grid come at its rim; what is not finite comes first.
+        """
+        cells = self.cells
+        known = np.where(np.isfinite(places), places, cells.lower)
+        inside = np.clip((known - cells.lower) / cells.size, 0.0, SIDE * cells.extent - 1.0)
+        return np.argsort(_keys(inside.astype(np.int64)), kind="stable").astype(np.int64)
+
+
+def of_points(points: Floats, cell: float) -> PointGrid:
+    """Sort points (n, 3), all finite, into cells of the edge ``cell`` or as much larger as room for the table asks."""
+    if len(points) == 0:
+        none = np.zeros((0, SIDE**3 + 1), np.int64)
+        empty = np.full(2, EMPTY, np.int64)
+        cells = Cells(np.zeros((0, 3)), empty, empty.copy(), none, np.zeros(3), 1.0, np.ones(3, np.int64))
+        return PointGrid(cells, np.empty(0, np.int64))
+    lower = points.min(axis=0)
+    extent = float((points.max(axis=0) - lower).max())
+    size = max(float(cell), extent / (SIDE * (1 << FIELD) - 2 * SIDE), 1e-300)
+    while True:
+        key = _keys(((points - lower) / size).astype(np.int64))
+        order = np.argsort(key)
+        key = key[order]
+        block_key = key >> 6
+        first = np.flatnonzero(np.concatenate([[True], block_key[1:] != block_key[:-1]]))
+        if len(first) * SIDE**3 <= ROOM_SHARE * len(points) + SIDE**3:
+            break
+        size *= 2.0
+    rows = np.ascontiguousarray(points[order])
+    block = np.cumsum(np.concatenate([[0], block_key[1:] != block_key[:-1]]))
+    count = np.bincount(block * SIDE**3 + (key & 63), minlength=len(first) * SIDE**3).reshape(-1, SIDE**3)
+    starts = np.zeros((len(first), SIDE**3 + 1), np.int64)
+    np.cumsum(count, axis=1, out=starts[:, 1:])
+    starts += first[:, None]
+    order = order.astype(np.int64)
+    over_ranges(lambda a, b: _sort_cells(rows, order, starts, a, b), len(first), least=64)
+    slots = 1 << max(4, int(2 * len(first)).bit_length())
+    keys, blocks = np.full(slots, EMPTY, np.int64), np.full(slots, EMPTY, np.int64)
+    _fill(keys, blocks, np.ascontiguousarray(block_key[first]))
+    reach = ((points.max(axis=0) - lower) / size).astype(np.int64) // SIDE + 1
+    return PointGrid(Cells(rows, keys, blocks, starts, lower, size, reach), order)
+
+
+def _keys(cell: Ints) -> Ints:
+    """Return a number for each cell (n, 3): its block's, then its own within the block."""
+    block = (cell[:, 0] // SIDE << FIELD | cell[:, 1] // SIDE) << FIELD | cell[:, 2] // SIDE
+    inner = (cell & (SIDE - 1)) @ np.array([16, 4, 1])
+    found: Ints = block << 6 | inner
+    return found
+
+
+@njit(cache=True, nogil=True, inline="always")
+def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
+    """Find the row of a block by its numbers along the axes, EMPTY where it holds no point."""
+    key = ((i << FIELD) | j) << FIELD | k
+    mask = np.uint64(len(cells.keys) - 1)
+    h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
+    at = (h ^ (h >> np.uint64(32))) & mask
+    while cells.keys[at] != EMPTY and cells.keys[at] != key:
+        at = (at + np.uint64(1)) & mask
+    return cells.blocks[at]
+
+
+@njit(cache=True, nogil=True)
+def _fill(keys, blocks, found):  # type: ignore[no-untyped-def]
+    mask = np.uint64(len(keys) - 1)
+    for row in range(len(found)):
+        h = np.uint64(found[row]) * np.uint64(0x9E3779B97F4A7C15)
+        at = (h ^ (h >> np.uint64(32))) & mask
+        while keys[at] != EMPTY:
+            at = (at + np.uint64(1)) & mask
+        keys[at] = found[row]
+        blocks[at] = row
+
+
+@njit(cache=True, nogil=True)
+def _sort_cells(points, order, starts, first, last):  # type: ignore[no-untyped-def]
+    """Sort the rows of each cell of some blocks by x, y, z (Shell's sort: cells are small)."""
+    for block in range(first, last):
+        for cell in range(starts.shape[1] - 1):
+            a, b = starts[block, cell], starts[block, cell + 1]
+            gap = (b - a) // 2
+            while gap > 0:
+                for i in range(a + gap, b):
+                    x, y, z, row = points[i, 0], points[i, 1], points[i, 2], order[i]
+                    j = i
+                    while j >= a + gap:
+                        u, v, w = points[j - gap, 0], points[j - gap, 1], points[j - gap, 2]
+                        if u < x or (u == x and (v < y or (v == y and w <= z))):
+                            break
+                        points[j, 0], points[j, 1], points[j, 2], order[j] = u, v, w, order[j - gap]
+                        j -= gap
+                    points[j, 0], points[j, 1], points[j, 2], order[j] = x, y, z, row
+                gap //= 2

@@ -1,0 +1,140 @@
+"""The folder of ``processor compare``: compare.csv, compare.json, figures and a page."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import html
+import json
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+
+from processor import pipeline
+from processor.compare import Comparison
+from processor.geometry.m3c2 import FEWEST_FOR_LOD
+from processor.report import core_points, figures_deviation, writing
+
+TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
+OWN_NAMES = (TABLE, *FIGURES, RECORD, PAGE)
+DEFINITION = (
+    "distance = compared minus reference, means along the normal; lod95 = 1.96 (sqrt(std1^2/n1 + std2^2/n2) + "
+    "registration error), population standard deviations; the cylinder reaches max depth to either side; "
+    f"lod95 is nan below {FEWEST_FOR_LOD} points of either cloud, distance where either has none"
+)
+
+
+def check_output(out: Path, found: tuple[Path | None, ...]) -> None:
+    """Refuse a folder that holds anything but an earlier comparison, or one of the inputs: UsageError."""
+    for path in found:
+        if path is not None:
+            writing.check_output(out, path, RECORD, OWN_NAMES)
+
+
+def as_json(found: Comparison) -> dict[str, Any]:
+    """Build the object of compare.json; lengths in the clouds' unit."""
+    request, scales, summary = found.request, found.scales, found.summary
+    files = {"reference": request.reference, "compared": request.compared, "core": request.core}
+    files["normals"] = request.normals
+    share = summary.significant_share
+    figures = {
+        field.name: getattr(summary, field.name)
+        for field in dataclasses.fields(summary)
+        if field.name != "significant_share"
+    }
+    written: dict[str, Any] = json.loads(
+        pipeline.as_json(
+            {
+                "format": "processor-comparison",
+                "format_version": "1.0",
+                "inputs": {
+                    name: {"file": path.name, "sha256": found.hashes[name], "points": found.points.get(name)}
+                    for name, path in files.items()
+                    if path is not None
+                },
+                "unit": found.unit or "that of the files, which do not say it",
+                "definition": DEFINITION,
+                "normals": found.normals_from,
+                "parameters": {
+                    "normal_diameter": None if request.normals else scales.normal_diameter_mm,
+                    "projection_diameter": scales.projection_diameter_mm,
+                    "max_depth": scales.max_depth_mm,
+                    "registration_error": request.registration_error,
+                    "given": [
+                        name
+                        for name in ("normal_diameter", "projection_diameter", "max_depth", "registration_error")
+                        if getattr(request, name)
+                    ],
+                },
+                "spacing": {"reference": scales.reference_spacing_mm, "compared": scales.compared_spacing_mm},
+                "summary": {
+                    **figures,
+                    "significant_share": share.share,
+                    "significant_share_ci95": [share.low, share.high],
+                },
+                "software": pipeline.software(),
+            }
+        )
+    )
+    return written
+
+
+def write(out: Path, found: Comparison) -> dict[str, Any]:
+    """Write the folder, in place of an earlier one; returns what compare.json holds."""
+    record = as_json(found)
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams["text.parse_math"] = False
+        drawn = [
+            figures_deviation.deviation_map(found.core + found.origin, found.normals, found.distances, found.unit),
+            figures_deviation.histogram(found.distances, found.unit),
+        ]
+    with writing.whole(out) as making:
+        text = core_points.csv_text(found.origin, found.core, found.distances, found.normals)
+        writing.write_text(making / TABLE, text)
+        record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
+        writing.write_text(making / RECORD, record_text + "\n")
+        for name, (_, data) in zip(FIGURES, drawn, strict=True):
+            writing.write_bytes(making / name, data)
+        writing.write_text(making / PAGE, _page(record, drawn))
+    return record
+
+
+def lines(record: dict[str, Any]) -> list[str]:
+    """Say the outcome in words, for the terminal and the page."""
+    summary = record["summary"]
+    unit = f" {record['unit']}" if len(record["unit"]) < 8 else ""
+
+    def number(key: str) -> str:
+        return "–" if summary[key] is None else f"{summary[key]:.6g}{unit}"
+
+    known = summary["core_points"] - summary["without_lod"]
+    found = [f"{summary['core_points']} core points, {known} with a level of detection"]
+    if known:
+        low, high = (f"{100.0 * one:.1f}" for one in summary["significant_share_ci95"])
+        found += [
+            f"beyond it: {summary['significant']}, {100.0 * summary['significant_share']:.1f} % (95 %: {low}-{high})",
+            f"distance: mean {number('mean')}, median {number('median')}, sd {number('sd')}, "
+            f"from {number('min')} to {number('max')}",
+            f"median level of detection {number('lod95_median')}",
+        ]
+    return found
+
+
+def _page(record: dict[str, Any], drawn: list[tuple[str, bytes]]) -> str:
+    figures = "".join(
+        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
+        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
+        for caption, data in drawn
+    )
+    said = "".join(f"<p>{html.escape(one)}</p>" for one in lines(record))
+    names = " to ".join(html.escape(record["inputs"][name]["file"]) for name in ("reference", "compared"))
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Comparison</title>'
+        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
+        "style-src 'unsafe-inline'\"><style>body{margin:auto;max-width:60rem;padding:1.5rem;"
+        "font:16px/1.5 system-ui,sans-serif}img{max-width:100%}pre{overflow-x:auto;font-size:.85rem}</style></head>"
+        f"<body><h1>From {names}</h1>{said}{figures}<h2>Parameters and provenance</h2>"
+        f"<pre>{html.escape(json.dumps(record, indent=2, ensure_ascii=False))}</pre></body></html>\n"
+    )

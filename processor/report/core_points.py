@@ -1,0 +1,31 @@
+"""Core points and what M3C2 says at them as CSV, every number in full: coordinates may be far from zero."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from processor.geometry.m3c2 import Distances
+from processor.model import Floats
+
+COLUMNS = ("x", "y", "z", "distance", "lod95", "significant", "n1", "n2", "std1", "std2", "nx", "ny", "nz")
+ROWS_AT_ONCE = 50_000
+
+
+def csv_text(origin: Floats, core: Floats, found: Distances, normals: Floats) -> str:
+    """Write core points (k, 3), less an ``origin`` (3,), with distances and normals (k, 3); nan where there is none."""
+    return "".join(_lines(origin, core, found, normals))
+
+
+def _lines(origin: Floats, core: Floats, found: Distances, normals: Floats) -> Iterator[str]:
+    yield ",".join(COLUMNS) + "\n"
+    for start in range(0, len(core), ROWS_AT_ONCE):
+        part = slice(start, start + ROWS_AT_ONCE)
+        significant = found.significant[part].astype(np.int64)
+        numbers = (
+            *(core[part] + origin).T, found.distance[part], found.lod95[part], significant, found.n1[part],
+            found.n2[part], found.std1[part], found.std2[part], *normals[part].T,
+        )  # fmt: skip
+        texts = [map(repr, column.tolist()) for column in numbers]
+        yield "".join(",".join(row) + "\n" for row in zip(*texts, strict=True))

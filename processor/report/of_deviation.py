@@ -1,0 +1,113 @@
+"""How deviations report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from processor.deviation.result import Result
+from processor.evaluate import ErrorReport
+from processor.model import Ints, Scene, StepRun
+from processor.pipeline import Execution
+from processor.report import core_points, figures_deviation, results_deviation, view_points
+from processor.report.drawing import Drawn
+from processor.report.printing import shown
+from processor.report.step_report import StepReport
+from processor.report.table import Table
+
+MAP, HISTOGRAM = "deviation-map.png", "deviation-histogram.png"
+
+
+def _summary(result: Result) -> tuple[str, str]:
+    if not len(result.core):
+        return result.status, result.message
+    found = results_deviation.figures(result)
+    head = f"{result.status}, {_percent(result.significant_share)} % of the surface measured is beyond its LOD95"
+    low, high, near = (
+        _percent(one) for one in (result.significant_low, result.significant_high, found["within_10mm_share"])
+    )
+    registration = shown(1.96 * result.registration_error)
+    said = (
+        f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; "
+        f"median LOD95 {shown(found['lod95_median'])} mm, {registration} mm of it registration. "
+        f"{found['measured']:.0f} of {len(result.core)} core points were measured."
+    )
+    return head, said
+
+
+def _percent(share: float) -> str:
+    return f"{100.0 * share:.1f}" if np.isfinite(share) else "–"
+
+
+def _tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
+    columns = [_column(run.result) for run in runs]
+    names = ("figure", *(run.method for run in runs), "unit")
+    rows = tuple((name, *(one[name][0] for one in columns), unit) for name, (_, unit) in columns[0].items())
+    return [Table("Deviation of the surface from the design", names, rows, "deviation-figures")]
+
+
+def _column(result: Result) -> dict[str, tuple[Any, str]]:
+    found = results_deviation.figures(result)
+    return {
+        "status": (result.status, ""),
+        "core points": (len(result.core), ""),
+        "core points measured": (int(found["measured"]), ""),
+        "beyond LOD95": (100.0 * result.significant_share, "%"),
+        "beyond LOD95, 95 % from": (100.0 * result.significant_low, "%"),
+        "beyond LOD95, 95 % to": (100.0 * result.significant_high, "%"),
+        "within 10 mm": (100.0 * found["within_10mm_share"], "%"),
+        "mean": (found["mean"], "mm"),
+        "median": (found["median"], "mm"),
+        "least": (found["min"], "mm"),
+        "greatest": (found["max"], "mm"),
+        "LOD95, median": (found["lod95_median"], "mm"),
+        "registration error, one sd": (result.registration_error, "mm"),
+        "from": (result.registration_error_from, ""),
+        "registration": (result.registration, ""),
+        "ambiguity: error of the next best attitude": (result.ambiguity, "times"),
+        "points read": (result.points_read, ""),
+        "points kept by the outlier removal": (result.points_kept, ""),
+        "points on the surface": (100.0 * result.on_surface_share, "%"),
+        "spacing of the scan": (result.spacing, "mm"),
+        "sd of a point from the surface": (result.sigma, "mm"),
+        "normal diameter": (result.normal_diameter, "mm"),
+        "projection diameter": (result.projection_diameter, "mm"),
+        "depth to either side": (result.max_depth, "mm"),
+    }
+
+
+def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
+    result: Result = runs[0].result
+    if not np.isfinite(result.lod95).any():
+        return {}
+    return {
+        MAP: figures_deviation.deviation_map(result.core + result.origin, result.normals, result.distances, "mm"),
+        HISTOGRAM: figures_deviation.histogram(result.distances, "mm"),
+    }
+
+
+def _files(result: Result) -> dict[str, bytes]:
+    text = core_points.csv_text(result.origin, result.core, result.distances, result.normals)
+    return {"deviation.csv": text.encode("ascii")}
+
+
+def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+    result: Result = runs[0].result
+    points = result.core + result.origin
+    everything: Ints = np.arange(len(points), dtype=np.int64)
+    return view_points.of_points(
+        "Deviation in space", runs[0].method, points, result.distances.distance, [("surface", everything)]
+    )
+
+
+REPORT = StepReport(
+    title="Deviation",
+    summary=_summary,
+    written=results_deviation.written,
+    tables=_tables,
+    figures=_figures,
+    files=_files,
+    live=_live,
+)
