@@ -19,10 +19,10 @@ from processor.stitching.joint import Blocks
 from processor.stitching.pairs import Pair
 from processor.stitching.params import Params
 
-# How far scans may still be apart, by cells' side: across faces, and for ends of faces, as what only these tell starts
-# worse.
-GATES = ((0.25, 3.2), (0.2, 1.6), (0.15, 0.8), (0.1, 0.4), (0.05, 0.2))
-LAST = 2  # adjustments without a gate
+GATES = (0.25, 0.15, 0.08)  # how far faces of scans may still be apart, by cells' side
+REACH = 6.0  # the same of what only ends of faces tell
+END_GATES = (0.1, 0.05)  # and once these have been looked at
+LAST = 5  # adjustments at most without a gate
 STILL_MM = 0.02
 
 
@@ -94,13 +94,18 @@ def _adjusted(own: list[Cloud], T: Floats, reference: int) -> tuple[Solution, Bl
         empty = np.empty(0, np.int64)
         blocks = Blocks(empty, empty, np.empty((0, 10)), np.empty(0), empty, 0)
         return bundle.solve(blocks, T, reference), blocks
-    for gate, end_gate in (*GATES, *[(0.0, 0.0)] * LAST):
-        pieces = joint.pieces(cells, T, gate * cells.size_mm)
+    for gate in GATES:
+        blocks = joint.shared(joint.pieces(cells, T, gate * cells.size_mm))
+        T = bundle.solve(blocks, T, reference, slack_mm=gate * cells.size_mm).T
+    pieces = joint.pieces(cells, T, 0.0)
+    T = bounding.settled(own, pieces, bundle.solve(joint.shared(pieces), T, reference), REACH * cells.size_mm)
+    for end_gate in (*END_GATES, *[0.0] * LAST):
+        pieces = joint.pieces(cells, T, 0.0)
         blocks = joint.shared(bounding.bounded(own, pieces, T, end_gate * cells.size_mm))
         before = T
-        solution = bundle.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
+        solution = bundle.solve(blocks, T, reference, slack_mm=end_gate * cells.size_mm)
         T = solution.T
-        if gate == 0.0 and joint.moved_apart(T, before) < STILL_MM:
+        if end_gate == 0.0 and joint.moved_apart(T, before) < STILL_MM:
             break
     return solution, blocks
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.model import Floats
+from processor.geometry import rigid
+from processor.model import Floats, Ints
 from processor.stitching import octree
 from processor.stitching.clouds import Cloud
+from processor.stitching.bundle import Solution
 from processor.stitching.joint import Blocks
 
 BEHIND_COS = -0.03  # a face looks away from the scanner
@@ -16,18 +20,39 @@ SQUARE_COS = 0.85  # the two faces meet at an angle
 NEIGHBOURS = 12
 REACH = 1.9  # of a piece: its half width by its standard deviation, with a little to spare
 LEAST_MM = 1.0  # standard deviation of an end, however close the rays
-INSIDE = 0.55  # of the width between two rays
+INSIDE = 0.75  # of the width between two rays, half of it to either side and half as much again
 MOST_NODES_MM = 4000.0
 
 
-def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
-    """Add the ends of faces to the pieces that bound them, as blocks of kind 1.
+LOOSE_MM = 1.0  # standard deviation of a motion that faces alone do not tell
+LEVER_MM = 1e4  # a turn counts by what it moves so far off
+SHIFT_STEP_MM = 2.0
+SLACK_MM = 3.0
+MOST_LOOSE = 12
+
+
+@dataclass(frozen=True)
+class Matches:
+    """Ends (n, 3) of scans (n,), in their clouds' frames, on pieces (n,) that bound them.
+
+    ``off`` (n,) is how far beyond the piece each lies, ``width`` (n,) the room between its two rays, both across the
+    piece; ``normal`` (n, 3) the piece's.
+    """
+
+    piece: Ints
+    scan: Ints
+    points: Floats
+    off: Floats
+    width: Floats
+    normal: Floats
+
+
+def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Matches:
+    """Find the pieces that bound ends of faces.
 
     A piece bounds an end where it looks away from the end's scanner, stands across, and passes within ``gate_mm`` of
     where the two rays leave room.
     """
-    if not blocks.pieces:
-        return blocks
     world = octree.moved(blocks.sums, T[blocks.scan])
     planes = octree.planes_of(octree.summed(world, blocks.piece, blocks.pieces))
     # A piece looks at the scanners that saw it; all of a piece see the same side.
@@ -35,7 +60,7 @@ def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> B
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
     normal = planes.normal * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     half = REACH * np.sqrt(planes.variance[:, 1:]) + 2.0 * clouds[0].cell_mm
-    added: list[tuple[Floats, Floats, Floats, Floats]] = []
+    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats]] = []
     for s, cloud in enumerate(clouds):
         if not len(cloud.ends.points) or not np.isfinite(T[s]).all():
             continue
@@ -65,23 +90,84 @@ def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> B
         cost = np.where(fits, np.abs(off), np.inf)
         best = np.argmin(cost, axis=1)
         rows = np.flatnonzero(np.isfinite(cost[np.arange(len(cost)), best]))
-        if not len(rows):
-            continue
-        piece, wide = q[rows, best[rows]], width[rows, best[rows]]
-        weight = 1.0 / (wide**2 / 12.0 + LEAST_MM**2)
-        own, inverse = np.unique(piece, return_inverse=True)
-        inverse = inverse.ravel()
-        sums = octree.summed(octree.sums_of(cloud.ends.points[rows]) * weight[:, None], inverse, len(own))
-        added.append((own, np.full(len(own), s), sums, np.bincount(inverse).astype(float)))
-    if not added:
+        piece = q[rows, best[rows]]
+        found.append(
+            (piece, np.full(len(rows), s), cloud.ends.points[rows], off[rows, best[rows]], width[rows, best[rows]],
+             normal[piece])
+        )  # fmt: skip
+    if not found:
+        none = np.empty(0, np.int64)
+        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)))
+    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(6)))  # type: ignore[arg-type]
+
+
+def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
+    """Add the ends of faces to the pieces that bound them, as blocks of kind 1; see :func:`matched`."""
+    if not blocks.pieces:
         return blocks
-    piece = np.concatenate([blocks.piece, *(one[0] for one in added)])
+    ends = matched(clouds, blocks, T, gate_mm)
+    if not len(ends.piece):
+        return blocks
+    weight = 1.0 / (ends.width**2 / 12.0 + LEAST_MM**2)
+    key, inverse = np.unique(ends.piece * len(T) + ends.scan, return_inverse=True)
+    inverse = inverse.ravel()
+    sums = octree.summed(octree.sums_of(ends.points) * weight[:, None], inverse, len(key))
+    piece = np.concatenate([blocks.piece, key // len(T)])
     order = np.argsort(piece, kind="stable")
     return Blocks(
         piece[order],
-        np.concatenate([blocks.scan, *(one[1] for one in added)])[order],
-        np.vstack([blocks.sums, *(one[2] for one in added)])[order],
-        np.concatenate([blocks.count, *(one[3] for one in added)])[order],
-        np.concatenate([blocks.kind, np.ones(len(piece) - len(blocks.piece), np.int64)])[order],
+        np.concatenate([blocks.scan, key % len(T)])[order],
+        np.vstack([blocks.sums, sums])[order],
+        np.concatenate([blocks.count, np.bincount(inverse).astype(float)])[order],
+        np.concatenate([blocks.kind, np.ones(len(key), np.int64)])[order],
         blocks.pieces,
     )
+
+
+def settled(clouds: list[Cloud], blocks: Blocks, faces: Solution, reach_mm: float) -> Floats:
+    """Move poses along what faces alone do not tell, to where most ends agree; returns T (k, 4, 4).
+
+    ``faces`` is an adjustment without ends. Along each of its loose motions all shifts up to ``reach_mm`` are tried:
+    the right one has every true end between its two rays, while ends that are matched wrongly agree on nothing.
+    """
+    T = faces.T.copy()
+    k = len(T)
+    scale = np.tile([LEVER_MM] * 3 + [1.0] * 3, k)
+    known = np.isfinite(faces.covariance).all(axis=1)
+    C = np.where(known[:, None] & known[None], faces.covariance, 0.0) * scale[:, None] * scale[None]
+    value, vector = np.linalg.eigh(C)
+    loose = [m for m in range(6 * k - 1, -1, -1) if value[m] > LOOSE_MM**2][:MOST_LOOSE]
+    first = np.full(blocks.pieces, -1, np.int64)
+    heaviest = np.argsort(blocks.sums[:, 9], kind="stable")
+    first[blocks.piece[heaviest]] = blocks.scan[heaviest]  # the last written counts: the heaviest
+    for m in loose:
+        ends = matched(clouds, blocks, T, reach_mm)
+        if not len(ends.piece):
+            return T
+        motion = (vector[:, m] / scale).reshape(k, 6)
+        largest = np.abs(vector[:, m].reshape(k, 6)[:, 3:]).max()
+        if largest < 1e-6:
+            continue
+        motion = motion / largest  # mm of the scan that moves most
+        at = np.einsum("nij,nj->ni", T[ends.scan, :3, :3], ends.points) + T[ends.scan, :3, 3]
+        rate = np.einsum(
+            "ni,ni->n", ends.normal, _moved(motion, T, ends.scan, at) - _moved(motion, T, first[ends.piece], at)
+        )
+        tell = np.abs(rate) > 0.1
+        if tell.sum() < NEIGHBOURS:
+            continue
+        off, rate, room = ends.off[tell], rate[tell], 0.5 * ends.width[tell] + SLACK_MM
+        shifts = np.arange(-reach_mm, reach_mm + SHIFT_STEP_MM, SHIFT_STEP_MM)
+        held = np.array([((np.abs(off + rate * shift) < room) / room).sum() for shift in shifts])
+        good = np.flatnonzero(held > 0.98 * held.max())
+        step = float(shifts[good].mean()) if np.ptp(good) < len(shifts) // 10 else float(shifts[np.argmax(held)])
+        for s in range(k):
+            T[s, :3, :3] = rigid.rotation_from_vector(step * motion[s, :3]) @ T[s, :3, :3]
+            T[s, :3, 3] += step * motion[s, 3:]
+    return T
+
+
+def _moved(motion: Floats, T: Floats, scan: Ints, at: Floats) -> Floats:
+    """Return how points ``at`` (n, 3) of scans (n,) move with a motion (k, 6) of the scans about their own origins."""
+    found: Floats = np.cross(motion[scan, :3], at - T[scan, :3, 3]) + motion[scan, 3:]
+    return found
