@@ -21,6 +21,7 @@ MOST_BLOCKS = 3000
 FEWEST_BLOCKS = 24
 FINER = 3  # times smaller blocks for the last fit
 FLOOR_MM = 0.02
+JUMP_CELLS = 1.5
 LEAST_Z = 4.5  # of a shape: what stations share is known from few of them
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
 NORMAL_95 = 1.959964
@@ -115,6 +116,20 @@ def values(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int,
     return found
 
 
+def jumps(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int, list[shapes.Shape]]) -> Ints:
+    """Return the cells that a step runs through: their means are of both of its sides."""
+    found = [np.empty(0, np.int64)]
+    component = component_of_cells(surface)
+    for one in shaped:
+        for shape in kept.get(one.component, ()):
+            if shape.kind == "step":
+                axis = int(shape.at[0])
+                rows = np.flatnonzero(component == one.component)
+                along = one.frame.local(surface.centres[rows])[:, axis] - shape.at[1] * one.frame.half[axis]
+                found.append(rows[np.abs(along) <= JUMP_CELLS * surface.charts.cell_mm])
+    return np.concatenate(found)
+
+
 @dataclass(frozen=True)
 class Judged:
     """A shape that is more than chance: its largest value (mm, signed, outward) and the 95 % interval."""
@@ -177,7 +192,9 @@ def significant(
         rows = rows[surface.share[rows] > 0.5]
         area = float(surface.share[rows].sum()) * surface.charts.cell_mm**2
         threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shapes.BASES)))))
-        inflation = float(levels.inflation[-1])
+        # Of blocks: what larger places share beyond that stands beside it.
+        size = int(np.searchsorted(levels.sides, one.blocks.side_mm / surface.charts.cell_mm))
+        inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
         points, outward = with_corners(surface, rows)
         registration = alignment.sd(points, outward)
         for k, shape in real:

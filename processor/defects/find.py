@@ -72,7 +72,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     judged = components.significant(shaped, whole, field, fitted, levels, alarms)
     kept = {number: [one.shape for one in own] for number, own in judged.items()}
     shape_values = components.values(whole, shaped, kept)
-    left = field.less(shape_values)
+    left = field.less(shape_values).without(components.jumps(whole, shaped, kept))
     finding = scan_statistic.search(left, whole, levels)
     hoped = absence.expected(scene, T, pairs, whole, stations)
     places = regions.united(
