@@ -21,6 +21,7 @@ MOST_BLOCKS = 3000
 FEWEST_BLOCKS = 24
 FINER = 3  # times smaller blocks for the last fit
 FLOOR_MM = 0.02
+APART_GAIN = 100.0  # of chi-square
 JUMP_CELLS = 1.5
 LEAST_Z = 4.5  # of a shape: what stations share is known from few of them
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
@@ -91,6 +92,11 @@ def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[
                 fitted = shapes.refitted(fitted, _unmasked(fitted, blocks, field, surface, own, side), frame)
             found.append(ComponentShape(number, frame, blocks, fitted))
     return found
+
+
+def shaped_ones(shaped: list[ComponentShape]) -> frozenset[int]:
+    """Return the components that have a shape of their own beyond doubt, as far as the whole's place is known."""
+    return frozenset(one.component for one in shaped if any(gain > APART_GAIN for gain in one.fitted.gain))
 
 
 def _unmasked(
