@@ -10,6 +10,7 @@ from pathlib import Path
 import click
 
 from designgen import __version__, designs
+from processor.progress import stage
 
 DONE, IN_PART, ALL_FAILED = 0, 1, 2
 FORMATS = ("ply", "las", "laz", "e57", "ptx", "pcd", "xyz")
@@ -84,7 +85,8 @@ def make(
             json.dumps(said) if as_json else "{index}: {done} of {scenes} scene(s), {made} made now".format(**said)
         )
         context.exit(DONE if not said["failed"] else IN_PART if said["done"] else ALL_FAILED)
-    used, scans, points = batch.make_scene(output, name, loaded, seed)
+    with stage(f"making {name}"):
+        used, scans, points = batch.make_scene(output, name, loaded, seed)
     if as_json:
         click.echo(json.dumps({"scene": str(output), "recipe": name, "seed": used, "scans": scans, "points": points}))
     else:
@@ -107,15 +109,16 @@ def export(
 
     if spherical and format_ != "e57":
         raise click.UsageError("--spherical is for --format e57")
-    written = scan_folder.export(
-        scene,
-        output,
-        format_,
-        with_truth=not without_truth,
-        spherical=spherical,
-        step=step,
-        with_meshes=not without_meshes,
-    )
+    with stage(f"writing {output.name}"):
+        written = scan_folder.export(
+            scene,
+            output,
+            format_,
+            with_truth=not without_truth,
+            spherical=spherical,
+            step=step,
+            with_meshes=not without_meshes,
+        )
     for name in written.left_out:
         click.echo(f"{output}: scan {name!r} is left out: it saw next to nothing", err=True)
     click.echo(f"{output}: {written.scans} scan(s) as {format_}")

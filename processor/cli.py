@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from processor import __version__
+from processor import __version__, cli_folders
+from processor.cli_shared import DONE, IN_PART, LIMIT_MISSED, UNITS, named, say
 from processor.model import InputError, Metric
+from processor.progress import stage
 
 if TYPE_CHECKING:
     from processor.evaluate import ErrorReport
     from processor.pipeline import Execution
-
-DONE, IN_PART, LIMIT_MISSED = 0, 1, 4
-UNITS = ("m", "mm", "cm", "inch", "ft")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -28,23 +27,19 @@ def commands() -> None:
     """
 
 
-def say(line: str) -> None:
-    """Write one line on standard error, whatever control characters a name in it holds."""
-    click.echo("".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in line), err=True)
-
-
-def _named(_: click.Context, __: click.Parameter, value: str | None) -> tuple[str, ...]:
-    return tuple(name.strip() for name in value.split(",") if name.strip()) if value else ()
+commands.add_command(cli_folders.batch)
+commands.add_command(cli_folders.init)
 
 
 @commands.command()
 @click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of the results")
-@click.option("--steps", callback=_named, metavar="A,B", help="instead of those of the input's kind")
-@click.option("--method", "methods", callback=_named, metavar="NAME[,NAME]", help="further ones are run for comparison")
+@click.option("--steps", callback=named, metavar="A,B", help="instead of those of the input's kind")
+@click.option("--method", "methods", callback=named, metavar="NAME[,NAME]", help="further ones are run for comparison")
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
 @click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
 @click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
@@ -57,10 +52,11 @@ def run(
     params: Path | None,
     units: str | None,
     seed: int | None,
+    lang: str,
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
-    from processor import pipeline
+    from processor import inputs, pipeline
     from processor.evaluate import evaluate
     from processor.report import writing
 
@@ -70,8 +66,10 @@ def run(
     parameters = pipeline.read_params(params)
     if steps:
         pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
+    before = inputs.signature(input_.resolve(), output.resolve())
     piecewise = pipeline.is_large(input_)
-    scene = pipeline.read(input_, units, piecewise)
+    with stage(f"reading {input_.name}"):
+        scene = pipeline.read(input_, units, piecewise)
     jobs = pipeline.plan(steps or pipeline.steps_for(scene), methods, parameters, seed)
     if piecewise and not pipeline.streams(jobs):
         piecewise = False
@@ -79,7 +77,9 @@ def run(
     say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
     execution = pipeline.execute(input_, scene, jobs, say, piecewise)
     report = evaluate(input_, execution)
-    writing.write(output, execution, report)
+    inputs.check_unchanged(input_.resolve(), before, output.resolve())
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, report, lang)
     _show(context, output, execution, report, as_json)
 
 
@@ -151,9 +151,10 @@ def compare(
 @click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
 @click.option("--units", type=click.Choice(UNITS), help="as given to the run")
+@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.pass_context
-def report(context: click.Context, output: Path, input_: Path, units: str | None, as_json: bool) -> None:
+def report(context: click.Context, output: Path, input_: Path, units: str | None, lang: str, as_json: bool) -> None:
     """Check and report again what is in OUT, without running its steps on INPUT anew."""
     from processor import pipeline
     from processor.evaluate import evaluate
@@ -162,7 +163,8 @@ def report(context: click.Context, output: Path, input_: Path, units: str | None
     writing.check_output(output, input_)
     execution = pipeline.read_execution(output / writing.RUNS, input_, units)
     found = evaluate(input_, execution)
-    writing.write(output, execution, found)
+    with stage("drawing and writing the report"):
+        writing.write(output, execution, found, lang)
     _show(context, output, execution, found, as_json)
 
 
@@ -202,3 +204,45 @@ def _read_results(output: Path) -> dict[str, Any]:
     if found.get("format") != "processor-results" or not isinstance(found.get("checks"), list):
         raise InputError(f"{path}: expected results of processor, found something else")
     return found
+
+
+@commands.command()
+@click.argument("matrix", metavar="[MATRIX.toml]", required=False, type=click.Path(path_type=Path, dir_okay=False))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of all nights")
+@click.option("--jobs", type=click.IntRange(min=1), help="cells at a time  [default: 1]")
+@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers do them, e.g. tcp://10.0.0.1:8786")
+@click.option("--full", is_flag=True, help="the cells that are marked full as well")
+@click.option("--history", type=click.Path(path_type=Path, dir_okay=False), help="[default: history.sqlite in OUT]")
+@click.option("--night", metavar="YYYY-MM-DD", help="whose seeds are used  [default: today, UTC]")
+@click.option("--again", is_flag=True, help="do all of a night again that other software began")
+@click.option("--accept", is_flag=True, help="do nothing but accept what got worse in the night as the new level")
+@click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
+@click.pass_context
+def validate(
+    context: click.Context,
+    matrix: Path | None,
+    output: Path,
+    jobs: int | None,
+    cluster: str | None,
+    full: bool,
+    history: Path | None,
+    night: str | None,
+    again: bool,
+    accept: bool,
+    as_json: bool,
+) -> None:
+    """Make, run and check a matrix of scenes, and say what changed since the nights before.
+
+    Without MATRIX.toml the default one, which covers every step. Run again, it goes on where it was.
+    Exit codes: 0 done, 1 some cells failed, 4 a limit was missed or a figure got worse.
+    """
+    from processor.validation import command
+
+    if jobs is not None and cluster is not None:
+        raise click.UsageError("--jobs and --cluster exclude each other: a cluster has as many processes as workers")
+    if accept:
+        click.echo(command.accept(output, history, night))
+        return
+    told = command.run(matrix, output, jobs or 1, cluster, full, history, night, again)
+    click.echo(json.dumps(told.as_object(), ensure_ascii=False) if as_json else told.line)
+    context.exit(LIMIT_MISSED if not told.passed else IN_PART if told.failed else DONE)

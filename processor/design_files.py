@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from processor import cad
 from processor.fields import Table, inside
 from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints
 from processor.preassembly import surrogate
@@ -20,7 +21,6 @@ from processor.readers.raw import decoded, parsing
 from processor.units import MM_PER_UNIT, SYNONYMS
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj")
-CAD_SUFFIXES = (".step", ".stp", ".ifc")
 TEXT_LIMIT = 256 * 2**20
 
 
@@ -32,8 +32,11 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
     suffix = path.suffix.lower()
     if suffix == ".csv":
         return _read_balls(path, table_unit)
-    if suffix in CAD_SUFFIXES:
-        raise InputError(f"{path}: turn a {suffix[1:].upper()} design into meshes first: designgen import {path.name}")
+    if suffix in (*cad.SUFFIXES, *MESH_SUFFIXES):
+        raise InputError(
+            f"{path}: a {suffix[1:].upper()} file alone is a design of kind structure; an arch bridge or a space frame "
+            "needs a design.json (its components may name such files as 'mesh')"
+        )
     if suffix != ".json":
         raise InputError(f"{path}: expected a design as .json or .csv, found {suffix or 'no suffix'}")
     design = read_json(path)
@@ -92,7 +95,9 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
             f"{design.where}: expected one joint for each two neighbours in 'order' (left, right); see {wrong}"
         )
     at = [None, *(joints[sides][1] for sides in expected), None]
-    parts = tuple(_part(folder, name, components.table(name), scale, at[i : i + 2]) for i, name in enumerate(order))
+    parts = tuple(
+        _part(folder, name, components.table(name), design.unit("units"), at[i : i + 2]) for i, name in enumerate(order)
+    )
     return ArchDesign(
         parts,
         tuple(joints[sides][0] for sides in expected),
@@ -102,8 +107,9 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
     )
 
 
-def _part(folder: Path, name: str, part: Table, scale: float, joints: Sequence[Floats | None]) -> DesignPart:
+def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floats | None]) -> DesignPart:
     """Read a component between its joints' key points (8, 3, mm); without a mesh it gets one from what is known."""
+    scale = MM_PER_UNIT[unit]
     part.only(("mesh", "bottom_edge_left", "bottom_edge_right", "plate_mm"))
     edges = [part.array(f"bottom_edge_{side}", -1, 3) * scale for side in ("left", "right")]
     for side, edge in zip(("left", "right"), edges, strict=True):
@@ -111,8 +117,8 @@ def _part(folder: Path, name: str, part: Table, scale: float, joints: Sequence[F
             raise InputError(f"{part.where}: bottom_edge_{side} needs two points or more, none of them twice in a row")
     plate_mm = part.number("plate_mm", surrogate.PLATE_MM, positive=True)
     if "mesh" in part.values:
-        vertices, faces = read_mesh(inside(folder, part.text("mesh"), part.where))
-        return DesignPart(name, vertices * scale, faces, edges[0], edges[1])
+        vertices, faces = read_surface(inside(folder, part.text("mesh"), part.where), unit)
+        return DesignPart(name, vertices, faces, edges[0], edges[1])
     try:
         vertices, faces = surrogate.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
     except InputError as error:
@@ -195,13 +201,20 @@ def _read_balls(path: Path, table_unit: str) -> FrameDesign:
     return FrameDesign(np.array(ids, np.int64), table[:, :3], table[:, 3])
 
 
+def read_surface(path: Path, unit: str) -> tuple[Floats, Ints]:
+    """Vertices (v, 3) in mm and triangles (f, 3) of a mesh in ``unit``, or of a CAD file with a unit of its own."""
+    if path.suffix.lower() in cad.SUFFIXES:
+        return cad.read(path, unit)
+    vertices, faces = read_mesh(path)
+    return vertices * MM_PER_UNIT[unit], faces
+
+
 def read_mesh(path: Path) -> tuple[Floats, Ints]:
     """Vertices (v, 3) in the file's unit and triangles (f, 3) of a PLY, STL or OBJ file."""
     suffix = path.suffix.lower()
-    if suffix in CAD_SUFFIXES:
-        raise InputError(f"{path}: turn a {suffix[1:].upper()} file into a mesh first: designgen import {path.name}")
     if suffix not in MESH_SUFFIXES:
-        raise InputError(f"{path}: expected a mesh ({', '.join(MESH_SUFFIXES)}), found {suffix or 'no suffix'}")
+        known = ", ".join((*MESH_SUFFIXES, *cad.SUFFIXES))
+        raise InputError(f"{path}: expected a mesh or CAD file ({known}), found {suffix or 'no suffix'}")
     vertices, faces = _read_ply_mesh(path) if suffix == ".ply" else _read_other_mesh(path, suffix)
     if not len(vertices) or not len(faces):
         raise InputError(f"{path}: expected a mesh with faces, found {len(vertices)} vertices and {len(faces)} faces")

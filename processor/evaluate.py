@@ -40,7 +40,7 @@ def evaluate(path: Path, execution: Execution) -> ErrorReport:
     that cannot be read, or is that of another scene.
     """
     source = folder.truth_file(path)
-    truth = None if source is None else store.read_truth(source)
+    truth = None if source is None else store.read_truth(source, labels=execution.stored is None)
     if source is None or truth is None:
         return ErrorReport()
     modules = pipeline.step_modules()

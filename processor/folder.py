@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import sys
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from processor import readers, store
-from processor.design_files import read_design, read_json, read_mesh
+from processor import cad, readers, store
+from processor.control_files import CONTROL, Measured, control_points, read_control
+from processor.design_files import MESH_SUFFIXES, read_design, read_json, read_surface
 from processor.fields import Table, inside
 from processor.model import (
     KINDS,
@@ -25,9 +27,11 @@ from processor.model import (
     StructureDesign,
     Tolerance,
 )
+from processor.picks_file import PICKS, read_picks
 from processor.preassembly import tolerance
+from processor.progress import tracked
 from processor.readers import RawScan
-from processor.readers.raw import decoded
+from processor.readers.raw import decoded, stem, text_of, used_up
 from processor.units import MM_PER_UNIT, known_unit
 
 if sys.version_info >= (3, 11):
@@ -39,14 +43,18 @@ PROJECT = "project.toml"
 TRUTH = "truth.h5"
 STATIONS = "stations.json"
 DESIGNS = ("design.json", "design.csv")
-NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv")
-KEYS = ("name", "kind", "units", "design", "temperature_C", "scan", "tolerance")
+NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL)
+KEYS = ("name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control")
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
+FLOAT_STEP_MM = 1.0
 
 # How much larger than the design a scan comes out when a unit is mistaken for another one.
-UNIT_SLIPS: tuple[float, ...] = (1000.0, 304.8, 100.0, 25.4, 10.0, 0.1, 1 / 25.4, 0.01, 1 / 304.8, 0.001)
-CLEAR_UNIT_SLIPS: tuple[float, ...] = (1000.0, 304.8, 25.4, 1 / 304.8, 0.001)
+UNIT_SLIPS: tuple[float, ...] = (
+    1000.0, 304.8, 100.0, 1 / 0.0254, 25.4, 10.0, 1 / 0.3048, 0.1, 1 / 25.4, 0.0254, 0.01, 1 / 304.8, 0.001,
+)  # fmt: skip
+FRAME_SLIPS: tuple[float, ...] = (1000.0, 304.8, 25.4, 1 / 304.8, 0.001)
+CLEAREST_SLIPS: tuple[float, ...] = (1000.0, 304.8, 1 / 304.8, 0.001)
 SLIP_TOLERANCE = 0.25
 
 
@@ -68,9 +76,11 @@ class _Project:
     kind: str
     units: str
     design: Path | None
+    design_units: str
     temperature_C: float
     entries: tuple[_Entry, ...]
     tolerance: Tolerance | None = None
+    control: tuple[Measured, ...] = ()
 
 
 def truth_file(path: Path) -> Path | None:
@@ -95,18 +105,29 @@ def read_input(path: Path, units: str | None = None) -> Scene:
         return _read_folder(path, asked)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return _scene(_Project(path.stem, "", "", None, float("nan"), (_Entry(path),)), None, asked)
+    return _scene(_Project(stem(path), "", "", None, "", float("nan"), (_Entry(path),)), None, asked)
 
 
 def _read_folder(folder: Path, asked: str) -> Scene:
     project = _read_project(folder)
     design: ArchDesign | FrameDesign | StructureDesign | None = None
-    if project.design is not None and project.kind == "structure":
-        vertices, faces = read_mesh(project.design)
-        design = StructureDesign(project.design.stem, vertices * MM_PER_UNIT[project.units or asked or "m"], faces)
-    elif project.design is not None:
-        design = read_design(folder, project.design, asked or project.units or "m")
-    return _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+    if project.design is not None:
+        unit = project.design_units or project.units or asked or "m"
+        surface = project.design.suffix.lower() in (*MESH_SUFFIXES, *cad.SUFFIXES)
+        if surface and project.kind in ("", "structure"):
+            design = StructureDesign(stem(project.design), *read_surface(project.design, unit))
+        else:
+            design = read_design(folder, project.design, project.design_units or asked or project.units or "m")
+    scene = _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+    if not (folder / PICKS).exists():
+        return scene
+    # Picks are in their scans' own units; where formats differ in these, --units says what all are in.
+    unit = scene.units if scene.units in MM_PER_UNIT else ""
+    if not unit:
+        raise InputError(f"{folder / PICKS}: the scans are in {scene.units}; say one unit for all by --units")
+    inside(folder, PICKS, str(folder))
+    picks = read_picks(folder / PICKS, scene.scans, unit)
+    return dataclasses.replace(scene, picks=picks)
 
 
 def _places(folder: Path, unit: str) -> Stations | None:
@@ -142,14 +163,17 @@ def _read_project(folder: Path) -> _Project:
     named = table.text("design", "") or next((name for name in DESIGNS if (folder / name).exists()), "")
     design = inside(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
+    control, apart = read_control(folder, table)
     return _Project(
-        table.text("name", folder.resolve().name),
+        table.text("name", text_of(folder.resolve().name)),
         kind,
         table.unit("units", ""),
         design,
+        table.unit("design_units", ""),
         table.number("temperature_C", float("nan")),
-        tuple(entries or [_Entry(found) for found in _found(folder, design)]),
+        tuple(entries or [_Entry(found) for found in _found(folder, {design, apart})]),
         _tolerance(table),
+        control,
     )
 
 
@@ -195,18 +219,36 @@ def _entry(folder: Path, scan: Table) -> _Entry:
     )
 
 
-def _found(folder: Path, design: Path | None) -> list[Path]:
-    found = []
+def _found(folder: Path, others: Collection[Path | None]) -> list[Path]:
+    """Find the scans of a folder: all files of their formats but those of a name, and ``others``."""
+    found, closed = list[Path](), list[Path]()
     for place in (folder, folder / "scans"):
         for path in sorted(place.iterdir()) if place.is_dir() else []:
-            scan = path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS and path != design
+            scan = path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS and path not in others
             if ((scan and path.is_file()) or readers.is_closed(path)) and not path.name.startswith("."):
-                found.append(inside(folder, str(path.relative_to(folder)), str(folder)))
+                inside(folder, str(path.relative_to(folder)), str(folder))
+                (closed if readers.is_closed(path) else found).append(path)
+    # A scanner's own files often lie beside what was exported from them.
+    exported = {path.stem for path in found}
+    left = [path for path in closed if path.stem not in exported]
+    if left and not found:
+        readers.read(left[0])
+    if left:
+        raise InputError(
+            f"{left[0]}: is in a closed format, and no other file here has its name; export it to E57 under that name, "
+            f"or say in {PROJECT} by [[scan]] which files are to be read"
+        )
     if not found:
         raise InputError(
-            f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in scans/, found none"
+            f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in scans/, "
+            f"found none{_packed(folder)}"
         )
     return found
+
+
+def _packed(folder: Path) -> str:
+    packed = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in readers.ARCHIVES]
+    return f"; unpack {packed[0]} first" if packed else ""
 
 
 def _scene(
@@ -222,8 +264,9 @@ def _scene(
         raise InputError(f"{project.design}: the design is of kind {kind}, but {PROJECT} says {project.kind}")
     parts = {part.name for part in arch.parts} if arch else set()
     scans: list[Scan] = []
+    units: list[str] = []
     reasons: dict[str, str] = {}
-    for entry in project.entries:
+    for entry in tracked(project.entries):
         if entry.component and parts and entry.component not in parts:
             raise InputError(
                 f"{entry.path}: the design has no component {entry.component!r}; it has {', '.join(sorted(parts))}"
@@ -231,28 +274,33 @@ def _scene(
         raws = readers.read(entry.path)
         if len(raws) > 1 and (entry.pose is not None or entry.position is not None):
             raise InputError(f"{entry.path}: holds {len(raws)} scans, so one 'pose' or 'position' does not fit them")
-        for number, raw in enumerate(raws, 1):
-            if len(raws) > 1 and any(raw.name == other.name for other in scans):  # scanners call each file's first S1
-                raw = dataclasses.replace(raw, name=f"{entry.path.stem}-{number}")
+        several = len(raws) > 1
+        for number in range(1, len(raws) + 1):
+            raw = raws.pop(0)
+            if several and any(raw.name == other.name for other in scans):  # scanners call each file's first S1
+                raw = dataclasses.replace(raw, name=f"{stem(entry.path)}-{number}")
             unit, reason = _unit(raw, entry.path, project, asked)
             reasons.setdefault(unit, reason)
             scan = _scan(raw, entry, unit, parts, places)
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
-            _check_size(entry.path, scan, unit, reason, arch, frame)
+            _check_size(entry.path, scan, unit, reason, design)
             scans.append(scan)
+            units.append(unit)
+    where = places or _stations(scans)
     return Scene(
         project.name,
         kind,
         tuple(scans),
         arch,
         frame,
-        places or _stations(scans),
+        where,
         project.temperature_C,
         ", ".join(reasons),
         "; ".join(dict.fromkeys(reasons.values())),
         design if isinstance(design, StructureDesign) else None,
         project.tolerance,
+        control_points(project.control, scans, units, where, project.units or asked or "m"),
     )
 
 
@@ -272,6 +320,12 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], places: Stati
             f"{entry.path}: scan {raw.name!r} has {len(raw.points)} points; expected {FEWEST_POINTS} or more"
         )
     scale = MM_PER_UNIT[unit]
+    if raw.step * scale > FLOAT_STEP_MM:
+        raise InputError(
+            f"{entry.path}: scan {raw.name!r} has its coordinates in 32 bits, which so far from their origin hold "
+            f"steps of {raw.step * scale:.3g} mm; export it in double precision, or nearer to its origin"
+        )
+    origin = raw.origin * scale
     pose = np.array(raw.T_project_scan if entry.pose is None else entry.pose)
     if pose.size:
         pose[:3, 3] *= scale
@@ -284,8 +338,8 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], places: Stati
         )
     return Scan(
         raw.name,
-        raw.points * scale,
-        raw.origin * scale,
+        used_up(raw, scale),
+        origin,
         raw.intensity,
         station.astype(np.int32),
         component=entry.component or (raw.name if raw.name in parts else ""),
@@ -307,19 +361,22 @@ def _stations(scans: list[Scan]) -> Stations | None:
 
 
 def _check_size(
-    path: Path, scan: Scan, unit: str, reason: str, arch: ArchDesign | None, frame: FrameDesign | None
+    path: Path, scan: Scan, unit: str, reason: str, design: ArchDesign | FrameDesign | StructureDesign | None
 ) -> None:
     """Raise InputError where a scan is larger or smaller than its design by what a mistaken unit would make it.
 
-    Sizes are distances from the middle, which hardly change when a part is turned. Of a space frame often a piece is
-    scanned, and within a hall, so only the clear cases count there.
+    Sizes are distances from the middle, which hardly change when a part is turned. Of frames and whole structures often
+    a piece is scanned, and within a hall, so only the clear cases count there.
     """
-    part = next((one for one in arch.parts if one.name == scan.component), None) if arch else None
-    if part is not None:
-        nominal, slips = part.vertices, UNIT_SLIPS
-    elif frame is not None and len(frame.centres) > 2:
-        nominal, slips = frame.centres, CLEAR_UNIT_SLIPS
+    slips = CLEAREST_SLIPS
+    if isinstance(design, ArchDesign):
+        part = next((one for one in design.parts if one.name == scan.component), None)
+        nominal, slips = part.vertices if part else np.empty((0, 3)), UNIT_SLIPS
+    elif isinstance(design, FrameDesign):
+        nominal, slips = design.centres if len(design.centres) > 2 else np.empty((0, 3)), FRAME_SLIPS
     else:
+        nominal = design.vertices if design else np.empty((0, 3))
+    if not len(nominal):
         return
     middle = (nominal.min(axis=0) + nominal.max(axis=0)) / 2.0
     size = float(np.linalg.norm(nominal - middle, axis=1).max())
@@ -327,9 +384,11 @@ def _check_size(
     centre = np.quantile(points, [0.01, 0.99], axis=0).mean(axis=0)
     ratio = float(np.quantile(np.linalg.norm(points - centre, axis=1), 0.99)) / size if size > 0 else 1.0
     slip = next((one for one in slips if abs(ratio / one - 1.0) <= SLIP_TOLERANCE), None)
-    if slip is not None:
-        raise InputError(
-            f"{path}: scan {scan.name!r} is {ratio:.4g} times as large as the design, close to {slip:.4g}: its unit "
-            f"was read as {unit} ({reason}), and that seems wrong; say which it is by --units or in {PROJECT}, "
-            "or correct the design's units"
-        )
+    if slip is None:
+        return
+    likely = [name for name, mm in MM_PER_UNIT.items() if abs(MM_PER_UNIT[unit] / mm / slip - 1.0) < 0.01]
+    raise InputError(
+        f"{path}: scan {scan.name!r} is {ratio:.4g} times as large as the design, close to {slip:.4g}: its unit "
+        f"was read as {unit} ({reason}), and that seems wrong{f' (is it {likely[0]}?)' if likely else ''}; "
+        f"say which it is by --units or in {PROJECT}, or correct the design's units"
+    )

@@ -36,9 +36,7 @@ def read(path: Path, core: Floats, origin: Floats, tolerance: float) -> Floats:
         off = np.linalg.norm(places - origin - core, axis=1)
         if len(off) and not off.max() <= tolerance:
             row = int(np.argmax(np.where(np.isfinite(off), off, np.inf)))
-            raise InputError(
-                f"{path}: row {row + 1} is of another place than core point {row + 1}; give the same order"
-            )
+            raise InputError(f"{path}: row {row + 1} lies elsewhere than that core point; expected the same order")
     length = np.linalg.norm(found, axis=1)
     bad = np.flatnonzero(~(length > 0.0) & ~np.isnan(length) | np.isinf(length))
     if len(bad):
@@ -58,8 +56,7 @@ def _of_ply(path: Path) -> tuple[Floats | None, Floats]:
 
 def _of_text(path: Path) -> tuple[Floats | None, Floats]:
     layout = text.sniff(path)
-    with parsing(path, "text"):
-        data = text.rows(path, layout, list(range(layout.columns)))
+    data = text.numbers(path, layout)
     names = [name.strip("\"' ") for name in layout.header]
     if len(names) == layout.columns and any(first_named(names, one) for one in NAMES):
         return _picked(path, names, lambda name: data[:, names.index(name)])

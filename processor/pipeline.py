@@ -20,6 +20,7 @@ from typing import Any
 
 from processor import __version__, steps
 from processor.model import InputError, Scene, StepRun, UsageError
+from processor.progress import stage
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -46,6 +47,7 @@ class Execution:
     scene: Scene
     runs: tuple[StepRun, ...]  # the answer of each step first, then other methods for comparison
     provenance: dict[str, Any]
+    stored: Path | None = None  # the scene's file, where its points are still in it
 
 
 def step_modules() -> dict[str, ModuleType]:
@@ -220,13 +222,14 @@ def execute(
         "software": software(),
         "parameters": _parameters(runs),
     }
-    return Execution(scene, tuple(runs), provenance)
+    return Execution(scene, tuple(runs), provenance, path if piecewise else None)
 
 
 def _run(path: Path, scene: Scene, job: Job, given: Mapping[str, Any], log: Callable[[str], None]) -> StepRun:
     started = time.monotonic()
     try:
-        result = job.module.run(scene, job.params, **given)
+        with stage(f"{job.step} ({job.params.method})"):
+            result = job.module.run(scene, job.params, **given)
     except (InputError, UsageError):
         raise
     except Exception as error:
@@ -259,7 +262,7 @@ def read_execution(results: Path, path: Path, units: str | None) -> Execution:
         digest = store.scene_hash(scene, None if points is None else points.pieces)
     if digest != provenance["input_sha256"]:
         raise InputError(f"{results}: was made from {provenance['input']!r} as it was then, not from {path} as it is")
-    return Execution(scene, runs, provenance)
+    return Execution(scene, runs, provenance, path if piecewise else None)
 
 
 def software() -> dict[str, str]:

@@ -14,6 +14,7 @@ import dataclasses
 import hashlib
 import json
 import os
+import re
 import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -28,12 +29,14 @@ from processor.codec import DecodeError
 from processor.model import Floats, InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.2"
+FORMAT_VERSION = "1.3"
+READABLE = ("1.2", FORMAT_VERSION)  # of scenes and truths: what is newer in a record may be absent there
 HISTORY = [
     "1.0: first",
     "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
     "1.2: bottom edges as built, in the truth of arch bridges; limits that the project names; "
     "what a part's mesh is made from",
+    "1.3: control points",
 ]
 
 # All that HDF5 and h5py raise for a damaged file; none of it names the file or helps its user.
@@ -59,8 +62,13 @@ def replacing(path: Path) -> Iterator[Path]:
         sync(temporary)
         os.replace(temporary, path)
         sync(path.parent)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
+    except (OSError, RuntimeError) as error:
+        # Of a full disk HDF5 says so within a text of its own, and not always as an OSError.
+        said = re.search(r"error message = '([^']*)'", str(error))
+        if isinstance(error, RuntimeError) and not said:
+            raise
+        why = said[1] if said else getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be written ({why})") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -76,13 +84,19 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterator[Any]:
-    with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest") as file:
+    # HDF5 can end the process at once when the disk is full. What is small is made in memory and written as bytes.
+    small = kind != "scene"
+    driver: dict[str, Any] = {"driver": "core", "backing_store": False} if small else {}
+    with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest", **driver) as file:
         header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "units": "mm"}
         header["history"] = json.dumps(HISTORY)
         for name, text in header.items():
             file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
         codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
         yield file
+        if small:
+            file.flush()
+            temporary.write_bytes(file.id.get_file_image())
 
 
 def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mapping[str, object]) -> None:
@@ -163,8 +177,11 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
 def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
     """Open a file of one of ``kinds`` that passes vetting. Raises InputError for any other and for damage."""
     try:
-        with h5py.File(path, "r", locking=False) as file:
-            found = vetting.problems(file, path)
+        with vetting.limited_memory():
+            file = h5py.File(path, "r", locking=False)
+        with file:
+            with vetting.limited_memory():
+                found = vetting.problems(file, path)
             found = found or _header_problems(file, kinds)
             if found:
                 raise DecodeError(found)
@@ -196,8 +213,9 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
     if header["format"] not in wanted:
         return [f"expected format {' or '.join(wanted)}, found {header['format'] or 'none'}"]
     found = []
-    if header["format_version"] != FORMAT_VERSION:
-        found.append(f"expected format_version {FORMAT_VERSION}, found {header['format_version'] or 'none'}")
+    readable = (FORMAT_VERSION,) if header["format"] == FORMATS["results"] else READABLE
+    if header["format_version"] not in readable:
+        found.append(f"expected format_version {' or '.join(readable)}, found {header['format_version'] or 'none'}")
     if header["units"] != "mm":
         found.append(f"expected units mm, found {header['units'] or 'none'}")
     return found
@@ -247,12 +265,15 @@ def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats)
         return scan_tiles.read_box(members[names.index(scan_name)], lower, upper)
 
 
-def read_truth(path: Path) -> Truth | None:
-    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone."""
+def read_truth(path: Path, labels: bool = True) -> Truth | None:
+    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone.
+
+    Without ``labels`` what each point really is stays in the file.
+    """
     with opened(path, ["scene", "truth"]) as file:
         if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
             return None
-        return codec.read_record(_group(file, "truth"), Truth)
+        return codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()})
 
 
 def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:
@@ -354,7 +375,9 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
                 for part in parts:
                     digest.update(np.ascontiguousarray(part, kind).data)
                 continue
-            _feed(digest, field.name, getattr(value, field.name), pieces)
+            item = getattr(value, field.name)
+            if item is not None or not field.metadata.get("newer"):
+                _feed(digest, field.name, item, pieces)
         digest.update(b")")
     elif isinstance(value, tuple):
         digest.update(f"{name}:tuple{len(value)}(".encode())

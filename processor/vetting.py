@@ -8,6 +8,9 @@ hard links to groups and to datasets of numbers or fixed text, stored in the fil
 from __future__ import annotations
 
 import math
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +20,28 @@ GZIP_LIMIT = 1032  # deflate's largest possible expansion
 CHUNK_LIMIT = 64 * 2**20
 ROOM = 1 << 16  # bytes of a size that need no proof
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
+
+
+MEMORY_BYTES = 1 << 30  # for a file's structure
+
+
+@contextmanager
+def limited_memory() -> Iterator[None]:
+    """Let this process take no more than ``MEMORY_BYTES`` beyond what it has: a damaged size may ask for any."""
+    pages = Path("/proc/self/statm")
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if not pages.exists():
+        yield
+        return
+    wanted = int(pages.read_text().split()[0]) * resource.getpagesize() + MEMORY_BYTES
+    low = soft != resource.RLIM_INFINITY and soft < wanted
+    try:
+        if not low:
+            resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))
+        yield
+    finally:
+        if not low:
+            resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
 
 
 def problems(file: Any, path: Path) -> list[str]:

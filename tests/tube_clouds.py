@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.bolt_balls.stations import TubePoints
+from processor.bolt_balls.station_records import TubePoints
 
 
 def turn(w):

@@ -9,13 +9,14 @@ from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.frame import Extracted
 from processor.bolt_balls.params import Params
 from processor.bolt_balls.result import Result
-from processor.bolt_balls.scene_source import PointReader, SceneSource, of_scene
+from processor.bolt_balls.scene_source import PointReader, SceneSource, control_of, of_scene
 from processor.model import Floats, FrameDesign, Ints, Scene
 from processor.preassembly import tolerance
 
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
 NOWHERE = "not in the design"
+UNUSED = "control points were not used: that takes members that meet, scanner positions, and stations that may be moved"
 
 
 def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
@@ -24,7 +25,7 @@ def of_frame(scene: Scene, params: Params, points: PointReader | None = None) ->
     degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
     found = frame.extract(
         source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
-        register_stations=params.register_stations,
+        control_of(scene, source), params.register_stations, params.datum_mm,
     )  # fmt: skip
     return None if found is None else _result(found, source, scene)
 
@@ -55,6 +56,8 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
     tubes, stations = found.tubes, found.stations
     half = 0.5 * tubes.lengths[:, None] * tubes.directions
     said = [*found.said, balls.message]
+    held = stations is not None and stations.control
+    said += [UNUSED] if scene.control is not None and not held else []
     said += [] if matched is None else [matched.message]
     sure = matched is None or matched.status == "ok"
     found_only = np.where(missing, np.nan, 1.0)  # of a ball that is not there the design's numbers are no answer
@@ -99,6 +102,10 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         station_names=() if stations is None else source.names,
         T_station=np.empty((0, 4, 4)) if stations is None else _in_place(stations.T_project_station, source.origin),
         station_said=() if stations is None else stations.weak,
+        datum="" if stations is None else stations.datum,
+        control_names=() if stations is None else stations.control,
+        control_off=np.empty((0, 3)) if stations is None else stations.control_off,
+        control_used=np.empty(0, np.int64) if stations is None else stations.control_used,
     )
 
 

@@ -17,6 +17,7 @@ LARGEST_RADIUS_SD = 0.05
 LARGEST_SCALE = 1.6
 UNLIKELY = 1e-3  # probability below which ball and priors are said to disagree
 LEAST_NEWS = 0.02  # share of a prior's variance that points must take away to be heard against it
+SURE = 3.0  # standard deviations beyond which an offset of all radii is spoken of
 FEW = 30
 FEW_MARGIN = 10.0  # more that the runner-up must lose by where points are few
 
@@ -30,15 +31,22 @@ def judged(
     noise: Floats,
     radius_sd: float,
     station_sd: float,
+    offset: tuple[float, float],
 ) -> Balls:
-    """Give every node its numbers, evidence, flag and reason."""
+    """Give every node its numbers, evidence, flag and reason.
+
+    ``offset`` is what radii lie off their sizes on the whole and its standard deviation, mm: it may come from an offset
+    of all ranges or from the beam's width, so it stays in the radii, and in their covariances. Seen from below the
+    surface stays where it is.
+    """
     k = nodes.count
     fitted = np.asarray(fits.numbers[:, 7] > 0)
     state = fits.states.copy()
     degrees = fits.numbers[:, 5]
     # The scale is estimated: the variance of Student's t is wider than the normal one.
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
-    covariance = fits.covariance * wider[:, None, None]
+    common = np.array([0.0, 0.0, 1.0, 1.0]) * offset[0]
+    covariance = fits.covariance * wider[:, None, None] + np.outer(common, common)
     axes_known = np.asarray(np.isfinite(nodes.covariance).all(axis=(1, 2)))
     evidence, flags, reasons = [], [], []
     margin = fits.margin
@@ -57,8 +65,9 @@ def judged(
             evidence.append("axes")
             enough = axes_known[i] and nodes.axes[i] >= 2
             flags.append("low-confidence" if enough else "not-found")
+            seen = f"known from {nodes.axes[i]} axes alone" if enough else "and no two axes that fix the node"
             source = "the radius is the design's" if np.isfinite(expected[i]) else "the radius is unknown"
-            reasons.append(f"no ball seen, known from {nodes.axes[i]} axes alone; {source}")
+            reasons.append(f"no ball seen, {seen}" + (f"; {source}" if enough else ""))
             continue
         has_prior = bool(axes_known[i]) and fits.numbers[i, 6] > 0.0
         evidence.append("fused" if has_prior else "ball")
@@ -101,6 +110,9 @@ def judged(
     )
     if station_sd > 0.0:
         message += f"; stations disagree by {station_sd:.1f} mm an axis (sd), which every covariance holds"
+    if abs(offset[0]) > SURE * offset[1]:
+        message += f"; radii lie {offset[0]:+.2f} mm off their sizes on the whole, as where all ranges err alike or "
+        message += "the beam is wide: their intervals hold that"
     if len(catalogue.radii) and not catalogue.verified:
         message += f"; the catalogue of radii ({catalogue.name}) was not held against a published one"
     return Balls(
@@ -140,18 +152,23 @@ def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:
     What the points move an estimate by has the covariance that they take away from the prior.
     """
     found = np.ones(nodes.count)
-    for i in np.flatnonzero(fits.numbers[:, 7] > 0):
-        prior = np.zeros((4, 4))
-        held = np.zeros(4, bool)
-        if np.isfinite(nodes.covariance[i]).all() and fits.numbers[i, 6] > 0.0:
-            prior[:3, :3], held[:3] = nodes.covariance[i], True
-        if np.isfinite(radius_sd):
-            prior[3, 3], held[3] = radius_sd**2, True
-        if not held.any():
+    fitted = np.asarray(fits.numbers[:, 7] > 0)
+    placed = np.isfinite(nodes.covariance).all(axis=(1, 2)) & np.asarray(fits.numbers[:, 6] > 0.0)
+    sized = bool(np.isfinite(radius_sd))
+    every = fits.states - fits.sizes[:, None] * np.array([0.0, 0.0, 0.0, 1.0])
+    for has_place in (True, False):
+        held = np.flatnonzero([has_place] * 3 + [sized])
+        rows = np.flatnonzero(fitted & (placed == has_place))
+        if not len(held) or not len(rows):
             continue
-        off = (fits.states[i] - [0.0, 0.0, 0.0, fits.sizes[i]])[held]
-        L = np.linalg.inv(np.linalg.cholesky(prior[np.ix_(held, held)]))
-        taken, axes = np.linalg.eigh(np.eye(len(L)) - L @ fits.covariance[i][np.ix_(held, held)] @ L.T)
-        chi2 = float(np.sum((axes.T @ (L @ off)) ** 2 / np.maximum(taken, LEAST_NEWS)))
-        found[i] = float(chdtrc(len(L), chi2))
+        prior = np.zeros((len(rows), 4, 4))
+        if has_place:
+            prior[:, :3, :3] = nodes.covariance[rows]
+        if sized:
+            prior[:, 3, 3] = radius_sd**2
+        L = np.linalg.inv(np.linalg.cholesky(prior[:, held[:, None], held]))
+        C = fits.covariance[rows][:, held[:, None], held]
+        taken, axes = np.linalg.eigh(np.eye(len(held)) - L @ C @ np.swapaxes(L, 1, 2))
+        along = np.einsum("kji,kjl,kl->ki", axes, L, every[rows][:, held])
+        found[rows] = chdtrc(len(held), np.sum(along**2 / np.maximum(taken, LEAST_NEWS), axis=1))
     return found

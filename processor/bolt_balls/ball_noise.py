@@ -100,15 +100,7 @@ def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, used_sd: flo
     ``radii`` (k,) and ``variances`` (k,) are of fits with ``used_sd`` as prior. It is taken out again, so that each
     ball says what its points alone do; the stated scatter counts as ten balls. Balls that know little are left out.
     """
-    prior = 1.0 / used_sd**2
-    weight = 1.0 / variances - prior
-    good = np.isfinite(weight) & (weight > 0.1 * prior)
-    if not good.any():
-        return stated_sd
-    own = 1.0 / weight[good]
-    off = (radii[good] / variances[good] - sizes[good] * prior) * own - sizes[good]
-    near = np.abs(off) < 4.0 * np.sqrt(own + stated_sd**2)
-    off, own = off[near], own[near]
+    off, own = _off_sizes(radii, variances, sizes, used_sd, stated_sd)
     if not len(off):
         return stated_sd
     grid = stated_sd * np.geomspace(0.2, 2.5, 128)
@@ -116,3 +108,31 @@ def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, used_sd: flo
     cost = (np.log(total) + off[None] ** 2 / total).sum(axis=1)
     cost += RADII * (np.log(grid**2) + stated_sd**2 / grid**2)
     return float(grid[np.argmin(cost)])
+
+
+def radius_offset(
+    radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float
+) -> tuple[float, float]:
+    """Return what radii lie off their sizes in the mean of all balls, mm, and its standard deviation.
+
+    Ranges that are wrong alike at all stations, or means over a wide beam, make every ball too small or too large, and
+    no ball alone shows it.
+    Arguments are those of :func:`radius_scatter`; ``used_sd`` is also what radii scatter by.
+    """
+    off, own = _off_sizes(radii, variances, sizes, used_sd, stated_sd)
+    weight = 1.0 / (own + used_sd**2)
+    total = float(weight.sum())
+    return (float((weight * off).sum()) / total, total**-0.5) if total > 0.0 else (0.0, np.inf)
+
+
+def _off_sizes(
+    radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float
+) -> tuple[Floats, Floats]:
+    """Radii less sizes (j,) by the points alone, and their variances (j,), of balls that know something of it."""
+    prior = 1.0 / used_sd**2
+    weight = 1.0 / variances - prior
+    good = np.isfinite(weight) & (weight > 0.1 * prior)
+    own = 1.0 / weight[good]
+    off = (radii[good] / variances[good] - sizes[good] * prior) * own - sizes[good]
+    near = np.abs(off) < 4.0 * np.sqrt(own + stated_sd**2)
+    return off[near], own[near]

@@ -114,9 +114,23 @@ def fit_crops(
             fits = None
         setting = learnt
     assert fits is not None
+    offset = (0.0, np.inf)
+    if len(catalogue.radii):
+        sure = fits.clear
+        offset = ball_noise.radius_offset(
+            fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
+        )
     stations = setting.station_sd if station_covariance is None else NAN
     return ball_flags.judged(
-        fits, nodes, expected, catalogue, bool(np.any(ranges > 0.0)), setting.noise, setting.radius_sd, stations
+        fits,
+        nodes,
+        expected,
+        catalogue,
+        bool(np.any(ranges > 0.0)),
+        setting.noise,
+        setting.radius_sd,
+        stations,
+        offset,
     )
 
 

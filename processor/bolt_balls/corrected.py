@@ -12,7 +12,7 @@ from numba import njit
 
 from processor.bolt_balls.corridors import FIELD, HALF, Gathered
 from processor.bolt_balls.source import Chunk, Source
-from processor.bolt_balls.stations import Stations
+from processor.bolt_balls.station_records import Stations
 from processor.bolt_balls.thinning import STEPS_PER_MM
 from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats

@@ -1,4 +1,8 @@
-"""The points about every node, gathered from the whole source in one pass."""
+"""The points about every node, gathered from the whole source in one pass, in bounded memory.
+
+A node keeps the points whose hash lies below a threshold of its own, which is lowered a step where its points are more
+than its room: at the end it is the highest for which they fit, and which points are kept depends on no order.
+"""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
@@ -10,14 +14,16 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.bolt_balls.crop_shares import STEPS_PER_MM, Kept, taken
 from processor.bolt_balls.source import Source
 from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats, Ints, Labels, UsageError
 
-STEPS_PER_MM = 1000.0  # gathered coordinates are whole micrometres: sorting them is exact
 GREATEST_REACH_MM = 1000.0  # 21 bits an axis
 BLOCK = 1 << 14
 EMPTY = -1
+MOST_POINTS = 2_000_000  # of all crops together, and of each
+LEAST_ROOM = 512  # of a crop, however many there are
 
 
 @dataclass(frozen=True)
@@ -33,10 +39,11 @@ class Crops:
     station: Labels
 
 
-def gather(source: Source, nodes: Floats, reach_mm: float, threads: int = 0) -> Crops:
+def gather(source: Source, nodes: Floats, reach_mm: float, threads: int = 0, most: int = MOST_POINTS) -> Crops:
     """Gather the points within ``reach_mm`` of nodes (k, 3), given less the source's origin; one pass over the source.
 
-    A point near two nodes is gathered for both. The answer does not depend on chunks, order of points or threads.
+    A point near two nodes is gathered for both. Of a node with more than its share of ``most`` points some are kept,
+    evenly. The answer does not depend on chunks, order of points or threads.
     """
     if not 0.0 < reach_mm <= GREATEST_REACH_MM:
         raise UsageError(f"reach of a crop: expected above 0 to {GREATEST_REACH_MM:g} mm, got {reach_mm!r}")
@@ -46,18 +53,15 @@ def gather(source: Source, nodes: Floats, reach_mm: float, threads: int = 0) -> 
     lower = nodes.min(axis=0) - reach_mm
     upper = nodes.max(axis=0) + reach_mm
     table, cells = _cells(nodes, lower, reach_mm)
-    owners: list[Labels] = [np.empty(0, np.int32)]
-    steps: list[Labels] = [np.empty((0, 3), np.int32)]
-    stations: list[Labels] = [np.empty(0, np.int32)]
+    kept = Kept(len(nodes), max(most // len(nodes), LEAST_ROOM))
     for chunk in source.chunks():
-        found = _near(
-            _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32), nodes, lower, upper, reach_mm, table,
-            cells, threads,
+        kept.add(
+            *_near(
+                _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32), nodes, lower, upper, reach_mm,
+                table, cells, kept.thresholds, threads,
+            )
         )  # fmt: skip
-        owners.append(found[0])
-        steps.append(found[1])
-        stations.append(found[2])
-    return _sorted(np.concatenate(owners), np.concatenate(steps), np.concatenate(stations), len(nodes), threads)
+    return _sorted(*kept.all(), len(nodes), threads)
 
 
 def _frozen(values: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
@@ -119,6 +123,7 @@ def _near(
     reach: float,
     table: tuple[Ints, Labels],
     cells: tuple[Ints, Labels],
+    thresholds: npt.NDArray[np.uint64],
     threads: int,
 ) -> tuple[Labels, Labels, Labels]:
     """Owner (m,), offset from it in steps (m, 3) and station (m,) of every pair of a node and a point near it."""
@@ -128,7 +133,20 @@ def _near(
     candidates, pairs = np.zeros(blocks, np.int64), np.zeros(blocks, np.int64)
     over_ranges(
         lambda a, b: _look(
-            a, b, points, nodes, lower, upper, reach, *table, *cells, candidate, cell, candidates, pairs
+            a,
+            b,
+            points,
+            nodes,
+            lower,
+            upper,
+            reach,
+            *table,
+            *cells,
+            thresholds,
+            candidate,
+            cell,
+            candidates,
+            pairs,
         ),
         blocks,
         threads,
@@ -138,7 +156,21 @@ def _near(
     owner, steps, seen = np.empty(count, np.int32), np.empty((count, 3), np.int32), np.empty(count, np.int32)
     over_ranges(
         lambda a, b: _take(
-            a, b, points, station, nodes, reach, *cells, candidate, cell, candidates, place, owner, steps, seen
+            a,
+            b,
+            points,
+            station,
+            nodes,
+            reach,
+            *cells,
+            thresholds,
+            candidate,
+            cell,
+            candidates,
+            place,
+            owner,
+            steps,
+            seen,
         ),
         blocks,
         threads,
@@ -148,8 +180,8 @@ def _near(
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _look(  # type: ignore[no-untyped-def]
-    begin, end, points, nodes, lower, upper, reach, table, row, cell_start, cell_nodes, candidate, cell, candidates,
-    pairs,
+    begin, end, points, nodes, lower, upper, reach, table, row, cell_start, cell_nodes, thresholds, candidate, cell,
+    candidates, pairs,
 ):  # fmt: skip
     """Fill, by blocks, which points are near a node, the cells they are in, and how many they and the pairs are."""
     n = len(points)
@@ -178,7 +210,7 @@ def _look(  # type: ignore[no-untyped-def]
             for j in range(cell_start[here], cell_start[here + 1]):
                 node = cell_nodes[j]
                 dx, dy, dz = x - nodes[node, 0], y - nodes[node, 1], z - nodes[node, 2]
-                if dx * dx + dy * dy + dz * dz <= reach2:
+                if dx * dx + dy * dy + dz * dz <= reach2 and taken(dx, dy, dz, thresholds[node]):
                     near += 1
             if near > 0:
                 candidate[base + kept] = i
@@ -191,8 +223,8 @@ def _look(  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _take(  # type: ignore[no-untyped-def]
-    begin, end, points, station, nodes, reach, cell_start, cell_nodes, candidate, cell, candidates, place, owner,
-    steps, seen,
+    begin, end, points, station, nodes, reach, cell_start, cell_nodes, thresholds, candidate, cell, candidates,
+    place, owner, steps, seen,
 ):  # fmt: skip
     """Fill the pairs of blocks from their places on."""
     for block in range(begin, end):
@@ -205,7 +237,7 @@ def _take(  # type: ignore[no-untyped-def]
                 dx = points[i, 0] - nodes[node, 0]
                 dy = points[i, 1] - nodes[node, 1]
                 dz = points[i, 2] - nodes[node, 2]
-                if dx * dx + dy * dy + dz * dz <= reach * reach:
+                if dx * dx + dy * dy + dz * dz <= reach * reach and taken(dx, dy, dz, thresholds[node]):
                     owner[to] = node
                     steps[to, 0] = np.int32(np.rint(dx * STEPS_PER_MM))
                     steps[to, 1] = np.int32(np.rint(dy * STEPS_PER_MM))

@@ -14,13 +14,14 @@ from processor.bolt_balls import balls, junctions, matching, members, movement, 
 from processor.bolt_balls.ball_records import Balls
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.corrected import Corrected, corrected_gathered
-from processor.bolt_balls.matching import Found, Matching
+from processor.bolt_balls.match_odds import Found
+from processor.bolt_balls.matching import Matching
 from processor.bolt_balls.members import Measured
 from processor.bolt_balls.movement import Movement
 from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.source import Source
-from processor.bolt_balls.station_adjustment import ControlPoints
-from processor.bolt_balls.stations import Stations
+from processor.bolt_balls.station_control import ControlPoints
+from processor.bolt_balls.station_records import Stations
 from processor.bolt_balls.tube_points import tube_points
 from processor.geometry import rigid
 from processor.model import Floats, FrameDesign, Ints
@@ -74,18 +75,21 @@ def extract(
     expansion: float = 1.0,
     control: ControlPoints | None = None,
     register_stations: bool = True,
+    datum_mm: float = 0.0,
 ) -> Extracted | None:
     """Find every node of a frame; None where the cloud has no members that meet.
 
-    ``expansion`` is the factor by which temperature lengthens the design. ``control`` points hold the datum.
+    ``expansion`` is the factor by which temperature lengthens the design. ``control`` points hold the datum; where
+    they do not, all stations share a shift of standard deviation ``datum_mm`` beside their own.
     """
     start = _blind(source, params) if design is None else _designed(source, design, expansion, params)
     if start is None:
         return None
     measured, said = start.measured, list(start.said)
     registered: Stations | None = None
-    if register_stations and len(source.scanners) > 1 and (measured.apart_mm > APART_MM or control is not None):
-        source, measured, registered = _registered(source, start, control, params)
+    apart = len(source.scanners) > 1 and measured.apart_mm > APART_MM
+    if register_stations and (apart or control is not None):
+        source, measured, registered = _registered(source, start, control, params, datum_mm)
         said.append(registered.message)
     design_row = start.design_row
     if design is None:
@@ -100,15 +104,25 @@ def extract(
     trusted = registered is not None and registered.status in ("ok", "weak")
     between = registered.between if registered is not None and trusted else None
     found = balls.find_balls(source, nodes, measured.tubes, catalogue, expected, between)
-    datum = np.zeros((len(found.radii), 3, 3))
+    beside = np.zeros((len(found.radii), 3, 3))
+    datum = np.tile(datum_mm**2 * np.eye(3), (len(found.radii), 1, 1))
     if registered is not None and trusted:
         datum = registered.datum_at(found.centres)
+        beside = registered.shared_offset_at(found.centres)
     matched = moved = None
     if design is not None and known.any():
         matched, moved = _moved(
-            source, measured.tubes, found, design, start.pose, registered if trusted else None, expansion
+            source,
+            measured.tubes,
+            found,
+            beside,
+            design,
+            start.pose,
+            registered if trusted else None,
+            expansion,
+            datum_mm,
         )
-    return Extracted(nodes, measured.tubes, found, design_row, datum, registered, matched, moved, tuple(said))
+    return Extracted(nodes, measured.tubes, found, design_row, datum + beside, registered, matched, moved, tuple(said))
 
 
 def _blind(source: Source, params: members.Params) -> _Start | None:
@@ -163,13 +177,13 @@ def _designed(source: Source, design: FrameDesign, expansion: float, params: mem
 
 
 def _registered(
-    source: Source, start: _Start, control: ControlPoints | None, params: members.Params
+    source: Source, start: _Start, control: ControlPoints | None, params: members.Params, datum_mm: float
 ) -> tuple[Source, Measured, Stations]:
     """Register the stations on the tubes, and measure the tubes again where that moved them."""
     measured = start.measured
     tubes = measured.tubes
     on_tubes = tube_points(measured.points, measured.lines, tubes)
-    found = stations.register(on_tubes, tubes.points, tubes.directions, tubes.radii, source.scanners, control)
+    found = stations.register(on_tubes, tubes.points, tubes.directions, tubes.radii, source.scanners, control, datum_mm)
     if found.status not in ("ok", "weak"):
         return source, measured, found
     moved = Corrected(source, found)
@@ -189,10 +203,12 @@ def _moved(
     source: Source,
     tubes: Tubes,
     found: Balls,
+    beside: Floats,
     design: FrameDesign,
     pose: Matching | None,
     registered: Stations | None,
     expansion: float,
+    datum_mm: float,
 ) -> tuple[Matching, Movement]:
     """Match the balls as fitted with the design, and say how far each is from its nominal place."""
     rows = np.flatnonzero(np.array([flag != "not-found" for flag in found.flag], bool))
@@ -211,11 +227,11 @@ def _moved(
         matched = replace(matched, T_design_scan=again.T_best_fit @ T, T_best_fit=again.T_best_fit @ T)
     else:
         matched = matching.match(nodes, design, expansion=expansion)
-    common = at = None
-    if registered is not None:
-        at = nodes.positions.mean(axis=0)
-        common = registered.common(at)
-    moved = movement.movement(matched, nodes, found.covariance[rows, :3, :3], design, common, at, expansion=expansion)
+    at = nodes.positions.mean(axis=0)
+    common = np.diag([0.0, 0.0, 0.0, *3 * [datum_mm**2]]) if registered is None else registered.common(at)
+    moved = movement.movement(
+        matched, nodes, found.covariance[rows, :3, :3] + beside[rows], design, common, at, expansion=expansion
+    )
     return replace(
         matched,
         assignment=_spread(matched.assignment, rows, len(place), -1),

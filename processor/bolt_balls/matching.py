@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.bolt_balls import pattern
+from processor.bolt_balls.match_odds import Found, member_odds, radius_odds
 from processor.geometry import rigid
 from processor.model import Checked, Floats, FrameDesign, Ints, column
 
@@ -22,36 +23,12 @@ LEAST_SHARE = 0.5  # of the smaller pattern's nodes that must agree
 DOUBTFUL_SHARE = 0.05  # missing and extra nodes both: another pose may explain them
 FAR = 2.0  # tolerances: a node farther from its nominal place is another node
 NODE_ODDS = 4.0  # log odds that a pose loses by a found node that is none of the design's while one of those is missing
-RADIUS_ODDS = 4.0  # at most, by a ball of another size
-RADIUS_SD_MM = 1.0  # of balls against the catalogue, beside the measurement's
-MEMBER_ODDS = 2.0  # by a member that is not in the design
 INDEPENDENT = 20  # nodes' distances count as at most so many: those of neighbours go together
 DECISIVE = 7.0  # log odds, 1000 to 1
 NEAR = 19  # nodes about one that may be a bay's length off
 UPRIGHT_COS = 0.996  # 5 degrees
 TUKEY = 4.685
 MEDIAN_OF_3 = 1.538  # of the length of a normal vector in space, per sd
-
-
-@dataclass(frozen=True)
-class Found:
-    """Found nodes (k, 3) less ``origin``, mm; radii and their sd (k,) where balls were fitted, NaN or empty = unknown.
-
-    ``node_a`` and ``node_b`` are the rows of the nodes at both ends of each tube found, -1 = none.
-    """
-
-    positions: Floats
-    origin: Floats
-    radii: Floats
-    radius_sd: Floats
-    node_a: Ints
-    node_b: Ints
-
-    @classmethod
-    def bare(cls, positions: Floats, origin: Floats | None = None) -> Found:
-        """Make a record of nodes of which nothing but the places is known."""
-        none, no_rows = np.empty(0), np.empty(0, np.int64)
-        return cls(positions, np.zeros(3) if origin is None else origin, none, none, no_rows, no_rows)
 
 
 @dataclass(frozen=True)
@@ -195,7 +172,7 @@ def _judged(
     off = rigid.apply(T, found.positions[on]) - nominal[assignment[on]]
     rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     odds = -NODE_ODDS * int(on.sum()) + min(int(on.sum()), INDEPENDENT) * float(np.log(max(rms, 1e-6)))
-    odds += _radius_odds(found, design, assignment) + _member_odds(found, design, assignment)
+    odds += radius_odds(found, design, assignment) + member_odds(found, design, assignment)
     return _Candidate(T, assignment, every, rms, odds)
 
 
@@ -230,51 +207,6 @@ def robust_fit(source: Floats, target: Floats) -> tuple[Floats, Floats]:
 
 def _weighted_fit(source: Floats, target: Floats, weight: Floats) -> Floats:
     found: Floats = pattern.fitted(source[None], target[None], weight[None])[0]
-    return found
-
-
-def _radius_odds(found: Found, design: FrameDesign, assignment: Ints) -> float:
-    if not len(found.radii) or not len(design.radii):
-        return 0.0
-    on = (assignment >= 0) & np.isfinite(found.radii)
-    off = found.radii[on] - design.radii[assignment[on]]
-    sd = np.hypot(found.radius_sd[on] if len(found.radius_sd) else 0.0, RADIUS_SD_MM)
-    odds = np.minimum(0.5 * (off / np.where(np.isfinite(sd), sd, np.inf)) ** 2, RADIUS_ODDS)
-    return float(np.sum(odds[np.isfinite(odds)]))
-
-
-def _member_odds(found: Found, design: FrameDesign, assignment: Ints) -> float:
-    if not len(found.node_a) or not len(design.member_a):
-        return 0.0
-    rows, _ = match_members(assignment, found.node_a, found.node_b, design)
-    a, b = _ends(assignment, found.node_a), _ends(assignment, found.node_b)
-    return MEMBER_ODDS * float(((rows < 0) & (a >= 0) & (b >= 0)).sum())
-
-
-def match_members(assignment: Ints, node_a: Ints, node_b: Ints, design: FrameDesign) -> tuple[Ints, Ints]:
-    """Row of the design's member (m,) that each tube between found nodes is, -1 = extra; and the rows without a tube.
-
-    ``node_a`` and ``node_b`` (m,) are rows of the found nodes, -1 = none.
-    """
-    row_of = {int(id_): row for row, id_ in enumerate(design.ids)}
-    pairs = [
-        (row_of.get(int(a), -1), row_of.get(int(b), -1)) for a, b in zip(design.member_a, design.member_b, strict=True)
-    ]
-    count = len(design.ids)
-    nominal = {min(a, b) * count + max(a, b): row for row, (a, b) in enumerate(pairs)}
-    a, b = _ends(assignment, node_a), _ends(assignment, node_b)
-    rows = np.array(
-        [
-            nominal.get(min(i, j) * count + max(i, j), -1) if i >= 0 and j >= 0 else -1
-            for i, j in zip(a.tolist(), b.tolist(), strict=True)
-        ],
-        np.int64,
-    )
-    return rows, np.setdiff1d(np.arange(len(pairs)), rows)
-
-
-def _ends(assignment: Ints, node: Ints) -> Ints:
-    found: Ints = np.where(node >= 0, assignment[node], -1) if len(assignment) else np.full(len(node), -1)
     return found
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.bolt_balls.matching import SAME, Found, Matching
+from processor.bolt_balls.match_odds import Found
+from processor.bolt_balls.matching import SAME, Matching
 from processor.geometry import rigid
 from processor.model import Checked, Floats, FrameDesign, Ints, column
 

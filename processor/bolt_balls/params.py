@@ -22,6 +22,7 @@ class Params:
     catalogue: str = "plausible"  # ray: of ball radii, by name; "none" leaves radii free
     radii_mm: tuple[float, ...] = ()  # ray: a catalogue of one's own, instead
     register_stations: bool = True  # ray: against each other, on the tubes, where they are off
+    datum_mm: float = 0.0  # ray: sd an axis of a shift that all stations share, where no control points hold them
     members: members.Params = field(default_factory=members.Params)  # ray
     crop_margin_mm: float = 20.0  # the paper's: beyond the nominal radius, about the nominal centre
     tau_mm: float = 4.0  # ransac: distance from the surface within which a point consents; two sd of a 2 mm scanner
@@ -43,6 +44,7 @@ class Params:
             ("min_points", self.min_points >= 1),
             ("max_balls", self.max_balls >= 1),
             ("seed", self.seed >= 0),
+            ("datum_mm", 0.0 <= self.datum_mm < np.inf),
             ("radius_mm", np.isnan(self.radius_mm) or 0.0 < self.radius_mm < np.inf),
         ):
             if not sound:

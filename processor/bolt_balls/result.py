@@ -59,3 +59,7 @@ class Result(Checked):
     station_names: tuple[str, ...] = names("s")
     T_station: Floats = column("s", 4, 4)
     station_said: tuple[str, ...] = names("s")
+    datum: str = ""  # what holds all stations together where they are
+    control_names: tuple[str, ...] = names("c")  # control points, a row a sighting
+    control_off: Floats = column("c", 3)  # known place minus the sighting after the stations were moved
+    control_used: Ints = column("c", dtype=np.int64)  # 1 = yes, 0 = left out: the others speak against it

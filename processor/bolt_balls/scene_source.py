@@ -9,8 +9,11 @@ from typing import Protocol
 import numpy as np
 
 from processor.bolt_balls.source import CHUNK_POINTS, UNKNOWN_STATION, Chunk
+from processor.bolt_balls.station_control import ControlPoints
 from processor.geometry import rigid
-from processor.model import Floats, Labels, Scan, Scene
+from processor.model import Floats, InputError, Labels, Scan, Scene
+
+FARTHEST_MM = 1000.0  # control points that lie farther from where they were seen are of another frame
 
 
 class PointReader(Protocol):
@@ -94,6 +97,40 @@ def of_scene(scene: Scene, points: PointReader | None = None) -> SceneSource:
         places.append(T[:3, :3] @ scan.position + (T[:3, 3] - origin))
     scanners = np.array(places, np.float64).reshape(-1, 3)
     return SceneSource(scene.scans, origin, scanners, tuple(names), tuple(scanner_of), points or InScans(scene.scans))
+
+
+def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
+    """Return the scene's control points as its scanners saw them; None without any from a scanner that is known.
+
+    Raises InputError where they are known in another frame than the scans are in.
+    """
+    if scene.control is None or not len(scene.control.scan):
+        return None
+    own = scene.control
+    scanner = np.array([source.scanner_of[s] if k < 0 else k for s, k in zip(own.scan, own.station, strict=True)])
+    held = np.flatnonzero((scanner >= 0) & (scanner < len(source.scanners)))
+    if not len(held):
+        return None
+    measured = np.empty((len(held), 3))
+    for i, row in enumerate(held.tolist()):
+        T = _pose(scene.scans[own.scan[row]])
+        measured[i] = T[:3, :3] @ own.seen[row] + (T[:3, 3] - source.origin)
+    target = own.positions[own.point[held]] - source.origin
+    off = float(np.median(np.linalg.norm(target - measured, axis=1)))
+    if off > FARTHEST_MM:
+        raise InputError(
+            f"{scene.name}: control points lie {off / 1000.0:.3g} m from where the scans have them (median); give "
+            "the scans poses in the frame of the control points, or their coordinates in the scans' frame"
+        )
+    return ControlPoints(
+        tuple(own.ids[k] for k in own.point[held].tolist()),
+        measured,
+        target,
+        np.repeat(own.seen_sd[held, None], 3, axis=1),
+        np.eye(len(source.scanners))[scanner[held]],
+        own.point[held],
+        own.sd[own.point[held]],
+    )
 
 
 def _pose(scan: Scan) -> Floats:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
+from processor.bolt_balls.station_control import ControlPoints, Doubt, doubted, motions
 from processor.bolt_balls.station_kernels import STATION
 from processor.bolt_balls.station_normals import cholesky, product, solve
 from processor.geometry import rigid
-from processor.model import Checked, Floats, column, names
+from processor.model import Floats
 
 # of turn (rad), translation and offset of the ranges (mm)
 START = (5e-5, 2.0, 0.5)  # sd: where the iteration starts, nothing more
@@ -19,36 +18,11 @@ LEAST_TOLD = 0.5  # motions the data must tell of before they say anything of a 
 ALLOWED = 6.0  # in log density below the likeliest variance
 
 
-@dataclass(frozen=True)
-class ControlPoints(Checked):
-    """Points with known coordinates: where the cloud has them, and where they are; mm, less one origin.
-
-    ``share`` (c, s) is how much of the measurement comes from each station (rows add up to 1). ``sd`` (c, 3) is that of
-    measured minus target without the stations' errors.
-    """
-
-    ids: tuple[str, ...] = names("c")
-    measured: Floats = column("c", 3)
-    target: Floats = column("c", 3)
-    sd: Floats = column("c", 3)
-    share: Floats = column("c", "s")
-
-    @property
-    def hold_all(self) -> bool:
-        """Whether they alone say where the whole cloud lies: three of them, not on one line."""
-        if len(self.ids) < 3:
-            return False
-        extent = np.linalg.svd(self.target - self.target.mean(axis=0), compute_uv=False)
-        return bool(extent[1] > 0.05 * extent[0])
-
-
 def corrections(x: Floats, places: Floats) -> Floats:
     """Return T (s, 4, 4) of the stations' unknowns x (7 s,): turns about places (s, 3), then translations."""
-    found = np.empty((len(places), 4, 4))
-    for i, (one, place) in enumerate(zip(x.reshape(-1, STATION), places, strict=True)):
-        R = rigid.rotation_from_vector(one[:3])
-        found[i] = rigid.transform(R, place - R @ place + one[3:6])
-    return found
+    R, t = motions(x, places)
+    shift = places - np.einsum("sij,sj->si", R, places) + t
+    return np.array([rigid.transform(turn, move) for turn, move in zip(R, shift, strict=True)])
 
 
 def common_motion(places: Floats) -> Floats:
@@ -69,18 +43,44 @@ def mean_gain(M: Floats, precision: Floats) -> Floats:
 class Posterior:
     """The unknowns of stations at ``places`` (s, 3), x = (turn, translation, offset of the ranges) of each.
 
-    A priori they are normal about zero, or about a common motion where control points hold the whole cloud. The three
+    A priori they are normal about zero, about a shift that all share of sd ``datum_mm`` an axis, or about any common
+    motion where control points hold the whole cloud. The three
     variances are those under which the unknowns' sum of squares is what the data make one expect (MacKay 1992).
     """
 
-    def __init__(self, places: Floats, control: ControlPoints | None) -> None:
-        self.places, self.control = places, control
+    def __init__(self, places: Floats, control: ControlPoints | None, datum_mm: float = 0.0) -> None:
+        self.places, self.datum_mm = places, datum_mm
         self.variance = np.array(START) ** 2
-        self.free = control is not None and control.hold_all
         self.M = common_motion(places - places.mean(axis=0))
         self.kind = np.tile(np.array([0, 0, 0, 1, 1, 1, 2]), len(places))
+        self.control: ControlPoints | None = None
+        self.hold(control)
+
+    def hold(self, control: ControlPoints | None) -> None:
+        """Take control points into the equations, or none."""
+        if self.control is None:
+            self.untouched = self.variance.copy()
+        self.control = control
+        self.free = control is not None and control.hold_all
         # of each kind, how many are not common to all stations where a common motion is free
-        self.number = np.array([3.0, 3.0, 1.0]) * len(places) - np.array([3.0, 3.0, 0.0]) * self.free
+        self.number = np.array([3.0, 3.0, 1.0]) * len(self.places) - np.array([3.0, 3.0, 0.0]) * self.free
+
+    def doubted(self, H: Floats, g: Floats, x: Floats) -> Doubt:
+        """Hold the control points against each other; H and g are the tubes' equations at x."""
+        # Where they do not hold all, what they say has gone into the variances: that would excuse them.
+        P = self._prior(self.variance if self.free else self.untouched)
+        if self.free:  # what is left without one of them may not hold all
+            gain = mean_gain(self.M, self.precision(self.variance))
+            loose = np.repeat(np.array(LOOSE[:2]) ** -2.0, 3)
+            P = P + product(np.ascontiguousarray(gain.T) * loose, gain)
+
+        def solved(some: ControlPoints) -> tuple[Floats, Floats]:
+            Hs, gs = some.added(H, g, x, self.places)
+            right = np.column_stack([gs - product(P, x[:, None])[:, 0], np.eye(len(x))])
+            both = solve(cholesky(Hs + P), right)
+            return both[:, 0], np.ascontiguousarray(both[:, 1:])
+
+        return doubted(self.control or ControlPoints(), x, self.places, solved)
 
     def step(self, H: Floats, g: Floats, x: Floats, rounds: int) -> tuple[Floats, Floats]:
         """Return the change of x (7 s,) and the covariance a posteriori; H and g are the tubes' equations at x.
@@ -145,21 +145,15 @@ class Posterior:
         P = np.diag(precision)
         if self.free:
             P -= product(precision[:, None] * self.M, mean_gain(self.M, precision))
-            P = 0.5 * (P + P.T)
-        return P
+        elif self.datum_mm > 0.0:  # D and a common shift of its own variance, by Woodbury's identity
+            weighted = precision[:, None] * self.M[:, 3:]
+            inner = product(np.ascontiguousarray(self.M[:, 3:].T), weighted) + np.eye(3) / self.datum_mm**2
+            P -= product(weighted, solve(cholesky(inner), np.ascontiguousarray(weighted.T)))
+        found: Floats = 0.5 * (P + P.T)
+        return found
 
     def _with_control(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
-        if self.control is None:
-            return H, g
-        own = self.control
-        T = corrections(x, self.places)
-        moved = np.einsum("sij,cj->sci", T[:, :3, :3], own.measured) + T[:, None, :3, 3]
-        off = own.target - np.einsum("cs,sci->ci", own.share, moved)
-        J = np.zeros((len(own.ids), 3, len(self.places), STATION))
-        J[..., :6] = np.stack([rigid.motion(own.measured - place) for place in self.places], axis=2)
-        A = (own.share[:, None, :, None] * J).reshape(3 * len(own.ids), -1)
-        weighted = np.ascontiguousarray(A.T) / own.sd.ravel() ** 2
-        return H + product(weighted, A), g + product(weighted, off.reshape(-1, 1))[:, 0]
+        return (H, g) if self.control is None else self.control.added(H, g, x, self.places)
 
     def _estimate(self, x: Floats, C: Floats) -> None:
         own, spread = x, np.diag(C)
@@ -184,6 +178,8 @@ class Posterior:
         self, H: Floats, g: Floats, x: Floats, sd: Floats, kind: int, resolved: Floats
     ) -> tuple[Floats, Floats]:
         """Return the likeliest sd (3,) along one ``kind``, and those (n,) that the data allow, even in the log."""
+        if self.number[kind] < 1.0:  # one station, held by control points: nothing to compare it with
+            return sd, sd[kind : kind + 1]
 
         def density(value: float) -> float:
             tried = sd.copy()

@@ -14,16 +14,17 @@ tube tells of has the prior's variance: nothing is more certain than the data ma
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from processor.bolt_balls import station_kernels as kernels
 from processor.bolt_balls import station_normals as normals
-from processor.bolt_balls.station_adjustment import ControlPoints, Posterior, common_motion, corrections, mean_gain
-from processor.geometry import rigid
-from processor.model import Checked, Floats, Ints, Labels, column, names
+from processor.bolt_balls.station_adjustment import Posterior, common_motion, corrections
+from processor.bolt_balls.station_control import ControlPoints, Doubt
+from processor.bolt_balls.station_records import Stations, TubePoints
+from processor.model import Floats, Ints
 
 Bools = npt.NDArray[np.bool_]
 
@@ -41,103 +42,9 @@ TAKEN = 6.0  # unknowns of a tube: seven, of which the bow's are held a little
 LEAST_POINTS = 20  # of a station, for a scale of their own
 SMALLEST_MM = 1e-3  # scale of residuals
 WEAK_MM, WEAK_RAD = 0.1, 1e-5  # sd that is too small to be called weak
+TOLD_MM = 0.3  # an offset of all ranges that is spoken of
 WEAK_SHARE = 0.5  # of the prior variance left: what the tubes told is not worth the name
 MOTIONS = ("turn about x", "turn about y", "turn about z", "shift along x", "shift along y", "shift along z")
-
-
-@dataclass(frozen=True)
-class TubePoints:
-    """Points on tubes, sorted by tube: those of tube j are rows start[j]:start[j + 1], mm, in a canonical order.
-
-    ``station`` (n,) is the row of the scanners; -1 = unknown, such points are left out.
-    """
-
-    points: Floats
-    station: Labels
-    start: Ints
-
-
-@dataclass(frozen=True)
-class Stations(Checked):
-    """Corrections of all stations, and what remains uncertain after they are applied.
-
-    Off the ranges of a station goes its ``range_offset``; then ``T_project_station`` (s, 4, 4) maps its points, in the
-    project's frame as registered less the origin, to where they belong: see :meth:`corrected`.
-
-    ``covariance`` (7 s, 7 s) is of each station's (turn about x, y, z through ``places`` (s, 3), translation, range
-    offset) in turn; rad and mm, T = exp(xi) T. It holds both what is left between the stations and the motion that all
-    have in common; NaN where nothing tells of it.
-    """
-
-    status: str  # ok | weak | single | unknown
-    message: str
-    T_project_station: Floats = column("s", 4, 4)
-    places: Floats = column("s", 3)
-    covariance: Floats = column("p", "p")
-    before_mm: float = float("nan")  # sd of a station's translation along an axis, as registered
-    before_rad: float = float("nan")  # and of its turn
-    range_offset: Floats = column("s")  # of a station's ranges, mm
-    range_offset_sd: float = float("nan")  # of all stations, as scanned
-    observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
-    weak: tuple[str, ...] = names("s")  # which motions of a station the tubes do not tell; empty = all told
-    range_sd: Floats = column("s")  # scale of the residuals along the ray, mm
-    floor_mm: float = 0.0  # sd of what an observation of a tube lies off beyond the points' noise
-    axis_points: Floats = column("m", 3)  # of the tubes after the corrections, and their directions and radii
-    axis_directions: Floats = column("m", 3)
-    axis_radii: Floats = column("m")
-    datum: str = ""  # what says where all stations together lie, and how well
-
-    def corrected(self, points: Floats, station: Labels) -> Floats:
-        """Return points (n, 3) of stations (n,), less the origin, where they belong; those of station -1 unmoved."""
-        return kernels.corrected(
-            np.ascontiguousarray(points), station, self.places, self.range_offset, self.T_project_station
-        )
-
-    def effect(self, points: Floats, influence: Floats, relative: bool = False) -> Floats:
-        """Covariance (k, d, d) that the stations add to estimates near points (k, 3).
-
-        ``influence`` is how an estimate follows the stations' points: (k, s) weights adding up to 1 for centres that
-        move as the weighted mean of the stations does, or (k, s, d, 3) derivatives by a shift of a station's points at
-        the place, for d parameters each. ``relative`` leaves out what all stations have in common (:meth:`common`).
-        """
-        if influence.ndim == 2:
-            influence = influence[:, :, None, None] * np.eye(3)
-        covariance = self.covariance
-        if relative and np.isfinite(self.before_mm):
-            own = np.eye(len(covariance)) - normals.product(
-                common_motion(self.places), mean_gain(common_motion(self.places), self._precision())
-            )
-            covariance = normals.product(normals.product(own, covariance), np.ascontiguousarray(own.T))
-        return kernels.effect(np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance)
-
-    def common(self, place: Floats) -> Floats:
-        """Covariance (6, 6) of the motion all stations have in common: turn about ``place`` (3,), translation.
-
-        It is that of the rigid motion which fits the stations' own motions best, weighted as they scatter.
-        """
-        if not np.isfinite(self.before_mm):
-            known: Floats = self.covariance[:6, :6].copy()
-            return known
-        gain = mean_gain(common_motion(self.places - place), self._precision())
-        found: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
-        return found
-
-    def datum_at(self, points: Floats) -> Floats:
-        """Covariance (k, 3, 3) that the motion of all stations adds to anything at points (k, 3), the same for all."""
-        middle = points.mean(axis=0) if len(points) else np.zeros(3)
-        J = rigid.motion(points - middle)
-        found: Floats = np.einsum("kip,pq,kjq->kij", J, self.common(middle), J)
-        return found
-
-    @property
-    def between(self) -> Floats:
-        """Covariance (s, 3, 3) of each station's place against all the others': without what they have in common."""
-        alone = np.eye(len(self.places))
-        return self.effect(self.places, alone, relative=True)
-
-    def _precision(self) -> Floats:
-        one = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
-        return np.tile(one, len(self.places))
 
 
 @dataclass(frozen=True)
@@ -158,10 +65,12 @@ def register(
     radii: Floats,
     scanners: Floats,
     control: ControlPoints | None = None,
+    datum_mm: float = 0.0,
 ) -> Stations:
     """Estimate the corrections of all stations from points on tubes with axes (m, 3), (m, 3) and radii (m,), mm.
 
-    ``scanners`` (s, 3) are the stations' places; coordinates are less one origin.
+    ``scanners`` (s, 3) are the stations' places; coordinates are less one origin. ``datum_mm`` is
+    the standard deviation, along each axis, of a shift that all stations share beside their own.
     """
     count = len(scanners)
     if count < 2 and control is None:
@@ -181,7 +90,7 @@ def register(
     ordered = np.ascontiguousarray(points.points[order])
     tubes = _tubes(ordered, np.append(start[tube_obs[:-1]], start[-1]), axis_points, axis_directions, radii)
     x, weight, floor = np.zeros(kernels.STATION * count), np.ones(len(used)), 0.0
-    posterior = Posterior(scanners, control)
+    posterior, doubt = Posterior(scanners, None, datum_mm), None
     scale = np.full(count, FIRST_CUT_MM / CUT)
     by_station, bounds = _by_station(station, start, count)
     for turn in range(ROUNDS):
@@ -194,6 +103,10 @@ def register(
         N, b, _ = kernels.observations(seen, start, station, scale, CUT)
         geometry = (tube_obs, station, tubes.axis, tubes.e1, tubes.e2, tubes.half, scanners, _prior(tubes))
         last = turn == ROUNDS - 1
+        if turn and control is not None:  # once the tubes have laid the stations onto each other
+            posterior.hold(control)
+            doubt = posterior.doubted(*normals.reduced(N, b, weight, floor, *geometry), x)
+            posterior.hold(control.only(doubt.kept))
         for _ in range(2 if last else 1):
             H, g = normals.reduced(N, b, weight, floor, *geometry)
             step, C = posterior.step(H, g, x, 5)
@@ -203,7 +116,23 @@ def register(
         if last:
             step, C = posterior.integrated(H, g, x)
         x, tubes = x + step, _moved(tubes, unknown)
-    return _result(x, C, posterior, seen_by, scale, floor, tubes)
+    x, C, mean_offset = _apart(x, C)
+    found = _result(x, C, posterior, seen_by, scale, floor, tubes, mean_offset)
+    return found if control is None or doubt is None else _controlled(found, x, control, doubt)
+
+
+def _apart(x: Floats, C: Floats) -> tuple[Floats, Floats, float]:
+    """Take the mean of all range offsets out of the unknowns (7 s,) and their covariance; returns it as well.
+
+    How residuals follow the incidence tells of an offset that all ranges share, but a beam that is wide on thin tubes
+    looks the same: only differences between stations are corrected. What the tubes make of the mean is left behind.
+    """
+    of_range = np.zeros(len(x))
+    of_range[kernels.STATION - 1 :: kernels.STATION] = 1.0
+    count = len(x) // kernels.STATION
+    shared = float(x[of_range > 0.0].mean())
+    own = np.eye(len(x)) - np.outer(of_range, of_range) / count
+    return x - shared * of_range, normals.product(normals.product(own, C), np.ascontiguousarray(own.T)), shared
 
 
 def _tubes(points: Floats, start: Ints, at: Floats, along: Floats, radii: Floats) -> _Tubes:
@@ -276,7 +205,7 @@ def _judged(differs: Floats, shared: Bools, weight: Floats, floor: float) -> tup
 
 
 def _result(
-    x: Floats, C: Floats, posterior: Posterior, seen_by: Ints, scale: Floats, floor: float, tubes: _Tubes
+    x: Floats, C: Floats, posterior: Posterior, seen_by: Ints, scale: Floats, floor: float, tubes: _Tubes, shared: float
 ) -> Stations:
     places, count = posterior.places, len(posterior.places)
     before_rad, before_mm, offset_mm = np.sqrt(posterior.variance).tolist()
@@ -288,13 +217,18 @@ def _result(
         ", ".join(name for name, is_weak in zip(MOTIONS, row, strict=True) if is_weak) for row in (left > bound) & large
     )
     said = [f"stations lay {before_mm:.2g} mm and {1e3 * before_rad:.2g} mrad (sd an axis) off before"]
+    if abs(shared) > TOLD_MM:
+        said.append(
+            f"an offset of {shared:+.1f} mm that all ranges seem to share is not applied: a wide beam looks alike"
+        )
     said += [f"station {i}: {what} hardly told by the tubes" for i, what in enumerate(weak) if what]
+    common = np.hypot(before_mm / np.sqrt(count), posterior.datum_mm)
     if posterior.control is None:
-        datum = f"mean of {count} stations, {before_mm / np.sqrt(count):.2g} mm (sd an axis): no control points"
+        datum = f"mean of {count} stations, {common:.2g} mm (sd an axis): no control points"
     elif posterior.free:
-        datum = f"{len(posterior.control.ids)} control points"
+        datum = f"{posterior.control.count} control points"
     else:
-        datum = f"mean of {count} stations and {len(posterior.control.ids)} control points, too few to hold it alone"
+        datum = f"mean of {count} stations and {posterior.control.count} control points, too few to hold it alone"
     return Stations(
         "weak" if any(weak) else "ok",
         "; ".join(said),
@@ -305,6 +239,7 @@ def _result(
         before_rad,
         x[6 :: kernels.STATION],
         offset_mm,
+        float(np.std(x[6 :: kernels.STATION], ddof=1)) / np.sqrt(count) if count > 1 else 0.0,
         seen_by,
         weak,
         scale,
@@ -313,6 +248,23 @@ def _result(
         tubes.axis[:, 3:],
         tubes.radius,
         datum,
+    )
+
+
+def _controlled(found: Stations, x: Floats, control: ControlPoints, doubt: Doubt) -> Stations:
+    """Return the answer with what is left at the control points, and in the covariance what they contradict by."""
+    M = common_motion(found.places)[:, 3:]
+    shift = np.mean(x.reshape(-1, kernels.STATION)[:, 3:6], axis=0)
+    moved = f"all stations were moved to them by {np.linalg.norm(shift):.2g} mm (mean)"
+    C = found.covariance + normals.product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
+    return replace(
+        found,
+        status="weak" if doubt.off.any() else found.status,
+        message="; ".join([found.message, f"datum: {found.datum}", moved, *doubt.said]),
+        covariance=C,
+        control=control.ids,
+        control_off=control.off(x, found.places),
+        control_used=doubt.kept.astype(np.int64),
     )
 
 

@@ -10,7 +10,7 @@ from numba import njit
 
 from processor.bolt_balls.corridors import FIELD, HALF, Gathered, hash_of
 from processor.bolt_balls.nodes import Tubes
-from processor.bolt_balls.stations import TubePoints
+from processor.bolt_balls.station_records import TubePoints
 from processor.bolt_balls.thinning import STEPS_PER_MM, WHOLE
 from processor.bolt_balls.threads import over_ranges
 from processor.model import Ints

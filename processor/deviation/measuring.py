@@ -29,6 +29,7 @@ from processor.preassembly.registration import about_origin
 SURFACE_SAMPLES = 1_000_000
 SAMPLE_MM = (8.0, 40.0)  # least and greatest spacing of samples on the design
 MOST_CORE = 150_000
+POINTS_A_CORE = 40.0  # scanned points about a core point; fewer where a surface is narrow
 CORE_SHARE = 0.5  # of the projection diameter: the spacing of core points
 REACH_MM = 200.0  # farther from the design's surface nothing is of it
 DEPTH_SHARE, DEPTH_TIMES, LEAST_DEPTH_MM = 0.98, 2.5, 20.0
@@ -60,9 +61,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     curved = curved_facets.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
     placed = registering.place(scan, surface, given, params.register)
-    diameter = params.projection_diameter_mm or scales.rounded(
-        scales.diameter_for(scales.POINTS_A_CYLINDER, scan.spacing_mm)
-    )
+    diameter = params.projection_diameter_mm or scales.rounded(scales.diameter_for(POINTS_A_CORE, scan.spacing_mm))
     area = clouds.area(vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
     core = clouds.sampled(vertices, surface.faces, core_spacing)
@@ -186,6 +185,8 @@ def _result(
     diameter, depth, error, source, share = used
     total = summary.of_distances(found, core.points, core.normals, diameter, scales.PAPER_POINTS_A_CYLINDER)
     status, said = _status(placed, total, params)
+    if scan.unposed > 1:
+        said += f" {scan.unposed} scans have no pose: they were taken to be in one frame already."
     known = found.std2[np.isfinite(found.lod95)]
     return Result(
         status=status,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processor.geometry.m3c2 import FEWEST_FOR_LOD, LEAST_RANGE, Z95
 from processor.geometry.m3c2_kernels import HALF_DIAGONAL, eigen
@@ -65,7 +65,7 @@ def movement(
         ),
         len(places), least=LEAST_RANGE,
     )  # fmt: skip
-    table = student.ppf(0.975, np.arange(1, 401)) / Z95
+    table = stdtrit(np.arange(1.0, 401.0), 0.975) / Z95
     factor = np.where(free > 0, table[np.clip(free, 1, 400) - 1], np.nan)
     return Movement(along, count, np.sqrt(variance) * factor, vector)
 

@@ -23,6 +23,7 @@ from processor.preassembly.params import Params
 from processor.preassembly.proposals import propose
 from processor.preassembly.result import Result
 from processor.preassembly.systematic import EXPANSION_PER_K
+from processor.progress import tracked
 
 REFERENCE_C = 20.0
 TRADE_OFF = (1000.0, 1.0, 0.1, 0.01, 0.001)
@@ -33,7 +34,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     temperature_C, weight = scene.temperature_C, params.adjust.weight
     degrees = temperature_C - REFERENCE_C if np.isfinite(temperature_C) else 0.0
     shrink = 1.0 / (1.0 + EXPANSION_PER_K * degrees)
-    parts = [measure(own, index, design, shrink, params.systematic) for index, own in enumerate(scans)]
+    parts = [measure(own, index, design, shrink, params.systematic) for index, own in enumerate(tracked(scans))]
     firsts = [part.scans[0] for part in parts]
     frames = np.array([features.joint_frame(points) for points in design.joint_points])
     members = [part.member for part in parts]

@@ -12,6 +12,7 @@ import numpy as np
 from scipy.optimize import least_squares
 
 from processor.geometry import rigid
+from processor.geometry.error_figures import signed
 from processor.geometry.lines import Polyline
 from processor.model import ArchDesign, ArchTruth, Floats, Metric, Scene, Truth
 from processor.preassembly import errors
@@ -54,6 +55,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("preassemble", "linear error of the true edges, max", largest, none, "mm"),
         Metric("preassemble", "key points in the scan, rms", _rms(errors_at_points), none, "mm"),
         *_coverage(result, truth.arch, true),
+        *signed("preassemble", "key points", errors_at_points),
         *_gaps_as_they_should_be(scene.arch, result, truth.arch, true),
         Metric("preassemble", "pose, largest turn", 1000.0 * max(turns, default=none), none, "mrad"),
     ]
@@ -103,6 +105,7 @@ def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth
     return [
         Metric("preassemble", "gaps against the truth's, rms", float(np.sqrt(np.mean(off[known] ** 2))), none, "mm"),
         Metric("preassemble", "gaps within their 95 % intervals", share, none, "%"),
+        *signed("preassemble", "gaps", off[known]),
     ]
 
 

@@ -8,7 +8,7 @@ what is fitted by the sum of its own points' rows, so many points of few station
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy.special import stdtrit
 
 from processor.model import Floats, Ints
 from processor.preassembly.joint_measures import NORMAL_95
@@ -41,7 +41,7 @@ def variance(residual: Floats, station: Ints, cell: Ints) -> float:
     surplus = (scatter - (count - 1))[several]
     weight = (total - square / np.where(total > 0.0, total, 1.0))[several]
     # A variance known from k stations only: widened so that 1.96 standard deviations hold what Student's t would.
-    widened = (float(stats.t.ppf(0.975, len(np.unique(station[kept[group]])) - 1)) / NORMAL_95) ** 2
+    widened = (float(stdtrit(len(np.unique(station[kept[group]])) - 1, 0.975)) / NORMAL_95) ** 2
     return widened * max(float(np.mean(surplus / weight)), 0.0)
 
 

@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError
-from processor.readers import e57, las, pcd, ply, ptx, text
+from processor.readers import apart, closed, e57, las, pcd, ply, ptx, text
 from processor.readers.raw import RawScan
 
-__all__ = ["SUFFIXES", "RawScan", "read"]
+__all__ = ["ARCHIVES", "SUFFIXES", "RawScan", "read"]
 
 _FORMATS = {suffix: module for module in (e57, las, pcd, ply, ptx, text) for suffix in module.SUFFIXES}
-_CLOSED = (".fls", ".fws", ".zfs", ".rxp", ".rdbx", ".rcp", ".rcs", ".lsproj", ".imp")
 
 SUFFIXES = tuple(sorted(_FORMATS))
+ARCHIVES = closed.ARCHIVES
 
 
 def read(path: Path) -> list[RawScan]:
@@ -24,25 +24,28 @@ def read(path: Path) -> list[RawScan]:
     Raises InputError for a file that is missing, damaged, empty or of a format that cannot be read.
     """
     suffix = path.suffix.lower()
-    if suffix in _CLOSED:
-        raise InputError(
-            f"{path}: {suffix} is a closed format that only its maker's software reads; export the scan to E57"
-        )
+    if is_closed(path):
+        raise InputError(f"{path}: {closed.advice(suffix)}")
     if suffix not in _FORMATS:
         raise InputError(f"{path}: expected a scan file ({', '.join(SUFFIXES)}), found {suffix or 'no suffix'}")
     if not path.is_file():
         raise InputError(f"{path}: {'a folder, expected a file' if path.is_dir() else 'there is no such file'}")
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; copy or export it again")
+    module = _FORMATS[suffix]
     try:
+        if getattr(module, "apart", lambda _: False)(path):
+            return apart.read(path, module.__name__.rpartition(".")[2])
         # A damaged float32 may be a signalling NaN, of which numpy warns; what is not finite is refused later.
-        with np.errstate(invalid="ignore"):
-            scans: list[RawScan] = _FORMATS[suffix].read(path)
+        with np.errstate(invalid="ignore", over="ignore"):
+            scans: list[RawScan] = module.read(path)
         return scans
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
+    except MemoryError:
+        raise InputError(f"{path}: takes more memory than there is") from None
 
 
 def is_closed(path: Path) -> bool:
     """Whether a path has the suffix of a format that only its maker's software reads."""
-    return path.suffix.lower() in _CLOSED
+    return path.suffix.lower() in closed.FORMATS

@@ -5,6 +5,8 @@ Points whose invalid state is set are no returns and are left out. SI metres.
 
 from __future__ import annotations
 
+import re
+import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -12,29 +14,70 @@ from typing import Any
 import numpy as np
 
 from processor.model import Floats, InputError
-from processor.readers.raw import RawScan, make, parsing
+from processor.readers.raw import RawScan, make, parsing, room_for, stem
 
 SUFFIXES = (".e57",)
 UNIT = "m"
+HEADER = struct.Struct("<8sIIQQQQ")  # signature, version, length, start and length of the XML, page
+PAGE, PAYLOAD = 1024, 1020
+XML_LIMIT = 64 << 20
+PIECE = 1 << 18
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 LONGEST_NAME = 100
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+
+
+def apart(path: Path) -> bool:
+    """Whether the file is read in a process of its own."""
+    return True
 
 
 def read(path: Path) -> list[RawScan]:
     """Read every scan of an E57 file."""
     import pye57
 
-    with parsing(path, "E57"):
-        file = pye57.E57(str(path))
+    _check_structure(path)
+    with parsing(path, "E57"), path.open("rb") as opened:
+        # By its descriptor, as the library takes names in UTF-8 alone.
+        by_descriptor = Path(f"/proc/self/fd/{opened.fileno()}")
+        file = pye57.E57(str(by_descriptor if by_descriptor.exists() else path))
         try:
             count = file.scan_count
             if not count:
                 raise InputError(f"{path}: holds no scans")
-            called = names(path.stem, [_own_name(file.get_header(i)) for i in range(count)])
+            called = names(stem(path), [_own_name(file.get_header(i)) for i in range(count)])
             return [_read_scan(path, file, i, called) for i in range(count)]
         finally:
             file.close()
+
+
+def _check_structure(path: Path) -> None:
+    """Refuse a file whose header does not fit its size, and XML that declares types or entities of its own.
+
+    The XML of ASTM E2807 has neither; entities can be made to grow without bound or to name other files.
+    """
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        head = file.read(HEADER.size)
+        if len(head) < HEADER.size or not head.startswith(b"ASTM-E57"):
+            raise InputError(f"{path}: not a readable E57 file: it has no E57 header; copy or export it again")
+        _, _, _, length, start, xml_length, page = HEADER.unpack(head)
+        pages = -(-(start % PAGE + xml_length) // PAYLOAD) + 1
+        if page != PAGE or length != size or start > size or xml_length > min(size, XML_LIMIT):
+            raise InputError(f"{path}: its header does not fit a file of {size} bytes; copy or export it again")
+        first = start // PAGE
+        file.seek(first * PAGE)
+        raw = file.read(pages * PAGE)
+    # Each page ends in a check sum of four bytes.
+    text = b"".join(raw[i : i + PAYLOAD] for i in range(0, len(raw), PAGE))
+    text = text[start % PAGE : start % PAGE + xml_length]
+    if text[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in text:
+        raise InputError(f"{path}: its XML is not in UTF-8, as the format has it; export it again")
+    if re.search(rb"<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
+        raise InputError(f"{path}: its XML declares a document type or entities, which scans have not; it is not read")
+    declared = re.match(rb"\s*<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)", text.removeprefix(b"\xef\xbb\xbf"))
+    if declared and declared[1].lower() not in (b"utf-8", b"utf8", b"us-ascii"):
+        raise InputError(f"{path}: its XML is in {declared[1][:40]!r}, expected UTF-8; export it again")
 
 
 def names(stem: str, own: Sequence[str]) -> list[str]:
@@ -75,28 +118,53 @@ def _read_scan(path: Path, file: Any, index: int, called: Sequence[str]) -> RawS
     if not cartesian and not fields.issuperset(SPHERICAL):
         raise InputError(f"{path}: scan {name!r} has neither Cartesian nor spherical points ({', '.join(fields)})")
     state = "cartesianInvalidState" if cartesian else "sphericalInvalidState"
-    wanted = [*(CARTESIAN if cartesian else SPHERICAL), *({state, "intensity"} & fields)]
-    data, buffers = file.make_buffers(wanted, declared)
-    found = header.points.reader(buffers).read() if declared else 0
-    if found != declared:
-        raise InputError(f"{path}: scan {name!r} declares {declared} points but holds {found}; copy it again")
-    valid = data[state] == 0 if state in data else np.ones(declared, bool)
-    if cartesian:
-        xyz = np.stack([data[name][valid] for name in CARTESIAN], axis=1)
-    else:
-        xyz = cartesian_from_spherical(*(data[name][valid] for name in SPHERICAL))
+    axes = CARTESIAN if cartesian else SPHERICAL
+    wanted = [*axes, *({state, "intensity"} & fields)]
+    points = room_for(declared, 3)
+    intensity = room_for(declared if "intensity" in fields else 0)
+    data, buffers = file.make_buffers(wanted, min(declared, PIECE) or 1)
+    reader = header.points.reader(buffers)
+    read = found = 0
+    while declared and (rows := reader.read()):
+        read += rows
+        if read > declared:
+            break
+        valid = data[state][:rows] == 0 if state in data else slice(None)
+        columns = [data[axis][:rows][valid] for axis in axes]
+        kept = len(columns[0])
+        xyz = points[found : found + kept]
+        if cartesian:
+            for i in range(3):
+                xyz[:, i] = columns[i]
+        else:
+            xyz[:] = cartesian_from_spherical(*columns)
+        if len(intensity):
+            intensity[found : found + kept] = data["intensity"][:rows][valid]
+        found += kept
+    if read != declared:
+        raise InputError(f"{path}: scan {name!r} declares {declared} points but holds {read}; copy it again")
+    if declared and not found:
+        raise InputError(f"{path}: scan {name!r} holds no returns: all of its {declared} points are marked invalid")
     pose = _pose(path, name, header) if header.has_pose() else np.empty(0)
     # Writers give a lone or merged cloud an identity pose too, so it says nothing of where a scanner stood.
     posed = pose.size > 0 and (count > 1 or bool((pose != np.eye(4)).any()))
     return make(
         path,
         name,
-        xyz,
+        points[:found],
         unit=UNIT,
-        intensity=data["intensity"][valid] if "intensity" in data else (),
+        intensity=intensity[:found],
         position=np.zeros(3) if posed else (),
         T_project_scan=pose,
+        single=_is_single(header, axes[0]),
     )
+
+
+def _is_single(header: Any, field: str) -> bool:
+    from pye57 import libe57
+
+    node = libe57.StructureNode(header.points.prototype())[field]
+    return isinstance(node, libe57.FloatNode) and node.precision() == libe57.E57_SINGLE
 
 
 def cartesian_from_spherical(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats:

@@ -10,13 +10,23 @@ from typing import Any
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.raw import RawScan, check_room, make, parsing
+from processor.readers.raw import RawScan, check_room, make, parsing, room_for, stem
 
 SUFFIXES = (".las", ".laz")
 UNIT = "m"
+PIECE = 1_000_000
+PACKED = 0xC0  # bits of the point format
 LAZ_LIMIT = 2_000  # no real file is packed more tightly than this
 LINEAR_UNIT_KEYS = (3076, 4052)  # ProjLinearUnitsGeoKey, GeogLinearUnitsGeoKey of GeoTIFF
+VERTICAL_UNIT_KEY, MODEL_KEY, GEOGRAPHIC = 4099, 1024, 2
 EPSG_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
+
+
+def apart(path: Path) -> bool:
+    """Whether the file is read in a process of its own: where it is compressed, by native code."""
+    with path.open("rb") as file:
+        head = file.read(105)
+    return len(head) == 105 and bool(head[104] & PACKED)
 
 
 def read(path: Path) -> list[RawScan]:
@@ -24,17 +34,30 @@ def read(path: Path) -> list[RawScan]:
     import laspy
 
     _check_header(path)
-    with parsing(path, "LAS"):
-        las = laspy.read(str(path))
-        xyz = np.asarray(las.xyz, np.float64)
-        intensity = np.asarray(las.intensity, np.float64)
-        station = np.asarray(las.point_source_id, np.int64)
-        unit = _unit(las.header.vlrs)
-        declared = int(las.header.point_count)
-    if len(xyz) != declared:
-        raise InputError(f"{path}: the header declares {declared} points, but {len(xyz)} were read; copy it again")
+    found = 0
+    with parsing(path, "LAS"), laspy.open(str(path)) as file:
+        header = file.header
+        fits_degrees = bool((np.abs([header.mins, header.maxs])[:, :2] <= [180.0, 90.0]).all())
+        unit = _unit(path, [*header.vlrs, *(header.evlrs or [])], fits_degrees)
+        declared = int(header.point_count)
+        if not np.isfinite([header.scales, header.offsets]).all() or not np.all(header.scales):
+            raise InputError(f"{path}: scales {header.scales} and offsets {header.offsets} make no coordinates")
+        points, intensity = room_for(declared, 3), room_for(declared)
+        station = np.empty(declared, np.uint16)
+        for piece in file.chunk_iterator(PIECE):
+            rows = slice(found, found + len(piece))
+            for i, axis in enumerate("XYZ"):
+                column = points[rows, i]
+                np.multiply(piece[axis], header.scales[i], out=column)
+                column += header.offsets[i]
+            intensity[rows] = piece["intensity"]
+            station[rows] = piece["point_source_id"]
+            found += len(piece)
+    if found != declared:
+        raise InputError(f"{path}: the header declares {declared} points, but {found} were read; copy it again")
     # 0 in all of the file: it does not say.
-    return [make(path, path.stem, xyz, unit=unit, intensity=intensity, station=station if station.any() else ())]
+    said = station if station.any() else ()
+    return [make(path, stem(path), points, unit=unit, intensity=intensity, station=said)]
 
 
 def _check_header(path: Path) -> None:
@@ -50,18 +73,54 @@ def _check_header(path: Path) -> None:
         extended_start, extended, count = struct.unpack_from("<QIQ", head, 235)
     if not length or start > size or vlrs * 54 > start or extended * 60 > size or extended_start > size:
         raise InputError(f"{path}: the header's counts do not fit the file of {size} bytes; copy or export it again")
-    packed = bool(form & 0xC0)
+    packed = bool(form & PACKED)
     check_room(path, "LAS", count, length / (LAZ_LIMIT if packed else 1), size - start)
+    # From version 1.3 on other data may follow the points.
+    if not packed and head[25] < 3 and size - start - count * length >= length:
+        raise InputError(
+            f"{path}: the header declares {count} points, but there is room for {(size - start) // length}; "
+            "the file was not finished or its header is damaged: export it again"
+        )
 
 
-def _unit(vlrs: Any) -> str:
+def _unit(path: Path, vlrs: Any, fits_degrees: bool) -> str:
+    """Return the unit that the coordinate system names. Raises InputError for degrees, and for heights in another unit.
+
+    A system in degrees beside coordinates that can be none (``fits_degrees``) is taken for a slip of the writer.
+    """
+    unit, heights = "", ""
     for vlr in vlrs:
-        for key in getattr(vlr, "geo_keys", ()):
-            if key.id in LINEAR_UNIT_KEYS and key.value_offset in EPSG_UNITS:
-                return EPSG_UNITS[key.value_offset]
+        keys = {key.id: key.value_offset for key in getattr(vlr, "geo_keys", ())}
+        if fits_degrees and keys.get(MODEL_KEY) == GEOGRAPHIC:
+            raise _in_degrees(path)
+        unit = unit or next((EPSG_UNITS[keys[key]] for key in LINEAR_UNIT_KEYS if keys.get(key) in EPSG_UNITS), "")
+        heights = heights or EPSG_UNITS.get(keys.get(VERTICAL_UNIT_KEY, 0), "")
         # In WKT the unit of a projected system's axes is the last UNIT of the horizontal part.
-        wkt = str(getattr(vlr, "string", "")).split("VERT_CS")[0]
-        units = re.findall(r'UNIT\["([^"]*)",\s*([0-9.eE+-]+)', wkt) if "PROJCS" in wkt else []
-        if units and 0.3 < float(units[-1][1]) < 0.31:
-            return "us-ft" if "US" in units[-1][0].upper() else "ft"
-    return UNIT
+        wkt = re.split("VERT_?CS|VERTCRS", str(getattr(vlr, "string", "")))
+        if fits_degrees and re.match(r"\s*(GEOGCS|GEOGCRS|GEODCRS|COMPD_?(CS|CRS)\[[^\[]*,\s*GEOG)", wkt[0]):
+            raise _in_degrees(path)
+        if "PROJC" in wkt[0]:
+            unit = unit or _last_unit(wkt[0])
+            heights = heights or (_last_unit(wkt[1]) if len(wkt) > 1 else "")
+    unit = unit or UNIT
+    if heights and heights != unit:
+        raise InputError(
+            f"{path}: x and y are in {unit}, z in {heights} by its coordinate system; export it in one unit"
+        )
+    return unit
+
+
+def _in_degrees(path: Path) -> InputError:
+    return InputError(f"{path}: its coordinates are longitude and latitude; export it in a projected system, in metres")
+
+
+def _last_unit(wkt: str) -> str:
+    """Return the last unit of length of a coordinate system in WKT, "" for one that is not known."""
+    units = re.findall(r'(?<!ANGLE)UNIT\["([^"]*)",\s*([0-9.eE+-]+)', wkt)
+    lengths = [(name, float(size)) for name, size in units if not 0.017 < float(size) < 0.018]
+    if not lengths:
+        return ""
+    name, size = lengths[-1]
+    if 0.3 < size < 0.31:
+        return "us-ft" if "US" in name.upper() else "ft"
+    return "m" if size == 1.0 else ""

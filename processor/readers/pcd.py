@@ -5,68 +5,161 @@ VIEWPOINT is not used: programs differ on whether the points are to be moved by 
 
 from __future__ import annotations
 
-import io
+import os
+import struct
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from processor.model import InputError
-from processor.readers.raw import INTENSITY_NAMES, STATION_NAMES, RawScan, check_room, first_named, make, parsing
+from processor.model import Floats, InputError
+from processor.readers.raw import (
+    INTENSITY_NAMES,
+    STATION_NAMES,
+    RawScan,
+    check_room,
+    first_named,
+    make,
+    parsing,
+    room_for,
+    stem,
+)
+from processor.readers.records import fill, of_records
+from processor.readers.rows import Rows
 
 SUFFIXES = (".pcd",)
 UNIT = ""
 HEADER_LIMIT = 65_536
+PIECE = 1 << 15  # points
 LZF_LIMIT = 100  # a match of LZF turns 3 bytes into at most 264
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file declares, and where its data begin."""
+
+    names: list[str]
+    types: list[str]  # of numpy, with a shape where COUNT is not 1
+    counts: list[int]
+    width: int
+    height: int
+    points: int
+    data: str
+    start: int
+
+    def dtype(self) -> Any:
+        """Return the type of one record; fields are called by their number, as names may be there twice."""
+        return np.dtype([(str(i), t, (n,)) for i, (t, n) in enumerate(zip(self.types, self.counts, strict=True))])
 
 
 def read(path: Path) -> list[RawScan]:
     """Read a PCD file as one scan."""
-    from pypcd4.pypcd4 import MetaData, PointCloud
+    header = read_header(path)
+    names, count = header.names, header.points
+    missing = [name for name in "xyz" if name not in names]
+    if missing:
+        raise InputError(f"{path}: expected FIELDS with x, y, z, found {' '.join(names)}")
+    intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
+    fields = [names.index(one) for one in (*"xyz", intensity, station) if one]
+    columns = [room_for(count, 3), *(room_for(count) for _ in fields[3:])]
+    with parsing(path, "PCD"), path.open("rb") as file:
+        file.seek(header.start)
+        if header.data == "ascii":
+            first = np.cumsum([0, *header.counts])
+            fill(columns, Rows(file).pieces([int(first[one]) for one in fields], count))
+        elif header.data == "binary":
+            pieces = of_records(file, header.dtype(), [str(one) for one in fields], count)
+            fill(columns, ([column[:, 0] for column in piece] for piece in pieces))
+        else:
+            fill(columns, _unpacked(file, header, fields))
+    found = _without_nan(columns)
+    return [
+        make(
+            path,
+            stem(path),
+            columns[0][:found],
+            unit=UNIT,
+            intensity=columns[1][:found] if intensity else (),
+            station=columns[-1][:found] if station else (),
+            single=header.data != "ascii" and header.types[fields[0]] == "<f4",
+        )
+    ]
 
+
+def read_header(path: Path) -> Header:
+    """Read the header and hold what it declares against the file's size. Raises InputError where it does not fit."""
     with path.open("rb") as file:
         head = file.read(HEADER_LIMIT)
     data = head.find(b"\nDATA ")
     stop = head.find(b"\n", data + 1)
     if data < 0 or stop < 0:
         raise InputError(f"{path}: not a readable PCD file: it has no DATA line; copy or export it again")
-    lines = [line.strip() for line in head[:stop].decode("latin-1").splitlines()]
-    lines = [line for line in lines if line and not line.startswith("#")]
+    said = {}
+    for line in head[:stop].decode("latin-1").splitlines():
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            said[words[0]] = words[1:]
+    lost = [key for key in ("FIELDS", "SIZE", "TYPE", "WIDTH", "HEIGHT") if not said.get(key)]
+    if lost:
+        raise InputError(f"{path}: not a readable PCD file: its header has no {lost[0]} line; copy or export it again")
+    names = said["FIELDS"]
     with parsing(path, "PCD"):
-        meta = MetaData.parse_header(lines)
-        row = meta.build_dtype().itemsize
-        lengths = {len(meta.fields), len(meta.size), len(meta.type), len(meta.count)}
-    if len(lengths) != 1:
-        raise InputError(f"{path}: FIELDS, SIZE, TYPE and COUNT differ in length; export the file again")
-    if meta.width * meta.height != meta.points:
-        raise InputError(f"{path}: WIDTH {meta.width} x HEIGHT {meta.height} is not POINTS {meta.points}")
+        sizes, kinds = said["SIZE"], said["TYPE"]
+        counts = [int(one) for one in said.get("COUNT", ["1"] * len(names))]
+        if not len(names) == len(sizes) == len(kinds) == len(counts):
+            raise InputError(f"{path}: FIELDS, SIZE, TYPE and COUNT differ in length; export the file again")
+        codes = {"F": ("4", "8"), "I": ("1", "2", "4", "8"), "U": ("1", "2", "4", "8")}
+        if any(size not in codes.get(kind, ()) for size, kind in zip(sizes, kinds, strict=True)):
+            raise ValueError(f"no type {' '.join(kinds)[:40]} of size {' '.join(sizes)[:40]}")
+        types = [f"<{kind.lower()}{size}" for kind, size in zip(kinds, sizes, strict=True)]
+        width, height = int(said["WIDTH"][0]), int(said["HEIGHT"][0])
+        points = int(said["POINTS"][0]) if "POINTS" in said else width * height
+        form = said["DATA"][0].lower()
+        if form not in ("ascii", "binary", "binary_compressed") or min(counts) < 1 or max(counts) > HEADER_LIMIT:
+            raise ValueError(f"DATA {form[:40]}, COUNT {min(counts)} to {max(counts)}")
+    if width * height != points:
+        raise InputError(f"{path}: WIDTH {width} x HEIGHT {height} is not POINTS {points}")
     room = path.stat().st_size - stop - 1
-    encoding = meta.data.value
-    least = {"ascii": 2 * sum(meta.count), "binary": row}.get(encoding, row / LZF_LIMIT)
-    check_room(path, "PCD", meta.points, least, room + (encoding == "ascii"))
-    with parsing(path, "PCD"):
-        # Runs of blanks are one separator, which the library does not know; and its header ends at ten lines.
-        content = path.read_bytes()
-        body = b"\n".join(b" ".join(line.split()) for line in content[stop + 1 :].splitlines())
-        text = "\n".join(lines).encode() + b"\n"
-        stream: Any = io.BytesIO(text + (body if encoding == "ascii" else content[stop + 1 :]))
-        rows = np.atleast_1d(PointCloud.from_fileobj(stream).pc_data)
-    if len(rows) != meta.points:
-        raise InputError(f"{path}: POINTS declares {meta.points}, but {len(rows)} were found; copy or export it again")
-    missing = [name for name in "xyz" if name not in meta.fields]
-    if missing:
-        raise InputError(f"{path}: expected FIELDS with x, y, z, found {' '.join(meta.fields)}")
-    xyz = np.stack([np.asarray(rows[name], np.float64) for name in "xyz"], axis=1)
-    valid = ~np.isnan(xyz).any(axis=1)
-    intensity = first_named(meta.fields, INTENSITY_NAMES)
-    station = first_named(meta.fields, STATION_NAMES)
-    return [
-        make(
-            path,
-            path.stem,
-            xyz[valid],
-            unit=UNIT,
-            intensity=rows[intensity][valid] if intensity else (),
-            station=rows[station][valid] if station else (),
-        )
-    ]
+    row = sum(int(size) * n for size, n in zip(sizes, counts, strict=True))
+    least = {"ascii": 2 * sum(counts), "binary": row}.get(form, row / LZF_LIMIT)
+    check_room(path, "PCD", points, least, room + (form == "ascii"))
+    return Header(names, types, counts, width, height, points, form, stop + 1)
+
+
+def _unpacked(file: BinaryIO, header: Header, fields: Sequence[int]) -> Iterator[list[Any]]:
+    """Give columns of compressed data, which hold field after field."""
+    import lzf
+
+    packed_size, size = struct.unpack("<II", file.read(8))
+    sizes = [int(t[2]) * n * header.points for t, n in zip(header.types, header.counts, strict=True)]
+    room = os.fstat(file.fileno()).st_size - header.start - 8
+    if size != sum(sizes) or packed_size > room:
+        raise ValueError(f"{size} bytes in {packed_size} are declared, expected {sum(sizes)} in {room} or fewer")
+    packed = file.read(packed_size)
+    unpacked = lzf.decompress(packed, size) if size else b""
+    if unpacked is None or len(unpacked) != size:
+        raise ValueError("the compressed data are damaged")
+    del packed
+    starts = np.cumsum([0, *sizes])
+    whole = [np.frombuffer(unpacked, header.types[i], header.points * header.counts[i], int(starts[i])) for i in fields]
+    for start in range(0, header.points, PIECE):
+        stop = min(start + PIECE, header.points)
+        yield [column.reshape(-1, header.counts[i])[start:stop, 0] for i, column in zip(fields, whole, strict=True)]
+
+
+def _without_nan(columns: Sequence[Floats]) -> int:
+    """Move the rows that have no NaN coordinate to the front, in their order, and return their count."""
+    found, count = 0, len(columns[0])
+    if count and not np.isnan(columns[0].min()):
+        return count
+    for start in range(0, count, PIECE):
+        rows = slice(start, min(start + PIECE, count))
+        valid = np.atleast_1d(~np.isnan(columns[0][rows]).any(axis=1))
+        kept = int(np.count_nonzero(valid))
+        if found != start or kept != len(valid):
+            for column in columns:
+                column[found : found + kept] = column[rows][valid]
+        found += kept
+    return found

@@ -1,52 +1,101 @@
-"""PLY: ASCII or binary, of either byte order, float or double. The vertices are the points."""
+"""PLY: ASCII or binary, of either byte order, float or double. The vertices are the points; the rest is passed over."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.raw import INTENSITY_NAMES, STATION_NAMES, RawScan, check_room, first_named, make, parsing
+from processor.readers.raw import (
+    INTENSITY_NAMES,
+    STATION_NAMES,
+    RawScan,
+    check_room,
+    first_named,
+    make,
+    parsing,
+    room_for,
+    stem,
+)
+from processor.readers.records import fill, of_records
+from processor.readers.rows import Rows
 
 SUFFIXES = (".ply",)
 UNIT = ""
 HEADER_LIMIT = 65_536
-SIZES = {
-    **dict.fromkeys(("char", "uchar", "int8", "uint8"), 1),
-    **dict.fromkeys(("short", "ushort", "int16", "uint16"), 2),
-    **dict.fromkeys(("int", "uint", "float", "int32", "uint32", "float32"), 4),
-    **dict.fromkeys(("double", "float64"), 8),
+TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
 }
+ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
+
+
+@dataclass
+class _Element:
+    name: str
+    count: int
+    types: dict[str, str] = field(default_factory=dict)
+    lists: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class Header:
+    """What a file declares: byte order ("" = ASCII), elements in their order, and where the data begin."""
+
+    order: str
+    elements: list[_Element]
+    start: int
 
 
 def read(path: Path) -> list[RawScan]:
     """Read the vertices of a PLY file as one scan, with their intensity where there is one."""
-    from plyfile import PlyData
-
-    check_header(path)
-    with parsing(path, "PLY"):
-        vertex = PlyData.read(str(path))["vertex"].data
-    fields = vertex.dtype.names or ()
-    missing = [name for name in "xyz" if name not in fields]
+    header = check_header(path)
+    vertex = next((one for one in header.elements if one.name == "vertex"), _Element("vertex", 0))
+    before = header.elements[: header.elements.index(vertex)] if vertex in header.elements else []
+    missing = [name for name in "xyz" if name not in vertex.types]
     if missing:
-        raise InputError(f"{path}: expected vertices with x, y, z, found {', '.join(fields) or 'none'}")
-    intensity = first_named(fields, INTENSITY_NAMES)
-    xyz = np.stack([np.asarray(vertex[name], np.float64) for name in "xyz"], axis=1)
-    station = first_named(fields, STATION_NAMES)
+        found = ", ".join(vertex.types) or "none"
+        raise InputError(f"{path}: expected vertices with x, y, z, found {found}")
+    if vertex.lists or (header.order and any(one.lists for one in before)):
+        raise InputError(f"{path}: has lists of numbers before or within its vertices; export it with points alone")
+    intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
+    wanted = [*"xyz", *(one for one in (intensity, station) if one)]
+    columns = [room_for(vertex.count, 3), *(room_for(vertex.count) for _ in wanted[3:])]
+    with parsing(path, "PLY"), path.open("rb") as file:
+        file.seek(header.start)
+        if header.order:
+            dtype = np.dtype([(name, header.order + code) for name, code in vertex.types.items()])
+            skipped = sum(one.count * sum(int(code[1]) for code in one.types.values()) for one in before)
+            file.seek(header.start + skipped)
+            fill(columns, of_records(file, dtype, wanted, vertex.count))
+        else:
+            rows = Rows(file)
+            for _ in range(sum(one.count for one in before)):
+                rows.skip_line()
+            names = list(vertex.types)
+            fill(columns, rows.pieces([names.index(one) for one in wanted], vertex.count))
     return [
         make(
             path,
-            path.stem,
-            xyz,
+            stem(path),
+            columns[0],
             unit=UNIT,
-            intensity=vertex[intensity] if intensity else (),
-            station=vertex[station] if station else (),
+            intensity=columns[1] if intensity else (),
+            station=columns[-1] if station else (),
+            single=bool(header.order) and vertex.types["x"] == "f4",
         )
     ]
 
 
-def check_header(path: Path) -> None:
+def check_header(path: Path) -> Header:
     """Hold the numbers that a header declares against the file's size, before anything makes room for them.
 
     Raises InputError where the file has too few or too many bytes, and for a file without a header.
@@ -58,27 +107,36 @@ def check_header(path: Path) -> None:
     if not head.startswith(b"ply") or end < 0 or stop < 0:
         raise InputError(f"{path}: not a readable PLY file: it has no PLY header; copy or export it again")
     room = path.stat().st_size - stop - 1
-    ascii_rows, least, exact, count = False, 0, True, 0
-    for line in head[:end].decode("latin-1").splitlines():
-        words = line.split() or [""]
-        with parsing(path, "PLY"):
+    order, elements = "", list[_Element]()
+    with parsing(path, "PLY"):
+        for line in head[:end].decode("latin-1").splitlines():
+            words = line.split() or [""]
             if words[0] == "format":
-                ascii_rows = words[1] == "ascii"
+                order = ORDERS[words[1]]
             elif words[0] == "element":
-                count = int(words[2])
-                check_room(path, "PLY", count, 1, room)
+                elements.append(_Element(words[1], int(words[2])))
+                check_room(path, "PLY", elements[-1].count, 1, room)
+            elif words[0] == "property" and words[1] == "list":
+                elements[-1].lists.append(TYPES[words[2]])
+                elements[-1].types[words[4]] = TYPES[words[3]]
             elif words[0] == "property":
-                listed = words[1] == "list"
-                exact = exact and not listed
-                least += count * (2 if ascii_rows else SIZES[words[2 if listed else 1]])
+                if words[2] in elements[-1].types:
+                    raise ValueError(f"two properties {words[2]}")
+                elements[-1].types[words[2]] = TYPES[words[1]]
+    exact = not any(one.lists for one in elements)
+    least = 0
+    for one in elements:
+        codes = [*list(one.types.values())[: len(one.types) - len(one.lists)], *one.lists]
+        least += one.count * (2 * len(codes) if not order else sum(int(code[1]) for code in codes))
     # The last number of an ASCII file needs no separator after it.
-    if least > room + ascii_rows:
+    if least > room + (not order):
         raise InputError(
             f"{path}: the header declares {least} bytes of data or more, but {room} follow; "
             "the file is cut off or damaged: copy or export it again"
         )
-    if exact and not ascii_rows and least < room:
+    if exact and order and least < room:
         raise InputError(
             f"{path}: the header declares {least} bytes of data, but {room} follow; "
             "the header does not fit the file: export it again"
         )
+    return Header(order, elements, stop + 1)

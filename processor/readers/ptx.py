@@ -7,14 +7,13 @@ here; then a line a grid cell ``x y z intensity [r g b]``. A cell of ``0 0 0`` h
 from __future__ import annotations
 
 import dataclasses
-from itertools import islice
 from pathlib import Path
-from typing import TextIO
 
 import numpy as np
 
 from processor.model import Floats, InputError
-from processor.readers.raw import RawScan, check_room, make, parsing
+from processor.readers.raw import RawScan, check_room, make, parsing, room_for, stem
+from processor.readers.rows import Rows
 
 SUFFIXES = (".ptx",)
 UNIT = "m"
@@ -26,34 +25,31 @@ def read(path: Path) -> list[RawScan]:
     """Read every grid of a PTX file as a scan."""
     scans: list[RawScan] = []
     size = path.stat().st_size
-    with path.open(encoding="utf-8-sig", errors="replace") as file:
-        while (first := _next_line(file)) is not None:
-            number = len(scans) + 1
-            scans.append(_read_grid(path, file, first, number, size))
+    with path.open("rb") as file:
+        rows = Rows(file)
+        with parsing(path, "PTX"):
+            first = rows.line()
+        while first is not None:
+            scans.append(_read_grid(path, rows, first, len(scans) + 1, size))
+            with parsing(path, "PTX"):
+                first = rows.line()
     if not scans:
         raise InputError(f"{path}: holds no scans")
     if len(scans) == 1:
         return scans
-    return [_renamed(scan, f"{path.stem}-{i}") for i, scan in enumerate(scans, 1)]
+    return [dataclasses.replace(scan, name=f"{stem(path)}-{i}") for i, scan in enumerate(scans, 1)]
 
 
-def _renamed(scan: RawScan, name: str) -> RawScan:
-    return dataclasses.replace(scan, name=name)
-
-
-def _next_line(file: TextIO) -> str | None:
-    return next((line for line in iter(file.readline, "") if line.strip()), None)
-
-
-def _read_grid(path: Path, file: TextIO, first: str, number: int, size: int) -> RawScan:
-    head = [first, *islice(file, 9)]
+def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> RawScan:
     widths = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
+    with parsing(path, "PTX"):
+        head = [first, *(rows.line() or "" for _ in range(9))]
     try:
-        rows = [[float(word) for word in line.split()] for line in head]
+        numbers = [[float(word) for word in line.split()] for line in head]
         columns, lines = int(head[0]), int(head[1])
-    except (ValueError, IndexError):
-        rows = []
-    if len(rows) != 10 or any(len(row) != width for row, width in zip(rows, widths, strict=True)):
+    except ValueError:
+        numbers = []
+    if len(numbers) != 10 or any(len(row) != width for row, width in zip(numbers, widths, strict=True)):
         raise InputError(
             f"{path}: scan {number} has no PTX header of ten lines (columns, rows, position, axes, matrix); "
             "the file is cut off or damaged, or declares fewer cells than it holds"
@@ -62,25 +58,31 @@ def _read_grid(path: Path, file: TextIO, first: str, number: int, size: int) -> 
     if columns < 1 or lines < 1:
         raise InputError(f"{path}: scan {number} declares a grid of {columns} x {lines} cells")
     check_room(path, "PTX", cells, SHORTEST_ROW, size)
-    T_project_scan = _rigid(path, number, np.array(rows[6:]).T)
+    T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
     with parsing(path, "PTX"):
-        data = np.loadtxt(islice(file, cells), ndmin=2, comments=None)
-    if len(data) != cells or data.shape[1] < 3:
-        raise InputError(
-            f"{path}: scan {number} declares {cells} cells of three columns or more, "
-            f"found {len(data)} of {data.shape[1]}; copy or export it again"
-        )
-    returned = (data[:, :3] != 0.0).any(axis=1)
-    if not returned.any():
+        wide = rows.width() in (4, 7)
+        points, intensity = room_for(cells, 3), room_for(cells if wide else 0)
+        read = found = 0
+        for piece in rows.pieces((0, 1, 2, 3) if wide else (0, 1, 2), cells):
+            read += len(piece)
+            x, y, z = piece.T[:3]
+            hit = (x != 0.0) | (y != 0.0) | (z != 0.0)
+            returned = piece if hit.all() else piece[hit]
+            points[found : found + len(returned)] = returned[:, :3]
+            if wide:
+                intensity[found : found + len(returned)] = returned[:, 3]
+            found += len(returned)
+    if read != cells:
+        raise InputError(f"{path}: scan {number} declares {cells} cells, found {read}; copy or export it again")
+    if not found:
         raise InputError(f"{path}: scan {number} holds no returns, only cells of 0 0 0")
-    position = T_project_scan[:3, :3].T @ (np.array(rows[2]) - T_project_scan[:3, 3])
-    intensity = data[returned, 3] if data.shape[1] in (4, 7) else ()
+    position = T_project_scan[:3, :3].T @ (np.array(numbers[2]) - T_project_scan[:3, 3])
     return make(
         path,
-        path.stem,
-        data[returned, :3],
+        stem(path),
+        points[:found],
         unit=UNIT,
-        intensity=intensity,
+        intensity=intensity[: found if wide else 0],
         position=position,
         T_project_scan=T_project_scan,
     )

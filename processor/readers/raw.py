@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,36 +34,73 @@ class RawScan(Checked):
     T_project_scan: Floats = optional(4, 4)
     unit: str = ""  # "" = the format does not say
     station: Ints = column("n", dtype=np.int64)  # number of the station a point was seen from, from 1; 0 = unknown
+    step: float = 0.0  # what two coordinates differ by at least, in the type the file has them in; 0 = nothing
+
+
+# How readers get the arrays they fill: in a process of its own (see apart) they lie in memory shared with the other.
+_new_array: Callable[[tuple[int, ...]], Floats] = np.empty
+
+
+def room_for(*shape: int) -> Floats:
+    """Return an array to be filled; of what is never written no memory is taken."""
+    return _new_array(shape)
+
+
+def give_room_by(new_array: Callable[[tuple[int, ...]], Floats]) -> None:
+    """Let another function make the arrays of ``room_for``."""
+    global _new_array
+    _new_array = new_array
+
+
+def stem(path: Path) -> str:
+    """Return how a file calls its scan: its name without suffix, as text."""
+    return text_of(path.stem) or "scan"
+
+
+def text_of(name: str) -> str:
+    """Return the name of a file as text: by GB18030 where its bytes are no UTF-8."""
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return decoded(os.fsencode(name))
+    return name
 
 
 def make(
     path: Path,
     name: str,
-    xyz: npt.ArrayLike,
+    points: Floats,
     *,
     unit: str,
     intensity: npt.ArrayLike = (),
     position: npt.ArrayLike = (),
     T_project_scan: npt.ArrayLike = (),
     station: npt.ArrayLike = (),
+    single: bool = False,
 ) -> RawScan:
-    """Make the record from coordinates (n, 3), taking off an origin of whole thousands where they are far.
+    """Make the record from coordinates (n, 3), taking off an origin of whole thousands, in place, where they are far.
 
-    Raises InputError for no points, and for coordinates that are not finite.
+    ``single``: the file has the coordinates in 32 bits. Raises InputError for no points, and for coordinates that are
+    not finite.
     """
-    points = np.array(xyz, np.float64)
     if not len(points):
         raise InputError(f"{path}: scan {name!r} holds no points")
-    bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-    if len(bad):
+    low, high = float(points.min()), float(points.max())  # NaN where there is one
+    if not (np.isfinite(low) and np.isfinite(high)):
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise InputError(
             f"{path}: {len(bad)} of {len(points)} points of {name!r} have coordinates that are not finite, "
             f"the first in row {bad[0] + 1}; remove them or export the scan again"
         )
+    farthest = max(-low, high)
     origin = np.zeros(3)
-    if np.abs(points).max() > FAR:
-        origin = np.floor(points[0] / ORIGIN_STEP) * ORIGIN_STEP
+    if farthest > FAR:
+        # The middle of a sample: the first point may be a stray one.
+        sample = points[:: max(1, len(points) // 1000)]
+        origin = np.floor(np.sort(sample, axis=0)[len(sample) // 2] / ORIGIN_STEP) * ORIGIN_STEP
         points -= origin
+    with np.errstate(over="ignore"):
+        step = float(np.spacing(np.float32(farthest))) if single else 0.0
     return RawScan(
         name,
         points,
@@ -72,7 +110,17 @@ def make(
         np.asarray(T_project_scan, np.float64),
         unit,
         np.asarray(station, np.int64),
+        step,
     )
+
+
+def used_up(raw: RawScan, factor: float) -> Floats:
+    """Return the points times a factor, in the record's own memory: the record is not to be used afterwards."""
+    points: Floats = raw.points
+    points.flags.writeable = True
+    if factor != 1.0:
+        points *= factor
+    return points
 
 
 @contextmanager

@@ -6,12 +6,13 @@ seven. A first line of one whole number is the count of points.
 
 from __future__ import annotations
 
+import io
 import re
-import warnings
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 
@@ -25,13 +26,24 @@ from processor.readers.raw import (
     first_named,
     make,
     parsing,
+    room_for,
+    stem,
 )
+from processor.readers.rows import Rows
 
 SUFFIXES = (".asc", ".csv", ".pts", ".txt", ".xyz")
 UNIT = ""
 SNIFFED = 65_536
+SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 COMMENTS = ("#", "//", "%")
-UNITS_IN_HEADERS = r"(mm|cm|m|ft|in)?"
+COUNTED = 5  # rows that tell a column of numbers of points
+SAMPLED = 200  # rows
+AXES = {
+    "x": "x|easting|east",
+    "y": "y|northing|north",
+    "z": "z|elevation|height|altitude",
+}
+UNIT_AFTER = r"[\s_\[(]*(?P<unit>mm|cm|m|ft|in)?[\])]?"
 
 
 @dataclass(frozen=True)
@@ -46,46 +58,84 @@ class Layout:
     columns: int = 0
     comments_between: bool = False
     encoding: str = "latin-1"
+    sample: tuple[tuple[str, ...], ...] = ()  # of rows
 
 
 def read(path: Path) -> list[RawScan]:
-    """Read a table of points as one scan."""
+    """Read a table of points as one scan, or a PTS file of several, each after its count."""
     layout = sniff(path)
-    axes, intensity, station, unit = _columns(path, layout)
-    check_room(path, "text", max(layout.declared, 0), 6, path.stat().st_size)
-    wanted = [*axes, *(one for one in (intensity, station) if one is not None)]
-    with parsing(path, "text"):
-        data = rows(path, layout, wanted)
-    if layout.declared >= 0 and len(data) != layout.declared:
-        raise InputError(
-            f"{path}: the first line declares {layout.declared} points, but {len(data)} follow; export it again"
-        )
+    columns = _columns(path, layout)
+    wanted = [*columns.axes, *(one for one in (columns.intensity, columns.station) if one is not None)]
+    size = path.stat().st_size
+    found, declared = [], layout.declared
+    with parsing(path, "text"), _opened(path, layout) as file:
+        rows = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
+        for _ in range(layout.skip):
+            rows.skip_line()
+        while True:
+            check_room(path, "text", max(declared, 0), SHORTEST_ROW, size)
+            found.append(_filled(rows, wanted, declared))
+            following = rows.line()
+            if following is None or declared < 0:
+                break
+            if not re.fullmatch(r"\d+", following):
+                raise InputError(f"{path}: the first line declares {declared} points, but more follow; export it again")
+            declared = int(following)
+    names = [stem(path)] if len(found) == 1 else [f"{stem(path)}-{i}" for i in range(1, len(found) + 1)]
     return [
         make(
             path,
-            path.stem,
-            data[:, :3],
-            unit=unit,
-            intensity=data[:, 3] if intensity is not None else (),
-            station=data[:, -1] if station is not None else (),
+            name,
+            points,
+            unit=columns.unit,
+            intensity=others[:, 0] if columns.intensity is not None else (),
+            station=others[:, -1] if columns.station is not None else (),
         )
+        for name, (points, others) in zip(names, found, strict=True)
     ]
 
 
-def rows(path: Path, layout: Layout, columns: list[int]) -> Floats:
-    """Return columns (n, k) of a table; ValueError where a row is not of numbers."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)  # of numpy, for a table without rows: seen by who asked
-        found: Floats = np.loadtxt(
-            _normalised(path, layout) if layout.decimal_comma else path,
-            delimiter=None if layout.decimal_comma else layout.separator,
-            comments=list(COMMENTS) if layout.comments_between else "#",
-            skiprows=0 if layout.decimal_comma else layout.skip,
-            usecols=columns,
-            ndmin=2,
-            encoding=layout.encoding,
-        )
-    return found
+def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, Floats]:
+    """Return the coordinates (n, 3) of the rows that are declared, of all for -1, and what else is wanted (n, k)."""
+    room, found = declared if declared >= 0 else rows.likely_left(), 0
+    points, others = room_for(room, 3), room_for(room, len(wanted) - 3)
+    for piece in rows.pieces(wanted, declared if declared >= 0 else 2**62):
+        if found + len(piece) > room:
+            room = room + room // 4 + len(piece)
+            points, others = (_grown(column[:found], room) for column in (points, others))
+        points[found : found + len(piece)] = piece[:, :3]
+        others[found : found + len(piece)] = piece[:, 3:]
+        found += len(piece)
+    if found < declared:
+        raise ValueError(f"it declares {declared} points, but {found} follow")
+    return points[:found], others[:found]
+
+
+def _grown(column: Floats, room: int) -> Floats:
+    larger = room_for(room, column.shape[1])
+    larger[: len(column)] = column
+    return larger
+
+
+def numbers(path: Path, layout: Layout) -> Floats:
+    """Return all columns (n, k) of a table. Raises InputError for what is no number."""
+    with parsing(path, "text"), _opened(path, layout) as file:
+        rows = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
+        for _ in range(layout.skip):
+            rows.skip_line()
+        pieces = [piece.copy() for piece in rows.pieces(range(layout.columns))]
+    return np.concatenate(pieces) if pieces else np.empty((0, layout.columns))
+
+
+@contextmanager
+def _opened(path: Path, layout: Layout) -> Iterator[BinaryIO]:
+    """Open a table as bytes in which ASCII is ASCII, after its byte order mark."""
+    if layout.encoding == "utf-16":
+        yield io.BytesIO(path.read_bytes().decode("utf-16", "replace").encode())
+        return
+    with path.open("rb") as file:
+        file.seek(3 if layout.encoding == "utf-8-sig" else 0)
+        yield file
 
 
 def sniff(path: Path) -> Layout:
@@ -109,10 +159,17 @@ def sniff(path: Path) -> Layout:
             continue
         separator, comma = _separator(stripped)
         cells = _cells(stripped, separator, comma)
-        if stripped and not comment and all(map(_is_number, cells)) and len(cells) >= 3:
-            names = tuple(_cells(header, *_separator(header))) if header else ()
-            later = any(one.strip().startswith(COMMENTS[1:]) for one in lines[number:])
-            return Layout(number, declared, names, separator, comma, len(cells), later, encoding)
+        names = tuple(_cells(header, *_separator(header))) if header else ()
+        if stripped and not comment and len(cells) >= 3 and _is_row(cells, names):
+            later = any(mark in one for one in lines[number:] for mark in COMMENTS[1:])
+            whole = lines[number:-1] if len(head) == SNIFFED else lines[number:]
+            following = [one.strip() for one in whole[:SAMPLED] if one.strip()] or [stripped]
+            # Whole numbers do not show how others are written.
+            comma = comma or (
+                separator in (None, ";") and any(_separator(one) == (separator, True) for one in following)
+            )
+            sample = tuple(tuple(_cells(one, separator, comma)) for one in following if not one.startswith(COMMENTS))
+            return Layout(number, declared, names, separator, comma, len(cells), later, encoding, sample)
         if stripped:
             header = re.sub(r"^(#|//|%)+\s*", "", stripped)
     raise InputError(
@@ -142,6 +199,23 @@ def _cells(line: str, separator: str | None, decimal_comma: bool) -> list[str]:
     return [cell.replace(",", ".") for cell in cells] if decimal_comma else cells
 
 
+def _is_row(cells: Sequence[str], names: Sequence[str]) -> bool:
+    """Whether cells are all numbers, or those are that a header names as coordinates: others may be names of points."""
+    axes = _axes(names) if len(names) == len(cells) else []
+    return all(map(_is_number, [cells[one] for one in axes] or cells))
+
+
+def _axes(header: Sequence[str]) -> list[int]:
+    """Columns that a header calls x, y and z; none where it does not call all three so."""
+    names = [_bare(name) for name in header]
+    found = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
+    return [names.index(name) for name in found if name is not None] if all(found) else []
+
+
+def _bare(name: str) -> str:
+    return re.sub(r'["\']', "", name).strip()
+
+
 def _is_number(cell: str) -> bool:
     try:
         float(cell)
@@ -150,32 +224,47 @@ def _is_number(cell: str) -> bool:
     return "_" not in cell
 
 
-def _columns(path: Path, layout: Layout) -> tuple[list[int], int | None, int | None, str]:
+@dataclass(frozen=True)
+class _Columns:
+    axes: Sequence[int]
+    intensity: int | None = None
+    station: int | None = None
+    unit: str = UNIT
+
+
+def _columns(path: Path, layout: Layout) -> _Columns:
     """Columns of x, y, z, of the intensity and of the station, and the unit that a header names."""
-    names = [re.sub(r'["\']', "", name).strip() for name in layout.header]
-    found = [first_named(names, rf"{axis}([\s_\[(]*{UNITS_IN_HEADERS}[\])]?)") for axis in "xyz"]
+    names = [_bare(name) for name in layout.header]
+    found = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
     if len(names) == layout.columns and all(found):
         intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
-        units = {re.fullmatch(rf".[\s_\[(]*{UNITS_IN_HEADERS}[\])]?", name or "", re.IGNORECASE) for name in found}
-        said = {(match.group(1) or "").lower() for match in units if match}
+        units = [re.search(rf"{UNIT_AFTER}$", name or "", re.IGNORECASE) for name in found]
+        said = {(match.group("unit") or "").lower() for match in units if match}
         if len(said) != 1:
             raise InputError(f"{path}: the header gives x, y, z in different units ({', '.join(layout.header)})")
         axes = [names.index(name) for name in found if name is not None]
         others = [names.index(name) if name else None for name in (intensity, station)]
-        return axes, others[0], others[1], said.pop()
-    if any(found) and len(names) != layout.columns:
+        return _Columns(axes, others[0], others[1], said.pop())
+    if sum(map(bool, found)) > 1 and len(names) != layout.columns:
         raise InputError(
             f"{path}: the header names {len(names)} columns ({' '.join(names)[:80]}), but rows have {layout.columns}"
         )
-    return [0, 1, 2], 3 if layout.columns in (4, 7) else None, None, UNIT
+    _check_plain(path, layout)
+    return _Columns([0, 1, 2], 3 if layout.columns in (4, 7) else None)
 
 
-def _normalised(path: Path, layout: Layout) -> Iterator[str]:
-    with path.open(encoding=layout.encoding) as file:
-        yield from _pointed(islice(file, layout.skip, None))
-
-
-def _pointed(lines: Iterable[str]) -> Iterator[str]:
-    """Lines with decimal points and blanks for separators."""
-    to = str.maketrans({",": ".", ";": " "})
-    return (line.translate(to) for line in lines)
+def _check_plain(path: Path, layout: Layout) -> None:
+    """Refuse a table without names of columns that can be read in two ways."""
+    rows = layout.sample
+    if layout.columns == 6 and layout.separator == "," and all(re.fullmatch(r"[+-]?\d+", c) for r in rows for c in r):
+        raise InputError(
+            f"{path}: commas may separate six whole numbers or be the decimal signs of three; "
+            "separate by semicolons, or name the columns in a first line"
+        )
+    counts = [row[0] for row in rows]
+    counting = len(counts) >= COUNTED and counts[0].isdecimal() and layout.columns >= 4
+    if counting and counts == [str(int(counts[0]) + i) for i in range(len(counts))]:
+        raise InputError(
+            f"{path}: the first column only counts ({', '.join(counts[:3])}, ...); "
+            "name the columns in a first line (id x y z), or leave the numbers of the points out"
+        )

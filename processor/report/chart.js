@@ -4,8 +4,8 @@ function lineChart(host, wanted) {
   let logY = wanted.logY;
   const canvas = make("canvas", { className: "chart" });
   canvas.setAttribute("role", "img");
-  canvas.setAttribute("aria-label", `${yLabel} against ${xLabel}`);
-  const said = make("output", { className: "said" }, "Point at a line to read it; names switch lines on and off.");
+  canvas.setAttribute("aria-label", `${yLabel} ${say("against")} ${xLabel}`);
+  const said = make("output", { className: "said" }, say("Point at a line to read it; names switch lines on and off."));
   const context = canvas.getContext("2d");
   const lines = series.map((one) => ({ ...one, on: true }));
   let waiting = false, ratio = 1, spots = [];
@@ -21,7 +21,7 @@ function lineChart(host, wanted) {
   };
   host.append(canvas, said, make("div", { className: "tools" },
     ...lines.map((one) => tick([swatch(one), one.name], true, (on) => { one.on = on; })),
-    ...(logX ? [] : [tick([" logarithmic"], logY, (on) => { logY = on; })])));
+    ...(logX ? [] : [tick([` ${say("logarithmic")}`], logY, (on) => { logY = on; })])));
   if (note) host.append(make("p", { className: "soft" }, note));
 
   function ticks(low, high, log) {

@@ -17,6 +17,6 @@ def of_run(execution: Execution, report: ErrorReport) -> dict[str, Drawn]:
         mpl.rcdefaults()
         mpl.rcParams["text.parse_math"] = False  # a name from outside may hold dollar signs
         return {
-            run.step: step_report.of(run.step).figures(execution.scene, [run, *others], report)
+            run.step: step_report.of(run.step).figures(execution, [run, *others], report)
             for run, others in grouped(execution.runs)
         }

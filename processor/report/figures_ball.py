@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import textwrap
+from contextlib import nullcontext
+from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,34 +12,40 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from processor.bolt_balls.scene_source import of_scene
+from processor.bolt_balls.scene_source import SceneSource, of_scene
 from processor.geometry import rigid
 from processor.model import Floats, Scene
 from processor.report.drawing import COLOURS, Drawn, png
 from processor.report.dxf import nominal_places
 from processor.steps import spheres
+from processor.stored_points import StoredPoints, points_of
 
 PREFIX = "ball-to-see-"
 MOST_BALLS = 12
 ORDER = ("wrong-size", "not-found", "low-confidence")  # of what is drawn first
 ROUND_MM = 60.0  # about the ball, that is shown
 SLICE_MM = 8.0  # on either side of the plane through the centre
+SLACK_MM = 0.1  # of a box, beyond what is shown
 MOST_POINTS = 20_000  # of a panel; more are no more to see
 LEAST_RADIUS_MM = 30.0
 VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
 
 
-def of_result(scene: Scene, result: spheres.Result) -> Drawn:
-    """Draw the balls that are not ok, MOST_BALLS of them at most; none where the scene's points are not at hand."""
+def of_result(scene: Scene, result: spheres.Result, stored: Path | None = None) -> Drawn:
+    """Draw the balls that are not ok, MOST_BALLS of them at most; none where the scene's points are not at hand.
+
+    ``stored`` is the scene's file, where its points were left there.
+    """
     nominal = designed_places(scene, result)
     centres = np.where(np.isfinite(result.centres), result.centres, nominal)
     there = np.flatnonzero(np.isfinite(centres).all(axis=1)).tolist()
     doubtful = [i for flag in ORDER for i in there if result.flag[i] == flag]
     shown = doubtful[:MOST_BALLS]
-    if not shown or not all(len(scan.points) for scan in scene.scans):
+    if not shown or (stored is None and not all(len(scan.points) for scan in scene.scans)):
         return {}
     reach = [_radius(result, i) + ROUND_MM for i in shown]
-    crops = crops_about(scene, centres[shown], np.array(reach))
+    with points_of(stored) if stored is not None else nullcontext() as points:
+        crops = crops_about(scene, centres[shown], np.array(reach), points)
     as_is = ", each station where it was registered" if result.station_names else ""
     more = f" (the first {len(shown)} of {len(doubtful)} to look at)" if len(shown) < len(doubtful) else ""
     return {
@@ -67,9 +75,30 @@ def designed_places(scene: Scene, result: spheres.Result) -> Floats:
     return places
 
 
-def crops_about(scene: Scene, centres: Floats, reach: Floats) -> list[Floats]:
-    """Return the points (n, 3) within ``reach`` (k,) of each centre (k, 3), less the centre; one pass over all."""
-    source = of_scene(scene)
+def crops_about(scene: Scene, centres: Floats, reach: Floats, stored: StoredPoints | None = None) -> list[Floats]:
+    """Return the points (n, 3) within ``reach`` (k,) of each centre (k, 3), less the centre; one pass over all.
+
+    Of points in a file only those of the tiles about each centre are read.
+    """
+    if stored is not None:
+        return [
+            _within(of_scene(scene, stored.within(_boxes(scene, centre, far))), centre[None], np.array([far]))[0]
+            for centre, far in zip(centres, reach.tolist(), strict=True)
+        ]
+    return _within(of_scene(scene), centres, reach)
+
+
+def _boxes(scene: Scene, centre: Floats, far: float) -> list[tuple[Floats, Floats]]:
+    """Box a scan, less its origin, that holds all that is within ``far`` of a place (3,) in the project's frame."""
+    found = []
+    for scan in scene.scans:
+        T = scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
+        middle = T[:3, :3].T @ (centre - T[:3, 3]) - scan.origin
+        found.append((middle - far - SLACK_MM, middle + far + SLACK_MM))
+    return found
+
+
+def _within(source: SceneSource, centres: Floats, reach: Floats) -> list[Floats]:
     middles = centres - source.origin
     found: list[list[Floats]] = [[] for _ in reach]
     for chunk in source.chunks():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -27,8 +28,8 @@ ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest a
 PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
 
 
-def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport) -> Drawn:
-    """Draw balls; ``runs`` are the answer and the methods compared with it."""
+def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> Drawn:
+    """Draw balls; ``runs`` are the answer and those compared with it, ``stored`` the file that still has the points."""
     first: spheres.Result = runs[0].result
     found: Drawn = {}
     if len(first.ids) > 1:
@@ -38,7 +39,7 @@ def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport) -> Drawn
         if has_bounds(first):
             found[BALL_ERRORS] = _ball_errors(runs[0], report)
     if has_bounds(first):
-        found |= figures_ball.of_result(scene, first)
+        found |= figures_ball.of_result(scene, first, stored)
     return found
 
 

@@ -32,5 +32,5 @@ REPORT = StepReport(
     summary=_summary,
     written=results_defects.written,
     tables=tables_defects.of_runs,
-    figures=figures_defects.of_runs,
+    figures=lambda execution, runs, report: figures_defects.of_runs(execution.scene, runs, report),
 )

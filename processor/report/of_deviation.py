@@ -9,8 +9,9 @@ import numpy as np
 
 from processor.deviation.result import Result
 from processor.evaluate import ErrorReport
-from processor.model import Scene, StepRun
-from processor.report import core_points, figures_deviation, results_deviation
+from processor.model import Ints, Scene, StepRun
+from processor.pipeline import Execution
+from processor.report import core_points, figures_deviation, results_deviation, view_points
 from processor.report.drawing import Drawn
 from processor.report.printing import shown
 from processor.report.step_report import StepReport
@@ -27,9 +28,10 @@ def _summary(result: Result) -> tuple[str, str]:
     low, high, near = (
         _percent(one) for one in (result.significant_low, result.significant_high, found["within_10mm_share"])
     )
+    registration = shown(1.96 * result.registration_error)
     said = (
-        f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; median "
-        f"LOD95 {shown(found['lod95_median'])} mm, of which registration {shown(1.96 * result.registration_error)} mm. "
+        f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; "
+        f"median LOD95 {shown(found['lod95_median'])} mm, {registration} mm of it registration. "
         f"{found['measured']:.0f} of {len(result.core)} core points were measured."
     )
     return head, said
@@ -76,12 +78,12 @@ def _column(result: Result) -> dict[str, tuple[Any, str]]:
     }
 
 
-def _figures(scene: Scene, runs: Sequence[StepRun], _: ErrorReport) -> Drawn:
+def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
     result: Result = runs[0].result
     if not np.isfinite(result.lod95).any():
         return {}
     return {
-        MAP: figures_deviation.deviation_map(result.core + result.origin, result.distances, "mm"),
+        MAP: figures_deviation.deviation_map(result.core + result.origin, result.normals, result.distances, "mm"),
         HISTOGRAM: figures_deviation.histogram(result.distances, "mm"),
     }
 
@@ -91,6 +93,15 @@ def _files(result: Result) -> dict[str, bytes]:
     return {"deviation.csv": text.encode("ascii")}
 
 
+def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+    result: Result = runs[0].result
+    points = result.core + result.origin
+    everything: Ints = np.arange(len(points), dtype=np.int64)
+    return view_points.of_points(
+        "Deviation in space", runs[0].method, points, result.distances.distance, [("surface", everything)]
+    )
+
+
 REPORT = StepReport(
     title="Deviation",
     summary=_summary,
@@ -98,4 +109,5 @@ REPORT = StepReport(
     tables=_tables,
     figures=_figures,
     files=_files,
+    live=_live,
 )

@@ -50,7 +50,7 @@ REPORT = StepReport(
     summary=_summary,
     written=results_preassembly.written,
     tables=tables_preassembly.of_runs,
-    figures=lambda scene, runs, _: figures_preassembly.of_runs(scene, runs),
+    figures=lambda execution, runs, _: figures_preassembly.of_runs(execution.scene, runs),
     further=_further,
     live=view.of_runs,
 )

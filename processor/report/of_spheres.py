@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 
-from processor.report import dxf, figures_balls, results_balls, tables_balls
+from processor.report import dxf, figures_balls, results_balls, tables_balls, view_balls
 from processor.report.step_report import StepReport
 from processor.steps import spheres
 
@@ -25,6 +25,7 @@ REPORT = StepReport(
     summary=_summary,
     written=results_balls.written,
     tables=tables_balls.of_runs,
-    figures=figures_balls.of_runs,
+    figures=lambda execution, runs, report: figures_balls.of_runs(execution.scene, runs, report, execution.stored),
     files=_files,
+    live=view_balls.of_runs,
 )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import itertools
 import json
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from typing import Any
 
 import jinja2
@@ -15,48 +15,55 @@ from processor.model import StepRun
 from processor.pipeline import Execution
 from processor.report import step_report, tables, view
 from processor.report.drawing import Drawn
+from processor.report.language import language
 from processor.report.printing import headings, numeric, shown
 
 GOOD = "ok"
 LEAD = ("what-to-do", "limits")  # tables above the figures
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
+NAMES = (
+    "method",
+    "joint",
+    "component",
+    "left_part",
+    "right_part",
+    "station",
+    "point",
+)  # columns that no language translates
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 
-def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]) -> str:
-    """Render the page, with the figures of each step; every text is escaped."""
+def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], lang: str = "en") -> str:
+    """Render the page, with the figures of each step, in a language of CODES; every text is escaped."""
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("processor", "report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
     environment.filters["shown"] = shown
+    environment.filters["say"] = language(lang).say
     scene = execution.scene
     points = sum(len(scan.points) for scan in scene.scans)
-    live_step, live = _live(execution)
-    script, digest = view.script() if live else ("", "'none'")
+    live = {
+        run.step: data
+        for run, others in tables.grouped(execution.runs)
+        if (data := step_report.of(run.step).live(scene, [run, *others])) is not None
+    }
+    script, digest = view.script()
     text: str = environment.get_template("page.html").render(
         title=scene.name,
-        kind=scene.kind,
-        scans=len(scene.scans),
-        points=f"{points:,} points" if points else "points left in the file",
-        units=scene.units,
-        units_reason=scene.units_reason,
-        live=live,
+        input_said=(
+            f"{scene.kind}, {len(scene.scans)} scan{'' if len(scene.scans) == 1 else 's'}, "
+            f"{f'{points:,} points' if points else 'points left in the file'}. "
+            f"Coordinates read as {scene.units} ({scene.units_reason}). All lengths in mm."
+        ),
+        lang=lang,
+        live=view.embedded({"words": language(lang).of_scripts(script), "steps": language(lang).in_figures(live)}),
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),
-        sections=_sections(execution, report, figures, live_step),
+        sections=_sections(execution, report, figures, set(live)),
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
     return text
-
-
-def _live(execution: Execution) -> tuple[str, str]:
-    """Return what the page's script draws, as JSON, with the step that it is of; empty where there is nothing."""
-    for run, others in tables.grouped(execution.runs):
-        data = step_report.of(run.step).live(execution.scene, [run, *others])
-        if data is not None:
-            return run.step, view.embedded(data)
-    return "", ""
 
 
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]:
@@ -65,7 +72,7 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]
         report_of = step_report.of(run.step)
         head, said = report_of.summary(run.result)
         title = f"{report_of.title}: {head}"
-        found.append({"tone": _tone(run), "head": title, "text": f"Method {run.method}. {said}"})
+        found.append({"tone": _tone(run), "head": title, "text": f"Method {run.method}. {said}".strip()})
         found += [{"tone": "", "head": head, "text": text} for head, text in report_of.further(run.result)]
     if report.metrics:
         limited = [m for m in report.metrics if m.limit == m.limit]
@@ -89,7 +96,7 @@ def _tone(run: StepRun) -> str:
 
 
 def _sections(
-    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live_step: str
+    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str]
 ) -> list[dict[str, Any]]:
     sections = []
     for run, others in tables.grouped(execution.runs):
@@ -100,7 +107,8 @@ def _sections(
                 "message": run.result.message,
                 "lead": [_table(one) for one in shown_tables if one.file in LEAD],
                 "tables": [_table(one) for one in shown_tables if one.file not in LEAD],
-                "live": run.step == live_step,
+                "step": run.step,
+                "live": run.step in live,
                 "figures": [
                     {"caption": caption, "data": base64.b64encode(png).decode("ascii")}
                     for caption, png in figures.get(run.step, {}).values()
@@ -109,7 +117,9 @@ def _sections(
         )
     if report.metrics:
         checks = _table(tables.of_checks(report))
-        sections.append({"title": "Truth", "message": "", "lead": [], "tables": [checks], "figures": [], "live": False})
+        sections.append(
+            {"title": "Truth", "message": "", "lead": [], "tables": [checks], "figures": [], "live": False, "step": ""}
+        )
     return sections
 
 
@@ -122,5 +132,6 @@ def _table(table: tables.Table) -> dict[str, Any]:
         "note": note,
         "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
         "columns": list(zip(headings(table), numeric(table), strict=True)),
+        "named": [column in NAMES for column in table.columns],
         "rows": table.rows[:MOST_ROWS],
     }

@@ -63,6 +63,13 @@ def written(result: Result) -> dict[str, Any]:
             {"name": name, "T": result.T_station[i], "said": result.station_said[i]}
             for i, name in enumerate(result.station_names)
         ]
+    if result.datum:
+        found["datum"] = result.datum
+    if result.control_names:
+        found["control"] = [
+            {"name": name, "off": result.control_off[i], "used": bool(result.control_used[i])}
+            for i, name in enumerate(result.control_names)
+        ]
     return found
 
 

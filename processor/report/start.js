@@ -1,16 +1,15 @@
-// Fills the page's live figures. Without this script the pictures below them say the same.
-(() => {
-  const data = JSON.parse(document.getElementById("live-data").textContent);
+// Fills the page's live figures and lets tables be copied. Without this script the pictures and tables say the same.
+function start(box, data) {
   const colours = ["#0072B2", "#D55E00", "#009E73", "#CC79A7"];
   const mm = (value) => (value === null ? "–" : value.toFixed(3));
-  const box = document.getElementById("live");
   box.hidden = false;
   const panel = (title) => {
     const host = make("div", {});
     box.append(make("h3", {}, title), host);
     return host;
   };
-  spaceView(panel(`Gaps${data.parts.some((part) => part.residual.length) ? " and residuals" : ""} in space, method ${data.method}`), data);
+  spaceView(panel(`${say(data.title)}${say(", method")} ${data.method}`), data);
+  if (!data.linear) return;
 
   const lines = (values, banded) => data.linear.flatMap((one, m) => ["left", "right"].map((edge) => {
     const rows = one.edge.map((_, i) => i).filter((i) => one.edge[i] === edge);
@@ -19,32 +18,54 @@
     const beyond = (sign) => half && y.map((value, i) => (value === null || half[i] === null ? null : Math.max(value + sign * half[i], 1e-3)));
     const x = rows.map((i) => one.station[i] / 1000);
     return {
-      name: `${one.method}, ${edge}`, colour: colours[m % 4], style: m, thin: edge === "right", x, y,
+      name: `${one.method}, ${say(edge)}`, colour: colours[m % 4], style: m, thin: edge === "right", x, y,
       low: beyond(-1), high: beyond(1),
-      read: (i) => `${one.method}, ${edge} edge, ${x[i].toFixed(2)} m: ${mm(y[i])}${half && half[i] !== null ? ` ± ${mm(half[i])}` : ""} mm`,
+      read: (i) => `${one.method}, ${say(edge === "left" ? "left edge" : "right edge")}, ${x[i].toFixed(2)} m: ${mm(y[i])}${half && half[i] !== null ? ` ± ${mm(half[i])}` : ""} mm`,
     };
   }));
   const known = (values) => data.linear.some((one) => one[values].some((value) => value !== null));
-  for (const [values, title] of [["deviation", "as assembled"], ["best_fit", "the bridge moved so that Foot 1 lies best on its design"]]) {
+  for (const [values, title] of [
+    ["deviation", "Linear error, as assembled"],
+    ["best_fit", "Linear error, the bridge moved so that Foot 1 lies best on its design"],
+  ]) {
     if (!known(values)) continue;
     const series = lines(values, values === "deviation");
-    lineChart(panel(`Linear error, ${title}`), {
-      xLabel: "station along the bottom edge, m", yLabel: "linear error, mm", series, logY: data.linear.length > 1,
-      note: series.some((one) => one.high) ? "The shaded band holds 95 % or more." : "",
+    lineChart(panel(say(title)), {
+      xLabel: say("station along the bottom edge, m"), yLabel: say("linear error, mm"), series, logY: data.linear.length > 1,
+      note: series.some((one) => one.high) ? say("The shaded band holds 95 % or more.") : "",
     });
   }
   const trade = data.trade;
-  if (trade.lambda.length) {
-    const host = panel("Splicing against linear error over the weight lambda");
-    const own = trade.lambda.findIndex((value) => Math.abs(value / trade.weight - 1) < 1e-6);
-    lineChart(host, {
-      xLabel: "splicing error, mm", yLabel: "linear error, mm", logX: true, logY: true,
-      series: ["mean", "max"].map((which, k) => ({
-        name: which === "mean" ? "mean" : "largest", colour: colours[k], style: k, own, labels: trade.lambda.map(String),
-        x: trade[`splicing_${which}`], y: trade[`linear_${which}`],
-        read: (i) => `lambda ${trade.lambda[i]}, ${which}: splicing ${mm(trade[`splicing_${which}`][i])} mm, linear ${mm(trade[`linear_${which}`][i])} mm`,
-      })),
-      note: `The numbers at the points are lambda; the answer's, ${trade.weight}, is ${own < 0 ? "not among them" : "framed"}.`,
-    });
-  }
-})();
+  if (!trade.lambda.length) return;
+  const own = trade.lambda.findIndex((value) => Math.abs(value / trade.weight - 1) < 1e-6);
+  lineChart(panel(say("Splicing against linear error over the weight lambda")), {
+    xLabel: say("splicing error, mm"), yLabel: say("linear error, mm"), logX: true, logY: true,
+    series: ["mean", "max"].map((which, k) => ({
+      name: say(which === "mean" ? "mean" : "largest"), colour: colours[k], style: k, own, labels: trade.lambda.map(String),
+      x: trade[`splicing_${which}`], y: trade[`linear_${which}`],
+      read: (i) => `lambda ${trade.lambda[i]}: ${say("splicing")} ${mm(trade[`splicing_${which}`][i])} mm, ${say("linear")} ${mm(trade[`linear_${which}`][i])} mm`,
+    })),
+    note: own < 0 ? "" : `${say("The numbers at the points are lambda; the answer's is framed:")} ${trade.weight}`,
+  });
+}
+
+function copying(scroll) { // into a spreadsheet, as the table stands
+  const button = make("button", { type: "button", className: "copy" }, say("copy table"));
+  button.addEventListener("click", () => {
+    const range = document.createRange(), chosen = getSelection();
+    range.selectNode(scroll.querySelector("table"));
+    chosen.removeAllRanges();
+    chosen.addRange(range);
+    document.execCommand("copy");
+    chosen.removeAllRanges();
+    button.textContent = say("copied");
+  });
+  scroll.before(button);
+}
+
+{
+  const page = JSON.parse(document.getElementById("live-data").textContent);
+  words = page.words;
+  for (const scroll of document.querySelectorAll(".scroll")) copying(scroll);
+  for (const box of document.querySelectorAll(".live")) start(box, page.steps[box.dataset.step]);
+}

@@ -9,6 +9,7 @@ from typing import Any
 
 from processor.evaluate import ErrorReport
 from processor.model import Scene, StepRun
+from processor.pipeline import Execution
 from processor.report.drawing import Drawn
 from processor.report.table import Table
 
@@ -21,7 +22,7 @@ class StepReport:
     summary: Callable[[Any], tuple[str, str]]  # of a result: the verdict's head, and what is said below it
     written: Callable[[Any], dict[str, Any]]  # of a result: its object in results.json, arrays and NaN as they are
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
-    figures: Callable[[Scene, Sequence[StepRun], ErrorReport], Drawn]  # file names are the step's own
+    figures: Callable[[Execution, Sequence[StepRun], ErrorReport], Drawn]  # file names are the step's own
     further: Callable[[Any], list[tuple[str, str]]] = lambda _: []  # heads and texts beside the verdict
     files: Callable[[Any], dict[str, bytes]] = lambda _: {}  # further files in OUT by name
     live: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None  # what the page's script draws

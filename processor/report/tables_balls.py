@@ -292,7 +292,7 @@ def _tubes(result: Result) -> list[Table]:
 
 def _stations(result: Result) -> list[Table]:
     if not result.station_names:
-        return []
+        return _control(result)
     known = np.isfinite(result.centres).all(axis=1)
     middle = result.centres[known].mean(axis=0) if known.any() else np.zeros(3)
     rows = []
@@ -305,4 +305,15 @@ def _stations(result: Result) -> list[Table]:
     columns = (
         "station", "dx_mm", "dy_mm", "dz_mm", "turn_x_mrad", "turn_y_mrad", "turn_z_mrad", "remark",
     )  # fmt: skip
-    return [Table("Stations against each other (mm, mrad)", columns, tuple(rows), "stations", STATIONS_NOTE)]
+    note = f"{STATIONS_NOTE} What holds all of them: {result.datum}." if result.datum else STATIONS_NOTE
+    return [Table("Stations against each other (mm, mrad)", columns, tuple(rows), "stations", note), *_control(result)]
+
+
+def _control(result: Result) -> list[Table]:
+    rows = tuple(
+        (name, *off.tolist(), float(np.linalg.norm(off)), "yes" if used else "no, the others speak against it")
+        for name, off, used in zip(result.control_names, result.control_off, result.control_used, strict=True)
+    )
+    columns = ("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used")
+    note = "Known place minus where the scans have it after the stations were moved; a row a sighting."
+    return [Table("Control points (mm)", columns, rows, "control", note)] if rows else []

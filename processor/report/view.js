@@ -1,5 +1,7 @@
 "use strict";
-// A view in space, drawn on a canvas: points by a depth buffer, lines and arrows over them. Right-handed, z up, mm.
+// A view in space, drawn on a canvas: points by a depth buffer, lines, circles and arrows over them. Right-handed, z up,
+// mm. Parts can be switched off: each has lines, points with a value, and marks that are its own (balls, defects). Joints
+// have a section and gaps at its points. What is shown is less `origin`; what is read out has it put back.
 function make(tag, attributes, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(attributes || {})) {
@@ -9,6 +11,9 @@ function make(tag, attributes, ...children) {
   return element;
 }
 
+let words = {}; // of the page's language; what is not among them is said as it is
+function say(text) { return words[text] || text; }
+
 function colourTable(stops, size) {
   const rgb = stops.map((stop) => [1, 3, 5].map((at) => parseInt(stop.slice(at, at + 2), 16)));
   return Array.from({ length: size }, (_, i) => {
@@ -17,28 +22,40 @@ function colourTable(stops, size) {
   });
 }
 
+function reachOf(sizes) { // a square seen from a corner is wider than its side
+  const [, middle, largest] = [...sizes].sort((a, b) => a - b);
+  return Math.max(largest, 0.75 * (largest + middle), 1);
+}
+
 function spaceView(host, data) {
   const table = colourTable(data.stops, 101);
   const packed = Uint32Array.from(table, ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0);
   const parts = data.parts.map((part) => ({ ...part, on: true, points: Float32Array.from(part.points) }));
-  const all = parts.flatMap((part) => part.edges.flat()).concat(data.joints.flatMap((joint) => joint.at));
-  const low = [0, 1, 2].map((k) => all.reduce((least, p) => Math.min(least, p[k]), Infinity));
-  const high = [0, 1, 2].map((k) => all.reduce((most, p) => Math.max(most, p[k]), -Infinity));
-  const whole = { target: low.map((value, k) => (value + high[k]) / 2), reach: Math.max(...low.map((v, k) => high[k] - v)) };
-  const largest = data.joints.flatMap((joint) => joint.gap.flat()).reduce((m, v) => Math.max(m, Math.abs(v || 0)), 0);
+  const joints = data.joints || [], marks = data.marks || [], origin = data.origin || [0, 0, 0];
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  const hold = (p) => p.forEach((value, k) => { low[k] = Math.min(low[k], value); high[k] = Math.max(high[k], value); });
+  for (const part of parts) {
+    part.edges.forEach((edge) => edge.forEach(hold));
+    for (let i = 0; i < part.points.length; i += 3) hold(Array.from(part.points.subarray(i, i + 3)));
+  }
+  joints.forEach((joint) => joint.at.forEach(hold));
+  marks.forEach((mark) => hold(mark.at));
+  const whole = { target: low.map((value, k) => (value + high[k]) / 2), reach: reachOf(low.map((v, k) => high[k] - v)) };
+  const vectors = joints.flatMap((joint) => joint.gap).concat(marks.map((mark) => mark.by || []));
+  const largest = vectors.flat().reduce((m, v) => Math.max(m, Math.abs(v || 0)), 0);
   const camera = { yaw: -0.5, pitch: 0.35, zoom: 1, ...whole };
   const state = { times: 1, limit: data.limit, points: true, arrows: true, joint: -1 };
 
   const canvas = make("canvas", { className: "space", tabIndex: 0 });
-  canvas.setAttribute("aria-label", "the bridge in space; arrow keys turn it, plus and minus zoom");
+  canvas.setAttribute("aria-label", say("the structure in space; arrow keys turn it, plus and minus zoom"));
   canvas.setAttribute("role", "img");
-  const said = make("output", { className: "said" }, "Drag to turn, wheel or pinch to zoom, point at something to read it.");
+  const said = make("output", { className: "said" }, say("Drag to turn, wheel or pinch to zoom, point at something to read it."));
   const context = canvas.getContext("2d");
   let width = 0, height = 0, ratio = 1, owner = new Int32Array(0), tips = [], waiting = false;
 
   const hasPoints = parts.some((part) => part.points.length);
-  const place = make("select", {}, make("option", { value: "-1" }, "whole bridge"),
-    ...data.joints.map((joint, j) => make("option", { value: String(j) }, `joint ${joint.name}`)));
+  const place = make("select", {}, make("option", { value: "-1" }, say("everything")),
+    ...joints.map((joint, j) => make("option", { value: String(j) }, `${say("joint")} ${joint.name}`)));
   const exponent = (value) => Math.log10(Math.max(value, 1));
   const slider = make("input", { type: "range", min: "0", max: "6", step: "0.02" });
   const sliderSaid = make("span", {});
@@ -58,19 +75,19 @@ function spaceView(host, data) {
   };
   const look = (yaw, pitch) => () => { camera.yaw = yaw; camera.pitch = pitch; };
   host.append(
-    make("div", { className: "tools" }, make("label", {}, "look at ", place), button("side", look(0, 0)),
-      button("plan", look(0, Math.PI / 2)), button("along", look(-Math.PI / 2, 0)),
+    make("div", { className: "tools" }, ...(joints.length ? [make("label", {}, `${say("look at")} `, place)] : []),
+      button(say("side"), look(0, 0)), button(say("plan"), look(0, Math.PI / 2)), button(say("along"), look(-Math.PI / 2, 0)),
       button("+", () => zoom(1.4)), button("−", () => zoom(1 / 1.4))),
     canvas, said,
-    make("div", { className: "tools" }, tick("gaps as arrows", true, (on) => { state.arrows = on; }),
-      make("label", {}, "drawn ", slider, sliderSaid)),
-    ...(hasPoints ? [make("div", { className: "tools" }, tick("residuals", true, (on) => { state.points = on; }),
-      make("label", {}, "colours to ", limit), make("span", { className: "scale" }, least, bar, most))] : []),
-    make("fieldset", { className: "tools" }, make("legend", {}, "components"),
-      ...parts.map((part) => tick(part.name, true, (on) => { part.on = on; }))));
+    ...(largest > 0 ? [make("div", { className: "tools" }, tick(say(data.arrows), true, (on) => { state.arrows = on; }),
+      make("label", {}, `${say("drawn")} `, slider, sliderSaid))] : []),
+    ...(hasPoints ? [make("div", { className: "tools" }, tick(say(data.values), true, (on) => { state.points = on; }),
+      make("label", {}, `${say("colours to")} `, limit), make("span", { className: "scale" }, least, bar, most))] : []),
+    make("fieldset", { className: "tools" }, make("legend", {}, say("components")),
+      ...parts.map((part) => tick(part.text || part.name, true, (on) => { part.on = on; }))));
 
   function goTo(j) {
-    const joint = data.joints[j];
+    const joint = joints[j];
     state.joint = joint ? j : -1; // a joint is shown without the others, which would stand behind it
     if (!joint) Object.assign(camera, whole, { zoom: 1 });
     else {
@@ -99,11 +116,13 @@ function spaceView(host, data) {
     const [right, up, near] = axes();
     const scale = (Math.min(width, 2.2 * height) / camera.reach) * 0.9 * camera.zoom;
     const [tx, ty, tz] = camera.target;
-    return (x, y, z) => {
+    const at = (x, y, z) => {
       const a = x - tx, b = y - ty, c = z - tz;
       return [width / 2 + scale * (a * right[0] + b * right[1] + c * right[2]),
         height / 2 - scale * (a * up[0] + b * up[1] + c * up[2]), a * near[0] + b * near[1] + c * near[2]];
     };
+    at.scale = scale;
+    return at;
   }
 
   function paint() {
@@ -120,13 +139,14 @@ function spaceView(host, data) {
     if (state.points) paintPoints(at, new Uint32Array(image.data.buffer));
     context.putImageData(image, 0, 0);
     for (const part of parts) if (part.on) for (const edge of part.edges) line(edge.map((p) => at(...p)), "#555", 1.2);
-    for (const joint of data.joints.filter(visible)) line([0, 1, 2, 3, 0].map((k) => at(...joint.at[k])), "#222", 1);
     tips = [];
-    if (state.arrows) data.joints.forEach((joint, j) => visible(joint, j) && joint.at.forEach((p, k) => arrow(at, joint, j, p, k)));
+    for (const mark of marks) if (parts[mark.part].on) circle(at, mark);
+    for (const joint of joints.filter(visible)) line([0, 1, 2, 3, 0].map((k) => at(...joint.at[k])), "#222", 1);
+    if (state.arrows) joints.forEach((joint, j) => visible(joint, j) && joint.at.forEach((p, k) => gap(at, joint, p, k)));
     names(at);
-    sliderSaid.textContent = ` ${Number(state.times.toPrecision(2)).toLocaleString("en")} times their size`;
+    sliderSaid.textContent = ` ${Number(state.times.toPrecision(2)).toLocaleString("en")} ${say("times their size")}`;
     least.textContent = `−${state.limit.toPrecision(2)} mm `;
-    most.textContent = ` +${state.limit.toPrecision(2)} mm outward`;
+    most.textContent = ` +${state.limit.toPrecision(2)} mm ${say("outward")}`;
   }
   function visible(_, j) { return state.joint < 0 || j === state.joint; }
   function paintPoints(at, pixels) {
@@ -159,22 +179,37 @@ function spaceView(host, data) {
     points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
     context.stroke();
   }
-  function arrow(at, joint, j, p, k) {
-    const gap = joint.gap[k];
-    if (gap.some((value) => value === null)) return;
-    const from = at(...p), to = at(...p.map((value, axis) => value + state.times * gap[axis]));
+  function gap(at, joint, p, k) {
+    const by = joint.gap[k];
+    if (by.some((value) => value === null)) return;
+    const to = arrow(at, p, by);
+    tips.push({ x: to[0], y: to[1], reach: 9 * ratio, text: () => `${joint.name} (${say(joint.verdict)}), ${data.keys[k]}: ${vector(by, joint.ci95[k])}` });
+  }
+  function circle(at, mark) {
+    const [x, y] = at(...mark.at), scale = at.scale;
+    const radius = Math.max(mark.radius * scale, 3 * ratio);
+    context.strokeStyle = data.tones[mark.tone];
+    context.lineWidth = (mark.tone ? 3 : 1.5) * ratio; // what is to be looked at stands out without colour too
+    context.beginPath();
+    context.arc(x, y, radius, 0, 2 * Math.PI);
+    context.stroke();
+    tips.push({ x, y, reach: Math.max(radius, 6 * ratio), text: () => `${mark.name}: ${mark.text}${mark.by ? `; ${vector(mark.by, mark.ci95)}` : ""}` });
+    if (state.arrows && mark.by && mark.by.every((value) => value !== null)) arrow(at, mark.at, mark.by);
+  }
+  function arrow(at, p, by) {
+    const from = at(...p), to = at(...p.map((value, axis) => value + state.times * by[axis]));
     line([from, to], "#000", 2);
     const angle = Math.atan2(to[1] - from[1], to[0] - from[0]);
     const head = Math.min(7 * ratio, 0.5 * Math.hypot(to[0] - from[0], to[1] - from[1]));
     line([2.7, -2.7].map((turn) => [to[0] + head * Math.cos(angle + turn), to[1] + head * Math.sin(angle + turn)])
       .flatMap((end, i) => (i ? [to, end] : [end])), "#000", 2);
-    tips.push({ x: to[0], y: to[1], j, k });
+    return to;
   }
   function names(at) {
     context.fillStyle = "#111";
     context.font = `${12 * ratio}px system-ui, sans-serif`;
     context.textAlign = "center";
-    for (const joint of data.joints.filter(visible)) {
+    for (const joint of joints.filter(visible)) {
       const spots = joint.at.map((p) => at(...p));
       const x = spots.reduce((sum, p) => sum + p[0] / spots.length, 0);
       context.fillText(joint.name, x, Math.min(...spots.map((p) => p[1])) - 14 * ratio);
@@ -185,19 +220,16 @@ function spaceView(host, data) {
   }
 
   const two = (value) => (value === null ? "–" : value.toFixed(3));
+  const vector = (by, ci95) => `${["dx", "dy", "dz"].map((name, axis) => {
+    const half = ci95 ? ci95[axis] : null;
+    return `${name} ${two(by[axis])}${half === null ? "" : ` ± ${two(half)}`}`;
+  }).join(", ")} mm`;
   function read(event) {
     const box = canvas.getBoundingClientRect();
     const x = (event.clientX - box.left) * ratio, y = (event.clientY - box.top) * ratio;
-    const tip = tips.map((one) => ({ ...one, off: Math.hypot(one.x - x, one.y - y) })).sort((a, b) => a.off - b.off)[0];
-    if (tip && tip.off < 9 * ratio) {
-      const joint = data.joints[tip.j];
-      const numbers = ["dx", "dy", "dz"].map((name, axis) => {
-        const half = joint.ci95[tip.k][axis];
-        return `${name} ${two(joint.gap[tip.k][axis])}${half === null ? "" : ` ± ${two(half)}`}`;
-      });
-      said.textContent = `${joint.name} (${joint.verdict}), ${data.keys[tip.k]}: ${numbers.join(", ")} mm`;
-      return;
-    }
+    const tip = tips.map((one) => ({ ...one, off: Math.hypot(one.x - x, one.y - y) })).filter((one) => one.off < one.reach)
+      .sort((a, b) => a.off - b.off)[0];
+    if (tip) { said.textContent = tip.text(); return; }
     let index = -1;
     for (let v = -3; v <= 3 && index < 0; v++) for (let u = -3; u <= 3 && index < 0; u++) {
       const column = Math.round(x) + u, row = Math.round(y) + v;
@@ -205,8 +237,8 @@ function spaceView(host, data) {
     }
     for (const part of parts) {
       if (index >= 0 && index < part.residual.length) {
-        const where = Array.from(part.points.subarray(3 * index, 3 * index + 3), (value) => value.toFixed(0)).join(", ");
-        said.textContent = `${part.name}: ${two(part.residual[index])} mm from the design at ${where} mm`;
+        const where = Array.from(part.points.subarray(3 * index, 3 * index + 3), (value, k) => (value + origin[k]).toFixed(0)).join(", ");
+        said.textContent = `${part.name}: ${two(part.residual[index])} mm ${say("from the design at")} ${where} mm`;
         return;
       }
       index -= part.residual.length;

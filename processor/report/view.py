@@ -31,6 +31,9 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
         return None
     result: preassemble.Result = runs[0].result
     found = {
+        "title": "Gaps and residuals in space" if len(result.residual) else "Gaps in space",
+        "arrows": "gaps as arrows",
+        "values": "residuals",
         "method": runs[0].method,
         "keys": KEY_POINTS,
         "stops": DIVERGING_STOPS,

@@ -12,12 +12,12 @@ from pathlib import Path
 
 from processor import store
 from processor.evaluate import ErrorReport
-from processor.model import UsageError
+from processor.model import InputError, UsageError
 from processor.pipeline import Execution
 from processor.report import figures, page, printing, results_json, step_report, tables
 
 RESULTS, RUNS = "results.json", "results.h5"
-OWN_NAMES = (RESULTS, RUNS, "report.html", "figures")
+OWN_NAMES = (RESULTS, RUNS, "report.html", "figures", "job.json")  # the last is a batch's; gone, it does the job again
 OWN_ENDINGS = (".csv", ".dxf")
 
 
@@ -38,8 +38,12 @@ def check_output(out: Path, source: Path, mark: str = RESULTS, own: Collection[s
         raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
 
 
-def write(out: Path, execution: Execution, report: ErrorReport) -> None:
-    """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others."""
+def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
+    """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others.
+
+    The page alone is in the language ``lang``; tables and numbers for other programs are not. Raises InputError where
+    they cannot be written; then ``out`` is as it was.
+    """
     with whole(out) as making:
         store.write_results(making / RUNS, execution.runs, execution.provenance)
         found = results_json.results_json(execution, report)
@@ -56,22 +60,36 @@ def write(out: Path, execution: Execution, report: ErrorReport) -> None:
         for of_step in drawn.values():
             for name, (_, png) in of_step.items():
                 write_bytes(making / "figures" / name, png)
-        write_text(making / "report.html", page.html(execution, report, drawn))
+        write_text(making / "report.html", page.html(execution, report, drawn, lang))
 
 
 @contextmanager
 def whole(out: Path) -> Iterator[Path]:
-    """Give a folder to write into that takes the place of ``out`` when all is written, and is gone on any error."""
+    """Give a folder to write into that takes the place of ``out`` when all is written, and is gone on any error.
+
+    Raises InputError where it cannot be written.
+    """
     out = out.absolute()
-    out.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        making = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
+    except OSError as error:
+        raise _unwritable(out, error) from error
     try:
         os.chmod(making, 0o755)
         yield making
         _replace(making, out)
-    except BaseException:
+    except BaseException as error:
         shutil.rmtree(making, ignore_errors=True)
+        if isinstance(error, OSError):
+            raise _unwritable(out, error) from error
+        if isinstance(error, InputError):  # of a file in the folder that is gone
+            raise InputError(str(error).replace(str(making), str(out))) from error
         raise
+
+
+def _unwritable(out: Path, error: OSError) -> InputError:
+    return InputError(f"{out}: cannot be written ({error.strerror or error}); nothing was changed there")
 
 
 def write_text(path: Path, text: str) -> None:

@@ -17,6 +17,7 @@ from processor.bolt_balls import answer, single
 from processor.bolt_balls.params import METHODS, Params
 from processor.bolt_balls.result import Result
 from processor.bolt_balls.scene_source import PointReader
+from processor.geometry.error_figures import signed
 from processor.geometry.merging import merged
 from processor.model import Floats, FrameTruth, InputError, Ints, Metric, Scene, Tolerance, Truth
 from processor.preassembly import tolerance
@@ -43,16 +44,23 @@ def run(scene: Scene, params: Params, points: PointReader | None = None) -> Resu
     limits = tolerance.default_for(scene.tolerance)
     if params.method != "ray":
         if scene.frame is None:
-            return single.search(merged(scene, with_scanner=True), params)
-        return single.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits)
+            return _told(scene, single.search(merged(scene, with_scanner=True), params))
+        return _told(scene, single.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits))
     found = answer.of_frame(scene, params, points)
     if found is None and points is not None:
         raise InputError(
             f"{scene.name}: no members that meet were found, and the cloud is too large to search otherwise"
         )
     if found is None:
-        return _without_members(scene, params, limits)
+        return _told(scene, _without_members(scene, params, limits))
     return found
+
+
+def _told(scene: Scene, result: Result) -> Result:
+    """Say of control points that nothing was held by them."""
+    if scene.control is None:
+        return result
+    return replace(result, message="; ".join(filter(None, (result.message, answer.UNUSED))))
 
 
 def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
@@ -110,6 +118,12 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *_honesty("centres", off, sd[:, :3], ok),
         *_honesty("radii", radius, sd[:, 3], ok),
         *_honesty("lowest points", lowest, result.lowest_sd[rows], ok),
+    ]
+    bound = result.bound_sd[rows] if len(result.bound_sd) else np.full((len(rows), 5), NAN)
+    metrics += [
+        *signed("spheres", "centres", off[ok], bound[ok, :3]),
+        *signed("spheres", "radii", radius[ok], bound[ok, 3]),
+        *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
     ]
     return metrics
 

@@ -166,6 +166,32 @@ def test_crops_hold_what_is_near_and_nothing_else(roof):
     assert crops.gather(source, np.empty((0, 3)), 100.0).start.tolist() == [0]
 
 
+def test_crops_of_many_points_keep_an_even_share_whatever_the_order():
+    rng = np.random.default_rng(8)
+    nodes = np.array([[0.0, 0.0, 0.0], [900.0, 0.0, 0.0], [0.0, 5000.0, 0.0]])
+    counts = (60_000, 3000, 200)
+    cloud = np.vstack([n + rng.uniform(-110.0, 110.0, (c, 3)) for n, c in zip(nodes, counts, strict=True)])
+    station = rng.integers(0, 3, len(cloud)).astype(np.int32)
+    most = 6000  # 2000 each
+    answers = []
+    for seed, chunk_size, threads in ((0, 1 << 20, 1), (1, 1000, 2), (2, 7777, 3)):
+        order = np.random.default_rng(seed).permutation(len(cloud))
+        source = InMemory(cloud[order], station[order], np.zeros((3, 3)), chunk_size=chunk_size)
+        answers.append(crops.gather(source, nodes, 100.0, threads, most))
+    for other in answers[1:]:
+        for field in ("start", "points", "station"):
+            assert getattr(answers[0], field).tobytes() == getattr(other, field).tobytes()
+    got = answers[0]
+    within = [int((np.linalg.norm(cloud - node, axis=1) <= 100.0).sum()) for node in nodes]
+    kept = np.diff(got.start)
+    assert kept[2] == within[2]
+    assert kept[1] == within[1] < 2000
+    assert 0.8 * 2000 < kept[0] <= 2000 < within[0]  # a step is a factor of 2^(1/4), and what it lets by is chance's
+    some = got.points[: kept[0]]
+    assert np.abs(some.mean(axis=0)).max() < 4.0 * 45.0 / np.sqrt(kept[0])  # sd a coordinate in a sphere: r / root 5
+    assert np.bincount(got.station[: kept[0]]).min() > 0.28 * kept[0]
+
+
 def test_the_papers_estimators_run_on_the_same_points(roof, found):
     _, radii, _, source, nodes, tubes = roof
     near = crops.gather(source, nodes.positions, 190.0)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from processor.bolt_balls.ball_noise import limb_cosine, noise_model, radius_scatter
+from processor.bolt_balls.ball_noise import limb_cosine, noise_model, radius_offset, radius_scatter
 from processor.bolt_balls.ball_residuals import residual, select, weight
 from processor.bolt_balls.ball_solve import inverse_of, solve
 from tests.bench import ball_fit
@@ -162,3 +162,20 @@ def test_the_scatter_of_radii_is_that_of_the_balls():
     posterior = (measured / own**2 + sizes / 0.4**2) / weight_
     assert radius_scatter(posterior, 1 / weight_, sizes, 0.4, 0.4) == pytest.approx(0.2, abs=0.04)
     assert radius_scatter(posterior[:2], 1 / weight_[:2], sizes[:2], 0.4, 0.4) == pytest.approx(0.4, abs=0.08)
+
+
+def test_an_offset_that_all_radii_share_is_found_with_its_standard_deviation():
+    """Radii fused with a prior about their sizes: the mean of what the points say, by its own standard deviation."""
+    rng = np.random.default_rng(4)
+    pulls = []
+    for shared in (0.0, -0.25):
+        for _ in range(200):
+            sizes = rng.choice([45.0, 60.0, 80.0], 80)
+            own = rng.uniform(0.1, 0.5, 80)
+            points = sizes + shared + 0.3 * rng.standard_normal(80) + own * rng.standard_normal(80)
+            weight = 1.0 / own**2 + 1.0 / 0.3**2
+            fused = (points / own**2 + sizes / 0.3**2) / weight
+            found, sd = radius_offset(fused, 1.0 / weight, sizes, 0.3, 0.3)
+            pulls.append((found - shared) / sd)
+    assert 0.88 < np.sqrt(np.mean(np.square(pulls))) < 1.12  # 400 draws: 3.5 %
+    assert radius_offset(np.empty(0), np.empty(0), np.empty(0), 0.3, 0.3) == (0.0, np.inf)

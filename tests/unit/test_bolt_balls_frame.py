@@ -7,6 +7,8 @@ import pytest
 
 from designgen import recipes
 from designgen.scene import make
+from processor.bolt_balls import answer, threads
+from processor.bolt_balls.scene_source import of_scene
 from processor.geometry import rigid
 from processor.steps import spheres
 
@@ -92,15 +94,18 @@ def test_a_ball_of_another_size_is_named(roof):
     assert [i for i, flag in enumerate(result.flag) if flag == "wrong-size"] == [3]
 
 
-def test_points_in_another_order_give_the_same_bytes(roof):
+@pytest.mark.parametrize(("chunk", "threads_used"), [(1 << 20, 2), (70_001, 1), (12_345, 3)])
+def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used, monkeypatch):
     scene, _ = roof
+    first = spheres.run(scene, spheres.Params())
+    monkeypatch.setattr(threads, "usable", lambda: threads_used)
+    monkeypatch.setattr(answer, "of_scene", lambda *given: dataclasses.replace(of_scene(*given), chunk_size=chunk))
     rng = np.random.default_rng(1)
     scans = []
     for scan in scene.scans:
         order = rng.permutation(len(scan.points))
         columns = {name: getattr(scan, name) for name in ("points", "intensity", "grid_row", "grid_column")}
         scans.append(dataclasses.replace(scan, **{k: v[order] if len(v) else v for k, v in columns.items()}))
-    first = spheres.run(scene, spheres.Params())
     again = spheres.run(dataclasses.replace(scene, scans=tuple(scans)), spheres.Params())
     for field in dataclasses.fields(first):
         one, other = getattr(first, field.name), getattr(again, field.name)

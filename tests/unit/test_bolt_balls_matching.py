@@ -6,7 +6,8 @@ from scipy.spatial.transform import Rotation
 
 from designgen.designs import space_frame
 from processor.bolt_balls import matching
-from processor.bolt_balls.matching import Found, match, match_members
+from processor.bolt_balls.match_odds import Found, match_members
+from processor.bolt_balls.matching import match
 from processor.bolt_balls.movement import movement
 from processor.model import FrameDesign
 

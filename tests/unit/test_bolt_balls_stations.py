@@ -7,7 +7,9 @@ from scipy.spatial import cKDTree
 from processor.bolt_balls import station_adjustment, station_kernels, station_normals, threads
 from processor.bolt_balls.corrected import Corrected, corrected_gathered
 from processor.bolt_balls.source import InMemory
-from processor.bolt_balls.stations import ControlPoints, TubePoints, register
+from processor.bolt_balls.station_control import ControlPoints
+from processor.bolt_balls.station_records import TubePoints
+from processor.bolt_balls.stations import register
 from tests import tube_clouds
 
 
@@ -132,6 +134,27 @@ def test_range_offsets_are_found():
     np.testing.assert_allclose(before - after, found.range_offset[station], atol=1e-6)
 
 
+def test_of_range_offsets_only_what_stations_differ_by_is_corrected():
+    """A wide beam on thin tubes looks like an offset of all ranges: balls must not be moved by that."""
+    _, seen, rng = frame(8, 5, 5, per_pair=60)
+    offset = np.array([1.8, 0.5, 1.2, 0.4])
+    station = seen.points.station
+    ray = seen.points.points - seen.scanners[station]
+    away = np.linalg.norm(ray, axis=1)[:, None]
+    shifted = TubePoints(seen.points.points + offset[station][:, None] * ray / away, station, seen.points.start)
+    found = registered(tube_clouds.Seen(shifted, seen.ends, seen.scanners, seen.motions, seen.places, 30.0), rng)
+    assert np.abs(found.range_offset.mean()) < 1e-9
+    sd = np.sqrt(np.diag(found.covariance)[6::7])
+    assert np.abs((found.range_offset - (offset - offset.mean())) / sd).max() < 4.0
+    assert "not applied" in found.message
+    # what all share may be the mean of four that scatter so, along the mean ray
+    scatter = np.std(offset, ddof=1) / 2.0
+    assert found.shared_offset_sd == pytest.approx(scatter, rel=0.3)
+    above = found.places.mean(axis=0) + np.array([0.0, 0.0, 1e6])
+    along = found.shared_offset_at(above[None])[0]
+    np.testing.assert_allclose(along, found.shared_offset_sd**2 * np.diag([0.0, 0.0, 1.0]), atol=1e-2 * along[2, 2])
+
+
 def test_without_control_the_datum_is_the_mean_of_the_stations():
     """The common translation is known to sd / sqrt(s) of the stations' own, whatever the tubes say."""
     _, seen, rng = frame(2, 5, 5, grid=(3, 3), per_pair=30)
@@ -167,6 +190,93 @@ def test_control_points_hold_the_datum():
         assert np.abs(found.corrected(wrong, np.full(len(nodes), k)) - right).max() < 1.0
     assert np.sqrt(np.diag(found.common(nodes.mean(axis=0)))[3:]).max() < 0.3
     assert found.before_mm < 5.0  # the 40 mm are no station's error
+
+
+def targets(seen, seed, count, sd=0.3, off=None):
+    """Targets about the roof, seen by two stations each, their places known to ``sd``; ``off`` is added to those."""
+    rng = np.random.default_rng(seed)
+    places = np.column_stack([rng.uniform(-2e3, 14e3, (count, 2)), rng.uniform(0.0, 6e3, count)])
+    known = places + rng.normal(0.0, sd, places.shape) + (0.0 if off is None else off)
+    s = [rng.permutation(len(seen.scanners))[:2] for _ in range(count)]
+    point, s = np.repeat(np.arange(count), [len(one) for one in s]), np.concatenate(s)
+    measured = np.array([
+        tube_clouds.turn(seen.motions[k, :3]) @ (p - seen.places[k]) + seen.places[k] + seen.motions[k, 3:]
+        for k, p in zip(s, places[point], strict=True)
+    ])  # fmt: skip
+    measured += rng.normal(0.0, 0.5, measured.shape)
+    return ControlPoints(
+        tuple(f"T{k}" for k in point), measured, known[point], np.full(measured.shape, 0.5),
+        np.eye(len(seen.scanners))[s], point, np.full(len(point), sd),
+    )  # fmt: skip
+
+
+def test_covariances_with_control_points_are_honest_over_many_seeds():
+    """Pulls of nodes after the correction, the error that the sightings of one target share among them."""
+    pulls, shift, doubted = [], [], 0
+    for seed in range(30):
+        nodes, seen, rng = frame(seed, per_pair=24)
+        found = registered(seen, rng, control=targets(seen, seed, 4, sd=0.6))
+        doubted += int((found.control_used == 0).sum())
+        share = np.full((len(nodes), 4), 0.25)
+        left = remaining(seen, found)
+        moved = np.mean(left[None, :, 3:] + np.cross(left[None, :, :3], nodes[:, None] - seen.scanners), axis=1)
+        pulls.append(moved / np.sqrt(np.einsum("kii->ki", found.effect(nodes, share))))
+        shift.append(np.diag(found.common(found.places.mean(axis=0)))[3:])
+    # four of 0.6 mm seen twice to 0.5: 0.35 mm at their middle, and more where the stations are
+    assert 0.35 < np.sqrt(np.median(shift)) < 0.8
+    assert 0.85 < np.sqrt(np.mean(np.square(pulls))) < 1.2
+    assert doubted == 0
+
+
+def test_a_wrong_control_point_is_left_out_and_named():
+    _, seen, _ = frame(4, 5, 5, per_pair=40)
+    for size in (15.0, 400.0):
+        off = np.zeros((5, 3))
+        off[2] = [0.6 * size, 0.0, 0.8 * size]
+        good, wrong = (
+            registered(seen, np.random.default_rng(1), control=one)
+            for one in (targets(seen, 3, 5).only(np.repeat(np.arange(5) != 2, 2)), targets(seen, 3, 5, off=off))
+        )
+        assert wrong.control_used.tolist() == [1, 1, 1, 1, 0, 0, 1, 1, 1, 1]
+        assert "control point T2 left out" in wrong.message
+        np.testing.assert_allclose(wrong.T_project_station, good.T_project_station, atol=0.02)
+        np.testing.assert_allclose(wrong.control_off[4:6], np.tile(off[2], (2, 1)), atol=3.0)
+
+
+def test_control_points_that_contradict_each_other_widen_the_intervals():
+    """Of three none can be told to be wrong; of one alone nothing but the stations' own scatter speaks against it."""
+    nodes, seen, _ = frame(4, 5, 5, per_pair=40)
+    three = targets(seen, 3, 3)
+    away = three.target[0] - three.target[[2, 4]].mean(axis=0)
+    off = np.zeros((3, 3))
+    off[0] = 30.0 * away / np.linalg.norm(away)  # no motion of all keeps the distances between them
+    for control in (targets(seen, 3, 3, off=off), targets(seen, 3, 1, off=[0.0, 0.0, 60.0])):
+        found = registered(seen, np.random.default_rng(1), control=control)
+        assert found.status == "weak"
+        assert "contradict" in found.message
+        assert (found.control_used == 1).all()
+        sd = np.sqrt(np.diag(found.common(nodes.mean(axis=0)))[3:])
+        left = remaining(seen, found)
+        moved = np.mean(left[:, 3:] + np.cross(left[:, :3], nodes.mean(axis=0) - seen.scanners), axis=0)
+        assert (np.abs(moved) < 2.0 * sd).all()
+
+
+def test_one_station_is_held_by_control_points():
+    _, seen, rng = frame(1, 5, 5, grid=(1, 1), per_pair=40)
+    shift = np.array([30.0, -20.0, 8.0])
+    found = registered(seen, rng, control=targets(seen, 2, 4, off=shift))
+    left = remaining(seen, found)[0, 3:] - shift
+    assert np.abs(left).max() < 1.5
+    assert np.abs(left / np.sqrt(np.diag(found.covariance)[3:6])).max() < 4.0
+
+
+def test_a_declared_shift_of_all_stations_is_in_the_datum():
+    _, seen, _ = frame(2, 5, 5, grid=(3, 3), per_pair=30)
+    own, more = (registered(seen, np.random.default_rng(1), datum_mm=sd) for sd in (0.0, 3.0))
+    variance = [np.diag(one.common(one.places.mean(axis=0)))[3:] for one in (own, more)]
+    np.testing.assert_allclose(variance[1] - variance[0], 9.0, rtol=0.05)
+    np.testing.assert_allclose(more.between, own.between, rtol=0.05, atol=1e-4)
+    assert "3" in more.datum
 
 
 def test_two_control_points_help_without_holding_all():

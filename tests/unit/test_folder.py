@@ -229,7 +229,7 @@ PROJECTS = {
     "absolute": ("[[scan]]\nfile = '/etc/passwd'", "leads out of the folder"),
     "absolute design": ("design = '/etc/passwd'", "leads out of the folder"),
     "zero": ('design = "a\\u0000b"', "leads out of the folder"),
-    "STEP": ('design = "scans/a.step"', "designgen import"),
+    "STEP": ('kind = "arch-bridge"\ndesign = "scans/a.step"', "alone is a design of kind structure"),
     "other design": ('design = "scans/foot1.xyz"', "expected a design as .json or .csv"),
 }
 

@@ -252,17 +252,36 @@ def test_spherical_points_by_hand():
 
 SCANS = [path for path in sorted(DATA.rglob("*")) if path.suffix in readers.SUFFIXES] if DATA.is_dir() else []
 REFUSED = {
-    "bunny_8.pts": "declares 8 points, but 9 follow",
+    "bunny_8.pts": "declares 8 points, but more follow",
     "multiple-and-transform.ptx": "not a rotation and a translation",
 }
-COUNTS = {  # as the files' headers or line counts say
-    "bunnyDouble.e57": 30571,
-    "bunnyInt32.e57": 30571,
-    "indoor.laz": 808042,
-    "autzen_trim.laz": 110000,
-    "simple.laz": 1065,
-    "SPH101.xyz": 6474,
-    "plane_horizontal_t1.xyz": 441,
+# Points of each scan, less those without a return, and the unit: as headers, line counts and grids say.
+EXPECTED = {
+    "bunnyDouble.e57": ([30_571], "m"),
+    "bunnyInt32.e57": ([30_571], "m"),
+    "pumpAVisualReferenceImage.e57": ([155_201], "m"),
+    "testWithNormals.e57": ([2], "m"),
+    "translationWithoutRotation.e57": ([4], "m"),
+    "autzen_trim.laz": ([110_000], "ft"),
+    "indoor.laz": ([808_042], "m"),
+    "simple.las": ([1_065], "m"),
+    "simple.laz": ([1_065], "m"),
+    "simple1_4.las": ([22_600], "m"),  # it also says degrees, which its coordinates are not
+    "plane_horizontal_t1.xyz": ([441], ""),
+    "plane_horizontal_t2.xyz": ([441], ""),
+    "bun0.pcd": ([397], ""),
+    "region_growing_tutorial.pcd": ([108_104], ""),
+    "room_scan1.pcd": ([112_586], ""),
+    "room_scan2.pcd": ([112_624], ""),
+    "1.2-with-color.ptx": ([1_065], "m"),
+    "complex-transform.ptx": ([4], "m"),  # of 12 cells
+    "no-color.ptx": ([15], "m"),
+    "autzen.pts": ([10], ""),
+    "site_56_8.pts": ([8], ""),
+    "test.pts": ([19], ""),
+    "SPH101.xyz": ([6_474], ""),
+    "SPH102.xyz": ([1_893], ""),
+    "SPH103.xyz": ([6_716], ""),
 }
 
 
@@ -274,7 +293,7 @@ def test_every_real_file(path):
             readers.read(path)
         return
     scans = readers.read(path)
-    assert sum(len(scan.points) for scan in scans) == COUNTS.get(path.name, sum(len(s.points) for s in scans)) > 0
+    assert ([len(scan.points) for scan in scans], scans[0].unit) == EXPECTED[path.name]
     for scan in scans:
         assert np.isfinite(scan.points).all()
         assert np.abs(scan.points).max() < 20_000.0

@@ -252,7 +252,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
     assert "scan both ends" in last[2]
     assert set(last[3:]) <= {"–", ""}
     assert "Closure by" not in parsed.text
-    data = json.loads(parsed.scripts[0][1])
+    data = json.loads(parsed.scripts[0][1])["steps"]["preassemble"]
     assert data["joints"][1]["gap"] == [[None] * 3] * 8
 
 

@@ -20,7 +20,19 @@ from processor.bolt_balls import verdicts
 from processor.evaluate import ErrorReport
 from processor.model import FrameDesign, Scan, Scene, Stations, StepRun
 from processor.pipeline import Execution
-from processor.report import dxf, figures, figures_ball, figures_balls, page, printing, results_json, tables, writing
+from processor.report import (
+    dxf,
+    figures,
+    figures_ball,
+    figures_balls,
+    page,
+    printing,
+    results_balls,
+    results_json,
+    tables,
+    tables_balls,
+    writing,
+)
 from processor.steps import spheres
 from tests.unit.test_report import PROVENANCE, Page, balls
 
@@ -395,6 +407,44 @@ def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
         away = np.linalg.norm(points + origin - centre, axis=1)
         assert len(crop) == (away <= far).sum() > 0
         np.testing.assert_allclose(np.sort(np.linalg.norm(crop, axis=1)), np.sort(away[away <= far]), atol=1e-5)
+
+
+def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
+    """The same bytes, though of the file only the tiles about each ball are read."""
+    rng = np.random.default_rng(4)
+    made = whole()
+    T = pose(TURN, (100.0, 0.0, 0.0))
+    near = np.repeat(made.centres[np.isfinite(made.centres).all(axis=1)], 300, axis=0)
+    far = rng.uniform(-5e3, 5e3, (60_000, 3)) + near.mean(axis=0)
+    points = np.vstack([near + rng.uniform(-150.0, 150.0, near.shape), far])
+    origin = np.array([500.0, -300.0, 0.0])
+    scans = (
+        Scan("a", (points - T[:3, 3]) @ T[:3, :3] - origin, origin, T_project_scan=T),
+        Scan("b", points[:5000], point_station=np.zeros(5000, np.int32)),
+    )
+    one = dataclasses.replace(scene(made), scans=scans, stations=Stations(("S1",), np.zeros((1, 3))))
+    store.write_scene(tmp_path / "s.h5", one, None, {})
+    in_memory = figures_ball.of_result(store.read_scene(tmp_path / "s.h5"), made)
+    alone = store.read_scene(tmp_path / "s.h5", points=False)
+    assert len(in_memory) > 1
+    assert figures_ball.of_result(alone, made) == {}
+    assert figures_ball.of_result(alone, made, tmp_path / "s.h5") == in_memory
+
+
+def test_control_points_have_a_table_and_their_place_in_results_json():
+    made = whole(
+        datum="2 control points", control_names=("T1", "T2"), control_off=[[0.3, 0.0, -0.4], [30.0, 0.0, 0.0]],
+        control_used=[1, 0],
+    )  # fmt: skip
+    (table,) = (one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+                if one.file == "control")  # fmt: skip
+    assert table.columns[0] == "control_point"
+    assert table.rows[0] == ("T1", 0.3, 0.0, -0.4, pytest.approx(0.5), "yes")
+    assert table.rows[1][-1].startswith("no, ")
+    written = results_balls.written(made)
+    assert written["datum"] == "2 control points"
+    assert [(one["name"], one["used"]) for one in written["control"]] == [("T1", True), ("T2", False)]
+    assert not {"datum", "control"} & set(results_balls.written(whole()))
 
 
 def test_the_expected_distribution_holds_as_many_errors_as_there_are():

@@ -1,0 +1,34 @@
+"""Errors with their sign as figures of a check: what a certificate of accuracy is made of."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.model import Floats, Metric
+
+
+def signed(step: str, quantity: str, errors: Floats, bound: Floats | None = None, unit: str = "mm") -> list[Metric]:
+    """Bias, standard deviation, 95 % error and number of errors, measured less true; NaN among them are left out.
+
+    ``bound`` holds the least possible standard deviation of each (Cramér-Rao), of the same shape: then also the
+    efficiency, 1 / rms(error / bound). Names begin with the quantity, in the plural; the share of errors within their
+    intervals is "<quantity> within their 95 % intervals". None of these has a limit.
+    """
+    known = np.isfinite(errors)
+    found = errors[known]
+    nan = float("nan")
+    if not len(found):
+        return []
+    figures = [
+        ("bias", float(np.mean(found)), unit),
+        ("standard deviation", float(np.std(found, ddof=1)) if len(found) > 1 else nan, unit),
+        ("95 % error", float(np.quantile(np.abs(found), 0.95)), unit),
+        ("number", float(len(found)), ""),
+    ]
+    if bound is not None:
+        least = bound[known]
+        bounded = np.isfinite(least) & (least > 0.0)
+        if bounded.any():
+            rms = float(np.sqrt(np.mean((found[bounded] / least[bounded]) ** 2)))
+            figures.append(("efficiency", 1.0 / rms if rms > 0.0 else nan, ""))
+    return [Metric(step, f"{quantity}, {name}", value, nan, own) for name, value, own in figures]

@@ -1,0 +1,33 @@
+"""Formats that only their makers' software reads, and how to get the scans out of them."""
+
+from __future__ import annotations
+
+_FARO = ("FARO", "SCENE: right-click the scans, Import/Export, Export Scan Points")
+_ZF = ("Zoller + Froehlich", "Z+F LaserControl: File, Export")
+_RIEGL = ("RIEGL", "RiSCAN PRO: right-click the scan positions, Export")
+_RECAP = ("Autodesk", "ReCap: Export")
+_LEICA = ("Leica", "Cyclone or Cyclone REGISTER 360: Export")
+_TRIMBLE = ("Trimble", "RealWorks: File, Export")
+_DOT = ("DotProduct", "Dot3D: Export")
+_TOPCON = ("Topcon", "ScanMaster or MAGNET Collage: Export")
+
+FORMATS = {
+    **dict.fromkeys((".fls", ".fws", ".lsproj"), _FARO),
+    **dict.fromkeys((".zfs", ".zfprj"), _ZF),
+    **dict.fromkeys((".rxp", ".rdb", ".rdbx", ".3dd"), _RIEGL),
+    **dict.fromkeys((".rcp", ".rcs"), _RECAP),
+    **dict.fromkeys((".imp", ".lgs", ".lgsx", ".b2g", ".blk"), _LEICA),
+    **dict.fromkeys((".tzf", ".tzs", ".rwp"), _TRIMBLE),
+    ".dp": _DOT,
+    **dict.fromkeys((".cl3", ".clr"), _TOPCON),
+}
+ARCHIVES = (".zip", ".7z", ".rar", ".gz", ".tar", ".tgz")
+
+
+def advice(suffix: str) -> str:
+    """Say of a suffix of FORMATS whose it is and how to export."""
+    maker, way = FORMATS[suffix]
+    return (
+        f"{suffix} is a closed format that only software of its maker ({maker}) reads; export the scan to E57 there "
+        f"({way}), unmerged and with scanner positions where it asks, and give the E57 file instead"
+    )

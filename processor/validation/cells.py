@@ -1,0 +1,130 @@
+"""Cells of a validation: one scene made from a recipe, run by some methods, and the figures of its checks."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+HASH_DIGITS = 16
+SEED_DIGITS = 7  # of a fresh seed, in base 16
+
+
+@dataclass(frozen=True)
+class Case:
+    """A scene but for its seed, and what is run on it; ``settings`` are those of ``designgen make --set``."""
+
+    name: str
+    recipe: str  # a name designgen knows, or the stem of a file
+    recipe_text: str
+    from_file: bool
+    settings: tuple[str, ...]
+    steps: tuple[str, ...]
+    methods: tuple[str, ...]
+    params: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def recipe_sha256(self) -> str:
+        """Hash of the recipe's text."""
+        return hashlib.sha256(self.recipe_text.encode("utf-8")).hexdigest()
+
+    @property
+    def key(self) -> str:
+        """What figures of one method must share to be of the same case; the other methods are not in it."""
+        return _digest([self.recipe, self.recipe_text, self.settings, self.steps, dict(self.params)])
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A case with its seed; ``fixed`` seeds are those of every night."""
+
+    case: Case
+    seed: int
+    fixed: bool
+
+    @property
+    def key(self) -> str:
+        """Hash of all that is asked for: two cells of one key have the same figures as long as the software is."""
+        return _digest([self.case.key, self.case.methods, self.seed])
+
+    @property
+    def title(self) -> str:
+        """Name the cell for a person."""
+        return " ".join([self.case.name, *self.case.settings, f"seed {self.seed}"])
+
+    def spec(self) -> dict[str, Any]:
+        """Return what a process elsewhere needs to do this cell, as JSON can hold it."""
+        case = self.case
+        return {
+            "recipe": case.recipe,
+            "recipe_text": case.recipe_text if case.from_file else "",
+            "settings": list(case.settings),
+            "steps": list(case.steps),
+            "methods": list(case.methods),
+            "params": dict(case.params),
+            "seed": self.seed,
+        }
+
+
+@dataclass(frozen=True)
+class Figure:
+    """One check of a cell. ``limit`` is NaN where there is none; a value that is not a number never keeps one."""
+
+    step: str
+    method: str
+    name: str
+    value: float
+    limit: float
+    unit: str
+
+    @property
+    def passed(self) -> bool:
+        """Whether the value keeps within its limit."""
+        return math.isnan(self.limit) or self.value <= self.limit
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a cell ended: ``results`` is its results.json, empty where it ``failed``; the message says why."""
+
+    failed: str = ""
+    results: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
+    peak_mb: float = 0.0  # of the largest of its processes
+
+
+def fresh_seed(case: Case, number: int, i: int) -> int:
+    """Seed ``i`` of a case in the night of that number: another one every night, and for every case.
+
+    The figures of two cases are then independent, which the test of changes counts on.
+    """
+    return int(_digest([case.key, number, i])[:SEED_DIGITS], 16)
+
+
+def figures_of(results: Mapping[str, Any]) -> list[Figure]:
+    """Read the checks of a results.json, each with the method it is of."""
+    answers = {step: str(found.get("method", "")) for step, found in results["steps"].items()}
+    others = {
+        step: [str(one.get("method", "")) for one in found] for step, found in results.get("comparison", {}).items()
+    }
+    figures = []
+    for check in results["checks"]:
+        step, name = str(check["step"]), str(check["name"])
+        method = answers.get(step, "")
+        prefix, colon, rest = name.partition(": ")
+        if colon and prefix in others.get(step, ()):
+            method, name = prefix, rest
+        figures.append(Figure(step, method, name, _number(check["value"]), _number(check["limit"]), str(check["unit"])))
+    return figures
+
+
+def _number(value: Any) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _digest(value: Any) -> str:
+    text = json.dumps(value, sort_keys=True, ensure_ascii=False, default=str)
+    return hashlib.sha256(text.encode("utf-8")).hexdigest()[:HASH_DIGITS]

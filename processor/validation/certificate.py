@@ -1,0 +1,227 @@
+"""The certificate of accuracy: what was measured, on which scenes, how well, and what that does not show.
+
+In the form of ISO 15530-3, where a calibrated workpiece is measured over and over under the conditions of use: here
+the scene made by the generator is the workpiece and its truth the calibration, so u_cal = 0 but for rounding. Of each
+quantity u_p is the standard deviation of all errors, b their mean, u_b the standard uncertainty of b from the scatter
+between scenes, and, as results are not corrected by b, U = k sqrt(u_cal^2 + u_p^2 + u_b^2) + |b| with k = 2. The
+standard's u_w, for what workpieces differ in by material and make, is not in it: recipes "as built" vary the make,
+and are rows of their own.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import jinja2
+
+from processor.validation.cells import Case
+from processor.validation.history import Row
+from processor.validation.matrix import Matrix
+from processor.validation.software import Software
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+FORMAT, FORMAT_VERSION = "processor-certificate", "1.0"
+COVERAGE_FACTOR = 2.0
+LEAST_SCENES = 3  # that a scatter between scenes is taken from
+METHOD = (
+    "After ISO 15530-3 (uncertainty from repeated measurement of a calibrated workpiece): the simulated structure is "
+    "the workpiece, its truth the calibration (u_cal = 0). u_p: standard deviation of all errors. b: their mean, u_b "
+    "its standard uncertainty from the scatter between scenes. Results are not corrected by b, so U = k sqrt(u_cal^2 "
+    "+ u_p^2 + u_b^2) + |b| with k = 2. u_w (material and make of workpieces) is not included. Coverage: share of "
+    "errors within the 95 % intervals that the program states itself. Efficiency: 1 / rms(error / least possible "
+    "standard deviation), 1 where no unbiased estimator can do better (Cramer-Rao). Of errors, those of answers "
+    "without a flag count for balls, those of all key points for bridges."
+)
+NOT_SHOWN = (
+    "The scans are simulated. No instrument took part, and the scanner classes are rounded from data sheets, not "
+    "calibrated against instruments: this is no calibration certificate and is not traceable.",
+    "Not simulated, so not covered: reflections between surfaces, movement during a scan, refraction, wet, oily or "
+    "painted surfaces other than by their brightness.",
+    "Structures, damage and surroundings are those of the recipes named. A row holds for its recipe, noise and "
+    "density; nothing is said between or beyond them.",
+    "Truth and scans come from one generator: what its model of steel or scanner leaves out, no row can show. It "
+    "shares no geometry with the processor.",
+    "u_p pools errors within scenes, which may have a part in common; where scenes differ more than errors within "
+    "them, u_b shows it, once there are three scenes.",
+)
+
+
+@dataclass(frozen=True)
+class Line:
+    """One quantity of one method on one kind of scene; NaN where it is not known. Lengths in ``unit``."""
+
+    recipe: str
+    settings: tuple[str, ...]
+    scanner: str
+    noise: str
+    density: str
+    step: str
+    method: str
+    quantity: str
+    unit: str
+    scenes: int
+    number: int
+    bias: float
+    u_b: float
+    u_p: float
+    U95: float
+    error_95: float  # median over the scenes
+    coverage: float  # %
+    efficiency: float
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """All lines, and what was run. ``nights``: those by this very software, from the first to the last."""
+
+    night: str
+    nights: tuple[str, ...]
+    commit: str
+    versions: Mapping[str, str]
+    matrix: str
+    matrix_sha256: str
+    recipes: Mapping[str, str]  # name -> hash of the recipe's text
+    lines: tuple[Line, ...] = ()
+    method: str = METHOD
+    not_shown: tuple[str, ...] = field(default=NOT_SHOWN)
+
+
+def make(
+    night: str, rows: Sequence[Row], nights: Sequence[str], cases: Sequence[Case], software: Software, matrix: Matrix
+) -> Certificate:
+    """Make the certificate from the figures of ``nights``, all by the present software."""
+    of_case = {case.key: case for case in cases}
+    # A fixed seed is one scene, however many nights it was run in.
+    scenes: dict[tuple[str, str, str], dict[int, dict[str, Row]]] = defaultdict(lambda: defaultdict(dict))
+    for row in rows:
+        if row.night in nights and row.case in of_case:
+            scenes[row.case, row.name[0], row.name[1]][row.seed][row.name[2]] = row
+    lines: list[Line] = []
+    for (case, step, method), by_seed in scenes.items():
+        quantities = {
+            name.removesuffix(", bias"): None for found in by_seed.values() for name in found if name.endswith(", bias")
+        }
+        lines += [_line(of_case[case], step, method, quantity, list(by_seed.values())) for quantity in quantities]
+    order = {case.key: i for i, case in enumerate(cases)}
+    by_title = {(case.recipe, case.settings): order[case.key] for case in reversed(cases)}
+    lines.sort(key=lambda one: (one.step, by_title[one.recipe, one.settings], one.method, one.quantity))
+    return Certificate(
+        night,
+        tuple(nights),
+        software.commit,
+        software.versions,
+        matrix.name,
+        matrix.sha256,
+        {case.recipe: case.recipe_sha256 for case in cases},
+        tuple(one for one in lines if one.scenes),
+    )
+
+
+def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Mapping[str, Row]]) -> Line:
+    def of(figure: str) -> list[float]:
+        return [scene[figure].value if figure in scene else math.nan for scene in scenes]
+
+    numbers, biases = of(f"{quantity}, number"), of(f"{quantity}, bias")
+    deviations = of(f"{quantity}, standard deviation")
+    used = [
+        (n, b, s if n > 1 else 0.0)
+        for n, b, s in zip(numbers, biases, deviations, strict=True)
+        if n > 0 and math.isfinite(b) and (n == 1 or math.isfinite(s))
+    ]
+    total = sum(n for n, _, _ in used)
+    bias = sum(n * b for n, b, _ in used) / total if total else math.nan
+    spread = sum((n - 1.0) * s**2 + n * (b - bias) ** 2 for n, b, s in used)
+    u_p = math.sqrt(spread / (total - 1.0)) if total > 1 else math.nan
+    u_b = math.nan
+    if len(used) >= LEAST_SCENES:
+        count = len(used)
+        # The mean of the scenes, weighted as the bias is.
+        u_b = math.sqrt(sum((n * (b - bias)) ** 2 for n, b, _ in used) * count / (count - 1.0)) / total
+    unit = next(scene[f"{quantity}, bias"].unit for scene in scenes if f"{quantity}, bias" in scene)
+    known_u_b = u_b if math.isfinite(u_b) else (u_p / math.sqrt(total) if total > 1 else math.nan)
+    scanner, noise, density = conditions(case)
+    return Line(
+        case.recipe,
+        case.settings,
+        scanner,
+        noise,
+        density,
+        step,
+        method,
+        quantity,
+        unit,
+        len(used),
+        int(total),
+        bias,
+        u_b,
+        u_p,
+        COVERAGE_FACTOR * math.hypot(u_p, known_u_b) + abs(bias),
+        _median(of(f"{quantity}, 95 % error")),
+        _weighted(of(f"{quantity} within their 95 % intervals"), numbers),
+        _weighted(of(f"{quantity}, efficiency"), numbers),
+    )
+
+
+def conditions(case: Case) -> tuple[str, str, str]:
+    """Name scanner, noise and density of a case, from its recipe and settings."""
+    recipe: dict[str, Any] = tomllib.loads(case.recipe_text)
+    for setting in case.settings:
+        key, _, text = setting.partition("=")
+        *sections, last = key.split(".")
+        table = recipe
+        for section in sections:
+            table = table.setdefault(section, {})
+        table[last] = tomllib.loads(f"value = {text}")["value"]
+    scan, scanner = recipe.get("scan", {}), recipe.get("scanner", {})
+    if scan.get("mode") == "rays":
+        own = ", ".join(f"{key} {value}" for key, value in scanner.items() if "noise" in key)
+        return str(scan.get("scanner", "default")), own or "the preset's", f"{scan.get('step_mrad', '?')} mrad"
+    return "none (sampled)", f"{scan.get('sigma_mm', '?')} mm", f"{scan.get('spacing_mm', '?')} mm"
+
+
+def _median(values: Sequence[float]) -> float:
+    known = sorted(value for value in values if math.isfinite(value))
+    middle = len(known) // 2
+    return math.nan if not known else known[middle] if len(known) % 2 else 0.5 * (known[middle - 1] + known[middle])
+
+
+def _weighted(values: Sequence[float], weights: Sequence[float]) -> float:
+    known = [(v, w) for v, w in zip(values, weights, strict=True) if math.isfinite(v) and w > 0]
+    return sum(v * w for v, w in known) / sum(w for _, w in known) if known else math.nan
+
+
+# --- as files -------------------------------------------------------------------------------------------------------
+
+
+def as_json(certificate: Certificate) -> str:
+    """Write the certificate as JSON; what is not known is null."""
+    found = {"format": FORMAT, "format_version": FORMAT_VERSION, "k": COVERAGE_FACTOR, **asdict(certificate)}
+    found["lines"] = [
+        {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in line.items()}
+        for line in found["lines"]
+    ]
+    return json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+
+
+def as_html(certificate: Certificate) -> str:
+    """Write the certificate as a page of its own."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    environment.filters["shown"] = _shown
+    return environment.get_template("certificate.html").render(certificate=certificate) + "\n"
+
+
+def _shown(value: float, digits: int = 3) -> str:
+    return f"{value:.{digits}g}" if math.isfinite(value) else "–"

@@ -1,0 +1,262 @@
+"""The history of all nights: one SQLite file that can be kept for years.
+
+A cell is written with its figures in one transaction, so that whatever ends the program leaves whole cells behind;
+keys make a second row of one figure of one cell in one night impossible. The journal is a rollback journal, not WAL:
+the file is then all there is, to be copied or cached, also on a network's disk.
+
+View ``rows`` has one row a figure a night with all that made it.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sqlite3
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from processor.model import InputError
+from processor.validation.cells import Cell, Figure, Outcome, figures_of
+from processor.validation.software import Software
+
+VERSION = 1
+BUSY_S = 60.0
+SCHEMA = """
+CREATE TABLE nights (
+  night TEXT PRIMARY KEY,             -- YYYY-MM-DD
+  code TEXT NOT NULL,                 -- digest of the sources and the libraries' versions
+  commit_ TEXT NOT NULL,              -- git's; + where files differed from it
+  software TEXT NOT NULL,             -- JSON, versions by name
+  matrix TEXT NOT NULL, matrix_sha256 TEXT NOT NULL,
+  begun TEXT NOT NULL,                -- UTC
+  ended TEXT,                         -- NULL until all of it is done
+  line TEXT NOT NULL DEFAULT ''
+) WITHOUT ROWID;
+CREATE TABLE cells (
+  night TEXT NOT NULL REFERENCES nights ON DELETE CASCADE, cell TEXT NOT NULL, case_ TEXT NOT NULL,
+  title TEXT NOT NULL, recipe TEXT NOT NULL, recipe_sha256 TEXT NOT NULL, settings TEXT NOT NULL,
+  seed INTEGER NOT NULL, fixed INTEGER NOT NULL, input_sha256 TEXT NOT NULL, failed TEXT NOT NULL,
+  seconds REAL NOT NULL, peak_mb REAL NOT NULL,
+  PRIMARY KEY (night, cell)
+) WITHOUT ROWID;
+CREATE TABLE figures (
+  night TEXT NOT NULL, cell TEXT NOT NULL, step TEXT NOT NULL, method TEXT NOT NULL, name TEXT NOT NULL,
+  value REAL, limit_ REAL, unit TEXT NOT NULL,        -- NULL = not a number, no limit
+  PRIMARY KEY (night, cell, step, method, name),
+  FOREIGN KEY (night, cell) REFERENCES cells ON DELETE CASCADE
+) WITHOUT ROWID;
+CREATE TABLE changes (
+  night TEXT NOT NULL REFERENCES nights ON DELETE CASCADE, step TEXT NOT NULL, method TEXT NOT NULL, name TEXT NOT NULL,
+  kind TEXT NOT NULL, said TEXT NOT NULL, accepted INTEGER NOT NULL DEFAULT 0,
+  PRIMARY KEY (night, step, method, name)
+) WITHOUT ROWID;
+CREATE VIEW rows AS SELECT f.night, c.title, f.step, f.method, f.name, f.value, f.limit_, f.unit, c.recipe,
+  c.recipe_sha256, c.settings, c.seed, c.fixed, c.input_sha256, n.software, n.commit_, n.code, n.matrix, f.cell, c.case_
+  FROM figures f JOIN cells c USING (night, cell) JOIN nights n USING (night);
+"""
+Name = tuple[str, str, str]  # of a figure: step, method, name
+
+
+@dataclass(frozen=True)
+class Row:
+    """One figure of one cell in one night, as the test of changes takes it."""
+
+    night: str
+    case: str
+    recipe: str
+    seed: int
+    fixed: bool
+    input_sha256: str
+    name: Name
+    value: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Night:
+    """One night as the history has it."""
+
+    night: str
+    code: str
+    commit: str
+    software: dict[str, str]
+    ended: str
+    line: str
+
+
+class History:
+    """An open history. Raises InputError for a file that is none, or of a later version."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            # Transactions are begun and ended below, by name.
+            self.db = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None)
+            self.db.execute("PRAGMA foreign_keys = ON")
+            self.db.execute("PRAGMA synchronous = FULL")
+            with self._transaction():
+                (version,) = self.db.execute("PRAGMA user_version").fetchone()
+                if version == 0 and not self.db.execute("SELECT name FROM sqlite_master").fetchall():
+                    for statement in SCHEMA.split(";\n"):
+                        self.db.execute(statement)
+                    self.db.execute(f"PRAGMA user_version = {VERSION}")
+                    version = VERSION
+        except (sqlite3.Error, OSError) as error:
+            raise InputError(f"{path}: expected a history of nights, could not open it ({error})") from error
+        if version != VERSION:
+            self.close()
+            raise InputError(f"{path}: expected a history of version {VERSION}, found {version}; name another file")
+
+    def close(self) -> None:
+        """Close the file."""
+        self.db.close()
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self.db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
+        except BaseException:
+            self.db.execute("ROLLBACK")
+            raise
+        self.db.execute("COMMIT")
+
+    # --- a night that is under way ---------------------------------------------------------------------------------
+
+    def begun_by(self, night: str) -> str | None:
+        """Return the digest of the software a night was begun by, None where there is no such night."""
+        found = self.db.execute("SELECT code FROM nights WHERE night = ?", [night]).fetchone()
+        return None if found is None else str(found[0])
+
+    def begin(self, night: str, software: Software, matrix: str, matrix_sha256: str, now: str) -> None:
+        """Begin a night, or go on with it."""
+        with self._transaction():
+            self.db.execute(
+                "INSERT INTO nights (night, code, commit_, software, matrix, matrix_sha256, begun)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?) ON CONFLICT (night) DO UPDATE SET ended = NULL",
+                [night, software.code, software.commit, _json(software.versions), matrix, matrix_sha256, now],
+            )
+
+    def forget(self, night: str) -> None:
+        """Delete a night, to be done again by other software."""
+        with self._transaction():
+            self.db.execute("DELETE FROM nights WHERE night = ?", [night])
+
+    def done(self, night: str) -> set[str]:
+        """Return the cells of a night that are done; those that failed are not."""
+        return {
+            str(cell) for (cell,) in self.db.execute("SELECT cell FROM cells WHERE night = ? AND failed = ''", [night])
+        }
+
+    def add(self, night: str, cell: Cell, outcome: Outcome) -> None:
+        """Write a cell with its figures, in place of an earlier attempt at it that failed."""
+        case = cell.case
+        figures: list[Figure] = [] if outcome.failed else figures_of(outcome.results)
+        with self._transaction():
+            self.db.execute("DELETE FROM cells WHERE night = ? AND cell = ? AND failed != ''", [night, cell.key])
+            added = self.db.execute(
+                "INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
+                [night, cell.key, case.key, cell.title, case.recipe, case.recipe_sha256, _json(case.settings),
+                 cell.seed, int(cell.fixed), str(outcome.results.get("input_sha256", "")), outcome.failed,
+                 outcome.seconds, outcome.peak_mb],
+            )  # fmt: skip
+            if added.rowcount:
+                self.db.executemany(
+                    "INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    [
+                        [night, cell.key, f.step, f.method, f.name, _stored(f.value), _stored(f.limit), f.unit]
+                        for f in figures
+                    ],
+                )
+
+    def end(self, night: str, changes: Iterable[tuple[Name, str, dict[str, Any]]], line: str, now: str) -> None:
+        """End a night with what changed in it: a figure's name, the kind of change, and what is said of it."""
+        with self._transaction():
+            accepted = set(self._names("SELECT step, method, name FROM changes WHERE night = ? AND accepted", night))
+            self.db.execute("DELETE FROM changes WHERE night = ?", [night])
+            self.db.executemany(
+                "INSERT INTO changes VALUES (?, ?, ?, ?, ?, ?, ?)",
+                [[night, *name, kind, _json(said), int(name in accepted)] for name, kind, said in changes],
+            )
+            self.db.execute("UPDATE nights SET line = ?, ended = ? WHERE night = ?", [line, now, night])
+
+    def accept(self, night: str) -> int:
+        """Accept what got worse in a night as the new level: how many figures."""
+        with self._transaction():
+            return self.db.execute(
+                "UPDATE changes SET accepted = 1 WHERE night = ? AND kind IN ('regression', 'lost') AND NOT accepted",
+                [night],
+            ).rowcount
+
+    # --- what the history knows -------------------------------------------------------------------------------------
+
+    def nights(self) -> list[Night]:
+        """Return all nights, the earliest first."""
+        return [
+            Night(night, code, commit, json.loads(software), ended or "", line)
+            for night, code, commit, software, ended, line in self.db.execute(
+                "SELECT night, code, commit_, software, ended, line FROM nights ORDER BY night"
+            )
+        ]
+
+    def rows(self, first: str, last: str) -> list[Row]:
+        """Return the figures of the nights from ``first`` to ``last``, the earliest first."""
+        return [
+            Row(night, case, recipe, seed, bool(fixed), digest, (step, method, name), _number(value), unit)
+            for night, case, recipe, seed, fixed, digest, step, method, name, value, unit in self.db.execute(
+                "SELECT night, case_, recipe, seed, fixed, input_sha256, step, method, name, value, unit"
+                " FROM figures JOIN cells USING (night, cell) WHERE night BETWEEN ? AND ?"
+                " ORDER BY night, case_, seed, step, method, name",
+                [first, last],
+            )
+        ]
+
+    def missed(self, night: str) -> dict[str, list[Figure]]:
+        """Return the figures of a night that are beyond their limits, by cell."""
+        found: dict[str, list[Figure]] = {}
+        for cell, step, method, name, value, limit, unit in self.db.execute(
+            "SELECT cell, step, method, name, value, limit_, unit FROM figures"
+            " WHERE night = ? AND limit_ IS NOT NULL AND (value IS NULL OR value > limit_)",
+            [night],
+        ):
+            found.setdefault(cell, []).append(Figure(step, method, name, _number(value), _number(limit), unit))
+        return found
+
+    def cells(self, night: str) -> list[dict[str, Any]]:
+        """Return the cells of a night: title, case, failed, seconds, peak_mb, fixed, seed and figures (a number)."""
+        keys = ("cell", "title", "case", "failed", "seconds", "peak_mb", "fixed", "seed", "figures")
+        found = self.db.execute(
+            "SELECT cell, title, case_, failed, seconds, peak_mb, fixed, seed, (SELECT COUNT(*) FROM figures f"
+            " WHERE f.night = c.night AND f.cell = c.cell) FROM cells c WHERE night = ? ORDER BY title, cell",
+            [night],
+        )
+        return [dict(zip(keys, row, strict=True)) for row in found]
+
+    def worse(self, before: str) -> dict[Name, set[str]]:
+        """Return the earlier nights in which a figure was worse and not accepted as it was: no level to go by."""
+        found: dict[Name, set[str]] = {}
+        for night, step, method, name in self.db.execute(
+            "SELECT night, step, method, name FROM changes"
+            " WHERE night < ? AND kind IN ('regression', 'lost') AND NOT accepted",
+            [before],
+        ):
+            found.setdefault((step, method, name), set()).add(night)
+        return found
+
+    def _names(self, query: str, *values: str) -> list[Name]:
+        return [(step, method, name) for step, method, name in self.db.execute(query, values)]
+
+
+def _stored(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _json(value: dict[str, Any] | Sequence[str]) -> str:
+    return json.dumps(value, ensure_ascii=False, sort_keys=True)

@@ -1,0 +1,57 @@
+"""JUnit XML of a night, as CI servers read it: a test case a cell, and one a figure that changed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+from xml.etree import ElementTree as ET
+
+from processor.validation.cells import Figure
+from processor.validation.changes import ALARMS, Found
+
+
+def xml(night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Sequence[Figure]], found: Found) -> bytes:
+    """Write cells (failed ones as errors, figures beyond their limits as failures) and regressions."""
+    root = ET.Element("testsuites", name="processor validate")
+    suite = ET.SubElement(root, "testsuite", name=f"accuracy.{night}")
+    failures = errors = 0
+    for cell in cells:
+        case = _case(suite, "accuracy", cell["title"], cell["seconds"])
+        if cell["failed"]:
+            errors += 1
+            ET.SubElement(case, "error", message=_clean(cell["failed"]))
+        own = missed.get(cell["cell"], ())
+        if own:
+            failures += 1
+            said = [f"{f.step} ({f.method}), {f.name}: {f.value:g} {f.unit}, limit {f.limit:g}" for f in own]
+            ET.SubElement(case, "failure", message=_clean(said[0])).text = _clean("\n".join(said))
+    _counts(suite, len(cells), failures, errors, sum(cell["seconds"] for cell in cells))
+    suite = ET.SubElement(root, "testsuite", name=f"changes.{night}")
+    alarms = found.of(*ALARMS)
+    for one in alarms:
+        step, method, name = one.name
+        case = _case(suite, f"changes.{step}.{method}", name, 0.0)
+        text = f"{one.kind}: {one.said} ({one.test} test, p {one.p:.2g}, {one.cases} cases)"
+        ET.SubElement(case, "failure", message=_clean(text))
+    if not alarms:
+        _case(suite, "changes", f"{found.figures} figures, none worse", 0.0)
+    _counts(suite, max(1, len(alarms)), len(alarms), 0, 0.0)
+    ET.indent(root)
+    data: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)
+    return data + b"\n"
+
+
+def _case(suite: ET.Element, of: str, name: str, seconds: float) -> ET.Element:
+    return ET.SubElement(suite, "testcase", classname=_clean(of), name=_clean(name), time=f"{seconds:.3f}")
+
+
+def _counts(suite: ET.Element, tests: int, failures: int, errors: int, seconds: float) -> None:
+    counts = {"tests": tests, "failures": failures, "errors": errors, "skipped": 0}
+    for key, value in counts.items():
+        suite.set(key, str(value))
+    suite.set("time", f"{seconds:.3f}")
+
+
+def _clean(text: str) -> str:
+    """Leave out what XML 1.0 cannot hold."""
+    return "".join(one for one in text if one in "\t\n" or (one.isprintable() and ord(one) < 0xFFFE) or one == "\r")

@@ -1,0 +1,211 @@
+"""The matrix: a TOML file that says which recipes, settings, seeds and methods are run every night.
+
+Example::
+
+    fixed_seeds = [1, 2]       # of every night, for cells that name none: their figures move when the software does
+    fresh_seeds = 1            # so many more, other ones every night
+
+    [[cell]]
+    recipe = "frame-small"     # a name of designgen's, or a TOML file beside the matrix
+    steps = ["spheres"]
+    methods = ["ray", "ransac"]
+    seeds = [1, 2, 3]          # fixed ones of this cell; fresh = 2: the number of others
+    set."scan.sigma_mm" = [1.0, 2.0]       # lists are multiplied with each other; of a value that is one, [[2, 2]]
+    set."scan.spacing_mm" = 5.0
+    params.spheres.radius_mm = 50.0        # as in a parameter file
+    full = true                # with --full alone
+
+    [aim]                      # where better lies, of figures whose name does not tell: "low", "high" or a number
+    "share of the sky" = "high"
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import itertools
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from processor.model import InputError, UsageError
+from processor.validation.cells import Case, Cell, fresh_seed
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+DEFAULT = Path(__file__).with_name("default.toml")
+TOP_KEYS = {"name", "about", "fixed_seeds", "fresh_seeds", "aim", "cell"}
+CELL_KEYS = {"name", "recipe", "steps", "methods", "seeds", "fresh", "set", "params", "full"}
+AIMS = ("low", "high")
+MOST_SEED = 2**63
+MOST_CELLS = 10_000
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One ``[[cell]]`` of the file with its settings chosen, and its seeds."""
+
+    case: Case
+    seeds: tuple[int, ...]
+    fresh: int
+
+
+@dataclass(frozen=True)
+class Matrix:
+    """What is run every night. ``aim`` says of figures by name where better lies: low, high, or a number."""
+
+    name: str
+    sha256: str
+    entries: tuple[Entry, ...]
+    aim: Mapping[str, str | float]
+
+    def cells(self, number: int) -> tuple[Cell, ...]:
+        """Return the cells of the night of that number, fixed seeds first: those of one key once."""
+        found = [Cell(entry.case, seed, True) for entry in self.entries for seed in entry.seeds]
+        found += [
+            Cell(entry.case, fresh_seed(entry.case, number, i), False)
+            for entry in self.entries
+            for i in range(entry.fresh)
+        ]
+        unique: dict[str, Cell] = {}
+        for cell in found:
+            unique.setdefault(cell.key, cell)
+        return tuple(unique.values())
+
+
+def read(path: Path, full: bool) -> Matrix:
+    """Read a matrix; ``full`` takes the cells marked so as well.
+
+    Raises InputError for a file that cannot be read, UsageError for what it says that is not known.
+    """
+    try:
+        raw = path.read_bytes()
+        table: dict[str, Any] = tomllib.loads(raw.decode("utf-8"))
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise InputError(f"{path}: expected a matrix in TOML, could not read it ({error})") from error
+    _known(table, TOP_KEYS, str(path))
+    fixed = _seeds(table.get("fixed_seeds", [1]), f"{path}: fixed_seeds")
+    fresh = _count(table.get("fresh_seeds", 1), f"{path}: fresh_seeds")
+    aim = table.get("aim", {})
+    if not isinstance(aim, dict) or not all(isinstance(a, int | float) or a in AIMS for a in aim.values()):
+        raise UsageError(f"{path}: aim: expected figures' names with low, high or a number, got {aim!r}")
+    cells = table.get("cell")
+    if not isinstance(cells, list) or not cells or not all(isinstance(cell, dict) for cell in cells):
+        raise UsageError(f"{path}: expected at least one [[cell]]")
+    entries: list[Entry] = []
+    for i, cell in enumerate(cells):
+        where = f"{path}: cell {i + 1}"
+        _known(cell, CELL_KEYS, where)
+        own = _entries(cell, path, where, fixed, fresh)
+        entries += own if full or not _flag(cell, where) else []
+        if sum(len(entry.seeds) + entry.fresh for entry in entries) > MOST_CELLS:
+            raise UsageError(f"{where}: more than {MOST_CELLS} cells; set fewer values or seeds")
+    if not entries:
+        raise UsageError(f"{path}: every cell of it is for --full")
+    return Matrix(str(table.get("name", path.stem)), hashlib.sha256(raw).hexdigest(), tuple(entries), aim)
+
+
+def _entries(cell: dict[str, Any], path: Path, where: str, fixed: tuple[int, ...], fresh: int) -> list[Entry]:
+    from processor import pipeline
+
+    recipe = cell.get("recipe")
+    if not isinstance(recipe, str) or not recipe:
+        raise UsageError(f"{where}: expected recipe = a name or a TOML file, got {recipe!r}")
+    steps, methods = (_names(cell.get(key, []), f"{where}: {key}") for key in ("steps", "methods"))
+    if not steps:
+        raise UsageError(f"{where}: expected steps = the names of those to run")
+    params = cell.get("params", {})
+    if not isinstance(params, dict):
+        raise UsageError(f"{where}: params: expected a table a step, got {params!r}")
+    try:
+        pipeline.plan(steps, methods, params, None)
+    except UsageError as error:
+        raise UsageError(f"{where}: {error}") from None
+    text, from_file = _recipe(recipe, path, where)
+    seeds = _seeds(cell["seeds"], f"{where}: seeds") if "seeds" in cell else fixed
+    own_fresh = _count(cell.get("fresh", fresh), f"{where}: fresh")
+    stem = Path(recipe).stem if from_file else recipe
+    name = cell.get("name", stem)
+    if not isinstance(name, str):
+        raise UsageError(f"{where}: name: expected a text, got {name!r}")
+    return [
+        Entry(Case(name, stem, text, from_file, settings, steps, methods, params), seeds, own_fresh)
+        for settings in _combinations(cell.get("set", {}), where)
+    ]
+
+
+def _combinations(table: Any, where: str) -> list[tuple[str, ...]]:
+    if not isinstance(table, dict):
+        raise UsageError(f"{where}: set: expected keys with values or lists of values, got {table!r}")
+    flat = _flat(table)
+    lists = [value if isinstance(value, list) else [value] for value in flat.values()]
+    if not all(lists):
+        raise UsageError(f"{where}: set: a list of values is empty")
+    return [
+        tuple(f"{key}={_as_toml(value)}" for key, value in zip(flat, chosen, strict=True))
+        for chosen in itertools.product(*lists)
+    ]
+
+
+def _flat(table: dict[str, Any], above: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for key, value in table.items():
+        found |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
+    return found
+
+
+def _as_toml(value: Any) -> str:
+    return json.dumps(value, ensure_ascii=False)  # of numbers, texts, truth values and lists of these the same
+
+
+def _recipe(recipe: str, path: Path, where: str) -> tuple[str, bool]:
+    """Return the recipe's text, and whether it is a file of the user's. The generator itself is not imported."""
+    if recipe.endswith(".toml"):
+        file, from_file = path.parent / recipe, True
+    else:
+        found = importlib.util.find_spec("designgen")
+        if found is None or not found.submodule_search_locations:
+            raise UsageError(f"{where}: scenes are made by designgen, which is not installed")
+        file, from_file = Path(found.submodule_search_locations[0]) / "recipes" / f"{recipe}.toml", False
+    try:
+        return file.read_text("utf-8"), from_file
+    except (OSError, UnicodeDecodeError) as error:
+        known = "" if from_file else " (designgen list names them)"
+        raise UsageError(f"{where}: no recipe {recipe!r}{known}: {error}") from error
+
+
+def _known(table: dict[str, Any], keys: set[str], where: str) -> None:
+    unknown = sorted(set(table) - keys)
+    if unknown:
+        raise UsageError(f"{where}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")
+
+
+def _flag(cell: dict[str, Any], where: str) -> bool:
+    full = cell.get("full", False)
+    if not isinstance(full, bool):
+        raise UsageError(f"{where}: full: expected true or false, got {full!r}")
+    return full
+
+
+def _names(value: Any, where: str) -> tuple[str, ...]:
+    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+        raise UsageError(f"{where}: expected a list of names, got {value!r}")
+    return tuple(value)
+
+
+def _seeds(value: Any, where: str) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(type(one) is int and 0 <= one < MOST_SEED for one in value):
+        raise UsageError(f"{where}: expected a list of whole numbers from 0, got {value!r}")
+    return tuple(dict.fromkeys(value))
+
+
+def _count(value: Any, where: str) -> int:
+    if type(value) is not int or not 0 <= value <= MOST_CELLS:
+        raise UsageError(f"{where}: expected a number from 0 to {MOST_CELLS}, got {value!r}")
+    return value

@@ -1,0 +1,197 @@
+"""What is told of a night: one line, an object for programs, and the page of all nights."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jinja2
+import numpy as np
+
+from processor.validation import changes
+from processor.validation.cells import Figure
+from processor.validation.changes import ALARMS, CHANGED, IMPROVEMENT, Change, Found
+from processor.validation.history import Name, Night, Row
+from processor.validation.software import Software
+
+FORMAT, FORMAT_VERSION = "processor-validation", "1.0"
+MOST_NAMED = 2  # changes that the line names
+SPARK_NIGHTS, SPARK_WIDTH, SPARK_HEIGHT = 60, 120, 22
+TEST = (
+    "Fixed seeds: the same scenes every night, whose figures move only when the software does; where they moved, "
+    "paired one-sided t tests over the scenes against a margin of 2 % (1 point for shares), by the differences' own "
+    "scatter and by that from seed to seed, the smaller p doubled. Seeds of the night: an exact stratified rank "
+    f"test (normal scores) against {changes.LEAST_NIGHTS} to {changes.MOST_NIGHTS} earlier nights. Holm's correction "
+    "over all tests of a night: on a night when nothing got worse, the chance of any alarm is at most "
+    f"{100.0 * changes.ALARM_RATE:g} %; the same for improvements."
+)
+
+
+@dataclass(frozen=True)
+class Summary:
+    """All that a night has to say. ``missed``: figures beyond their limits, by cell."""
+
+    night: str
+    software: Software
+    cells: tuple[Mapping[str, Any], ...]
+    missed: Mapping[str, Sequence[Figure]]
+    found: Found
+
+    @property
+    def failed(self) -> list[Mapping[str, Any]]:
+        """The cells that came to no answer."""
+        return [cell for cell in self.cells if cell["failed"]]
+
+    @property
+    def passed(self) -> bool:
+        """Whether no limit was missed and nothing got worse."""
+        return not self.missed and not self.found.of(*ALARMS)
+
+    @property
+    def line(self) -> str:
+        """The night in one line, for a chat channel."""
+        misses = sum(map(len, self.missed.values()))
+        verdict = "ok" if self.passed and not self.failed else "NOT OK"
+        parts = [f"{self.night} {verdict}", self._version()]
+        parts.append(f"{_count(len(self.cells) - len(self.failed), 'cell')}, {_count(self.found.figures, 'figure')}")
+        parts += [f"{_count(len(self.failed), 'cell')} failed"] if self.failed else []
+        parts.append(f"{_count(misses, 'limit')} missed" if misses else "limits kept")
+        for kinds, word in ((ALARMS, "worse"), ((IMPROVEMENT,), "better")):
+            some = self.found.of(*kinds)
+            if some:
+                parts.append(f"{len(some)} {word}: {'; '.join(map(_named, some[:MOST_NAMED]))}{_more(some)}")
+        moved = len(self.found.of(CHANGED))
+        parts += [f"{moved} moved, neither worse nor better"] if moved else []
+        if self.found.first:
+            parts.append("nothing to compare with yet")
+        elif not self.found.changes:
+            parts.append("nothing changed")
+        parts += [f"scenes of {self.found.moved_scenes} cells are others"] if self.found.moved_scenes else []
+        return " | ".join(parts)
+
+    def _version(self) -> str:
+        commit = self.software.commit
+        short = commit[:8] + ("+" if commit.endswith("+") else "")
+        return " ".join([self.software.versions.get("steel-scan-check", ""), short]).strip() or "no version"
+
+    def as_object(self) -> dict[str, Any]:
+        """Return what summary.json holds."""
+        return {
+            "format": FORMAT,
+            "format_version": FORMAT_VERSION,
+            "night": self.night,
+            "passed": self.passed,
+            "line": self.line,
+            "commit": self.software.commit,
+            "code": self.software.code,
+            "software": self.software.versions,
+            "cells": [dict(cell) for cell in self.cells],
+            "missed": [
+                {"cell": cell, "step": f.step, "method": f.method, "name": f.name, "value": _finite(f.value)}
+                | {"limit": f.limit, "unit": f.unit}
+                for cell, own in self.missed.items()
+                for f in own
+            ],
+            "changes": [change_object(one) for one in self.found.of(*ALARMS, IMPROVEMENT, CHANGED)],
+            "test": {
+                "about": TEST,
+                "alarm_rate": changes.ALARM_RATE,
+                "figures": self.found.figures,
+                "paired": self.found.paired,
+                "fresh": self.found.fresh,
+            },
+        }
+
+
+def change_object(one: Change) -> dict[str, Any]:
+    """Write a change as an object; ``ratio`` of what is better low, else ``difference`` of how bad it is."""
+    step, method, name = one.name
+    size = {"ratio": _finite(math.exp(one.size))} if one.is_ratio else {"difference": _finite(one.size)}
+    said = {"kind": one.kind, "said": one.said, "test": one.test, "p": one.p, "cases": one.cases, "unit": one.unit}
+    return {"step": step, "method": method, "name": name, **said, **size}
+
+
+def _named(one: Change) -> str:
+    step, method, name = one.name
+    return f"{step} ({method}) {name} {one.said}"
+
+
+def _more(some: Sequence[Change]) -> str:
+    return f"; {len(some) - MOST_NAMED} more" if len(some) > MOST_NAMED else ""
+
+
+def _count(number: int, word: str) -> str:
+    return f"{number} {word}{'' if number == 1 else 's'}"
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+# --- the page of all nights -----------------------------------------------------------------------------------------
+
+
+def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row]) -> str:
+    """Write the page: the nights, the latest first, and of every figure its course over them."""
+    environment = jinja2.Environment(
+        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    shown = [night.night for night in nights][-SPARK_NIGHTS:]
+    course: dict[Name, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    units: dict[Name, str] = {}
+    for row in rows:
+        course[row.name][row.night].append(row.value)
+        units[row.name] = row.unit
+    said = {one.name: one for one in summary.found.changes}
+    figures = []
+    for name in sorted(course):
+        if summary.night not in course[name]:
+            continue
+        levels = [_middle(course[name].get(night, [])) for night in shown]
+        change = said.get(name)
+        figures.append(
+            {
+                "name": name,
+                "unit": units[name],
+                "value": f"{levels[-1]:.3g}" if math.isfinite(levels[-1]) else "–",
+                "spark": _spark(levels),
+                "kind": change.kind if change else "",
+                "said": change.said if change else "",
+            }
+        )
+    text: str = environment.get_template("nights.html").render(
+        summary=summary,
+        nights=list(reversed(nights)),
+        figures=figures,
+        test=TEST,
+        width=SPARK_WIDTH,
+        height=SPARK_HEIGHT,
+    )
+    return text + "\n"
+
+
+def _middle(values: Sequence[float]) -> float:
+    known = [value for value in values if math.isfinite(value)]
+    return float(np.median(known)) if known else math.nan
+
+
+def _spark(levels: Sequence[float]) -> list[str]:
+    """Points of a polyline through the levels, a polyline for every run of nights that have one."""
+    known = [level for level in levels if math.isfinite(level)]
+    if not known:
+        return []
+    low, high = min(known), max(known)
+    scale = (SPARK_HEIGHT - 4) / (high - low) if high > low else 0.0
+    step = (SPARK_WIDTH - 4) / max(1, len(levels) - 1)
+    runs: list[list[str]] = [[]]
+    for i, level in enumerate(levels):
+        if math.isfinite(level):
+            y = SPARK_HEIGHT - 2 - scale * (level - low) if scale else SPARK_HEIGHT / 2
+            runs[-1].append(f"{2 + i * step:.1f},{y:.1f}")
+        elif runs[-1]:
+            runs.append([])
+    return [" ".join([*run, run[-1]]) for run in runs if run]  # a point drawn twice is seen also where it is alone

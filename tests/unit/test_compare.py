@@ -1,0 +1,185 @@
+"""processor compare: what it writes, in the inputs' own unit and order, and what it refuses."""
+
+import csv
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from processor import compare
+from processor.__main__ import main
+from processor.compare import Request
+from processor.geometry.m3c2 import Distances
+from processor.model import InputError, UsageError
+from processor.report import core_points
+from processor.report.core_points import COLUMNS
+from tests.unit.test_m3c2 import brute, wavy
+
+UTM = np.array([512_345.25, 5_412_678.5, 231.0])  # metres
+
+
+def written(path, points, header="", columns="%.17g"):
+    np.savetxt(path, points, fmt=columns, header=header, comments="")
+    return path
+
+
+@pytest.fixture
+def clouds(tmp_path):
+    """Two clouds in metres at UTM coordinates, 5 mm apart, and core points."""
+    first, second = wavy(6000, 1) / 1000.0 + UTM, wavy(6000, 2, 5.0) / 1000.0 + UTM
+    core = np.random.default_rng(3).permutation(first)[:50]
+    names = ("first.xyz", "second.xyz", "core.xyz")
+    return [written(tmp_path / name, one) for name, one in zip(names, (first, second, core), strict=True)]
+
+
+def run(*arguments):
+    return subprocess.run(
+        [sys.executable, "-m", "processor", "compare", *map(str, arguments)], capture_output=True, text=True
+    )
+
+
+def called(monkeypatch, *arguments):
+    """Exit code of the command within this process."""
+    monkeypatch.setattr(sys, "argv", ["processor", "compare", *map(str, arguments)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    return end.value.code or 0
+
+
+def table(folder):
+    with (folder / "compare.csv").open() as file:
+        rows = list(csv.reader(file))
+    assert tuple(rows[0]) == COLUMNS
+    return dict(zip(COLUMNS, np.array([[float(cell) for cell in row] for row in rows[1:]]).T, strict=True))
+
+
+def test_all_of_it_at_utm_coordinates(clouds, tmp_path, monkeypatch, capsys):
+    first, second, core_file = clouds
+    out = tmp_path / "out"
+    options = ("--normal-diameter", 0.08, "--projection-diameter", 0.05, "--max-depth", 0.04)
+    assert called(
+        monkeypatch, first, second, "-o", out, "--core", core_file, *options, "--registration-error", 0.0003
+    ) == 0  # fmt: skip
+    found = table(out)
+    core = np.loadtxt(core_file)
+    for axis, column in zip("xyz", core.T, strict=True):
+        np.testing.assert_array_equal(found[axis], column)  # every bit, in the order of the core file
+    normals = np.column_stack([found["nx"], found["ny"], found["nz"]])
+    assert (normals[:, 2] > 0.0).all()
+    local = [np.loadtxt(path) - UTM for path in (first, second, core_file)]
+    distance, lod95, n1, n2, std1, std2 = brute(*local, normals, 0.05, 0.04, 0.0003)
+    for name, expected in [("n1", n1), ("n2", n2)]:
+        np.testing.assert_array_equal(found[name], expected)
+    for name, expected in [("distance", distance), ("lod95", lod95), ("std1", std1), ("std2", std2)]:
+        np.testing.assert_allclose(found[name], expected, atol=2e-9)  # of coordinates that have 1e-9 themselves
+    np.testing.assert_array_equal(found["significant"], np.abs(found["distance"]) > found["lod95"])
+    record = json.loads((out / "compare.json").read_text())
+    assert record["parameters"]["projection_diameter"] == 0.05
+    assert record["parameters"]["registration_error"] == 0.0003
+    assert set(record["inputs"]) == {"reference", "compared", "core"}
+    assert record["summary"]["core_points"] == 50
+    assert record["summary"]["mean"] == pytest.approx(np.mean(distance), abs=1e-8)
+    low, high = record["summary"]["significant_share_ci95"]
+    assert low <= record["summary"]["significant_share"] <= high
+    assert (out / "map.png").read_bytes().startswith(b"\x89PNG")
+    page = (out / "report.html").read_text()
+    assert "http" not in page.replace("http-equiv", "")
+    assert "median level of detection" in capsys.readouterr().out
+    assert called(monkeypatch, first, second, "-o", out, "--core", core_file, *options) == 0  # in place of the first
+
+
+def test_without_options_the_scales_are_made_from_the_density(clouds, tmp_path):
+    first, second, _ = clouds
+    said = []
+    found = compare.compare(Request(first, second), said.append)
+    assert len(found.core) == 6000
+    np.testing.assert_array_equal(found.core + found.origin, np.loadtxt(first))
+    inside = (found.distances.n1 >= 20) & (found.distances.n2 >= 20)
+    assert inside.mean() > 0.95
+    assert found.scales.normal_diameter_mm >= found.scales.projection_diameter_mm
+    text = "\n".join(said)
+    used = found.scales
+    assert f"normal diameter {used.normal_diameter_mm:.6g}" in text
+    assert f"projection diameter {used.projection_diameter_mm:.6g}" in text
+    assert f"max depth to either side {used.max_depth_mm:.6g}" in text
+    again = compare.compare(Request(first, second))
+    np.testing.assert_array_equal(found.distances.lod95, again.distances.lod95)
+
+
+def test_the_unit_is_that_of_the_files_and_two_are_refused(tmp_path):
+    plane = np.array([[x, y, 0.0] for x in range(20) for y in range(20)])
+    a = written(tmp_path / "a.csv", plane, "x[mm] y[mm] z[mm]")
+    b = written(tmp_path / "b.csv", plane + np.array([0.0, 0.0, 0.5]), "x[mm] y[mm] z[mm]")
+    c = written(tmp_path / "c.csv", plane, "x[m] y[m] z[m]")
+    found = compare.compare(Request(a, b))
+    assert found.unit == "mm"
+    np.testing.assert_allclose(found.distances.distance, 0.5, atol=1e-12)
+    with pytest.raises(InputError, match="one unit"):
+        compare.compare(Request(a, c))
+
+
+def test_normals_come_from_a_file(clouds, tmp_path):
+    first, second, core_file = clouds
+    core = np.loadtxt(core_file)
+    normals = np.tile([0.6, 0.0, -0.8], (len(core), 1)) * 2.0
+    request = {"projection_diameter": 0.08, "max_depth": 0.06}
+    tables = [
+        written(tmp_path / "three.txt", normals),
+        written(tmp_path / "six.txt", np.hstack([core, normals])),
+        written(tmp_path / "named.csv", np.hstack([normals, core]), "nx ny nz x y z"),
+    ]
+    results = [compare.compare(Request(first, second, core_file, one, **request)) for one in tables]
+    for one in results:
+        np.testing.assert_allclose(one.normals, normals / 2.0)
+        np.testing.assert_array_equal(one.distances.distance, results[0].distances.distance)
+    for rows, said in [(normals[:-1], "for each of 50"), (normals * 0.0, "no direction")]:
+        with pytest.raises(InputError, match=said):
+            compare.compare(Request(first, second, core_file, written(tmp_path / "bad.txt", rows), **request))
+    moved = written(tmp_path / "moved.txt", np.hstack([core[::-1], normals]))
+    with pytest.raises(InputError, match="elsewhere"):
+        compare.compare(Request(first, second, core_file, moved, **request))
+
+
+def test_what_has_no_answer_is_nan(tmp_path):
+    origin = np.zeros(3)
+    nan = np.array([np.nan])
+    found = Distances(nan, nan, np.array([0]), np.array([2]), nan, np.array([0.5]))
+    text = core_points.csv_text(origin, np.zeros((1, 3)), found, np.full((1, 3), np.nan))
+    assert text.splitlines()[1] == "0.0,0.0,0.0,nan,nan,0,0,2,nan,0.5,nan,nan,nan"
+
+
+def test_bad_input_is_one_line_and_exit_3(clouds, tmp_path, monkeypatch, capsys):
+    first, second, _ = clouds
+    out = tmp_path / "out"
+    empty, text, one = tmp_path / "empty.xyz", tmp_path / "text.xyz", tmp_path / "one.xyz"
+    empty.write_bytes(b"")
+    text.write_text("no numbers here\n")
+    one.write_text("1 2 3\n1 2 3\n1 2 3\n")
+    cases = [
+        (tmp_path / "none.xyz", second), (first, empty), (text, second), (one, one), (first, tmp_path),
+        (first, second, "--core", text), (first, second, "--normals", tmp_path / "none.txt"),
+    ]  # fmt: skip
+    for case in cases:
+        assert called(monkeypatch, *case, "-o", out) == 3
+        said = capsys.readouterr()
+        errors = [line for line in said.err.splitlines() if line.startswith("error")]
+        assert len(errors) == 1
+        assert "Traceback" not in said.err
+        assert not out.exists()
+    for options in (("--projection-diameter", "0"), ("--max-depth", "-1"), ("--registration-error", "x")):
+        assert called(monkeypatch, first, second, "-o", out, *options) == 2
+    with pytest.raises(UsageError, match="max-depth"):
+        Request(first, second, max_depth=float("nan"))
+    assert called(monkeypatch, first, second, "-o", tmp_path) == 2  # holds the inputs
+    assert Path(first).exists()
+
+
+def test_the_command_runs_as_its_own_process(clouds, tmp_path):
+    first, second, core_file = clouds
+    done = run(first, second, "-o", tmp_path / "out", "--core", core_file, "--json")
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)["summary"]["core_points"] == 50
+    assert "projection diameter" in done.stderr

@@ -1,0 +1,204 @@
+"""Step deviation on a bracket that moved in a known way, in the design's frame and in any other."""
+
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import trimesh
+
+from designgen import recipes
+from designgen.scene import make
+from processor import pipeline
+from processor.evaluate import ErrorReport
+from processor.geometry import rigid
+from processor.model import InputError, Scan, Scene, Stations, StructureDesign, StructureTruth, Truth, UsageError
+from processor.pipeline import Execution
+from processor.report import results_json, writing
+from processor.steps import deviation
+from tests.unit.test_deviation_parts import bracket
+
+FAR = np.array([5.0e8, 3.2e9, 1.0e5])  # mm
+SIGMA = 1.0
+
+
+def field(points):
+    """Sideways by 4 mm, and down towards the middle."""
+    x = points[:, 0] / 2000.0
+    return np.column_stack([0.0 * x, 4.0 + 0.0 * x, -6.0 * (1.0 - x**2)])
+
+
+def scene_of(seed, move=field, T_design_scan=None, origin=0.0, count=60_000):
+    mesh = bracket()
+    rng = np.random.default_rng(seed)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+    points = points + move(points) + rng.normal(0.0, SIGMA, points.shape)
+    if T_design_scan is not None:
+        points = rigid.apply(rigid.invert(T_design_scan), points)
+    design = StructureDesign("bracket", np.asarray(mesh.vertices) + origin, np.asarray(mesh.faces))
+    scan = Scan("scan", points, origin + np.zeros(3))
+    truth_at = np.asarray(trimesh.sample.sample_surface(mesh, 3000, seed=99)[0])
+    truth = Truth(structure=StructureTruth(truth_at + origin, np.zeros_like(truth_at), move(truth_at)))
+    return Scene("bracket", "structure", (scan,), structure=design, units="mm"), truth
+
+
+def metrics(scene, result, truth):
+    return {one.name: one for one in deviation.check(scene, result, truth)}
+
+
+def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_bad_frame():
+    scene, truth = scene_of(1, origin=FAR)
+    result = deviation.run(scene, deviation.Params())
+    assert (result.status, result.registration) == ("ok", "as given")
+    np.testing.assert_array_equal(result.T_design_scan, np.eye(4))
+    found = metrics(scene, result, truth)["core points farther from the truth than their LOD95"]
+    assert found.limit == 5.0
+    assert found.value < 5.0
+    up = result.normals[:, 2] > 0.99
+    known = up & np.isfinite(result.lod95)
+    expected = field(result.core[known])[:, 2]
+    assert np.median(np.abs(result.distance[known] - expected)) < 0.5
+    assert result.significant_low < result.significant_share < result.significant_high
+    assert "A best fit would move" in result.message
+    assert 3.0 < result.best_fit_shift @ [0.0, -1.0, 0.0] < 5.0  # as the scan lies 4 mm to +y
+    fitted = deviation.run(scene, deviation.Params(register="fine"))
+    assert fitted.registration == "fine"
+    assert abs(np.nanmean(fitted.distance[result.normals[:, 1] > 0.9])) < 0.7  # the best fit has it
+    assert "taken up" in fitted.message
+    assert metrics(scene, fitted, truth)["core points farther from the truth than their LOD95"].value < 5.0
+
+
+def test_a_scan_in_another_frame_is_registered_whatever_its_order():
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([9e3, -4e3, 700.0]))
+    scene, _ = scene_of(2, lambda p: 0.0 * p, T)
+    result = deviation.run(scene, deviation.Params())
+    assert (result.status, result.registration) == ("ok", "coarse")
+    off = result.T_design_scan @ rigid.invert(T)
+    sd = np.sqrt(np.diag(result.covariance))
+    moved = np.concatenate([rigid.vector_from_rotation(off[:3, :3]), off[:3, 3]])
+    assert (np.abs(moved) < 4.0 * sd + 1e-9).all()
+    assert result.ambiguity > 2.0
+    assert result.significant_share < 0.06
+    points = np.random.default_rng(3).permutation(scene.scans[0].points)
+    mixed = Scene("bracket", "structure", (Scan("scan", points),), structure=scene.structure, units="mm")
+    again = deviation.run(mixed, deviation.Params())
+    np.testing.assert_allclose(again.distance, result.distance, atol=1e-9)
+    np.testing.assert_array_equal(again.n2, result.n2)
+
+
+@pytest.mark.parametrize("seed", [4, 5])
+def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(seed):
+    scene, _ = scene_of(seed, lambda p: 0.0 * p)
+    result = deviation.run(scene, deviation.Params(registration_error_mm=0.0))
+    assert 0.035 < result.significant_share < 0.065
+    cautious = deviation.run(scene, deviation.Params())
+    assert cautious.registration_error > 0.0
+    assert cautious.significant_share < result.significant_share
+
+
+def test_a_scanner_tells_the_sides_of_a_plate_apart():
+    """A plate 10 mm thick, seen from the front, that moved back by 7 mm: nearer to its own back."""
+    mesh = trimesh.creation.box((1500.0, 10.0, 1000.0))
+    rng = np.random.default_rng(6)
+    points = np.column_stack(
+        [rng.uniform(-740, 740, 40_000), rng.normal(-2.0, 0.5, 40_000), rng.uniform(-490, 490, 40_000)]
+    )
+    scan = Scan("scan", points, position=np.array([0.0, 5000.0, 0.0]))
+    design = StructureDesign("plate", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    station = Stations(("S1",), np.array([[0.0, 5000.0, 0.0]]))
+    scene = Scene("plate", "structure", (scan,), stations=station, structure=design, units="mm")
+    result = deviation.run(scene, deviation.Params())
+    front = np.isfinite(result.lod95) & (result.normals[:, 1] > 0.9)
+    assert front.sum() > 100
+    assert np.nanmedian(result.distance[front]) == pytest.approx(-7.0, abs=0.1)
+    assert not np.isfinite(result.lod95[result.normals[:, 1] < -0.9]).any()
+
+
+def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not():
+    scene, _ = scene_of(10, lambda p: 0.0 * p)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, 1.0])), np.array([500.0, 0.0, 0.0]))
+    points = scene.scans[0].points
+    scans = (
+        Scan("a", points[::2]), Scan("b", rigid.apply(rigid.invert(T), points[1::2])), Scan("c", points + 3000.0),
+    )  # fmt: skip
+    several = Scene("bracket", "structure", scans, structure=scene.structure, units="mm")
+    stitched = SimpleNamespace(scans=("a", "b", "c"), T_project_scan=np.array([np.eye(4), T, np.full((4, 4), np.nan)]))
+    result = deviation.run(several, deviation.Params(), earlier={"stitch": stitched})
+    assert result.points_read == len(points)
+    assert result.status == "ok"
+    assert abs(np.nanmean(result.distance)) < 0.05
+    assert "no pose" in deviation.run(several, deviation.Params(register="none")).message
+
+
+def test_what_is_no_structure_and_what_has_no_design():
+    scene, _ = scene_of(7, count=5000)
+    without = Scene("bracket", "structure", scene.scans, units="mm")
+    assert deviation.applies(scene)
+    assert not deviation.applies(without)
+    with pytest.raises(InputError, match="needs a design"):
+        deviation.run(without, deviation.Params())
+    few = Scene("bracket", "structure", (Scan("scan", np.eye(3)),), structure=scene.structure, units="mm")
+    with pytest.raises(InputError, match="100 points"):
+        deviation.run(few, deviation.Params())
+    flat = StructureDesign("line", np.eye(3), np.array([[0, 0, 1]]))
+    with pytest.raises(InputError, match="surface"):
+        deviation.run(Scene("b", "structure", scene.scans, structure=flat, units="mm"), deviation.Params())
+    for bad in ({"register": "sideways"}, {"method": "magic"}, {"max_depth_mm": -1.0}, {"neighbours": 0}):
+        with pytest.raises(UsageError):
+            deviation.run(scene, deviation.Params(**bad))
+    elsewhere = Scene(
+        "b", "structure", (Scan("scan", scene.scans[0].points, FAR),), structure=scene.structure, units="mm"
+    )
+    lost = deviation.run(elsewhere, deviation.Params(register="none"))
+    assert lost.status == "failed"
+    assert "0 % of the scan" in lost.message
+    assert np.isnan(lost.significant_share)
+
+
+def test_the_papers_chain_says_what_its_scales_leave(tmp_path):
+    scene, truth = scene_of(8, count=20_000)
+    result = deviation.run(scene, deviation.Params(method="paper", register="fine"))
+    assert (result.normal_diameter, result.projection_diameter) == (110.541, 55.270)
+    assert result.registration_error < 0.01  # of a clone: repeatability alone
+    assert np.isnan(result.lod95[np.minimum(result.n1, result.n2) < 4]).all()
+    assert "no level of detection" in result.message
+    known = np.isfinite(result.lod95)
+    expected = 1.96 * (
+        np.sqrt(result.std1**2 / result.n1 + result.std2**2 / result.n2)[known] + result.registration_error
+    )
+    np.testing.assert_allclose(result.lod95[known], expected, rtol=1e-12)
+    assert all(np.isnan(one.limit) for one in metrics(scene, result, truth).values())
+
+
+def test_it_is_written_as_the_interface_says(tmp_path):
+    scene, truth = scene_of(9, count=20_000)
+    jobs = pipeline.plan(("deviation",), (), {}, 0)
+    found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
+    report = ErrorReport(tuple(deviation.check(scene, found.runs[0].result, truth)))
+    assert isinstance(found, Execution)
+    writing.write(tmp_path / "out", found, report)
+    written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["deviation"]
+    for key in ("T_design_scan", "registration_error", "core_points", "significant_share", "min", "max"):
+        assert written[key] is not None
+    assert 0.0 <= written["within_10mm_share"] <= 1.0
+    assert written["lod95_median"] > 0.0
+    lines = (tmp_path / "out" / "deviation.csv").read_text().splitlines()
+    assert lines[0] == "x,y,z,distance,lod95,significant,n1,n2,std1,std2,nx,ny,nz"
+    assert len(lines) == written["core_points"] + 1
+    data = np.array([[float(cell) for cell in line.split(",")] for line in lines[1:]])
+    known = np.isfinite(data[:, 4])
+    spread = np.sqrt(data[known, 8] ** 2 / data[known, 6] + data[known, 9] ** 2 / data[known, 7])
+    np.testing.assert_allclose(data[known, 4], 1.96 * (spread + written["registration_error"]), rtol=1e-9)
+    np.testing.assert_array_equal(data[:, 5], np.abs(data[:, 3]) > data[:, 4])
+    assert (tmp_path / "out" / "figures" / "deviation-map.png").exists()
+    assert results_json.step_json(found.runs[0])["status"] == "ok"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
+    scene, truth = make("roof", recipes.overridden(recipes.load("stadium-roof")[1], [f"seed={seed}"]))
+    result = deviation.run(scene, deviation.Params())
+    assert all(one.passed for one in deviation.check(scene, result, truth))
+    assert np.isfinite(result.lod95).mean() > 0.95
+    assert np.nanmedian(result.lod95) < 2.0

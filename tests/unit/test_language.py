@@ -1,0 +1,233 @@
+"""The page in another language."""
+
+import dataclasses
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from processor.evaluate import ErrorReport
+from processor.model import Metric
+from processor.preassembly import joint_measures, proposals
+from processor.report import figures, language, page, view
+from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
+from tests.unit.test_report_balls import of_frame, whole, with_truth
+
+
+@pytest.fixture
+def spoken(monkeypatch):
+    found = language.Language("en")
+    found.words = {"pass": "合格", "fail": "不合格", "gap": "间隙", "a turn": "转动", "a shift": "平移"}
+    found._patterns = [
+        (language._pattern(key), text)
+        for key, text in {
+            "{} of {} parts": "{1}件中{0}件",
+            "{#} mm": "{0}毫米",
+            "all of: {;}": "全部{0}",
+            "joint {}: {}": "接头{0}：{1}",
+        }.items()
+    ]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("pass", "合格"),
+        ("3 of 5 parts", "5件中3件"),
+        ("joint J1: pass", "接头J1：合格"),
+        ("joint fail", "joint fail"),
+        ("pass; 3 of 5 parts", "合格；5件中3件"),
+        ("pass, gap.", "合格，间隙。"),
+        ("rib1, x", "rib1, x"),
+        ("<b>3</b> of {0} parts", "{0}件中<b>3</b>件"),
+        ("", ""),
+        ("-1.5e+02 mm.", "-1.5e+02毫米。"),
+        ("– mm", "–毫米"),
+        ("some mm", "some mm"),
+        ("all of: fail; b: gap", "全部不合格；b：间隙"),
+        ("J1: all of: pass; fail", "J1：全部合格；不合格"),
+        ("a turn and a shift", "转动、平移"),
+        ("rib1 and gap", "rib1 and gap"),
+    ],
+)
+def test_texts_are_looked_up_matched_or_taken_apart(spoken, text, said):
+    assert spoken.say(text) == said
+
+
+def test_english_says_what_it_is_given():
+    assert language.language("en").say("pass; fail.") == "pass; fail."
+    assert language.language("en").of_scripts("pass") == {}
+
+
+CODES = [code for code in language.CODES if code != "en"]
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_a_catalogue_fills_all_its_places(code):
+    found = language.Language(code)
+    for pattern, text in found._patterns:
+        text.format(*range(pattern.groups))
+        assert all(f"{{{i}}}" in text for i in range(pattern.groups)), text
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_a_text_stands_in_one_section_only(code):
+    for kind in ("words", "sentences"):
+        keys = [key for section in language.catalogue(code).values() for key in section.get(kind, {})]
+        assert len(keys) == len(set(keys))
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_all_that_the_scripts_say_is_known(code):
+    script, _ = view.script()
+    said = set(re.findall(r'say\("([^"]+)"\)', script))
+    assert len(said) > 20
+    assert said - set(language.language(code).of_scripts(script)) == set()
+
+
+def test_names_from_files_are_left_alone():
+    execution = of_bridge(names=("top", "rib1", "foot2"), joints=("gap", "J2"))
+    seen = Visible(page.html(execution, ErrorReport(), {}, "zh"))
+    assert {"top", "gap"} <= set(seen.texts)
+    assert "顶" not in seen.texts
+
+
+def test_live_figures_are_translated_but_for_names():
+    found = language.language("zh").in_figures(
+        {"title": "Balls in space", "parts": [{"name": "top", "text": "balls: wrong-size"}], "stops": ["left", 1.0]}
+    )
+    assert found == {
+        "title": "螺栓球的三维视图",
+        "parts": [{"name": "top", "text": "螺栓球：规格不符"}],
+        "stops": ["left", 1.0],
+    }
+
+
+# --- Chinese -------------------------------------------------------------------------------------------------------
+
+UNITS = {"mm", "mrad", "ci"}
+METHODS = {"adjustment", "corner", "line", "design", "aided", "ray", "ransac", "least", "squares"}
+STANDARDS = {"GB", "Cram", "rao"}  # Cramér-Rao, the name of a bound
+IN_FILES = {
+    "foot1",
+    "rib1",
+    "foot2",
+    "bridge",
+    "frame",
+    "project",
+    "toml",
+    "balls",
+    "results",
+    "csv",
+    "json",
+    "plausible",
+}
+SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm"}
+STAYS = UNITS | METHODS | STANDARDS | IN_FILES | SYMBOLS
+
+
+class Visible(HTMLParser):
+    """Text of a page that a reader sees: no scripts, no style, no provenance; what stands for a picture too."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.texts, self.lang, self._hidden = [], "", 0
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        self._hidden += tag in ("script", "style", "pre")
+        self.texts += [value for name, value in attrs if name in ("alt", "title")]
+        self.lang = dict(attrs).get("lang", self.lang)
+
+    def handle_endtag(self, tag):
+        self._hidden -= tag in ("script", "style", "pre")
+
+    def handle_data(self, data):
+        if not self._hidden:
+            self.texts.append(data)
+
+
+def latin(texts):
+    """Texts with words that are not Chinese and are no names."""
+    return [one for one in texts if set(re.findall(r"[A-Za-z]{2}\w*", one)) - STAYS]
+
+
+def chinese_page(execution, report):
+    return page.html(execution, report, figures.of_run(execution, report), "zh")
+
+
+def a_bridge():
+    """Return the bridge of the report's tests, saying what the adjustment says."""
+    execution = of_bridge()
+    first, *others = execution.runs
+    result = dataclasses.replace(
+        first.result,
+        component_message=(
+            "the part fits its design as well when turned by 180 deg; a mark on it would tell",
+            "J1: the bottom and the right face may be the plate's inner side",
+            "what the scan shows does not hold a shift along its length and a turn sideways",
+        ),
+        component_status=("ambiguous", "weak", "ok"),
+        limiting="J1 P1: +-0.087 mm (95 %), 69% of the variance from the end face at the end of rib1",
+        advice="no answer at J2: scan both ends there; a scan of rib1 that shows more of the end face at its end: "
+        "four times the points halve its part",
+        budget_source=("noise of the points, median", "scanner offset"),
+        message="lambda 0.1; no temperature given: taken as the reference; limits of GB 50205-2020, not verified",
+        gauge="all joints and the design's curve at once, lambda 0.1",
+    )
+    other = dataclasses.replace(
+        others[0].result,
+        gauge="Foot 1 at its principal-axes attitude, its joint corners on the design's",
+        message="no uncertainty is stated by this method; key points lie on the plates' inner edges",
+    )
+    runs = (dataclasses.replace(first, result=result), dataclasses.replace(others[0], result=other))
+    return dataclasses.replace(
+        execution, runs=runs, scene=dataclasses.replace(execution.scene, units_reason="made in millimetres")
+    )
+
+
+def a_frame():
+    result = whole(
+        message="ranges from the known scanners; the catalogue of radii (plausible) was not held against a published "
+        "one; registered: 4 nodes of 5, 1 missing, 0 extra",
+        reason=(
+            "",
+            "size 60 mm instead of 50 mm",
+            "no ball seen, known from 2 axes alone; the radius is the design's",
+            "12 points, fewer than 20; ill-conditioned: sd of the radius 2.5 mm",
+            "not in the design",
+        ),
+        station_said=("", "turn about x, shift along z"),
+    )
+    metrics = (
+        Metric("spheres", "radius error, median", 0.5, 3.0, "mm"),
+        Metric("spheres", "ransac: centres within their 95 % intervals", 93.0, float("nan"), "%"),
+        Metric("spheres", "ransac: balls called ok, lowest point over 3 mm off", 1.0, 0.0, ""),
+    )
+    execution, truth = of_frame(result, with_truth()[0])
+    scene = dataclasses.replace(execution.scene, units_reason="said by project.toml")
+    return dataclasses.replace(execution, scene=scene), ErrorReport(metrics, truth.true_radii, truth.true_centres)
+
+
+@pytest.mark.parametrize("made", [lambda: (a_bridge(), ErrorReport()), a_frame], ids=["bridge", "frame"])
+def test_nothing_but_names_and_units_is_left_in_english(made):
+    seen = Visible(chinese_page(*made()))
+    assert seen.lang == "zh"
+    assert len(seen.texts) > 100
+    assert latin(seen.texts) == []
+
+
+@pytest.mark.parametrize("size_mm", [0.2, 1.0, 4.0])
+def test_no_proposal_keeps_a_word_of_english(size_mm):
+    say = language.language("zh").say
+    rng = np.random.default_rng(int(10 * size_mm))
+    said = set()
+    for sd in np.repeat([0.05, 0.6], 5):
+        tilt = np.outer(SECTION[:, 1] / 450.0, rng.normal(0.0, [size_mm, 0.0, 0.0]))
+        gaps = rng.normal(0.0, size_mm, 3) + tilt + rng.normal(0.0, 0.3, (8, 3))
+        found = joint_measures.measure(gaps, sd**2 * np.eye(24), np.eye(4), SECTION)
+        said.add(say(proposals.propose("J1", found, LIMITS).sentence))
+    assert len(said) > 1
+    assert latin(said) == []
