@@ -60,8 +60,13 @@ def none(surface: DesignSurface, stations: int, error_mm: float) -> Alignment:
     return Alignment(centre, np.zeros((stations, 7)), np.zeros(6), covariance, False)
 
 
-def align(pairs: Pairs, surface: DesignSurface, stations: Stations, error_mm: float) -> Alignment:
-    """Fit stations to each other, and where there are components enough the whole to the design."""
+def align(
+    pairs: Pairs, surface: DesignSurface, stations: Stations, error_mm: float, apart: frozenset[int] = frozenset()
+) -> Alignment:
+    """Fit stations to each other, and where there are components enough the whole to the design.
+
+    Components ``apart`` are known to have moved or bent: the whole is fitted by the others.
+    """
     start = none(surface, len(stations.names), error_mm)
     block, station, mean, variance, place = _blocks(pairs, surface)
     if not len(block):
@@ -71,9 +76,10 @@ def align(pairs: Pairs, surface: DesignSurface, stations: Stations, error_mm: fl
     moves = _between(block, station, mean, variance, J, len(stations.names))
     left = mean - np.einsum("nk,nk->n", J, moves[station])
     component = surface.charts.component[chart_of_cells(surface)[place]]
-    if len(np.unique(component)) < FEWEST_COMPONENTS:
+    used = ~np.isin(component, sorted(apart))
+    if len(np.unique(component[used])) < FEWEST_COMPONENTS:
         return Alignment(start.centre, moves, start.whole, start.covariance, False)
-    whole, covariance = _whole(left, variance, J[:, :6], component)
+    whole, covariance = _whole(left[used], variance[used], J[used, :6], component[used])
     return Alignment(start.centre, moves, whole, covariance, True)
 
 

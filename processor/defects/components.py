@@ -21,6 +21,8 @@ MOST_BLOCKS = 3000
 FEWEST_BLOCKS = 24
 FINER = 3  # times smaller blocks for the last fit
 FLOOR_MM = 0.02
+APART_GAIN = 100.0  # of chi-square
+JUMP_CELLS = 1.5
 LEAST_Z = 4.5  # of a shape: what stations share is known from few of them
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
 NORMAL_95 = 1.959964
@@ -92,6 +94,11 @@ def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[
     return found
 
 
+def shaped_ones(shaped: list[ComponentShape]) -> frozenset[int]:
+    """Return the components that have a shape of their own beyond doubt, as far as the whole's place is known."""
+    return frozenset(one.component for one in shaped if any(gain > APART_GAIN for gain in one.fitted.gain))
+
+
 def _unmasked(
     fitted: shapes.Fitted, blocks: shapes.Blocks, field: Field, surface: DesignSurface, own: Ints, side: int
 ) -> shapes.Blocks:
@@ -113,6 +120,20 @@ def values(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int,
             for shape in kept[one.component]:
                 found[rows] += shape.values(one.frame, surface.centres[rows], surface.outward[rows])
     return found
+
+
+def jumps(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int, list[shapes.Shape]]) -> Ints:
+    """Return the cells that a step runs through: their means are of both of its sides."""
+    found = [np.empty(0, np.int64)]
+    component = component_of_cells(surface)
+    for one in shaped:
+        for shape in kept.get(one.component, ()):
+            if shape.kind == "step":
+                axis = int(shape.at[0])
+                rows = np.flatnonzero(component == one.component)
+                along = one.frame.local(surface.centres[rows])[:, axis] - shape.at[1] * one.frame.half[axis]
+                found.append(rows[np.abs(along) <= JUMP_CELLS * surface.charts.cell_mm])
+    return np.concatenate(found)
 
 
 @dataclass(frozen=True)
@@ -177,7 +198,9 @@ def significant(
         rows = rows[surface.share[rows] > 0.5]
         area = float(surface.share[rows].sum()) * surface.charts.cell_mm**2
         threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shapes.BASES)))))
-        inflation = float(levels.inflation[-1])
+        # Of blocks: what larger places share beyond that stands beside it.
+        size = int(np.searchsorted(levels.sides, one.blocks.side_mm / surface.charts.cell_mm))
+        inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
         points, outward = with_corners(surface, rows)
         registration = alignment.sd(points, outward)
         for k, shape in real:

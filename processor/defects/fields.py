@@ -37,6 +37,12 @@ class Field:
         """Return the field with a shape (cells,) taken off."""
         return dataclasses.replace(self, deviation=self.deviation - fitted)
 
+    def without(self, rows: Ints) -> Field:
+        """Return the field with some cells not counted."""
+        seen = self.seen.copy()
+        seen[rows] = 0.0
+        return dataclasses.replace(self, seen=seen)
+
 
 def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, edge_mm: float) -> Field:
     """Put together what the stations say of each cell, after what they are off was taken off."""

@@ -66,13 +66,21 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     field = fields.of_pairs(pairs, whole, stations, fitted, params.edge_mm)
     alarms = params.false_alarms / (1e6 * params.per_m2)
     shaped = components.fit_all(field, whole, fitted)
+    apart = components.shaped_ones(shaped)
+    if fitted.fitted and apart:
+        again = alignment.align(pairs, whole, stations, placed.error_mm, apart)
+        # Components that are few, or all to one side, may tell less than many of which some moved.
+        if again.fitted and _typical_sd(again, whole) < _typical_sd(fitted, whole):
+            fitted = again
+            field = fields.of_pairs(pairs, whole, stations, fitted, params.edge_mm)
+            shaped = components.fit_all(field, whole, fitted)
     kept = {one.component: [s for s in one.fitted.shapes if s.kind != "bump"] for one in shaped}
     left = field.less(components.values(whole, shaped, kept))
     levels = scan_statistic.levels_of(left, whole, alarms, params.systematic_mm)
     judged = components.significant(shaped, whole, field, fitted, levels, alarms)
     kept = {number: [one.shape for one in own] for number, own in judged.items()}
     shape_values = components.values(whole, shaped, kept)
-    left = field.less(shape_values)
+    left = field.less(shape_values).without(components.jumps(whole, shaped, kept))
     finding = scan_statistic.search(left, whole, levels)
     hoped = absence.expected(scene, T, pairs, whole, stations)
     places = regions.united(
@@ -99,6 +107,12 @@ def _coarse(vertices: Floats, faces: Any) -> float:
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
     return max(FIRST_CELL_MM, float(np.sqrt(area / (0.25 * MOST_CELLS))))
+
+
+def _typical_sd(fitted: alignment.Alignment, whole: surface.DesignSurface) -> float:
+    """Return the median over the surface of what the fit of the whole leaves uncertain, mm."""
+    rows = slice(None, None, max(1, len(whole.centres) // 20_000))
+    return float(np.median(fitted.sd(whole.centres[rows], whole.outward[rows])))
 
 
 def _largest(fitted: alignment.Alignment, whole: surface.DesignSurface) -> float:

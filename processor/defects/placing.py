@@ -36,14 +36,7 @@ def stitched(scene: Scene, earlier: dict[str, Any]) -> Scene:
     found = earlier.get("stitch")
     if found is None:
         return scene
-    poses = dict(zip(found.scans, found.T_project_scan, strict=True))
-    placed = [
-        dataclasses.replace(scan, T_project_scan=poses[scan.name])
-        if scan.name in poses and np.isfinite(poses[scan.name]).all()
-        else scan
-        for scan in scene.scans
-    ]
-    return dataclasses.replace(scene, scans=tuple(placed))
+    return dataclasses.replace(scene, scans=clouds.posed(scene, found))
 
 
 def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> Placing:

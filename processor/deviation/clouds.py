@@ -43,7 +43,7 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     Raises InputError for too few points.
     """
     if stitched is not None:
-        scene = replace(scene, scans=_posed(scene, stitched))
+        scene = replace(scene, scans=posed(scene, stitched))
     unposed = sum(not scan.T_project_scan.size for scan in scene.scans)
     cloud = merging.merged(scene, with_scanner=True)
     if len(cloud.points) < FEWEST_POINTS:
@@ -62,7 +62,7 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     return ScanCloud(grid.cells.points[rows], cloud.origin, scanner, spacing * thinner, grid.count, kept, unposed)
 
 
-def _posed(scene: Scene, stitched: Any) -> tuple[Scan, ...]:
+def posed(scene: Scene, stitched: Any) -> tuple[Scan, ...]:
     """Return the scans with the poses that stitching found, without those that it could not place."""
     T = dict(zip(stitched.scans, stitched.T_project_scan, strict=True))
     return tuple(
