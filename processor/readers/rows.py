@@ -104,7 +104,7 @@ class Rows:
                 jobs = [pool.submit(parse, room, *part) for room, part in zip(rooms[1:], parts[1:], strict=False)]
                 for i, part in enumerate(parts):
                     why, rows, end, odds, column = jobs[i - 1].result() if i else parse(rooms[0], *part)
-                    if i and rows > most:
+                    if i and rows >= most:
                         break  # it was not known before how many rows the parts before it have
                     self._settle(rooms[i], odds)
                     if why == SHORT_ROW:

@@ -143,3 +143,18 @@ def test_short_lines_after_long_ones(tmp_path, monkeypatch):
     (scan,) = read(tmp_path, "a.xyz", text)
     assert len(scan.points) == 5_050
     assert scan.points[:, 0].tolist() == [*range(50), *[1] * 5_000]
+
+
+def test_many_grids_in_one_ptx_are_told_apart_however_the_text_is_cut(tmp_path):
+    """Parts that threads take end in the middle of a grid, or hold the head of the next one."""
+    rng = np.random.default_rng(5)
+    grids = [rng.uniform(1.0, 9.0, (rows, 4)).round(4) for rows in (3000, 6001, 9000, 3, 7000)]
+    head = "1\n{}\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    with (tmp_path / "many.ptx").open("w") as file:
+        for grid in grids:
+            file.write(head.format(len(grid)))
+            np.savetxt(file, grid, fmt="%.4f")
+    found = readers.read(tmp_path / "many.ptx")
+    assert len(found) == len(grids)
+    for scan, grid in zip(found, grids, strict=True):
+        np.testing.assert_allclose(scan.points + scan.origin, 1e3 * grid[:, :3] if scan.unit == "mm" else grid[:, :3])

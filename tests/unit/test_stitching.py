@@ -176,6 +176,7 @@ def test_scans_that_hold_nothing_to_go_by_fail_without_a_crash(kind):
     assert result.status in ("partial", "failed")
 
 
+@pytest.mark.slow
 def test_intervals_cover_over_seeds():
     """Errors by their standard deviations over seeds: what is called 95 % holds in most of few cases."""
     pulls = []
