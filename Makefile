@@ -28,6 +28,7 @@ bench: $(VENV)/.test
 	$(BIN)/python -m tests.bench.bolt_balls --cases frame-1040 --seeds 1 --output $(OUT)/bench-frame-1040.json
 	$(BIN)/python -m tests.bench.paper_comparison --output $(OUT)/bench.json
 	$(BIN)/python -m tests.bench.generator --whole --output $(OUT)/bench-generator.json
+	$(BIN)/python -m tests.bench.readers --speed --output $(OUT)/bench-readers.json
 
 # Exit code 4, as of the command: a limit was missed or a figure got worse. --again: today's night by other software is replaced.
 nightly: $(VENV)/.demo
@@ -37,6 +38,7 @@ weekend: $(VENV)/.test
 	$(BIN)/processor validate -o $(OUT)/nightly --jobs $(JOBS) --again --full
 	$(BIN)/python -m pytest -n 2
 	$(BIN)/python -m tests.bench.bolt_balls --output $(OUT)/nightly-bolt-balls.json
+	$(BIN)/python -m tests.bench.readers --mutations 2000 --output $(OUT)/nightly-damaged-files.json
 	$(BIN)/python -m tests.bench.paper_comparison --seeds 5 --sets D1,D2,D3 --output $(OUT)/nightly.json
 
 system:

@@ -27,6 +27,7 @@ from processor.model import (
     StructureDesign,
     Tolerance,
 )
+from processor.picks_file import PICKS, read_picks
 from processor.preassembly import tolerance
 from processor.progress import tracked
 from processor.readers import RawScan
@@ -42,7 +43,7 @@ PROJECT = "project.toml"
 TRUTH = "truth.h5"
 STATIONS = "stations.json"
 DESIGNS = ("design.json", "design.csv")
-NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv", CONTROL)
+NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL)
 KEYS = ("name", "kind", "units", "design", "design_units", "temperature_C", "scan", "tolerance", "control")
 SCAN_KEYS = ("file", "component", "station", "pose", "sigma_mm", "position")
 FEWEST_POINTS = 4
@@ -117,7 +118,16 @@ def _read_folder(folder: Path, asked: str) -> Scene:
             design = StructureDesign(stem(project.design), *read_surface(project.design, unit))
         else:
             design = read_design(folder, project.design, project.design_units or asked or project.units or "m")
-    return _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+    scene = _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+    if not (folder / PICKS).exists():
+        return scene
+    # Picks are in their scans' own units; where formats differ in these, --units says what all are in.
+    unit = scene.units if scene.units in MM_PER_UNIT else ""
+    if not unit:
+        raise InputError(f"{folder / PICKS}: the scans are in {scene.units}; say one unit for all by --units")
+    inside(folder, PICKS, str(folder))
+    picks = read_picks(folder / PICKS, scene.scans, unit)
+    return dataclasses.replace(scene, picks=picks)
 
 
 def _places(folder: Path, unit: str) -> Stations | None:

@@ -47,8 +47,12 @@ def test_arrows_run_one_way(path):
         reached = {n for n in within(own, "processor") if not within({n}, *shared)}
         assert reached <= {"processor"}, "designgen shares records and store with processor, and no geometry"
         assert not within(used, "h5py")
-    if name == "processor.model":
+    if name == "processor.records":
         assert not own
+    if name == "processor.model":
+        assert not own - within(own, "processor.records") - {"processor"}
+    elif name != "processor":
+        assert not within(used, "processor.records"), "records are known by the model"
     if name.startswith("processor.validation"):
         allowed = within(own, "processor.validation", "processor.model", "processor.pipeline")
         assert not own - allowed - {"processor"}, "a night runs programs and reads what they wrote"
@@ -56,7 +60,7 @@ def test_arrows_run_one_way(path):
         assert not within(used, "processor.validation")
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
-    methods = ("processor.preassembly", "processor.bolt_balls", "processor.deviation")
+    methods = tuple(f"processor.{one}" for one in ("preassembly", "bolt_balls", "stitching", "deviation", "defects"))
     if name.startswith(("processor.steps.", *methods)):
         lower = within(own, "processor.geometry", "processor.model", "processor.progress", *methods)
         assert not own - lower - {"processor"}, "a step sees records and geometry, not files"

@@ -107,8 +107,9 @@ def _serve():
     import numba  # noqa: F401  is there before the limit is set, as in a run
 
     from processor import folder, store  # noqa: F401
-    from processor.readers import decimal  # noqa: F401
+    from processor.readers import apart, decimal  # noqa: F401
 
+    apart._running()  # starting is no part of reading
     before = _mapped("VmSize")
     resource.setrlimit(resource.RLIMIT_AS, (before + 4 * MEMORY_BYTES,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

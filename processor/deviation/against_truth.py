@@ -7,6 +7,7 @@ from scipy.spatial import cKDTree
 
 from processor.deviation.result import Result
 from processor.geometry import rigid
+from processor.geometry.error_figures import signed
 from processor.model import Floats, Metric, Scene, StructureTruth, Truth
 
 NEIGHBOURS = 24
@@ -46,6 +47,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("deviation", "deviation error, mean", float(np.mean(error[known])), NAN, "mm"),
         Metric("deviation", "true deviation, rms", float(np.sqrt(np.mean(true[known] ** 2))), NAN, "mm"),
         Metric("deviation", "LOD95, median", float(np.median(result.lod95[known])), NAN, "mm"),
+        *signed("deviation", "deviations", error[known]),
     ]
 
 

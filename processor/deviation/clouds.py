@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from processor.geometry import merging, point_neighbors
-from processor.model import Floats, InputError, Ints, Scene, StructureDesign
+from processor.model import Floats, InputError, Ints, Scan, Scene, StructureDesign
 
 ORIGIN_STEP_MM = 1000.0
 MOST_POINTS = 3_000_000  # of a scan: more are thinned evenly, which no core point's answer needs
@@ -25,6 +25,7 @@ class ScanCloud:
     spacing_mm: float
     read: int
     kept: int
+    unposed: int = 0  # scans without a pose
 
 
 @dataclass(frozen=True)
@@ -42,7 +43,8 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     Raises InputError for too few points.
     """
     if stitched is not None:
-        scene = replace(scene, scans=tuple(_posed(scan, stitched) for scan in scene.scans))
+        scene = replace(scene, scans=posed(scene, stitched))
+    unposed = sum(not scan.T_project_scan.size for scan in scene.scans)
     cloud = merging.merged(scene, with_scanner=True)
     if len(cloud.points) < FEWEST_POINTS:
         raise InputError(f"{scene.name}: expected a scan of {FEWEST_POINTS} points or more, got {len(cloud.points)}")
@@ -57,15 +59,17 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     rows = rows[:: max(1, -(-kept // MOST_POINTS))]
     thinner = np.sqrt(kept / len(rows))
     scanner = None if cloud.scanner is None else cloud.scanner[grid.order[rows]]
-    return ScanCloud(grid.cells.points[rows], cloud.origin, scanner, spacing * thinner, grid.count, kept)
+    return ScanCloud(grid.cells.points[rows], cloud.origin, scanner, spacing * thinner, grid.count, kept, unposed)
 
 
-def _posed(scan: Any, stitched: Any) -> Any:
-    names = list(stitched.scans)
-    if scan.name not in names:
-        return scan
-    T = stitched.T_project_scan[names.index(scan.name)]
-    return replace(scan, T_project_scan=T) if np.isfinite(T).all() else scan
+def posed(scene: Scene, stitched: Any) -> tuple[Scan, ...]:
+    """Return the scans with the poses that stitching found, without those that it could not place."""
+    T = dict(zip(stitched.scans, stitched.T_project_scan, strict=True))
+    return tuple(
+        replace(scan, T_project_scan=T[scan.name]) if scan.name in T else scan
+        for scan in scene.scans
+        if scan.name not in T or np.isfinite(T[scan.name]).all()
+    )
 
 
 def local_design(design: StructureDesign) -> tuple[Floats, Floats]:

@@ -185,6 +185,8 @@ def _result(
     diameter, depth, error, source, share = used
     total = summary.of_distances(found, core.points, core.normals, diameter, scales.PAPER_POINTS_A_CYLINDER)
     status, said = _status(placed, total, params)
+    if scan.unposed > 1:
+        said += f" {scan.unposed} scans have no pose: they were taken to be in one frame already."
     known = found.std2[np.isfinite(found.lod95)]
     return Result(
         status=status,

@@ -33,6 +33,7 @@ from processor.readers.raw import RawScan
 
 SLACK_BYTES = 1 << 30
 LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # no library for a format is nearly as slow
+PATIENCE = 4.0  # times as long by the clock: the machine may be busy with other work
 START_S = 120.0
 ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station")
 SMALL = 1 << 16
@@ -58,7 +59,7 @@ _lock = threading.Lock()
 
 
 def limit_s(path: Path) -> float:
-    """Seconds that reading a file may take."""
+    """Processor seconds that reading a file may take."""
     return LEAST_S + path.stat().st_size / BYTES_PER_S
 
 
@@ -74,7 +75,7 @@ def read(path: Path, module: str) -> list[RawScan]:
                 helper.channel, {"module": module, "path": os.fsencode(path.absolute()).hex(), "limit_s": limit_s(path)}
             )
             # The process ends itself in time; this is for one that is stopped or cannot be ended.
-            helper.channel.settimeout(limit_s(path) + 30.0)
+            helper.channel.settimeout(PATIENCE * limit_s(path) + 30.0)
             said, descriptor = _receive(helper.channel)
         except (OSError, EOFError) as error:
             raise _death(path, helper, error) from None
@@ -127,7 +128,7 @@ def _death(path: Path, helper: _Helper, error: BaseException) -> InputError:
     global _helper
     _helper = None
     code = helper.end()
-    if code == -signal.SIGALRM or isinstance(error, TimeoutError):
+    if code in (-signal.SIGPROF, -signal.SIGALRM) or isinstance(error, TimeoutError):
         why = f"reading took more than {limit_s(path):.0f} s, far more than a file of its size needs"
     elif code == -signal.SIGKILL:
         why = "reading was killed, most likely for want of memory"
@@ -262,7 +263,8 @@ def serve() -> None:
     channel = socket.socket(fileno=int(sys.argv[2]))
     for name in ("laspy", "pye57"):
         importlib.import_module(name)
-    signal.signal(signal.SIGALRM, signal.SIG_DFL)  # ends the process even within a library
+    for number in (signal.SIGPROF, signal.SIGALRM):
+        signal.signal(number, signal.SIG_DFL)  # ends the process even within a library
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
@@ -278,9 +280,11 @@ def serve() -> None:
         shared = _Shared()
         raw.give_room_by(shared.new)
         _limit_memory(SLACK_BYTES)
-        signal.setitimer(signal.ITIMER_REAL, asked["limit_s"])
+        signal.setitimer(signal.ITIMER_PROF, asked["limit_s"])
+        signal.setitimer(signal.ITIMER_REAL, PATIENCE * asked["limit_s"])
         said = _answer(Path(os.fsdecode(bytes.fromhex(asked["path"]))), asked["module"], shared)
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
+            signal.setitimer(timer, 0.0)
         _send(channel, said, shared.descriptor)
         os.close(shared.descriptor)
         del shared

@@ -14,11 +14,9 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.model import Floats
+from processor.readers.rows import ENDED, FULL, ODD, SHORT_ROW
 
 REACH = 60  # largest power of ten in the table
-ODD_LIMIT = 4096  # numbers left to float(), before a piece ends
-
-ENDED, FULL, ODD, SHORT_ROW = 0, 1, 2, 3
 
 
 def _powers() -> tuple[Floats, Floats]:
@@ -140,6 +138,15 @@ def parse(
                     if at == number:
                         at = mark
                     power += sign * exponent
+            if plain and at < size and count <= 19 and -REACH <= power <= REACH:
+                c = text[at]
+                if c == 10 or (c == separator if separator != 0 else c == 32):  # nearly always
+                    value = _times_power(digits, power, high, low)
+                    out[rows, slot] = -value if negative else value
+                    column += 1
+                    at += 1
+                    done = c == 10
+                    continue
             # What follows ends the token, or makes it one that is no plain number.
             while at < size:
                 c = text[at]

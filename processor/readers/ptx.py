@@ -65,7 +65,9 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         read = found = 0
         for piece in rows.pieces((0, 1, 2, 3) if wide else (0, 1, 2), cells):
             read += len(piece)
-            returned = piece[(piece[:, :3] != 0.0).any(axis=1)]
+            x, y, z = piece.T[:3]
+            hit = (x != 0.0) | (y != 0.0) | (z != 0.0)
+            returned = piece if hit.all() else piece[hit]
             points[found : found + len(returned)] = returned[:, :3]
             if wide:
                 intensity[found : found + len(returned)] = returned[:, 3]

@@ -2,18 +2,35 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from itertools import pairwise
 from typing import BinaryIO
 
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Floats
+from processor.model import Floats, Ints
 
 PIECE_BYTES = 4 << 20
+PIECE_ROWS = 1 << 17  # more than a worker's part of a piece has
+MOST_WORKERS = 4
+LEAST_PART = 1 << 16
+ODD_LIMIT = 4096  # numbers left to float() before a piece ends
+ENDED, FULL, ODD, SHORT_ROW = range(4)  # why parsing stopped
 LONGEST_LINE = 1 << 20
 NUMBERS = frozenset(b"+-0123456789.eE")
 WORDS = ("nan", "inf", "infinity")
+
+
+class _Room:
+    """What one worker parses into."""
+
+    def __init__(self, rows: int, columns: int) -> None:
+        self.out = np.empty((rows, columns))
+        self.odd = np.empty((ODD_LIMIT, 4), np.int64)
 
 
 class Rows:
@@ -24,14 +41,13 @@ class Rows:
     """
 
     def __init__(
-        self, file: BinaryIO, separator: str | None = None, commas: bool = False, remarks: bool = False, line: int = 1
+        self, file: BinaryIO, separator: str | None = None, commas: bool = False, remarks: bool = False
     ) -> None:
         self._file = file
         self._separator = ord(separator) if separator else 0
         self._commas, self._remarks = commas, remarks
         self._text = np.empty(0, np.uint8)
         self._at = 0
-        self._line = line  # number of the line that begins at _at
 
     def line(self) -> str | None:
         """Return the next line that is not blank; None at the end."""
@@ -39,7 +55,6 @@ class Rows:
             rest = self._text[self._at : self._at + LONGEST_LINE].tobytes()
             text = rest.replace(b"\r\n", b"\n ").replace(b"\r", b"\n").split(b"\n", 1)[0]
             self._at = min(self._at + len(text) + 1, len(self._text))
-            self._line += 1
             if text.strip():
                 return text.decode("utf-8-sig", "replace").strip()
         return None
@@ -59,46 +74,85 @@ class Rows:
             ends = np.flatnonzero(_ends(self._text[self._at : self._at + LONGEST_LINE]))
             end = self._at + int(ends[0]) if len(ends) else len(self._text)
             pair = self._text[end : end + 2].tobytes() == b"\r\n"
-            self._at, self._line = min(end + 1 + pair, len(self._text)), self._line + 1
+            self._at = min(end + 1 + pair, len(self._text))
 
-    def most_left(self) -> int:
-        """Return how many rows there can be at most to the end of the file."""
+    def likely_left(self) -> int:
+        """Return about how many rows there are to the end of the file, by the lines at hand; rather too many."""
         from processor.readers.decimal import count_ends
 
-        found = int(count_ends(self._text, self._at, len(self._text))) + 1
+        if not self._fill():
+            return 0
+        lines, size = int(count_ends(self._text, self._at, len(self._text))) + 1, len(self._text) - self._at
         place = self._file.tell()
-        while piece := self._file.read(PIECE_BYTES):
-            found += int(count_ends(np.frombuffer(piece, np.uint8), 0, len(piece)))
+        beyond = self._file.seek(0, os.SEEK_END) - place
         self._file.seek(place)
-        return found
+        return lines + int(1.05 * beyond * lines / size)
 
     def pieces(self, columns: Sequence[int], most: int = 2**62) -> Iterator[Floats]:
         """Give the numbers (n, k) of some columns of the next rows, at most ``most`` of them, piece by piece.
 
         Each piece is good until the next one is asked for.
         """
-        from processor.readers import decimal
-
         slots = np.full(max(columns) + 1, -1, np.int64)
         slots[list(columns)] = np.arange(len(columns))
-        odd = np.empty((decimal.ODD_LIMIT, 4), np.int64)
-        out = np.empty((0, len(columns)))
-        while most > 0 and self._fill():
-            text = self._text
-            ends = decimal.count_ends(text, self._at, len(text)) + 1
-            if len(out) < min(most, ends):
-                out = np.empty((min(most, ends), len(columns)))
-            kinds = (slots, self._separator, self._commas, self._remarks, out, odd, decimal.HIGH, decimal.LOW)
-            why, rows, end, odds, column = decimal.parse(text, self._at, min(most, len(out)), *kinds)
-            for row, slot, first, last in odd[:odds].tolist():
-                out[row, slot] = self._number(text[first:last].tobytes(), first)
-            if why == decimal.SHORT_ROW:
-                raise ValueError(f"line {self._at_line(end)}: expected {len(slots)} columns or more, found {column}")
-            self._line = self._at_line(end)
-            self._at = end
-            most -= rows
-            if rows:
-                yield out[:rows]
+        workers = max(1, min(MOST_WORKERS, os.cpu_count() or 1))
+        rooms = [_Room(min(most, PIECE_ROWS), len(columns)) for _ in range(workers)]
+        with ThreadPoolExecutor(workers) as pool:
+            while most > 0 and self._fill():
+                parts = self._parts(workers)
+                parse = partial(self._parse, slots, most)
+                jobs = [pool.submit(parse, room, *part) for room, part in zip(rooms[1:], parts[1:], strict=False)]
+                for i, part in enumerate(parts):
+                    why, rows, end, odds, column = jobs[i - 1].result() if i else parse(rooms[0], *part)
+                    if i and rows >= most:
+                        break  # it was not known before how many rows the parts before it have
+                    self._settle(rooms[i], odds)
+                    if why == SHORT_ROW:
+                        line = self._at_line(end)
+                        raise ValueError(f"line {line}: expected {len(slots)} columns or more, found {column}")
+                    self._at = end
+                    most -= rows
+                    if rows:
+                        yield rooms[i].out[:rows]
+                    if why != ENDED:
+                        break  # the rest of it comes next
+                for job in jobs:
+                    job.result()
+
+    def _parts(self, workers: int) -> list[tuple[int, int]]:
+        """Cut the text at ends of lines, into one part a worker where there is enough of it."""
+        size = len(self._text) - self._at
+        if size < workers * LEAST_PART:
+            return [(self._at, len(self._text))]
+        cuts = [self._at]
+        for i in range(1, workers):
+            start = max(cuts[-1], self._at + i * size // workers)
+            ends = np.flatnonzero(self._text[start : start + LEAST_PART] == 10)
+            if len(ends):
+                cuts.append(start + int(ends[0]) + 1)
+        return list(pairwise([*cuts, len(self._text)]))
+
+    def _parse(self, slots: Ints, most: int, room: _Room, start: int, stop: int) -> tuple[int, int, int, int, int]:
+        from processor.readers import decimal
+
+        found: tuple[int, int, int, int, int] = decimal.parse(
+            self._text[:stop],
+            start,
+            min(most, len(room.out)),
+            slots,
+            self._separator,
+            self._commas,
+            self._remarks,
+            room.out,
+            room.odd,
+            decimal.HIGH,
+            decimal.LOW,
+        )
+        return found
+
+    def _settle(self, room: _Room, odds: int) -> None:
+        for row, slot, first, last in room.odd[:odds].tolist():
+            room.out[row, slot] = self._number(self._text[first:last].tobytes(), first)
 
     def _number(self, token: bytes, place: int) -> float:
         text = token.decode("latin-1").strip()
@@ -111,9 +165,18 @@ class Rows:
             raise ValueError(f"line {self._at_line(place)}: expected a number, found {text[:40]!r}") from None
 
     def _at_line(self, place: int) -> int:
+        """Return the number in the file of the line with a place in ``_text``: counted only when asked for."""
         from processor.readers.decimal import count_ends
 
-        return self._line + int(count_ends(self._text, self._at, place))
+        left = self._file.tell() - len(self._text) + place
+        self._file.seek(0)
+        lines = 1
+        while left > 0 and (piece := self._file.read(min(left, PIECE_BYTES))):
+            if piece.endswith(b"\r") and left > len(piece):
+                piece += self._file.read(1)  # both bytes of an end at once
+            lines += int(count_ends(np.frombuffer(piece, np.uint8), 0, len(piece)))
+            left -= len(piece)
+        return lines
 
     def _fill(self) -> bool:
         """Have whole lines from ``_at`` on. False at the end of the file."""
@@ -124,7 +187,8 @@ class Rows:
             return False
         tail = self._file.readline(LONGEST_LINE + 1)
         if len(tail) > LONGEST_LINE:
-            raise ValueError(f"line {self._line} or one after it is longer than {LONGEST_LINE} bytes")
+            line = self._at_line(len(self._text))
+            raise ValueError(f"line {line} or one after it is longer than {LONGEST_LINE} bytes")
         self._text, self._at = np.frombuffer(piece + tail, np.uint8), 0
         return True
 

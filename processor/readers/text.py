@@ -97,9 +97,12 @@ def read(path: Path) -> list[RawScan]:
 
 def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, Floats]:
     """Return the coordinates (n, 3) of the rows that are declared, of all for -1, and what else is wanted (n, k)."""
-    most, found = declared if declared >= 0 else rows.most_left(), 0
-    points, others = room_for(most, 3), room_for(most, len(wanted) - 3)
-    for piece in rows.pieces(wanted, most):
+    room, found = declared if declared >= 0 else rows.likely_left(), 0
+    points, others = room_for(room, 3), room_for(room, len(wanted) - 3)
+    for piece in rows.pieces(wanted, declared if declared >= 0 else 2**62):
+        if found + len(piece) > room:
+            room = room + room // 4 + len(piece)
+            points, others = (_grown(column[:found], room) for column in (points, others))
         points[found : found + len(piece)] = piece[:, :3]
         others[found : found + len(piece)] = piece[:, 3:]
         found += len(piece)
@@ -108,13 +111,19 @@ def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, F
     return points[:found], others[:found]
 
 
+def _grown(column: Floats, room: int) -> Floats:
+    larger = room_for(room, column.shape[1])
+    larger[: len(column)] = column
+    return larger
+
+
 def numbers(path: Path, layout: Layout) -> Floats:
     """Return all columns (n, k) of a table. Raises InputError for what is no number."""
     with parsing(path, "text"), _opened(path, layout) as file:
         rows = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
         for _ in range(layout.skip):
             rows.skip_line()
-        pieces = [piece.copy() for piece in rows.pieces(range(layout.columns), rows.most_left())]
+        pieces = [piece.copy() for piece in rows.pieces(range(layout.columns))]
     return np.concatenate(pieces) if pieces else np.empty((0, layout.columns))
 
 

@@ -87,7 +87,7 @@ def write(out: Path, found: Comparison) -> dict[str, Any]:
         mpl.rcdefaults()
         mpl.rcParams["text.parse_math"] = False
         drawn = [
-            figures_deviation.deviation_map(found.core + found.origin, found.distances, found.unit),
+            figures_deviation.deviation_map(found.core + found.origin, found.normals, found.distances, found.unit),
             figures_deviation.histogram(found.distances, found.unit),
         ]
     with writing.whole(out) as making:

@@ -4,53 +4,70 @@ from __future__ import annotations
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
 
 from processor.geometry.m3c2 import Distances
-from processor.model import Floats
+from processor.model import Floats, Ints
 from processor.report.drawing import COLOURS, DIVERGING, HATCHES, png
 
 MOST_DRAWN = 60_000
 COLOUR_QUANTILE = 0.98  # of |distance|: what is beyond has the colours of the ends
 AXES = "xyz"
+BOTH_SIDES = 0.1  # share of core points that look away from which they get a panel of their own
 
 
-def deviation_map(core: Floats, found: Distances, unit: str) -> tuple[str, bytes]:
-    """Draw core points (k, 3) coloured by distance, seen along the axis on which they spread least.
+def deviation_map(core: Floats, normals: Floats, found: Distances, unit: str) -> tuple[str, bytes]:
+    """Draw core points (k, 3) with normals (k, 3) by distance, seen along the axis on which they spread least.
 
-    What is beyond its level of detection is a large dot, what is within a small one, so that grey print tells too.
+    What is beyond its level of detection is a large dot, what is within a small one, so that grey print tells too. A
+    structure that looks both ways is drawn from either side: what is seen from there.
     """
-    figure = Figure(figsize=(8.0, 6.5), layout="constrained")
-    axes = figure.subplots()
     drawn = np.unique(np.linspace(0, len(core) - 1, min(len(core), MOST_DRAWN)).astype(np.int64))
-    distance, known = found.distance[drawn], np.isfinite(found.lod95[drawn])
     spread = np.ptp(core, axis=0) if len(core) else np.zeros(3)
     across, up = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
-    u, v = core[drawn, across], core[drawn, up]
-    limit = max(float(np.quantile(np.abs(distance[known]), COLOUR_QUANTILE)) if known.any() else 0.0, 1e-12)
-    beyond = found.significant[drawn]
-    axes.scatter(u[~known], v[~known], s=2.0, marker="x", linewidths=0.4, color="0.6", label="no level of detection")
+    along = 3 - across - up
+    away = normals[drawn, along] < 0.0
+    known = np.isfinite(found.lod95[drawn])
+    size = np.abs(found.distance[drawn][known])
+    limit = max(float(np.quantile(size, COLOUR_QUANTILE)) if known.any() else 0.0, 1e-12)
     norm = TwoSlopeNorm(0.0, -limit, limit)
+    sides = [(drawn[~away], "+"), (drawn[away], "-")] if away.mean() > BOTH_SIDES else [(drawn, "")]
+    wide = spread[across] > spread[up]
+    figure = Figure(figsize=(8.0, 4.8 * len(sides) + 1.0) if wide else (7.0 * len(sides), 6.5), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(*((len(sides), 1) if wide else (1, len(sides)))))
+    for axes, (rows, side) in zip(panels, sides, strict=True):
+        _panel(axes, core[rows][:, [across, up]], rows, found, norm)
+        axes.set(xlabel=f"{AXES[across]}{_in(unit)}", ylabel=f"{AXES[up]}{_in(unit)}")
+        if side:
+            axes.set_title(f"what looks towards {side}{AXES[along]}", fontsize=10)
+    bar = ScalarMappable(norm, DIVERGING)
+    label = f"compared minus reference along the normal{_in(unit)}"
+    figure.colorbar(bar, ax=panels.tolist(), label=label, shrink=0.7)
+    part = "" if len(drawn) == len(core) else f"; {len(drawn):,} of {len(core):,} core points drawn"
+    caption = f"Deviations seen along {AXES[along]}; large dots are beyond their level of detection{part}"
+    return caption, png(figure)
+
+
+def _panel(axes: Axes, places: Floats, rows: Ints, found: Distances, norm: TwoSlopeNorm) -> None:
+    distance, known = found.distance[rows], np.isfinite(found.lod95[rows])
+    beyond = found.significant[rows]
+    u, v = places.T
+    axes.scatter(u[~known], v[~known], s=2.0, marker="x", linewidths=0.4, color="0.6", label="no level of detection")
     for which, size, label in ((known & ~beyond, 2.0, "within the level of detection"), (beyond, 9.0, "beyond")):
         order = np.flatnonzero(which)
         order = order[np.argsort(np.abs(distance[order]), kind="stable")]
+        shown = np.clip(distance[order], norm.vmin, norm.vmax)
         axes.scatter(
-            u[order], v[order], c=np.clip(distance[order], -limit, limit), s=size, cmap=DIVERGING, norm=norm,
-            linewidths=0.0, label=f"{label} ({which.sum()})",
+            u[order], v[order], c=shown, s=size, cmap=DIVERGING, norm=norm, linewidths=0.0,
+            label=f"{label} ({which.sum()})",
         )  # fmt: skip
-    bar = ScalarMappable(norm, DIVERGING)
-    figure.colorbar(bar, ax=axes, label=f"compared minus reference along the normal{_in(unit)}", shrink=0.7)
-    axes.set(xlabel=f"{AXES[across]}{_in(unit)}", ylabel=f"{AXES[up]}{_in(unit)}")
     axes.ticklabel_format(useOffset=True, style="plain")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3)
-    part = "" if len(drawn) == len(core) else f"; {len(drawn):,} of {len(core):,} core points drawn"
-    return f"Deviations seen along {AXES[3 - across - up]}; large dots are beyond their level of detection{part}", png(
-        figure
-    )
+    axes.legend(fontsize=7, loc="upper right")
 
 
 def histogram(found: Distances, unit: str) -> tuple[str, bytes]:

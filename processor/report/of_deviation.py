@@ -9,9 +9,9 @@ import numpy as np
 
 from processor.deviation.result import Result
 from processor.evaluate import ErrorReport
-from processor.model import StepRun
+from processor.model import Ints, Scene, StepRun
 from processor.pipeline import Execution
-from processor.report import core_points, figures_deviation, results_deviation
+from processor.report import core_points, figures_deviation, results_deviation, view_points
 from processor.report.drawing import Drawn
 from processor.report.printing import shown
 from processor.report.step_report import StepReport
@@ -83,7 +83,7 @@ def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
     if not np.isfinite(result.lod95).any():
         return {}
     return {
-        MAP: figures_deviation.deviation_map(result.core + result.origin, result.distances, "mm"),
+        MAP: figures_deviation.deviation_map(result.core + result.origin, result.normals, result.distances, "mm"),
         HISTOGRAM: figures_deviation.histogram(result.distances, "mm"),
     }
 
@@ -93,6 +93,15 @@ def _files(result: Result) -> dict[str, bytes]:
     return {"deviation.csv": text.encode("ascii")}
 
 
+def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+    result: Result = runs[0].result
+    points = result.core + result.origin
+    everything: Ints = np.arange(len(points), dtype=np.int64)
+    return view_points.of_points(
+        "Deviation in space", runs[0].method, points, result.distances.distance, [("surface", everything)]
+    )
+
+
 REPORT = StepReport(
     title="Deviation",
     summary=_summary,
@@ -100,4 +109,5 @@ REPORT = StepReport(
     tables=_tables,
     figures=_figures,
     files=_files,
+    live=_live,
 )

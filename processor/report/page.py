@@ -21,7 +21,15 @@ from processor.report.printing import headings, numeric, shown
 GOOD = "ok"
 LEAD = ("what-to-do", "limits")  # tables above the figures
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
-NAMES = ("method", "joint", "component", "left_part", "right_part", "station")  # columns that no language translates
+NAMES = (
+    "method",
+    "joint",
+    "component",
+    "left_part",
+    "right_part",
+    "station",
+    "point",
+)  # columns that no language translates
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 

@@ -14,6 +14,7 @@ BY_NAME: tuple[tuple[str, str | float], ...] = (
     ("rms of error by standard deviation", 1.0),
     (", bias", 0.0),
     (", number", HIGH),
+    ("farther", LOW),
     ("efficiency", HIGH),
     ("not found", LOW),
     ("are none", LOW),
@@ -64,4 +65,4 @@ def badness(name: str, unit: str, aims: Mapping[str, str | float]) -> Badness:
 
 
 def _log(value: float) -> float:
-    return math.log(max(value, TINY)) if value == value else math.nan
+    return math.log(max(abs(value), TINY)) if value == value else math.nan  # a mean error may have a sign

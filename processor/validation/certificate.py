@@ -187,7 +187,7 @@ def conditions(case: Case) -> tuple[str, str, str]:
     if scan.get("mode") == "rays":
         own = ", ".join(f"{key} {value}" for key, value in scanner.items() if "noise" in key)
         return str(scan.get("scanner", "default")), own or "the preset's", f"{scan.get('step_mrad', '?')} mrad"
-    return "none: points of the surfaces", f"{scan.get('sigma_mm', '?')} mm", f"{scan.get('spacing_mm', '?')} mm"
+    return "none (sampled)", f"{scan.get('sigma_mm', '?')} mm", f"{scan.get('spacing_mm', '?')} mm"
 
 
 def _median(values: Sequence[float]) -> float:

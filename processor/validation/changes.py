@@ -4,9 +4,11 @@ Two tests a figure (step, method, name), each over all cases together, each for 
 
 ``paired``: on the fixed seeds. While the software is as it was, their figures are what they were to the last bits, so
 there is no scatter and no false alarm. Where they moved (by more than 1e-6 of themselves), the differences from the
-last night that was not worse are held against their own scatter: a one-sided t test of their mean against a margin of
-2 % (1 point for shares). Differences of one recipe and seed are averaged first, as settings share the scene. It takes
-three such pairs. Scenes that are not the same any more are left out: the generator has changed, not the estimator.
+last night that was not worse are put to one-sided t tests of their mean against a margin of 2 % (1 point for shares):
+by their own scatter, and by that from seed to seed in the history, where it is the larger (two values drawn anew
+differ by no more than sqrt(2) of it, and few scenes say little of their own); the smaller p counts, doubled.
+Differences of one recipe and seed are averaged first, as settings share the scene. It takes three such pairs. Scenes
+that are not the same any more are left out: the generator has changed, not the estimator.
 
 ``fresh``: on the seeds of this night alone. In every case this night's value is ranked among those of the earlier
 nights (at least 5, at most 120), the ranks are turned into normal scores (van der Waerden) and summed over the cases.
@@ -38,6 +40,7 @@ from processor.validation.history import Name, Row
 ALARM_RATE = 0.005  # of a night, for worse and for better each
 SAME = 1e-6  # relative: what another library's rounding may move
 LEAST_PAIRS = 3
+LEAST_FREEDOM = 5  # of the scatter from seed to seed
 LEAST_NIGHTS, MOST_NIGHTS = 5, 120
 GRID = 64  # steps of normal scores in 1
 LEAST_SPREAD = 1e-9  # of differences: those that agree to the last bit still have rounding
@@ -148,7 +151,7 @@ def find(
         if lost:
             changes.append(Change(name, LOST, "", math.inf, False, own.unit, 0.0, lost))
         if any(difference != 0.0 for _, difference, _ in pairs):
-            moved[name] = _paired(name, pairs, measure)
+            moved[name] = _paired(name, pairs, own, measure)
             tests += [moved[name]] if moved[name].p_worse == moved[name].p_worse else []
         fresh = _fresh(name, own.fresh, own.earlier, measure)
         tests += [] if fresh is None else [fresh]
@@ -197,7 +200,7 @@ def _pairs(
     return pairs, lost, scenes
 
 
-def _paired(name: Name, pairs: Sequence[_Pair], measure: Badness) -> _Test:
+def _paired(name: Name, pairs: Sequence[_Pair], own: _Series, measure: Badness) -> _Test:
     """Test the differences; p is NaN where there are too few."""
     groups: dict[tuple[str, int], list[float]] = defaultdict(list)
     for key, difference, _ in pairs:
@@ -208,10 +211,33 @@ def _paired(name: Name, pairs: Sequence[_Pair], measure: Badness) -> _Test:
     if count < LEAST_PAIRS:
         return _Test(name, "paired", size, math.nan, math.nan, count)
     margin = measure.margin + measure.share * float(np.sqrt(np.mean([before**2 for *_, before in pairs])))
-    spread = max(float(np.std(means, ddof=1)), LEAST_SPREAD) / math.sqrt(count)
-    mean = float(np.mean(means))
-    worse, better = (float(stats.t.sf((sign * mean - margin) / spread, count - 1)) for sign in (1.0, -1.0))
+    spread = max(float(np.std(means, ddof=1)), LEAST_SPREAD)
+    scales = [(spread, count - 1)]
+    seeds, freedom = _between_seeds(own, measure)
+    if freedom >= LEAST_FREEDOM and math.sqrt(2.0) * seeds > spread:
+        scales.append((math.sqrt(2.0) * seeds, freedom))
+    mean, root = float(np.mean(means)), math.sqrt(count)
+    worse, better = (
+        min(1.0, 2.0 * min(float(stats.t.sf((sign * mean - margin) * root / scale, dof)) for scale, dof in scales))
+        for sign in (1.0, -1.0)
+    )
     return _Test(name, "paired", size, worse, better, count)
+
+
+def _between_seeds(own: _Series, measure: Badness) -> tuple[float, int]:
+    """Return the standard deviation of a case's figures from seed to seed, before this night, and its freedom."""
+    of_case: dict[str, list[float]] = defaultdict(list)
+    for (case, _), row in own.last.items():
+        of_case[case].append(measure.of(row.value))
+    for case, earlier in own.earlier.items():
+        of_case[case] += [measure.of(value) for values in earlier.values() for value in values]
+    squares, freedom = 0.0, 0
+    for found in of_case.values():
+        levels = np.array([level for level in found if math.isfinite(level)])
+        if len(levels) > 1:
+            squares += float(np.sum((levels - levels.mean()) ** 2))
+            freedom += len(levels) - 1
+    return (math.sqrt(squares / freedom), freedom) if freedom else (math.nan, 0)
 
 
 # --- on the seeds of the night --------------------------------------------------------------------------------------

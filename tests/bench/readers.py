@@ -5,9 +5,9 @@
 
 ``--speed``: seconds to float64 coordinates and intensities, each in a process of its own with everything imported and
 compiled, in turns, the least of three rounds or more, beside processor seconds (on a busy machine look at these); and
-by how much the memory of the process and its helper rises at most (proportional set size) beside 24 bytes a point. ``--mutations``: damaged files of each format, always the same ones, each read in a
-watched process with 2 GB and 10 s; exits 1 where one of them crashes, hangs, takes memory, raises anything but a plain
-error, or comes out empty.
+by how much the memory of the process and its helper rises at most (proportional set size) beside 24 bytes a point.
+``--mutations``: damaged files of each format, always the same ones, each read in a watched process with 2 GB and 10 s;
+exits 1 where one of them crashes, hangs, takes memory, raises anything but a plain error, or comes out empty.
 """
 
 from __future__ import annotations

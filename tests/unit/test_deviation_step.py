@@ -1,6 +1,7 @@
 """Step deviation on a bracket that moved in a known way, in the design's frame and in any other."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -111,6 +112,22 @@ def test_a_scanner_tells_the_sides_of_a_plate_apart():
     assert front.sum() > 100
     assert np.nanmedian(result.distance[front]) == pytest.approx(-7.0, abs=0.1)
     assert not np.isfinite(result.lod95[result.normals[:, 1] < -0.9]).any()
+
+
+def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not():
+    scene, _ = scene_of(10, lambda p: 0.0 * p)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, 1.0])), np.array([500.0, 0.0, 0.0]))
+    points = scene.scans[0].points
+    scans = (
+        Scan("a", points[::2]), Scan("b", rigid.apply(rigid.invert(T), points[1::2])), Scan("c", points + 3000.0),
+    )  # fmt: skip
+    several = Scene("bracket", "structure", scans, structure=scene.structure, units="mm")
+    stitched = SimpleNamespace(scans=("a", "b", "c"), T_project_scan=np.array([np.eye(4), T, np.full((4, 4), np.nan)]))
+    result = deviation.run(several, deviation.Params(), earlier={"stitch": stitched})
+    assert result.points_read == len(points)
+    assert result.status == "ok"
+    assert abs(np.nanmean(result.distance)) < 0.05
+    assert "no pose" in deviation.run(several, deviation.Params(register="none")).message
 
 
 def test_what_is_no_structure_and_what_has_no_design():

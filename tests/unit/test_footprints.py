@@ -82,6 +82,7 @@ def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     )
 
 
+@pytest.mark.slow
 def test_a_ray_within_an_edge_is_as_far_as_the_mean_of_its_sub_rays():
     """10 mm inside the half plane the beam, of 22 mm, has two of its seven sub-rays on the wall, 13.3 mm away."""
     surfaces, device = before_a_wall()

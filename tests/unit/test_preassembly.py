@@ -46,6 +46,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous():
     assert "turned by 180 deg" in found.message
 
 
+@pytest.mark.slow
 def test_a_scan_of_something_else_fits_no_attitude():
     rng = np.random.default_rng(0)
     ball = rng.normal(size=(20_000, 3))
@@ -265,6 +266,7 @@ def test_a_coarse_pose_slid_along_the_bridge_is_not_believed(slide, believed, mo
     assert believed or "1500 mm from where the joint puts the part" in message
 
 
+@pytest.mark.slow
 def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
     scene, _ = bridge
     widest = np.abs(runs["corner"].gaps).max(axis=(1, 2))

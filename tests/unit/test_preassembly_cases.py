@@ -110,7 +110,7 @@ def test_a_foot_as_erected_is_found_without_a_turn():
     assert_right(found, design, 0, parts[0], T, ("end",))
 
 
-@pytest.mark.parametrize("share", [0.01, 0.02])
+@pytest.mark.parametrize("share", [0.01, pytest.param(0.02, marks=pytest.mark.slow)])
 def test_outliers_all_about_do_not_pull(share):
     parts, design = bridge()
     points, rng = cloud(parts[RIB]), np.random.default_rng(3)
@@ -137,6 +137,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
     assert sorted(round(turn) for turn in turns) == [0, 180]
 
 
+@pytest.mark.slow
 def test_a_scan_of_one_end_only_says_so():
     parts, design = bridge()
     part = parts[RIB]
@@ -150,6 +151,7 @@ def test_a_scan_of_one_end_only_says_so():
         assert_right(found, design, RIB, part, T, ("start",))
 
 
+@pytest.mark.slow
 def test_two_scans_of_one_part_make_one():
     """One scan sees the left side, the other the right: each holds the part, both ends are whole in the two only."""
     parts, design = bridge()
@@ -170,6 +172,7 @@ def _back(seed):
     return rigid.invert(random_pose(np.random.default_rng(seed)))
 
 
+@pytest.mark.slow
 def test_unequal_plates_meet_at_their_outer_faces():
     parts, _ = bridge()
     thin = dataclasses.replace(parts[1].plates, bottom=16.0, top=16.0, web=12.0)

@@ -1,4 +1,4 @@
-"""A sample of damaged files of every format, read in watched processes; python -m tests.bench.readers takes thousands."""
+"""A sample of damaged files of every format, read in watched processes; tests.bench.readers takes thousands."""
 
 from __future__ import annotations
 

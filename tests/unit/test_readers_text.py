@@ -1,4 +1,4 @@
-"""Numbers in text: rounding against float(), tables against NumPy's reader, and tables that could be read in two ways."""
+"""Numbers in text: rounding against float(), tables against NumPy, and tables that could be read in two ways."""
 
 from __future__ import annotations
 
@@ -44,8 +44,11 @@ def test_every_number_is_rounded_as_by_float():
 
 
 @pytest.mark.parametrize("separator", [None, ",", ";", "\t"])
-def test_tables_against_numpy(monkeypatch, separator):
-    monkeypatch.setattr(rows_module, "PIECE_BYTES", 1_000)  # many pieces, each ends within a line
+@pytest.mark.parametrize(("pieces", "workers"), [(1_000, 1), (20_000, 3), (1 << 20, 4)])
+def test_tables_against_numpy(monkeypatch, separator, pieces, workers):
+    monkeypatch.setattr(rows_module, "PIECE_BYTES", pieces)  # the smallest end within a line
+    monkeypatch.setattr(rows_module, "LEAST_PART", 200)
+    monkeypatch.setattr(rows_module.os, "cpu_count", lambda: workers)
     rng = random.Random(7)
     join, lines = (separator or " "), []
     for _ in range(2_000):
@@ -131,3 +134,27 @@ def test_utf16_and_old_line_ends(tmp_path):
         [4, 5, 6],
     ]
     assert read(tmp_path, "b.txt", "1 2 3\r4 5 6\r")[0].points.tolist() == [[1, 2, 3], [4, 5, 6]]
+
+
+def test_short_lines_after_long_ones(tmp_path, monkeypatch):
+    """The room for rows is guessed from the first of them."""
+    monkeypatch.setattr(rows_module, "PIECE_BYTES", 1_000)
+    text = "".join(f"{i}.00000000 2.0000000000000 3.000000000000\n" for i in range(50)) + "1 2 3\n" * 5_000
+    (scan,) = read(tmp_path, "a.xyz", text)
+    assert len(scan.points) == 5_050
+    assert scan.points[:, 0].tolist() == [*range(50), *[1] * 5_000]
+
+
+def test_many_grids_in_one_ptx_are_told_apart_however_the_text_is_cut(tmp_path):
+    """Parts that threads take end in the middle of a grid, or hold the head of the next one."""
+    rng = np.random.default_rng(5)
+    grids = [rng.uniform(1.0, 9.0, (rows, 4)).round(4) for rows in (3000, 6001, 9000, 3, 7000)]
+    head = "1\n{}\n0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
+    with (tmp_path / "many.ptx").open("w") as file:
+        for grid in grids:
+            file.write(head.format(len(grid)))
+            np.savetxt(file, grid, fmt="%.4f")
+    found = readers.read(tmp_path / "many.ptx")
+    assert len(found) == len(grids)
+    for scan, grid in zip(found, grids, strict=True):
+        np.testing.assert_allclose(scan.points + scan.origin, 1e3 * grid[:, :3] if scan.unit == "mm" else grid[:, :3])

@@ -14,7 +14,7 @@ import pytest
 
 from processor import store
 from processor.evaluate import ErrorReport
-from processor.model import ArchDesign, DesignPart, FrameDesign, Metric, Scan, Scene, StepRun, UsageError
+from processor.model import ArchDesign, DesignPart, FrameDesign, InputError, Metric, Scan, Scene, StepRun, UsageError
 from processor.pipeline import Execution
 from processor.report import figures, page, printing, results_json, tables, writing
 from processor.steps import preassemble, spheres
@@ -402,7 +402,7 @@ def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
             replace(source, target)
 
         monkeypatch.setattr(os, "replace", failing)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(InputError, match=r"cannot be written \(No space left"):
         writing.write(out, of_bridge(), ErrorReport())
     monkeypatch.undo()
     assert contents(tmp_path) == before

@@ -328,6 +328,7 @@ def test_mixed_pixels_on_a_net_lie_where_they_do_on_the_exact_tube():
     assert np.abs(apart[on_both]).max() < 5e-4  # by energies, which differ by what the normals do; the net is 0.32 off
 
 
+@pytest.mark.slow
 def test_rays_meet_cones_where_bisection_does():
     """From anywhere, also from inside and along the axis, where a cone is steeper than the ray."""
     rng = np.random.default_rng(2)

@@ -195,6 +195,7 @@ def without_meshes(tmp_path_factory):
     return folder.read_input(out), truth
 
 
+@pytest.mark.slow
 def test_ends_are_measured_as_with_meshes(without_meshes):
     scene, truth = without_meshes
     result = preassemble.run(scene, preassemble.Params(seed=1))

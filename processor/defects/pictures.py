@@ -1,0 +1,65 @@
+"""The deviations about each defect on a small grid, for a picture."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from processor.defects.alignment import chart_of_cells
+from processor.defects.fields import Field
+from processor.defects.surface import DesignSurface
+from processor.model import Floats, Ints
+
+MOST_SIDE = 120  # cells of a picture
+MARGIN = 0.6  # of a defect's extent that is shown beside it
+LEAST_CELLS = 12
+SAME_WAY = 0.5
+
+
+def of_rows(rows: list[tuple[Floats, Ints, Field, int]], surface: DesignSurface, most: int) -> dict[str, Any]:
+    """Return the columns of pictures of the first ``most`` defects: centre, cells, field and component of each."""
+    shapes, lows, cells, values, parts = [], [], [], [], []
+    chart = chart_of_cells(surface)
+    component = surface.charts.component[chart]
+    for centre, own, field, number in rows[:most]:
+        out = surface.outward[own].mean(axis=0)
+        near = np.flatnonzero((component == number) & (surface.outward @ out > SAME_WAY) & (surface.share > 0.3))
+        # Along the cells of the face that it lies on: a turned grid would leave gaps.
+        frame = surface.charts.axes[chart[own[len(own) // 2]]]
+        side = np.cross(out / np.linalg.norm(out), frame[0])
+        axes = np.stack([frame[0], side])
+        here = (surface.centres[own] - centre) @ axes.T
+        low, high = here.min(axis=0), here.max(axis=0)
+        margin = np.maximum(MARGIN * (high - low), LEAST_CELLS * surface.charts.cell_mm)
+        low, high = low - margin, high + margin
+        uv = (surface.centres[near] - centre) @ axes.T
+        shown = ((uv >= low) & (uv <= high)).all(axis=1)
+        near, uv = near[shown], uv[shown]
+        cell = surface.charts.cell_mm
+        low, high = np.maximum(low, uv.min(axis=0)), np.minimum(high, uv.max(axis=0))
+        size = cell * max(1.0, np.ceil(float((high - low).max()) / MOST_SIDE / cell))
+        low = uv.min(axis=0) - 0.5 * cell
+        shape = np.maximum(np.ceil((high - low) / size).astype(np.int64) + 1, 1)
+        at = np.clip(((uv - low) / size).astype(np.int64), 0, shape - 1)
+        flat = at[:, 0] * shape[1] + at[:, 1]
+        total = int(shape.prod())
+        weight = np.where(field.count[near] > 0, 1.0 / field.variance[near], 0.0)
+        sums = np.bincount(flat, weight, total)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            mean = np.bincount(flat, weight * field.deviation[near], total) / sums
+        part = np.zeros(total, np.int32)
+        part[flat[np.isin(near, own)]] = 1
+        shapes.append(shape)
+        lows.append(low)
+        cells.append(size)
+        values.append(mean)
+        parts.append(part)
+    return {
+        "picture_defect": np.arange(len(shapes)),
+        "picture_shape": np.array(shapes).reshape(-1, 2),
+        "picture_low": np.array(lows).reshape(-1, 2),
+        "picture_cell_mm": np.array(cells),
+        "picture_mm": np.concatenate([[], *values]),
+        "picture_part": np.concatenate([[], *parts]),
+    }

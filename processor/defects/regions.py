@@ -1,0 +1,133 @@
+"""Cells that belong together: places that deviate and places that are missing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from processor.defects.absence import Expected
+from processor.defects.fields import Field
+from processor.defects.scan_statistic import Finding
+from processor.defects.surface import CYLINDER, Charts, DesignSurface
+from processor.model import Floats, Ints
+
+ROUND = np.ones((3, 3))
+ABSENT_SHARE = 0.15  # of the points expected, below which a cell is empty
+DOUBT = 0.5  # of the points expected that are counted on: scanners thin out where a surface reflects badly
+
+
+@dataclass(frozen=True)
+class Region:
+    """Cells of one face; ``sign`` -1 inward, 1 outward, 0 missing; ``z`` the largest deviation by its noise."""
+
+    chart: int
+    cells: Ints  # rows of all cells
+    sign: int
+    z: float
+
+
+def of_finding(finding: Finding, surface: DesignSurface) -> list[Region]:
+    """Return connected cells that deviate to one side."""
+    charts = surface.charts
+    found = []
+    for chart in range(len(charts.kind)):
+        if not finding.sign[charts.cells(chart)].any():
+            continue
+        sign, z = (charts.image(x, chart) for x in (finding.sign.astype(float), finding.z))
+        for way in (-1, 1):
+            whole = ndimage.binary_closing(np.pad(sign == way, 2), ROUND)[2:-2, 2:-2] & (sign != -way)
+            found += [
+                Region(chart, rows, way, float(np.abs(z.ravel()[rows - charts.first[chart]]).max()))
+                for rows in _connected(whole, charts, chart)
+            ]
+    return found
+
+
+def missing(field: Field, hoped: Expected, surface: DesignSurface, alarms_per_mm2: float) -> list[Region]:
+    """Return connected cells without points where points should be, unless chance or bad reflection may do it.
+
+    Points expected count by half; that many must be improbable to be missing (Poisson) as often as alarms are allowed,
+    on a core of cells that are not at the face's border.
+    """
+    charts = surface.charts
+    count = field.count + field.stray
+    # The border is told from cells that could be examined: those a beam sees the face alone from.
+    inner = field.inner > 0.0
+    empty = (hoped.points > 0.0) & (count <= ABSENT_SHARE * hoped.points)
+    needed = -np.log(alarms_per_mm2 * charts.cell_mm**2)
+    found = []
+    for chart in range(len(charts.kind)):
+        rows = charts.cells(chart)
+        if not (empty[rows] & inner[rows]).any():
+            continue
+        for own in _connected(charts.image(empty.astype(float), chart) > 0.0, charts, chart):
+            core = own[inner[own]]
+            lost = DOUBT * hoped.points[core].sum()
+            got = float(count[core].sum())
+            # Chernoff's bound of a Poisson number far below what is expected.
+            strength = lost - got + (got * np.log(got / lost) if got else 0.0) if lost > got else 0.0
+            if strength > needed:
+                found.append(Region(chart, own, 0, float(np.sqrt(2.0 * strength))))
+    return found
+
+
+def _connected(mask: np.ndarray, charts: Charts, chart: int) -> list[Ints]:
+    label, count = ndimage.label(mask, ROUND)
+    if charts.kind[chart] == CYLINDER and count:  # across the seam
+        for i in range(label.shape[0]):
+            one, two = label[i, 0], label[i, -1]
+            if one and two and one != two:
+                label[label == max(one, two)] = min(one, two)
+    flat = label.ravel()
+    order = np.argsort(flat, kind="stable")
+    at = np.searchsorted(flat[order], np.arange(1, count + 2))
+    rows = [order[at[k] : at[k + 1]] for k in range(count)]
+    return [charts.first[chart] + own.astype(np.int64) for own in rows if len(own)]
+
+
+def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> list[list[Region]]:
+    """Put together the parts of one defect: of one component, near each other, and missing or to the same side.
+
+    What deviates right beside something missing is part of that: beams that hit its edge.
+    """
+    groups: list[list[Region]] = []
+    trees: list[cKDTree] = []
+    for region in sorted(regions, key=lambda one: (one.sign != 0, -len(one.cells), int(one.cells[0]))):
+        places = surface.centres[region.cells]
+        component = surface.charts.component[region.chart]
+        for group, tree in zip(groups, trees, strict=True):
+            first = group[0]
+            same = first.sign in (0, region.sign) and surface.charts.component[first.chart] == component
+            if same and float(tree.query(places)[0].min()) < near_mm:
+                group.append(region)
+                break
+        else:
+            groups.append([region])
+            trees.append(cKDTree(places))
+    return [_joined(group) for group in groups]
+
+
+def _joined(group: list[Region]) -> list[Region]:
+    """Make one region of those on the first one's face and to its side; the others stay beside it."""
+    first = group[0]
+    alike = [one for one in group if one.chart == first.chart and one.sign == first.sign]
+    if len(alike) == 1:
+        return group
+    cells = np.unique(np.concatenate([one.cells for one in alike]))
+    whole = Region(first.chart, cells, first.sign, max(one.z for one in alike))
+    return [whole, *(one for one in group if not any(one is other for other in alike))]
+
+
+def flat(surface: DesignSurface, region: Region) -> Floats:
+    """Return u, v (n, 2) of the middles of a region's cells on its face; of a cylinder unrolled from the region."""
+    charts = surface.charts
+    at = region.cells - charts.first[region.chart]
+    grid = np.stack([at // charts.shape[region.chart, 1], at % charts.shape[region.chart, 1]], axis=1) + 0.5
+    uv: Floats = charts.low[region.chart] + grid * charts.cell_mm
+    if charts.kind[region.chart] == CYLINDER:
+        turn = 2.0 * np.pi * charts.radius[region.chart]
+        uv[:, 1] -= turn * np.round((uv[:, 1] - uv[0, 1]) / turn)
+    return uv

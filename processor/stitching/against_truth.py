@@ -1,0 +1,78 @@
+"""Stitching held against the stations' true poses, after a datum fit."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats, Metric, Scene, Truth
+from processor.stitching import frames
+from processor.stitching.result import Result
+
+POSITION_MM, ROTATION_MRAD = 0.5, 0.02
+WRONG_MM = 50.0
+NORMAL_95 = 1.96
+NAN = float("nan")
+
+
+def datum(T: Floats, true: Floats) -> Floats:
+    """Motion (4, 4) of poses T (k, 4, 4) that brings them closest to the true ones: positions and attitudes weighed.
+
+    A turn counts by how far it moves a point at the stations' mean distance from their middle.
+    """
+    middle = T[:, :3, 3].mean(axis=0)
+    reach = max(float(np.sqrt(((T[:, :3, 3] - middle) ** 2).sum(axis=1).mean())), 1000.0)
+    M = np.eye(4)
+    own = np.vstack([(one[:3, 3] + reach * np.vstack([axis, -axis])) for one in T for axis in one[:3, :3].T])
+    target = np.vstack([(one[:3, 3] + reach * np.vstack([axis, -axis])) for one in true for axis in one[:3, :3].T])
+    M = rigid.fit(own, target)
+    return M
+
+
+def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
+    """Compare poses with the stations' of the truth; the limits are those asked of scans with 2 mm of noise."""
+    if truth.stations is None:
+        return []
+    known = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
+    rows = [i for i, name in enumerate(result.scans) if name in known and np.isfinite(result.T_project_scan[i]).all()]
+    failed = sum(not np.isfinite(T).all() for T in result.T_project_scan)
+    metrics = [Metric("stitch", "scans not placed", float(failed), NAN, "")]
+    if len(rows) < 2:
+        return metrics
+    T = result.T_project_scan[rows]
+    true = np.stack([known[result.scans[i]] for i in rows])
+    M = datum(T, true)
+    fitted = M @ T
+    off = np.linalg.norm(fitted[:, :3, 3] - true[:, :3, 3], axis=1)
+    turn = 1e3 * np.array([rigid.rotation_angle(a[:3, :3] @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)])
+    sure = np.array([result.scan_status[i] == "ok" for i in rows])
+    metrics += [
+        Metric("stitch", "station positions after datum fit, max", float(off.max()), POSITION_MM, "mm"),
+        Metric("stitch", "station positions after datum fit, rms", float(np.sqrt((off**2).mean())), NAN, "mm"),
+        Metric("stitch", "rotations after datum fit, max", float(turn.max()), ROTATION_MRAD, "mrad"),
+        Metric("stitch", f"scans called ok, over {WRONG_MM:g} mm off", float((off[sure] > WRONG_MM).sum()), 0.0, ""),
+    ]
+    pulls = pulls_of(result, rows, true)
+    if len(pulls):
+        share = 100.0 * float((np.abs(pulls) < NORMAL_95).mean())
+        metrics.append(Metric("stitch", "pose components within their 95 % intervals", share, NAN, "%"))
+    return metrics
+
+
+def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:
+    """Errors by standard deviations (m,) of poses relative to the reference, which holds the datum."""
+    if result.reference not in [result.scans[i] for i in rows]:
+        return np.empty(0)
+    held = [result.scans[i] for i in rows].index(result.reference)
+    M = result.T_project_scan[rows[held]] @ rigid.invert(true[held])
+    found = []
+    for one, i in zip(true, rows, strict=True):
+        if i == rows[held] or not np.isfinite(result.position_sd[i]).all():
+            continue
+        at = M @ one
+        place = result.position[i]
+        scan_place = rigid.apply(rigid.invert(result.T_project_scan[i]), place)
+        d = frames.difference(result.T_project_scan[i], at)
+        shift = place - rigid.apply(at, scan_place)
+        found.append(np.concatenate([shift / result.position_sd[i], d[:3] / result.rotation_sd[i]]))
+    return np.concatenate(found) if found else np.empty(0)

@@ -1,0 +1,119 @@
+"""From what a method found to the result: the project's frame, statuses, pairs and loops."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats, Scan
+from processor.stitching import frames, pairs
+from processor.stitching.pairs import Pair
+from processor.stitching.params import Params
+from processor.stitching.placing import AMBIGUOUS
+from processor.stitching.result import Result
+
+CONTRARY = 0.25  # of what speaks for a pose; people and cars that moved make some
+LITTLE = 0.1  # of both scans' faces
+
+
+@dataclass(frozen=True)
+class Network:
+    """Poses of scans as found, T_ref_scan (k, 4, 4) in frames less ``origins`` (k, 3), and all that stands beside."""
+
+    T: Floats
+    covariance: Floats  # (6k, 6k): turns about each scan's own origin
+    origins: Floats
+    rivalry: Floats
+    T_rival: Floats
+    contrary: Floats  # (k,) what speaks against a scan's pose by what speaks for it
+    shared: Floats  # (k,) its largest overlap with another scan
+    pairs: list[Pair]
+    overlap: Floats
+    used: list[bool]
+    messages: list[str]
+    scale: Floats = field(default_factory=lambda: np.empty(0))
+    scale_sd: Floats = field(default_factory=lambda: np.empty(0))
+    spread: tuple[float, ...] = (float("nan"),) * 3  # noise, patches, ends
+
+
+def result(scans: Sequence[Scan], network: Network, reference: int, params: Params, said: Sequence[str] = ()) -> Result:
+    """Write a result; see :class:`Result` for its frames."""
+    given = scans[reference].T_project_scan
+    T_project_file = given if given.size else np.eye(4)
+    # The reference's cloud frame in the project.
+    base = T_project_file @ rigid.transform(np.eye(3), network.origins[reference])
+    k = len(scans)
+    T, C = np.full((k, 4, 4), np.nan), np.full((k, 6, 6), np.nan)
+    place, place_sd, turn_sd = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3), np.nan)
+    rival = np.full((k, 4, 4), np.nan)
+    status, message = [], []
+    for s in range(k):
+        if not np.isfinite(network.T[s]).all():
+            status.append("failed")
+            message.append("shares too little with the others to be placed")
+            continue
+        posed = base @ network.T[s]
+        T[s] = frames.of_file(posed, network.origins[s])
+        place[s] = posed[:3, 3]
+        own = network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
+        own = frames.turned(own, base[:3, :3])
+        C[s] = frames.about_origin(own, place[s])
+        turn_sd[s], place_sd[s] = np.sqrt(np.diag(own)[:3]), np.sqrt(np.diag(own)[3:])
+        if np.isfinite(network.T_rival[s]).all():
+            rival[s] = frames.of_file(base @ network.T_rival[s], network.origins[s])
+        state, why = _judged(network, s, place_sd[s], turn_sd[s], params)
+        status.append(state)
+        message.append(why)
+    names = [scan.name for scan in scans]
+    found = network.pairs
+    heavy = np.array([1.0 / max(float(np.trace(p.covariance[3:, 3:])), 1e-12) for p in found])
+    used = np.array(network.used, bool)
+    good = [p for p, u in zip(found, used, strict=True) if u]
+    loops = pairs.loops(good, heavy[used], reference, k) if good else []
+    states = set(status)
+    overall = "ok" if states <= {"ok"} else "failed" if states - {"failed"} == set() or k < 2 else "partial"
+    if sum(one != "failed" for one in status) < 2:
+        overall = "failed"
+    text = list(said) + [f"{n}: {m}" for n, m in zip(names, message, strict=True) if m]
+    count = len(found)
+    return Result(
+        overall, params.method, "; ".join(text), names[reference],
+        tuple(names), tuple(status), tuple(message), T, C, place, place_sd, turn_sd, network.rivalry, rival,
+        tuple(names[p.a] for p in found), tuple(names[p.b] for p in found),
+        network.overlap, np.array([p.residual for p in found]), used.astype(np.uint8), tuple(network.messages),
+        np.array([_pair_of_files(p, network.origins) for p in found]).reshape(-1, 4, 4),
+        np.array([_pair_covariance(p, network.origins) for p in found]).reshape(-1, 6, 6),
+        np.array([p.pieces for p in found], np.int64),
+        network.scale if len(network.scale) else np.full(count, np.nan),
+        network.scale_sd if len(network.scale_sd) else np.full(count, np.nan),
+        tuple(" > ".join(names[i] for i in loop.rows) for loop in loops),
+        np.array([loop.mm for loop in loops]), np.array([loop.mrad for loop in loops]),
+        np.array([loop.ratio for loop in loops]), *network.spread,
+    )  # fmt: skip
+
+
+def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params: Params) -> tuple[str, str]:
+    rivalry = float(network.rivalry[s])
+    if network.contrary[s] > CONTRARY:
+        return "weak", f"much speaks against its pose ({100.0 * network.contrary[s]:.0f} % of what speaks for it)"
+    if network.shared[s] < LITTLE:
+        return "weak", f"it shares little with any other scan ({100.0 * network.shared[s]:.0f} %)"
+    if rivalry > AMBIGUOUS:
+        return "ambiguous", f"another pose speaks for itself as well ({100.0 * rivalry:.0f} % of this one's score)"
+    if not np.isfinite(place_sd).all():
+        return "weak", "nothing tells how sure its pose is"
+    if place_sd.max() > params.weak_mm or 1e3 * turn_sd.max() > params.weak_mrad:
+        return "weak", f"its pose is sure to {1.96 * place_sd.max():.2g} mm and {1960.0 * turn_sd.max():.2g} mrad only"
+    return "ok", ""
+
+
+def _pair_of_files(pair: Pair, origins: Floats) -> Floats:
+    T = rigid.transform(np.eye(3), origins[pair.a]) @ pair.T_a_b
+    return frames.of_file(T, origins[pair.b])
+
+
+def _pair_covariance(pair: Pair, origins: Floats) -> Floats:
+    return frames.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a])

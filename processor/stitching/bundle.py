@@ -1,0 +1,243 @@
+"""Adjustment of all scans' poses at once on the flat pieces they share; every piece's plane is an unknown too.
+
+The points enter by their sums alone: distances from a plane are linear in [p; 1], so that 4 x 4 sums give the normal
+equations exactly. A piece's plane is eliminated, and so is one offset a scan and piece, of a standard deviation tau
+that the misfits between scans tell: what errors of neighbouring points have in common does not average out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats, Ints
+from processor.stitching import octree
+from processor.stitching.joint import Blocks
+
+HUBER = 2.5
+DROPPED = 6.0  # standard deviations of a scan's misfit on a piece
+PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # keep what nothing tells where it is
+MEDIAN = 0.6745  # of |z|, z normal
+KINDS = 2
+LEAST_REAL = 0.01  # share of a direction's strength that is taken as real
+
+
+@dataclass(frozen=True)
+class Solution:
+    """Poses T_ref_scan (k, 4, 4), their joint covariance (6k, 6k; rad, mm; turns about the scan's own origin).
+
+    ``misfit`` (b,) of each block in standard deviations, ``offset`` (b,) in mm; ``tau`` of each kind: mm, of ends in
+    standard deviations of a single one.
+    """
+
+    T: Floats
+    covariance: Floats
+    misfit: Floats
+    offset: Floats
+    tau: tuple[float, ...]
+    weight: Floats
+    chi2: float
+    free: float
+
+
+def solve(
+    blocks: Blocks,
+    T: Floats,
+    reference: int,
+    *,
+    iterations: int = 8,
+    robust: bool = True,
+    tau: tuple[float, ...] | None = None,
+    tolerance_mm: float = 1e-4,
+    slack_mm: float = 0.0,
+) -> Solution:
+    """Adjust poses from a start T (k, 4, 4), the reference held; scans without blocks stay, without covariance.
+
+    ``tau`` given is held, else it is found. ``slack_mm`` is how far off the start may be: no piece is dropped for that.
+    """
+    common = np.zeros(KINDS) if tau is None else np.array(tau)
+    if not len(_free(blocks, T, reference)):
+        covariance = np.full((6 * len(T), 6 * len(T)), np.nan)
+        covariance[6 * reference : 6 * reference + 6] = covariance[:, 6 * reference : 6 * reference + 6] = 0.0
+        none = np.empty(0)
+        return Solution(T, covariance, none, none, tuple(common.tolist()), none, 0.0, 0.0)
+    weight = np.ones(len(blocks.piece))
+    for iteration in range(iterations):
+        N, _, g, z, offset, spread = _normal(blocks, T, common, weight)
+        common = _tau(blocks, offset, spread, common) if iteration and tau is None else common
+        free = _free(blocks, T, reference)
+        step = np.zeros(len(g))
+        step[free] = -np.linalg.solve(N[np.ix_(free, free)], g[free])
+        T = _stepped(T, step.reshape(-1, 6))
+        if robust:
+            # A misfit that the poses have not yet been given the chance to take up is none.
+            weight = _robust(blocks, offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm))
+        if iteration > 2 and np.abs(step.reshape(-1, 6)[:, 3:]).max(initial=0.0) < tolerance_mm:
+            break
+    N, spurious, _, z, offset, spread = _normal(blocks, T, common, weight)
+    covariance = np.full(N.shape, np.nan)
+    free = _free(blocks, T, reference)
+    covariance[np.ix_(free, free)] = _sandwich(N[np.ix_(free, free)], spurious[np.ix_(free, free)])
+    own = slice(6 * reference, 6 * reference + 6)
+    covariance[own], covariance[:, own] = 0.0, 0.0
+    inside = weight > 0.5
+    return Solution(
+        T, covariance, z, offset, tuple(common.tolist()), weight, float((z[inside] ** 2).sum()), float(inside.sum())
+    )
+
+
+def _robust(blocks: Blocks, z: Floats) -> Floats:
+    """Weights (b,) by misfits; where fewer than two scans of a piece are left, all share the least of the weights.
+
+    One of two scans cannot be told to be the wrong one, and alone it would seem to fit without a misfit.
+    """
+    weight = np.where(np.abs(z) > DROPPED, 1e-6, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)))
+    left = np.bincount(blocks.piece, weight > 1e-3, blocks.pieces)
+    least = np.ones(blocks.pieces)
+    np.minimum.at(least, blocks.piece, weight)
+    found: Floats = np.where(left[blocks.piece] < 2, least[blocks.piece], weight)
+    return found
+
+
+def _free(blocks: Blocks, T: Floats, reference: int) -> Ints:
+    """Rows (6m,) of the unknowns: six for every scan with blocks but the reference."""
+    scans = [s for s in range(len(T)) if s != reference and (blocks.scan == s).any()]
+    return (6 * np.array(scans, np.int64)[:, None] + np.arange(6)).ravel()
+
+
+def _stepped(T: Floats, step: Floats) -> Floats:
+    found: Floats = T.copy()
+    for s in np.flatnonzero(np.abs(step).sum(axis=1) > 0.0):
+        R = rigid.rotation_from_vector(step[s, :3])
+        found[s, :3, :3] = R @ T[s, :3, :3]
+        found[s, :3, 3] = T[s, :3, 3] + step[s, 3:]
+    return found
+
+
+def _normal(
+    blocks: Blocks, T: Floats, tau: Floats, weight: Floats
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
+    """Return normal matrix, what of it is none, gradient, misfits in sd (b,), in mm, and their variances without tau.
+
+    A plane's normal is not known exactly: where it is off, a piece seems to hold scans along itself as well. How much
+    of the normal matrix is made up of that follows from the planes' own uncertainty.
+    """
+    k = len(T)
+    world = T[blocks.scan]
+    W = world @ octree.square(blocks.sums) @ world.transpose(0, 2, 1)
+    total = octree.summed(octree.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
+    planes = octree.planes_of(total)
+    n, c = planes.normal[blocks.piece], planes.mean[blocks.piece]
+    W = _shifted(W, c)
+    mass = W[:, 3, 3]
+    t2 = tau[blocks.kind] ** 2 * _unit2(blocks)
+    # A common offset of the block's points is eliminated.
+    e = W[:, :, 3]
+    W = (W - (t2 / (1.0 + t2 * mass))[:, None, None] * e[:, :, None] * e[:, None, :]) * weight[:, None, None]
+    axes = planes.axes[blocks.piece]
+    b = len(mass)
+    Lp = np.zeros((b, 3, 4))
+    Lp[:, 0, :3], Lp[:, 1, :3], Lp[:, 2, 3] = axes[:, :, 1], axes[:, :, 2], -1.0
+    # Turns about the scan's own origin: q = p - o, and n . (w x q) = w . (q x n).
+    arm = c - T[blocks.scan, :3, 3]
+    Ls = np.zeros((b, 6, 4))
+    Ls[:, 0, 1], Ls[:, 0, 2] = n[:, 2], -n[:, 1]
+    Ls[:, 1, 0], Ls[:, 1, 2] = -n[:, 2], n[:, 0]
+    Ls[:, 2, 0], Ls[:, 2, 1] = n[:, 1], -n[:, 0]
+    Ls[:, :3, 3] = np.cross(arm, n)
+    Ls[:, 3:, 3] = n
+    rho = np.concatenate([n, np.zeros((b, 1))], axis=1)
+    LsW, Wr = Ls @ W, np.einsum("bij,bj->bi", W, rho)
+    Hss = LsW @ Ls.transpose(0, 2, 1)
+    Hsp = LsW @ Lp.transpose(0, 2, 1)
+    Hpp = octree.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(-1, 3, 3)
+    gs = np.einsum("bij,bj->bi", Ls, Wr)
+    gp = octree.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
+    scale = np.einsum("nii->ni", Hpp)
+    Hpp = Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3)
+    inverse = np.linalg.inv(Hpp)
+    by_scan = np.zeros((blocks.pieces, k, 6, 3))
+    np.add.at(by_scan, (blocks.piece, blocks.scan), Hsp)
+    A = by_scan.reshape(blocks.pieces, 6 * k, 3)
+    own = np.zeros((k, k, 6, 6))
+    np.add.at(own, (blocks.scan, blocks.scan), Hss)
+    N: Floats = own.transpose(0, 2, 1, 3).reshape(6 * k, 6 * k)
+    AI = A @ inverse
+    axis = planes.normal
+    along = np.zeros((blocks.pieces, k))
+    np.add.at(along, (blocks.piece, blocks.scan), np.einsum("bi,bij,bj->b", n, Hss[:, 3:, 3:], n))
+    pull = np.einsum("pi,pkij->pkj", axis, by_scan[:, :, 3:])
+    held = along[:, :, None] * np.eye(k) - pull @ inverse @ pull.transpose(0, 2, 1)
+    tilt = planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1)
+    seeming = np.zeros((k, 6, k, 6))
+    seeming[:, 3:, :, 3:] = np.einsum("pab,pij->aibj", held, tilt)
+    spurious: Floats = seeming.reshape(6 * k, 6 * k)
+    N = N - np.tensordot(AI, A, axes=([0, 2], [0, 2]))
+    g = np.zeros((k, 6))
+    np.add.at(g, blocks.scan, gs)
+    g = g.ravel() - np.einsum("nij,nj->i", AI, gp)
+    N += np.diag(np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k))
+    # Misfits: a block's mean distance from the plane, and how sure that is beside the plane's own uncertainty.
+    mean = e[:, :3] / mass[:, None]
+    offset = np.einsum("bi,bi->b", mean, n)
+    v = np.einsum("bij,bj->bi", Lp, _one(mean))
+    leverage = np.einsum("bi,bij,bj->b", v, inverse[blocks.piece], v) * weight / (1.0 / mass + t2)
+    share = np.maximum(1.0 - leverage, 0.02)
+    z = offset / np.sqrt((1.0 / mass + t2) * share)
+    return N, spurious, g, z, offset / np.sqrt(share), 1.0 / mass
+
+
+def _sandwich(N: Floats, spurious: Floats) -> Floats:
+    """Covariance of an estimate whose normal matrix N is in part spurious: more, the more of it is."""
+    L = np.linalg.cholesky(N)
+    S = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
+    share, V = np.linalg.eigh(0.5 * (S + S.T))
+    half = np.linalg.solve(L.T, V) / np.maximum(1.0 - share, LEAST_REAL)
+    found: Floats = half @ half.T
+    return found
+
+
+def _unit2(blocks: Blocks) -> Floats:
+    """Return what the squares (b,) of common offsets are counted in: mm^2, of ends the variance of a single one.
+
+    Where an edge runs along the scanner's rows or columns, all its ends err by the same part of a step.
+    """
+    found: Floats = np.where(blocks.kind == 1, blocks.count / np.maximum(blocks.sums[:, 9], 1e-300), 1.0)
+    return found
+
+
+def _one(points: Floats) -> Floats:
+    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
+
+
+def _shifted(W: Floats, c: Floats) -> Floats:
+    """Move the origin of sums (b, 4, 4) to c (b, 3)."""
+    S = np.tile(np.eye(4), (len(c), 1, 1))
+    S[:, :3, 3] = -c
+    found: Floats = S @ W @ S.transpose(0, 2, 1)
+    return found
+
+
+def _tau(blocks: Blocks, offset: Floats, spread: Floats, before: Floats) -> Floats:
+    """Find the standard deviation of offsets, mm, of each kind beyond what single points' noise explains."""
+    found: Floats = before.copy()
+    unit2 = _unit2(blocks)
+    for kind in range(KINDS):
+        rows = blocks.kind == kind
+        if rows.sum() < 10:
+            continue
+        r2, v, u = offset[rows] ** 2, spread[rows], unit2[rows]
+        low, high = 0.0, float(np.sqrt(np.max(r2 / u)))
+        if np.median(r2 / v) <= MEDIAN**2:
+            found[kind] = 0.0
+            continue
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            if np.median(r2 / (v + middle**2 * u)) > MEDIAN**2:
+                low = middle
+            else:
+                high = middle
+        found[kind] = high
+    return found

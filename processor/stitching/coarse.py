@@ -1,0 +1,192 @@
+"""Poses that two scans may have to each other, each with what speaks for it and against it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.geometry import rigid
+from processor.model import Floats
+from processor.stitching import directions, votes
+from processor.stitching.clouds import Cloud
+from processor.stitching.elements import Elements, elements
+from processor.stitching.sight import Sight
+
+SIDES = 48.0  # a view's coarse cubes: so many along the reach of the points
+LIKE_COS = float(np.cos(np.radians(15.0)))
+FEWEST = 6  # faces
+REFINED = 8  # poses of a pair that are refined
+GATES = (0.7, 0.35, 0.2, 0.12)  # of the cubes' side
+STEPS = 4
+NEAR, MARGIN = 0.15, 0.4  # of the cubes' side: faces closer than that are the same; seen this far beyond is through
+SLID, SLIDES = 3, (-1.2, -0.9, -0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.9, 1.2)  # poses tried so, by shares of the side
+LOOSE = 0.01  # of the strength of the strongest direction
+ENOUGH = 0.08  # overlap that two scans should have; less is a weak sign
+AGAINST_SHARE = 0.007
+SAME_MM, SAME_RAD = 0.7, 0.03  # of the cubes' side; poses closer than that are one
+
+
+def score(agree: float, against: float, total: float) -> float:
+    """Weigh agreement and what speaks against it, 0 to 1.
+
+    Beyond an overlap that is enough, more says nothing: a bridge turned end for end may overlap more. What tells is
+    the share of faces that speak against a pose, as a right one has next to none.
+    """
+    if not agree > 0.0:
+        return 0.0
+    return (1.0 - math.exp(-agree / (ENOUGH * total))) * math.exp(-against / (AGAINST_SHARE * agree))
+
+
+@dataclass(frozen=True)
+class View:
+    """A cloud made ready for being placed: coarse and finer elements, their weights, what was looked through."""
+
+    cloud: Cloud
+    side_mm: float
+    coarse: Elements
+    weight: Floats
+    fine: Elements
+    tree: cKDTree
+    modes: tuple[Floats, Floats]
+    sight: Sight | None
+
+
+@dataclass(frozen=True)
+class Placing:
+    """One pose of scan b in the frame of scan a: the share of b's faces (of those that a could see) that a sees too.
+
+    ``agree`` and ``against`` are weighted counts of both scans' faces: found in the other, and looked through by it.
+    """
+
+    T_a_b: Floats
+    agree: float
+    against: float
+    overlap: float
+
+    @property
+    def score(self) -> float:
+        """Evidence for the pose, 0 to 1; see :func:`score`."""
+        return score(self.agree, self.against, self.agree / max(self.overlap, 1e-12))
+
+
+def side_of(clouds: list[Cloud]) -> float:
+    """Side of coarse cubes, mm, for clouds that are to be placed together."""
+    reach = [
+        float(np.quantile(np.linalg.norm(c.cells.mean - np.median(c.cells.mean, axis=0), axis=1), 0.8))
+        for c in clouds
+        if len(c.sums)
+    ]
+    return float(np.median(reach)) / SIDES * 2.0 if reach else 1.0
+
+
+def view(cloud: Cloud, side_mm: float) -> View:
+    """Make a cloud ready."""
+    coarse = elements(cloud, side_mm)
+    fine = elements(cloud, 0.3 * side_mm)
+    return View(
+        cloud, side_mm, coarse, votes.weights(coarse.normals), fine, cKDTree(fine.points),
+        directions.modes(coarse.normals), cloud.sight,
+    )  # fmt: skip
+
+
+def placings(a: View, b: View, most_tilt_rad: float, most: int = 4) -> list[Placing]:
+    """Poses of b to a, the best first; none where nothing is alike."""
+    if min(len(a.coarse.points), len(b.coarse.points)) < FEWEST:
+        return []
+    tried: list[tuple[float, Floats]] = []
+    for R in directions.turns(a.modes, b.modes, most_tilt_rad):
+        for t, score in zip(*votes.shifts(a.coarse, a.weight, b.coarse, b.weight, R, a.side_mm), strict=True):
+            tried.append((float(score), rigid.transform(R, t)))
+    checked = [held(a, b, T, 0.7 * a.side_mm, 1.0 * a.side_mm) for _, T in sorted(tried, key=lambda one: -one[0])[:60]]
+    checked.sort(key=lambda one: -one.score)
+    refined = [
+        held(a, b, refine(a, b, one.T_a_b)[0], NEAR * a.side_mm, MARGIN * a.side_mm) for one in checked[:REFINED]
+    ]
+    refined.sort(key=lambda one: (-one.score, -one.agree))
+    refined = [slid(a, b, one) for one in refined[:SLID]] + refined[SLID:]
+    refined.sort(key=lambda one: (-one.score, -one.agree))
+    found: list[Placing] = []
+    for one in refined:
+        if not any(same(one.T_a_b, other.T_a_b, a.side_mm, b) for other in found):
+            found.append(one)
+    return found[:most]
+
+
+def same(T: Floats, S: Floats, side_mm: float, b: View) -> bool:
+    """Whether two poses of b differ by less than what tells poses apart."""
+    D = rigid.invert(T) @ S
+    middle = b.coarse.points.mean(axis=0)
+    apart = np.linalg.norm(rigid.apply(D, middle) - middle)
+    return bool(rigid.rotation_angle(D[:3, :3]) < SAME_RAD and apart < SAME_MM * side_mm)
+
+
+def held(a: View, b: View, T_a_b: Floats, near_mm: float, margin_mm: float) -> Placing:
+    """Count what speaks for and against a pose: faces of each in the other, and faces the other looked through."""
+    agree, against, total = 0.0, 0.0, 0.0
+    for one, other, T in ((a, b, rigid.invert(T_a_b)), (b, a, T_a_b)):
+        # faces of `one`, in the frame of `other`
+        points, normals = rigid.apply(T, one.coarse.points), one.coarse.normals @ T[:3, :3].T
+        distance, index = other.tree.query(points, k=4, distance_upper_bound=0.45 * a.side_mm)
+        there = np.isfinite(distance)
+        at = np.where(there, index, 0)
+        off = np.abs(np.einsum("nki,nki->nk", points[:, None] - other.fine.points[at], other.fine.normals[at]))
+        like = np.einsum("ni,nki->nk", normals, other.fine.normals[at]) > LIKE_COS
+        found = (there & like & (off < near_mm)).any(axis=1)
+        w = one.weight
+        agree += float(w[found].sum())
+        total += float(w.sum())
+        if other.sight is not None:
+            through = other.sight.through(points, margin_mm)
+            against += float((w * through)[~found].sum())
+    return Placing(T_a_b, agree, against, agree / max(total, 1e-12))
+
+
+def slid(a: View, b: View, one: Placing) -> Placing:
+    """Move a pose along what the shared faces do not tell, to where most speaks for it."""
+    _, loose = refine(a, b, one.T_a_b, GATES[-1:])
+    if loose is None:
+        return one
+    best = one
+    for k in SLIDES:
+        T = one.T_a_b.copy()
+        T[:3, 3] += k * a.side_mm * loose
+        other = held(a, b, T, NEAR * a.side_mm, MARGIN * a.side_mm)
+        if (other.score, other.agree) > (best.score, best.agree):
+            best = other
+    return best
+
+
+def refine(a: View, b: View, T: Floats, gates: tuple[float, ...] = GATES) -> tuple[Floats, Floats | None]:
+    """Move b's faces onto a's, gate by gate; along what the faces do not tell, a pose stays as it is.
+
+    Returns the pose, and the unit vector (3,) along which it is loose, if there is one.
+    """
+    w, loose = b.weight, None
+    for gate in gates:
+        for _ in range(STEPS):
+            points, normals = rigid.apply(T, b.coarse.points), b.coarse.normals @ T[:3, :3].T
+            distance, index = a.tree.query(points, distance_upper_bound=gate * a.side_mm + 0.35 * a.side_mm)
+            there = np.flatnonzero(np.isfinite(distance))
+            at = index[there]
+            n = a.fine.normals[at]
+            p = points[there]
+            r = np.einsum("ni,ni->n", p - a.fine.points[at], n)
+            keep = (np.einsum("ni,ni->n", n, normals[there]) > LIKE_COS) & (np.abs(r) < gate * a.side_mm)
+            if keep.sum() < 6:
+                return T, None
+            p, n, r, weight = p[keep], n[keep], r[keep], w[there[keep]]
+            centre = p.mean(axis=0)
+            reach = float(np.sqrt(((p - centre) ** 2).sum(axis=1).mean()))
+            J = np.hstack([np.cross((p - centre) / reach, n), n])
+            H = J.T @ (weight[:, None] * J)
+            step = -np.linalg.solve(H + 1e-3 * np.trace(H) / 6.0 * np.eye(6), J.T @ (weight * r))
+            R = rigid.rotation_from_vector(step[:3] / reach)
+            T = rigid.transform(R, centre + step[3:] - R @ centre) @ T
+            value, vector = np.linalg.eigh(J[:, 3:].T @ (weight[:, None] * J[:, 3:]))
+            loose = vector[:, 0] if value[0] < LOOSE * value[2] else None
+            if np.abs(step).max() < 1e-3 * a.side_mm:
+                break
+    return T, loose

@@ -1,0 +1,35 @@
+"""Parameters of stitching."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from processor.model import UsageError
+
+METHODS = ("automatic", "three-point")  # the first is the default
+SCALES = ("fixed", "free")
+
+
+@dataclass(frozen=True)
+class Params:
+    """Parameters of both methods; zeros are worked out from the scans."""
+
+    method: str = METHODS[0]
+    seed: int = 0
+    reference: str = ""  # name of the scan that is held; empty: the first
+    scale: str = SCALES[0]  # three-point: fixed = six parameters with scale as a diagnostic, free = the paper's seven
+    scale_limit_ppm: float = 1000.0  # three-point: beyond, and beyond its own uncertainty, a scale is a blunder
+    cell_mm: float = 0.0  # side of the cells that points are gathered in
+    levelled_mrad: float = 0.0  # instruments stood upright within this; 0 = not relied upon
+    weak_mm: float = 5.0  # a scan whose position is less sure (one standard deviation) is called weak
+    weak_mrad: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.scale not in SCALES:
+            raise UsageError(f"stitch.scale: expected one of {', '.join(SCALES)}, got {self.scale!r}")
+        for key in ("cell_mm", "levelled_mrad"):
+            if not getattr(self, key) >= 0.0:
+                raise UsageError(f"stitch.{key}: expected 0 or more, got {getattr(self, key)!r}")
+        for key in ("scale_limit_ppm", "weak_mm", "weak_mrad"):
+            if not getattr(self, key) > 0.0:
+                raise UsageError(f"stitch.{key}: expected a number above 0, got {getattr(self, key)!r}")

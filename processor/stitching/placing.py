@@ -1,0 +1,114 @@
+"""Scans placed one after another, each where all that stand already speak for it; rivals are remembered."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats
+from processor.stitching import coarse
+from processor.stitching.coarse import Placing, View
+
+MOST_TRIED = 5
+AMBIGUOUS = 0.75  # of the best pose's score: a rival that reaches it cannot be told from it
+LEAST_OVERLAP = 0.08
+
+Candidates = dict[tuple[int, int], list[Placing]]
+
+
+@dataclass(frozen=True)
+class Placed:
+    """Poses T_ref_scan (k, 4, 4), NaN of scans without one; a rival's share of the best score (k,) and pose.
+
+    ``contrary`` (k,) is what speaks against a scan's pose by what speaks for it, ``overlap`` (k,) its largest.
+    """
+
+    T: Floats
+    rivalry: Floats
+    T_rival: Floats
+    contrary: Floats
+    overlap: Floats
+
+
+def towards(candidates: Candidates, i: int, j: int) -> list[tuple[Floats, float]]:
+    """Poses of j in i with their scores, whichever of the two was the first of the pair."""
+    if (i, j) in candidates:
+        return [(one.T_a_b, one.score) for one in candidates[i, j]]
+    return [(rigid.invert(one.T_a_b), one.score) for one in candidates.get((j, i), [])]
+
+
+def place(views: list[View], candidates: Candidates, reference: int) -> Placed:
+    """Place all scans that can be, the surest first."""
+    k = len(views)
+    T = np.full((k, 4, 4), np.nan)
+    T[reference] = np.eye(4)
+    rivalry, T_rival = np.zeros(k), np.full((k, 4, 4), np.nan)
+    contrary, overlap = np.zeros(k), np.ones(k)
+    done = [reference]
+    while len(done) < k:
+        best: tuple[float, int, list[tuple[float, Floats]]] | None = None
+        for j in sorted(set(range(k)) - set(done)):
+            ranked = ranking(views, candidates, T, done, j)
+            if not ranked:
+                continue
+            sure = ranked[0][0] - (ranked[1][0] if len(ranked) > 1 else 0.0)
+            if best is None or sure > best[0]:
+                best = (sure, j, ranked)
+        if best is None:
+            break
+        _, j, ranked = best
+        T[j] = ranked[0][1]
+        done.append(j)
+    for j in done:
+        others = [i for i in done if i != j]
+        if j == reference or not others:
+            continue
+        ranked = ranking(views, candidates, T, others, j, T[j])
+        own = next(s for s, pose in ranked if coarse.same(pose, T[j], views[0].side_mm, views[j]))
+        rivals = [(s, p) for s, p in ranked if not coarse.same(p, T[j], views[0].side_mm, views[j])]
+        if rivals:
+            rivalry[j] = rivals[0][0] / max(own, 1e-12)
+            T_rival[j] = rivals[0][1]
+        all_held = [held(views, T, i, j, T[j]) for i in others]
+        agree = sum(one.agree for one in all_held if one.overlap > LEAST_OVERLAP)
+        contrary[j] = sum(one.against for one in all_held) / max(agree, 1e-12)
+        overlap[j] = max(one.overlap for one in all_held)
+    return Placed(T, rivalry, T_rival, contrary, overlap)
+
+
+def held(views: list[View], T: Floats, i: int, j: int, pose: Floats) -> Placing:
+    """Count what speaks for and against a pose (4, 4) of scan j, beside scan i at its pose in T (k, 4, 4)."""
+    side = views[i].side_mm
+    return coarse.held(views[i], views[j], rigid.invert(T[i]) @ pose, coarse.NEAR * side, coarse.MARGIN * side)
+
+
+def ranking(
+    views: list[View], candidates: Candidates, T: Floats, done: list[int], j: int, own: Floats | None = None
+) -> list[tuple[float, Floats]]:
+    """Poses of scan j with the score that all of ``done`` give them together, the best first."""
+    poses: list[tuple[Floats, float]] = [] if own is None else [(own, np.inf)]
+    for i in done:
+        for T_i_j, score in towards(candidates, i, j):
+            pose = T[i] @ T_i_j
+            for row, (other, sum_) in enumerate(poses):
+                if coarse.same(other, pose, views[0].side_mm, views[j]):
+                    poses[row] = (other, sum_ + score)
+                    break
+            else:
+                poses.append((pose, score))
+    poses.sort(key=lambda one: -one[1])
+    found = []
+    for pose, _ in poses[:MOST_TRIED]:
+        agree, against, total = 0.0, 0.0, 0.0
+        for i in done:
+            one = held(views, T, i, j, pose)
+            against += one.against
+            if one.overlap > LEAST_OVERLAP:
+                agree += one.agree
+                total += one.agree / one.overlap
+        if agree > 0.0:
+            found.append((coarse.score(agree, against, total), pose))
+    found.sort(key=lambda one: -one[0])
+    return found

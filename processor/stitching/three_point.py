@@ -1,0 +1,164 @@
+"""Method ``three-point``: pairs of scans by picked common points, chained into one frame. Source: paper 003, eq. 1-2.
+
+The paper's model x_a = t + lambda R x_b has seven parameters. A free scale takes up a blunder in one of three points
+without a trace, so six are the default, and scale is a diagnostic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats
+from processor.stitching import frames
+from processor.stitching.pairs import Pair
+
+LEAST_POINTS = 3
+LEAST_SD_MM = 1e-6  # of picks without any error, as tests make them
+UNIT_SLIPS = (
+    (1000.0, "m and mm"),
+    (304.8, "feet and mm"),
+    (39.3701, "inches and m"),
+    (25.4, "inches and mm"),
+    (12.0, "inches and feet"),
+    (10.0, "cm and mm"),
+    (3.28084, "feet and m"),
+)
+LEAST_HEIGHT = 1e-3  # of a triangle, by its longest side: nearer to a line than that is a line
+
+
+@dataclass(frozen=True)
+class Tie:
+    """One pair from picks: T_a_b (rotation and shift), scale of b in a, and how well the points agree.
+
+    ``covariance`` (6, 6): turn about a's axes at the middle of the points, and shift, carried to turns about b's
+    origin; NaN where three points leave nothing to judge by and no standard deviation was given.
+    """
+
+    T_a_b: Floats
+    scale: float
+    scale_sd: float
+    residuals: Floats  # (n, 3) a less b moved, mm
+    sd_mm: float  # of a picked coordinate of one scan
+    covariance: Floats
+
+
+class TooFewError(ValueError):
+    """Fewer than three points, or all on a line: a pose cannot be told."""
+
+
+def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
+    """Fit a pair's picked points (n, 3) of each scan, least squares; raises TooFewError.
+
+    With six parameters three points leave three freedoms, with seven two: the standard deviation of a pick comes from
+    these. The scale is (sum of spreads in a) / (in b), the least-squares one by the moved points where it is free.
+    """
+    n = len(points_a)
+    if n < LEAST_POINTS:
+        raise TooFewError(f"{n} common points")
+    middle_a, middle_b = points_a.mean(axis=0), points_b.mean(axis=0)
+    a, b = points_a - middle_a, points_b - middle_b
+    widths = np.linalg.svd(b, compute_uv=False)
+    if widths[0] <= 0.0 or widths[1] < LEAST_HEIGHT * widths[0]:
+        raise TooFewError("all common points on a line")
+    R = rigid.fit(b, a)[:3, :3]
+    moved = b @ R.T
+    scale = float((a * moved).sum() / (moved**2).sum())
+    used = scale if scale_free else 1.0
+    residuals = a - used * moved
+    free = 3 * n - 6 - scale_free
+    both = max(float(np.sqrt((residuals**2).sum() / free)), LEAST_SD_MM)  # of a difference: both scans' picks are in it
+    sd = both / np.sqrt(2.0)
+    # The scale's own standard deviation by what six or seven parameters leave; with it free, 3n - 7 in any case.
+    left = float(np.sqrt(((a - scale * moved) ** 2).sum() / max(3 * n - 7, 1)))
+    scale_sd = left / float(np.sqrt((moved**2).sum()))
+    J = rigid.motion(moved).reshape(-1, 6)
+    own = np.linalg.inv(J.T @ J) * both**2
+    T = rigid.transform(R, middle_a - used * R @ middle_b)
+    # Turns about the middle of the points -> about b's origin in a.
+    covariance = frames.about_origin(own, middle_a - T[:3, 3])
+    return Tie(T, scale, scale_sd, residuals, sd, covariance)
+
+
+def verdict(scale: float, sd: float, limit_ppm: float) -> str:
+    """Say what a scale other than 1 means, or nothing."""
+    off = 1e6 * abs(scale - 1.0)
+    for factor, units in UNIT_SLIPS:
+        if min(abs(scale / factor - 1.0), abs(scale * factor - 1.0)) < 0.02:
+            return f"scale {scale:.5g}: units mixed up ({units})?"
+    if off <= 3.0 * 1e6 * sd:
+        return ""
+    if off > limit_ppm:
+        return f"scale {scale:.6f}: a blunder in the picks"
+    return (
+        f"scale {1e6 * (scale - 1.0):+.0f} ± {1.96e6 * sd:.0f} ppm: temperature (12 ppm a kelvin), instrument or picks"
+    )
+
+
+def as_pair(a: int, b: int, found: Tie) -> Pair:
+    """Write a tie as a pair of the network."""
+    residual = float(np.sqrt((found.residuals**2).sum(axis=1).mean()))
+    return Pair(a, b, len(found.residuals), found.T_a_b, found.covariance, residual, 0.0)
+
+
+def adjusted(pairs: list[Pair], count: int, reference: int) -> tuple[Floats, Floats]:
+    """Poses T_ref_scan (k, 4, 4) and their covariance (6k, 6k) of a network of pairs; NaN of scans it does not reach.
+
+    The first poses are the paper's chain, from the reference on by the surest pairs; then all pairs are adjusted.
+    Turns about the scans' own origins, along the reference's axes.
+    """
+    T = np.full((count, 4, 4), np.nan)
+    T[reference] = np.eye(4)
+    done = {reference}
+    order = sorted(pairs, key=lambda one: (float(np.trace(one.covariance[3:, 3:])), one.a, one.b))
+    while True:
+        one = next((p for p in order if (p.a in done) != (p.b in done)), None)
+        if one is None:
+            break
+        if one.a in done:
+            T[one.b] = T[one.a] @ one.T_a_b
+            done.add(one.b)
+        else:
+            T[one.a] = T[one.b] @ rigid.invert(one.T_a_b)
+            done.add(one.a)
+    used = [one for one in pairs if one.a in done and one.b in done]
+    free = sorted(done - {reference})
+    covariance = np.full((6 * count, 6 * count), np.nan)
+    own = slice(6 * reference, 6 * reference + 6)
+    covariance[own], covariance[:, own] = 0.0, 0.0
+    rows = np.array([6 * s + np.arange(6) for s in free], np.int64).ravel()
+    if not len(rows):
+        return T, covariance
+    for _ in range(10):
+        N, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+        for one in used:
+            A, r, W = _equation(one, T)
+            at = np.concatenate([6 * one.a + np.arange(6), 6 * one.b + np.arange(6)])
+            N[np.ix_(at, at)] += A.T @ W @ A
+            g[at] += A.T @ W @ r
+        step = np.zeros(6 * count)
+        step[rows] = -np.linalg.solve(N[np.ix_(rows, rows)], g[rows])
+        for s in free:
+            d = step[6 * s : 6 * s + 6]
+            T[s, :3, :3] = rigid.rotation_from_vector(d[:3]) @ T[s, :3, :3]
+            T[s, :3, 3] += d[3:]
+        if np.abs(step).max() < 1e-9:
+            break
+    covariance[np.ix_(rows, rows)] = np.linalg.inv(N[np.ix_(rows, rows)])
+    return T, covariance
+
+
+def _equation(one: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the derivative (6, 12) by both scans' motions, the misclosure (6,) in a's axes, and the weight."""
+    R = T[one.a, :3, :3]
+    now = rigid.invert(T[one.a]) @ T[one.b]
+    r = frames.difference(now, one.T_a_b)
+    arm = T[one.b, :3, 3] - T[one.a, :3, 3]
+    A = np.zeros((6, 12))
+    A[:3, :3], A[:3, 6:9] = -R.T, R.T
+    A[3:, 3:6], A[3:, 9:] = -R.T, R.T
+    A[3:, :3] = R.T @ frames.cross_matrix(arm)
+    weight: Floats = np.asarray(np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True), np.float64)
+    return A, r, weight

@@ -1,0 +1,353 @@
+"""Defects found on clouds made here: plates seen from stations, their damage and their truth in closed form."""
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from processor.defects import deflection, facets, fields, paper, scan_statistic, shapes, surface
+from processor.defects.measures import thickness_at
+from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
+from processor.pipeline import as_json
+from processor.report import of_defects
+from processor.report.results_json import plain
+from processor.steps import defects
+
+SIDE, THICK, GAP = 600.0, 12.0, 300.0
+BOX_FACES = np.array(
+    [[0, 2, 1], [0, 3, 2], [4, 5, 6], [4, 6, 7], [0, 1, 5], [0, 5, 4],
+     [2, 3, 7], [2, 7, 6], [1, 2, 6], [1, 6, 5], [0, 4, 7], [0, 7, 3]]
+)  # fmt: skip
+
+
+def box(low, high):
+    """Vertices and outward faces of an upright box."""
+    (x0, y0, z0), (x1, y1, z1) = low, high
+    corners = [[x0, y0, z0], [x1, y0, z0], [x1, y1, z0], [x0, y1, z0]]
+    corners += [[x, y, z1] for x, y, _ in corners]
+    return np.array(corners), BOX_FACES
+
+
+def design_of(count):
+    """A row of plates with their fronts in y = 0, looking to -y."""
+    parts = [box((i * (SIDE + GAP), 0.0, 0.0), (i * (SIDE + GAP) + SIDE, THICK, SIDE)) for i in range(count)]
+    faces = [own + 8 * i for i, (_, own) in enumerate(parts)]
+    return StructureDesign("plates", np.vstack([corners for corners, _ in parts]), np.vstack(faces))
+
+
+def scene_of(count, inward, missing=lambda x, z: x < -1e9, seed=1, sigma=0.4, clutter=None, spacing=4.0):
+    """Scans of a row of plates from two stations; ``inward`` and ``missing`` are functions of x and z.
+
+    ``clutter``: x, y, z and radius of a ball between the stations and the plates.
+    """
+    design = design_of(count)
+    rng = np.random.default_rng(seed)
+    width = count * (SIDE + GAP)
+    scans = []
+    for name, station in (("S1", (0.2 * width, -4000.0, 700.0)), ("S2", (0.8 * width, -4500.0, 800.0))):
+        parts = []
+        for i in range(count):
+            n = int((SIDE / spacing) ** 2)
+            x, z = i * (SIDE + GAP) + rng.uniform(0.0, SIDE, n), rng.uniform(0.0, SIDE, n)
+            there = ~missing(x, z)
+            parts.append(np.stack([x, inward(x, z), z], axis=1)[there])
+        points = np.vstack(parts)
+        ray = points - station
+        away = np.linalg.norm(ray, axis=1)
+        ray /= away[:, None]
+        if clutter is not None:
+            centre, radius = np.array(clutter[:3]) - station, clutter[3]
+            along = ray @ centre
+            hit = (centre @ centre - along**2 < radius**2) & (along > 0.0)
+            away = np.where(hit, along - np.sqrt(np.maximum(radius**2 - centre @ centre + along**2, 0.0)), away)
+        points = station + ray * (away + rng.normal(0.0, sigma, len(away)))[:, None]
+        scans.append(Scan(name, points, position=np.array(station), T_project_scan=np.eye(4)))
+    return Scene("plates", "structure", tuple(scans), structure=design)
+
+
+def flat(x, z):
+    return np.zeros(len(x))
+
+
+def bump(depth, radius, at):
+    return lambda x, z: depth * np.maximum(1.0 - ((x - at[0]) ** 2 + (z - at[1]) ** 2) / radius**2, 0.0) ** 2
+
+
+def found(result):
+    return [(kind, name) for kind, name in zip(result.classes, result.components, strict=True)]
+
+
+# --- the whole step ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_an_undamaged_structure_has_no_defect(seed):
+    result = defects.run(scene_of(3, flat, seed=seed), defects.Params())
+    assert result.status == "ok"
+    assert found(result) == []
+    inner = SIDE - 16.0  # less a border of 8 mm, and what a row of cells may take
+    assert 3 * (inner - 2.0 * result.cell_mm) ** 2 <= result.examined_mm2 <= 3 * inner**2
+    assert result.noise_mm == pytest.approx(0.4, rel=0.05)
+
+
+def test_a_dent_a_bulge_and_a_pit_are_measured():
+    dent, bulge, pit = (
+        bump(3.0, 90.0, (250.0, 300.0)),
+        bump(-2.0, 80.0, (1250.0, 350.0)),
+        bump(4.0, 16.0, (2100.0, 200.0)),
+    )
+    scene = scene_of(3, lambda x, z: dent(x, z) + bulge(x, z) + pit(x, z), spacing=3.0)
+    result = defects.run(scene, defects.Params())
+    assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
+    for kind, depth, radius, at in (("dent", 3.0, 90.0, (250.0, 300.0)), ("bulge", -2.0, 80.0, (1250.0, 350.0)),
+                                    ("pit", 4.0, 16.0, (2100.0, 200.0))):  # fmt: skip
+        k = result.classes.index(kind)
+        assert abs(result.depth_max[k] - depth) < max(0.1 * abs(depth), 2.0 * result.lod95[k])
+        assert abs(result.depth_max[k] - depth) < 2.5 * result.depth_ci95[k]
+        np.testing.assert_allclose(result.centres[k], [at[0], 0.0, at[1]], atol=0.1 * radius + 1.0)
+        assert result.confidence[k] > 0.9
+        # A third of the cylinder about a bump (1 - r^2 / R^2)^2.
+        if kind != "pit":
+            assert result.volume_mm3[k] == pytest.approx(np.pi * radius**2 * depth / 3.0, rel=0.05)
+            curvature = 4.0 * abs(depth) / radius**2 * 1000.0
+            assert result.curvature_per_m[k] == pytest.approx(curvature, rel=0.35)
+
+
+def test_missing_corners_edges_and_holes_are_named():
+    def missing(x, z):
+        corner = (x > SIDE - 90.0) & (x <= SIDE) & (z > SIDE - 90.0)
+        edge = (np.abs(x - 1150.0) < 40.0) & (z > SIDE - 50.0)
+        hole = np.hypot(x - 2100.0, z - 300.0) < 50.0
+        return corner | edge | hole
+
+    result = defects.run(scene_of(3, flat, missing), defects.Params())
+    assert sorted(found(result)) == [
+        ("edge-loss", "component-2"), ("missing-part", "component-1"), ("missing-part", "component-3"),
+    ]  # fmt: skip
+    np.testing.assert_allclose(result.depth_max, THICK)
+    area = dict(zip(result.components, result.area_mm2, strict=True))
+    assert area["component-1"] == pytest.approx(90.0**2, rel=0.15)
+    assert area["component-2"] == pytest.approx(80.0 * 50.0, rel=0.2)
+    assert area["component-3"] == pytest.approx(np.pi * 50.0**2, rel=0.15)
+
+
+def test_what_something_hides_is_not_missing():
+    """A ball in the way of both stations: no point of the surface in its shadow."""
+    clutter = (1200.0, -250.0, 300.0, 90.0)
+    scene = scene_of(3, flat, clutter=clutter)
+    result = defects.run(scene, defects.Params())
+    assert found(result) == []
+    assert result.expected_mm2 < 3 * SIDE**2 - 8_000.0
+    # The same points gone without anything in the way are.
+    kept = [dataclasses.replace(s, points=s.points[s.points[:, 1] > -100.0]) for s in scene.scans]
+    gone = defects.run(dataclasses.replace(scene, scans=tuple(kept)), defects.Params())
+    assert set(found(gone)) == {("missing-part", "component-2")}
+
+
+@pytest.mark.parametrize(
+    ("kind", "inward", "depth"),
+    [
+        ("bend", lambda x, z: 3.0 * np.cos(np.pi * (x - 1200.0) / SIDE), 3.0),
+        ("twist", lambda x, z: 0.006 * (x - 1200.0) / SIDE * (z - 300.0) * 2.0, 1.8),
+        ("waviness", lambda x, z: 1.0 * np.sin(2.0 * np.pi * (x - 1200.0) / 150.0), 1.0),
+        ("step", lambda x, z: np.where(x > 1300.0, 1.5, 0.0), 1.5),
+        ("misalignment", lambda x, z: 2.0 + 0.003 * (z - 300.0), 2.9),
+    ],
+)
+def test_shapes_of_whole_components(kind, inward, depth):
+    """On the second of five plates; the others tell where the whole is."""
+    result = defects.run(
+        scene_of(5, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)), defects.Params()
+    )
+    assert found(result) == [(kind, "component-2")]
+    assert abs(result.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
+    curve = result.curve_mm[result.curve_defect == 0]
+    assert len(curve) == (40 if kind == "bend" else 0)
+    if kind == "bend":
+        at = result.curve_at_mm
+        np.testing.assert_allclose(curve, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)
+
+
+def test_stations_that_are_off_are_no_defect():
+    """Each station has its range zero wrong by half a millimetre, the other way each."""
+    scene = scene_of(3, flat)
+    scans = []
+    for scan, off in zip(scene.scans, (0.5, -0.5), strict=True):
+        ray = scan.points - scan.position
+        scans.append(dataclasses.replace(scan, points=scan.points + off * ray / np.linalg.norm(ray, axis=1)[:, None]))
+    result = defects.run(dataclasses.replace(scene, scans=tuple(scans)), defects.Params())
+    assert found(result) == []
+
+
+def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
+    dent = bump(3.0, 90.0, (250.0, 300.0))
+    scene = scene_of(3, dent)
+    first = defects.run(scene, defects.Params())
+    mixed = [dataclasses.replace(s, points=np.random.default_rng(5).permutation(s.points)) for s in scene.scans]
+    again = defects.run(dataclasses.replace(scene, scans=tuple(mixed)), defects.Params())
+    assert found(again) == found(first)
+    np.testing.assert_allclose(again.depth_max, first.depth_max, atol=1e-6)
+    np.testing.assert_allclose(again.centres, first.centres, atol=1e-6)
+    far = np.array([4.5e8, 3.2e9, 1e5])
+    T = np.eye(4)
+    T[:3, 3] = far
+    moved = Scene(
+        "far", "structure", tuple(dataclasses.replace(s, T_project_scan=T) for s in scene.scans),
+        structure=StructureDesign("far", scene.structure.vertices + far, scene.structure.faces),
+    )  # fmt: skip
+    there = defects.run(moved, defects.Params())
+    assert found(there) == found(first)
+    np.testing.assert_allclose(there.depth_max, first.depth_max, atol=1e-3)
+    np.testing.assert_allclose(there.centres - far, first.centres, atol=1e-2)
+
+
+def test_the_papers_chain_finds_a_dent_and_is_seeded():
+    scene = scene_of(2, bump(5.0, 120.0, (250.0, 300.0)), spacing=8.0)
+    params = defects.Params(method="paper", paper=paper.Paper(trials=60, feature_points=80))
+    result = defects.run(scene, params)
+    assert set(result.classes) == {"unknown"}
+    np.testing.assert_allclose(result.centres[0], [250.0, 2.0, 300.0], atol=12.0)
+    assert result.depth_max[0] == pytest.approx(5.0, abs=1.2)
+    assert (result.curve_defect == 0).sum() > 5
+    again = defects.run(scene, params)
+    np.testing.assert_array_equal(again.depth_max, result.depth_max)
+
+
+def test_what_is_written():
+    result = defects.run(scene_of(3, bump(3.0, 90.0, (250.0, 300.0))), defects.Params())
+    written = json.loads(as_json(plain(of_defects.REPORT.written(result))))
+    (one,) = written["defects"]
+    keys = {"id", "class", "confidence", "component", "centre", "area_mm2", "depth_max", "depth_ci95", "volume_mm3"}
+    assert keys <= set(one)
+    assert one["class"] == "dent"
+
+
+def test_what_cannot_be_used_is_said():
+    scene = scene_of(2, flat, spacing=20.0)
+    with pytest.raises(InputError, match="design"):
+        defects.run(dataclasses.replace(scene, structure=None), defects.Params())
+    with pytest.raises(InputError, match="points"):
+        defects.run(dataclasses.replace(scene, scans=()), defects.Params())
+    with pytest.raises(UsageError, match="reach_mm"):
+        defects.run(scene, defects.Params(reach_mm=0.0))
+    with pytest.raises(UsageError, match="method"):
+        defects.run(scene, defects.Params(method="magic"))
+
+
+# --- parts of it ---------------------------------------------------------------------------------------------------
+
+
+def test_false_alarms_are_no_more_than_asked_for():
+    """A hundred square metres of independent noise, over and over: one alarm each is allowed, and chance on top."""
+    plate = surface.of_mesh(*box((0.0, 0.0, 0.0), (10_000.0, 12.0, 10_000.0)), 50.0)
+    chart = int(np.argmin(plate.charts.axes[:, 2, 1]))
+    rows = plate.charts.cells(chart)
+    seen = np.zeros(len(plate.share))
+    seen[rows] = 1.0
+    alarms = 0
+    for seed in range(10):
+        noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
+        ones = np.ones(len(seen), np.int64)
+        field = fields.Field(noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen)
+        levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
+        sign = scan_statistic.search(field, plate, levels).sign
+        alarms += int((np.abs(plate.charts.image(sign.astype(float), chart)) > 0).any())
+    assert alarms <= 10  # of 10 runs, in each of which 1 is allowed: at 0.63 a run, ten of ten is one in a hundred
+    assert np.all(levels.inflation < 1.1)
+
+
+def test_facets_are_the_nearest_that_a_scanner_can_see():
+    vertices, faces = box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0))
+    normals = trimesh.Trimesh(vertices, faces, process=False).face_normals
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-30.0, -30.0, -30.0], [330.0, 42.0, 230.0], (2000, 3))
+    grid = facets.grid_of(vertices, faces, normals, 60.0)
+    facet, distance = facets.nearest(grid, points, np.zeros((1, 3)), np.full(2000, -1))
+    _, true, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(vertices, faces, process=False), points)
+    corner = vertices[faces[facet, 0]]
+    np.testing.assert_allclose(distance, np.einsum("ni,ni->n", points - corner, normals[facet]), atol=1e-9)
+    nearest = np.array([trimesh.triangles.closest_point(vertices[faces[f]][None], p[None])[0]
+                        for f, p in zip(facet, points, strict=True)])  # fmt: skip
+    np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), true, atol=1e-9)
+    # Deep in the plate, nearer to its back, but seen from the front.
+    deep = np.array([[150.0, 9.0, 100.0]])
+    facet, distance = facets.nearest(grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64))
+    assert distance[0] == pytest.approx(-9.0)
+    np.testing.assert_allclose(normals[facet[0]], [0.0, -1.0, 0.0])
+
+
+def test_cells_cover_what_a_design_has():
+    plate = surface.of_mesh(*box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0)), 5.0)
+    area = 2.0 * (300.0 * 200.0 + 300.0 * 12.0 + 200.0 * 12.0)
+    assert plate.area_mm2 == pytest.approx(area, rel=0.02)
+    assert plate.components == 1
+    assert thickness_at(plate, np.array([100.0, 0.0, 90.0]), np.array([0.0, -1.0, 0.0]), 0) == pytest.approx(12.0)
+    tube = trimesh.creation.cylinder(100.0, 1000.0, sections=96)
+    round_ = surface.of_mesh(np.asarray(tube.vertices), np.asarray(tube.faces, np.int64), 10.0)
+    cylinder = np.flatnonzero(round_.charts.kind == surface.CYLINDER)
+    assert len(cylinder) == 1
+    mantle = round_.share[round_.charts.cells(int(cylinder[0]))].sum() * 100.0
+    assert mantle == pytest.approx(2.0 * np.pi * 100.0 * 1000.0, rel=0.02)
+    np.testing.assert_allclose(
+        np.linalg.norm(round_.centres[round_.charts.cells(int(cylinder[0]))][:, :2], axis=1), 100.0, rtol=0.01
+    )
+
+
+def test_bodies_that_touch_are_one_component():
+    web, flange = box((0.0, 0.0, 0.0), (500.0, 10.0, 300.0)), box((0.0, -60.0, 300.0), (500.0, 70.0, 316.0))
+    alone = box((900.0, 0.0, 0.0), (1100.0, 10.0, 300.0))
+    vertices = np.vstack([web[0], flange[0], alone[0]])
+    faces = np.vstack([BOX_FACES, BOX_FACES + 8, BOX_FACES + 16])
+    whole = surface.of_mesh(vertices, faces, 20.0)
+    assert whole.components == 2
+    assert len(set(whole.component_of[:24].tolist())) == 1
+
+
+def test_density_clusters_are_those_of_the_definition():
+    rng = np.random.default_rng(4)
+    points = np.vstack([rng.normal(0, 3, (60, 3)), rng.normal(40, 3, (50, 3)), rng.uniform(-80, 120, (40, 3))])
+    label = paper.density_clusters(points, 4.0, 4)
+    near = np.linalg.norm(points[:, None] - points[None], axis=2) <= 4.0
+    core = near.sum(axis=1) >= 4
+    reach = np.where(core[:, None] & core[None], near, False)
+    for _ in range(8):  # who is reached by way of others
+        reach = (reach.astype(int) @ reach.astype(int)) > 0
+    same = label[:, None] == label[None]
+    np.testing.assert_array_equal(same[np.ix_(core, core)], reach[np.ix_(core, core)])
+    np.testing.assert_array_equal(label < 0, ~core & ~(near & core[None]).any(axis=1))
+
+
+def test_numbers_by_hand():
+    # Huber, limit 2: 1 -> 0.5; 3 -> 0.5 * 2 * (6 - 2) = 4.
+    assert paper.huber(np.array([1.0, 3.0]), 2.0) == pytest.approx(4.5)
+    # A parabola of 1 mm at 100 mm: slopes of its chords add up to what it is at the end.
+    x = np.linspace(0.0, 100.0, 2001)
+    at, mu = deflection.by_slopes(x, (x / 100.0) ** 2, 10)
+    np.testing.assert_allclose(mu, (at / 100.0) ** 2, atol=5e-4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "height"),
+    [
+        ("bend", lambda p: -2.0 * np.cos(np.pi * p[:, 0] / 1000.0)),
+        ("twist", lambda p: 3e-6 * p[:, 0] * p[:, 1]),
+        ("waviness", lambda p: 0.8 * np.sin(2.0 * np.pi * p[:, 0] / 230.0)),
+        ("step", lambda p: np.where(p[:, 0] > 130.0, 0.6, 0.0)),
+        ("misalignment", lambda p: 0.5 + 1e-3 * p[:, 1]),
+        ("", lambda p: bump(3.0, 150.0, (100.0, -50.0))(p[:, 0], p[:, 1])),
+        ("", lambda p: np.zeros(len(p))),
+    ],
+)
+def test_one_shape_is_chosen(kind, height):
+    a, b = (x.ravel() for x in np.meshgrid(np.linspace(-485.0, 485.0, 34), np.linspace(-285.0, 285.0, 20)))
+    points = np.stack([a, b, np.zeros(len(a))], axis=1)
+    frame = shapes.Frame(np.zeros(3), np.eye(3), np.array([500.0, 300.0, 6.0]), 300.0)
+    mean = height(points) + np.random.default_rng(2).normal(0.0, 0.03, len(a))
+    outward = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
+    fitted = shapes.fit(shapes.Blocks(points, outward, mean, np.full(len(a), 0.03**-2), 30.0), frame)
+    assert [one.kind for one in fitted.shapes] == ([kind] if kind else [])
+    if kind:
+        value = fitted.shapes[0].values(frame, points, outward)
+        np.testing.assert_allclose(value, height(points), atol=0.06 if kind != "step" else 0.7)

@@ -1,0 +1,168 @@
+"""Picked common points: the paper's method, six parameters and seven, and the file they come in."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from processor import folder
+from processor.model import InputError, Picks, Scan, Scene
+from processor.steps import stitch
+from processor.stitching import three_point
+from tests.stitch_clouds import pose
+
+CORNERS = np.array([[0.0, 0.0, 0.0], [9000.0, 0.0, 500.0], [2000.0, 7000.0, 4000.0], [8000.0, 6000.0, 100.0]])
+
+
+def test_three_points_worked_by_hand():
+    """b is a turned a quarter about z and moved: x_a = (-y_b + 10, x_b + 20, z_b)."""
+    b = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
+    a = np.array([[10.0, 20.0, 0.0], [10.0, 120.0, 0.0], [-40.0, 20.0, 0.0]])
+    found = three_point.tie(a, b, scale_free=False)
+    np.testing.assert_allclose(found.T_a_b, [[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12)
+    assert found.scale == pytest.approx(1.0)
+    assert np.abs(found.residuals).max() < 1e-12
+
+
+def test_seven_parameters_take_up_a_scale_six_show_it():
+    R = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
+    a = 1.0005 * CORNERS @ R.T + [100.0, 200.0, 300.0]
+    free = three_point.tie(a, CORNERS, scale_free=True)
+    assert free.scale == pytest.approx(1.0005, abs=1e-12)
+    assert np.abs(free.residuals).max() < 1e-9
+    np.testing.assert_allclose(free.T_a_b[:3, :3], R, atol=1e-12)
+    np.testing.assert_allclose(free.T_a_b[:3, 3], [100.0, 200.0, 300.0], atol=1e-6)
+    held = three_point.tie(a, CORNERS, scale_free=False)
+    assert held.scale == pytest.approx(1.0005, abs=1e-9)
+    assert np.abs(held.residuals).max() > 1.0
+
+
+def test_a_scale_is_named_for_what_it_may_be():
+    assert "m and mm" in three_point.verdict(1000.3, 1e-4, 1000.0)
+    assert "inches" in three_point.verdict(1.0 / 25.4, 1e-6, 1000.0)
+    assert "blunder" in three_point.verdict(1.02, 1e-4, 1000.0)
+    assert "temperature" in three_point.verdict(1.00024, 1e-5, 1000.0)
+    assert three_point.verdict(1.0001, 1e-4, 1000.0) == ""
+
+
+@pytest.mark.parametrize(
+    "points", [CORNERS[:2], np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), np.zeros((3, 3))], ids=["two", "line", "place"]
+)
+def test_too_few_points_tell_no_pose(points):
+    with pytest.raises(three_point.TooFewError):
+        three_point.tie(points, points, scale_free=False)
+
+
+def test_a_pairs_covariance_is_what_noisy_picks_scatter_by():
+    """2000 draws of 5 mm: the scatter of the poses against the mean of the stated covariances."""
+    rng = np.random.default_rng(7)
+    T = pose([4000.0, -3000.0, 200.0], 70.0, 10.0)
+    a = CORNERS @ T[:3, :3].T + T[:3, 3]
+    drawn, stated = [], []
+    for _ in range(2000):
+        found = three_point.tie(a + rng.normal(0, 5.0, a.shape), CORNERS + rng.normal(0, 5.0, a.shape), False)
+        turn = Rotation.from_matrix(found.T_a_b[:3, :3] @ T[:3, :3].T).as_rotvec()
+        drawn.append([*turn, *(found.T_a_b[:3, 3] - T[:3, 3])])
+        stated.append(found.covariance)
+    np.testing.assert_allclose(np.std(drawn, axis=0), np.sqrt(np.diag(np.mean(stated, axis=0))), rtol=0.06)
+
+
+def network(seed, noise, scale=1.0, count=5, points=6):
+    """Scans with picks between neighbours and from the first to the last: a loop."""
+    rng = np.random.default_rng(seed)
+    T = [pose([8000.0 * i, 500.0 * i, 1500.0], 50.0 * i, 2.0 * i) for i in range(count)]
+    scans = tuple(Scan(f"S{i + 1}", rng.normal(0.0, 5000.0, (200, 3))) for i in range(count))
+    rows = []
+    for a, b in [*((i, i + 1) for i in range(count - 1)), (0, count - 1)]:
+        world = rng.uniform([0, -8e3, 0], [3e4, 8e3, 8e3], (points, 3))
+        for k, x in enumerate(world):
+            own = [np.linalg.inv(T[s]) @ [*x, 1.0] for s in (a, b)]
+            rows.append((f"S{a + 1}", f"S{b + 1}", f"P{k}", *(one[:3] + rng.normal(0, noise, 3) for one in own)))
+    names_a, names_b, names, in_a, in_b = zip(*rows, strict=True)
+    picks = Picks(names_a, names_b, names, np.array(in_a), scale * np.array(in_b))
+    return np.array(T), Scene("network", "structure", scans, picks=picks)
+
+
+def test_a_chain_of_all_scans_with_picks_of_5_mm():
+    errors, pulls = [], []
+    for seed in range(20):
+        T, scene = network(seed, 5.0)
+        result = stitch.run(scene, stitch.Params(method="three-point"))
+        assert result.status in ("ok", "partial")  # partial where luck leaves a scan weak
+        assert "failed" not in result.scan_status
+        want = np.linalg.inv(T[0]) @ T
+        off = result.T_project_scan[1:, :3, 3] - want[1:, :3, 3]
+        errors.append(np.abs(off).max())
+        at = np.array([(one @ [*p, 1.0])[:3] for one, p in zip(result.T_project_scan, _places(scene), strict=True)])
+        true = np.array([(one @ [*p, 1.0])[:3] for one, p in zip(want, _places(scene), strict=True)])
+        pulls.append((at - true)[1:] / result.position_sd[1:])
+    assert np.median(errors) < 30.0
+    assert 0.85 < (np.abs(pulls) < 1.96).mean() <= 0.99
+    assert len(result.loops) == 1
+
+
+def _places(scene):
+    return [scan.points.mean(axis=0) for scan in scene.scans]
+
+
+def test_exact_picks_give_exact_poses_and_close_the_loop():
+    T, scene = network(1, 0.0)
+    result = stitch.run(scene, stitch.Params(method="three-point"))
+    np.testing.assert_allclose(result.T_project_scan, np.linalg.inv(T[0]) @ T, atol=1e-6)
+    assert result.closure_mm[0] < 1e-6
+    assert sorted(result.loops[0].split(" > ")[1:]) == ["S1", "S2", "S3", "S4", "S5"]
+
+
+def test_a_scan_in_other_units_is_told():
+    _, scene = network(2, 1.0, scale=0.001)
+    result = stitch.run(scene, stitch.Params(method="three-point"))
+    assert "units mixed up (m and mm)" in result.message
+
+
+def test_picks_are_read_in_the_scans_units(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("A", "B"):
+        np.savetxt(tmp_path / f"{name}.xyz", rng.normal(0.0, 3.0, (300, 3)))
+    (tmp_path / "picks.csv").write_text(
+        "scan_a,scan_b,point,xa,ya,za,xb,yb,zb\nA,B,P1,1,2,3,4,5,6\nB,A,P2,0.1,0,0,0,0,0.2\n"
+    )
+    picks = folder.read_input(tmp_path).picks
+    assert picks.scan_a == ("A", "B")
+    np.testing.assert_allclose(picks.in_a, [[1000, 2000, 3000], [100, 0, 0]])
+    np.testing.assert_allclose(picks.in_b, [[4000, 5000, 6000], [0, 0, 200]])
+    assert folder.read_input(tmp_path, "mm").picks.in_a[0, 0] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("a,b,c\n", "expected columns scan_a,scan_b"),
+        ("HEAD\nA,C,P,1,2,3,4,5,6\n", "line 2: there is no scan 'C'; there are A, B"),
+        ("HEAD\nA,A,P,1,2,3,4,5,6\n", "with itself"),
+        ("HEAD\nA,B,P,1,2,3,4,5\n", "expected 9 cells, found 8"),
+        ("HEAD\nA,B,P,1,2,x,4,5,6\n", "expected six numbers"),
+        ("HEAD\nA,B,P,1,2,nan,4,5,6\n", "expected finite numbers"),
+        ("HEAD\n\n", "holds no points"),
+    ],
+)
+def test_bad_picks_are_named(tmp_path, text, said):
+    for name in ("A", "B"):
+        np.savetxt(tmp_path / f"{name}.xyz", np.random.default_rng(0).normal(0.0, 3.0, (300, 3)))
+    (tmp_path / "picks.csv").write_text(text.replace("HEAD", "scan_a,scan_b,point,xa,ya,za,xb,yb,zb"))
+    with pytest.raises(InputError, match=said):
+        folder.read_input(tmp_path)
+
+
+def test_picks_start_a_pair_that_nothing_else_brings_together():
+    """Automatic on scans whose picks name the pose: it is among those tried, and held against the scans."""
+    from tests.stitch_clouds import four
+
+    T, scans = four(step_mrad=20.0)
+    want = np.linalg.inv(T[0]) @ T[1]
+    in_b = np.array([[1000.0, 0, 0], [0, 2000.0, 0], [0, 0, 1500.0]])
+    in_a = in_b @ want[:3, :3].T + want[:3, 3] + 4.0
+    picks = Picks(("S1",) * 3, ("S2",) * 3, ("P", "Q", "R"), in_a, in_b)
+    scene = dataclasses.replace(Scene("room", "structure", scans[:2]), picks=picks)
+    result = stitch.run(scene, stitch.Params())
+    assert np.linalg.norm(result.T_project_scan[1][:3, 3] - want[:3, 3]) < 0.5
