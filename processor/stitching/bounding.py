@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching import octree
-from processor.stitching.clouds import Cloud
 from processor.stitching.bundle import Solution
+from processor.stitching.clouds import Cloud
 from processor.stitching.joint import Blocks
 
 BEHIND_COS = -0.03  # a face looks away from the scanner
