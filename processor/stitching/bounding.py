@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
@@ -98,7 +99,7 @@ def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> M
     if not found:
         none = np.empty(0, np.int64)
         return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)))
-    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(6)))  # type: ignore[arg-type]
+    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(6)))
 
 
 def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
@@ -130,10 +131,10 @@ def settled(clouds: list[Cloud], blocks: Blocks, faces: Solution, reach_mm: floa
     ``faces`` is an adjustment without ends. Along each of its loose motions all shifts up to ``reach_mm`` are tried:
     the right one has every true end between its two rays, while ends that are matched wrongly agree on nothing.
     """
-    T = faces.T.copy()
+    T: Floats = faces.T.copy()
     k = len(T)
     scale = np.tile([LEVER_MM] * 3 + [1.0] * 3, k)
-    known = np.isfinite(faces.covariance).all(axis=1)
+    known = np.asarray(np.isfinite(faces.covariance).all(axis=1))
     C = np.where(known[:, None] & known[None], faces.covariance, 0.0) * scale[:, None] * scale[None]
     value, vector = np.linalg.eigh(C)
     loose = [m for m in range(6 * k - 1, -1, -1) if value[m] > LOOSE_MM**2][:MOST_LOOSE]
@@ -153,7 +154,7 @@ def settled(clouds: list[Cloud], blocks: Blocks, faces: Solution, reach_mm: floa
         rate = np.einsum(
             "ni,ni->n", ends.normal, _moved(motion, T, ends.scan, at) - _moved(motion, T, first[ends.piece], at)
         )
-        tell = np.abs(rate) > 0.1
+        tell: npt.NDArray[np.bool_] = np.asarray(np.abs(rate) > 0.1)
         if tell.sum() < NEIGHBOURS:
             continue
         off, rate, room = ends.off[tell], rate[tell], 0.5 * ends.width[tell] + SLACK_MM

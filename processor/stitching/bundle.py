@@ -223,7 +223,8 @@ def _shifted(W: Floats, c: Floats) -> Floats:
 
 def _tau(blocks: Blocks, offset: Floats, spread: Floats, before: Floats) -> Floats:
     """Find the standard deviation of offsets, mm, of each kind beyond what single points' noise explains."""
-    found, unit2 = before.copy(), _unit2(blocks)
+    found: Floats = before.copy()
+    unit2 = _unit2(blocks)
     for kind in range(KINDS):
         rows = blocks.kind == kind
         if rows.sum() < 10:

@@ -117,7 +117,7 @@ def flat_pieces(
         _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
         up.append(inverse.ravel())
         total = summed(total, up[-1], len(first))
-        number = np.bincount(up[-1], number, len(first))
+        number = np.bincount(up[-1], number, len(first)).astype(np.float64)
         flat.append(_is_flat(total, number, size_mm * 2**level, limit_mm, least))
         where = where[first] >> 1
         groups = None if groups is None else groups[first]

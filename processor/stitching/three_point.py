@@ -160,5 +160,5 @@ def _equation(one: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
     A[:3, :3], A[:3, 6:9] = -R.T, R.T
     A[3:, 3:6], A[3:, 9:] = -R.T, R.T
     A[3:, :3] = R.T @ frames.cross_matrix(arm)
-    weight: Floats = np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True)
+    weight: Floats = np.asarray(np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True), float)
     return A, r, weight
