@@ -9,6 +9,7 @@ from matplotlib.figure import Figure
 
 from processor.evaluate import ErrorReport
 from processor.model import Scene, StepRun
+from processor.pipeline import Execution
 from processor.report.drawing import COLOURS, Drawn, label, png
 from processor.stitching.result import Result
 
@@ -17,12 +18,12 @@ PLAN_POINTS = 4000  # of each scan
 MOST_NAMED = 40
 
 
-def of_runs(scene: Scene, runs: Sequence[StepRun], _: ErrorReport) -> Drawn:
+def of_runs(execution: Execution, runs: Sequence[StepRun], _: ErrorReport) -> Drawn:
     """Draw the answer of stitching."""
     result: Result = runs[0].result
     found: Drawn = {}
     if len(result.scans) > 1 and np.isfinite(result.position).any():
-        found[PLAN] = _plan(scene, result)
+        found[PLAN] = _plan(execution.scene, result)
         if len(result.pair_a) and np.isfinite(result.overlap).any():
             found[OVERLAP] = _overlap(result)
     return found

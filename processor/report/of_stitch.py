@@ -26,6 +26,6 @@ REPORT = StepReport(
     summary=_summary,
     written=results_stitch.written,
     tables=tables_stitch.of_runs,
-    figures=lambda execution, runs, report: figures_stitch.of_runs(execution.scene, runs, report),
+    figures=figures_stitch.of_runs,
     files=_files,
 )

@@ -174,7 +174,8 @@ def _normal(
     seeming = np.zeros((k, 6, k, 6))
     seeming[:, 3:, :, 3:] = np.einsum("pab,pij->aibj", held, tilt)
     spurious: Floats = seeming.reshape(6 * k, 6 * k)
-    N = N - np.tensordot(AI, A, axes=([0, 2], [0, 2]))
+    # Without the linear algebra's threads: the same sum whatever their number, and no waiting for them.
+    N = N - np.einsum("pia,pja->ij", AI, A, optimize=False)
     g = np.zeros((k, 6))
     np.add.at(g, blocks.scan, gs)
     g = g.ravel() - np.einsum("nij,nj->i", AI, gp)

@@ -18,6 +18,8 @@ from processor.stitching.sight import Sight
 SIDES = 48.0  # a view's coarse cubes: so many along the reach of the points
 LIKE_COS = float(np.cos(np.radians(15.0)))
 FEWEST = 6  # faces
+FINE = 0.3  # of the cubes' side
+CHECKED = 60  # poses of a pair that are held against the rays
 REFINED = 8  # poses of a pair that are refined
 GATES = (0.7, 0.35, 0.2, 0.12)  # of the cubes' side
 STEPS = 4
@@ -48,6 +50,7 @@ class View:
     side_mm: float
     coarse: Elements
     weight: Floats
+    voters: tuple[Elements, Floats]
     fine: Elements
     tree: cKDTree
     modes: tuple[Floats, Floats]
@@ -85,11 +88,11 @@ def side_of(clouds: list[Cloud]) -> float:
 def view(cloud: Cloud, side_mm: float) -> View:
     """Make a cloud ready."""
     coarse = elements(cloud, side_mm)
-    fine = elements(cloud, 0.3 * side_mm)
-    return View(
-        cloud, side_mm, coarse, votes.weights(coarse.normals), fine, cKDTree(fine.points),
-        directions.modes(coarse.normals), cloud.sight,
-    )  # fmt: skip
+    fine = elements(cloud, FINE * side_mm)
+    weight = votes.weights(coarse.normals)
+    voters = votes.voters(coarse, weight) if len(weight) else (coarse, weight)
+    axes = directions.modes(coarse.normals)
+    return View(cloud, side_mm, coarse, weight, voters, fine, cKDTree(fine.points), axes, cloud.sight)
 
 
 def placings(a: View, b: View, most_tilt_rad: float, most: int = 4) -> list[Placing]:
@@ -98,9 +101,10 @@ def placings(a: View, b: View, most_tilt_rad: float, most: int = 4) -> list[Plac
         return []
     tried: list[tuple[float, Floats]] = []
     for R in directions.turns(a.modes, b.modes, most_tilt_rad):
-        for t, score in zip(*votes.shifts(a.coarse, a.weight, b.coarse, b.weight, R, a.side_mm), strict=True):
+        for t, score in zip(*votes.shifts(*a.voters, *b.voters, R, a.side_mm), strict=True):
             tried.append((float(score), rigid.transform(R, t)))
-    checked = [held(a, b, T, 0.7 * a.side_mm, 1.0 * a.side_mm) for _, T in sorted(tried, key=lambda one: -one[0])[:60]]
+    tried = sorted(tried, key=lambda one: -one[0])[:CHECKED]
+    checked = [held(a, b, T, 0.7 * a.side_mm, a.side_mm, few=True) for _, T in tried]
     checked.sort(key=lambda one: -one.score)
     refined = [
         held(a, b, refine(a, b, one.T_a_b)[0], NEAR * a.side_mm, MARGIN * a.side_mm) for one in checked[:REFINED]
@@ -123,19 +127,22 @@ def same(T: Floats, S: Floats, side_mm: float, b: View) -> bool:
     return bool(rigid.rotation_angle(D[:3, :3]) < SAME_RAD and apart < SAME_MM * side_mm)
 
 
-def held(a: View, b: View, T_a_b: Floats, near_mm: float, margin_mm: float) -> Placing:
-    """Count what speaks for and against a pose: faces of each in the other, and faces the other looked through."""
+def held(a: View, b: View, T_a_b: Floats, near_mm: float, margin_mm: float, few: bool = False) -> Placing:
+    """Count what speaks for and against a pose: faces of each in the other, and faces the other looked through.
+
+    ``few`` asks the faces that vote alone.
+    """
     agree, against, total = 0.0, 0.0, 0.0
     for one, other, T in ((a, b, rigid.invert(T_a_b)), (b, a, T_a_b)):
         # faces of `one`, in the frame of `other`
-        points, normals = rigid.apply(T, one.coarse.points), one.coarse.normals @ T[:3, :3].T
+        faces, w = one.voters if few else (one.coarse, one.weight)
+        points, normals = rigid.apply(T, faces.points), faces.normals @ T[:3, :3].T
         distance, index = other.tree.query(points, k=4, distance_upper_bound=0.45 * a.side_mm)
         there = np.isfinite(distance)
         at = np.where(there, index, 0)
         off = np.abs(np.einsum("nki,nki->nk", points[:, None] - other.fine.points[at], other.fine.normals[at]))
         like = np.einsum("ni,nki->nk", normals, other.fine.normals[at]) > LIKE_COS
         found = (there & like & (off < near_mm)).any(axis=1)
-        w = one.weight
         agree += float(w[found].sum())
         total += float(w.sum())
         if other.sight is not None:

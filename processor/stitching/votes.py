@@ -7,11 +7,12 @@ import numpy as np
 from numba import njit
 
 from processor.model import Floats
-from processor.stitching.elements import Elements
+from processor.stitching.elements import Elements, facing
 
 LIKE_COS = float(np.cos(np.radians(10.0)))
 PEAKS = 6  # shifts kept of a turn
 LEAST_OF_BEST = 0.5
+MOST_VOTERS = 350  # faces of a scan that look one way
 SPARE = 20.0  # a direction with few faces votes with less weight
 
 
@@ -44,6 +45,19 @@ def smooth(votes, out):  # type: ignore[no-untyped-def]
                     out[i, j, k] = total
                     most = max(most, total)
     return most
+
+
+def voters(places: Elements, weight: Floats) -> tuple[Elements, Floats]:
+    """Thin faces that look the same way to MOST_VOTERS or so, each with the weight of those it stands for."""
+    group = facing(places.normals)
+    kept, weights = [], []
+    for one in np.unique(group):
+        rows = np.flatnonzero(group == one)
+        step = max(1, len(rows) // MOST_VOTERS)
+        kept.append(rows[::step])
+        weights.append(weight[rows[::step]] * (len(rows) / len(kept[-1])))
+    rows = np.concatenate(kept)
+    return Elements(places.points[rows], places.normals[rows]), np.concatenate(weights)
 
 
 def weights(normals: Floats) -> Floats:

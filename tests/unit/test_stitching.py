@@ -1,12 +1,17 @@
 """Scans stitched by the structure itself, against poses that made them."""
 
 import dataclasses
+import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from processor import folder, pipeline, store
+from processor.evaluate import ErrorReport
 from processor.model import InputError, Scan, Scene, UsageError
+from processor.report import writing
 from processor.steps import stitch
 from tests import stitch_clouds
 from tests.stitch_clouds import four
@@ -187,3 +192,58 @@ def test_intervals_cover_over_seeds():
         pulls.append(shift[1:] / result.position_sd[1:])
     assert (np.abs(pulls) < 1.96).mean() > 0.8
     assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5
+
+
+def test_a_run_is_reported_whole(room, tmp_path):
+    """Scene file to OUT: results.json as agreed, poses that read back exactly, both figures, every table."""
+    _, scans, result = room
+    path = tmp_path / "room.h5"
+    store.write_scene(path, Scene("room", "structure", scans, units="mm", units_reason="made so"), None, {})
+    scene = pipeline.read(path, None)
+    execution = pipeline.execute(path, scene, pipeline.plan(("stitch",), (), {}, None))
+    writing.write(tmp_path / "out", execution, ErrorReport())
+    found = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
+    assert found["reference"] == "S1"
+    assert [one["status"] for one in found["scans"]] == ["ok"] * 4
+    assert set(found["pairs"][0]) >= {"a", "b", "overlap", "residual", "used"}
+    assert set(found["closures"][0]) >= {"loop", "mm", "mrad"}
+    assert np.array(found["scans"][1]["covariance"]).shape == (6, 6)
+    rows = (tmp_path / "out" / "stitch.csv").read_text().splitlines()
+    poses = np.array([[float(x) for x in row.split(",")[2:]] for row in rows[1:]]).reshape(-1, 4, 4)
+    np.testing.assert_array_equal(poses, execution.runs[0].result.T_project_scan)
+    np.testing.assert_allclose(poses, result.T_project_scan, atol=1e-3)  # a scene file rounds to 0.01 mm
+    names = {one.name for one in (tmp_path / "out").rglob("*")}
+    assert names >= {
+        "stitch-scans.csv",
+        "stitch-pairs.csv",
+        "stitch-loops.csv",
+        "stitch-plan.png",
+        "stitch-overlap.png",
+    }
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "T_PRCS_SOCS(S2)" in page
+    assert "GLCS" in page
+
+
+ROOMS = Path(__file__).resolve().parents[2] / "../shared/data/pcd"
+
+
+@pytest.mark.skipif(not ROOMS.is_dir(), reason="the real room scans are not there")
+def test_two_real_scans_of_a_room_come_together():
+    """By another library: point-to-plane ICP of Open3D, started at the answer, stays there."""
+    scans = tuple(folder.read_input(ROOMS / f"room_scan{i}.pcd").scans[0] for i in (1, 2))
+    result = stitch.run(Scene("rooms", "structure", scans), stitch.Params())
+    assert result.scan_status[1] == "ok"
+    T = result.T_project_scan[1].copy()
+    # The robot's own odometry, published with the data, says 0.69 rad about the vertical.
+    assert np.arctan2(T[1, 0], T[0, 0]) == pytest.approx(0.69, abs=0.05)
+    o3d = pytest.importorskip("open3d")
+    clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(1e-3 * (scan.points + scan.origin))) for scan in scans]
+    clouds[0].estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.15, 30))
+    T[:3, 3] *= 1e-3
+    method = o3d.pipelines.registration.TransformationEstimationPointToPlane()
+    found = o3d.pipelines.registration.registration_icp(clouds[1], clouds[0], 0.1, T, method)
+    D = found.transformation @ np.linalg.inv(T)
+    assert found.fitness > 0.5
+    assert np.linalg.norm(D[:3, 3]) < 0.03  # spacing of the points: 0.04 m
+    assert Rotation.from_matrix(D[:3, :3].copy()).magnitude() < 0.015
