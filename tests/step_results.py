@@ -67,7 +67,7 @@ def stitching(names=("S1", "S2", "S3", "S4", "S5", "S6", "S7")):
 ALL = len(CLASSES)
 
 
-def defects(count=ALL, message="1.2 m2 examined of 2.4 m2 of the design's surface", seed=1):
+def defects(count=ALL, message="1.2 m2 examined of 2.4 m2 of the design's surface", seed=1, places=288):
     """Defects of every class, a picture of two and the curve of one."""
     rng = np.random.default_rng(seed)
     side, shown = 5, min(count, 2)
@@ -90,6 +90,8 @@ def defects(count=ALL, message="1.2 m2 examined of 2.4 m2 of the design's surfac
         np.zeros(4, np.int64), np.linspace(-200.0, 200.0, 4), one[:1].repeat(4), 0.1 * one[:1].repeat(4),
         np.arange(shown), np.full((shown, 2), side), np.full((shown, 2), -30.0), np.full(shown, 12.0),
         rng.normal(size=shown * side**2).astype(np.float32), (np.arange(shown * side**2) % 3 == 0).astype(np.int32),
+        np.column_stack([rng.uniform(0.0, 1150.0, places), np.zeros(places), rng.uniform(0.0, 550.0, places)]),
+        np.sin(np.arange(places)).astype(np.float32), np.where(np.arange(places) % 4, -1, np.arange(places) % count),
     )  # fmt: skip
 
 

@@ -110,6 +110,7 @@ def result_of(found: Found, params: Params, name: str) -> Result:
             [(row.columns["centres"], row.cells, row.field, row.component) for row in rows],
             surface, params.pictures,
         ),
+        **pictures.of_surface([row.cells for row in rows], field, surface),
     )  # fmt: skip
 
 

@@ -33,7 +33,14 @@ PLACES = {
     "{;}": "(.+?)",
     "{#}": r"([-+−]?\d(?:[\d.,]*\d)?(?:e[-+]?\d+)?%?|–|[-+]?(?:nan|inf)%?)",
 }
-SAID_IN_FIGURES = ("title", "arrows", "values", "verdict", "text")  # what live figures show that is no name from a file
+SAID_IN_FIGURES = (
+    "title",
+    "arrows",
+    "values",
+    "verdict",
+    "text",
+    "regions",
+)  # what live figures show that is no name from a file
 
 
 class Language:
@@ -88,13 +95,19 @@ class Language:
         return {key: text for key, text in self.words.items() if f'"{key}"' in scripts}
 
     def in_figures(self, data: Any) -> Any:
-        """Translate what live figures show: the texts under the keys SAID_IN_FIGURES, at any depth."""
+        """Translate what live figures show: texts, or lists of them, under the keys SAID_IN_FIGURES, at any depth."""
         if isinstance(data, dict):
             return {
-                key: self.say(value) if key in SAID_IN_FIGURES and isinstance(value, str) else self.in_figures(value)
+                key: self._shown(value) if key in SAID_IN_FIGURES else self.in_figures(value)
                 for key, value in data.items()
             }
         return [self.in_figures(one) for one in data] if isinstance(data, list) and self.words else data
+
+    def _shown(self, value: Any) -> Any:
+        if isinstance(value, str):
+            return self.say(value)
+        whole = isinstance(value, list) and all(isinstance(one, str) for one in value)
+        return [self.say(one) for one in value] if whole else self.in_figures(value)
 
 
 def catalogue(code: str) -> dict[str, dict[str, dict[str, str]]]:
