@@ -156,7 +156,8 @@ function spaceView(host, data) {
   function paintPoints(at, pixels) {
     const near = state.joint < 0 ? Infinity : 1.2 * camera.reach, [tx, ty, tz] = camera.target;
     const depth = new Float32Array(width * height).fill(-Infinity);
-    const size = Math.max(2, Math.round(2 * ratio * Math.min(Math.max(camera.zoom, 1), 2)));
+    const least = Math.max(2, Math.round(2 * ratio * Math.min(Math.max(camera.zoom, 1), 2)));
+    const size = Math.max(least, Math.min(Math.ceil(at.scale * (data.spacing || 0)), 32 * ratio)); // near to, points close up
     let first = 0;
     for (const part of parts) {
       const { points, residual } = part;
@@ -166,7 +167,7 @@ function spaceView(host, data) {
         const [x, y, z] = at(a, b, c);
         const share = Math.min(Math.max(residual[i] / state.limit, -1), 1);
         const colour = packed[Math.round(50 + 50 * share)];
-        const left = Math.round(x), top = Math.round(y);
+        const left = Math.round(x - size / 2), top = Math.round(y - size / 2);
         if (left < 0 || top < 0 || left + size >= width || top + size >= height) continue;
         for (let v = top; v < top + size; v++) for (let u = left; u < left + size; u++) {
           const cell = v * width + u;

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from processor.model import Floats, Ints
 from processor.report.drawing import DIVERGING_STOPS, LEAST_SHOWN_MM
 from processor.report.results_json import plain
 
 MOST_POINTS = 60_000  # about 1.4 MB of the page
+LEAST_POINTS, SAMPLE = 20, 2_000  # to tell the spacing from
 TONES = ("#0072B2", "#000000")
 MOST_REGIONS, MOST_TICKS = 400, 40  # outlines drawn, and those of them with a tick of their own
 
@@ -83,6 +85,7 @@ def of_points(
         "stops": DIVERGING_STOPS,
         "tones": TONES,
         "limit": max(float(np.quantile(np.abs(values[known]), 0.98)), LEAST_SHOWN_MM),
+        "spacing": _spacing(points[known][::step]),
         "parts": drawn + lines,
         "marks": shown + spots,
         "regions": [f"{region.name}: {region.brief}" for region in regions] if region_of is not None else [],
@@ -90,6 +93,15 @@ def of_points(
     }
     made: dict[str, Any] = plain(found)
     return made
+
+
+def _spacing(points: Floats) -> float:
+    """Return how far points (n, 3) are apart, by the median of the distances to the nearest ones."""
+    if len(points) < LEAST_POINTS:
+        return 0.0
+    middle = points - points.mean(axis=0)
+    some = middle[:: max(1, len(points) // SAMPLE)]
+    return round(float(np.median(cKDTree(middle).query(some, k=2)[0][:, 1])), 2)
 
 
 def _outlined(

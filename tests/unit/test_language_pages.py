@@ -341,15 +341,20 @@ def test_the_line_of_a_night_in_chinese(told):
     assert latin([said.replace("ray", "").replace("c0ffeec0", "")]) == []
 
 
-def test_pages_of_nights_in_chinese(tmp_path):
+def two_nights(out, lang):
     stored = {figure["name"] for case in nights.Simulated(1).cases for figure in case["figures"]}
     figures_of = {name: (0.5, 0.2 if "bias" in name else None, "mm") for name in stored}
     figures_of |= dict.fromkeys((*STITCH_CHECKS[:-1], *DEFECT_CHECKS), (1.0, None, "mm"))
     rays = '[scan]\nmode = "rays"\nscanner = "phase"\nstep_mrad = 1.5\n'
     cases = (nights.case(), nights.case("scan", text=rays), nights.case(steps=("defects",), methods=("default",)))
+    asked = nights.matrix(*cases)
     for day in ("2026-11-20", "2026-11-21"):
-        night.run(nights.matrix(*cases), tmp_path, day, nights.runner(lambda cell: dict(figures_of)),
-                  made_by=nights.SOFTWARE, lang="zh")  # fmt: skip
+        runner = nights.runner(lambda cell: dict(figures_of))
+        night.run(asked, out, day, runner, made_by=nights.SOFTWARE, lang=lang)
+
+
+def test_pages_of_nights_in_chinese(tmp_path):
+    two_nights(tmp_path, "zh")
     more = {"ray", "phase", "mrad", "steel", "numpy", "ISO", "Holm", "sqrt", "cal", "Cramer", "Rao",
             "c0ffee", "check", "rms"}  # fmt: skip
     for name in ("nights.html", "certificate.html"):
