@@ -280,7 +280,7 @@ def test_the_index_of_a_batch_in_chinese(tmp_path):
 def test_errors_of_inputs_are_marked_as_english(tmp_path):
     error = "scan.ply: expected 1000 points, found 50; export it again"
     text = indexed(tmp_path, "zh", (error, *REASONS))
-    assert f'<span lang="en">{error}</span>' in text
+    assert f'lang="en">{error}</td>' in text
     assert "错误信息与命令行一致" in text
     assert text.count('lang="en"') == 1
     assert "错误信息与命令行一致" not in indexed(tmp_path, "zh")
