@@ -271,7 +271,7 @@ def gather(
 
         def keep(first: int, last: int, pieces=pieces, into=into) -> None:  # type: ignore[no-untyped-def]
             for entries in pieces:
-                insert(*entries, *into, first, last)
+                insert(*entries, *into, first, last)  # type: ignore[call-arg]
 
         over_ranges(keep, count, threads, least=max(count // (threads or usable()), 1))
     most_station = int(stations.max(initial=-1)) if count else -1
