@@ -89,14 +89,22 @@ def parse(
             return FULL, rows, at, odds, 0
         if odds + columns > len(odd):
             return ODD, rows, at, odds, 0
+        if text[at] == 10:  # a blank line, or the second byte of an end
+            at += 1
+            continue
         begin = at
         column, done = 0, False
         while not done:
+            if column == columns:  # nothing is asked of the rest of the line
+                while at < size and text[at] != 10 and text[at] != 13:
+                    at += 1
+                at += 1
+                break
             while at < size and (text[at] == 32 or (text[at] == 9 and separator != 9)):
                 at += 1
             first = at
             # Digits first: most tokens are plain numbers.
-            slot = slots[column] if column < columns else -1
+            slot = slots[column]
             plain, digits, count, power = slot >= 0, np.uint64(0), 0, 0
             negative = False
             if plain:
@@ -138,12 +146,12 @@ def parse(
                     power += sign * exponent
             if plain and at < size and count <= 19 and -REACH <= power <= REACH:
                 c = text[at]
-                if c == 10 or (c == separator if separator != 0 else c == 32):  # nearly always
+                if c == 10 or c == 13 or (c == separator if separator != 0 else c == 32):  # nearly always
                     value = _times_power(digits, power)
                     out[rows, slot] = -value if negative else value
                     column += 1
                     at += 1
-                    done = c == 10
+                    done = c == 10 or c == 13
                     continue
             # What follows ends the token, or makes it one that is no plain number.
             while at < size:
