@@ -13,11 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.linalg import cho_factor, cho_solve
+from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
 from processor.model import Floats
 
-SIZES_MM = (0.0, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
+SIZES_MM = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0)
 LEAST_SHARE = 1e-4  # of a hypothesis, to be counted
 
 
@@ -53,3 +53,16 @@ def weigh(
             mean += weight * own
             second += weight * (prior - prior[:, at] @ cho_solve(factor, prior[at]) + np.outer(own, own))
     return Believed(mean, second - np.outer(mean, mean))
+
+
+def no_surer(believed: Believed, least: Floats) -> Believed:
+    """Raise the covariance (k, k) of what is believed to one that is ``least`` in every direction.
+
+    The average over sizes is right for parts whose departures are of every size alike. Where all are as large as the
+    noise, it draws them towards nothing more often than it owns up to.
+    """
+    root = np.linalg.cholesky(least)
+    inner = solve_triangular(root, solve_triangular(root, believed.covariance, lower=True).T, lower=True)
+    value, vector = np.linalg.eigh(0.5 * (inner + inner.T))
+    own = root @ vector
+    return Believed(believed.mean, (own * np.maximum(value, 1.0)) @ own.T)

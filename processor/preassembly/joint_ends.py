@@ -18,16 +18,17 @@ from processor.geometry.mesh_surface import MeshSurface
 from processor.model import Floats, Ints
 from processor.preassembly import between, end_faces, end_ring, form, layers
 from processor.preassembly.end_faces import FACE, FLOOR_MM, LEAST_POINTS, REACH_MM, ZONE_MM
-from processor.preassembly.evidence import SIZES_MM, Believed, weigh
+from processor.preassembly.evidence import SIZES_MM, Believed, no_surer, weigh
 from processor.preassembly.outer_faces import FACES
 
 # Weights of bends of each size beforehand: ends are cut by a plane.
-STRAIGHT = (1.0, 1.0, 0.3, *(0.03,) * (len(SIZES_MM) - 3))
+STRAIGHT = (1.0, *(0.1,) * (len(SIZES_MM) - 1))
 RING = 8  # numbers of the ring
 TURNS = 4
 # Of a movement: shapes are held against the design where they are, not where they came from. A corner 20 mm off, on
-# faces tilted by as much over their width, is 0.5 mm off in ways of which the numbers follow most, but not all.
-SECOND_ORDER = 0.005
+# faces tilted by as much over their width, is 0.5 mm off in ways of which the numbers follow most, but not all: the
+# rest is within 0.005 of the movement, anywhere within.
+SECOND_ORDER = 0.005 / np.sqrt(3.0)
 COUNT = len(FACES) * FACE + RING
 
 
@@ -201,7 +202,10 @@ def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
     ]
     for rows, sizes in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
         noise = covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
-        found = weigh(number[rows], noise, [(before, by_pose[rows, rows] + np.diag(size**2)) for before, size in sizes])
+        every = [(before, by_pose[rows, rows] + np.diag(size**2)) for before, size in sizes]
+        # That ends are cut by planes is known beforehand; where these lie, no better than the points say.
+        loose = [one for one, (_, size) in zip(every, sizes, strict=True) if size[0] == size[1] == SIZES_MM[-1]]
+        found = no_surer(weigh(number[rows], noise, every), weigh(number[rows], noise, loose).covariance)
         mean[rows], spread[rows, rows] = found.mean, found.covariance
     return Believed(mean, spread)
 
