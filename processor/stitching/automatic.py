@@ -76,7 +76,7 @@ def _usable() -> int:
 def _candidates(views: list[View], key: tuple[int, int], tilt: float, picked: picks.Picked) -> list[Placing]:
     a, b = views[key[0]], views[key[1]]
     found = coarse.placings(a, b, tilt)
-    if key in picked and len(a.fine.points) and len(b.fine.points):
+    if key in picked and len(a.coarse.points) and len(b.coarse.points):
         in_a, in_b, _ = picked[key]
         try:
             T = three_point.tie(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
-from processor.stitching import octree
+from processor.stitching import grouping, octree
 from processor.stitching.bundle import Solution
 from processor.stitching.clouds import Cloud
 from processor.stitching.joint import Blocks
@@ -55,7 +55,7 @@ def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> M
     where the two rays leave room.
     """
     world = octree.moved(blocks.sums, T[blocks.scan])
-    planes = octree.planes_of(octree.summed(world, blocks.piece, blocks.pieces))
+    planes = octree.planes_of(grouping.summed(world, blocks.piece, blocks.pieces))
     # A piece looks at the scanners that saw it; all of a piece see the same side.
     first = np.unique(blocks.piece, return_index=True)[1]
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
@@ -112,7 +112,7 @@ def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> B
     weight = 1.0 / (ends.width**2 / 12.0 + LEAST_MM**2)
     key, inverse = np.unique(ends.piece * len(T) + ends.scan, return_inverse=True)
     inverse = inverse.ravel()
-    sums = octree.summed(octree.sums_of(ends.points) * weight[:, None], inverse, len(key))
+    sums = grouping.summed(octree.sums_of(ends.points) * weight[:, None], inverse, len(key))
     piece = np.concatenate([blocks.piece, key // len(T)])
     order = np.argsort(piece, kind="stable")
     return Blocks(

@@ -13,7 +13,7 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
-from processor.stitching import octree
+from processor.stitching import grouping, octree
 from processor.stitching.joint import Blocks
 
 HUBER = 2.5
@@ -127,7 +127,7 @@ def _normal(
     k = len(T)
     world = T[blocks.scan]
     W = world @ octree.square(blocks.sums) @ world.transpose(0, 2, 1)
-    total = octree.summed(octree.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
+    total = grouping.summed(octree.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
     planes = octree.planes_of(total)
     n, c = planes.normal[blocks.piece], planes.mean[blocks.piece]
     W = _shifted(W, c)
@@ -152,9 +152,9 @@ def _normal(
     LsW, Wr = Ls @ W, np.einsum("bij,bj->bi", W, rho)
     Hss = LsW @ Ls.transpose(0, 2, 1)
     Hsp = LsW @ Lp.transpose(0, 2, 1)
-    Hpp = octree.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(-1, 3, 3)
+    Hpp = grouping.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(-1, 3, 3)
     gs = np.einsum("bij,bj->bi", Ls, Wr)
-    gp = octree.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
+    gp = grouping.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
     scale = np.einsum("nii->ni", Hpp)
     Hpp = Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3)
     inverse = np.linalg.inv(Hpp)

@@ -42,34 +42,42 @@ def ends_of(points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes
     if not len(row) or not len(planes.count):
         return Ends()
     grid = grid_of(row, column)
-    R = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
-    ray = points / R[:, None]
-    r, c = np.nonzero(grid >= 0)
-    here = grid[r, c]
-    turn = grid.shape[1]
+    on_face = np.where(grid >= 0, piece[grid], -1)
     found = []
     for up, left in WAYS:
-        inside = (r + up >= 0) & (r + up < grid.shape[0]) & (r - up >= 0) & (r - up < grid.shape[0])
-        i = here[inside]
-        k = grid[r[inside] - up, (c[inside] - left) % turn]
-        j = grid[r[inside] + up, (c[inside] + left) % turn]
-        i, k, j = i[k >= 0], k[k >= 0], j[k >= 0]
-        face = np.where(piece[i] >= 0, piece[i], piece[k])
-        # Most neighbours lie on the same face: they are not ends.
-        keep = (face >= 0) & ((j < 0) | (piece[j] != face))
-        i, k, j, face = i[keep], k[keep], j[keep], face[keep]
+        i, k, j, face = _leaving(grid, on_face, up, left)
+        ray_i, ray_k, ray_j = (_rays(points[one]) for one in (i, k, j))
         n, at = planes.normal[face], planes.mean[face]
         d = np.einsum("ni,ni->n", n, at)
-        following = 2.0 * ray[i] - ray[k]
+        following = 2.0 * ray_i - ray_k
         following /= np.linalg.norm(following, axis=1)[:, None]
-        following = np.where((j >= 0)[:, None], ray[j], following)
-        own, other = np.einsum("ni,ni->n", n, ray[i]), np.einsum("ni,ni->n", n, following)
+        following = np.where((j >= 0)[:, None], ray_j, following)
+        own, other = np.einsum("ni,ni->n", n, ray_i), np.einsum("ni,ni->n", n, following)
         with np.errstate(divide="ignore", invalid="ignore"):
             near, far = d / own, d / other
         on = np.abs(np.einsum("ni,ni->n", n, points[i]) - d) < ON_SIGMAS * sigma_mm
-        a, b = ray[i] * near[:, None], following * far[:, None]
+        a, b = ray_i * near[:, None], following * far[:, None]
         width = np.linalg.norm(b - a, axis=1)
-        behind = (j < 0) | (R[j] - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
-        good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * R[i])
+        behind = (j < 0) | (np.linalg.norm(points[j], axis=1) - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
+        good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * np.linalg.norm(points[i], axis=1))
         found.append((0.5 * (a + b)[good], (b - a)[good], n[good]))
     return Ends(*(np.vstack([one[m] for one in found]) for m in range(3)))
+
+
+def _leaving(grid: Ints, on_face: Ints, up: int, left: int) -> tuple[Ints, Ints, Ints, Ints]:
+    """Return points i (m,) of a face that the next one j leaves, those before them k, and the face; j may be -1.
+
+    Rows end, columns go round. Most neighbours lie on the same face: they are not ends.
+    """
+    before, after = (np.roll(grid, (way * up, way * left), (0, 1)) for way in (1, -1))
+    face = np.where(on_face >= 0, on_face, np.roll(on_face, (up, left), (0, 1)))
+    next_face = np.roll(on_face, (-up, -left), (0, 1))
+    keep = (grid >= 0) & (before >= 0) & (face >= 0) & ((after < 0) | (next_face != face))
+    if up:
+        keep[[0, -1]] = False
+    return grid[keep], before[keep], after[keep], face[keep]
+
+
+def _rays(points: Floats) -> Floats:
+    found: Floats = points / np.maximum(np.linalg.norm(points, axis=1), 1e-9)[:, None]
+    return found

@@ -9,7 +9,7 @@ import numpy as np
 from processor.geometry import rigid
 from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
-from processor.stitching import directions, octree
+from processor.stitching import directions, grouping, octree
 from processor.stitching.clouds import LIMIT_SIGMAS, Cloud
 from processor.stitching.elements import facing
 
@@ -119,7 +119,7 @@ def pieces(cells: Gathered, T: Floats, gate_mm: float) -> Blocks:
     keep = piece >= 0
     # A cell's own plane must be the piece's: across a wide gate, cubes may hold two faces.
     there = np.flatnonzero(keep)
-    planes = octree.planes_of(octree.summed(sums[there], piece[there], int(piece.max(initial=-1)) + 1))
+    planes = octree.planes_of(grouping.summed(sums[there], piece[there], int(piece.max(initial=-1)) + 1))
     n = planes.normal[piece[there]]
     off = np.einsum("ni,ni->n", mean[there] - origin - planes.mean[piece[there]], n)
     same = (np.abs(np.einsum("ni,ni->n", n, normal[there])) > SAME_COS) & (np.abs(off) < 2.0 * limit)
@@ -127,7 +127,7 @@ def pieces(cells: Gathered, T: Floats, gate_mm: float) -> Blocks:
     rows, scan, piece = rows[keep], scan[keep], piece[keep]
     key = piece * 4096 + scan
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-    weighted = octree.summed(cells.sums[rows] / cells.variance[rows][:, None], inverse.ravel(), len(first))
+    weighted = grouping.summed(cells.sums[rows] / cells.variance[rows][:, None], inverse.ravel(), len(first))
     count: Floats = np.bincount(inverse.ravel(), cells.sums[rows, 9], len(first)).astype(np.float64)
     enough = count >= LEAST_POINTS
     _, piece = np.unique(piece[first][enough], return_inverse=True)

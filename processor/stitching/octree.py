@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.model import Floats, Ints
+from processor.stitching.grouping import numbered, summed
 
 BITS = 19
 OFFSET = 1 << (BITS - 1)
@@ -33,11 +34,6 @@ def packed(cells: Ints, group: Ints | None = None) -> Ints:
     c = cells + OFFSET
     key: Ints = (c[:, 0] << (2 * BITS)) | (c[:, 1] << BITS) | c[:, 2]
     return key if group is None else key | (group << (3 * BITS))
-
-
-def summed(values: Floats, inverse: Ints, count: int) -> Floats:
-    """Sum rows of values (n, k) by group: (count, k)."""
-    return np.stack([np.bincount(inverse, column, count) for column in values.T], axis=1)
 
 
 def sums_of(points: Floats) -> Floats:
@@ -115,8 +111,8 @@ def flat_pieces(
     number: Floats = np.asarray(n, np.float64)
     for level in range(levels):
         key = packed(where, groups)
-        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-        up.append(inverse.ravel())
+        first, inverse = numbered(key)
+        up.append(inverse)
         total = summed(total, up[-1], len(first))
         number = np.asarray(np.bincount(up[-1], number, len(first)), np.float64)
         flat.append(_is_flat(total, number, size_mm * 2**level, limit_mm, least))
