@@ -14,6 +14,7 @@ import numpy as np
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching import grouping, octree
+from processor.stitching.elimination import eliminate
 from processor.stitching.joint import Blocks
 
 HUBER = 2.5
@@ -158,27 +159,15 @@ def _normal(
     scale = np.einsum("nii->ni", Hpp)
     Hpp = Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3)
     inverse = np.linalg.inv(Hpp)
-    by_scan = np.zeros((blocks.pieces, k, 6, 3))
-    np.add.at(by_scan, (blocks.piece, blocks.scan), Hsp)
-    A = by_scan.reshape(blocks.pieces, 6 * k, 3)
     own = np.zeros((k, k, 6, 6))
     np.add.at(own, (blocks.scan, blocks.scan), Hss)
-    N: Floats = own.transpose(0, 2, 1, 3).reshape(6 * k, 6 * k)
-    AI = A @ inverse
-    axis = planes.normal
-    along = np.zeros((blocks.pieces, k))
-    np.add.at(along, (blocks.piece, blocks.scan), np.einsum("bi,bij,bj->b", n, Hss[:, 3:, 3:], n))
-    pull = np.einsum("pi,pkij->pkj", axis, by_scan[:, :, 3:])
-    held = along[:, :, None] * np.eye(k) - pull @ inverse @ pull.transpose(0, 2, 1)
+    N: Floats = np.ascontiguousarray(own.transpose(0, 2, 1, 3)).reshape(6 * k, 6 * k)
+    gradient = np.zeros((k, 6))
+    np.add.at(gradient, blocks.scan, gs)
+    g, spurious = gradient.ravel(), np.zeros((6 * k, 6 * k))
+    along = np.einsum("bi,bij,bj->b", n, Hss[:, 3:, 3:], n)
     tilt = planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1)
-    seeming = np.zeros((k, 6, k, 6))
-    seeming[:, 3:, :, 3:] = np.einsum("pab,pij->aibj", held, tilt)
-    spurious: Floats = seeming.reshape(6 * k, 6 * k)
-    # Without the linear algebra's threads: the same sum whatever their number, and no waiting for them.
-    N = N - np.einsum("pia,pja->ij", AI, A, optimize=False)
-    g = np.zeros((k, 6))
-    np.add.at(g, blocks.scan, gs)
-    g = g.ravel() - np.einsum("nij,nj->i", AI, gp)
+    eliminate(blocks.piece, blocks.scan, Hsp, inverse, gp, planes.normal, tilt, along, N, g, spurious)
     N += np.diag(np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k))
     # Misfits: a block's mean distance from the plane, and how sure that is beside the plane's own uncertainty.
     mean = e[:, :3] / mass[:, None]

@@ -21,6 +21,7 @@ FINE = 0.3  # of the cubes' side
 CHECKED = 60  # poses of a pair that are held against the rays
 REFINED = 8  # poses of a pair that are refined
 GATES = (0.7, 0.35, 0.2, 0.12)  # of the cubes' side
+FEW_ABOVE = 0.3  # of the cubes' side: wider gates ask the faces that vote alone
 STEPS = 4
 NEAR, MARGIN = 0.15, 0.4  # of the cubes' side: faces closer than that are the same; seen this far beyond is through
 FOUND = 0.45  # of the cubes' side: as far as faces are asked for what is near
@@ -171,9 +172,10 @@ def refine(a: View, b: View, T: Floats, gates: tuple[float, ...] = GATES) -> tup
     """
     loose = None
     for gate in gates:
+        faces, weight = b.voters if gate > FEW_ABOVE else (b.coarse, b.weight)
         for _ in range(STEPS):
             H, g, centre, reach, count = near.equations(
-                a.small, a.large, T, b.coarse.points, b.coarse.normals, b.weight,
+                a.small, a.large, T, faces.points, faces.normals, weight,
                 (gate + BEYOND) * a.side_mm, gate * a.side_mm, LIKE_COS,
             )  # fmt: skip
             if count < FEWEST:

@@ -207,6 +207,9 @@ def equations(small, large, T, points, normals, weight, bound, gate, like):  # t
         J[3], J[4], J[5] = u, v, w
         for i in range(6):
             g[i] += kept[k, 7] * J[i] * kept[k, 6]
-            for j in range(6):
+            for j in range(i + 1):
                 H[i, j] += kept[k, 7] * J[i] * J[j]
+    for i in range(6):
+        for j in range(i):
+            H[j, i] = H[i, j]
     return H, g, centre, reach, count
