@@ -8,9 +8,10 @@ import numpy as np
 
 from processor.model import Floats, Ints, Scan
 from processor.stitching import grouping, octree
+from processor.stitching import rays as grid_rays
 from processor.stitching.ends import Ends, ends_of
 from processor.stitching.octree import Planes
-from processor.stitching.sight import Sight, unanswered
+from processor.stitching.sight import Sight
 
 POINTS_A_CELL = 5.0
 LEVELS = 6
@@ -90,15 +91,17 @@ def prepared(scan: Scan, cell_mm: float = 0.0) -> Cloud:
     else:
         turn = np.ones(len(planes.normal))
     planes = Planes(planes.count, planes.mean, planes.normal * turn[:, None], planes.variance, planes.axes)
-    ends, rays = Ends(), np.empty((0, 3))
+    ends, lost = Ends(), np.empty((0, 3))
     if known and len(scan.grid_row):
         row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
-        ends = ends_of(points, row, column, piece[of_point], planes, sigma)
-        rays = unanswered(points, row, column)
+        rays = grid_rays.fitted(points, row, column)
+        if rays is not None:
+            ends = ends_of(points, row, column, piece[of_point], planes, sigma, rays)
+            lost = grid_rays.unanswered(rays, row, column)
     return Cloud(
         scan.name, origin, known, size, sigma, kept, octree.planes_of(kept), of, level, planes,
         planes.normal[of], ends,
-        Sight.of(points, rays) if known else None,
+        Sight.of(points, lost) if known else None,
     )  # fmt: skip
 
 
