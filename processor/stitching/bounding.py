@@ -39,7 +39,7 @@ class Matches:
     """Ends (n, 3) of scans (n,), in their clouds' frames, on pieces (n,) that bound them.
 
     ``off`` (n,) is how far beyond the piece each lies, ``width`` (n,) the room between its two rays, both across the
-    piece; ``normal`` (n, 3) the piece's; ``gap`` and ``along`` (n,) as of :class:`Ends`.
+    piece; ``normal`` (n, 3) the piece's; ``gap`` (n,) as of :class:`Ends`.
     """
 
     piece: Ints
@@ -49,7 +49,6 @@ class Matches:
     width: Floats
     normal: Floats
     gap: Ints
-    along: Ints
 
 
 def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear: bool = False) -> Matches:
@@ -67,7 +66,7 @@ def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clea
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
     normal = planes.normal * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     half = REACH * np.sqrt(planes.variance[:, 1:]) + 2.0 * clouds[0].cell_mm
-    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, Ints, Ints]] = []
+    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, Ints]] = []
     for s, cloud in enumerate(clouds):
         if not len(cloud.ends.points) or not np.isfinite(T[s]).all():
             continue
@@ -104,12 +103,12 @@ def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clea
         piece = q[rows, best[rows]]
         found.append(
             (piece, np.full(len(rows), s), cloud.ends.points[rows], off[rows, best[rows]], width[rows, best[rows]],
-             normal[piece], cloud.ends.gap[rows], cloud.ends.along[rows])
+             normal[piece], cloud.ends.gap[rows])
         )  # fmt: skip
     if not found:
         none = np.empty(0, np.int64)
-        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)), none, none)
-    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(8)))
+        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)), none)
+    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(7)))
 
 
 def variance(ends: Matches) -> Floats:
@@ -122,9 +121,7 @@ def variance(ends: Matches) -> Floats:
     share = ends.off / np.maximum(ends.width, 1e-9)
     order = np.lexsort([share, ends.gap, ends.scan])
     same = (
-        (np.diff(ends.scan[order]) == 0)
-        & (np.diff(ends.gap[order]) == 0)
-        & (np.abs(np.diff(share[order])) < RUN_JUMP)
+        (np.diff(ends.scan[order]) == 0) & (np.diff(ends.gap[order]) == 0) & (np.abs(np.diff(share[order])) < RUN_JUMP)
     )
     run = np.empty(len(order), np.int64)
     run[order] = np.cumsum(np.concatenate([[0], ~same]))

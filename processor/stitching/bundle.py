@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
@@ -22,6 +23,7 @@ DROPPED = 6.0  # standard deviations of a scan's misfit on a piece
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # keep what nothing tells where it is
 MEDIAN = 0.6745  # of |z|, z normal
 KINDS = 2
+EVEN, WIDE_SIGMAS = 3, 0.3  # adjustments at first with pieces of much the same weight, by the noise of a point
 LEAST_REAL = 0.01  # share of a direction's strength that is taken as real
 
 
@@ -48,7 +50,7 @@ def solve(
     T: Floats,
     reference: int,
     *,
-    iterations: int = 8,
+    iterations: int = 10,
     robust: bool = True,
     tau: tuple[float, ...] | None = None,
     tolerance_mm: float = 1e-4,
@@ -65,17 +67,21 @@ def solve(
         none = np.empty(0)
         return Solution(T, covariance, none, none, tuple(common.tolist()), none, 0.0, 0.0)
     weight = np.ones(len(blocks.piece))
+    wide = _wide(blocks) if robust and tau is None else np.zeros(KINDS)
     for iteration in range(iterations):
-        N, _, g, z, offset, spread = _normal(blocks, T, common, weight)
+        loose = wide if iteration < EVEN else np.zeros(KINDS)
+        N, _, g, z, offset, spread = _normal(blocks, T, np.maximum(common, loose), weight)
         common = _tau(blocks, offset, spread, common) if iteration and tau is None else common
+        if iteration == EVEN and wide.any():
+            weight = _robust(blocks, _forgiving(z, offset, slack_mm))
+            continue
         free = _free(blocks, T, reference)
         step = np.zeros(len(g))
         step[free] = -np.linalg.solve(N[np.ix_(free, free)], g[free])
         T = _stepped(T, step.reshape(-1, 6))
         if robust:
-            # A misfit that the poses have not yet been given the chance to take up is none.
-            weight = _robust(blocks, offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm))
-        if iteration > 2 and np.abs(step.reshape(-1, 6)[:, 3:]).max(initial=0.0) < tolerance_mm:
+            weight = _robust(blocks, _forgiving(z, offset, slack_mm))
+        if iteration > EVEN and np.abs(step.reshape(-1, 6)[:, 3:]).max(initial=0.0) < tolerance_mm:
             break
     N, spurious, _, z, offset, spread = _normal(blocks, T, common, weight)
     covariance = np.full(N.shape, np.nan)
@@ -87,6 +93,36 @@ def solve(
     return Solution(
         T, covariance, z, offset, tuple(common.tolist()), weight, float((z[inside] ** 2).sum()), float(inside.sum())
     )
+
+
+def step_without(
+    blocks: Blocks, solution: Solution, reference: int, out: npt.NDArray[np.bool_], almost_none: float
+) -> Floats:
+    """Return how poses would move (6k,) from a solution if blocks ``out`` (b,) counted for ``almost_none``."""
+    weight = np.where(out, almost_none, solution.weight)
+    N, _, g, _, _, _ = _normal(blocks, solution.T, np.array(solution.tau), weight)
+    free = _free(blocks, solution.T, reference)
+    step = np.zeros(len(g))
+    step[free] = -np.linalg.solve(N[np.ix_(free, free)], g[free])
+    return step
+
+
+def _wide(blocks: Blocks) -> Floats:
+    """Return common offsets (KINDS,) that adjustments begin with: no piece says more than a few of its points do.
+
+    A wall of thousands of points with something leant against it would else be believed before all others.
+    """
+    points = blocks.kind == 0
+    if not points.any():
+        return np.zeros(KINDS)
+    noise = float(np.median(np.sqrt(blocks.count[points] / np.maximum(blocks.sums[points, 9], 1e-300))))
+    return np.array([WIDE_SIGMAS * noise, 0.0])
+
+
+def _forgiving(z: Floats, offset: Floats, slack_mm: float) -> Floats:
+    """Misfits by their standard deviations and a slack: what poses have not yet had the chance to take up is none."""
+    found: Floats = offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm)
+    return found
 
 
 def _robust(blocks: Blocks, z: Floats) -> Floats:

@@ -27,15 +27,13 @@ WIDEST = 0.02  # of the range: a step between rays, along the face, beyond which
 class Ends:
     """Ends (n, 3) in the cloud's frame, the way across each from ray to ray (n, 3), and the faces' normals (n, 3).
 
-    ``gap`` (n,) numbers the two rows or columns of the scanner's grid that an end lies between, ``along`` (n,) is its
-    place between these.
+    ``gap`` (n,) numbers the two rows or columns of the scanner's grid that an end lies between.
     """
 
     points: Floats = field(default_factory=lambda: np.empty((0, 3)))
     across: Floats = field(default_factory=lambda: np.empty((0, 3)))
     normals: Floats = field(default_factory=lambda: np.empty((0, 3)))
     gap: Ints = field(default_factory=lambda: np.empty(0, np.int64))
-    along: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 def grid_of(row: Ints, column: Ints) -> Ints:
@@ -75,9 +73,7 @@ def grow(grid, on_face, points, normal, offset, limit):  # type: ignore[no-untyp
                             break
 
 
-def ends_of(
-    points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes, sigma_mm: float, rays: Rays
-) -> Ends:
+def ends_of(points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes, sigma_mm: float, rays: Rays) -> Ends:
     """Find ends of the flat pieces of points (n, 3) around their scanner; ``piece`` (n,) is a row of planes or -1.
 
     A bar that a single ray of a row met has two ends there as well: to ask for a second one would leave out those whose
@@ -104,9 +100,9 @@ def ends_of(
         width = np.linalg.norm(b - a, axis=1)
         behind = (j < 0) | (np.linalg.norm(points[j], axis=1) - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
         good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * np.linalg.norm(points[i], axis=1))
-        across, along = (row[i], column[i]) if up else (column[i], row[i])
-        found.append((0.5 * (a + b)[good], (b - a)[good], n[good], (len(WAYS) * across + way)[good], along[good]))
-    return Ends(*(np.concatenate([one[m] for one in found]) for m in range(5)))
+        gap = len(WAYS) * (row[i] if up else column[i]) + way
+        found.append((0.5 * (a + b)[good], (b - a)[good], n[good], gap[good]))
+    return Ends(*(np.concatenate([one[m] for one in found]) for m in range(4)))
 
 
 def _leaving(grid: Ints, on_face: Ints, up: int, left: int) -> tuple[Ints, Ints, Ints]:

@@ -24,7 +24,7 @@ def place(table, key, shift):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def gather(keys, table, shift, number, distinct):  # type: ignore[no-untyped-def]
-    """Give numbers to keys (n,) as they come: writes ``number`` (n,) and the ``distinct`` ones, returns how many these are."""
+    """Give numbers to keys (n,) as they come: into ``number`` (n,) and ``distinct``; returns how many these are."""
     held = np.empty(len(table), np.int64)
     count = 0
     for i in range(len(keys)):
@@ -74,7 +74,7 @@ def add_points(points, group, out):  # type: ignore[no-untyped-def]
 
 
 def numbered(keys: Ints) -> tuple[Ints, Ints]:
-    """Give numbers to the distinct of keys (n,), in ascending order: the first row of each (k,), and each row's number (n,)."""
+    """Give numbers, ascending, to the distinct of keys (n,): the first row of each (k,), each row's number (n,)."""
     number, distinct = np.empty(len(keys), np.int64), np.empty(len(keys), np.int64)
     bits = max(1, int(2 * len(keys)).bit_length())
     table = np.full(1 << bits, EMPTY, np.int64)

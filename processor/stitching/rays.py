@@ -9,14 +9,13 @@ import numpy.typing as npt
 
 from processor.model import Floats, Ints
 
-LEAST_POINTS = 3  # of a row or a column that is known
-
 
 @dataclass(frozen=True)
 class Rays:
     """Rays by rows and columns: ``height`` (rows,) along the axis a scanner turns about, ``turn`` (columns,) about it.
 
-    ``axes`` (3, 3) has two directions across and the axis as columns. A column without points has no turn: NaN.
+    ``axes`` (3, 3) has two directions across and the axis as columns. A column without points has no turn: NaN. A row
+    without points has the height between its neighbours'.
     """
 
     axes: Floats
@@ -49,15 +48,15 @@ def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
     mean = np.stack([np.bincount(r, u[:, i], rows) for i in range(3)], axis=1) / np.maximum(number, 1)[:, None]
     apart = u - mean[r]
     axis = np.linalg.eigh(apart.T @ apart)[1][:, 0]
-    held = number >= LEAST_POINTS
+    held = number > 0
     if held.sum() < 2:
         return None
-    heights = np.interp(np.arange(rows), np.flatnonzero(held), (mean @ axis)[held])
+    heights = np.interp(np.arange(rows), np.flatnonzero(held), (mean @ axis)[held], left=np.nan, right=np.nan)
     e1 = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(axis, e1)
     x, y = np.bincount(c, u @ e1, columns), np.bincount(c, u @ e2, columns)
-    turn = np.where(np.bincount(c, minlength=columns) >= LEAST_POINTS, np.arctan2(y, x), np.nan)
+    turn = np.where(np.bincount(c, minlength=columns) > 0, np.arctan2(y, x), np.nan)
     return Rays(np.stack([e1, e2, axis], axis=1), heights, turn)
 
 
@@ -67,4 +66,5 @@ def unanswered(rays: Rays, row: Ints, column: Ints) -> Floats:
     empty: npt.NDArray[np.bool_] = np.ones((len(rays.height), len(rays.turn)), np.bool_)
     empty[row[on], column[on]] = False
     empty[:, ~np.isfinite(rays.turn)] = False
+    empty[~np.isfinite(rays.height)] = False
     return rays.of(*np.nonzero(empty))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from processor.model import Floats, Ints
+from processor.model import Floats
 
 PIXELS = 320  # at most along each side of the six faces of a cube: 0.28 degrees
 FEWEST_PIXELS = 40
