@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from processor import __version__, cli_folders
-from processor.cli_shared import DONE, IN_PART, LIMIT_MISSED, UNITS, named, say
+from processor.cli_shared import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, named, say
 from processor.model import InputError, Metric
 from processor.progress import stage
 
@@ -39,7 +39,7 @@ commands.add_command(cli_folders.init)
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False), help="TOML file, a table a step")
 @click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
 @click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
-@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
@@ -112,6 +112,7 @@ FILE = click.Path(path_type=Path)
 @click.option("--max-depth", type=LENGTH, help="of the cylinder, to either side of the core point")
 @click.option("--registration-error", type=click.FloatRange(min=0.0), default=0.0, help="a length, part of the LOD95")
 @click.option("--normals", type=FILE, help="nx, ny, nz of every core point, PLY or text, instead of fitted ones")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print compare.json")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 def compare(
@@ -124,6 +125,7 @@ def compare(
     max_depth: float | None,
     registration_error: float,
     normals: Path | None,
+    lang: str,
     as_json: bool,
 ) -> None:
     """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
@@ -138,7 +140,7 @@ def compare(
         reference, compared, core, normals, normal_diameter or 0.0, projection_diameter or 0.0, max_depth or 0.0,
         registration_error,
     )  # fmt: skip
-    record = comparison.write(output, comparing.compare(request, say))
+    record = comparison.write(output, comparing.compare(request, say), lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))
         return
@@ -151,7 +153,7 @@ def compare(
 @click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
 @click.argument("input_", metavar="INPUT", type=click.Path(path_type=Path))
 @click.option("--units", type=click.Choice(UNITS), help="as given to the run")
-@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True, help="of the page")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @click.pass_context
 def report(context: click.Context, output: Path, input_: Path, units: str | None, lang: str, as_json: bool) -> None:
@@ -216,6 +218,7 @@ def _read_results(output: Path) -> dict[str, Any]:
 @click.option("--night", metavar="YYYY-MM-DD", help="whose seeds are used  [default: today, UTC]")
 @click.option("--again", is_flag=True, help="do all of a night again that other software began")
 @click.option("--accept", is_flag=True, help="do nothing but accept what got worse in the night as the new level")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the pages")
 @click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
 @click.pass_context
 def validate(
@@ -229,6 +232,7 @@ def validate(
     night: str | None,
     again: bool,
     accept: bool,
+    lang: str,
     as_json: bool,
 ) -> None:
     """Make, run and check a matrix of scenes, and say what changed since the nights before.
@@ -243,6 +247,6 @@ def validate(
     if accept:
         click.echo(command.accept(output, history, night))
         return
-    told = command.run(matrix, output, jobs or 1, cluster, full, history, night, again)
+    told = command.run(matrix, output, jobs or 1, cluster, full, history, night, again, lang)
     click.echo(json.dumps(told.as_object(), ensure_ascii=False) if as_json else told.line)
     context.exit(LIMIT_MISSED if not told.passed else IN_PART if told.failed else DONE)

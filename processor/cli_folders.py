@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from processor.cli_shared import DONE, IN_PART, LIMIT_MISSED, UNITS, named, say
+from processor.cli_shared import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, named, say
 from processor.model import UsageError
 
 if TYPE_CHECKING:
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--units", type=click.Choice(UNITS), help="of scans; scene files know theirs")
 @click.option("--seed", type=click.IntRange(min=0))
-@click.option("--lang", type=click.Choice(("en", "zh")), default="en", show_default=True)
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of all pages")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
@@ -84,6 +84,7 @@ def batch(
         timeout_s,
         memory_mb,
         retry,
+        lang=lang,
     )
 
     def ended(one: Record) -> None:

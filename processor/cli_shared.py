@@ -5,6 +5,7 @@ from __future__ import annotations
 import click
 
 DONE, IN_PART, LIMIT_MISSED = 0, 1, 4
+LANGUAGES = ("en", "zh")
 UNITS = ("m", "mm", "cm", "inch", "ft")
 
 

@@ -54,10 +54,12 @@ def test_arrows_run_one_way(path):
     elif name != "processor":
         assert not within(used, "processor.records"), "records are known by the model"
     if name.startswith("processor.validation"):
-        allowed = within(own, "processor.validation", "processor.model", "processor.pipeline")
+        allowed = within(own, "processor.validation", "processor.model", "processor.pipeline", "processor.language")
         assert not own - allowed - {"processor"}, "a night runs programs and reads what they wrote"
     elif name != "processor.cli":
         assert not within(used, "processor.validation")
+    if name.startswith("processor.language"):
+        assert own <= {"processor", "processor.language"}
     if name.startswith("processor.geometry"):
         assert not own - within(own, "processor.geometry", "processor.model", "processor")
     methods = tuple(f"processor.{one}" for one in ("preassembly", "bolt_balls", "stitching", "deviation", "defects"))

@@ -51,6 +51,7 @@ class Settings:
     memory_mb: int | None = None
     retry: bool = False
     program: tuple[str, ...] = jobs_.PROGRAM
+    lang: str = "en"  # of the index
 
 
 def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record], None]) -> summary.Summary:
@@ -124,7 +125,7 @@ def _run(
         with suppress(OSError):
             token.unlink()  # whoever still works for this run, on a worker out of reach, ends
         shutil.rmtree(state / "work", ignore_errors=True)
-    return summary.write(out, [(job, records[job.name]) for job in jobs], found.left_out)
+    return summary.write(out, [(job, records[job.name]) for job in jobs], found.left_out, settings.lang)
 
 
 def _jobs(settings: Settings, found: Found, root: Path, out: Path, state: Path, token_file: Path) -> list[Job]:

@@ -21,6 +21,7 @@ from processor.batch import record
 from processor.batch.figures import COLUMNS
 from processor.batch.job import Job
 from processor.batch.record import FAILED, Record
+from processor.language import language
 from processor.model import InputError
 
 CSV, JSON, PAGE, TIMINGS = "summary.csv", "summary.json", "index.html", "timings.csv"
@@ -48,8 +49,11 @@ def remove(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, str]) -> Summary:
-    """Write the summary of all jobs into ``out``. Raises InputError where it cannot be written."""
+def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, str], lang: str = "en") -> Summary:
+    """Write the summary of all jobs into ``out``, its page in the language ``lang``.
+
+    Raises InputError where it cannot be written.
+    """
     rows = [_row(out, job, one) for job, one in done]
     states = Counter(one.status for _, one in done)
     counts = {name: states[name] for name in STATES}
@@ -63,7 +67,7 @@ def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, 
     times = ([readable(one.input), one.status, one.seconds, one.peak_mb, "yes" if one.kept else ""] for _, one in done)
     record.write_text(out / TIMINGS, _csv(["input", "status", "seconds", "peak_mb", "kept"], times))
     try:
-        record.write_text(out / PAGE, _html(rows, counts, left))  # last: where it is, all is
+        record.write_text(out / PAGE, _html(rows, counts, left, lang))  # last: where it is, all is
     except InputError:
         remove(out)
         raise
@@ -106,12 +110,16 @@ def _cell(cell: Any) -> Any:
     return "" if cell is None else cell
 
 
-def _html(rows: Sequence[dict[str, Any]], counts: Mapping[str, int], left_out: Sequence[tuple[str, str]]) -> str:
+def _html(
+    rows: Sequence[dict[str, Any]], counts: Mapping[str, int], left_out: Sequence[tuple[str, str]], lang: str
+) -> str:
     import jinja2
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("processor", "batch"), autoescape=True, undefined=jinja2.StrictUndefined
     )
+    say = language(lang).say
+    environment.filters["say"] = say
     columns = [name for name in COLUMNS if name != "verdict" and any(row.get(name) is not None for row in rows)]
     shown = [
         {
@@ -119,13 +127,18 @@ def _html(rows: Sequence[dict[str, Any]], counts: Mapping[str, int], left_out: S
             "tone": TONES[row["status"]],
             "verdict_tone": VERDICT_TONES.get(row["verdict"] or "", ""),
             "cells": [_shown(row.get(name)) for name in columns],
+            "english": bool(row["reason"]) and say(row["reason"]) == row["reason"],
         }
         for row in rows
     ]
     text: str = environment.get_template("summary.html").render(
+        lang=lang,
         title=f"{len(rows)} inputs",
-        counts={name: count for name, count in counts.items() if count},
-        columns=[name.replace("_", " ") for name in columns],
+        counted=", ".join(f"{count} {name}" for name, count in counts.items() if count) + ".",
+        columns=[
+            (name.replace("_", " "), any(cell["number"] for cell in cells))
+            for name, cells in zip(columns, zip(*(row["cells"] for row in shown), strict=True), strict=False)
+        ],
         rows=shown,
         left_out=left_out,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy.special import chdtrc
 
@@ -144,6 +146,17 @@ def judged(
         station_sd=station_sd,
         message=message,
     )
+
+
+def doubted(found: Balls, beside: Floats) -> Balls:
+    """Flag balls whose lowest points are no longer sure with a further covariance (k, 3, 3) of their centres."""
+    sd = np.sqrt(found.lowest_sd**2 + beside[:, 2, 2])
+    rows = [i for i, flag in enumerate(found.flag) if flag == "ok" and not sd[i] <= LARGEST_LOWEST_SD_MM]
+    flags, reasons = list(found.flag), list(found.reason)
+    for i in rows:
+        flags[i] = "low-confidence"
+        reasons[i] = f"what all ranges may be off alike leaves an sd of the lowest point of {sd[i]:.1f} mm"
+    return replace(found, flag=tuple(flags), reason=tuple(reasons))
 
 
 def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:

@@ -16,7 +16,7 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.bolt_balls.thinning import REACH, STEPS_PER_MM, WHOLE, hashed
-from processor.bolt_balls.threads import over_ranges
+from processor.bolt_balls.threads import over_ranges, usable
 from processor.bolt_balls.voxels import EMPTY, slot_of
 from processor.model import Floats, Ints, Labels
 
@@ -24,6 +24,7 @@ CELL_MM = 200.0
 FIELD = 21  # bits for each coordinate of a point less its line's middle
 HALF = 1 << (FIELD - 1)  # 10.5 m in steps of 0.01 mm
 CELL_FIELD = 20
+LEAST_RANGE = 100_000  # points a thread takes at once
 
 
 @dataclass(frozen=True)
@@ -137,16 +138,17 @@ def near(  # type: ignore[no-untyped-def]
     n = 0
     half = 1 << (CELL_FIELD - 1)
     held, at = np.int64(-2), np.uint64(0)
+    mm, per_cell = 1.0 / STEPS_PER_MM, 1.0 / cell
     for i in range(len(coordinates)):
         fx, fy, fz = coordinates[i, 0] * scale, coordinates[i, 1] * scale, coordinates[i, 2] * scale
         if not (abs(fx) < REACH and abs(fy) < REACH and abs(fz) < REACH):
             continue
         x, y, z = np.int64(np.rint(fx)), np.int64(np.rint(fy)), np.int64(np.rint(fz))
-        px, py, pz = x / STEPS_PER_MM, y / STEPS_PER_MM, z / STEPS_PER_MM
+        px, py, pz = x * mm, y * mm, z * mm
         key = (
-            ((np.int64(np.floor(px / cell)) + half) << (2 * CELL_FIELD))
-            | ((np.int64(np.floor(py / cell)) + half) << CELL_FIELD)
-            | (np.int64(np.floor(pz / cell)) + half)
+            ((np.int64(np.floor(px * per_cell)) + half) << (2 * CELL_FIELD))
+            | ((np.int64(np.floor(py * per_cell)) + half) << CELL_FIELD)
+            | (np.int64(np.floor(pz * per_cell)) + half)
         )
         if key != held:
             at, held = slot_of(table, key), key
@@ -172,10 +174,14 @@ def near(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def insert(found, new_places, new_stations, middles, room, counts, thresholds, places, stations):  # type: ignore[no-untyped-def]
-    """Put entries into their lines' room; a line that overflows halves its threshold and drops what is above it."""
+def insert(  # type: ignore[no-untyped-def]
+    found, new_places, new_stations, middles, room, counts, thresholds, places, stations, first, last
+):
+    """Put entries of lines first..last into their room; where it overflows a line halves its threshold and drops."""
     for i in range(len(found)):
         m = found[i]
+        if m < first or m >= last:
+            continue
         base = m * room
         if hash_of(new_places[i], middles[m]) >= thresholds[m]:
             continue
@@ -247,7 +253,7 @@ def gather(
         lines.lines,
     )  # fmt: skip
     for coordinates, station in stretches:
-        pieces: list[tuple[int, Labels, Ints, npt.NDArray[np.int16]]] = []
+        pieces: list[tuple[Labels, Ints, npt.NDArray[np.int16]]] = []
 
         def run(first: int, last: int, coordinates=coordinates, station=station, pieces=pieces) -> None:  # type: ignore[no-untyped-def]
             n = 3 * (last - first) + 64  # entries: a point belongs to few lines
@@ -258,11 +264,16 @@ def gather(
                 if found < n:
                     break
                 n *= 2
-            pieces.append((first, *(one[:found] for one in room_for)))
+            pieces.append((room_for[0][:found], room_for[1][:found], room_for[2][:found]))
 
-        over_ranges(run, len(coordinates), threads, least=20_000)
-        for _, *entries in pieces:
-            insert(*entries, middles, room, counts, thresholds, places, stations)  # type: ignore[call-arg]
+        over_ranges(run, len(coordinates), threads, least=LEAST_RANGE)
+        into = (middles, room, counts, thresholds, places, stations)
+
+        def keep(first: int, last: int, pieces=pieces, into=into) -> None:  # type: ignore[no-untyped-def]
+            for entries in pieces:
+                insert(*entries, *into, first, last)  # type: ignore[call-arg]
+
+        over_ranges(keep, count, threads, least=max(count // (threads or usable()), 1))
     most_station = int(stations.max(initial=-1)) if count else -1
     over_ranges(partial(arrange, counts, room, places, stations, most_station), count, threads)
     return Gathered(room, counts, places, stations, middles, thresholds / WHOLE)

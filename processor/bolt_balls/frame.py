@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.bolt_balls import balls, junctions, matching, members, movement, stations
+from processor.bolt_balls import ball_flags, balls, junctions, matching, members, movement, stations
 from processor.bolt_balls.ball_records import Balls
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.corrected import Corrected, corrected_gathered
@@ -108,7 +108,9 @@ def extract(
     datum = np.tile(datum_mm**2 * np.eye(3), (len(found.radii), 1, 1))
     if registered is not None and trusted:
         datum = registered.datum_at(found.centres)
+    if registered is not None:
         beside = registered.shared_offset_at(found.centres)
+        found = ball_flags.doubted(found, beside)
     matched = moved = None
     if design is not None and known.any():
         matched, moved = _moved(

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
+from numba import njit
 
 from processor.bolt_balls.source import CHUNK_POINTS, UNKNOWN_STATION, Chunk
 from processor.bolt_balls.station_control import ControlPoints
 from processor.geometry import rigid
+from processor.geometry.threads import over_ranges
 from processor.model import Floats, InputError, Labels, Scan, Scene
 
 FARTHEST_MM = 1000.0  # control points that lie farther from where they were seen are of another frame
@@ -139,8 +142,16 @@ def _pose(scan: Scan) -> Floats:
 
 def _moved(points: Floats, R: Floats, shift: Floats) -> Floats:
     """Move points (n, 3), each coordinate by a sum of its own: the same bytes wherever a point stands in its chunk."""
-    found = np.empty_like(points)
-    x, y, z = points[:, 0], points[:, 1], points[:, 2]
-    for k in range(3):
-        found[:, k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + shift[k]
+    found = np.empty(points.shape)
+    points = np.ascontiguousarray(points, np.float64).view()
+    points.flags.writeable = False  # whatever it was: the kernel is compiled for one kind alone
+    over_ranges(partial(_move, points, np.ascontiguousarray(R), shift, found), len(points), least=100_000)
     return found
+
+
+@njit(cache=True, nogil=True)
+def _move(points, R, shift, found, first, last):  # type: ignore[no-untyped-def]
+    for i in range(first, last):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        for k in range(3):
+            found[i, k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + shift[k]

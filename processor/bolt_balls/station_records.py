@@ -46,7 +46,7 @@ class Stations(Checked):
     before_rad: float = float("nan")  # and of its turn
     range_offset: Floats = column("s")  # of a station's ranges less the mean of all, mm
     range_offset_sd: float = float("nan")  # of all stations, as scanned
-    shared_offset_sd: float = 0.0  # of what all ranges may be off alike, by how they differ; it is in no covariance
+    shared_offset_sd: float = 0.0  # of what all ranges may be off alike, for an offset or a wide beam; in no covariance
     observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
     weak: tuple[str, ...] = names("s")  # which motions of a station the tubes do not tell; empty = all told
     range_sd: Floats = column("s")  # scale of the residuals along the ray, mm

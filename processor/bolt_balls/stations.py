@@ -235,6 +235,7 @@ def _result(
     beam = posterior.control is None and abs(shared) > WIDE_MM + 3.0 * spread and abs(shared) > before_mm
     if beam:
         said.append("which explains as much as the stations seem off: they were left where they are")
+        x = np.zeros_like(x)
     return Stations(
         "doubtful" if beam else "weak" if any(weak) else "ok",
         "; ".join(said),
@@ -245,7 +246,7 @@ def _result(
         before_rad,
         x[6 :: kernels.STATION],
         offset_mm,
-        spread,
+        abs(shared) if beam else spread,
         seen_by,
         weak,
         scale,

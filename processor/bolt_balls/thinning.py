@@ -64,6 +64,6 @@ def thinned(source: Source, most: int, threads: int = 0) -> Steps:
             keep(points, threshold, found, count, 0, first, last)
             ranges.append((first, found[first : first + count[0]]))
 
-        over_ranges(run, len(chunk.points), threads, least=20_000)
+        over_ranges(run, len(chunk.points), threads, least=100_000)
         pieces.extend(one.copy() for _, one in ranges)
     return np.concatenate([np.empty((0, 3), np.int32), *pieces])

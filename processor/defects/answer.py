@@ -110,6 +110,7 @@ def result_of(found: Found, params: Params, name: str) -> Result:
             [(row.columns["centres"], row.cells, row.field, row.component) for row in rows],
             surface, params.pictures,
         ),
+        **pictures.of_surface([row.cells for row in rows], field, surface),
     )  # fmt: skip
 
 
@@ -133,8 +134,9 @@ def _shapes(found: Found) -> Iterator[Row]:
             seen = rows[(found.field.seen[rows] > 0) & part]
             centre = surface.centres[rows[part]].mean(axis=0)
             depth = abs(judged.peak) if both else -judged.peak
-            extent = 2.0 * frame.half[:2] * ([0.5 * (1.0 - judged.shape.at[1]), 1.0]
-                                             if judged.shape.kind == "step" else [1.0, 1.0])  # fmt: skip
+            extent = 2.0 * frame.half[:2]
+            if judged.shape.kind == "step":  # what lies beyond it, along the axis that it is across
+                extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
             axes = frame.axes.copy()
             named = classes.of_shape(judged.shape.kind, judged.margin)
             lod = judged.ci95

@@ -96,6 +96,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         status=placed.status if result.status == "ok" else result.status,
         T_design_project=moved,
         centres=result.centres + origin,
+        surface_at=result.surface_at + origin,
         points=offered,
         used=near,
         message=said,

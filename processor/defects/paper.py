@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from processor.defects import deflection, facets, placing
 from processor.defects.params import Paper, Params
+from processor.defects.pictures import MOST_PLACES
 from processor.defects.result import Result
 from processor.defects.surface import of_mesh
 from processor.deviation import clouds
@@ -220,6 +221,8 @@ def _result(
         })  # fmt: skip
         curves.append(deflection.by_slopes(along, d, min(params.paper.strips, max(2, len(at) // 4))))
     order = sorted(range(len(rows)), key=lambda k: -abs(rows[k]["volume_mm3"]))
+    row_of = np.append(np.argsort(order), NOISE).astype(np.int32)  # the last: what belongs to none
+    shown = slice(None, None, -(-len(placed) // MOST_PLACES) or 1)
     rows, curves = [rows[k] for k in order], [curves[k] for k in order]
     columns: dict[str, Any] = {key: [row[key] for row in rows] for key in (rows[0] if rows else ())}
     return Result(
@@ -230,4 +233,6 @@ def _result(
         curve_at_mm=np.concatenate([[], *(c[0] for c in curves)]),
         curve_mm=np.concatenate([[], *(c[1] for c in curves)]),
         curve_ci95=np.full(sum(len(c[0]) for c in curves), np.nan),
+        surface_at=placed[shown] + origin, surface_mm=distance[shown].astype(np.float32),
+        surface_defect=row_of[own[shown]],
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""The deviations about each defect on a small grid, for a picture."""
+"""The deviations about each defect on a small grid, for a picture, and over the whole surface, for a view in space."""
 
 from __future__ import annotations
 
@@ -15,6 +15,40 @@ MOST_SIDE = 120  # cells of a picture
 MARGIN = 0.6  # of a defect's extent that is shown beside it
 LEAST_CELLS = 12
 SAME_WAY = 0.5
+MOST_PLACES = 50_000  # of the whole surface
+SMALL_PLACES, MOST_SMALL_PLACES = 400, 10_000  # of one defect that is not thinned, and of all such
+
+
+def of_surface(defects: list[Ints], field: Field, surface: DesignSurface, most: int = MOST_PLACES) -> dict[str, Any]:
+    """Return the columns of places all over the surface; ``defects`` are the cells of each.
+
+    Of every face each s-th row and column of cells is taken, s the same for all; of small defects every cell.
+    """
+    charts = surface.charts
+    chart = chart_of_cells(surface)
+    own = np.full(len(chart), -1, np.int32)
+    for row in sorted(range(len(defects)), key=lambda row: -len(defects[row])):  # the small ones lie on the large ones
+        own[defects[row]] = row
+    seen = (field.count > 0) & (surface.share > 0.3)
+    along, across = np.divmod(np.arange(len(chart)) - charts.first[chart], charts.shape[chart, 1])
+    step = max(1, int(np.sqrt(seen.sum() / most)))
+    while (
+        kept := seen & _each(along, charts.shape[chart, 0], step) & _each(across, charts.shape[chart, 1], step)
+    ).sum() > most:
+        step += 1
+    room = MOST_SMALL_PLACES
+    for cells in defects:
+        if len(cells) <= min(SMALL_PLACES, room):
+            room -= len(cells)
+            kept[cells] = seen[cells]
+    return {
+        "surface_at": surface.centres[kept], "surface_mm": field.deviation[kept], "surface_defect": own[kept],
+    }  # fmt: skip
+
+
+def _each(index: Ints, count: Ints, step: int) -> Any:
+    """Mark each ``step``-th index; of a face with fewer rows than that, the middle one."""
+    return index % step == np.minimum(step, count) // 2
 
 
 def of_rows(rows: list[tuple[Floats, Ints, Field, int]], surface: DesignSurface, most: int) -> dict[str, Any]:

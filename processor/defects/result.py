@@ -68,3 +68,7 @@ class Result(Checked):
     picture_cell_mm: Floats = column("p")
     picture_mm: Shorts = column("q", dtype=np.float32)  # deviations, u slowest; NaN = nothing seen
     picture_part: Labels = column("q", dtype=np.int32)  # 1 = of the defect
+    # Places spread over the surface that was seen, so many that they can be drawn, and all of small defects.
+    surface_at: Floats = column("t", 3)
+    surface_mm: Shorts = column("t", dtype=np.float32)  # deviations, outward positive
+    surface_defect: Labels = column("t", dtype=np.int32)  # row of the defect, -1 = of none

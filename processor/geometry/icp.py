@@ -42,7 +42,7 @@ def point_to_point(
     rms, share = np.inf, 0.0
     for iteration in range(1, max_iterations + 1):
         moved = rigid.apply(T, source)
-        distance, index = tree.query(moved, distance_upper_bound=max_distance_mm)
+        distance, index = tree.query(moved, distance_upper_bound=max_distance_mm, workers=-1)
         paired = np.isfinite(distance)
         share = float(paired.mean())
         if paired.sum() < 3:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import numpy.typing as npt
@@ -10,11 +11,14 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
+from processor.geometry import facet_walk
+from processor.geometry.threads import over_ranges
 from processor.model import Floats, Ints
 
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
 WALK_STEPS = 24
 OUTER_SPACING_MM = 40.0  # of samples where there is one face only to choose
+LEAST_RANGE = 5_000  # points a thread takes at once
 EDGE_MM = 1.0  # a foot beyond its face by no more is still on it
 
 
@@ -37,32 +41,16 @@ class MeshSurface:
         walks over smooth edges to the facet that the foot is on, so that a curved face is not taken for a plane. Points
         that have moved little start where they were ``before`` (n,) instead.
         """
-        face = np.full(len(points), -1, np.int64)
-        distance, beyond = np.full(len(points), np.nan), np.full(len(points), np.nan)
         if before is None:
             found, sample = self.tree.query(points, distance_upper_bound=reach, workers=-1)
-            rows = np.flatnonzero(np.isfinite(found))
-            at = self.sample_face[sample[rows]]
+            start = np.where(np.isfinite(found), self.sample_face[np.minimum(sample, len(self.sample_face) - 1)], -1)
         else:
-            rows = np.flatnonzero(before >= 0)
-            at = before[rows]
-        active = np.arange(len(rows))
-        for _ in range(WALK_STEPS):
-            share = self.barycentric(points[rows[active]], at[active])
-            worst = np.argmin(share, axis=1)
-            next_ = self.neighbours[at[active], worst]
-            moves = (share[np.arange(len(active)), worst] < -1e-9) & (next_ >= 0)
-            if not moves.any():
-                break
-            active, next_ = active[moves], next_[moves]
-            at[active] = next_
-        face[rows] = at
-        share = self.barycentric(points[rows], at)
-        corner = self.vertices[self.faces[at, 0]]
-        distance[rows] = np.einsum("ni,ni->n", points[rows] - corner, self.normals[at])
-        lowest = np.minimum(share.min(axis=1), 0.0)
-        side = np.argmin(share, axis=1)
-        beyond[rows] = -lowest * self._height(at, side)
+            start = before
+        face = np.full(len(points), -1, np.int64)
+        distance, beyond = np.full(len(points), np.nan), np.full(len(points), np.nan)
+        given = (np.ascontiguousarray(points, np.float64), start, self.vertices, self.faces, self.normals)
+        walk = partial(facet_walk.feet, *given, self.neighbours, WALK_STEPS, face, distance, beyond)
+        over_ranges(walk, len(points), least=LEAST_RANGE)
         return face, distance, beyond
 
     def only(self, facets: npt.NDArray[np.bool_]) -> MeshSurface:
@@ -78,15 +66,6 @@ class MeshSurface:
         second = np.einsum("ni,ni->n", np.cross(p, c - a), n) / square
         third = np.einsum("ni,ni->n", np.cross(b - a, p), n) / square
         return np.stack([1.0 - second - third, second, third], axis=1)
-
-    def _height(self, face: Ints, side: Ints) -> Floats:
-        """Height (n,) of facets over the side opposite to a vertex."""
-        corners = self.vertices[self.faces[face]]
-        rows = np.arange(len(face))
-        a, b, c = (corners[rows, (side + k) % 3] for k in range(3))
-        base = np.linalg.norm(c - b, axis=1)
-        height: Floats = np.linalg.norm(np.cross(b - a, c - a), axis=1) / np.maximum(base, 1e-12)
-        return height
 
 
 def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurface:
@@ -105,7 +84,8 @@ def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurf
     u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
     samples = a[owner] + u[:, None] * (b - a)[owner] + v[:, None] * (c - a)[owner]
     neighbours = _neighbours(faces, normals)
-    return MeshSurface(vertices, faces, normals, neighbours, _smooth_faces(neighbours), cKDTree(samples), owner)
+    tree = cKDTree(samples, balanced_tree=False)
+    return MeshSurface(vertices, faces, normals, neighbours, _smooth_faces(neighbours), tree, owner)
 
 
 def _smooth_faces(neighbours: Ints) -> Ints:

@@ -6,11 +6,14 @@ Every item's answer is its own, so that neither the number of threads nor the ra
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from itertools import pairwise
+from typing import TypeVar
 
+A = TypeVar("A")
+B = TypeVar("B")
 PIECES = 32  # ranges, more than threads: they do not all take the same time
 
 
@@ -22,6 +25,12 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 def usable() -> int:
     """How many processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def each(function: Callable[[A], B], items: Iterable[A]) -> list[B]:
+    """Call a function that lets other threads run for each of the items; the answers in the items' order."""
+    with ThreadPoolExecutor(usable()) as pool:
+        return list(pool.map(function, items))
 
 
 def over_ranges(kernel: Callable[[int, int], object], count: int, threads: int = 0, least: int = 1) -> None:

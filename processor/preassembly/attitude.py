@@ -7,6 +7,7 @@ Principal axes leave four proper rotations, eight where the section is nearly sq
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,6 +15,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import icp, mesh_surface, principal, rigid
 from processor.geometry.mesh_surface import MeshSurface
 from processor.geometry.neighbors import thinned, voxel_means
+from processor.geometry.threads import each
 from processor.model import DesignPart, Floats
 from processor.preassembly import registration
 
@@ -74,7 +76,7 @@ def sample_surface(part: DesignPart) -> Surface:
     return Surface(
         points,
         (cross / double_area[:, None])[triangle],
-        cKDTree(points),
+        cKDTree(points, balanced_tree=False),
         mesh_surface.of_mesh(part.vertices, part.faces),
         principal.of_mesh(part.vertices, part.faces).axes,
         size,
@@ -118,17 +120,12 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     seeds = voxel_means(points, surface.size / 150.0, least=2)
     if len(seeds) < 50:
         seeds = points
-    coarse = []
-    for T in principal_hypotheses(points, part):
-        fitted = _aligned(thinned(seeds, COARSE_POINTS), surface, T, COARSE_GATES_MM)
-        coarse.append((_misfit(thinned(seeds, COARSE_POINTS), surface, fitted), fitted, T))
+    few = thinned(seeds, COARSE_POINTS)
+    coarse = each(partial(_tried, few, surface, COARSE_GATES_MM), [(T, T) for T in principal_hypotheses(points, part)])
     promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + 1.0]
     # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
     seeds = thinned(points, FINE_POINTS)
-    candidates = []
-    for _, T_coarse, T in promising:
-        fitted = _aligned(seeds, surface, T_coarse, FINE_GATES_MM)
-        candidates.append((_misfit(seeds, surface, fitted), fitted, T))
+    candidates = each(partial(_tried, seeds, surface, FINE_GATES_MM), [(fitted, T) for _, fitted, T in promising])
     candidates.sort(key=lambda item: item[0])
     misfit, best, start = candidates[0]
     if misfit > NO_FIT_MM:
@@ -150,6 +147,15 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         elif theirs > ours:
             best, start, message, other = rival, rival_start, "", np.full((4, 4), np.nan)
     return Attitude(start, best, "ambiguous" if message else "ok", message, other)
+
+
+def _tried(
+    points: Floats, surface: Surface, gates_mm: tuple[float, ...], start: tuple[Floats, Floats]
+) -> tuple[float, Floats, Floats]:
+    """Align from where a hypothesis has come to; returns misfit, pose, and where the hypothesis began."""
+    at, began = start
+    fitted = _aligned(points, surface, at, gates_mm)
+    return _misfit(points, surface, fitted), fitted, began
 
 
 def _aligned(points: Floats, surface: Surface, T: Floats, gates_mm: tuple[float, ...]) -> Floats:
@@ -189,7 +195,7 @@ def _only_in(surface: Surface, T: Floats, other: Floats) -> Floats:
     _, distance, beyond = surface.mesh.distances(there, 5.0 * TELLING_MM)
     near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # not so where nothing is in reach: NaN
     # Near a corner the nearest sample may be on the other face: a sample close by is surface enough.
-    near |= surface.mesh.tree.query(there)[0] <= 1.4 * TELLING_MM
+    near |= surface.mesh.tree.query(there, workers=-1)[0] <= 1.4 * TELLING_MM
     telling: Floats = surface.points[~near]
     return telling
 
@@ -202,5 +208,5 @@ def _shown(points: Floats, T: Floats, samples: Floats) -> int:
     near = ((moved > samples.min(axis=0) - TELLING_MM) & (moved < samples.max(axis=0) + TELLING_MM)).all(axis=1)
     if not near.any():
         return 0
-    distance = cKDTree(moved[near]).query(samples, distance_upper_bound=TELLING_MM)[0]
+    distance = cKDTree(moved[near], balanced_tree=False).query(samples, distance_upper_bound=TELLING_MM, workers=-1)[0]
     return int(np.isfinite(distance).sum())

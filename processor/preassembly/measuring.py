@@ -10,7 +10,7 @@ import numpy as np
 from processor.geometry import icp, rigid
 from processor.geometry.lines import Polyline
 from processor.geometry.mesh_surface import MeshSurface, on_face
-from processor.geometry.neighbors import thinned
+from processor.geometry.neighbors import by_cell, thinned
 from processor.model import ArchDesign, DesignPart, Floats, Ints, Scan
 from processor.preassembly import (
     attitude,
@@ -26,6 +26,7 @@ from processor.preassembly import (
 )
 from processor.preassembly.systematic import SystematicParams
 
+CELL_MM = 40.0  # points of one are looked up one after the other
 RESIDUALS = 4_000  # points of a part whose distances from the design are kept
 
 
@@ -48,9 +49,14 @@ class Measured:
 
 @dataclass(frozen=True)
 class _Placed:
-    """One scan registered to the design, or why it is not: then ``trouble`` says so."""
+    """One scan registered to the design, or why it is not: then ``trouble`` says so.
+
+    ``points`` (n, 3) are the scan's at the reference temperature, cell by cell, ``station`` (n,) from where each is.
+    """
 
     scan: Scan
+    points: Floats
+    station: Ints
     found: attitude.Attitude
     fitted: registration.Registration
     trouble: str
@@ -80,8 +86,8 @@ def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float
     for one in every:
         if one not in used:
             said_of.append(f"scan {one.scan.name} is not used: {one.trouble or one.found.message or _unheld(one)}")
-    moved = np.vstack([rigid.apply(one.fitted.T_bridge_scan, one.scan.points * shrink) for one in used])
-    station = _stations([one.scan for one in used])
+    moved = np.vstack([rigid.apply(one.fitted.T_bridge_scan, one.points) for one in used])
+    station = _stations([one.station for one in used])
     apart = _between_stations(moved, station, shape)
     outer = outer_faces.of_part(shape.mesh, [design.joint_points[j] for j in joints if j is not None])
     ends: list[joint_ends.JointEnd | None] = []
@@ -128,22 +134,23 @@ def _between_stations(moved: Floats, station: Ints, shape: attitude.Surface) -> 
     return between.variance(residual[near], station[near], cell)
 
 
-def _stations(scans: Sequence[Scan]) -> Ints:
+def _stations(given: Sequence[Ints]) -> Ints:
     """Return a number (n,) for each point of the scans, joined: one for all that were seen from one station."""
     found, before = [], 0
-    for scan in scans:
-        given = scan.point_station if len(scan.point_station) else np.zeros(len(scan.points), np.int32)
-        own = np.unique(given, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    for one in given:
+        own = np.unique(one, return_inverse=True)[1].reshape(-1).astype(np.int64)
         found.append(own + before)
         before += int(own.max(initial=-1)) + 1
     return np.concatenate(found)
 
 
 def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Surface, shrink: float) -> _Placed:
-    points = scan.points * shrink
+    order = by_cell(scan.points, CELL_MM)
+    points = scan.points[order] * shrink
+    station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
     found = attitude.find(points, part, shape)
     if found.status == "failed":
-        return _Placed(scan, found, registration.NOWHERE, found.message)
+        return _Placed(scan, points, station, found, registration.NOWHERE, found.message)
     fitted = registration.fine(points, shape.mesh, shape.axes, found.T_surface)
     trouble = ""
     if not (fitted.used_share > registration.LEAST_SHARE and np.isfinite(fitted.covariance).all()):
@@ -151,7 +158,9 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
     elif not registration.fits(fitted):
         trouble = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface, "
         trouble += f"the others typically {fitted.sigma_mm / 1.4826:.0f} mm"
-    return _Placed(scan, found, fitted, f"{trouble}; {_looks_like(points, design, part)}" if trouble else "")
+    return _Placed(
+        scan, points, station, found, fitted, f"{trouble}; {_looks_like(points, design, part)}" if trouble else ""
+    )
 
 
 def _unheld(one: _Placed) -> str:

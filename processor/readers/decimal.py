@@ -26,7 +26,7 @@ def _powers() -> tuple[Floats, Floats]:
     return np.array(high), np.array(low)
 
 
-HIGH, LOW = _powers()
+HIGH, LOW = _powers()  # constants of what is compiled: as arguments they cost more than the arithmetic
 
 
 @njit(cache=True, nogil=True)
@@ -43,15 +43,15 @@ def count_ends(text: npt.NDArray[np.uint8], start: int, stop: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def _times_power(digits: int, power: int, high: Floats, low: Floats) -> float:
+def _times_power(digits: int, power: int) -> float:
     if digits < 9007199254740992 and -22 <= power <= 22:  # both exact, so one rounding
         near = float(digits)
-        return float(near / high[REACH - power] if power < 0 else near * high[REACH + power])
+        return float(near / HIGH[REACH - power] if power < 0 else near * HIGH[REACH + power])
     a = float(digits >> np.uint64(32)) * 4294967296.0
     b = float(digits & np.uint64(0xFFFFFFFF))
     top = a + b
     rest = b - (top - a)
-    p, q = high[REACH + power], low[REACH + power]
+    p, q = HIGH[REACH + power], LOW[REACH + power]
     product = top * p
     split = 134217729.0 * top
     t1 = split - (split - top)
@@ -74,8 +74,6 @@ def parse(
     remarks: bool,
     out: Floats,
     odd: npt.NDArray[np.int64],
-    high: Floats,
-    low: Floats,
 ) -> tuple[int, int, int, int, int]:
     """Parse rows of ``text`` (bytes of whole lines) from ``start`` into ``out`` (n, k), at most ``most`` of them.
 
@@ -91,14 +89,22 @@ def parse(
             return FULL, rows, at, odds, 0
         if odds + columns > len(odd):
             return ODD, rows, at, odds, 0
+        if text[at] == 10:  # a blank line, or the second byte of an end
+            at += 1
+            continue
         begin = at
         column, done = 0, False
         while not done:
+            if column == columns:  # nothing is asked of the rest of the line
+                while at < size and text[at] != 10 and text[at] != 13:
+                    at += 1
+                at += 1
+                break
             while at < size and (text[at] == 32 or (text[at] == 9 and separator != 9)):
                 at += 1
             first = at
             # Digits first: most tokens are plain numbers.
-            slot = slots[column] if column < columns else -1
+            slot = slots[column]
             plain, digits, count, power = slot >= 0, np.uint64(0), 0, 0
             negative = False
             if plain:
@@ -140,12 +146,12 @@ def parse(
                     power += sign * exponent
             if plain and at < size and count <= 19 and -REACH <= power <= REACH:
                 c = text[at]
-                if c == 10 or (c == separator if separator != 0 else c == 32):  # nearly always
-                    value = _times_power(digits, power, high, low)
+                if c == 10 or c == 13 or (c == separator if separator != 0 else c == 32):  # nearly always
+                    value = _times_power(digits, power)
                     out[rows, slot] = -value if negative else value
                     column += 1
                     at += 1
-                    done = c == 10
+                    done = c == 10 or c == 13
                     continue
             # What follows ends the token, or makes it one that is no plain number.
             while at < size:
@@ -172,7 +178,7 @@ def parse(
                         c = text[at] if at < size else np.uint8(10)
                         ended = c == 10 or c == 13
                     if plain and count <= 19 and -REACH <= power <= REACH:
-                        value = _times_power(digits, power, high, low)
+                        value = _times_power(digits, power)
                         out[rows, slot] = -value if negative else value
                     else:
                         odd[odds, 0], odd[odds, 1], odd[odds, 2], odd[odds, 3] = rows, slot, first, last

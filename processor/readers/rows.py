@@ -145,8 +145,6 @@ class Rows:
             self._remarks,
             room.out,
             room.odd,
-            decimal.HIGH,
-            decimal.LOW,
         )
         return found
 

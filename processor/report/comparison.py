@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import dataclasses
-import html
 import json
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import matplotlib as mpl
 from processor import pipeline
 from processor.compare import Comparison
 from processor.geometry.m3c2 import FEWEST_FOR_LOD
+from processor.language import language
 from processor.report import core_points, figures_deviation, writing
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
@@ -80,8 +80,8 @@ def as_json(found: Comparison) -> dict[str, Any]:
     return written
 
 
-def write(out: Path, found: Comparison) -> dict[str, Any]:
-    """Write the folder, in place of an earlier one; returns what compare.json holds."""
+def write(out: Path, found: Comparison, lang: str = "en") -> dict[str, Any]:
+    """Write the folder, in place of an earlier one, its page in ``lang``; returns what compare.json holds."""
     record = as_json(found)
     with mpl.rc_context():
         mpl.rcdefaults()
@@ -97,7 +97,7 @@ def write(out: Path, found: Comparison) -> dict[str, Any]:
         writing.write_text(making / RECORD, record_text + "\n")
         for name, (_, data) in zip(FIGURES, drawn, strict=True):
             writing.write_bytes(making / name, data)
-        writing.write_text(making / PAGE, _page(record, drawn))
+        writing.write_text(making / PAGE, _page(record, drawn, lang))
     return record
 
 
@@ -122,19 +122,18 @@ def lines(record: dict[str, Any]) -> list[str]:
     return found
 
 
-def _page(record: dict[str, Any], drawn: list[tuple[str, bytes]]) -> str:
-    figures = "".join(
-        f'<figure><img alt="{html.escape(caption)}" src="data:image/png;base64,{base64.b64encode(data).decode()}">'
-        f"<figcaption>{html.escape(caption)}</figcaption></figure>"
-        for caption, data in drawn
+def _page(record: dict[str, Any], drawn: list[tuple[str, bytes]], lang: str) -> str:
+    import jinja2
+
+    environment = jinja2.Environment(
+        loader=jinja2.PackageLoader("processor", "report"), autoescape=True, undefined=jinja2.StrictUndefined
     )
-    said = "".join(f"<p>{html.escape(one)}</p>" for one in lines(record))
-    names = " to ".join(html.escape(record["inputs"][name]["file"]) for name in ("reference", "compared"))
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>Comparison</title>'
-        '<meta http-equiv="Content-Security-Policy" content="default-src \'none\'; img-src data:; '
-        "style-src 'unsafe-inline'\"><style>body{margin:auto;max-width:60rem;padding:1.5rem;"
-        "font:16px/1.5 system-ui,sans-serif}img{max-width:100%}pre{overflow-x:auto;font-size:.85rem}</style></head>"
-        f"<body><h1>From {names}</h1>{said}{figures}<h2>Parameters and provenance</h2>"
-        f"<pre>{html.escape(json.dumps(record, indent=2, ensure_ascii=False))}</pre></body></html>\n"
+    environment.filters["say"] = language(lang).say
+    text: str = environment.get_template("comparison.html").render(
+        lang=lang,
+        title=f"From {record['inputs']['reference']['file']} to {record['inputs']['compared']['file']}",
+        lines=lines(record),
+        figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
+        provenance=json.dumps(record, indent=2, ensure_ascii=False),
     )
+    return text

@@ -5,7 +5,7 @@ from __future__ import annotations
 import collections
 
 from processor.defects.result import CLASSES, Result
-from processor.report import figures_defects, results_defects, tables_defects
+from processor.report import figures_defects, results_defects, tables_defects, view_defects
 from processor.report.printing import shown
 from processor.report.step_report import StepReport
 
@@ -33,4 +33,5 @@ REPORT = StepReport(
     written=results_defects.written,
     tables=tables_defects.of_runs,
     figures=lambda execution, runs, report: figures_defects.of_runs(execution.scene, runs, report),
+    live=view_defects.of_runs,
 )

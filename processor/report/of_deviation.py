@@ -98,7 +98,7 @@ def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     points = result.core + result.origin
     everything: Ints = np.arange(len(points), dtype=np.int64)
     return view_points.of_points(
-        "Deviation in space", runs[0].method, points, result.distances.distance, [("surface", everything)]
+        "Deviation in space", runs[0].method, points, result.distances.distance, [("surface", everything)], named=False
     )
 
 

@@ -11,11 +11,11 @@ from typing import Any
 import jinja2
 
 from processor.evaluate import ErrorReport
+from processor.language import language
 from processor.model import StepRun
 from processor.pipeline import Execution
 from processor.report import step_report, tables, view
 from processor.report.drawing import Drawn
-from processor.report.language import language
 from processor.report.printing import headings, numeric, shown
 
 GOOD = "ok"
@@ -29,6 +29,11 @@ NAMES = (
     "right_part",
     "station",
     "point",
+    "scan",
+    "a",
+    "b",
+    "loop",
+    "matrix",
 )  # columns that no language translates
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
@@ -131,7 +136,7 @@ def _table(table: tables.Table) -> dict[str, Any]:
         "title": table.title,
         "note": note,
         "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
-        "columns": list(zip(headings(table), numeric(table), strict=True)),
+        "columns": list(zip(table.columns, headings(table), numeric(table), strict=True)),
         "named": [column in NAMES for column in table.columns],
         "rows": table.rows[:MOST_ROWS],
     }

@@ -1,7 +1,7 @@
 "use strict";
 // A view in space, drawn on a canvas: points by a depth buffer, lines, circles and arrows over them. Right-handed, z up,
 // mm. Parts can be switched off: each has lines, points with a value, and marks that are its own (balls, defects). Joints
-// have a section and gaps at its points. What is shown is less `origin`; what is read out has it put back.
+// have a section and gaps at its points; regions of points have an outline, each a part of its own. What is shown is less `origin`; what is read out has it put back.
 function make(tag, attributes, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(attributes || {})) {
@@ -31,7 +31,7 @@ function spaceView(host, data) {
   const table = colourTable(data.stops, 101);
   const packed = Uint32Array.from(table, ([r, g, b]) => (255 << 24 | b << 16 | g << 8 | r) >>> 0);
   const parts = data.parts.map((part) => ({ ...part, on: true, points: Float32Array.from(part.points) }));
-  const joints = data.joints || [], marks = data.marks || [], origin = data.origin || [0, 0, 0];
+  const joints = data.joints || [], marks = data.marks || [], regions = data.regions || [], origin = data.origin || [0, 0, 0];
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
   const hold = (p) => p.forEach((value, k) => { low[k] = Math.min(low[k], value); high[k] = Math.max(high[k], value); });
   for (const part of parts) {
@@ -54,8 +54,10 @@ function spaceView(host, data) {
   let width = 0, height = 0, ratio = 1, owner = new Int32Array(0), tips = [], waiting = false;
 
   const hasPoints = parts.some((part) => part.points.length);
+  const places = data.places || []; // to look at, where there are no joints
   const place = make("select", {}, make("option", { value: "-1" }, say("everything")),
-    ...joints.map((joint, j) => make("option", { value: String(j) }, `${say("joint")} ${joint.name}`)));
+    ...joints.map((joint, j) => make("option", { value: String(j) }, `${say("joint")} ${joint.name}`)),
+    ...places.map((one, j) => make("option", { value: String(j) }, one.text)));
   const exponent = (value) => Math.log10(Math.max(value, 1));
   const slider = make("input", { type: "range", min: "0", max: "6", step: "0.02" });
   const sliderSaid = make("span", {});
@@ -75,7 +77,7 @@ function spaceView(host, data) {
   };
   const look = (yaw, pitch) => () => { camera.yaw = yaw; camera.pitch = pitch; };
   host.append(
-    make("div", { className: "tools" }, ...(joints.length ? [make("label", {}, `${say("look at")} `, place)] : []),
+    make("div", { className: "tools" }, ...(joints.length + places.length ? [make("label", {}, `${say("look at")} `, place)] : []),
       button(say("side"), look(0, 0)), button(say("plan"), look(0, Math.PI / 2)), button(say("along"), look(-Math.PI / 2, 0)),
       button("+", () => zoom(1.4)), button("−", () => zoom(1 / 1.4))),
     canvas, said,
@@ -83,11 +85,11 @@ function spaceView(host, data) {
       make("label", {}, `${say("drawn")} `, slider, sliderSaid))] : []),
     ...(hasPoints ? [make("div", { className: "tools" }, tick(say(data.values), true, (on) => { state.points = on; }),
       make("label", {}, `${say("colours to")} `, limit), make("span", { className: "scale" }, least, bar, most))] : []),
-    make("fieldset", { className: "tools" }, make("legend", {}, say("components")),
+    make("fieldset", { className: "tools" }, make("legend", {}, say(joints.length ? "components" : "shown")),
       ...parts.map((part) => tick(part.text || part.name, true, (on) => { part.on = on; }))));
 
   function goTo(j) {
-    const joint = joints[j];
+    const joint = joints[j] || places[j];
     state.joint = joint ? j : -1; // a joint is shown without the others, which would stand behind it
     if (!joint) Object.assign(camera, whole, { zoom: 1 });
     else {
@@ -97,6 +99,8 @@ function spaceView(host, data) {
         return Math.max(...values) - Math.min(...values);
       }));
       camera.zoom = 1;
+      const out = joint.outward;
+      if (out) look(Math.hypot(out[0], out[1]) > 1e-3 ? Math.atan2(out[0], -out[1]) : 0, Math.asin(Math.min(Math.max(out[2], -1), 1)))();
     }
     const share = joint ? 0.12 : 0.04;
     setTimes(largest > 0 ? (share * camera.reach) / largest : 1);
@@ -138,7 +142,7 @@ function spaceView(host, data) {
     owner = new Int32Array(width * height).fill(-1);
     if (state.points) paintPoints(at, new Uint32Array(image.data.buffer));
     context.putImageData(image, 0, 0);
-    for (const part of parts) if (part.on) for (const edge of part.edges) line(edge.map((p) => at(...p)), "#555", 1.2);
+    for (const part of parts) if (part.on) for (const edge of part.edges) line(edge.map((p) => at(...p)), part.bold ? "#000" : "#555", part.bold ? 2 : 1.2);
     tips = [];
     for (const mark of marks) if (parts[mark.part].on) circle(at, mark);
     for (const joint of joints.filter(visible)) line([0, 1, 2, 3, 0].map((k) => at(...joint.at[k])), "#222", 1);
@@ -152,7 +156,8 @@ function spaceView(host, data) {
   function paintPoints(at, pixels) {
     const near = state.joint < 0 ? Infinity : 1.2 * camera.reach, [tx, ty, tz] = camera.target;
     const depth = new Float32Array(width * height).fill(-Infinity);
-    const size = Math.max(2, Math.round(2 * ratio * Math.min(Math.max(camera.zoom, 1), 2)));
+    const least = Math.max(2, Math.round(2 * ratio * Math.min(Math.max(camera.zoom, 1), 2)));
+    const size = Math.max(least, Math.min(Math.ceil(at.scale * (data.spacing || 0)), 32 * ratio)); // near to, points close up
     let first = 0;
     for (const part of parts) {
       const { points, residual } = part;
@@ -162,7 +167,7 @@ function spaceView(host, data) {
         const [x, y, z] = at(a, b, c);
         const share = Math.min(Math.max(residual[i] / state.limit, -1), 1);
         const colour = packed[Math.round(50 + 50 * share)];
-        const left = Math.round(x), top = Math.round(y);
+        const left = Math.round(x - size / 2), top = Math.round(y - size / 2);
         if (left < 0 || top < 0 || left + size >= width || top + size >= height) continue;
         for (let v = top; v < top + size; v++) for (let u = left; u < left + size; u++) {
           const cell = v * width + u;
@@ -194,7 +199,17 @@ function spaceView(host, data) {
     context.arc(x, y, radius, 0, 2 * Math.PI);
     context.stroke();
     tips.push({ x, y, reach: Math.max(radius, 6 * ratio), text: () => `${mark.name}: ${mark.text}${mark.by ? `; ${vector(mark.by, mark.ci95)}` : ""}` });
+    if (mark.label) label(mark.name, x + radius + 3 * ratio, y);
     if (state.arrows && mark.by && mark.by.every((value) => value !== null)) arrow(at, mark.at, mark.by);
+  }
+  function label(text, x, y) {
+    context.font = `bold ${12 * ratio}px system-ui, sans-serif`;
+    context.textAlign = "left";
+    context.lineWidth = 3 * ratio;
+    context.strokeStyle = "#fff";
+    context.strokeText(text, x, y + 4 * ratio);
+    context.fillStyle = "#000";
+    context.fillText(text, x, y + 4 * ratio);
   }
   function arrow(at, p, by) {
     const from = at(...p), to = at(...p.map((value, axis) => value + state.times * by[axis]));
@@ -238,7 +253,8 @@ function spaceView(host, data) {
     for (const part of parts) {
       if (index >= 0 && index < part.residual.length) {
         const where = Array.from(part.points.subarray(3 * index, 3 * index + 3), (value, k) => (value + origin[k]).toFixed(0)).join(", ");
-        said.textContent = `${part.name}: ${two(part.residual[index])} mm ${say("from the design at")} ${where} mm`;
+        const region = part.region && part.region[index] >= 0 ? `; ${regions[part.region[index]]}` : "";
+        said.textContent = `${part.text || part.name}: ${two(part.residual[index])} mm ${say("from the design at")} ${where} mm${region}`;
         return;
       }
       index -= part.residual.length;

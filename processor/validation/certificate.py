@@ -21,6 +21,7 @@ from typing import Any
 
 import jinja2
 
+from processor.language import language
 from processor.validation.cells import Case
 from processor.validation.history import Row
 from processor.validation.matrix import Matrix
@@ -214,13 +215,14 @@ def as_json(certificate: Certificate) -> str:
     return json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
-def as_html(certificate: Certificate) -> str:
-    """Write the certificate as a page of its own."""
+def as_html(certificate: Certificate, lang: str = "en") -> str:
+    """Write the certificate as a page of its own, in the language ``lang``."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
     environment.filters["shown"] = _shown
-    return environment.get_template("certificate.html").render(certificate=certificate) + "\n"
+    environment.filters["say"] = language(lang).say
+    return environment.get_template("certificate.html").render(certificate=certificate, lang=lang) + "\n"
 
 
 def _shown(value: float, digits: int = 3) -> str:

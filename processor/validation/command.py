@@ -28,6 +28,7 @@ def run(
     history: Path | None,
     night: str | None,
     again: bool,
+    lang: str = "en",
 ) -> Summary:
     """Do a night; cells that fail are said on standard error, with a progress bar where that is a terminal."""
     night = _night(night)
@@ -43,7 +44,7 @@ def run(
                     with bar.external_write_mode(sys.stderr):
                         print(f"{cell.title}: failed: {_printable(outcome.failed)}", file=sys.stderr)
 
-            return nights.run(wanted, out, night, runner, history, again, progress=progress)
+            return nights.run(wanted, out, night, runner, history, again, progress=progress, lang=lang)
 
 
 def accept(out: Path, history: Path | None, night: str | None) -> str:

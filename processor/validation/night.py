@@ -73,8 +73,9 @@ def run(
     again: bool = False,
     made_by: Software | None = None,
     progress: Callable[[int, int, Cell | None, Outcome | None], None] = lambda *_: None,
+    lang: str = "en",
 ) -> Summary:
-    """Do what is not done yet of a night and tell it; ``out`` must be ``opened``.
+    """Do what is not done yet of a night and tell it, its pages in the language ``lang``; ``out`` must be ``opened``.
 
     ``again`` deletes what other software has done of this night, which is refused otherwise (UsageError). ``progress``
     is told how many of how many cells are done, and of the one that was last.
@@ -109,13 +110,13 @@ def run(
                 history.add(night, cell, outcome)
                 ready += 1
                 progress(ready, len(cells), cell, outcome)
-        told = _tell(matrix, out, night, cells, present, history)
+        told = _tell(matrix, out, night, cells, present, history, lang)
     _forget_old(out)
     return told
 
 
 def _tell(
-    matrix: Matrix, out: Path, night: str, cells: tuple[Cell, ...], present: Software, history: History
+    matrix: Matrix, out: Path, night: str, cells: tuple[Cell, ...], present: Software, history: History, lang: str
 ) -> Summary:
     asked = {cell.key for cell in cells}
     nights = [one for one in history.nights() if one.night <= night]
@@ -131,7 +132,7 @@ def _tell(
         "summary.json": _json(told.as_object()).encode(),
         "junit.xml": junit.xml(night, own, missed, found),
         "certificate.json": certificate.as_json(certified).encode(),
-        "certificate.html": certificate.as_html(certified).encode(),
+        "certificate.html": certificate.as_html(certified, lang).encode(),
         "line.txt": f"{told.line}\n".encode(),
     }
     of_night = out / NIGHTS / night
@@ -140,7 +141,7 @@ def _tell(
         _write(of_night / name, data)
         _write(out / name, data)
     history.end(night, [(one.name, one.kind, summary.change_object(one)) for one in found.changes], told.line, _now())
-    page = summary.nights_html(told, [one for one in history.nights() if one.night <= night], rows)
+    page = summary.nights_html(told, [one for one in history.nights() if one.night <= night], rows, lang)
     _write(out / "nights.html", page.encode())
     return told
 

@@ -12,6 +12,7 @@ from typing import Any
 import jinja2
 import numpy as np
 
+from processor.language import language
 from processor.validation import changes
 from processor.validation.cells import Figure
 from processor.validation.changes import ALARMS, CHANGED, IMPROVEMENT, Change, Found
@@ -135,11 +136,12 @@ def _finite(value: float) -> float | None:
 # --- the page of all nights -----------------------------------------------------------------------------------------
 
 
-def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row]) -> str:
-    """Write the page: the nights, the latest first, and of every figure its course over them."""
+def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], lang: str = "en") -> str:
+    """Write the page in a language: the nights, the latest first, and of every figure its course over them."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
+    environment.filters["say"] = language(lang).say
     shown = [night.night for night in nights][-SPARK_NIGHTS:]
     course: dict[Name, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
     units: dict[Name, str] = {}
@@ -164,6 +166,7 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row]) 
             }
         )
     text: str = environment.get_template("nights.html").render(
+        lang=lang,
         summary=summary,
         nights=list(reversed(nights)),
         figures=figures,

@@ -151,6 +151,13 @@ def test_what_has_no_answer_is_nan(tmp_path):
     assert text.splitlines()[1] == "0.0,0.0,0.0,nan,nan,0,0,2,nan,0.5,nan,nan,nan"
 
 
+def test_the_page_may_be_chinese(clouds, tmp_path, monkeypatch):
+    assert called(monkeypatch, *clouds[:2], "-o", tmp_path / "out", "--core", clouds[2], "--lang", "zh") == 0
+    text = (tmp_path / "out" / "report.html").read_text("utf-8")
+    assert '<html lang="zh">' in text
+    assert "核心点" in text
+
+
 def test_bad_input_is_one_line_and_exit_3(clouds, tmp_path, monkeypatch, capsys):
     first, second, _ = clouds
     out = tmp_path / "out"

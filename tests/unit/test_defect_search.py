@@ -108,6 +108,10 @@ def test_a_dent_a_bulge_and_a_pit_are_measured():
         assert abs(result.depth_max[k] - depth) < 2.5 * result.depth_ci95[k]
         np.testing.assert_allclose(result.centres[k], [at[0], 0.0, at[1]], atol=0.1 * radius + 1.0)
         assert result.confidence[k] > 0.9
+        deep = np.linalg.norm(result.surface_at - [at[0], 0.0, at[1]], axis=1) < 0.1 * radius + result.cell_mm
+        assert set(result.surface_defect[deep].tolist()) in ({k}, {-1, k})
+        if kind != "pit":  # outward positive, and nearly as deep as its middle
+            assert np.median(result.surface_mm[deep]) == pytest.approx(-depth, rel=0.15)
         # A third of the cylinder about a bump (1 - r^2 / R^2)^2.
         if kind != "pit":
             assert result.volume_mm3[k] == pytest.approx(np.pi * radius**2 * depth / 3.0, rel=0.05)

@@ -7,10 +7,11 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
+from processor import language
 from processor.evaluate import ErrorReport
 from processor.model import Metric
 from processor.preassembly import joint_measures, proposals
-from processor.report import figures, language, page, view
+from processor.report import figures, page, view
 from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
 from tests.unit.test_report_balls import of_frame, whole, with_truth
 
@@ -107,7 +108,7 @@ def test_live_figures_are_translated_but_for_names():
 
 # --- Chinese -------------------------------------------------------------------------------------------------------
 
-UNITS = {"mm", "mrad", "ci"}
+UNITS = {"mm", "mrad", "ci", "ci95"}
 METHODS = {"adjustment", "corner", "line", "design", "aided", "ray", "ransac", "least", "squares"}
 STANDARDS = {"GB", "Cram", "rao"}  # Cramér-Rao, the name of a bound
 IN_FILES = {
@@ -149,9 +150,9 @@ class Visible(HTMLParser):
             self.texts.append(data)
 
 
-def latin(texts):
+def latin(texts, stays=STAYS):
     """Texts with words that are not Chinese and are no names."""
-    return [one for one in texts if set(re.findall(r"[A-Za-z]{2}\w*", one)) - STAYS]
+    return [one for one in texts if set(re.findall(r"[A-Za-z]{2}[A-Za-z0-9_]*", one)) - stays]
 
 
 def chinese_page(execution, report):

@@ -44,3 +44,41 @@ def test_facets_are_neighbours_over_smooth_sides_only():
     for face, row in enumerate(surface.neighbours):
         other = row.max()
         np.testing.assert_allclose(surface.normals[face], surface.normals[other])
+
+
+def _walked(surface, point, at):
+    """The facet a point's foot is on, its signed distance, and how far its foot is beyond the face: one by one."""
+
+    def shares(face):
+        corners = surface.vertices[surface.faces[face]]
+        edges = np.stack([corners[1] - corners[0], corners[2] - corners[0]])
+        second, third = np.linalg.lstsq(edges.T, point - corners[0], rcond=None)[0]
+        return np.array([1.0 - second - third, second, third]), corners
+
+    for _ in range(mesh_surface.WALK_STEPS):
+        share, corners = shares(at)
+        over = surface.neighbours[at, share.argmin()]
+        if share.min() > -1e-9 or over < 0:
+            break
+        at = over
+    share, corners = shares(at)
+    side = share.argmin()
+    base = corners[(side + 2) % 3] - corners[(side + 1) % 3]
+    up = corners[side] - corners[(side + 1) % 3]
+    height = np.linalg.norm(up - base * (up @ base) / (base @ base))
+    return at, (point - corners[0]) @ surface.normals[at], max(-share[side], 0.0) * height
+
+
+def test_walks_end_where_they_do_step_by_step():
+    mesh = trimesh.creation.cylinder(500.0, 2000.0, sections=48)
+    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-1.0, 1.0, (300, 3)) * (600.0, 600.0, 1100.0)
+    start = rng.integers(-1, len(mesh.faces), len(points))
+    face, distance, beyond = surface.distances(points, 50.0, start)
+    assert (face[start < 0] == -1).all()
+    for i in np.flatnonzero(start >= 0):
+        expected = _walked(surface, points[i], start[i])
+        assert face[i] == expected[0]
+        assert distance[i] == pytest.approx(expected[1], abs=1e-9)
+        assert beyond[i] == pytest.approx(expected[2], abs=1e-9)

@@ -59,9 +59,9 @@ def test_tables_against_numpy(monkeypatch, separator, pieces, workers):
         )
         if rng.random() < 0.1:
             lines.append(rng.choice(("", "# 1 2 3")))
-    for end in ("\n", "\r\n"):
+    expected = np.loadtxt(io.StringIO("\n".join(lines)), delimiter=separator, usecols=(3, 0, 1))
+    for end in ("\n", "\r\n", "\r"):
         text = end.join(lines) + rng.choice(("", end))
-        expected = np.loadtxt(io.StringIO(text), delimiter=separator, usecols=(3, 0, 1))
         assert np.array_equal(numbers(text, (3, 0, 1), separator=separator), expected)
         assert np.array_equal(numbers(text, (3, 0, 1), most=700, separator=separator), expected[:700])
 

@@ -390,6 +390,7 @@ def test_a_real_cell_through_the_command_line(tmp_path):
     (tmp_path / "tiny.toml").write_text(RECIPE, "utf-8")
     (tmp_path / "m.toml").write_text(TINY, "utf-8")
     words = ["validate", str(tmp_path / "m.toml"), "-o", str(tmp_path / "out"), "--night", NIGHT, "--json"]
+    words += ["--lang", "zh"]
     done = subprocess.run(
         [sys.executable, "-m", "processor", *words, "--jobs", "2"],
         capture_output=True,
@@ -403,6 +404,7 @@ def test_a_real_cell_through_the_command_line(tmp_path):
     real = next(cell for cell in told["cells"] if not cell["failed"])
     assert real["figures"] > 20
     assert real["peak_mb"] > 50.0
+    assert '<html lang="zh">' in (tmp_path / "out" / "nights.html").read_text("utf-8")
     rows = dict(stored(tmp_path / "out", "SELECT method || ' ' || name, value FROM rows"))
     assert rows["ransac balls not found"] == 0.0
     assert abs(rows["ransac radii, bias"]) < 1.0

@@ -1,10 +1,12 @@
-"""The page in another language: fixed texts looked up, texts with numbers and names in them matched by patterns.
+"""Pages in another language: fixed texts looked up, texts with numbers and names in them matched by patterns.
 
-A catalogue is a TOML file beside this one, in sections, one for each subject. ``[section.words]`` are whole texts,
-``[section.sentences]`` texts with places in them, the first that fits is taken. A place is ``{}`` for anything without
-"; ", ``{;}`` for anything, ``{#}`` for a number; in the other language they are ``{0}``, ``{1}`` ... in whatever order.
+A catalogue is some TOML files beside this one, CODE-PART.toml, in sections, one for each subject. ``[section.words]``
+are whole texts, ``[section.sentences]`` texts with places in them, the first that fits is taken. A place is ``{}`` for
+anything without "; ", ``{;}`` for anything, ``{#}`` for a number; in the other language they are ``{0}``, ``{1}`` ...
+in whatever order.
 What stands in a place is translated in turn where it can be. A text that is not known is taken apart at full stops,
-semicolons, colons, commas and "and"; what is left of it stays as it is, and so do names from files.
+semicolons, colons, commas and "and"; what is left of it stays as it is, and so do names from files. A word that means
+one thing in a column, say, and another elsewhere is ``column|word`` there.
 """
 
 from __future__ import annotations
@@ -22,14 +24,23 @@ else:
     import tomli as tomllib
 
 CODES = ("en", "zh")
-SEPARATORS = (". ", "; ", ": ", ", ", " and ")
-FULL_WIDTH = {". ": "。", "; ": "；", ": ": "：", ", ": "，", " and ": "、"}
+# Files of a catalogue, in the order in which sentences are tried; the last holds what anything else may end in.
+PARTS = ("page", "preassemble", "spheres", "deviation", "stitch", "defects", "batch", "validate", "live", "endings")
+SEPARATORS = (" | ", ". ", "; ", ": ", ", ", " and ")
+FULL_WIDTH = {" | ": " | ", ". ": "。", "; ": "；", ": ": "：", ", ": "，", " and ": "、"}
 PLACES = {
     "{}": "((?:(?!; ).)+?)",
     "{;}": "(.+?)",
     "{#}": r"([-+−]?\d(?:[\d.,]*\d)?(?:e[-+]?\d+)?%?|–|[-+]?(?:nan|inf)%?)",
 }
-SAID_IN_FIGURES = ("title", "arrows", "values", "verdict", "text")  # what live figures show that is no name from a file
+SAID_IN_FIGURES = (
+    "title",
+    "arrows",
+    "values",
+    "verdict",
+    "text",
+    "regions",
+)  # what live figures show that is no name from a file
 
 
 class Language:
@@ -46,10 +57,12 @@ class Language:
             sentences = {key: text for section in sections for key, text in section.get("sentences", {}).items()}
             self._patterns = [(_pattern(key), text) for key, text in sentences.items()]
 
-    def say(self, text: str) -> str:
-        """Translate a text; as it is where it is not known."""
+    def say(self, text: str, within: str = "") -> str:
+        """Translate a text; as it is where it is not known. ``within`` tells words of two senses apart."""
         if not self.words:
             return text
+        if within and (special := self.words.get(f"{within}|{text}")) is not None:
+            return special
         if text not in self._said:
             known = self._known(text)
             self._said[text] = self._taken_apart(text) if known is None else known
@@ -82,19 +95,28 @@ class Language:
         return {key: text for key, text in self.words.items() if f'"{key}"' in scripts}
 
     def in_figures(self, data: Any) -> Any:
-        """Translate what live figures show: the texts under the keys SAID_IN_FIGURES, at any depth."""
+        """Translate what live figures show: texts, or lists of them, under the keys SAID_IN_FIGURES, at any depth."""
         if isinstance(data, dict):
             return {
-                key: self.say(value) if key in SAID_IN_FIGURES and isinstance(value, str) else self.in_figures(value)
+                key: self._shown(value) if key in SAID_IN_FIGURES else self.in_figures(value)
                 for key, value in data.items()
             }
         return [self.in_figures(one) for one in data] if isinstance(data, list) and self.words else data
 
+    def _shown(self, value: Any) -> Any:
+        if isinstance(value, str):
+            return self.say(value)
+        whole = isinstance(value, list) and all(isinstance(one, str) for one in value)
+        return [self.say(one) for one in value] if whole else self.in_figures(value)
+
 
 def catalogue(code: str) -> dict[str, dict[str, dict[str, str]]]:
-    """Read a catalogue: words and sentences by section."""
-    text = (importlib.resources.files("processor.report") / f"{code}.toml").read_text("utf-8")
-    found: dict[str, dict[str, dict[str, str]]] = tomllib.loads(text)
+    """Read a catalogue: words and sentences by section, PART.SECTION."""
+    here = importlib.resources.files("processor.language")
+    found: dict[str, dict[str, dict[str, str]]] = {}
+    for part in PARTS:
+        sections = tomllib.loads((here / f"{code}-{part}.toml").read_text("utf-8"))
+        found |= {f"{part}.{section}": texts for section, texts in sections.items()}
     return found
 
 

@@ -1,0 +1,364 @@
+"""Pages other than of a bridge or a frame in Chinese: steps for structures, a batch, a comparison, the nights."""
+
+import ast
+import dataclasses
+import importlib.resources
+import re
+from pathlib import Path
+
+import pytest
+
+from processor import language
+from processor.batch import figures as batch_figures
+from processor.batch import summary
+from processor.batch.job import Job
+from processor.batch.record import Record
+from processor.defects.result import CLASSES
+from processor.defects.result import Result as Defects
+from processor.evaluate import ErrorReport
+from processor.model import Metric
+from processor.report import comparison, figures, page
+from processor.validation import changes, night
+from processor.validation import summary as nights_summary
+from tests import nights, step_results
+from tests.unit.test_language import CODES, STAYS, Visible, latin
+
+SOURCES = Path(language.__file__).parents[1]
+NAMES = {
+    *(f"S{i}" for i in range(9)),
+    *("site", "scan", "made", "component", "ply", "summary", "timings"),
+    *("automatic", "default", "paper", "three", "point", "stitch", "deviation", "spheres"),
+    *("PRCS", "SOCS", "GLCS", "T_PRCS_SOCS", "LOD95", "lod95", "ppm", "rms"),
+}
+
+
+def left_in_english(text, *more):
+    seen = Visible(re.sub(r"T_PRCS_SOCS\(.*?\)", "", text))
+    assert seen.lang == "zh"
+    assert len(seen.texts) > 20
+    return latin(seen.texts, STAYS | NAMES | set(more))
+
+
+# --- what the catalogue holds ---------------------------------------------------------------------------------------
+
+
+def literals():
+    """Texts in the sources, places in them as \\0, without docstrings; and pages, scripts, tables of limits."""
+    found = []
+    for path in sorted([*SOURCES.rglob("*.py"), *(SOURCES.parent / "designgen").rglob("*.py")]):
+        tree = ast.parse(path.read_text("utf-8"))
+        inner = {
+            id(part)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.JoinedStr)
+            for part in ast.walk(node)
+            if part is not node and not (isinstance(part, ast.Constant) and part not in node.values)
+        }
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
+                inner.add(id(node.value))  # a docstring
+        for node in ast.walk(tree):
+            if isinstance(node, ast.JoinedStr):
+                found.append("".join(one.value if isinstance(one, ast.Constant) else "\0" for one in node.values))
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:
+                found.append(node.value)
+    others = [path for pattern in ("*.html", "*.js") for path in SOURCES.rglob(pattern)]
+    others += (SOURCES / "tolerances").glob("*.toml")
+    return found, [path.read_text("utf-8") for path in sorted(others)]
+
+
+def pieced(piece, whole):
+    """Whether a piece of a phrase is put together of pieces of texts: the end of one, whole ones, the start of one."""
+    words = piece.split()
+    reached = {0}
+    for end in range(1, len(words) + 1):
+        for start in list(reached):
+            part = " ".join(words[start:end])
+            if (
+                part in whole
+                or (start == 0 and any(one.endswith(f" {part}") for one in whole))
+                or (end == len(words) and any(one.startswith(f"{part} ") for one in whole))
+            ):
+                reached.add(end)
+    return len(words) in reached
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_no_phrase_is_of_a_text_that_is_gone(code):
+    """Every piece of a phrase is said somewhere in the sources; a column's name may stand there with underscores."""
+    found, others = literals()
+    text = "\n".join([*found, *others])
+    text += "\n" + text.replace("_", " ")
+    whole = {part.strip(" .)?%±/-") for one in found for part in re.split("[\0_:;,(]", one)}
+    stale = []
+    for section in language.catalogue(code).values():
+        for key in [*section.get("words", {}), *section.get("sentences", {})]:
+            pieces = [one for part in re.split(r"\{[;#]?\}", key.split("|")[-1]) for one in re.split(r"[:;,(] ?", part)]
+            words = [one.strip(" .)?%±/-") for one in pieces]
+            stale += [(key, one) for one in words if len(one) > 2 and one not in text and not pieced(one, whole)]
+    assert stale == []
+
+
+@pytest.mark.parametrize("code", CODES)
+def test_every_file_of_a_catalogue_is_read(code):
+    there = {path.name for path in importlib.resources.files("processor.language").iterdir() if code in path.name}
+    assert there == {f"{code}-{part}.toml" for part in language.PARTS}
+
+
+# --- steps ----------------------------------------------------------------------------------------------------------
+
+
+def checks_of(step, *names):
+    return tuple(Metric(step, name, 1.0, 0.0 if i % 2 else float("nan"), "mm") for i, name in enumerate(names))
+
+
+STITCH_CHECKS = (
+    "scans not placed", "station positions after datum fit, max", "station positions after datum fit, rms",
+    "rotations after datum fit, max", "scans called ok, over 50 mm off", "pose components within their 95 % intervals",
+    "three-point: scans not placed",
+)  # fmt: skip
+DEFECT_CHECKS = (
+    *(f"{kind}: missed of 2" for kind in CLASSES), "paper: step: missed of 1", "false alarms", "surface examined",
+    "class wrong", "depths off by more than a tenth and 2 LOD95", "depth error, median", "depth error, max",
+    "depths that are bounds alone",
+)  # fmt: skip
+
+
+def stitched():
+    first = step_results.stitching()
+    other = dataclasses.replace(first, method="three-point")
+    made = step_results.execution(("stitch", "automatic", "{}", first), ("stitch", "three-point", "{}", other),
+                                  names=first.scans)  # fmt: skip
+    return made, ErrorReport(checks_of("stitch", *STITCH_CHECKS))
+
+
+def searched():
+    said = "placed by step deviation (as given); 1.2 m2 examined of 2.4 m2 of the design's surface"
+    paper = dataclasses.replace(
+        step_results.defects(3), method="paper",
+        message="2000 points 4.5 mm apart after density clustering; rms 1.20 mm of 87% paired; a defect is what is "
+        "farther than 3.10 mm from the design; the page names no classes",
+    )  # fmt: skip
+    first = step_results.defects(message=said)
+    made = step_results.execution(("defects", "default", "{}", first), ("defects", "paper", "{}", paper))
+    return made, ErrorReport(checks_of("defects", *DEFECT_CHECKS))
+
+
+@pytest.mark.parametrize("made", [stitched, searched])
+def test_nothing_but_names_and_units_is_left_in_english(made):
+    execution, report = made()
+    text = page.html(execution, report, figures.of_run(execution, report), "zh")
+    assert left_in_english(text) == []
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "no point of the scans is near the design; run the steps stitch and deviation first, or give the scans poses "
+        "in the design's frame",
+        "too few points to place the scans at the design",
+        "the scans are not in the design's frame and could not be placed there; run the steps stitch and deviation "
+        "first, or give the scans poses in the design's frame",
+        "too few points are left after the removal of noise",
+        "the scan could not be laid on the design",
+    ],
+)
+def test_a_search_that_failed_says_so_in_chinese(message):
+    execution = step_results.execution(("defects", "default", "{}", Defects("failed", "default", message)))
+    assert left_in_english(page.html(execution, ErrorReport(), {}, "zh")) == []
+
+
+@pytest.mark.parametrize(
+    "message",
+    [
+        "1.2 m2 examined of 2.4 m2 of the design's surface; too few components to fit the whole to the design: its "
+        "place is taken as it came",
+        "placed by principal axes and a best fit, which takes up what the whole was moved by; another attitude fits as "
+        "well; 1.2 m2 examined of 2.4 m2 of the design's surface",
+        "placed by step deviation (coarse); 1.2 m2 examined of 2.4 m2 of the design's surface",
+        "The scan is taken to be in the design's frame (asked for): deviations hold what moved as a whole. 3 "
+        "scans have no pose: they were taken to be in one frame already.",
+    ],
+)
+def test_messages_of_the_search_are_known(message):
+    assert latin([language.language("zh").say(message)], STAYS | NAMES) == []
+
+
+def test_a_word_of_two_senses_has_that_of_its_column():
+    say = language.language("zh").say
+    assert (say("step"), say("step", "class"), say("step: missed of 2")) == ("步骤", "错台", "错台：2 处中漏检")
+    assert (say("misalignment"), say("misalignment", "what")) == ("接口错边", "整体偏位")
+    assert (say("side"), say("side", "heading")) == ("立面", "边长")
+
+
+SPOKEN = ("stitching", "defects", "deviation")
+
+
+def messages(package):
+    """Texts of a package that are not of errors or of the code: with blanks, some words, places filled by 7."""
+    for path in sorted((SOURCES / package).glob("*.py")):
+        tree = ast.parse(path.read_text("utf-8"))
+        silent = {
+            id(part)
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
+            for part in ast.walk(node)
+        }
+        whole = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) and id(node) not in silent]
+        silent |= {id(part) for node in whole for part in ast.walk(node) if part is not node}
+        for node in ast.walk(tree):
+            if id(node) in silent:
+                continue
+            if isinstance(node, ast.JoinedStr):
+                yield "".join(one.value if isinstance(one, ast.Constant) else "7" for one in node.values)
+            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                yield node.value
+
+
+@pytest.mark.parametrize("package", SPOKEN)
+def test_all_that_a_step_may_say_is_known(package):
+    """Read from its sources, so that no sentence is changed there and stays English here."""
+    say = language.language("zh").say
+    said = [text for text in messages(package) if len(re.findall(r"\b[a-z]{2,}\b", text)) >= 3 and "->" not in text]
+    assert len(said) > 10
+    stays = STAYS | NAMES | {"cm", "register", "fine"}
+    assert [text for text in said if latin([say(text.strip("; "))], stays)] == []
+
+
+# --- a batch --------------------------------------------------------------------------------------------------------
+
+REASONS = (
+    "stopped before it ended",
+    "took longer than 3.5 s (--timeout-s)",
+    "needs more memory than 200 MB (--memory-mb)",
+    "crashed: SIGSEGV (signal 11)",
+    "crashed: signal 70",
+    "ended with exit code 9 and without results",
+    "ended with exit code 9 and without results: 坏",
+    "the input changed while it was processed, so nothing is kept; run again when it is complete",
+    "done, but not in this folder: all workers must share it, and the inputs, under the same path",
+    "every worker that did it died (out of memory?); run again, with fewer jobs at a time",
+    "a worker has other software: numpy 1.0, not 2.0; install the same everywhere",
+)
+LEFT_OUT = (
+    "cannot be read (Permission denied)",
+    "holds results of an earlier run",
+    "a link; the batch follows none",
+    "holds no rows of coordinates, so it is taken for no scan",
+    "lies within the scan folder 桥",
+    "has the name of one of the batch's own files; rename it",
+)
+
+
+LEFT = dict(zip("一二三四五六", LEFT_OUT, strict=True))
+
+
+def job(out, name):
+    (out / f"{name}.log").touch()
+    return Job(name, out, out, out, out / name, out / f"{name}.log", out, out, out, "", (), {}, {}, 1.0, 1, 1)
+
+
+def indexed(out, lang, reasons=REASONS):
+    everything = dict.fromkeys(batch_figures.COLUMNS, 3)
+    everything |= {"steps": "preassemble, spheres (partial), stitch (failed), deviation (ambiguous), defects (weak)"}
+    done = [
+        Record(f"扫描 {i}", "", status, figures={**everything, "verdict": verdict})
+        for i, (status, verdict) in enumerate(
+            [("done", "pass"), ("in-part", "indeterminate"), ("limit-missed", "fail"), ("done", None)]
+        )
+    ]
+    done += [Record(f"坏 {i}", "", "failed", reason) for i, reason in enumerate(reasons)]
+    found = summary.write(out, [(job(out, one.input), one) for one in done], LEFT, lang)
+    return found.page.read_text("utf-8")
+
+
+def test_the_index_of_a_batch_in_chinese(tmp_path):
+    more = {"csv", "json", "SIGSEGV", "timeout", "memory", "MB", "mb", "numpy", "not", "Permission", "denied"}
+    assert left_in_english(indexed(tmp_path, "zh"), *more) == []
+
+
+def test_errors_of_inputs_are_marked_as_english(tmp_path):
+    error = "scan.ply: expected 1000 points, found 50; export it again"
+    text = indexed(tmp_path, "zh", (error, *REASONS))
+    assert f'lang="en">{error}</td>' in text
+    assert "错误信息与命令行一致" in text
+    assert text.count('lang="en"') == 1
+    assert "错误信息与命令行一致" not in indexed(tmp_path, "zh")
+
+
+# --- a comparison ---------------------------------------------------------------------------------------------------
+
+
+def test_a_comparison_in_chinese():
+    share = {"core_points": 10, "without_lod": 2, "significant": 3, "significant_share": 0.375, "mean": -0.1,
+             "significant_share_ci95": [0.1, 0.6], "median": 1e-5, "sd": 0.2, "min": None, "max": 1.0,
+             "lod95_median": 0.01}  # fmt: skip
+    inputs = {name: {"file": f"{file}.ply"} for name, file in (("reference", "前"), ("compared", "后"))}
+    for unit in ("mm", "that of the files, which do not say it"):
+        for known in (2, 10):
+            record = {"summary": {**share, "without_lod": known}, "unit": unit, "inputs": inputs}
+            drawn = [("Deviations; the outermost bars hold all beyond", b"")]
+            seen = Visible(comparison._page(record, drawn, "zh"))
+            assert seen.lang == "zh"
+            assert "由 前.ply 至 后.ply" in seen.texts
+            assert [one for one in latin(seen.texts) if "ply" not in one] == []
+
+
+# --- nights ---------------------------------------------------------------------------------------------------------
+
+
+def change(kind, size, is_ratio=True, unit="mm", cases=3, name=("spheres", "ray", "radii, bias")):
+    return changes.Change(name, kind, "paired", size, is_ratio, unit, 0.001, cases)
+
+
+CHANGES = (
+    change("regression", 0.2), change("improvement", -0.2), change("changed", 0.1, False),
+    change("regression", -1.0, False), change("regression", 3.0, False, "%"), change("improvement", -3.0, False, "%"),
+    change("improvement", -3.0, False, ""), change("regression", 3.0, False, ""),
+    change("lost", float("inf"), False, cases=1), change("lost", float("inf"), False, cases=2),
+)  # fmt: skip
+
+
+def a_night(failed=1, missed=2, found=CHANGES, **more):
+    cells = tuple({"failed": "x" if i < failed else ""} for i in range(3))
+    figure = nights_summary.Figure("spheres", "ray", "radii, bias", 1.0, 0.5, "mm")
+    of = changes.Found(found, 12, 3, 4, **more)
+    return nights_summary.Summary("2026-11-21", nights.SOFTWARE, cells, {"a": [figure] * missed} if missed else {}, of)
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        *(a_night(found=(one,)) for one in CHANGES),
+        a_night(),
+        a_night(0, 0, (), first=True),
+        a_night(2, 1, (), moved_scenes=2),
+        a_night(2, 0, CHANGES[:1]),
+    ],
+)
+def test_the_line_of_a_night_in_chinese(told):
+    said = language.language("zh").say(told.line)
+    assert latin([said.replace("ray", "").replace("c0ffeec0", "")]) == []
+
+
+def two_nights(out, lang):
+    stored = {figure["name"] for case in nights.Simulated(1).cases for figure in case["figures"]}
+    figures_of = {name: (0.5, 0.2 if "bias" in name else None, "mm") for name in stored}
+    figures_of |= dict.fromkeys((*STITCH_CHECKS[:-1], *DEFECT_CHECKS), (1.0, None, "mm"))
+    rays = '[scan]\nmode = "rays"\nscanner = "phase"\nstep_mrad = 1.5\n'
+    cases = (nights.case(), nights.case("scan", text=rays), nights.case(steps=("defects",), methods=("default",)))
+    asked = nights.matrix(*cases)
+    for day in ("2026-11-20", "2026-11-21"):
+        runner = nights.runner(lambda cell: dict(figures_of))
+        night.run(asked, out, day, runner, made_by=nights.SOFTWARE, lang=lang)
+
+
+def test_pages_of_nights_in_chinese(tmp_path):
+    two_nights(tmp_path, "zh")
+    more = {"ray", "phase", "mrad", "steel", "numpy", "ISO", "Holm", "sqrt", "cal", "Cramer", "Rao",
+            "c0ffee", "check", "rms"}  # fmt: skip
+    for name in ("nights.html", "certificate.html"):
+        text = (tmp_path / name).read_text("utf-8")
+        text = re.sub(r"<code>[0-9a-f]+</code>|c0ffee\w*", "", text)
+        assert left_in_english(text, *more) == []
+    assert 'lang="zh"' in (tmp_path / "nights/2026-11-20/certificate.html").read_text("utf-8")
