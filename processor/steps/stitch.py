@@ -74,14 +74,17 @@ def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Par
         raise InputError(f"{scene.name}: method three-point needs common points; expected picks.csv in the scan folder")
     scans = scene.scans
     found, messages, scales, said = [], [], [], []
+    ties: dict[tuple[int, int], three_point.Tie] = {}
     origins = np.stack([_origin(scan) for scan in scans])
     for (a, b), (in_a, in_b, _) in picked.items():
         try:
-            one = three_point.tie(in_a - origins[a], in_b - origins[b], params.scale == "free")
+            ties[a, b] = three_point.tie(in_a - origins[a], in_b - origins[b], params.scale == "free")
         except three_point.TooFewError as error:
             said.append(f"pair {scans[a].name}, {scans[b].name} not used: {error}, three that span a plane are needed")
-            continue
+    for (a, b), one in zip(ties, three_point.pooled(list(ties.values())), strict=True) if ties else ():
         warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm)
+        if one.apart and not warning:
+            warning = f"its picks scatter by {one.sd_mm:.2g} mm, far more than the others': a blunder among them"
         if warning:
             said.append(f"pair {scans[a].name}, {scans[b].name}: {warning}")
         found.append(three_point.as_pair(a, b, one))

@@ -11,7 +11,7 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.model import Floats, Scan
-from processor.stitching import bounding, bundle, clouds, coarse, joint, pairs, picks, placing, three_point
+from processor.stitching import bounding, bundle, clouds, coarse, joint, pairs, picks, placing, regional, three_point
 from processor.stitching.bundle import Solution
 from processor.stitching.clouds import Cloud
 from processor.stitching.coarse import Placing, View
@@ -57,6 +57,7 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: picks.
         bad = {(pair.a, pair.b) for pair, is_bad in zip(measured, gross, strict=True) if is_bad}
         blocks = _without(blocks, bad)
         solution = bundle.solve(blocks, solution.T, reference)
+    solution = regional.honest(blocks, solution, reference)
     overlap, elsewhere = [], []
     for pair in measured:
         T = rigid.invert(solution.T[pair.a]) @ solution.T[pair.b]
@@ -76,7 +77,7 @@ def _usable() -> int:
 def _candidates(views: list[View], key: tuple[int, int], tilt: float, picked: picks.Picked) -> list[Placing]:
     a, b = views[key[0]], views[key[1]]
     found = coarse.placings(a, b, tilt)
-    if key in picked and len(a.fine.points) and len(b.fine.points):
+    if key in picked and len(a.coarse.points) and len(b.coarse.points):
         in_a, in_b, _ = picked[key]
         try:
             T = three_point.tie(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
-from processor.stitching import octree
+from processor.stitching import grouping, octree
 from processor.stitching.bundle import Solution
 from processor.stitching.clouds import Cloud
 from processor.stitching.joint import Blocks
@@ -19,11 +19,13 @@ BEHIND_COS = -0.03  # a face looks away from the scanner
 ACROSS_COS = 0.5  # of the way from ray to ray, to the face's normal
 SQUARE_COS = 0.85  # the two faces meet at an angle
 NEIGHBOURS = 12
+ONE_FACE_MM = 10.0  # planes of pieces of one face differ by less where an end is
 REACH = 1.9  # of a piece: its half width by its standard deviation, with a little to spare
 LEAST_MM = 1.0  # standard deviation of an end, however close the rays
 INSIDE = 0.75  # of the width between two rays, half of it to either side and half as much again
 MOST_NODES_MM = 4000.0
-
+UNIFORM = 1.0 / 12.0  # variance of a place anywhere in a gap, in gaps
+RUN_JUMP = 0.1  # gaps: ends of one run are no farther apart
 
 LOOSE_MM = 1.0  # standard deviation of a motion that faces alone do not tell
 LEVER_MM = 1e4  # a turn counts by what it moves so far off
@@ -37,7 +39,7 @@ class Matches:
     """Ends (n, 3) of scans (n,), in their clouds' frames, on pieces (n,) that bound them.
 
     ``off`` (n,) is how far beyond the piece each lies, ``width`` (n,) the room between its two rays, both across the
-    piece; ``normal`` (n, 3) the piece's.
+    piece; ``normal`` (n, 3) the piece's; ``gap`` (n,) as of :class:`Ends`.
     """
 
     piece: Ints
@@ -46,22 +48,25 @@ class Matches:
     off: Floats
     width: Floats
     normal: Floats
+    gap: Ints
 
 
-def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Matches:
+def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear: bool = False) -> Matches:
     """Find the pieces that bound ends of faces.
 
     A piece bounds an end where it looks away from the end's scanner, stands across, and passes within ``gate_mm`` of
-    where the two rays leave room.
+    where the two rays leave room. ``clear`` leaves out ends that two faces, one behind the other as a flange's and the
+    web's, may bound: the nearer one taken, the ends of a flange would seem to lie outside of it. Whether two are within
+    a gap's width of each other does not depend on where the rays happened to pass, so that what is left is not biased.
     """
     world = octree.moved(blocks.sums, T[blocks.scan])
-    planes = octree.planes_of(octree.summed(world, blocks.piece, blocks.pieces))
+    planes = octree.planes_of(grouping.summed(world, blocks.piece, blocks.pieces))
     # A piece looks at the scanners that saw it; all of a piece see the same side.
     first = np.unique(blocks.piece, return_index=True)[1]
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
     normal = planes.normal * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     half = REACH * np.sqrt(planes.variance[:, 1:]) + 2.0 * clouds[0].cell_mm
-    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats]] = []
+    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, Ints]] = []
     for s, cloud in enumerate(clouds):
         if not len(cloud.ends.points) or not np.isfinite(T[s]).all():
             continue
@@ -82,37 +87,63 @@ def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> M
         length = np.linalg.norm(across, axis=1)[:, None]
         fits = (
             np.isfinite(distance)
-            & (np.abs(off) < INSIDE * width + gate_mm)
             & (width > ACROSS_COS * length)
             & (np.abs(np.einsum("ni,nki->nk", faces, normal[q])) < SQUARE_COS)
             & (np.abs(np.einsum("nki,nki->nk", y, planes.axes[q, :, 1])) < half[q, 0])
             & (np.abs(np.einsum("nki,nki->nk", y, planes.axes[q, :, 2])) < half[q, 1])
         )
-        cost = np.where(fits, np.abs(off), np.inf)
-        best = np.argmin(cost, axis=1)
-        rows = np.flatnonzero(np.isfinite(cost[np.arange(len(cost)), best]))
+        cost = np.where(fits & (np.abs(off) < INSIDE * width + gate_mm), np.abs(off), np.inf)
+        best = np.argmin(cost, axis=1)[:, None]
+        good = np.isfinite(np.take_along_axis(cost, best, axis=1)[:, 0])
+        if clear:
+            apart = np.abs(off - np.take_along_axis(off, best, axis=1))
+            room = np.take_along_axis(width, best, axis=1) + 2.0 * gate_mm
+            good &= ~(fits & (apart > ONE_FACE_MM) & (apart < room)).any(axis=1)
+        rows, best = np.flatnonzero(good), best[:, 0]
         piece = q[rows, best[rows]]
         found.append(
             (piece, np.full(len(rows), s), cloud.ends.points[rows], off[rows, best[rows]], width[rows, best[rows]],
-             normal[piece])
+             normal[piece], cloud.ends.gap[rows])
         )  # fmt: skip
     if not found:
         none = np.empty(0, np.int64)
-        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)))
-    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(6)))
+        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)), none)
+    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(7)))
+
+
+def variance(ends: Matches) -> Floats:
+    """Variance (n,), mm^2, that each end is weighed by: that of its run's mean, times the ends of the run.
+
+    An end is anywhere in its gap, of variance 1/12 in gaps. But an edge along the scanner's rows or columns, as a post
+    is, lies at the same part of one gap all its way: its many ends tell no more than one. What the ends of a run do not
+    scatter by within the gap, of the 1/12, they have in common.
+    """
+    share = ends.off / np.maximum(ends.width, 1e-9)
+    order = np.lexsort([share, ends.gap, ends.scan])
+    same = (
+        (np.diff(ends.scan[order]) == 0) & (np.diff(ends.gap[order]) == 0) & (np.abs(np.diff(share[order])) < RUN_JUMP)
+    )
+    run = np.empty(len(order), np.int64)
+    run[order] = np.cumsum(np.concatenate([[0], ~same]))
+    count = np.bincount(run).astype(float)
+    mean = np.bincount(run, share) / count
+    scatter = np.bincount(run, (share - mean[run]) ** 2) / np.maximum(count - 1.0, 1.0)
+    of_mean = np.maximum(UNIFORM - scatter, UNIFORM / count)
+    found: Floats = ends.width**2 * (count * of_mean)[run]
+    return found
 
 
 def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
     """Add the ends of faces to the pieces that bound them, as blocks of kind 1; see :func:`matched`."""
     if not blocks.pieces:
         return blocks
-    ends = matched(clouds, blocks, T, gate_mm)
+    ends = matched(clouds, blocks, T, gate_mm, clear=True)
     if not len(ends.piece):
         return blocks
-    weight = 1.0 / (ends.width**2 / 12.0 + LEAST_MM**2)
+    weight = 1.0 / (variance(ends) + LEAST_MM**2)
     key, inverse = np.unique(ends.piece * len(T) + ends.scan, return_inverse=True)
     inverse = inverse.ravel()
-    sums = octree.summed(octree.sums_of(ends.points) * weight[:, None], inverse, len(key))
+    sums = grouping.summed(octree.sums_of(ends.points) * weight[:, None], inverse, len(key))
     piece = np.concatenate([blocks.piece, key // len(T)])
     order = np.argsort(piece, kind="stable")
     return Blocks(

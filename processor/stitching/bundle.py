@@ -10,10 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from processor.geometry import rigid
 from processor.model import Floats, Ints
-from processor.stitching import octree
+from processor.stitching import grouping, octree
+from processor.stitching.elimination import eliminate
 from processor.stitching.joint import Blocks
 
 HUBER = 2.5
@@ -21,6 +23,7 @@ DROPPED = 6.0  # standard deviations of a scan's misfit on a piece
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # keep what nothing tells where it is
 MEDIAN = 0.6745  # of |z|, z normal
 KINDS = 2
+EVEN, WIDE_SIGMAS = 3, 0.3  # adjustments at first with pieces of much the same weight, by the noise of a point
 LEAST_REAL = 0.01  # share of a direction's strength that is taken as real
 
 
@@ -47,7 +50,7 @@ def solve(
     T: Floats,
     reference: int,
     *,
-    iterations: int = 8,
+    iterations: int = 10,
     robust: bool = True,
     tau: tuple[float, ...] | None = None,
     tolerance_mm: float = 1e-4,
@@ -64,17 +67,21 @@ def solve(
         none = np.empty(0)
         return Solution(T, covariance, none, none, tuple(common.tolist()), none, 0.0, 0.0)
     weight = np.ones(len(blocks.piece))
+    wide = _wide(blocks) if robust and tau is None else np.zeros(KINDS)
     for iteration in range(iterations):
-        N, _, g, z, offset, spread = _normal(blocks, T, common, weight)
+        loose = wide if iteration < EVEN else np.zeros(KINDS)
+        N, _, g, z, offset, spread = _normal(blocks, T, np.maximum(common, loose), weight)
         common = _tau(blocks, offset, spread, common) if iteration and tau is None else common
+        if iteration == EVEN and wide.any():
+            weight = _robust(blocks, _forgiving(z, offset, slack_mm))
+            continue
         free = _free(blocks, T, reference)
         step = np.zeros(len(g))
         step[free] = -np.linalg.solve(N[np.ix_(free, free)], g[free])
         T = _stepped(T, step.reshape(-1, 6))
         if robust:
-            # A misfit that the poses have not yet been given the chance to take up is none.
-            weight = _robust(blocks, offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm))
-        if iteration > 2 and np.abs(step.reshape(-1, 6)[:, 3:]).max(initial=0.0) < tolerance_mm:
+            weight = _robust(blocks, _forgiving(z, offset, slack_mm))
+        if iteration > EVEN and np.abs(step.reshape(-1, 6)[:, 3:]).max(initial=0.0) < tolerance_mm:
             break
     N, spurious, _, z, offset, spread = _normal(blocks, T, common, weight)
     covariance = np.full(N.shape, np.nan)
@@ -86,6 +93,36 @@ def solve(
     return Solution(
         T, covariance, z, offset, tuple(common.tolist()), weight, float((z[inside] ** 2).sum()), float(inside.sum())
     )
+
+
+def step_without(
+    blocks: Blocks, solution: Solution, reference: int, out: npt.NDArray[np.bool_], almost_none: float
+) -> Floats:
+    """Return how poses would move (6k,) from a solution if blocks ``out`` (b,) counted for ``almost_none``."""
+    weight = np.where(out, almost_none, solution.weight)
+    N, _, g, _, _, _ = _normal(blocks, solution.T, np.array(solution.tau), weight)
+    free = _free(blocks, solution.T, reference)
+    step = np.zeros(len(g))
+    step[free] = -np.linalg.solve(N[np.ix_(free, free)], g[free])
+    return step
+
+
+def _wide(blocks: Blocks) -> Floats:
+    """Return common offsets (KINDS,) that adjustments begin with: no piece says more than a few of its points do.
+
+    A wall of thousands of points with something leant against it would else be believed before all others.
+    """
+    points = blocks.kind == 0
+    if not points.any():
+        return np.zeros(KINDS)
+    noise = float(np.median(np.sqrt(blocks.count[points] / np.maximum(blocks.sums[points, 9], 1e-300))))
+    return np.array([WIDE_SIGMAS * noise, 0.0])
+
+
+def _forgiving(z: Floats, offset: Floats, slack_mm: float) -> Floats:
+    """Misfits by their standard deviations and a slack: what poses have not yet had the chance to take up is none."""
+    found: Floats = offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm)
+    return found
 
 
 def _robust(blocks: Blocks, z: Floats) -> Floats:
@@ -127,7 +164,7 @@ def _normal(
     k = len(T)
     world = T[blocks.scan]
     W = world @ octree.square(blocks.sums) @ world.transpose(0, 2, 1)
-    total = octree.summed(octree.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
+    total = grouping.summed(octree.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
     planes = octree.planes_of(total)
     n, c = planes.normal[blocks.piece], planes.mean[blocks.piece]
     W = _shifted(W, c)
@@ -152,33 +189,21 @@ def _normal(
     LsW, Wr = Ls @ W, np.einsum("bij,bj->bi", W, rho)
     Hss = LsW @ Ls.transpose(0, 2, 1)
     Hsp = LsW @ Lp.transpose(0, 2, 1)
-    Hpp = octree.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(-1, 3, 3)
+    Hpp = grouping.summed((Lp @ W @ Lp.transpose(0, 2, 1)).reshape(b, 9), blocks.piece, blocks.pieces).reshape(-1, 3, 3)
     gs = np.einsum("bij,bj->bi", Ls, Wr)
-    gp = octree.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
+    gp = grouping.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
     scale = np.einsum("nii->ni", Hpp)
     Hpp = Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3)
     inverse = np.linalg.inv(Hpp)
-    by_scan = np.zeros((blocks.pieces, k, 6, 3))
-    np.add.at(by_scan, (blocks.piece, blocks.scan), Hsp)
-    A = by_scan.reshape(blocks.pieces, 6 * k, 3)
     own = np.zeros((k, k, 6, 6))
     np.add.at(own, (blocks.scan, blocks.scan), Hss)
-    N: Floats = own.transpose(0, 2, 1, 3).reshape(6 * k, 6 * k)
-    AI = A @ inverse
-    axis = planes.normal
-    along = np.zeros((blocks.pieces, k))
-    np.add.at(along, (blocks.piece, blocks.scan), np.einsum("bi,bij,bj->b", n, Hss[:, 3:, 3:], n))
-    pull = np.einsum("pi,pkij->pkj", axis, by_scan[:, :, 3:])
-    held = along[:, :, None] * np.eye(k) - pull @ inverse @ pull.transpose(0, 2, 1)
+    N: Floats = np.ascontiguousarray(own.transpose(0, 2, 1, 3)).reshape(6 * k, 6 * k)
+    gradient = np.zeros((k, 6))
+    np.add.at(gradient, blocks.scan, gs)
+    g, spurious = gradient.ravel(), np.zeros((6 * k, 6 * k))
+    along = np.einsum("bi,bij,bj->b", n, Hss[:, 3:, 3:], n)
     tilt = planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1)
-    seeming = np.zeros((k, 6, k, 6))
-    seeming[:, 3:, :, 3:] = np.einsum("pab,pij->aibj", held, tilt)
-    spurious: Floats = seeming.reshape(6 * k, 6 * k)
-    # Without the linear algebra's threads: the same sum whatever their number, and no waiting for them.
-    N = N - np.einsum("pia,pja->ij", AI, A, optimize=False)
-    g = np.zeros((k, 6))
-    np.add.at(g, blocks.scan, gs)
-    g = g.ravel() - np.einsum("nij,nj->i", AI, gp)
+    eliminate(blocks.piece, blocks.scan, Hsp, inverse, gp, planes.normal, tilt, along, N, g, spurious)
     N += np.diag(np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k))
     # Misfits: a block's mean distance from the plane, and how sure that is beside the plane's own uncertainty.
     mean = e[:, :3] / mass[:, None]

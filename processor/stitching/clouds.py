@@ -7,10 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import Floats, Ints, Scan
-from processor.stitching import octree
+from processor.stitching import grouping, octree
+from processor.stitching import rays as grid_rays
 from processor.stitching.ends import Ends, ends_of
 from processor.stitching.octree import Planes
-from processor.stitching.sight import Sight, unanswered
+from processor.stitching.sight import Sight
 
 POINTS_A_CELL = 5.0
 LEVELS = 6
@@ -51,7 +52,7 @@ def cell_size(points: Floats) -> float:
     size = max(spread, 1e-6) / 1024.0
     while size < spread:
         # A thinned cloud fills fewer cells; what counts is the mean number in an occupied cell of the whole.
-        held = len(some) / len(np.unique(octree.packed(octree.cells_of(some, size))))
+        held = len(some) / grouping.distinct_count(octree.packed(octree.cells_of(some, size)))
         if 1.0 + (held - 1.0) / share >= POINTS_A_CELL:
             break
         size *= 2.0**0.5
@@ -69,9 +70,8 @@ def prepared(scan: Scan, cell_mm: float = 0.0) -> Cloud:
         points = points[finite]
     size = cell_mm or cell_size(points)
     cells = octree.cells_of(points, size)
-    _, first, inverse = np.unique(octree.packed(cells), return_index=True, return_inverse=True)
-    of_point = inverse.ravel()
-    sums = octree.summed(octree.sums_of(points), of_point, len(first))
+    first, of_point = grouping.numbered(octree.packed(cells))
+    sums = grouping.sums_of_points(points, of_point, len(first))
     cells = cells[first]
     sigma = _scatter(cells, sums, size, scan.sigma_mm)
     piece, level = octree.flat_pieces(cells, sums, size, LIMIT_SIGMAS * sigma, LEVELS)
@@ -82,31 +82,33 @@ def prepared(scan: Scan, cell_mm: float = 0.0) -> Cloud:
     _, inverse = np.unique(np.stack([key, piece[on]], axis=1), axis=0, return_inverse=True)
     inverse = inverse.ravel()
     count = int(inverse.max()) + 1 if len(inverse) else 0
-    kept = octree.summed(sums[on], inverse, count)
+    kept = grouping.summed(sums[on], inverse, count)
     of = np.zeros(count, np.int64)
     of[inverse] = piece[on]
-    planes = octree.planes_of(octree.summed(kept, of, len(level)))
+    planes = octree.planes_of(grouping.summed(kept, of, len(level)))
     if known:
         turn = np.where(np.einsum("ni,ni->n", planes.normal, planes.mean) > 0.0, -1.0, 1.0)
     else:
         turn = np.ones(len(planes.normal))
     planes = Planes(planes.count, planes.mean, planes.normal * turn[:, None], planes.variance, planes.axes)
-    ends, rays = Ends(), np.empty((0, 3))
+    ends, lost = Ends(), np.empty((0, 3))
     if known and len(scan.grid_row):
         row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
-        ends = ends_of(points, row, column, piece[of_point], planes, sigma)
-        rays = unanswered(points, row, column)
+        rays = grid_rays.fitted(points, row, column)
+        if rays is not None:
+            ends = ends_of(points, row, column, piece[of_point], planes, sigma, rays)
+            lost = grid_rays.unanswered(rays, row, column)
     return Cloud(
         scan.name, origin, known, size, sigma, kept, octree.planes_of(kept), of, level, planes,
         planes.normal[of], ends,
-        Sight.of(points, rays) if known else None,
+        Sight.of(points, lost) if known else None,
     )  # fmt: skip
 
 
 def _scatter(cells: Ints, sums: Floats, size: float, said: float) -> float:
     """Scatter of flat places across their planes, mm: what is said of the scanner, or more where more is found."""
-    _, first, inverse = np.unique(octree.packed(cells >> 1), return_index=True, return_inverse=True)
-    total = octree.summed(sums, inverse.ravel(), len(first))
+    first, inverse = grouping.numbered(octree.packed(cells >> 1))
+    total = grouping.summed(sums, inverse, len(first))
     variance = np.linalg.eigvalsh(octree.scatter(total[total[:, 9] >= 12.0])[1])
     flat = variance[(variance[:, 0] < 0.02 * variance[:, 1]) & (variance[:, 1] > (0.1 * size) ** 2), 0]
     found = float(np.sqrt(np.quantile(np.maximum(flat, 0.0), 0.75))) if len(flat) else 0.02 * size

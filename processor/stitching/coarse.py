@@ -6,11 +6,10 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
 from processor.model import Floats
-from processor.stitching import directions, votes
+from processor.stitching import directions, near, votes
 from processor.stitching.clouds import Cloud
 from processor.stitching.elements import Elements, elements
 from processor.stitching.sight import Sight
@@ -22,8 +21,12 @@ FINE = 0.3  # of the cubes' side
 CHECKED = 60  # poses of a pair that are held against the rays
 REFINED = 8  # poses of a pair that are refined
 GATES = (0.7, 0.35, 0.2, 0.12)  # of the cubes' side
+FEW_ABOVE = 0.3  # of the cubes' side: wider gates ask the faces that vote alone
 STEPS = 4
 NEAR, MARGIN = 0.15, 0.4  # of the cubes' side: faces closer than that are the same; seen this far beyond is through
+FOUND = 0.45  # of the cubes' side: as far as faces are asked for what is near
+BEYOND = 0.35  # of the cubes' side: as far beyond a gate as a face may have its middle
+SMALL, LARGE = GATES[2] + BEYOND, GATES[0] + BEYOND
 SLID, SLIDES = 3, (-1.2, -0.9, -0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.9, 1.2)  # poses tried so, by shares of the side
 LOOSE = 0.01  # of the strength of the strongest direction
 ENOUGH = 0.08  # overlap that two scans should have; less is a weak sign
@@ -51,8 +54,8 @@ class View:
     coarse: Elements
     weight: Floats
     voters: tuple[Elements, Floats]
-    fine: Elements
-    tree: cKDTree
+    small: near.Near  # of the finer faces, by cells of SMALL and of LARGE
+    large: near.Near
     modes: tuple[Floats, Floats]
     sight: Sight | None
 
@@ -92,7 +95,8 @@ def view(cloud: Cloud, side_mm: float) -> View:
     weight = votes.weights(coarse.normals)
     voters = votes.voters(coarse, weight) if len(weight) else (coarse, weight)
     axes = directions.modes(coarse.normals)
-    return View(cloud, side_mm, coarse, weight, voters, fine, cKDTree(fine.points), axes, cloud.sight)
+    small, large = (near.of_faces(fine, share * side_mm) for share in (SMALL, LARGE))
+    return View(cloud, side_mm, coarse, weight, voters, small, large, axes, cloud.sight)
 
 
 def placings(a: View, b: View, most_tilt_rad: float, most: int = 4) -> list[Placing]:
@@ -136,18 +140,13 @@ def held(a: View, b: View, T_a_b: Floats, near_mm: float, margin_mm: float, few:
     for one, other, T in ((a, b, rigid.invert(T_a_b)), (b, a, T_a_b)):
         # faces of `one`, in the frame of `other`
         faces, w = one.voters if few else (one.coarse, one.weight)
-        points, normals = rigid.apply(T, faces.points), faces.normals @ T[:3, :3].T
-        distance, index = other.tree.query(points, k=4, distance_upper_bound=0.45 * a.side_mm)
-        there = np.isfinite(distance)
-        at = np.where(there, index, 0)
-        off = np.abs(np.einsum("nki,nki->nk", points[:, None] - other.fine.points[at], other.fine.normals[at]))
-        like = np.einsum("ni,nki->nk", normals, other.fine.normals[at]) > LIKE_COS
-        found = (there & like & (off < near_mm)).any(axis=1)
+        found = np.empty(len(w), np.bool_)
+        near.agreeing(other.small, T, faces.points, faces.normals, FOUND * a.side_mm, near_mm, LIKE_COS, found)
         agree += float(w[found].sum())
         total += float(w.sum())
         if other.sight is not None:
-            through = other.sight.through(points, margin_mm)
-            against += float((w * through)[~found].sum())
+            rest = rigid.apply(T, faces.points[~found])
+            against += float(w[~found] @ other.sight.through(rest, margin_mm))
     return Placing(T_a_b, agree, against, agree / max(total, 1e-12))
 
 
@@ -171,28 +170,20 @@ def refine(a: View, b: View, T: Floats, gates: tuple[float, ...] = GATES) -> tup
 
     Returns the pose, and the unit vector (3,) along which it is loose, if there is one.
     """
-    w, loose = b.weight, None
+    loose = None
     for gate in gates:
+        faces, weight = b.voters if gate > FEW_ABOVE else (b.coarse, b.weight)
         for _ in range(STEPS):
-            points, normals = rigid.apply(T, b.coarse.points), b.coarse.normals @ T[:3, :3].T
-            distance, index = a.tree.query(points, distance_upper_bound=gate * a.side_mm + 0.35 * a.side_mm)
-            there = np.flatnonzero(np.isfinite(distance))
-            at = index[there]
-            n = a.fine.normals[at]
-            p = points[there]
-            r = np.einsum("ni,ni->n", p - a.fine.points[at], n)
-            keep = (np.einsum("ni,ni->n", n, normals[there]) > LIKE_COS) & (np.abs(r) < gate * a.side_mm)
-            if keep.sum() < 6:
+            H, g, centre, reach, count = near.equations(
+                a.small, a.large, T, faces.points, faces.normals, weight,
+                (gate + BEYOND) * a.side_mm, gate * a.side_mm, LIKE_COS,
+            )  # fmt: skip
+            if count < FEWEST:
                 return T, None
-            p, n, r, weight = p[keep], n[keep], r[keep], w[there[keep]]
-            centre = p.mean(axis=0)
-            reach = float(np.sqrt(((p - centre) ** 2).sum(axis=1).mean()))
-            J = np.hstack([np.cross((p - centre) / reach, n), n])
-            H = J.T @ (weight[:, None] * J)
-            step = -np.linalg.solve(H + 1e-3 * np.trace(H) / 6.0 * np.eye(6), J.T @ (weight * r))
+            step = -np.linalg.solve(H + 1e-3 * np.trace(H) / 6.0 * np.eye(6), g)
             R = rigid.rotation_from_vector(step[:3] / reach)
             T = rigid.transform(R, centre + step[3:] - R @ centre) @ T
-            value, vector = np.linalg.eigh(J[:, 3:].T @ (weight[:, None] * J[:, 3:]))
+            value, vector = np.linalg.eigh(H[3:, 3:])
             loose = vector[:, 0] if value[0] < LOOSE * value[2] else None
             if np.abs(step).max() < 1e-3 * a.side_mm:
                 break

@@ -21,22 +21,24 @@ MOST_TURNS = 12
 
 def modes(normals: Floats) -> tuple[Floats, Floats]:
     """Directions (k, 3) that many of normals (n, 3) look, the commonest first, and each one's share (k,)."""
-    left = np.ones(len(normals))
+    left = np.ones(len(normals), bool)
     near = normals @ normals.T > CONE_COS
+    held = near.sum(axis=1)
     found, shares = [], []
     for _ in range(MOST_MODES):
-        held = near @ left
         best = int(np.argmax(held)) if len(held) else 0
         if not len(held) or held[best] < max(3.0, LEAST_SHARE * len(normals)):
             break
         axis = normals[best]
         for _ in range(3):
-            inside = (normals @ axis > CONE_COS) & (left > 0.0)
+            inside = (normals @ axis > CONE_COS) & left
             axis = normals[inside].sum(axis=0) if inside.any() else normals[best]
             axis = axis / np.linalg.norm(axis)
         found.append(axis)
         shares.append(max(held[best], 1.0) / len(normals))
-        left[normals @ axis > APART_COS] = 0.0
+        taken = left & (normals @ axis > APART_COS)
+        left[taken] = False
+        held = held - near[:, taken].sum(axis=1)
     return np.array(found).reshape(-1, 3), np.array(shares)
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import Floats, Ints
-from processor.stitching import octree
+from processor.stitching import grouping, octree
 from processor.stitching.clouds import Cloud
 
 MOST_NORMALS = 1500
@@ -30,8 +30,8 @@ def elements(cloud: Cloud, side_mm: float) -> Elements:
     inverse = inverse.ravel()
     one = np.ones(len(inverse))
     count = np.bincount(inverse, one, len(first))
-    points = octree.summed(cloud.cells.mean, inverse, len(first)) / count[:, None]
-    normals = octree.summed(cloud.normal, inverse, len(first))
+    points = grouping.summed(cloud.cells.mean, inverse, len(first)) / count[:, None]
+    normals = grouping.summed(cloud.normal, inverse, len(first))
     return Elements(points, normals / np.linalg.norm(normals, axis=1)[:, None])
 
 

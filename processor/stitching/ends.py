@@ -10,23 +10,30 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+from numba import njit
 
 from processor.model import Floats, Ints
 from processor.stitching.octree import Planes
+from processor.stitching.rays import Rays
 
 WAYS = ((1, 0), (-1, 0), (0, 1), (0, -1))
 JUMP_SIGMAS = 10.0
 ON_SIGMAS = 3.5
+SWEEPS = 4  # over the grid, there and back
 WIDEST = 0.02  # of the range: a step between rays, along the face, beyond which an end says next to nothing
 
 
 @dataclass(frozen=True)
 class Ends:
-    """Ends (n, 3) in the cloud's frame, the way across each from ray to ray (n, 3), and the faces' normals (n, 3)."""
+    """Ends (n, 3) in the cloud's frame, the way across each from ray to ray (n, 3), and the faces' normals (n, 3).
+
+    ``gap`` (n,) numbers the two rows or columns of the scanner's grid that an end lies between.
+    """
 
     points: Floats = field(default_factory=lambda: np.empty((0, 3)))
     across: Floats = field(default_factory=lambda: np.empty((0, 3)))
     normals: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    gap: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 def grid_of(row: Ints, column: Ints) -> Ints:
@@ -37,39 +44,82 @@ def grid_of(row: Ints, column: Ints) -> Ints:
     return grid
 
 
-def ends_of(points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes, sigma_mm: float) -> Ends:
-    """Find ends of the flat pieces of points (n, 3) around their scanner; ``piece`` (n,) is a row of planes or -1."""
+@njit(cache=True, nogil=True)
+def grow(grid, on_face, points, normal, offset, limit):  # type: ignore[no-untyped-def]
+    """Let points of no face, beside one of a face on the scanner's grid, join it where they lie on its plane.
+
+    Flat pieces need some points: how many rays met a bar would else decide whether its ends are found, and with that,
+    where between the rays these lie.
+    """
+    rows, columns = grid.shape
+    for sweep in range(SWEEPS):
+        way = 1 if sweep % 2 == 0 else -1
+        for a in range(rows):
+            r = a if way > 0 else rows - 1 - a
+            for b in range(-1, columns):
+                c = b % columns if way > 0 else (columns - 1 - b) % columns
+                i = grid[r, c]
+                if i < 0 or on_face[r, c] >= 0:
+                    continue
+                for beside in range(2):
+                    u, v = (r, (c - way) % columns) if beside == 0 else (r - way, c)
+                    if 0 <= u < rows and on_face[u, v] >= 0:
+                        f = on_face[u, v]
+                        off = -offset[f]
+                        for m in range(3):
+                            off += normal[f, m] * points[i, m]
+                        if abs(off) < limit:
+                            on_face[r, c] = f
+                            break
+
+
+def ends_of(points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes, sigma_mm: float, rays: Rays) -> Ends:
+    """Find ends of the flat pieces of points (n, 3) around their scanner; ``piece`` (n,) is a row of planes or -1.
+
+    A bar that a single ray of a row met has two ends there as well: to ask for a second one would leave out those whose
+    edges lie far from the rays, and the others would seem wider than they are.
+    """
     if not len(row) or not len(planes.count):
         return Ends()
     grid = grid_of(row, column)
-    R = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
-    ray = points / R[:, None]
-    r, c = np.nonzero(grid >= 0)
-    here = grid[r, c]
-    turn = grid.shape[1]
+    on_face = np.where(grid >= 0, piece[grid], -1)
+    d = np.einsum("ni,ni->n", planes.normal, planes.mean)
+    grow(grid, on_face, np.ascontiguousarray(points), planes.normal, d, ON_SIGMAS * sigma_mm)
     found = []
-    for up, left in WAYS:
-        inside = (r + up >= 0) & (r + up < grid.shape[0]) & (r - up >= 0) & (r - up < grid.shape[0])
-        i = here[inside]
-        k = grid[r[inside] - up, (c[inside] - left) % turn]
-        j = grid[r[inside] + up, (c[inside] + left) % turn]
-        i, k, j = i[k >= 0], k[k >= 0], j[k >= 0]
-        face = np.where(piece[i] >= 0, piece[i], piece[k])
-        # Most neighbours lie on the same face: they are not ends.
-        keep = (face >= 0) & ((j < 0) | (piece[j] != face))
-        i, k, j, face = i[keep], k[keep], j[keep], face[keep]
+    for way, (up, left) in enumerate(WAYS):
+        i, j, face = _leaving(grid, on_face, up, left)
+        ray_i, ray_j = _unit(points[i]), _unit(points[j])
         n, at = planes.normal[face], planes.mean[face]
         d = np.einsum("ni,ni->n", n, at)
-        following = 2.0 * ray[i] - ray[k]
-        following /= np.linalg.norm(following, axis=1)[:, None]
-        following = np.where((j >= 0)[:, None], ray[j], following)
-        own, other = np.einsum("ni,ni->n", n, ray[i]), np.einsum("ni,ni->n", n, following)
+        following = np.where((j >= 0)[:, None], ray_j, rays.of(row[i] + up, column[i] + left))
+        own, other = np.einsum("ni,ni->n", n, ray_i), np.einsum("ni,ni->n", n, following)
         with np.errstate(divide="ignore", invalid="ignore"):
             near, far = d / own, d / other
         on = np.abs(np.einsum("ni,ni->n", n, points[i]) - d) < ON_SIGMAS * sigma_mm
-        a, b = ray[i] * near[:, None], following * far[:, None]
+        a, b = ray_i * near[:, None], following * far[:, None]
         width = np.linalg.norm(b - a, axis=1)
-        behind = (j < 0) | (R[j] - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
-        good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * R[i])
-        found.append((0.5 * (a + b)[good], (b - a)[good], n[good]))
-    return Ends(*(np.vstack([one[m] for one in found]) for m in range(3)))
+        behind = (j < 0) | (np.linalg.norm(points[j], axis=1) - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
+        good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * np.linalg.norm(points[i], axis=1))
+        gap = len(WAYS) * (row[i] if up else column[i]) + way
+        found.append((0.5 * (a + b)[good], (b - a)[good], n[good], gap[good]))
+    return Ends(*(np.concatenate([one[m] for one in found]) for m in range(4)))
+
+
+def _leaving(grid: Ints, on_face: Ints, up: int, left: int) -> tuple[Ints, Ints, Ints]:
+    """Return points i (m,) of a face that the next one j leaves, and the face; j may be -1.
+
+    The face is i's own, or that of the one before. Rows end, columns go round. Most neighbours lie on the same face:
+    they are not ends.
+    """
+    after, next_face = (np.roll(one, (-up, -left), (0, 1)) for one in (grid, on_face))
+    face = np.where(on_face >= 0, on_face, np.roll(on_face, (up, left), (0, 1)))
+    keep = (grid >= 0) & (face >= 0) & ((after < 0) | (next_face != face))
+    if up:
+        keep[-1 if up > 0 else 0] = False
+        face[0 if up > 0 else -1] = on_face[0 if up > 0 else -1]
+    return grid[keep], after[keep], face[keep]
+
+
+def _unit(points: Floats) -> Floats:
+    found: Floats = points / np.maximum(np.linalg.norm(points, axis=1), 1e-9)[:, None]
+    return found

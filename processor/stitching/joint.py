@@ -9,7 +9,7 @@ import numpy as np
 from processor.geometry import rigid
 from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
-from processor.stitching import directions, octree
+from processor.stitching import directions, grouping, octree
 from processor.stitching.clouds import LIMIT_SIGMAS, Cloud
 from processor.stitching.elements import facing
 
@@ -18,6 +18,7 @@ SAME_COS = float(np.cos(np.radians(8.0)))
 MOST_NORMALS = 1500
 LEAST_POINTS = 6.0  # of a scan on a piece
 ACROSS_SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # of the noise that does not run along the ray
+FLAT_SIGMAS, SLACK_SIGMAS = 1.6, 0.5  # scatter of a piece of all scans: by the noise across it, and beside that
 LEAST_WEIGHT_SHARE = 0.05  # noise across a face seen at grazing incidence, of the range noise
 
 
@@ -82,6 +83,7 @@ class Gathered:
     variance: Floats
     size_mm: float
     limit_mm: float
+    slack_mm: float  # of flat pieces, beyond the noise
 
 
 def gather(clouds: list[Cloud]) -> Gathered:
@@ -99,6 +101,7 @@ def gather(clouds: list[Cloud]) -> Gathered:
         np.concatenate(variance),
         max(c.cell_mm for c in clouds),
         LIMIT_SIGMAS * max(c.sigma_mm for c in clouds),
+        SLACK_SIGMAS * max(c.sigma_mm for c in clouds),
     )
 
 
@@ -112,22 +115,26 @@ def pieces(cells: Gathered, T: Floats, gate_mm: float) -> Blocks:
     origin = np.median(mean, axis=0)
     world = T[scan].copy()
     world[:, :3, 3] -= origin
-    sums = octree.moved(cells.sums[rows], world)
+    sums = octree.moved(cells.sums[rows] / cells.variance[rows][:, None], world)
     where = octree.cells_of(mean - origin, cells.size_mm)
-    limit = float(np.hypot(cells.limit_mm, gate_mm))
-    piece, _ = octree.flat_pieces(where, sums, cells.size_mm, limit, LEVELS, 2.0 * LEAST_POINTS, looking(normal))
+    limit = float(np.hypot(cells.slack_mm, gate_mm))
+    piece, _ = octree.flat_pieces(
+        where, sums, cells.size_mm, limit, LEVELS, 2.0 * LEAST_POINTS, looking(normal), cells.sums[rows, 9], FLAT_SIGMAS
+    )
     keep = piece >= 0
     # A cell's own plane must be the piece's: across a wide gate, cubes may hold two faces.
     there = np.flatnonzero(keep)
-    planes = octree.planes_of(octree.summed(sums[there], piece[there], int(piece.max(initial=-1)) + 1))
+    planes = octree.planes_of(grouping.summed(sums[there], piece[there], int(piece.max(initial=-1)) + 1))
     n = planes.normal[piece[there]]
     off = np.einsum("ni,ni->n", mean[there] - origin - planes.mean[piece[there]], n)
-    same = (np.abs(np.einsum("ni,ni->n", n, normal[there])) > SAME_COS) & (np.abs(off) < 2.0 * limit)
+    same = (np.abs(np.einsum("ni,ni->n", n, normal[there])) > SAME_COS) & (
+        np.abs(off) < 2.0 * np.hypot(cells.limit_mm, gate_mm)
+    )
     keep[there[~same]] = False
     rows, scan, piece = rows[keep], scan[keep], piece[keep]
     key = piece * 4096 + scan
     _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-    weighted = octree.summed(cells.sums[rows] / cells.variance[rows][:, None], inverse.ravel(), len(first))
+    weighted = grouping.summed(cells.sums[rows] / cells.variance[rows][:, None], inverse.ravel(), len(first))
     count: Floats = np.bincount(inverse.ravel(), cells.sums[rows, 9], len(first)).astype(np.float64)
     enough = count >= LEAST_POINTS
     _, piece = np.unique(piece[first][enough], return_inverse=True)

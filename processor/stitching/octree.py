@@ -12,6 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.model import Floats, Ints
+from processor.stitching.grouping import numbered, summed
 
 BITS = 19
 OFFSET = 1 << (BITS - 1)
@@ -33,11 +34,6 @@ def packed(cells: Ints, group: Ints | None = None) -> Ints:
     c = cells + OFFSET
     key: Ints = (c[:, 0] << (2 * BITS)) | (c[:, 1] << BITS) | c[:, 2]
     return key if group is None else key | (group << (3 * BITS))
-
-
-def summed(values: Floats, inverse: Ints, count: int) -> Floats:
-    """Sum rows of values (n, k) by group: (count, k)."""
-    return np.stack([np.bincount(inverse, column, count) for column in values.T], axis=1)
 
 
 def sums_of(points: Floats) -> Floats:
@@ -101,12 +97,14 @@ def flat_pieces(
     least: float = 8.0,
     group: Ints | None = None,
     counts: Floats | None = None,
+    limit_sigmas: float = 0.0,
 ) -> tuple[Ints, Ints]:
     """Return for each cell (m,) the number of the largest flat cube around it, -1 = none, and each cube's level (k,).
 
     ``cells`` (m, 3) of side ``size_mm`` with ``sums`` (m, 10); a cube of level l is 2^l cells wide. Flat: a scatter
     across of at most ``limit_mm``, and wide enough to say where it looks. Cells of another ``group`` (m,) never share a
-    cube. ``counts`` (m,) stand for numbers of points where sums are weighted.
+    cube. ``counts`` (m,) stand for numbers of points where sums are weighted by 1 / variance: then the limits are
+    ``limit_sigmas`` of that, and ``limit_mm`` besides.
     """
     n = sums[:, 9] if counts is None else counts
     up: list[Ints] = []  # from the nodes below to the nodes of a level
@@ -115,11 +113,12 @@ def flat_pieces(
     number: Floats = np.asarray(n, np.float64)
     for level in range(levels):
         key = packed(where, groups)
-        _, first, inverse = np.unique(key, return_index=True, return_inverse=True)
-        up.append(inverse.ravel())
+        first, inverse = numbered(key)
+        up.append(inverse)
         total = summed(total, up[-1], len(first))
         number = np.asarray(np.bincount(up[-1], number, len(first)), np.float64)
-        flat.append(_is_flat(total, number, size_mm * 2**level, limit_mm, least))
+        variance = limit_mm**2 + limit_sigmas**2 * number / np.maximum(total[:, 9], 1e-300)
+        flat.append(_is_flat(total, number, size_mm * 2**level, variance, least))
         where = where[first] >> 1
         groups = None if groups is None else groups[first]
     # From the top: a node belongs to the piece of its parent, where that has one.
@@ -134,13 +133,13 @@ def flat_pieces(
     return piece[up[0]], np.array(depth, np.int64)
 
 
-def _is_flat(sums: Floats, number: Floats, side_mm: float, limit_mm: float, least: float) -> npt.NDArray[np.bool_]:
+def _is_flat(sums: Floats, number: Floats, side_mm: float, limit: Floats, least: float) -> npt.NDArray[np.bool_]:
     found = np.zeros(len(sums), bool)
     there = np.flatnonzero(number >= least)
     if len(there):
         variance = np.linalg.eigvalsh(scatter(sums[there])[1])
         found[there] = (
-            (variance[:, 0] <= limit_mm**2)
+            (variance[:, 0] <= limit[there])
             & (variance[:, 1] >= FLATNESS * variance[:, 0])
             & (variance[:, 1] >= (LEAST_WIDTH * side_mm) ** 2)
         )

@@ -16,6 +16,7 @@ AMBIGUOUS = 0.75  # of the best pose's score: a rival that reaches it cannot be 
 LEAST_OVERLAP = 0.08
 
 Candidates = dict[tuple[int, int], list[Placing]]
+Asked = dict[tuple[int, int, bytes], Placing]  # poses of scan j beside scan i that have been looked at
 
 
 @dataclass(frozen=True)
@@ -47,10 +48,11 @@ def place(views: list[View], candidates: Candidates, reference: int) -> Placed:
     rivalry, T_rival = np.zeros(k), np.full((k, 4, 4), np.nan)
     contrary, overlap = np.zeros(k), np.ones(k)
     done = [reference]
+    asked: Asked = {}
     while len(done) < k:
         best: tuple[float, int, list[tuple[float, Floats]]] | None = None
         for j in sorted(set(range(k)) - set(done)):
-            ranked = ranking(views, candidates, T, done, j)
+            ranked = ranking(views, candidates, T, done, j, asked)
             if not ranked:
                 continue
             sure = ranked[0][0] - (ranked[1][0] if len(ranked) > 1 else 0.0)
@@ -65,27 +67,39 @@ def place(views: list[View], candidates: Candidates, reference: int) -> Placed:
         others = [i for i in done if i != j]
         if j == reference or not others:
             continue
-        ranked = ranking(views, candidates, T, others, j, T[j])
+        ranked = ranking(views, candidates, T, others, j, asked, T[j])
         own = next(s for s, pose in ranked if coarse.same(pose, T[j], views[0].side_mm, views[j]))
         rivals = [(s, p) for s, p in ranked if not coarse.same(p, T[j], views[0].side_mm, views[j])]
         if rivals:
             rivalry[j] = rivals[0][0] / max(own, 1e-12)
             T_rival[j] = rivals[0][1]
-        all_held = [held(views, T, i, j, T[j]) for i in others]
+        all_held = [held(views, T, i, j, T[j], asked) for i in others]
         agree = sum(one.agree for one in all_held if one.overlap > LEAST_OVERLAP)
         contrary[j] = sum(one.against for one in all_held) / max(agree, 1e-12)
         overlap[j] = max(one.overlap for one in all_held)
     return Placed(T, rivalry, T_rival, contrary, overlap)
 
 
-def held(views: list[View], T: Floats, i: int, j: int, pose: Floats) -> Placing:
-    """Count what speaks for and against a pose (4, 4) of scan j, beside scan i at its pose in T (k, 4, 4)."""
-    side = views[i].side_mm
-    return coarse.held(views[i], views[j], rigid.invert(T[i]) @ pose, coarse.NEAR * side, coarse.MARGIN * side)
+def held(views: list[View], T: Floats, i: int, j: int, pose: Floats, asked: Asked) -> Placing:
+    """Count what speaks for and against a pose (4, 4) of scan j, beside scan i at its pose in T (k, 4, 4).
+
+    T of a scan does not change once it has one: what was asked before is remembered.
+    """
+    key = (i, j, pose.tobytes())
+    if key not in asked:
+        side, T_i_j = views[i].side_mm, rigid.invert(T[i]) @ pose
+        asked[key] = coarse.held(views[i], views[j], T_i_j, coarse.NEAR * side, coarse.MARGIN * side)
+    return asked[key]
 
 
 def ranking(
-    views: list[View], candidates: Candidates, T: Floats, done: list[int], j: int, own: Floats | None = None
+    views: list[View],
+    candidates: Candidates,
+    T: Floats,
+    done: list[int],
+    j: int,
+    asked: Asked,
+    own: Floats | None = None,
 ) -> list[tuple[float, Floats]]:
     """Poses of scan j with the score that all of ``done`` give them together, the best first."""
     poses: list[tuple[Floats, float]] = [] if own is None else [(own, np.inf)]
@@ -103,7 +117,7 @@ def ranking(
     for pose, _ in poses[:MOST_TRIED]:
         agree, against, total = 0.0, 0.0, 0.0
         for i in done:
-            one = held(views, T, i, j, pose)
+            one = held(views, T, i, j, pose, asked)
             against += one.against
             if one.overlap > LEAST_OVERLAP:
                 agree += one.agree

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from processor.model import Floats, Ints
+from processor.model import Floats
 
 PIXELS = 320  # at most along each side of the six faces of a cube: 0.28 degrees
 FEWEST_PIXELS = 40
@@ -123,40 +123,3 @@ class Sight:
         out = np.zeros(len(points))
         looked_through(np.ascontiguousarray(points), self.near, tolerance_mm, slope, SEEN_NEIGHBOURS, UNANSWERED, out)
         return out
-
-
-def unanswered(points: Floats, row: Ints, column: Ints) -> Floats:
-    """Directions (m, 3) of the grid's places without a point, between others: rays that did not come back.
-
-    The axis a scanner turns about is the one that points of a row keep their angle to.
-    """
-    on = np.flatnonzero((row >= 0) & (column >= 0))
-    if len(on) < 100:
-        return np.empty((0, 3))
-    u = points[on] / np.maximum(np.linalg.norm(points[on], axis=1), 1e-9)[:, None]
-    r, c = row[on], column[on]
-    rows, columns = int(r.max()) + 1, int(c.max()) + 1
-    number = np.bincount(r, minlength=rows)
-    mean = np.stack([np.bincount(r, u[:, i], rows) for i in range(3)], axis=1) / np.maximum(number, 1)[:, None]
-    apart = u - mean[r]
-    axis = np.linalg.eigh(apart.T @ apart)[1][:, 0]
-    height = mean @ axis
-    held = number >= 3
-    if held.sum() < 2:
-        return np.empty((0, 3))
-    heights = np.interp(np.arange(rows), np.flatnonzero(held), height[held])
-    e1 = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
-    e1 /= np.linalg.norm(e1)
-    e2 = np.cross(axis, e1)
-    x, y = np.bincount(c, u @ e1, columns), np.bincount(c, u @ e2, columns)
-    there = np.bincount(c, minlength=columns) >= 3
-    empty = np.ones((rows, columns), bool)
-    empty[r, c] = False
-    empty[:, ~there] = False
-    i, j = np.nonzero(empty)
-    turn = np.arctan2(y, x)[j]
-    flat = np.sqrt(np.maximum(1.0 - heights[i] ** 2, 0.0))
-    found: Floats = (
-        heights[i][:, None] * axis + (flat * np.cos(turn))[:, None] * e1 + (flat * np.sin(turn))[:, None] * e2
-    )
-    return found

@@ -6,9 +6,11 @@ without a trace, so six are the default, and scale is a diagnostic.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import f
+from scipy.stats import t as student
 
 from processor.geometry import rigid
 from processor.model import Floats
@@ -26,6 +28,8 @@ UNIT_SLIPS = (
     (10.0, "cm and mm"),
     (3.28084, "feet and m"),
 )
+BY_CHANCE = 1e-3  # that picks of a network scatter so much in one pair
+NORMAL_95 = 1.96
 LEAST_HEIGHT = 1e-3  # of a triangle, by its longest side: nearer to a line than that is a line
 
 
@@ -43,6 +47,8 @@ class Tie:
     residuals: Floats  # (n, 3) a less b moved, mm
     sd_mm: float  # of a picked coordinate of one scan
     covariance: Floats
+    free: int  # freedoms that the standard deviation is known by
+    apart: bool = False  # its picks scatter more than those of the other pairs, beyond chance
 
 
 class TooFewError(ValueError):
@@ -79,7 +85,40 @@ def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
     T = rigid.transform(R, middle_a - used * R @ middle_b)
     # Turns about the middle of the points -> about b's origin in a.
     covariance = frames.about_origin(own, middle_a - T[:3, 3])
-    return Tie(T, scale, scale_sd, residuals, sd, covariance)
+    if scale_free:  # what the scale takes up of the way from b's origin to the points, the shift has to answer for
+        way = R @ middle_b
+        covariance[3:, 3:] += (both**2 / float((moved**2).sum())) * np.outer(way, way)
+    return Tie(T, scale, scale_sd, residuals, sd, covariance, free)
+
+
+def pooled(ties: list[Tie]) -> list[Tie]:
+    """Give all pairs the standard deviation of a pick that they have together.
+
+    Three points leave a pair two or three freedoms: its own standard deviation may be anything, and pairs weighed by it
+    would be weighed by luck. A pair that scatters beyond chance keeps its own. Covariances are such that 1.96 standard
+    deviations hold 95 %: with few freedoms (Student) more than the pooled one.
+    """
+    used = list(ties)
+    while True:
+        free = sum(one.free for one in used)
+        sd = float(np.sqrt(sum(one.free * one.sd_mm**2 for one in used) / free))
+        others = [(free * sd**2 - one.free * one.sd_mm**2) / max(free - one.free, 1) for one in used]
+        beyond = [
+            one.sd_mm**2 / max(rest, 1e-300) / f.isf(BY_CHANCE / len(ties), one.free, max(free - one.free, 1))
+            for one, rest in zip(used, others, strict=True)
+        ]
+        if len(used) < 3 or max(beyond) <= 1.0:
+            break
+        del used[int(np.argmax(beyond))]
+    kept = {id(one) for one in used}
+    found = []
+    for one in ties:
+        apart = id(one) not in kept
+        freedoms, of = (one.free, one.sd_mm) if apart else (free, sd)
+        factor = of / one.sd_mm * float(student.isf(0.025, freedoms)) / NORMAL_95
+        scale_sd = of / one.sd_mm * one.scale_sd
+        found.append(replace(one, sd_mm=of, scale_sd=scale_sd, covariance=one.covariance * factor**2, apart=apart))
+    return found
 
 
 def verdict(scale: float, sd: float, limit_ppm: float) -> str:

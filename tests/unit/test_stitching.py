@@ -233,7 +233,12 @@ def test_two_real_scans_of_a_room_come_together():
     """By another library: point-to-plane ICP of Open3D, started at the answer, stays there."""
     scans = tuple(folder.read_input(ROOMS / f"room_scan{i}.pcd").scans[0] for i in (1, 2))
     result = stitch.run(Scene("rooms", "structure", scans), stitch.Params())
-    assert result.scan_status[1] == "ok"
+    # A sensor's errors, alike over whole walls, and rough normals: an adjustment that takes them as independent would
+    # say 0.6 mm. Plain ICP on halves of the room scatters by 5 to 15 mm and several mrad.
+    assert result.scan_status[1] == "weak"
+    assert "sure to" in result.scan_message[1]
+    assert 3.0 < 1.96 * result.position_sd[1].max() < 30.0
+    assert 1.0 < 1960.0 * result.rotation_sd[1].max() < 15.0
     T = result.T_project_scan[1].copy()
     # The robot's own odometry, published with the data, says 0.69 rad about the vertical.
     assert np.arctan2(T[1, 0], T[0, 0]) == pytest.approx(0.69, abs=0.05)

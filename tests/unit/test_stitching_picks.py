@@ -166,3 +166,31 @@ def test_picks_start_a_pair_that_nothing_else_brings_together():
     scene = dataclasses.replace(Scene("room", "structure", scans[:2]), picks=picks)
     result = stitch.run(scene, stitch.Params())
     assert np.linalg.norm(result.T_project_scan[1][:3, 3] - want[:3, 3]) < 0.5
+
+
+@pytest.mark.parametrize("scale", ["fixed", "free"])
+def test_three_points_a_pair_state_what_they_scatter_by(scale):
+    """Two or three freedoms a pair: by each one's own standard deviation intervals would hold 78 % and 53 %."""
+    inside = []
+    for seed in range(40):
+        T, scene = network(seed, 5.0, points=3)
+        result = stitch.run(scene, stitch.Params(method="three-point", scale=scale))
+        want = np.linalg.inv(T[0]) @ T
+        for s in range(1, len(T)):
+            place = [*_places(scene)[s], 1.0]
+            off = (result.T_project_scan[s] @ place - want[s] @ place)[:3]
+            inside.append(np.abs(off) < 1.96 * result.position_sd[s])
+    assert 0.9 <= np.mean(inside) <= 0.99
+
+
+def test_a_pair_with_a_blunder_does_not_make_the_others_unsure():
+    T, scene = network(3, 2.0)
+    in_a = scene.picks.in_a.copy()
+    in_a[0] += 4000.0
+    result = stitch.run(dataclasses.replace(scene, picks=dataclasses.replace(scene.picks, in_a=in_a)),
+                        stitch.Params(method="three-point"))  # fmt: skip
+    clean = stitch.run(scene, stitch.Params(method="three-point"))
+    assert "blunder" in result.message
+    assert np.nanmax(result.position_sd) < 3.0 * np.nanmax(clean.position_sd)
+    want = np.linalg.inv(T[0]) @ T
+    assert np.abs(result.T_project_scan[:, :3, 3] - want[:, :3, 3]).max() < 30.0

@@ -1,0 +1,70 @@
+"""Where the rays of a scanner's grid went, those that did not come back too."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from processor.model import Floats, Ints
+
+
+@dataclass(frozen=True)
+class Rays:
+    """Rays by rows and columns: ``height`` (rows,) along the axis a scanner turns about, ``turn`` (columns,) about it.
+
+    ``axes`` (3, 3) has two directions across and the axis as columns. A column without points has no turn: NaN. A row
+    without points has the height between its neighbours'.
+    """
+
+    axes: Floats
+    height: Floats
+    turn: Floats
+
+    def of(self, row: Ints, column: Ints) -> Floats:
+        """Return unit vectors (n, 3) of places in the grid; NaN where nothing tells."""
+        inside = (row >= 0) & (row < len(self.height))
+        height = np.where(inside, self.height[np.where(inside, row, 0)], np.nan)
+        turn = self.turn[column % len(self.turn)]
+        flat = np.sqrt(np.maximum(1.0 - height**2, 0.0))
+        own = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+        found: Floats = own @ self.axes.T
+        return found
+
+
+def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
+    """Find a scanner's rays from points (n, 3) around it; None for too few, or where they lie in no such grid.
+
+    The axis a scanner turns about is the one that points of a row keep their angle to.
+    """
+    on = np.flatnonzero((row >= 0) & (column >= 0))
+    if len(on) < 100:
+        return None
+    u = points[on] / np.maximum(np.linalg.norm(points[on], axis=1), 1e-9)[:, None]
+    r, c = row[on], column[on]
+    rows, columns = int(r.max()) + 1, int(c.max()) + 1
+    number = np.bincount(r, minlength=rows)
+    mean = np.stack([np.bincount(r, u[:, i], rows) for i in range(3)], axis=1) / np.maximum(number, 1)[:, None]
+    apart = u - mean[r]
+    axis = np.linalg.eigh(apart.T @ apart)[1][:, 0]
+    held = number > 0
+    if held.sum() < 2:
+        return None
+    heights = np.interp(np.arange(rows), np.flatnonzero(held), (mean @ axis)[held], left=np.nan, right=np.nan)
+    e1 = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
+    e1 /= np.linalg.norm(e1)
+    e2 = np.cross(axis, e1)
+    x, y = np.bincount(c, u @ e1, columns), np.bincount(c, u @ e2, columns)
+    turn = np.where(np.bincount(c, minlength=columns) > 0, np.arctan2(y, x), np.nan)
+    return Rays(np.stack([e1, e2, axis], axis=1), heights, turn)
+
+
+def unanswered(rays: Rays, row: Ints, column: Ints) -> Floats:
+    """Directions (m, 3) of the grid's places without a point, between others: rays that did not come back."""
+    on = (row >= 0) & (column >= 0)
+    empty: npt.NDArray[np.bool_] = np.ones((len(rays.height), len(rays.turn)), np.bool_)
+    empty[row[on], column[on]] = False
+    empty[:, ~np.isfinite(rays.turn)] = False
+    empty[~np.isfinite(rays.height)] = False
+    return rays.of(*np.nonzero(empty))

@@ -1,0 +1,128 @@
+"""Picked points with noise on the stations of a scene, and what its propagation through the network lets expect.
+
+Each scan is tied to the two after it by points of the structure that both stand before, and the last to the first: a
+chain with loops. The propagation is the linear least-squares one of all picks at once, written here anew: unknown are
+the poses, with seven parameters a scale a pair too.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from processor.model import Picks
+from processor.steps import stitch
+
+NOISE_MM = 5.0
+POINTS = 3  # as in the paper
+LEAST_APART_MM = 4000.0
+AWAY_FROM_A_LINE = 0.15  # of the longest side
+
+
+def pairs_of(count):
+    """Rows of the scans that are tied."""
+    return sorted({(min(p), max(p)) for i in range(count) for p in ((i, (i + 1) % count), (i, (i + 2) % count))})
+
+
+def spread_points(points, rng):
+    """Draw POINTS of points (n, 3) that are far from one another and from a line."""
+    while True:
+        p = points[rng.choice(len(points), POINTS, replace=False)]
+        sides = np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1)
+        height = np.linalg.norm(np.cross(p[1] - p[0], p[2] - p[0])) / sides.max()
+        if sides.min() > LEAST_APART_MM and height > AWAY_FROM_A_LINE * sides.max():
+            return p
+
+
+def picked(scene, truth, draw):
+    """Scene with noisy picks, true poses (k, 4, 4), and the places picked (p, POINTS, 3) with their pairs."""
+    rng = np.random.default_rng(draw)
+    known = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
+    T = np.stack([known[scan.name] for scan in scene.scans])
+    rows, places = [], []
+    pairs = pairs_of(len(scene.scans))
+    for a, b in pairs:
+        own = scene.scans[a]
+        x = spread_points(own.points + own.origin, rng) @ T[a][:3, :3].T + T[a][:3, 3]
+        places.append(x)
+        for k, p in enumerate(x):
+            at = [(np.linalg.inv(T[s]) @ [*p, 1.0])[:3] + rng.normal(0.0, NOISE_MM, 3) for s in (a, b)]
+            rows.append((own.name, scene.scans[b].name, f"P{k}", *at))
+    names_a, names_b, names, in_a, in_b = zip(*rows, strict=True)
+    return (
+        dataclasses.replace(scene, picks=Picks(names_a, names_b, names, np.array(in_a), np.array(in_b))),
+        T,
+        pairs,
+        places,
+    )
+
+
+def expected(T, pairs, places, scale_free):
+    """Covariance (k, 6, 6) of poses relative to the first: turns about the station, and its shift; project axes."""
+    k = len(T)
+    rows = 3 * sum(len(x) for x in places)
+    J = np.zeros((rows, 6 * k + len(pairs)))
+    at = 0
+    for number, ((a, b), x) in enumerate(zip(pairs, places, strict=True)):
+        for p in x:
+            for s, sign in ((a, -1.0), (b, 1.0)):
+                q = p - T[s][:3, 3]
+                J[at : at + 3, 6 * s : 6 * s + 3] = sign * np.array(
+                    [[0, q[2], -q[1]], [-q[2], 0, q[0]], [q[1], -q[0], 0]]
+                )
+                J[at : at + 3, 6 * s + 3 : 6 * s + 6] = sign * np.eye(3)
+            J[at : at + 3, 6 * k + number] = p - T[b][:3, 3]
+            at += 3
+    J = J[:, 6:] if scale_free else J[:, 6 : 6 * k]
+    unit = np.sqrt((J**2).sum(axis=0))
+    C = 2.0 * NOISE_MM**2 * np.linalg.inv((J / unit).T @ (J / unit)) / unit[:, None] / unit[None]
+    found = np.zeros((k, 6, 6))
+    for s in range(1, k):
+        found[s] = C[6 * s - 6 : 6 * s, 6 * s - 6 : 6 * s]
+    return found
+
+
+def figures(scene, truth, draw):
+    """Errors of one draw of picks by both forms, by what is expected, and the share of intervals that hold."""
+    scene, T, pairs, places = picked(scene, truth, draw)
+    found = {"draw": draw}
+    for name, scale in (("six", "fixed"), ("seven", "free")):
+        result = stitch.run(scene, stitch.Params(method="three-point", scale=scale, weak_mm=1e3, weak_mrad=1e2))
+        base = result.T_project_scan[0] @ np.linalg.inv(T[0])
+        C = expected(base @ T, pairs, places, scale == "free")
+        shift, ratio, pull = [], [], []
+        for s in range(1, len(T)):
+            want = base @ T[s]
+            own = np.linalg.inv(result.T_project_scan[s])
+            place = own[:3, :3] @ result.position[s] + own[:3, 3]
+            d = result.position[s] - (want[:3, :3] @ place + want[:3, 3])
+            station = result.T_project_scan[s][:3, 3] - want[:3, 3]
+            shift.append(np.linalg.norm(station))
+            ratio.append(station / np.sqrt(np.diag(C[s])[3:]))
+            pull.append(d / result.position_sd[s])
+        found[name] = {
+            "position_mm": float(max(shift)),
+            "expected_mm": float(np.sqrt(max(np.trace(one[3:, 3:]) for one in C))),
+            "by_expected": float(np.sqrt(np.mean(np.square(ratio)))),
+            "within_95": float((np.abs(pull) < 1.96).mean()),
+            "not_placed": int((~np.isfinite(result.T_project_scan).all(axis=(1, 2))).sum()),
+        }
+    return found
+
+
+def summary(rows):
+    """Median and worst of the draws, for both forms."""
+    found = {}
+    for name in ("six", "seven"):
+        own = [one[name] for one in rows]
+        found[name] = {
+            "position_mm": {
+                "median": float(np.median([o["position_mm"] for o in own])),
+                "worst": max(o["position_mm"] for o in own),
+            },
+            "expected_mm": {"median": float(np.median([o["expected_mm"] for o in own]))},
+            "rms error by expected": float(np.sqrt(np.mean([o["by_expected"] ** 2 for o in own]))),
+            "within_95": float(np.mean([o["within_95"] for o in own])),
+        }
+    return found

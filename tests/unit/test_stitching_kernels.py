@@ -1,0 +1,72 @@
+"""Compiled gathering and near faces, held against plain numpy."""
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from processor.stitching import grouping, near
+from processor.stitching.elements import Elements
+
+
+def test_keys_are_numbered_as_numpy_does():
+    rng = np.random.default_rng(1)
+    for keys in (
+        rng.integers(-50, 50, 1000),
+        rng.integers(0, 2**62, 500),
+        np.zeros(7, np.int64),
+        np.empty(0, np.int64),
+    ):
+        want, first, number = np.unique(keys, return_index=True, return_inverse=True)
+        got_first, got = grouping.numbered(keys)
+        np.testing.assert_array_equal(got_first, first)
+        np.testing.assert_array_equal(got, number.ravel())
+        assert grouping.distinct_count(keys) == len(want)
+
+
+def test_sums_by_group_are_those_of_a_matrix():
+    rng = np.random.default_rng(2)
+    points, group = rng.normal(size=(300, 3)), rng.integers(0, 9, 300)
+    member = (group == np.arange(9)[:, None]).astype(float)
+    np.testing.assert_allclose(grouping.summed(points, group, 9), member @ points)
+    x = np.hstack([points, np.ones((300, 1))])
+    want = [[(x[group == g, i] * x[group == g, j]).sum() for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2),
+                                                                     (0, 3), (1, 3), (2, 3), (3, 3))]
+            for g in range(9)]  # fmt: skip
+    np.testing.assert_allclose(grouping.sums_of_points(points, group, 9), want)
+
+
+def faces(rng, n, spread):
+    normals = rng.normal(size=(n, 3))
+    return Elements(rng.uniform(-spread, spread, (n, 3)), normals / np.linalg.norm(normals, axis=1)[:, None])
+
+
+def test_near_faces_are_those_of_all_distances():
+    rng = np.random.default_rng(3)
+    there, asked = faces(rng, 400, 5.0), faces(rng, 600, 6.0)
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), [0.3, -0.2, 0.1]
+    x, n = asked.points @ T[:3, :3].T + T[:3, 3], asked.normals @ T[:3, :3].T
+    d = np.linalg.norm(x[:, None] - there.points, axis=2)
+    off = np.abs(np.einsum("kni,ni->kn", x[:, None] - there.points, there.normals))
+    like = n @ there.normals.T
+    nearest = np.argsort(d, axis=1)[:, : near.KEPT]
+    fits = (d < 1.4) & (off < 0.6) & (like > 0.2)
+    want = np.take_along_axis(fits, nearest, axis=1).any(axis=1)
+    got = np.empty(600, np.bool_)
+    near.agreeing(near.of_faces(there, 1.5), T, asked.points, asked.normals, 1.4, 0.6, 0.2, got)
+    np.testing.assert_array_equal(got, want)
+    assert 20 < want.sum() < 580
+
+    weight = rng.uniform(0.5, 2.0, 600)
+    small, large = near.of_faces(there, 0.5), near.of_faces(there, 1.5)
+    H, g, centre, reach, count = near.equations(small, large, T, asked.points, asked.normals, weight, 1.2, 0.5, 0.1)
+    one = nearest[:, 0]
+    rows = np.arange(600)
+    kept = (d[rows, one] < 1.2) & (off[rows, one] < 0.5) & (like[rows, one] > 0.1)
+    assert count == kept.sum() > 50
+    p, m, w = x[kept], there.normals[one[kept]], weight[kept]
+    r = np.einsum("ni,ni->n", p - there.points[one[kept]], m)
+    np.testing.assert_allclose(centre, p.mean(axis=0))
+    assert np.isclose(reach, np.sqrt(((p - centre) ** 2).sum(axis=1).mean()))
+    J = np.hstack([np.cross((p - centre) / reach, m), m])
+    np.testing.assert_allclose(H, J.T @ (w[:, None] * J), atol=1e-9)
+    np.testing.assert_allclose(g, J.T @ (w * r), atol=1e-9)

@@ -1,0 +1,42 @@
+"""Poses by regions, and pieces that lie: what an adjustment alone would be too sure of."""
+
+import dataclasses
+
+import numpy as np
+
+from processor.model import Scene
+from processor.steps import stitch
+from tests.stitch_clouds import four
+
+
+def bent(scan, mm):
+    """Ranges off by a wave of the direction: alike over a wall, and no pose takes it up."""
+    R = np.linalg.norm(scan.points, axis=1)
+    turn = np.arctan2(scan.points[:, 1], scan.points[:, 0])
+    return dataclasses.replace(scan, points=scan.points * (1.0 + mm * np.sin(3.0 * turn) / R)[:, None])
+
+
+def test_scans_that_are_bent_are_not_called_sure():
+    T, scans = four(3, step_mrad=20.0)
+    want = np.linalg.inv(T[0]) @ T
+    crooked = (scans[0], *(bent(scan, 8.0) for scan in scans[1:]))
+    good, bad = (stitch.run(Scene("room", "structure", one), stitch.Params()) for one in (scans, crooked))
+    off = np.linalg.norm(bad.T_project_scan[1:, :3, 3] - want[1:, :3, 3], axis=1)
+    assert off.max() > 0.5  # far more than the noise makes
+    assert (bad.position_sd[1:].max(axis=1) > 2.0 * good.position_sd[1:].max(axis=1)).all()
+    assert (off < 4.0 * np.linalg.norm(bad.position_sd[1:], axis=1)).all()
+
+
+def test_a_board_that_stood_elsewhere_during_one_scan_does_not_pull_it():
+    """A board on the nearest wall, 3 mm off while one scan was made: its pieces hold the most points of all."""
+    T, scans = four(4, step_mrad=20.0)
+    inside = scans[2].points @ T[2][:3, :3].T + T[2][:3, 3]
+    board = (inside[:, 0] > 6900.0) & (np.abs(inside[:, 1:] - [-2000.0, 1500.0]) < 750.0).all(axis=1)
+    assert board.sum() > 400
+    points = (inside + np.where(board, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0] - T[2][:3, 3]) @ T[2][:3, :3]
+    moved = (*scans[:2], dataclasses.replace(scans[2], points=points), scans[3])
+    result = stitch.run(Scene("room", "structure", moved), stitch.Params())
+    want = np.linalg.inv(T[0]) @ T
+    off = np.abs(result.T_project_scan[1:, :3, 3] - want[1:, :3, 3])
+    assert (off < 4.0 * result.position_sd[1:]).all()
+    assert off.max() < 0.25
