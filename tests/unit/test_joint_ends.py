@@ -6,6 +6,7 @@ import pytest
 from processor.geometry import mesh_surface
 from processor.preassembly import features, form, joint_ends, layers, network, outer_faces
 from processor.preassembly.bottom_edges import EdgeStations
+from processor.preassembly.evidence import Believed, no_surer
 
 LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
 
@@ -155,3 +156,14 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
     assert np.abs(adjusted.motions[0][:3, 3]).max() < 1.0 + 60_000.0 * 2e-5  # its turn is about the middle
     moved = adjusted.motions[0] @ np.array([0.0, 0.0, 60_000.0, 1.0])
     assert abs(moved[0]) < 1.0
+
+
+def test_a_belief_is_no_surer_than_the_values_in_any_direction():
+    rng = np.random.default_rng(4)
+    least, own = (a @ a.T + 0.1 * np.eye(5) for a in rng.normal(size=(2, 5, 5)))
+    raised = no_surer(Believed(np.arange(5.0), own), least)
+    for floor in (own, least):
+        assert np.linalg.eigvalsh(raised.covariance - floor).min() > -1e-9
+    np.testing.assert_array_equal(raised.mean, np.arange(5.0))
+    # Where it is less sure already, nothing changes.
+    np.testing.assert_allclose(no_surer(Believed(np.zeros(5), 2.0 * least), least).covariance, 2.0 * least, rtol=1e-12)
