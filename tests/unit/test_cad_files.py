@@ -377,6 +377,7 @@ def test_what_is_lost_is_said(tmp_path):
     assert [body["name"] for body in said["bodies"] if body["kind"] == "solid"] == ["whole"]
 
 
+@pytest.mark.slow
 def test_a_large_sphere_takes_seconds_and_says_its_deviation(tmp_path):
     radius = 2500.0
     cad_files.write_step(tmp_path / "s.step", {"tank": cq.Solid.makeSphere(radius, angleDegrees1=-90)})

@@ -64,6 +64,7 @@ def offsets(result, truth):
     return off, sd
 
 
+@pytest.mark.slow
 def test_the_shift_all_stations_share_is_found_by_control_points_and_covered_without(roof):
     scene, truth = roof
     wrong = shifted(scene, 1)

@@ -484,6 +484,7 @@ def test_a_cluster_that_is_lost_is_said_and_the_next_run_goes_on(whole, tmp_path
     assert digests(folder) == digests(whole)
 
 
+@pytest.mark.slow
 def test_a_cluster_that_does_not_answer_is_said(tmp_path):
     (tmp_path / "set").mkdir()
     (tmp_path / "set" / "index.csv").write_text("mine")

@@ -130,7 +130,7 @@ def test_half_widths_against_draws():
         assert half == pytest.approx(1.959964 * values.std(), rel=0.01), name
 
 
-@pytest.mark.parametrize("shape", ["level", "two alike", "wedge", "zero"])
+@pytest.mark.parametrize("shape", ["level", "two alike", "wedge", pytest.param("zero", marks=pytest.mark.slow)])
 def test_intervals_of_extremes_hold(shape):
     """True extremes lie within the stated intervals in 95 % of measurements or more, however many points are alike."""
     true = np.zeros((8, 3))

@@ -116,7 +116,7 @@ def inside_by(body, points):
     return np.minimum.reduce(walls)
 
 
-@pytest.mark.parametrize("name", ["stadium-roof", "truss-bridge"])
+@pytest.mark.parametrize("name", ["stadium-roof", pytest.param("truss-bridge", marks=pytest.mark.slow)])
 def test_no_point_of_a_sample_lies_inside_a_body(name):
     table = {key: value for key, value in recipes.load(name)[1].items() if key not in ("scan", "asbuilt")}
     settings = ["scan.mode=surface", "scan.spacing_mm=60", "scan.sigma_mm=0"]
