@@ -158,6 +158,7 @@ def test_a_scan_does_not_depend_on_its_strips(monkeypatch):
             np.testing.assert_array_equal(getattr(other, column), getattr(found[0], column))
 
 
+@pytest.mark.slow
 def test_a_beam_on_two_plates_gives_a_mixed_pixel_by_the_device():
     builder = Builder()
     corners = np.array([[-3000.0, 0.0, -3000.0], [0.0, 0.0, -3000.0], [0.0, 0.0, 3000.0], [-3000.0, 0.0, 3000.0]])

@@ -25,7 +25,7 @@ def runs(bridge):
     return {method: preassemble.run(scene, preassemble.Params(method=method)) for method in preassemble.METHODS}
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(s, marks=pytest.mark.slow) for s in (2, 3))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in (1, 2, 3))])
 def test_attitudes_are_right_from_any_pose(seed):
     scene, truth = arch_clouds.bridge(spacing_mm=12.0, sigma_mm=1.0, seed=100 + seed)
     for part, scan, T in zip(scene.arch.parts, scene.scans, truth.arch.T_bridge_scan, strict=True):

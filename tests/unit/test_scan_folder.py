@@ -333,7 +333,7 @@ def test_a_station_that_saw_nothing_is_left_out_and_said(format_, tmp_path):
     assert not (tmp_path / "none").exists()
 
 
-@pytest.mark.parametrize("spherical", [False, True])
+@pytest.mark.parametrize("spherical", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_an_arch_bridge_comes_back_from_e57_with_its_components(spherical, tmp_path):
     settings = ["scan.step_mrad=15", "scan.stations=2", "scan.clutter=0"]
     scene, truth = make_scene("bridge", recipes.overridden(recipes.load("arch-s1-rays")[1], settings))
