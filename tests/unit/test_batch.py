@@ -419,7 +419,7 @@ def test_a_signal_stops_it_cleanly(tmp_path, stop):
     folder(tmp_path / "root/c")
     out = tmp_path / "out"
     process = started(tmp_path / "root", "-o", out)
-    until(lambda: attempts(out).get("b"))
+    until(lambda: attempts(out).get("b") and finished(out) == {"a"})
     os.kill(process.pid, stop)
     _, said_ = process.communicate(timeout=20)
     assert process.returncode == 1
