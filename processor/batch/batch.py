@@ -12,6 +12,7 @@ import secrets
 import shutil
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass, field
@@ -75,8 +76,8 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
         raise InputError(f"{settings.root}: expected scan folders, scenes or scans in it, found none")
     client = spreading.connect(settings.cluster, say) if settings.cluster else None
     try:
-        with _stoppable(), _alone_in(out) as state:
-            return _run(settings, found, root, out, state, client, say, ended)
+        with _stoppable() as stop_here, _alone_in(out) as state:
+            return _run(settings, found, root, out, state, client, say, ended, stop_here)
     finally:
         if client is not None:
             client.close()
@@ -95,6 +96,7 @@ def _run(
     client: Any,
     say: Callable[[str], None],
     ended: Callable[[Record], None],
+    stop_here: Callable[[], None],
 ) -> summary.Summary:
     from tqdm import tqdm
 
@@ -103,9 +105,10 @@ def _run(
         jobs = _jobs(settings, found, root, out, state, token)
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})") from error
-    spread = (
-        spreading.over_cluster(jobs, client, settings.cluster or "") if client else spreading.here(jobs, settings.jobs)
-    )
+    if client:
+        spread = spreading.over_cluster(jobs, client, settings.cluster or "", stop_here)
+    else:
+        spread = spreading.here(jobs, settings.jobs, stop_here)
     records: dict[str, Record] = {}
     try:
         with closing(spread), tqdm(total=len(jobs), unit="input", disable=not sys.stderr.isatty()) as bar:
@@ -205,18 +208,26 @@ def _alone_in(out: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def _stoppable() -> Iterator[None]:
-    """Raise StoppedError on the first SIGTERM or SIGINT; further ones do not disturb what is cleared up then."""
+def _stoppable() -> Iterator[Callable[[], None]]:
+    """Give a function that raises StoppedError once SIGTERM or SIGINT came; what is cleared up then is not disturbed.
+
+    Raised wherever the signal happens to come, it could leave a lock that threads wait for, and hang.
+    """
     signals = (signal.SIGTERM, signal.SIGINT)
+    asked = threading.Event()
 
     def stop(*_: int | FrameType | None) -> None:
         for one in signals:
             signal.signal(one, signal.SIG_IGN)
-        raise StoppedError
+        asked.set()
+
+    def stop_here() -> None:
+        if asked.is_set():
+            raise StoppedError
 
     before = [signal.signal(one, stop) for one in signals]
     try:
-        yield
+        yield stop_here
     finally:
         for one, handler in zip(signals, before, strict=True):
             signal.signal(one, handler)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import logging
 import threading
+import time
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
 from typing import Any
@@ -15,17 +16,19 @@ from processor.model import InputError, UsageError
 
 Results = Generator[tuple[Job, Record], None, None]
 CONNECT_SECONDS = 10
+LOOK_S = 0.1  # whether it is to stop
 DIED = "every worker that did it died (out of memory?); run again, with fewer jobs at a time"
 
 
-def here(jobs: Sequence[Job], at_once: int) -> Results:
-    """Do jobs, each in a process of its own that a thread watches; closing stops them."""
+def here(jobs: Sequence[Job], at_once: int, stop_here: Callable[[], None]) -> Results:
+    """Do jobs, each in a process of its own that a thread watches; closing, or ``stop_here`` raising, stops them."""
     stop = threading.Event()
     threads = ThreadPoolExecutor(at_once)
     try:
         waiting: dict[Future[Record], Job] = {threads.submit(do, job, stop.is_set): job for job in jobs}
         while waiting:
-            for future in wait(waiting, return_when=FIRST_COMPLETED).done:
+            stop_here()
+            for future in wait(waiting, timeout=LOOK_S, return_when=FIRST_COMPLETED).done:
                 yield waiting.pop(future), future.result()
     finally:
         stop.set()
@@ -52,16 +55,23 @@ def connect(address: str, say: Callable[[str], None]) -> Any:
     return client
 
 
-def over_cluster(jobs: Sequence[Job], client: Any, address: str) -> Results:
-    """Do jobs on a cluster; of a worker that is lost they are done by another. Closing cancels what is not begun.
+def over_cluster(jobs: Sequence[Job], client: Any, address: str, stop_here: Callable[[], None]) -> Results:
+    """Do jobs on a cluster; of a worker that is lost they are done by another.
 
+    Closing, or ``stop_here`` raising, cancels what is not begun.
     Raises InputError where the scheduler is lost.
     """
     distributed: Any = importlib.import_module("distributed")
     # Impure, as a job looks at files: what an earlier batch found is not to be taken from the scheduler's memory.
     waiting = {client.submit(do, job, pure=False): job for job in jobs}
+    completed = distributed.as_completed(list(waiting), loop=client.loop)
     try:
-        for future in distributed.as_completed(list(waiting), loop=client.loop):
+        while waiting:
+            stop_here()
+            if not completed.has_ready():
+                time.sleep(LOOK_S)
+                continue
+            future = completed.next()
             job = waiting.pop(future)
             try:
                 found: Record = future.result()
