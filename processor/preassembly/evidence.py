@@ -19,6 +19,7 @@ from processor.model import Floats
 
 SIZES_MM = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0)
 LEAST_SHARE = 1e-4  # of a hypothesis, to be counted
+LEAST_MM = 1e-4
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,8 @@ def no_surer(believed: Believed, least: Floats) -> Believed:
     The average over sizes is right for parts whose departures are of every size alike. Where all are as large as the
     noise, it draws them towards nothing more often than it owns up to.
     """
-    root = np.linalg.cholesky(least)
+    # What is surely nothing has no variance at all.
+    root = np.linalg.cholesky(least + LEAST_MM**2 * np.eye(len(least)))
     inner = solve_triangular(root, solve_triangular(root, believed.covariance, lower=True).T, lower=True)
     value, vector = np.linalg.eigh(0.5 * (inner + inner.T))
     own = root @ vector
