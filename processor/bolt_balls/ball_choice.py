@@ -93,7 +93,8 @@ def fit_one(  # type: ignore[no-untyped-def]
             return -1
         used = solve(
             points, rays, ranges, station, chosen, noise, stretch, centre, centre_weight, radius, radius_weight,
-            shift_covariance, settled, state, shifts, gains, 6 if turn + 1 < turns else 12, covariance,
+            shift_covariance, settled if turn + 1 == turns else max(settled, COARSE_MM), state, shifts, gains,
+            12 if turn + 1 == turns else 6, covariance,
         )  # fmt: skip
         if used < 0:
             return -1

@@ -8,7 +8,7 @@ import math
 import numpy as np
 from numba import njit
 
-from processor.bolt_balls.ball_choice import AROUND_MM, fit_one, segments
+from processor.bolt_balls.ball_choice import AROUND_MM, COARSE_MM, fit_one, segments
 from processor.bolt_balls.ball_residuals import residual, variance, weight
 from processor.bolt_balls.ball_solve import inverse_of, normal_equations, solve
 from processor.bolt_balls.ball_votes import rows_within, taken
@@ -16,6 +16,7 @@ from processor.bolt_balls.threads import over_ranges
 from processor.model import Floats, Ints, Labels
 
 SETTLED_MM = 1e-6
+TURNS = 4  # of the scale and the fit by it
 LARGEST_BIAS = 0.3  # sd
 BANDS, SECTORS = 10, 20  # cells of equal area that the visible share is counted in
 
@@ -164,7 +165,7 @@ def finish_at(  # type: ignore[no-untyped-def]
     steps, robust, whole = 6, False, True
     if n > 0:
         steps, robust, whole = 10, n < 0, n > 0
-    for _ in range(4):
+    for turn in range(TURNS):
         weights, squares, leverages, plain, seen, stations = leftover(
             p, u, L, s, chosen, local, state, shifts, gains, covariance, e, c, w, cells,
         )  # fmt: skip
@@ -175,7 +176,7 @@ def finish_at(  # type: ignore[no-untyped-def]
             local[i] = noise[i] * scale2
         used = solve(
             p, u, L, s, chosen, local, 1.0, origin, centre_weight[k], sizes[k], size_weights[k], shift_covariance,
-            SETTLED_MM, state, shifts, gains, steps, covariance,
+            SETTLED_MM if turn + 1 == TURNS else COARSE_MM, state, shifts, gains, steps, covariance,
         )  # fmt: skip
         if used < 1:
             break

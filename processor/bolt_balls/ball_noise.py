@@ -74,14 +74,17 @@ def noise_model(
     return parts, float(len(e))
 
 
-def limb_cosine(errors: Floats, cosines: Floats, variances: Floats, weights: Floats, least: float) -> float:
+def limb_cosine(
+    errors: Floats, cosines: Floats, ranges: Floats, weights: Floats, noise: Floats, least: float
+) -> float:
     """Return the cosine of incidence from which on residuals have no bias: ``least`` or more, 0.5 at most.
 
     Near the limb a wide beam is cut and its mean range is not that of its middle. Bands of the cosine whose median
     residual is off by more than a tenth of the noise, and by more than chance, are left out, and one band beyond them.
     """
-    on = weights > 0.0
-    u, c = errors[on] / np.sqrt(variances[on]), cosines[on]
+    on = (weights > 0.0) & (cosines < LIMB[-1])
+    c = cosines[on]
+    u = errors[on] / np.sqrt(variances_of(noise, c, ranges[on]))
     limb = least
     for low, high in pairwise(LIMB.tolist()):
         here = np.sort(u[(c >= low) & (c < high)])

@@ -149,8 +149,7 @@ def _learnt(
     errors, cosines, on = left
     corner = ball_ends.measured(found, crops.start, crops.points, fits.states[:, :3], fits.states[:, 3], params.threads)
     noise, count = ball_noise.noise_model(errors, cosines, rays.ranges, on, setting.noise)
-    variances = ball_noise.variances_of(noise, cosines, rays.ranges)
-    limb = ball_noise.limb_cosine(errors, cosines, variances, on, setting.least_cosine)
+    limb = ball_noise.limb_cosine(errors, cosines, rays.ranges, on, noise, setting.least_cosine)
     sure, radius_sd, size_weight = fits.clear, setting.radius_sd, 0.0
     if len(catalogue.radii):
         size_weight = 1.0 / setting.radius_sd**2

@@ -122,7 +122,9 @@ def corridors(points: Floats, directions: Floats, low: Floats, high: Floats, rea
     keys, lines = np.empty(count, np.int64), np.empty(count, np.int32)
     cells_near(*arguments, keys, lines, 0, 0, len(points))
     order = np.argsort(keys, kind="stable")
-    unique, first = np.unique(keys[order], return_index=True)
+    keys = keys[order]
+    first = np.flatnonzero(np.diff(keys, prepend=EMPTY))
+    unique = keys[first]
     slots = 1 << max(4, int(2 * len(unique)).bit_length())
     table, spans = np.full(slots, EMPTY, np.int64), np.zeros((slots, 2), np.int64)
     tabulate(unique, np.append(first, count), table, spans)

@@ -1,12 +1,13 @@
 """The ray fit of balls against the Cramér-Rao bound, by Monte Carlo: no prior, the radius free, noise along the ray.
 
-    python -m tests.bench.ball_fit [--draws 1000] [--seeds 3]
+    python -m tests.bench.ball_fit [--draws 1000] [--seeds 3] [--likelihood]
 
 A ball is seen from one station or from three; each ray meets a cap of the given share of the sphere, and rays are
 spread evenly over the cap's outline as a scanner spreads them. Printed: error rms over bound of centre, radius and
 lowest point, the radius's bias, pull rms and the share of 95 % intervals that hold. Bounds are those of the true ball
 from the rays that the method admits, of incidence cosine 0.15 or more. The paper's algebraic fit of the same points
-stands beside.
+stands beside, and with --likelihood, of centre and radius, what the likeliest ball of the admitted rays reaches: found
+by another library from the true ball on, told which rays are admitted. Where that misses the bound, so must any fit.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from __future__ import annotations
 import argparse
 
 import numpy as np
+from scipy.optimize import least_squares
 
 from processor.bolt_balls import balls, catalogue
 from processor.bolt_balls.crops import Crops
@@ -51,8 +53,8 @@ def draw(rng, radius, count, visible, sigma, stations):
     return points, station, information
 
 
-def trial(rng, draws, radius, count, visible, sigma, several, prior=None):
-    """Fit many draws at once; returns errors (n, 4), covariances (n, 4, 4), bounds (n, 4, 4) and algebraic errors."""
+def trial(rng, draws, radius, count, visible, sigma, several, prior=None, likelihood=False):
+    """Fit many draws at once; returns errors (n, 4), covariances, bounds (n, 4, 4), algebraic and likeliest errors."""
     stations = STATIONS[several]
     found = [draw(rng, radius, count, visible, sigma, stations) for _ in range(draws)]
     points = np.concatenate([p for p, _, _ in found])
@@ -71,7 +73,28 @@ def trial(rng, draws, radius, count, visible, sigma, several, prior=None):
     for p, _, _ in found:
         sphere = algebraic(p)
         plain.append(np.full(4, np.nan) if sphere is None else np.append(sphere.centre, sphere.radius - radius))
-    return errors, got.covariance, np.linalg.inv(np.array([n for _, _, n in found])), np.array(plain)
+    best = np.full((draws, 4), np.nan)
+    if likelihood:
+        best = np.array([likeliest(p, stations[s], radius) for p, s, _ in found])
+    return errors, got.covariance, np.linalg.inv(np.array([n for _, _, n in found])), np.array(plain), best
+
+
+def likeliest(points, seen, radius):
+    """Error (4,) of the likeliest ball of the rays admitted at the true one."""
+    away = np.linalg.norm(points - seen, axis=1)
+    u = (points - seen) / away[:, None]
+
+    def half_chord(ball):
+        along = ((ball[:3] - seen) * u).sum(1)
+        return along, ball[3] ** 2 - ((ball[:3] - seen) ** 2).sum(1) + along**2
+
+    admitted = half_chord(np.array([0.0, 0.0, 0.0, radius]))[1] >= (0.15 * radius) ** 2
+
+    def residuals(ball):
+        along, square = half_chord(ball)
+        return (away - along + np.sqrt(np.maximum(square, 1e-6)))[admitted]
+
+    return least_squares(residuals, [0.0, 0.0, 0.0, radius]).x - [0.0, 0.0, 0.0, radius]
 
 
 def ratios(errors, bounds):
@@ -86,6 +109,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--draws", type=int, default=1000)
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--likelihood", action="store_true")
     options = parser.parse_args()
     print("   r visible   n sigma st | rms/bound c     r   low | bias r  sd r | pull c    r  low | in 95 % | algebraic")
     for radius in (45.0, 150.0):
@@ -94,11 +118,14 @@ def main() -> None:
                 for sigma in (1.0, 2.0):
                     for several in (1, 3):
                         for seed in range(options.seeds):
-                            row(np.random.default_rng(seed), options.draws, radius, count, visible, sigma, several)
+                            case = (radius, count, visible, sigma, several)
+                            row(np.random.default_rng(seed), options.draws, *case, options.likelihood)
 
 
-def row(rng, draws, radius, count, visible, sigma, several):
-    errors, covariance, bounds, plain = trial(rng, draws, radius, count, visible, sigma, several)
+def row(rng, draws, radius, count, visible, sigma, several, likelihood):
+    errors, covariance, bounds, plain, best = trial(
+        rng, draws, radius, count, visible, sigma, several, likelihood=likelihood
+    )
     fitted = np.isfinite(errors).all(axis=1)
     e, C, B = errors[fitted], covariance[fitted], bounds[fitted]
     c, r, low = ratios(e, B)
@@ -111,6 +138,7 @@ def row(rng, draws, radius, count, visible, sigma, several):
         f" {e[:, 3].mean():+6.3f} {np.sqrt(B[:, 3, 3].mean()):5.2f} |"
         f" {np.sqrt((pulls[:3] ** 2).mean()):6.3f} {pulls[3]:4.2f} {np.sqrt(np.mean(low_pull**2)):4.2f} |"
         f" {inside:7.1%} | {ratios(plain, bounds)[0]:5.2f}"
+        + (" | likeliest {:5.3f} {:5.3f}".format(*ratios(best, bounds)[:2]) if likelihood else "")
         + ("" if fitted.all() else f" ({(~fitted).sum()} not fitted)")
     )
 

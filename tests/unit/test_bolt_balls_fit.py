@@ -113,7 +113,7 @@ def test_a_station_that_may_have_moved_is_worth_less():
 )
 def test_errors_keep_to_the_bound_and_intervals_hold(radius, count, visible, sigma, several):
     draws = 600
-    errors, covariance, bounds, _ = ball_fit.trial(
+    errors, covariance, bounds, *_ = ball_fit.trial(
         np.random.default_rng(7), draws, radius, count, visible, sigma, several
     )
     chance = 2.5 / np.sqrt(2.0 * draws)  # of an rms, beyond which one in a hundred falls
@@ -148,8 +148,9 @@ def test_the_limb_is_left_out_where_it_is_biased():
     c = rng.uniform(0.15, 1.0, 30_000)
     e = rng.standard_normal(30_000)
     ones = np.ones(30_000)
-    assert limb_cosine(e, c, ones, ones, 0.15) == 0.15
-    assert limb_cosine(np.where(c < 0.28, e - 0.5, e), c, ones, ones, 0.15) == pytest.approx(0.35)
+    unit = np.array([1.0, 0.0, 0.0])
+    assert limb_cosine(e, c, ones, ones, unit, 0.15) == 0.15
+    assert limb_cosine(np.where(c < 0.28, e - 0.5, e), c, ones, ones, unit, 0.15) == pytest.approx(0.35)
 
 
 def test_the_scatter_of_radii_is_that_of_the_balls():
