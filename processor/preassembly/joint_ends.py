@@ -21,8 +21,9 @@ from processor.preassembly.end_faces import FACE, FLOOR_MM, LEAST_POINTS, REACH_
 from processor.preassembly.evidence import SIZES_MM, Believed, no_surer, weigh
 from processor.preassembly.outer_faces import FACES
 
-# Weights of bends of each size beforehand: ends are cut by a plane.
-STRAIGHT = (1.0, *(0.1,) * (len(SIZES_MM) - 1))
+# Sizes of bends, the finest for scans without noise, and their weights beforehand: ends are cut by a plane.
+BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
+STRAIGHT = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))
 RING = 8  # numbers of the ring
 TURNS = 4
 # Of a movement: shapes are held against the design where they are, not where they came from. A corner 20 mm off, on
@@ -193,12 +194,12 @@ def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
         (before, np.tile(np.repeat([shift, tilt, bend], (1, 3, 4)), 4))
         for shift in SIZES_MM
         for tilt in SIZES_MM
-        for bend, before in zip(SIZES_MM, STRAIGHT, strict=True)
+        for bend, before in zip(BENDS_MM, STRAIGHT, strict=True)
     ]
     ring = [
         (before, np.repeat([plane, bend], (3, RING - 3)))
         for plane in SIZES_MM
-        for bend, before in zip(SIZES_MM, STRAIGHT, strict=True)
+        for bend, before in zip(BENDS_MM, STRAIGHT, strict=True)
     ]
     for rows, sizes in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
         noise = covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
