@@ -1,4 +1,4 @@
-"""The source papers' comparisons: three preassembly methods on D1-D3, two estimators on 100 balls.
+"""The source papers' comparisons: preassembly methods on D1-D3, two estimators on 100 balls.
 
 Median and worst over seeds, printed as a table and written as JSON:
 
@@ -24,19 +24,20 @@ from processor.steps import preassemble, spheres
 FIGURES = ("splicing mean", "splicing max", "linear mean", "linear max", "best-fit linear mean", "true linear mean")
 
 
-def bridges(sets, seeds, sigmas, spacing):
+def bridges(sets, seeds, sigmas, spacing, methods):
     """Figures of every method, set and sigma: (sets, sigmas, methods, seeds, figures)."""
     rows = []
     for name in sets:
         for sigma in sigmas:
-            found = {method: [] for method in preassemble.METHODS}
+            found = {method: [] for method in methods}
             for seed in seeds:
                 settings = [f"scan.sigma_mm={float(sigma)}", f"scan.spacing_mm={float(spacing)}"]
                 scene, truth = make(name, recipes.overridden(recipes.load(f"arch-{name.lower()}")[1], settings), seed)
                 started = time.monotonic()
-                scans = [own[0] for own in preassemble.scans_in_order(scene, scene.arch)]
-                parts = paper.extract(scans, scene.arch, preassemble.Params(seed=seed))
-                for method in preassemble.METHODS:
+                if set(methods) & set(PAPER_METHODS):
+                    scans = [own[0] for own in preassemble.scans_in_order(scene, scene.arch)]
+                    parts = paper.extract(scans, scene.arch, preassemble.Params(seed=seed))
+                for method in methods:
                     params = preassemble.Params(method=method, seed=seed)
                     if method in PAPER_METHODS:
                         result = paper.assemble(parts, scene.arch, params)
@@ -110,6 +111,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sigmas", default="0,1", help="mm, comma-separated")
     parser.add_argument("--spacing", type=float, default=5.0, help="mm")
+    parser.add_argument("--methods", default=",".join(preassemble.METHODS), help="of preassembly, comma-separated")
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     seeds = range(arguments.seeds)
@@ -117,7 +119,11 @@ def main():
     found = {
         "balls": balls(seeds),
         "bridges": bridges(
-            arguments.sets.split(","), seeds, [float(s) for s in arguments.sigmas.split(",")], arguments.spacing
+            arguments.sets.split(","),
+            seeds,
+            [float(s) for s in arguments.sigmas.split(",")],
+            arguments.spacing,
+            arguments.methods.split(","),
         ),
     }
     arguments.output.parent.mkdir(parents=True, exist_ok=True)
