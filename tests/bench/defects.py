@@ -1,6 +1,6 @@
 """Defects found, by class, size and scanner: share found, false alarms, depth, class.
 
-    python -m tests.bench.defects [--scanners phase,pulse,long-range] [--sizes 0.05,0.2,1] [--scenes 20] [--seed 1]
+    python -m tests.bench.defects [--scanners phase,pulse,long-range] [--sizes 0.05,0.2,1] [--scenes 20] [--seed 1] [--jobs 2]
 
 Every scene is a row of plates of 1 m with a defect of each class and one without, places drawn anew; ``--scenes`` is so
 the number of defects of each class, size and scanner. A size multiplies depths, angles, the pieces lost, and the width
@@ -12,6 +12,8 @@ from __future__ import annotations
 import argparse
 import json
 import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -103,15 +105,21 @@ def main() -> None:
     parser.add_argument("--scenes", type=int, default=20)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--jobs", type=int, default=1)
     given = parser.parse_args()
+    scenes = [
+        (scanner, size, seed)
+        for scanner in given.scanners.split(",")
+        for size in map(float, given.sizes.split(","))
+        for seed in range(given.seed, given.seed + given.scenes)
+    ]
     runs = []
-    for scanner in given.scanners.split(","):
-        for size in map(float, given.sizes.split(",")):
-            for seed in range(given.seed, given.seed + given.scenes):
-                runs.append(run_one(scanner, size, seed))
-                print(f"{scanner} size {size:g} seed {seed}: {runs[-1]['seconds']:.1f} s", flush=True)
-                if given.json:
-                    given.json.write_text(json.dumps(runs), "utf-8")
+    with ProcessPoolExecutor(given.jobs, mp_context=get_context("spawn")) as pool:
+        for run in pool.map(run_one, *zip(*scenes, strict=True)):
+            runs.append(run)
+            print(f"{run['scanner']} size {run['size']:g} seed {run['seed']}: {run['seconds']:.1f} s", flush=True)
+            if given.json:
+                given.json.write_text(json.dumps(runs), "utf-8")
     print(table(runs))
     unsure = [row for run in runs for row in run["rows"] if row["found"]]
     for low, high in ((0.0, 0.6), (0.6, 0.9), (0.9, 0.99), (0.99, 1.01)):
