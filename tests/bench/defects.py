@@ -1,6 +1,7 @@
 """Defects found, by class, size and scanner: share found, false alarms, depth, class.
 
-    python -m tests.bench.defects [--scanners phase,pulse,long-range] [--sizes 0.05,0.2,1] [--scenes 20] [--seed 1] [--jobs 2]
+    python -m tests.bench.defects [--scanners phase,pulse,long-range] [--sizes 0.05,0.2,1] [--scenes 20] [--seed 1]
+        [--jobs 2]
 
 Every scene is a row of plates of 1 m with a defect of each class and one without, places drawn anew; ``--scenes`` is so
 the number of defects of each class, size and scanner. A size multiplies depths, angles, the pieces lost, and the width
