@@ -129,6 +129,30 @@ def bias(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
+def lean(points, rays, chosen, noise, state, covariance, found):  # type: ignore[no-untyped-def]
+    """Fill what noise moves the state (4,) by where rays are unknown, if it is the same in all directions.
+
+    Noise across the normal of a sphere takes points off its centre by variance / distance in the mean. Of noise along a
+    ray only a part is across.
+    """
+    J, total = np.empty(4), np.zeros(4)
+    for i in range(len(points)):
+        if chosen[i] != 1 or rays[i, 0] != 0.0 or rays[i, 1] != 0.0 or rays[i, 2] != 0.0:
+            continue
+        e, cosine, J[0], J[1], J[2], J[3] = residual(
+            points[i, 0], points[i, 1], points[i, 2], 0.0, 0.0, 0.0, state[0], state[1], state[2], state[3]
+        )
+        if cosine > 0.0:
+            w = weight(e / np.sqrt(variance(noise, 0.0, 1.0))) / (state[3] + e)
+            for p in range(4):
+                total[p] += w * J[p]
+    for p in range(4):
+        found[p] = 0.0
+        for q in range(4):
+            found[p] -= covariance[p, q] * total[q]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
 def finish_at(  # type: ignore[no-untyped-def]
     k, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise,
     believed, centre_weight, sizes, size_weights, states, catch, shift_covariance, found, covariances, bounds,
@@ -211,6 +235,12 @@ def finish_at(  # type: ignore[no-untyped-def]
     if largest < LARGEST_BIAS:  # beyond it the series has no meaning, nor has the ball
         for i in range(4):
             state[i] -= off[i]
+    # Where rays are unknown noise moves the ball by nothing to all of this; as far off are both from the middle.
+    lean(p, u, chosen, local, state, covariance, off)
+    for i in range(4):
+        state[i] -= 0.5 * off[i]
+        for j in range(4):
+            covariance[i, j] += off[i] * off[j] / 12.0
     for i in range(n):
         errors[a + rows[i]], cosines[a + rows[i]], on[a + rows[i]] = e[i], c[i], w[i]
     for i in range(4):

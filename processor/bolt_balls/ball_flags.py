@@ -108,7 +108,8 @@ def judged(
     message = (
         "ranges from the known scanners"
         if rays
-        else "orthogonal distances, for the scanners are unknown: the bias of range noise stands, it is not corrected"
+        else "orthogonal distances, for the scanners are unknown: the bias of range noise stands, from none to that of "
+        "noise in all directions; the middle is taken off, the rest is in the intervals"
     )
     if station_sd > 0.0:
         message += f"; stations disagree by {station_sd:.1f} mm an axis (sd), which every covariance holds"

@@ -74,9 +74,7 @@ def noise_model(
     return parts, float(len(e))
 
 
-def limb_cosine(
-    errors: Floats, cosines: Floats, ranges: Floats, weights: Floats, noise: Floats, least: float
-) -> float:
+def limb_cosine(errors: Floats, cosines: Floats, ranges: Floats, weights: Floats, noise: Floats, least: float) -> float:
     """Return the cosine of incidence from which on residuals have no bias: ``least`` or more, 0.5 at most.
 
     Near the limb a wide beam is cut and its mean range is not that of its middle. Bands of the cosine whose median

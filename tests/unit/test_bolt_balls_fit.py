@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from processor.bolt_balls import balls, catalogue
 from processor.bolt_balls.ball_noise import limb_cosine, noise_model, radius_offset, radius_scatter
 from processor.bolt_balls.ball_residuals import residual, select, weight
 from processor.bolt_balls.ball_solve import inverse_of, solve
+from processor.bolt_balls.crops import Crops
+from processor.bolt_balls.nodes import Nodes, Tubes
 from tests.bench import ball_fit
 
 
@@ -141,6 +144,30 @@ def test_the_noise_is_read_from_residuals():
     few, worth = noise_model(e[:20], c[:20], R[:20], np.ones(20), np.array([4.0, 0.0, 0.0]))
     assert few.tolist() == [4.0, 0.0, 0.0]
     assert worth < 20
+
+
+def test_without_rays_half_of_what_noise_may_bring_is_taken_off_and_the_rest_is_in_the_interval():
+    rng = np.random.default_rng(12)
+    draws, count, radius, sigma = 400, 200, 45.0, 2.0
+    normal = rng.standard_normal((draws * count, 3))
+    normal /= np.linalg.norm(normal, axis=1)[:, None]
+    most = sigma**2 / radius  # by which noise in all directions lengthens distances from the centre
+
+    def radii(noise):
+        points = radius * normal + noise
+        crops = Crops(np.arange(draws + 1) * count, points, np.full(len(points), -1, np.int32))
+        unfixed = np.full((draws, 3, 3), np.nan)
+        nodes = Nodes(np.zeros((draws, 3)), unfixed, np.zeros(draws, np.int64), np.full(draws, np.nan))
+        params = balls.Params(sigma_mm=2.0, process_hole_mm=0.0)
+        found = balls.fit_crops(crops, np.empty((0, 3)), nodes, Tubes(), catalogue.of_radii([]), params=params)
+        return found.radii - radius, found.covariance[:, 3, 3]
+
+    chance = 4.0 * sigma / np.sqrt(draws * count)
+    off, variance = radii(rng.normal(0.0, sigma, (draws * count, 3)))
+    assert off.mean() == pytest.approx(0.5 * most, abs=chance)
+    assert np.median(variance) == pytest.approx(sigma**2 / count + most**2 / 12.0, rel=0.06)
+    off, _ = radii(rng.normal(0.0, sigma, (draws * count, 1)) * normal)
+    assert off.mean() == pytest.approx(-0.5 * most, abs=chance)
 
 
 def test_the_limb_is_left_out_where_it_is_biased():
