@@ -37,6 +37,8 @@ SAID_IN_FIGURES = (
     "title",
     "arrows",
     "values",
+    "from",
+    "side",
     "verdict",
     "text",
     "regions",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import collections
 
-from processor.report import figures_stitch, results_stitch, tables_stitch
+from processor.report import figures_stitch, results_stitch, tables_stitch, view_stitch
 from processor.report.step_report import StepReport
 from processor.stitching.result import Result
 
@@ -28,4 +28,5 @@ REPORT = StepReport(
     tables=tables_stitch.of_runs,
     figures=figures_stitch.of_runs,
     files=_files,
+    live=view_stitch.of_runs,
 )

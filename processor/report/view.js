@@ -150,7 +150,7 @@ function spaceView(host, data) {
     names(at);
     sliderSaid.textContent = ` ${Number(state.times.toPrecision(2)).toLocaleString("en")} ${say("times their size")}`;
     least.textContent = `−${state.limit.toPrecision(2)} mm `;
-    most.textContent = ` +${state.limit.toPrecision(2)} mm ${say("outward")}`;
+    most.textContent = ` +${state.limit.toPrecision(2)} mm ${say(data.side || "outward")}`;
   }
   function visible(_, j) { return state.joint < 0 || j === state.joint; }
   function paintPoints(at, pixels) {
@@ -254,7 +254,7 @@ function spaceView(host, data) {
       if (index >= 0 && index < part.residual.length) {
         const where = Array.from(part.points.subarray(3 * index, 3 * index + 3), (value, k) => (value + origin[k]).toFixed(0)).join(", ");
         const region = part.region && part.region[index] >= 0 ? `; ${regions[part.region[index]]}` : "";
-        said.textContent = `${part.text || part.name}: ${two(part.residual[index])} mm ${say("from the design at")} ${where} mm${region}`;
+        said.textContent = `${part.text || part.name}: ${two(part.residual[index])} mm ${say(data.from || "from the design at")} ${where} mm${region}`;
         return;
       }
       index -= part.residual.length;

@@ -85,7 +85,7 @@ def of_points(
         "stops": DIVERGING_STOPS,
         "tones": TONES,
         "limit": max(float(np.quantile(np.abs(values[known]), 0.98)), LEAST_SHOWN_MM),
-        "spacing": _spacing(points[known][::step]),
+        "spacing": spacing(points[known][::step]),
         "parts": drawn + lines,
         "marks": shown + spots,
         "regions": [f"{region.name}: {region.brief}" for region in regions] if region_of is not None else [],
@@ -95,7 +95,7 @@ def of_points(
     return made
 
 
-def _spacing(points: Floats) -> float:
+def spacing(points: Floats) -> float:
     """Return how far points (n, 3) are apart, by the median of the distances to the nearest ones."""
     if len(points) < LEAST_POINTS:
         return 0.0

@@ -1,0 +1,97 @@
+"""Scans in space: how far other scans lie from each point, by hand; and the page in a browser."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from processor.evaluate import ErrorReport
+from processor.geometry import rigid
+from processor.model import Scan
+from processor.report import figures, page, view_stitch
+from tests import step_results
+from tests.browser import opened, picture
+
+NAMES = ("S1", "S2", "S3", "<b>S4</b>")
+APART = 4.0  # mm of S2's wall behind that of S1
+
+
+@pytest.fixture(scope="module")
+def made():
+    """Two scans of a wall, one placed 4 mm off, one of another wall far away, and one without a place."""
+    rng = np.random.default_rng(3)
+    wall = np.column_stack([rng.uniform(0.0, 2000.0, 8000), np.full(8000, 3000.0), rng.uniform(0.0, 2000.0, 8000)])
+    turn = rigid.transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
+    poses = [np.eye(4), turn.copy(), np.eye(4), np.full((4, 4), np.nan)]
+    poses[1][:3, 3] = [500.0, 100.0, 0.0]
+    in_project = [wall[:4000], wall[4000:] + np.array([0.0, APART, 0.0]), wall[:500] + np.array([0.0, 9000.0, 0.0])]
+    origin = np.array([1e6, 2e6, 0.0])
+    scans = [
+        Scan(name, rigid.apply(rigid.invert(pose), points) - origin, origin)
+        for name, pose, points in zip(NAMES, poses, in_project, strict=False)
+    ]
+    scans.append(Scan(NAMES[3], wall[:100], np.zeros(3)))
+    four = {
+        field.name: value[:4]
+        for field in dataclasses.fields(step_results.Stitching)
+        if isinstance(value := getattr(step_results.stitching(), field.name), tuple | np.ndarray) and len(value) == 7
+    }
+    no_pairs = dict.fromkeys(("pair_a", "pair_b", "pair_message", "loops"), ())
+    no_figures = ("overlap", "residual", "scale", "scale_sd", "closure_mm", "closure_mrad", "closure_ratio")
+    result = dataclasses.replace(
+        step_results.stitching(), **four | {"scans": NAMES, "T_project_scan": np.array(poses)},
+        **no_pairs, **{name: np.empty(0) for name in no_figures}, used=np.empty(0, np.uint8),
+        pair_pieces=np.empty(0, np.int64), T_a_b=np.empty((0, 4, 4)), pair_covariance=np.empty((0, 6, 6)),
+    )  # fmt: skip
+    position = np.array([pose[:3, 3] for pose in poses])
+    execution = step_results.execution(
+        ("stitch", "automatic", "{}", dataclasses.replace(result, position=position)), names=NAMES
+    )
+    return dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, scans=tuple(scans)))
+
+
+def test_each_point_says_how_far_the_other_scan_lies(made):
+    data = view_stitch.of_runs(made.scene, made.runs)
+    assert [part["name"] for part in data["parts"]] == list(NAMES[:3])
+    off = [np.array(part["residual"], float) for part in data["parts"]]
+    # What lies behind as its scanner sees it is negative, what lies before it positive; both to the rounding.
+    assert np.isfinite(off[0]).mean() > 0.95
+    np.testing.assert_allclose(off[0][np.isfinite(off[0])], -APART, atol=2e-3)
+    np.testing.assert_allclose(off[1][np.isfinite(off[1])], APART, atol=2e-3)
+    assert np.isnan(off[2]).all()
+    assert [mark["name"] for mark in data["marks"]] == list(NAMES[:3])
+    places = np.array(data["parts"][0]["points"]).reshape(-1, 3) + data["origin"]
+    assert np.abs(places[:, 1] - 3000.0).max() < 1.0
+
+
+def test_one_scan_alone_has_no_view(made):
+    alone = dataclasses.replace(made.scene, scans=made.scene.scans[:1])
+    assert view_stitch.of_runs(alone, made.runs) is None
+
+
+def test_many_scans_keep_the_page_small(made):
+    rng = np.random.default_rng(1)
+    scans = [dataclasses.replace(scan, points=rng.normal(0.0, 1e4, (100_000, 3))) for scan in made.scene.scans]
+    data = view_stitch.of_runs(dataclasses.replace(made.scene, scans=tuple(scans)), made.runs)
+    assert sum(len(part["residual"]) for part in data["parts"]) <= view_stitch.MOST_POINTS
+
+
+@pytest.mark.parametrize(("lang", "unit"), [("en", "mm from the other scans at"), ("zh", "相对其他扫描")])
+def test_scans_in_space_react(made, tmp_path, lang, unit):
+    report = ErrorReport()
+    (tmp_path / "page.html").write_text(page.html(made, report, figures.of_run(made, report), lang), "utf-8")
+    with opened(tmp_path / "page.html") as shown:
+        canvas, said = shown.locator("canvas.space"), shown.locator("output.said").first
+        canvas.scroll_into_view_if_needed()
+        first = picture(shown)
+        ticks = shown.locator(".live fieldset label")
+        assert [one.strip() for one in ticks.all_text_contents()] == list(NAMES[:3])
+        box = canvas.bounding_box()
+        read = set()
+        for across in range(1, 30):
+            for down in range(1, 15):
+                shown.mouse.move(box["x"] + across / 30 * box["width"], box["y"] + down / 15 * box["height"])
+                read.add(said.text_content())
+        assert any(unit in one for one in read)
+        ticks.nth(0).locator("input").uncheck()
+        assert picture(shown) != first
