@@ -9,7 +9,7 @@ not, what is large is taken as measured, and the interval knows that the size is
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -24,10 +24,11 @@ LEAST_MM = 1e-4
 
 @dataclass(frozen=True)
 class Believed:
-    """Departures (k,) with their covariance (k, k)."""
+    """Departures (k,) with their covariance (k, k), and the logarithm of how well they explain the values."""
 
     mean: Floats
     covariance: Floats
+    evidence: float = 0.0
 
 
 def weigh(
@@ -45,6 +46,7 @@ def weigh(
         logs.append(np.log(before) - 0.5 * float(value @ fit) - float(np.log(np.diag(factor[0])).sum()))
         fits.append((prior, factor, fit))
     share = np.exp(np.array(logs) - max(logs))
+    evidence = float(max(logs) + np.log(share.sum()))
     share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
     share /= share.sum()
     mean, second = np.zeros(len(at)), np.zeros((len(at),) * 2)
@@ -53,7 +55,17 @@ def weigh(
             own = prior[:, at] @ fit
             mean += weight * own
             second += weight * (prior - prior[:, at] @ cho_solve(factor, prior[at]) + np.outer(own, own))
-    return Believed(mean, second - np.outer(mean, mean))
+    return Believed(mean, second - np.outer(mean, mean), evidence)
+
+
+def either(a: Believed, b: Believed) -> Believed:
+    """Believe in the one or the other, each as far as its evidence goes."""
+    most = max(a.evidence, b.evidence)
+    share = np.exp(a.evidence - most) / (np.exp(a.evidence - most) + np.exp(b.evidence - most))
+    apart = a.mean - b.mean
+    covariance = share * a.covariance + (1.0 - share) * b.covariance + share * (1.0 - share) * np.outer(apart, apart)
+    evidence = most + float(np.log(np.exp(a.evidence - most) + np.exp(b.evidence - most)))
+    return Believed(share * a.mean + (1.0 - share) * b.mean, covariance, evidence)
 
 
 def no_surer(believed: Believed, least: Floats) -> Believed:
@@ -67,4 +79,4 @@ def no_surer(believed: Believed, least: Floats) -> Believed:
     inner = solve_triangular(root, solve_triangular(root, believed.covariance, lower=True).T, lower=True)
     value, vector = np.linalg.eigh(0.5 * (inner + inner.T))
     own = root @ vector
-    return Believed(believed.mean, (own * np.maximum(value, 1.0)) @ own.T)
+    return replace(believed, covariance=(own * np.maximum(value, 1.0)) @ own.T)

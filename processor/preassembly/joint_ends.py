@@ -18,7 +18,7 @@ from processor.geometry.mesh_surface import MeshSurface
 from processor.model import Floats, Ints
 from processor.preassembly import between, end_faces, end_ring, form, layers
 from processor.preassembly.end_faces import FACE, FLOOR_MM, LEAST_POINTS, REACH_MM, ZONE_MM
-from processor.preassembly.evidence import SIZES_MM, Believed, no_surer, weigh
+from processor.preassembly.evidence import SIZES_MM, Believed, either, no_surer, weigh
 from processor.preassembly.outer_faces import FACES
 
 # Sizes of bends, the finest for scans without noise, and their weights beforehand: ends are cut by a plane.
@@ -203,10 +203,13 @@ def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
     ]
     for rows, sizes in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
         noise = covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
-        every = [(before, by_pose[rows, rows] + np.diag(size**2)) for before, size in sizes]
-        # That ends are cut by planes is known beforehand; where these lie, no better than the points say.
-        loose = [one for one, (_, size) in zip(every, sizes, strict=True) if size[0] == size[1] == SIZES_MM[-1]]
-        found = no_surer(weigh(number[rows], noise, every), weigh(number[rows], noise, loose).covariance)
+        every = [(size[0], size[1], (before, by_pose[rows, rows] + np.diag(size**2))) for before, size in sizes]
+        as_designed = [one for shift, tilt, one in every if shift == tilt == 0.0]
+        departing = [one for shift, tilt, one in every if shift > 0.0 or tilt > 0.0]
+        # That ends are cut by planes is known beforehand; where these lie that depart, no better than the points say.
+        loose = [one for shift, tilt, one in every if shift == tilt == SIZES_MM[-1]]
+        least = weigh(number[rows], noise, loose).covariance
+        found = either(weigh(number[rows], noise, as_designed), no_surer(weigh(number[rows], noise, departing), least))
         mean[rows], spread[rows, rows] = found.mean, found.covariance
     return Believed(mean, spread)
 

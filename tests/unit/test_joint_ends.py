@@ -6,7 +6,7 @@ import pytest
 from processor.geometry import mesh_surface
 from processor.preassembly import features, form, joint_ends, layers, network, outer_faces
 from processor.preassembly.bottom_edges import EdgeStations
-from processor.preassembly.evidence import Believed, no_surer
+from processor.preassembly.evidence import Believed, either, no_surer, weigh
 
 LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
 
@@ -173,3 +173,16 @@ def test_what_is_surely_nothing_may_stay_so():
     least = np.diag([0.5, 0.0])  # of a scan without noise bends are known not to be there
     raised = no_surer(Believed(np.zeros(2), np.diag([0.1, 0.0])), least)
     np.testing.assert_allclose(raised.covariance, least, atol=2e-8)
+
+
+def test_what_two_sets_of_hypotheses_say_is_what_all_of_them_say():
+    rng = np.random.default_rng(6)
+    noise, *priors = (a @ a.T + 0.1 * np.eye(3) for a in rng.normal(size=(5, 3, 3)))
+    every = [(before, prior) for before, prior in zip((0.4, 0.1, 2.0, 1.0), priors, strict=True)]
+    value = rng.normal(size=3)
+    whole = weigh(value, noise, every)
+    for parts in ((every[:1], every[1:]), (every[2:], every[:2])):
+        found = either(*(weigh(value, noise, part) for part in parts))
+        np.testing.assert_allclose(found.mean, whole.mean, rtol=1e-10)
+        np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-10, atol=1e-14)
+        assert found.evidence == pytest.approx(whole.evidence)
