@@ -18,7 +18,7 @@ from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
 from processor.preassembly import chain_figures, features, joint_measures, network, registration, tolerance
 from processor.preassembly.joint_measures import NORMAL_95
 from processor.preassembly.joint_verdicts import Verdict, judge
-from processor.preassembly.measuring import Measured, measure
+from processor.preassembly.measuring import Measured, finished, see
 from processor.preassembly.params import Params
 from processor.preassembly.proposals import propose
 from processor.preassembly.result import Result
@@ -34,7 +34,8 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     temperature_C, weight = scene.temperature_C, params.adjust.weight
     degrees = temperature_C - REFERENCE_C if np.isfinite(temperature_C) else 0.0
     shrink = 1.0 / (1.0 + EXPANSION_PER_K * degrees)
-    parts = [measure(own, index, design, shrink, params.systematic) for index, own in enumerate(tracked(scans))]
+    seen = [see(own, index, design, shrink, params.systematic) for index, own in enumerate(tracked(scans))]
+    parts = finished(seen, params.systematic)
     firsts = [part.scans[0] for part in parts]
     frames = np.array([features.joint_frame(points) for points in design.joint_points])
     members = [part.member for part in parts]

@@ -19,7 +19,9 @@ from processor.model import Floats
 
 SIZES_MM = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0)
 LEAST_SHARE = 1e-4  # of a hypothesis, to be counted
+LEAST_WEIGHT = 1e-300
 LEAST_MM = 1e-4
+ROUNDS = 50
 
 
 @dataclass(frozen=True)
@@ -39,23 +41,51 @@ def weigh(
     A hypothesis is its weight beforehand and the departures' covariance (k, k).
     """
     at = np.ones(len(hypotheses[0][1]), bool) if known is None else known
-    logs, fits = [], []
-    for before, prior in hypotheses:
-        factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
-        fit = cho_solve(factor, value)
-        logs.append(np.log(before) - 0.5 * float(value @ fit) - float(np.log(np.diag(factor[0])).sum()))
-        fits.append((prior, factor, fit))
-    share = np.exp(np.array(logs) - max(logs))
-    evidence = float(max(logs) + np.log(share.sum()))
+    logs = explained(value, noise, [prior for _, prior in hypotheses], at)
+    logs += np.log(np.maximum([before for before, _ in hypotheses], LEAST_WEIGHT))
+    share = np.exp(logs - logs.max())
+    evidence = float(logs.max() + np.log(share.sum()))
     share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
     share /= share.sum()
     mean, second = np.zeros(len(at)), np.zeros((len(at),) * 2)
-    for weight, (prior, factor, fit) in zip(share, fits, strict=True):
+    for weight, (_, prior) in zip(share, hypotheses, strict=True):
         if weight:
-            own = prior[:, at] @ fit
+            factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
+            own = prior[:, at] @ cho_solve(factor, value)
             mean += weight * own
             second += weight * (prior - prior[:, at] @ cho_solve(factor, prior[at]) + np.outer(own, own))
     return Believed(mean, second - np.outer(mean, mean), evidence)
+
+
+def explained(
+    value: Floats, noise: Floats, priors: Sequence[Floats], at: npt.NDArray[np.bool_] | None = None
+) -> Floats:
+    """Return the logarithm (h,) of how well each hypothesis, the departures' covariance (k, k), explains values (n,).
+
+    ``at`` (k,) marks those of which there are values: all where it is left out.
+    """
+    logs = []
+    for prior in priors:
+        factor = cho_factor((prior if at is None else prior[np.ix_(at, at)]) + noise, lower=True)
+        fit = float(value @ cho_solve(factor, value))
+        logs.append(-0.5 * fit - float(np.log(np.diag(factor[0])).sum()))
+    return np.array(logs)
+
+
+def by_the_others(logs: Floats, before: Floats) -> Floats:
+    """Return the weights (e, h) of hypotheses for each of several things, by what the others of them say.
+
+    ``logs`` (e, h) is how well each hypothesis explains each thing. What is believed ``before`` (h,) counts as one
+    thing more. Nothing judges itself, and alone all is as before.
+    """
+    before = before / before.sum()
+    likely = np.exp(logs - logs.max(axis=1, keepdims=True))
+    weights: Floats = np.tile(before, (len(logs), 1))
+    for _ in range(ROUNDS):
+        share = weights * likely
+        share /= share.sum(axis=1, keepdims=True)
+        weights = (share.sum(axis=0) - share + before) / len(logs)
+    return weights
 
 
 def either(a: Believed, b: Believed) -> Believed:

@@ -8,9 +8,11 @@ as built; the covariance is that of these 40 numbers, so points of one corner ar
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy.linalg import block_diag
 
 from processor.geometry import rigid
@@ -18,7 +20,7 @@ from processor.geometry.mesh_surface import MeshSurface
 from processor.model import Floats, Ints
 from processor.preassembly import between, end_faces, end_ring, form, layers
 from processor.preassembly.end_faces import FACE, FLOOR_MM, LEAST_POINTS, REACH_MM, ZONE_MM
-from processor.preassembly.evidence import SIZES_MM, Believed, either, no_surer, weigh
+from processor.preassembly.evidence import SIZES_MM, Believed, by_the_others, either, explained, no_surer, weigh
 from processor.preassembly.outer_faces import FACES
 
 # Sizes of bends, the finest for scans without noise, and their weights beforehand: ends are cut by a plane.
@@ -53,12 +55,28 @@ class _OnRing:
     sector: Ints
 
 
+@dataclass(frozen=True)
+class Observed:
+    """What the points of one end say before it is weighed: 40 numbers, their covariance, and that by the pose alone.
+
+    ``half`` (3,) is half of the joint's size, ``outward`` +1 where the part ends at the joint.
+    """
+
+    number: Floats
+    covariance: Floats
+    by_pose: Floats
+    half: Floats
+    outward: float
+    sigma_mm: float
+    trouble: str
+
+
 def nothing(trouble: str) -> JointEnd:
     """Return the end of which nothing is known."""
     return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), float("nan"), trouble)
 
 
-def fit(
+def observe(
     points: Floats,
     surface: MeshSurface,
     outer: MeshSurface,
@@ -68,8 +86,10 @@ def fit(
     pose: Floats,
     station: Ints,
     apart: float,
-) -> JointEnd:
-    """Fit one joint end of points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
+) -> Observed | JointEnd:
+    """Fit one joint end to points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
+
+    It is still to be judged; where there is nothing to be judged, that is said at once.
 
     ``outer`` are the outer faces of ``surface``, ``corners`` (4, 3) the design's P1..P4; ``outward`` is +1 where the
     part ends at the joint, -1 where it starts. ``station`` (n,) says from where each point was seen, ``apart`` is the
@@ -114,19 +134,26 @@ def fit(
         )
     )
     number = np.concatenate([coefficients for coefficients, _ in fits])
-    believed = _weighed(
-        number, block_diag(*(block for _, block in fits)), _by_pose(T_bridge_joint, half, outward, pose)
-    )
-    moved, derivative = _corners(half, outward, believed.mean)
-    second_order = np.repeat(SECOND_ORDER * np.linalg.norm(moved.reshape(8, 3), axis=1), 3)
-    covariance = derivative @ believed.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
     doubtful = [
         name
         for (name, axis, _), face in zip(FACES, faces, strict=True)
         if face.alone and face.coefficients[0] < -0.5 * thickness[axis - 1] < 0.0
     ]
     trouble = f"the {' and the '.join(doubtful)} face may be the plate's inner side" if doubtful else ""
-    return JointEnd(moved.reshape(8, 3), covariance, sigma, trouble)
+    covariance = block_diag(*(block for _, block in fits))
+    return Observed(number, covariance, _by_pose(T_bridge_joint, half, outward, pose), half, outward, sigma, trouble)
+
+
+def judged(ends: Sequence[Observed]) -> list[JointEnd]:
+    """Weigh the ends of one bridge against the design: by how far each departs, and by how far the others do."""
+    return [_corners_of(end, believed) for end, believed in zip(ends, _weighed(ends), strict=True)]
+
+
+def _corners_of(end: Observed, believed: Believed) -> JointEnd:
+    moved, derivative = _corners(end.half, end.outward, believed.mean)
+    second_order = np.repeat(SECOND_ORDER * np.linalg.norm(moved.reshape(8, 3), axis=1), 3)
+    covariance = derivative @ believed.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
+    return JointEnd(moved.reshape(8, 3), covariance, end.sigma_mm, end.trouble)
 
 
 def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Floats:
@@ -183,13 +210,13 @@ def _ring_basis(u: Floats, v: Floats) -> Floats:
     return np.stack([one, u, v, u * v, bent_u, bent_v, v * bent_u, u * bent_v], axis=1)
 
 
-def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
-    """Weigh the numbers (40,) of an end against an end as designed, which the registration alone moves: ``by_pose``.
+def _weighed(ends: Sequence[Observed]) -> list[Believed]:
+    """Weigh the numbers (40,) of ends against ends as designed, which the registration alone moves.
 
     The faces' shifts are of one unknown size, how they lie of another, how they bend of a third; so are the ring's
     plane and its bends.
     """
-    mean, spread = np.zeros(len(number)), np.zeros((len(number),) * 2)
+    found = [Believed(np.zeros(COUNT), np.zeros((COUNT, COUNT))) for _ in ends]
     faces = [
         (before, np.tile(np.repeat([shift, tilt, bend], (1, 3, 4)), 4))
         for shift in SIZES_MM
@@ -201,17 +228,37 @@ def _weighed(number: Floats, covariance: Floats, by_pose: Floats) -> Believed:
         for plane in SIZES_MM
         for bend, before in zip(BENDS_MM, STRAIGHT, strict=True)
     ]
-    for rows, sizes in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
-        noise = covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
-        every = [(size[0], size[1], (before, by_pose[rows, rows] + np.diag(size**2))) for before, size in sizes]
-        as_designed = [one for shift, tilt, one in every if shift == tilt == 0.0]
-        departing = [one for shift, tilt, one in every if shift > 0.0 or tilt > 0.0]
-        # That ends are cut by planes is known beforehand; where these lie that depart, no better than the points say.
-        loose = [one for shift, tilt, one in every if shift == tilt == SIZES_MM[-1]]
-        least = weigh(number[rows], noise, loose).covariance
-        found = either(weigh(number[rows], noise, as_designed), no_surer(weigh(number[rows], noise, departing), least))
-        mean[rows], spread[rows, rows] = found.mean, found.covariance
-    return Believed(mean, spread)
+    for rows, hypotheses in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
+        sizes = [size for _, size in hypotheses]
+        before = np.array([weight for weight, _ in hypotheses])
+        logs = [explained(end.number[rows], _noise(end, rows), _priors(end, rows, sizes)) for end in ends]
+        for end, weights, into in zip(ends, by_the_others(np.array(logs), before), found, strict=True):
+            own = _of_rows(end, rows, sizes, before, weights)
+            into.mean[rows], into.covariance[rows, rows] = own.mean, own.covariance
+    return found
+
+
+def _of_rows(end: Observed, rows: slice, sizes: Sequence[Floats], before: Floats, weights: Floats) -> Believed:
+    """Weigh some numbers of an end by hypotheses of sizes; ``before`` (h,) are their weights without other ends."""
+    number, noise, priors = end.number[rows], _noise(end, rows), _priors(end, rows, sizes)
+    lies = np.array([size[:2] for size in sizes])  # shift and tilt, or the plane twice
+    designed, largest = (lies == 0.0).all(axis=1), (lies == SIZES_MM[-1]).all(axis=1)
+
+    def weighed(of: npt.NDArray[np.bool_], by: Floats) -> Believed:
+        return weigh(number, noise, [(float(by[h]), priors[h]) for h in np.flatnonzero(of)])
+
+    # That ends are cut by planes is known beforehand; where these lie that depart, no better than the points say.
+    departing = no_surer(weighed(~designed, weights), weighed(largest, before).covariance)
+    return either(weighed(designed, weights), departing)
+
+
+def _noise(end: Observed, rows: slice) -> Floats:
+    found: Floats = end.covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
+    return found
+
+
+def _priors(end: Observed, rows: slice, sizes: Sequence[Floats]) -> list[Floats]:
+    return [end.by_pose[rows, rows] + np.diag(size**2) for size in sizes]
 
 
 def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats) -> Floats:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,11 +67,36 @@ class _Placed:
         return self.found.status == "ok", not self.fitted.weak, len(self.scan.points)
 
 
+@dataclass(frozen=True)
+class Seen:
+    """One part whose ends are still to be judged: those of ``measured`` say nothing yet."""
+
+    part: DesignPart
+    measured: Measured
+    ends: tuple[joint_ends.Observed | joint_ends.JointEnd | None, ...]
+
+
 def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, doubts: SystematicParams) -> Measured:
+    """Measure one part by itself; see :func:`see` and :func:`finished`."""
+    return finished([see(scans, index, design, shrink, doubts)], doubts)[0]
+
+
+def finished(parts: Sequence[Seen], doubts: SystematicParams) -> list[Measured]:
+    """Judge the ends of all parts together; ``doubts`` are added to their covariance."""
+    ends = iter(joint_ends.judged([end for one in parts for end in one.ends if isinstance(end, joint_ends.Observed)]))
+    found = []
+    for one in parts:
+        own = [next(ends) if isinstance(end, joint_ends.Observed) else end for end in one.ends]
+        first, last = (None if end is None else systematic.of_end(end, doubts, one.part) for end in own)
+        found.append(replace(one.measured, member=replace(one.measured.member, ends=(first, last))))
+    return found
+
+
+def see(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, doubts: SystematicParams) -> Seen:
     """Register the scans of one part and measure its ends and edges; ``index`` is its place in the design's order.
 
     Each scan is registered to the design by itself; the best of them is the part's, and others that are as sure add
-    their points to it. ``doubts`` are added to the covariance of ends and edges.
+    their points to it. ``doubts`` are added to the covariance of edges.
     """
     part = design.parts[index]
     shape = attitude.sample_surface(part)
@@ -90,7 +115,7 @@ def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float
     station = _stations([one.station for one in used])
     apart = _between_stations(moved, station, shape)
     outer = outer_faces.of_part(shape.mesh, [design.joint_points[j] for j in joints if j is not None])
-    ends: list[joint_ends.JointEnd | None] = []
+    ends: list[joint_ends.Observed | joint_ends.JointEnd | None] = []
     pose = first.fitted.covariance
     for outward, joint in zip((-1.0, 1.0), joints, strict=True):
         if joint is None:
@@ -98,21 +123,22 @@ def measure(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float
             continue
         corners = design.joint_points[joint]
         frame = features.joint_frame(corners)
-        end = joint_ends.fit(moved, shape.mesh, outer, frame, corners[:4], outward, pose, station, apart)
+        end = joint_ends.observe(moved, shape.mesh, outer, frame, corners[:4], outward, pose, station, apart)
         said_of += [f"{design.joint_names[joint]}: {end.trouble}"] if end.trouble else []
-        ends.append(systematic.of_end(end, doubts, part))
+        ends.append(end)
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
     edges = bottom_edges.measure(moved, shape.mesh, outer, *lines, first.fitted.sigma_mm, pose)
     edges = systematic.of_edges(edges, doubts, apart * between.share(station))
-    member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
+    member = network.Member((None, None), edges, part.vertices.mean(axis=0))
     said_of += [_unheld(first)] if first.fitted.weak else []
     said_of += _without_mesh(part, design)
     weak = bool(first.fitted.weak) or any(end is not None and end.trouble for end in ends)
     status = "ambiguous" if first.found.status == "ambiguous" else "weak" if weak else "ok"
-    return Measured(
+    measured = Measured(
         part.name, tuple(one.scan for one in used), status, "; ".join(said_of), first.fitted.T_bridge_scan, pose,
         member, shrink, first.found.T_rival, *_residuals(moved, shape.mesh),
     )  # fmt: skip
+    return Seen(part, measured, tuple(ends))
 
 
 def _without_mesh(part: DesignPart, design: ArchDesign) -> list[str]:
@@ -197,15 +223,14 @@ def _size_of(points: Floats) -> Floats:
     return found
 
 
-def _failed(
-    part: DesignPart, scans: Sequence[Scan], joints: Sequence[int | None], message: str, shrink: float
-) -> Measured:
+def _failed(part: DesignPart, scans: Sequence[Scan], joints: Sequence[int | None], message: str, shrink: float) -> Seen:
     ends = tuple(None if joint is None else joint_ends.nothing(message) for joint in joints)
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
     edges = bottom_edges.unseen(*lines)
-    member = network.Member((ends[0], ends[1]), edges, part.vertices.mean(axis=0))
+    member = network.Member((None, None), edges, part.vertices.mean(axis=0))
     nowhere, nothing = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
     no_points = np.empty((0, 3))
-    return Measured(
+    measured = Measured(
         part.name, (scans[0],), "failed", message, nowhere, nothing, member, shrink, nowhere, no_points, np.empty(0)
     )
+    return Seen(part, measured, ends)

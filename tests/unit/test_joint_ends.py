@@ -6,7 +6,7 @@ import pytest
 from processor.geometry import mesh_surface
 from processor.preassembly import features, form, joint_ends, layers, network, outer_faces
 from processor.preassembly.bottom_edges import EdgeStations
-from processor.preassembly.evidence import Believed, either, no_surer, weigh
+from processor.preassembly.evidence import Believed, by_the_others, either, no_surer, weigh
 
 LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
 
@@ -66,7 +66,8 @@ def fitted(points, rng, sigma=1.0):
     station = np.zeros(len(points), np.int64)
     frame = features.joint_frame(joint)
     assert np.allclose(frame[:3, :3], np.eye(3))
-    return joint_ends.fit(noisy, surface, outer, frame, joint[:4], 1.0, 1e-12 * np.eye(6), station, 0.0)
+    seen = joint_ends.observe(noisy, surface, outer, frame, joint[:4], 1.0, 1e-12 * np.eye(6), station, 0.0)
+    return seen if isinstance(seen, joint_ends.JointEnd) else joint_ends.judged([seen])[0]
 
 
 def test_the_outer_faces_are_those_that_the_corners_lie_on():
@@ -186,3 +187,16 @@ def test_what_two_sets_of_hypotheses_say_is_what_all_of_them_say():
         np.testing.assert_allclose(found.mean, whole.mean, rtol=1e-10)
         np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-10, atol=1e-14)
         assert found.evidence == pytest.approx(whole.evidence)
+
+
+def test_others_say_how_large_departures_are():
+    before = np.array([1.0, 1.0, 2.0])
+    logs = np.log(np.array([[0.9, 0.1, 1e-9], [0.8, 0.2, 1e-9], [1e-9, 1e-9, 1.0], [0.9, 0.1, 1e-9]]))
+    weights = by_the_others(logs, before)
+    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
+    # Three say the first: so it is for each of them, and less so by the others of these than by those of the third.
+    assert (weights.argmax(axis=1) == 0).all()
+    assert weights[2, 0] > weights[0, 0] > 0.45
+    # One by itself, and things that say nothing, leave all as it was.
+    np.testing.assert_allclose(by_the_others(logs[:1], before), [[0.25, 0.25, 0.5]])
+    np.testing.assert_allclose(by_the_others(np.zeros((3, 3)), before), np.tile([0.25, 0.25, 0.5], (3, 1)))
