@@ -146,7 +146,8 @@ def observe(
 
 def judged(ends: Sequence[Observed]) -> list[JointEnd]:
     """Weigh the ends of one bridge against the design: by how far each departs, and by how far the others do."""
-    return [_corners_of(end, believed) for end, believed in zip(ends, _weighed(ends), strict=True)]
+    believed = _weighed(ends) if ends else []
+    return [_corners_of(end, own) for end, own in zip(ends, believed, strict=True)]
 
 
 def _corners_of(end: Observed, believed: Believed) -> JointEnd:

@@ -189,6 +189,10 @@ def test_what_two_sets_of_hypotheses_say_is_what_all_of_them_say():
         assert found.evidence == pytest.approx(whole.evidence)
 
 
+def test_a_bridge_without_an_end_that_was_seen_has_none_to_judge():
+    assert joint_ends.judged([]) == []
+
+
 def test_others_say_how_large_departures_are():
     before = np.array([1.0, 1.0, 2.0])
     logs = np.log(np.array([[0.9, 0.1, 1e-9], [0.8, 0.2, 1e-9], [1e-9, 1e-9, 1.0], [0.9, 0.1, 1e-9]]))
