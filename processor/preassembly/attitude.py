@@ -23,7 +23,9 @@ SAMPLE_SPACING_MM = 30.0  # of the design's surface: a mark of 0.1 m shows in te
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for those that can still win
 COARSE_POINTS, FINE_POINTS = 600, 20_000
-PROMISING = 4.0  # a hypothesis this many times worse than the best after the coarse gates is dropped
+# After the coarse gates a hypothesis this many times worse than the best, and by so much, is dropped: the right one may
+# have come to rest some millimetres off.
+PROMISING, PROMISING_MM = 4.0, 10.0
 SHORT_SHARE = 0.1  # of its length, by which a scan may be shorter than the part and still be of all of it
 NO_FIT_MM = 25.0  # typical distance to the design, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses that move no corner of the part by more are one and the same
@@ -122,7 +124,7 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         seeds = points
     few = thinned(seeds, COARSE_POINTS)
     coarse = each(partial(_tried, few, surface, COARSE_GATES_MM), [(T, T) for T in principal_hypotheses(points, part)])
-    promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + 1.0]
+    promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + PROMISING_MM]
     # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
     seeds = thinned(points, FINE_POINTS)
     candidates = each(partial(_tried, seeds, surface, FINE_GATES_MM), [(fitted, T) for _, fitted, T in promising])
