@@ -4,6 +4,9 @@ In the joint's zone each outer face departs from the design by a plane in x (alo
 (across the face), a warp x w, and what bends it: x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
 and v and what bends it, see :mod:`processor.preassembly.end_ring`. A corner is where its two faces and the ring meet,
 as built; the covariance is that of these 40 numbers, so points of one corner are as dependent as they are.
+
+Whether numbers are departures or noise is judged for all ends of a bridge together, see
+:mod:`processor.preassembly.evidence`: how far the others depart says what one's numbers mean.
 """
 
 from __future__ import annotations
@@ -89,8 +92,7 @@ def observe(
 ) -> Observed | JointEnd:
     """Fit one joint end to points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
 
-    It is still to be judged; where there is nothing to be judged, that is said at once.
-
+    What comes back is still to be :func:`judged`, but for an end of which too little was seen: that is final.
     ``outer`` are the outer faces of ``surface``, ``corners`` (4, 3) the design's P1..P4; ``outward`` is +1 where the
     part ends at the joint, -1 where it starts. ``station`` (n,) says from where each point was seen, ``apart`` is the
     variance between stations, mm^2.
@@ -263,7 +265,7 @@ def _priors(end: Observed, rows: slice, sizes: Sequence[Floats]) -> list[Floats]
 
 
 def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats) -> Floats:
-    """Covariance (40, 38) of an end's numbers by that of the part's registration, (6, 6) about the bridge's origin."""
+    """Covariance (40, 40) of an end's numbers by that of the part's registration, (6, 6) about the bridge's origin."""
     rows = []
     x, w = (a.ravel() for a in np.meshgrid([0.0, -outward * ZONE_MM], [-1.0, 1.0]))
     for _, axis, sense in FACES:
