@@ -127,7 +127,12 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + PROMISING_MM]
     # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
     seeds = thinned(points, FINE_POINTS)
-    candidates = each(partial(_tried, seeds, surface, FINE_GATES_MM), [(fitted, T) for _, fitted, T in promising])
+    tried = partial(_tried, seeds, surface, FINE_GATES_MM)
+    candidates = each(tried, [(fitted, T) for _, fitted, T in promising])
+    # Few points hold a part of even curvature along itself, and it may have come to rest metres off: every attitude is
+    # tried from where the best one lies, too, turned as their beginnings are.
+    _, best, start = min(candidates, key=lambda item: item[0])
+    candidates += each(tried, [(T @ rigid.invert(start) @ best, T) for _, _, T in promising if T is not start])
     candidates.sort(key=lambda item: item[0])
     misfit, best, start = candidates[0]
     if misfit > NO_FIT_MM:

@@ -5,11 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen import sampler
+from designgen import recipes, sampler
 from designgen.designs import arch_bridge, arch_mesh
+from designgen.scene import make
 from processor.geometry import rigid
+from processor.geometry.neighbors import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene
-from processor.preassembly import features, measuring
+from processor.preassembly import attitude, features, measuring
 from processor.preassembly.systematic import SystematicParams
 from processor.steps import preassemble
 from tests.arch_clouds import random_pose
@@ -207,3 +209,16 @@ def test_no_random_pose_is_wrong_and_called_ok():
                 ).max()
                 < 3.0
             )
+
+
+@pytest.mark.slow
+def test_a_rib_of_even_curvature_is_not_laid_half_a_turn_round():
+    """The right attitude comes to rest 1.8 m along the arch here, and fits less well than the wrong one in place."""
+    recipe = recipes.overridden(recipes.load("arch-d3")[1], ["scan.sigma_mm=1.0", "scan.spacing_mm=5.0"])
+    scene, truth = make("d3", recipe, 1)
+    part = scene.arch.parts[2]
+    scan = next(scan for scan in scene.scans if scan.component == part.name)
+    found = attitude.find(scan.points[by_cell(scan.points, measuring.CELL_MM)], part)
+    turn = found.T_surface[:3, :3] @ truth.arch.T_bridge_scan[2][:3, :3].T
+    assert found.status == "ok"
+    assert np.degrees(rigid.rotation_angle(turn)) < 0.1
