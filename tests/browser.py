@@ -42,3 +42,14 @@ def picture(page, number=0):
         " done(document.querySelectorAll('canvas')[number].toDataURL()))))",
         number,
     )
+
+
+def read_over(page, across, downs):
+    """All that the view in space says where it is pointed at: in ``across`` columns, at shares of its height."""
+    box, said = page.locator("canvas.space").bounding_box(), page.locator("output.said").first
+    read = set()
+    for column in range(1, across):
+        for down in downs:
+            page.mouse.move(box["x"] + column / across * box["width"], box["y"] + down * box["height"])
+            read.add(said.text_content())
+    return read

@@ -87,14 +87,15 @@ def fit_one(  # type: ignore[no-untyped-def]
     used = -1
     turns = 3 if settled > FINE_MM else 4
     for turn in range(turns):
+        last = turn + 1 == turns
         stretch = first if turn == 0 else np.sqrt(first) if turn == 1 else 1.0
         gate = GATE_MM if turn == 0 else max(GATE_MM * 0.5, 30.0 * typical)
         if select(points, rays, axis_points, axes, keep_off, hole, state, least_cosine, gate, chosen) == 0:
             return -1
         used = solve(
             points, rays, ranges, station, chosen, noise, stretch, centre, centre_weight, radius, radius_weight,
-            shift_covariance, settled if turn + 1 == turns else max(settled, COARSE_MM), state, shifts, gains,
-            12 if turn + 1 == turns else 6, covariance,
+            shift_covariance, settled if last else max(settled, COARSE_MM), state, shifts, gains,
+            12 if last else 6, covariance,
         )  # fmt: skip
         if used < 0:
             return -1

@@ -19,9 +19,8 @@ from processor.model import Floats
 
 SIZES_MM = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0)
 LEAST_SHARE = 1e-4  # of a hypothesis, to be counted
-LEAST_WEIGHT = 1e-300
-LEAST_MM = 1e-4
-ROUNDS = 50
+LEAST_MM = 1e-4  # sd of what is surely nothing, where a covariance has to be turned round
+ROUNDS = 50  # until the weights of things that judge each other have settled
 
 
 @dataclass(frozen=True)
@@ -40,15 +39,38 @@ def weigh(
 
     A hypothesis is its weight beforehand and the departures' covariance (k, k).
     """
-    at = np.ones(len(hypotheses[0][1]), bool) if known is None else known
-    logs = explained(value, noise, [prior for _, prior in hypotheses], at)
-    logs += np.log(np.maximum([before for before, _ in hypotheses], LEAST_WEIGHT))
+    priors = [prior for _, prior in hypotheses]
+    logs = explained(value, noise, priors, known) + np.log([before for before, _ in hypotheses])
+    return averaged(value, noise, priors, logs, known)
+
+
+def explained(
+    value: Floats, noise: Floats, priors: Sequence[Floats], known: npt.NDArray[np.bool_] | None = None
+) -> Floats:
+    """Return the logarithm (h,) of how well each prior, a covariance (k, k) of departures, explains values (n,)."""
+    at = _all_or(known, priors)
+    logs = []
+    for prior in priors:
+        factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
+        logs.append(-0.5 * float(value @ cho_solve(factor, value)) - float(np.log(np.diag(factor[0])).sum()))
+    return np.array(logs)
+
+
+def averaged(
+    value: Floats,
+    noise: Floats,
+    priors: Sequence[Floats],
+    logs: Floats,
+    known: npt.NDArray[np.bool_] | None = None,
+) -> Believed:
+    """Average over hypotheses: ``logs`` (h,) is how well each is :func:`explained`, its weight beforehand added."""
+    at = _all_or(known, priors)
     share = np.exp(logs - logs.max())
     evidence = float(logs.max() + np.log(share.sum()))
     share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
     share /= share.sum()
     mean, second = np.zeros(len(at)), np.zeros((len(at),) * 2)
-    for weight, (_, prior) in zip(share, hypotheses, strict=True):
+    for weight, prior in zip(share, priors, strict=True):
         if weight:
             factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
             own = prior[:, at] @ cho_solve(factor, value)
@@ -57,19 +79,8 @@ def weigh(
     return Believed(mean, second - np.outer(mean, mean), evidence)
 
 
-def explained(
-    value: Floats, noise: Floats, priors: Sequence[Floats], at: npt.NDArray[np.bool_] | None = None
-) -> Floats:
-    """Return the logarithm (h,) of how well each hypothesis, the departures' covariance (k, k), explains values (n,).
-
-    ``at`` (k,) marks those of which there are values: all where it is left out.
-    """
-    logs = []
-    for prior in priors:
-        factor = cho_factor((prior if at is None else prior[np.ix_(at, at)]) + noise, lower=True)
-        fit = float(value @ cho_solve(factor, value))
-        logs.append(-0.5 * fit - float(np.log(np.diag(factor[0])).sum()))
-    return np.array(logs)
+def _all_or(known: npt.NDArray[np.bool_] | None, priors: Sequence[Floats]) -> npt.NDArray[np.bool_]:
+    return np.ones(len(priors[0]), bool) if known is None else known
 
 
 def by_the_others(logs: Floats, before: Floats) -> Floats:
@@ -90,11 +101,10 @@ def by_the_others(logs: Floats, before: Floats) -> Floats:
 
 def either(a: Believed, b: Believed) -> Believed:
     """Believe in the one or the other, each as far as its evidence goes."""
-    most = max(a.evidence, b.evidence)
-    share = np.exp(a.evidence - most) / (np.exp(a.evidence - most) + np.exp(b.evidence - most))
+    evidence = float(np.logaddexp(a.evidence, b.evidence))
+    share = float(np.exp(a.evidence - evidence))
     apart = a.mean - b.mean
     covariance = share * a.covariance + (1.0 - share) * b.covariance + share * (1.0 - share) * np.outer(apart, apart)
-    evidence = most + float(np.log(np.exp(a.evidence - most) + np.exp(b.evidence - most)))
     return Believed(share * a.mean + (1.0 - share) * b.mean, covariance, evidence)
 
 
@@ -104,7 +114,6 @@ def no_surer(believed: Believed, least: Floats) -> Believed:
     The average over sizes is right for parts whose departures are of every size alike. Where all are as large as the
     noise, it draws them towards nothing more often than it owns up to.
     """
-    # What is surely nothing has no variance at all.
     root = np.linalg.cholesky(least + LEAST_MM**2 * np.eye(len(least)))
     inner = solve_triangular(root, solve_triangular(root, believed.covariance, lower=True).T, lower=True)
     value, vector = np.linalg.eigh(0.5 * (inner + inner.T))

@@ -23,7 +23,7 @@ from processor.geometry.mesh_surface import MeshSurface
 from processor.model import Floats, Ints
 from processor.preassembly import between, end_faces, end_ring, form, layers
 from processor.preassembly.end_faces import FACE, FLOOR_MM, LEAST_POINTS, REACH_MM, ZONE_MM
-from processor.preassembly.evidence import SIZES_MM, Believed, by_the_others, either, explained, no_surer, weigh
+from processor.preassembly.evidence import SIZES_MM, Believed, averaged, by_the_others, either, explained, no_surer
 from processor.preassembly.outer_faces import FACES
 
 # Sizes of bends, the finest for scans without noise, and their weights beforehand: ends are cut by a plane.
@@ -232,36 +232,39 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
         for bend, before in zip(BENDS_MM, STRAIGHT, strict=True)
     ]
     for rows, hypotheses in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
-        sizes = [size for _, size in hypotheses]
         before = np.array([weight for weight, _ in hypotheses])
-        logs = [explained(end.number[rows], _noise(end, rows), _priors(end, rows, sizes)) for end in ends]
-        for end, weights, into in zip(ends, by_the_others(np.array(logs), before), found, strict=True):
-            own = _of_rows(end, rows, sizes, before, weights)
+        sizes = np.array([size for _, size in hypotheses])
+        seen = [_rows(end, rows, sizes) for end in ends]
+        logs = np.array([explained(*one) for one in seen])
+        for one, log, weights, into in zip(seen, logs, by_the_others(logs, before), found, strict=True):
+            own = _of_rows(one, log, sizes, before, weights)
             into.mean[rows], into.covariance[rows, rows] = own.mean, own.covariance
     return found
 
 
-def _of_rows(end: Observed, rows: slice, sizes: Sequence[Floats], before: Floats, weights: Floats) -> Believed:
-    """Weigh some numbers of an end by hypotheses of sizes; ``before`` (h,) are their weights without other ends."""
-    number, noise, priors = end.number[rows], _noise(end, rows), _priors(end, rows, sizes)
-    lies = np.array([size[:2] for size in sizes])  # shift and tilt, or the plane twice
+def _rows(end: Observed, rows: slice, sizes: Floats) -> tuple[Floats, Floats, list[Floats]]:
+    """Return some numbers of an end, their noise, and the covariance of departures by each of ``sizes`` (h, n)."""
+    noise = end.covariance[rows, rows] + FLOOR_MM**2 * np.eye(sizes.shape[1])
+    return end.number[rows], noise, [end.by_pose[rows, rows] + np.diag(size**2) for size in sizes]
+
+
+def _of_rows(
+    seen: tuple[Floats, Floats, list[Floats]], logs: Floats, sizes: Floats, before: Floats, weights: Floats
+) -> Believed:
+    """Weigh some numbers of an end: ``logs`` (h,) is how well hypotheses explain them.
+
+    ``weights`` (h,) are those of the hypotheses by the other ends, ``before`` (h,) those without.
+    """
+    number, noise, priors = seen
+    lies = sizes[:, :2]  # shift and tilt, or the plane twice
     designed, largest = (lies == 0.0).all(axis=1), (lies == SIZES_MM[-1]).all(axis=1)
 
     def weighed(of: npt.NDArray[np.bool_], by: Floats) -> Believed:
-        return weigh(number, noise, [(float(by[h]), priors[h]) for h in np.flatnonzero(of)])
+        return averaged(number, noise, [priors[h] for h in np.flatnonzero(of)], logs[of] + np.log(by[of]))
 
     # That ends are cut by planes is known beforehand; where these lie that depart, no better than the points say.
     departing = no_surer(weighed(~designed, weights), weighed(largest, before).covariance)
     return either(weighed(designed, weights), departing)
-
-
-def _noise(end: Observed, rows: slice) -> Floats:
-    found: Floats = end.covariance[rows, rows] + FLOOR_MM**2 * np.eye(rows.stop - rows.start)
-    return found
-
-
-def _priors(end: Observed, rows: slice, sizes: Sequence[Floats]) -> list[Floats]:
-    return [end.by_pose[rows, rows] + np.diag(size**2) for size in sizes]
 
 
 def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats) -> Floats:

@@ -15,6 +15,8 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
 
+from processor.model import Floats
+
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 DASHES = ("-", "--", ":", "-.")
 HATCHES = ("", "///", "...", "xxx")
@@ -47,6 +49,12 @@ def label(name: str, place: int) -> str:
     if not all(one.isprintable() and _font().get_char_index(ord(one)) for one in name):
         return f"#{place + 1}"
     return name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
+
+
+def colour_limit(values: Floats) -> float:
+    """Return the size at which the colours of values (n,) end: 98 % of those that are known are within."""
+    known = np.abs(values[np.isfinite(values)])
+    return max(float(np.quantile(known, 0.98)), LEAST_SHOWN_MM) if len(known) else LEAST_SHOWN_MM
 
 
 def rounded(value: float) -> float:

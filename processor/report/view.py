@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import KEY_POINTS, Floats, Scene, StepRun
-from processor.report.drawing import DIVERGING_STOPS, LEAST_SHOWN_MM
+from processor.report.drawing import DIVERGING_STOPS, colour_limit
 from processor.report.figures_preassembly import linear_band
 from processor.report.printing import shown
 from processor.report.results_json import plain
@@ -48,7 +48,7 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
             }
             for j, name in enumerate(result.joints)
         ],
-        "limit": _limit(result.residual),
+        "limit": colour_limit(result.residual) if np.isfinite(result.residual).any() else 1.0,
         "linear": [_linear(run) for run in runs],
         "trade": {
             "weight": result.weight,
@@ -101,12 +101,6 @@ def _thinned(edge: Floats) -> Floats:
         return edge
     chosen: Floats = edge[np.linspace(0, len(edge) - 1, MOST_ON_AN_EDGE).astype(int)]
     return chosen
-
-
-def _limit(residual: Floats) -> float:
-    """Residual at which the colours end: 98 % are within."""
-    known = np.abs(residual[np.isfinite(residual)])
-    return max(float(np.quantile(known, 0.98)), LEAST_SHOWN_MM) if len(known) else 1.0
 
 
 def _linear(run: StepRun) -> dict[str, Any]:

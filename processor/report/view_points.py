@@ -10,7 +10,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.model import Floats, Ints
-from processor.report.drawing import DIVERGING_STOPS, LEAST_SHOWN_MM
+from processor.report.drawing import DIVERGING_STOPS, colour_limit
 from processor.report.results_json import plain
 
 MOST_POINTS = 60_000  # about 1.4 MB of the page
@@ -84,7 +84,7 @@ def of_points(
         "origin": origin,
         "stops": DIVERGING_STOPS,
         "tones": TONES,
-        "limit": max(float(np.quantile(np.abs(values[known]), 0.98)), LEAST_SHOWN_MM),
+        "limit": colour_limit(values),
         "spacing": spacing(points[known][::step]),
         "parts": drawn + lines,
         "marks": shown + spots,

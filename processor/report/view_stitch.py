@@ -11,9 +11,10 @@ from scipy.spatial import cKDTree
 
 from processor.geometry import rigid, threads
 from processor.model import Floats, Scan, Scene, StepRun
-from processor.report.drawing import DIVERGING_STOPS, LEAST_SHOWN_MM
+from processor.report.drawing import DIVERGING_STOPS, colour_limit
 from processor.report.printing import shown
 from processor.report.results_json import plain
+from processor.report.tables_stitch import NORMAL_95
 from processor.report.view_points import spacing
 from processor.stitching.result import Result
 
@@ -41,17 +42,17 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     clouds = [_placed(scan, result.T_project_scan[i], origin) for scan, i in placed]
     trees = threads.each(cKDTree, clouds)
     step = max(1, -(-sum(map(len, clouds)) // MOST_POINTS))
-    parts, known, marks = [], [], []
+    drawn = [cloud[::step] for cloud in clouds]
+    apart = [
+        _apart(drawn[k], trees[k], trees[:k] + trees[k + 1 :], result.position[i] - origin)
+        for k, (_, i) in enumerate(placed)
+    ]
+    parts, marks = [], []
     for k, (scan, i) in enumerate(placed):
-        points = clouds[k][::step]
-        apart = _apart(points, trees[k], trees[:k] + trees[k + 1 :], result.position[i] - origin)
-        known.append(apart[np.isfinite(apart)])
-        parts.append(
-            {"name": scan.name, "edges": [], "points": np.rint(points).astype(int).ravel(), "residual": apart.round(3)}
-        )
+        places = np.rint(drawn[k]).astype(int).ravel()
+        parts.append({"name": scan.name, "edges": [], "points": places, "residual": apart[k].round(3)})
         if np.isfinite(result.position[i]).all():
             marks.append(_station(result, i, k, origin))
-    values = np.abs(np.concatenate(known))
     made: dict[str, Any] = plain(
         {
             "title": "Scans in space",
@@ -63,8 +64,8 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
             "origin": origin,
             "stops": DIVERGING_STOPS,
             "tones": TONES,
-            "spacing": spacing(np.vstack(clouds)[::step]),
-            "limit": max(float(np.quantile(values, 0.98)), LEAST_SHOWN_MM) if len(values) else LEAST_SHOWN_MM,
+            "spacing": spacing(np.vstack(drawn)),
+            "limit": colour_limit(np.concatenate(apart)),
             "parts": parts,
             "marks": marks,
         }
@@ -123,7 +124,7 @@ def _neighbours(tree: cKDTree, points: Floats) -> tuple[npt.NDArray[np.float64],
 
 
 def _station(result: Result, i: int, part: int, origin: Floats) -> dict[str, Any]:
-    sd = ", ".join(shown(float(1.959964 * value)) for value in result.position_sd[i])
+    sd = ", ".join(shown(float(NORMAL_95 * value)) for value in result.position_sd[i])
     return {
         "part": part,
         "tone": int(result.scan_status[i] != "ok"),

@@ -6,7 +6,7 @@ import pytest
 
 from processor.batch import figures as batch_figures
 from processor.report import figures, page
-from tests.browser import opened, picture
+from tests.browser import opened, picture, read_over
 from tests.unit import test_language_pages as pages
 from tests.unit.test_batch import folder, run
 
@@ -96,18 +96,12 @@ def test_defects_in_space_react(searched, lang, width):
 def test_a_place_of_a_defect_is_read_with_its_deviation_and_region(searched):
     folder_of, result = searched
     with opened(folder_of / "en.html") as shown:
-        canvas, said = shown.locator("canvas.space"), shown.locator("output.said").first
-        canvas.scroll_into_view_if_needed()
+        shown.locator("canvas.space").scroll_into_view_if_needed()
         picture(shown)
         everything = picture(shown)
         shown.locator("select").select_option(label="2: bend")
         assert picture(shown) != everything
-        box = canvas.bounding_box()
-        read = set()
-        for across in range(1, 20):
-            for down in range(1, 10):
-                shown.mouse.move(box["x"] + across / 20 * box["width"], box["y"] + down / 10 * box["height"])
-                read.add(said.text_content())
+        read = read_over(shown, 20, [down / 10 for down in range(1, 10)])
         k = result.classes.index("bend")
         mark = [one for one in read if one.startswith("2: bend, depth")]
         assert mark == [f"2: bend, depth 1.500 ± 0.300 mm, area 13500 mm2, {result.components[k]}"]

@@ -167,7 +167,7 @@ def test_a_belief_is_no_surer_than_the_values_in_any_direction():
         assert np.linalg.eigvalsh(raised.covariance - floor).min() > -1e-9
     np.testing.assert_array_equal(raised.mean, np.arange(5.0))
     # Where it is less sure already, nothing changes.
-    np.testing.assert_allclose(no_surer(Believed(np.zeros(5), 2.0 * least), least).covariance, 2.0 * least, rtol=1e-6)
+    np.testing.assert_allclose(no_surer(Believed(np.zeros(5), 2.0 * least), least).covariance, 2.0 * least, rtol=1e-12)
 
 
 def test_what_is_surely_nothing_may_stay_so():

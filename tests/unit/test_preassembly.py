@@ -180,9 +180,8 @@ def test_the_adjustment_states_intervals_that_hold(bridge, runs):
     known = np.isfinite(result.key_points_sd)
     assert known.sum() == 8 * 8 * 3
     pull = (off / result.key_points_sd)[known]
-    # 19 numbers an end are independent, not its 24 coordinates: 8 ends leave a spread of a tenth. Parts as designed are
-    # found better than intervals say, which hold for those that are built otherwise by as much as the noise.
-    assert np.sqrt((pull**2).mean()) < 1.3
+    # 19 numbers an end are independent, not its 24 coordinates: 8 ends leave a spread of a tenth.
+    assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
     for size in (off[known], result.key_points_sd[known]):
         assert np.sqrt((size**2).mean()) < 0.12
     np.testing.assert_array_less(np.abs(result.gaps), 2.0 * result.gap_ci95)  # perfect parts: no gap but noise

@@ -7,7 +7,7 @@ import pytest
 
 from processor.evaluate import ErrorReport
 from processor.report import figures, page, results_json
-from tests.browser import opened, picture
+from tests.browser import opened, picture, read_over
 from tests.unit.test_report_adjusted import BAD, of_bridge, rendered
 from tests.unit.test_report_balls import of_frame
 
@@ -49,16 +49,9 @@ def test_a_point_of_the_bridge_can_be_read(tmp_path):
     path = tmp_path / "r.html"
     path.write_text(rendered(of_bridge()), "utf-8")
     with opened(path) as shown:
-        canvas = shown.locator("canvas.space")
-        canvas.scroll_into_view_if_needed()
+        shown.locator("canvas.space").scroll_into_view_if_needed()
         picture(shown)
-        box, said = canvas.bounding_box(), shown.locator("output.said").first
-        read = set()
-        for across in range(1, 40):
-            for down in (0.4, 0.5, 0.6):
-                shown.mouse.move(box["x"] + across / 40 * box["width"], box["y"] + down * box["height"])
-                read.add(said.text_content())
-        assert any("mm from the design at" in one for one in read)
+        assert any("mm from the design at" in one for one in read_over(shown, 40, (0.4, 0.5, 0.6)))
 
 
 def test_balls_in_space_react_and_their_table_holds_the_results(tmp_path):
