@@ -37,7 +37,8 @@ class EdgeStations:
     points: Floats
     axes: Floats
     departure: Floats  # (k, 2) sideways (to the left) and up; NaN where nothing is known
-    covariance: Floats  # (2, k, k) of departures sideways, and of those up
+    covariance: Floats  # (2, k, k) of departures sideways, and of those up, but for what by_pose brings
+    by_pose: Floats  # (k, 2, 6) how their errors follow that of the part's registration
 
 
 def measure(
@@ -54,7 +55,7 @@ def measure(
     ``outer`` are the outer faces of ``surface``.
     """
     sides: list[str] = []
-    arcs, places, axes, smoothed = [], [], [], []
+    arcs, places, axes, smoothed, by_pose = [], [], [], [], []
     for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
         count = max(1, int(line.length / STATION_MM))
         arc = STATION_MM * (np.arange(count, dtype=np.float64) + 0.5)
@@ -92,16 +93,27 @@ def measure(
         places.append(line.at(arc))
         frame = _frame(line, other, arc, sense)
         axes.append(np.stack([frame[1], frame[2]], axis=1))
-        moves = rigid.motion(line.at(arc))
-        by_pose = [np.einsum("ki,kij->kj", frame[k], moves) for k in (1, 2)]
-        smoothed.append([smooth(arc, *one, moved @ pose @ moved.T) for one, moved in zip(found, by_pose, strict=True)])
+        moves = [np.einsum("ki,kij->kj", frame[k], rigid.motion(line.at(arc))) for k in (1, 2)]
+        smoothed.append([smooth(arc, *one, moved @ pose @ moved.T) for one, moved in zip(found, moves, strict=True)])
+        by_pose.append([one.left_of(moved) for one, moved in zip(smoothed[-1], moves, strict=True)])
     return EdgeStations(
         tuple(sides),
         np.concatenate(arcs),
         np.concatenate(places),
         np.concatenate(axes),
         np.concatenate([np.stack([one.mean for one in both], axis=1) for both in smoothed]),
-        np.array([block_diag(*(both[k].covariance for both in smoothed)) for k in range(2)]),
+        np.array(
+            [
+                block_diag(
+                    *(
+                        both[k].covariance - follows[k] @ pose @ follows[k].T
+                        for both, follows in zip(smoothed, by_pose, strict=True)
+                    )
+                )
+                for k in range(2)
+            ]
+        ),
+        np.concatenate([np.stack(both, axis=1) for both in by_pose]),
     )
 
 

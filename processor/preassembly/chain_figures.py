@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, ArchDesign, Floats
@@ -24,14 +25,12 @@ def span(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> t
     """
     ends = _outer_ends(design)
     chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    found, variance, D = 0.0, 0.0, np.zeros(len(adjusted.motion_covariance))
+    found, D, own = 0.0, *np.zeros((2, 1, len(adjusted.motion_covariance)))
     for i, at, sign in ((0, ends[0], -1.0), (len(parts) - 1, ends[1], 1.0)):
         found += sign * float(chord @ (rigid.apply(adjusted.motions[i], at[None])[0] - at))
-        D += sign * chord @ _to_point(parts, i, at)
-        own = chord @ rigid.motion(at[None])[0]
-        variance += float(own @ parts[i].covariance @ own)
-    variance += float(D @ adjusted.motion_covariance @ D)
-    return found, NORMAL_95 * float(np.sqrt(variance))
+        D[0] += sign * chord @ _to_point(parts, i, at)
+        own[0, 6 * i : 6 * i + 6] += sign * chord @ rigid.motion(at[None])[0]
+    return found, NORMAL_95 * float(np.sqrt(_covariance(parts, adjusted, D, own)[0, 0]))
 
 
 def closure(
@@ -48,14 +47,13 @@ def closure(
     at = _outer_ends(design)[1]
     T = rigid.invert(alone.motions[0]) @ alone.motions[-1]
     shift, turn = rigid.apply(T, at[None])[0] - at, rigid.vector_from_rotation(T[:3, :3])
-    D = np.zeros((6, len(alone.motion_covariance)))
+    D, own = np.zeros((2, 6, len(alone.motion_covariance)))
     for i, sign in ((0, -1.0), (len(parts) - 1, 1.0)):
         D[:3] += sign * _to_point(parts, i, at)
-        D[3:, 6 * i : 6 * i + 3] += sign * np.eye(3)
-    covariance = D @ alone.motion_covariance @ D.T
-    for part in (parts[0], parts[-1]):
-        own = np.vstack([rigid.motion(at[None])[0], np.hstack([np.eye(3), np.zeros((3, 3))])])
-        covariance += own @ part.covariance @ own.T
+        own[:3, 6 * i : 6 * i + 6] += sign * rigid.motion(at[None])[0]
+        for one in (D, own):
+            one[3:, 6 * i : 6 * i + 3] += sign * np.eye(3)
+    covariance = _covariance(parts, alone, D, own)
     unit = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
     return np.concatenate([shift, turn]) * unit, NORMAL_95 * np.sqrt(np.diag(covariance)) * unit
 
@@ -87,6 +85,14 @@ def limiting(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign, 
     limit += f"variance from the {AXES[axis]} at the {side} of {part}"
     advice = f"a scan of {part} that shows more of the {AXES[axis]} at its {side}: four times the points halve its part"
     return limit, "; ".join(filter(None, (missing, advice)))
+
+
+def _covariance(parts: Sequence[Measured], adjusted: Adjusted, by_motion: Floats, by_pose: Floats) -> Floats:
+    """Covariance (k, k) of what follows the motions (k, 6 c) and, where nothing was measured, the registrations."""
+    both = by_motion @ adjusted.motion_with_pose @ by_pose.T
+    registered = by_pose @ block_diag(*(part.member.pose for part in parts)) @ by_pose.T
+    found: Floats = by_motion @ adjusted.motion_covariance @ by_motion.T + both + both.T + registered
+    return found
 
 
 def _outer_ends(design: ArchDesign) -> Floats:

@@ -25,11 +25,20 @@ ROUNDS = 50  # until the weights of things that judge each other have settled
 
 @dataclass(frozen=True)
 class Believed:
-    """Departures (k,) with their covariance (k, k), and the logarithm of how well they explain the values."""
+    """Departures (k,) with their covariance (k, k), and the logarithm of how well they explain the values.
+
+    ``gain`` (k, k) is how they follow the values: columns of unknown ones are zero.
+    """
 
     mean: Floats
     covariance: Floats
+    gain: Floats
     evidence: float = 0.0
+
+    def left_of(self, moves: Floats) -> Floats:
+        """Return how much (k, m) of what ``moves`` (k, m) departures and values alike the mean does not follow."""
+        found: Floats = moves - self.gain @ moves
+        return found
 
 
 def weigh(
@@ -69,14 +78,16 @@ def averaged(
     evidence = float(logs.max() + np.log(share.sum()))
     share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
     share /= share.sum()
-    mean, second = np.zeros(len(at)), np.zeros((len(at),) * 2)
+    mean, second, gain = np.zeros(len(at)), np.zeros((len(at),) * 2), np.zeros((len(at),) * 2)
     for weight, prior in zip(share, priors, strict=True):
         if weight:
             factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
-            own = prior[:, at] @ cho_solve(factor, value)
+            follows = cho_solve(factor, prior[at]).T
+            own = follows @ value
             mean += weight * own
-            second += weight * (prior - prior[:, at] @ cho_solve(factor, prior[at]) + np.outer(own, own))
-    return Believed(mean, second - np.outer(mean, mean), evidence)
+            second += weight * (prior - follows @ prior[at] + np.outer(own, own))
+            gain[:, at] += weight * follows
+    return Believed(mean, second - np.outer(mean, mean), gain, evidence)
 
 
 def _all_or(known: npt.NDArray[np.bool_] | None, priors: Sequence[Floats]) -> npt.NDArray[np.bool_]:
@@ -104,8 +115,11 @@ def either(a: Believed, b: Believed) -> Believed:
     evidence = float(np.logaddexp(a.evidence, b.evidence))
     share = float(np.exp(a.evidence - evidence))
     apart = a.mean - b.mean
-    covariance = share * a.covariance + (1.0 - share) * b.covariance + share * (1.0 - share) * np.outer(apart, apart)
-    return Believed(share * a.mean + (1.0 - share) * b.mean, covariance, evidence)
+    mean, covariance, gain = (
+        share * one + (1.0 - share) * other
+        for one, other in ((a.mean, b.mean), (a.covariance, b.covariance), (a.gain, b.gain))
+    )
+    return Believed(mean, covariance + share * (1.0 - share) * np.outer(apart, apart), gain, evidence)
 
 
 def no_surer(believed: Believed, least: Floats) -> Believed:

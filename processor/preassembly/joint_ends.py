@@ -40,10 +40,14 @@ COUNT = len(FACES) * FACE + RING
 
 @dataclass(frozen=True)
 class JointEnd:
-    """What was built at one end: movements (8, 3) of P1..P8 from the design, joint axes; covariance (24, 24)."""
+    """What was built at one end: movements (8, 3) of P1..P8 from the design, joint axes; covariance (24, 24).
+
+    ``by_pose`` (24, 6) is how their errors follow that of the part's registration: it is the same at both ends.
+    """
 
     moved: Floats
     covariance: Floats
+    by_pose: Floats
     sigma_mm: float  # noise of the points about the fitted faces
     trouble: str
 
@@ -60,14 +64,16 @@ class _OnRing:
 
 @dataclass(frozen=True)
 class Observed:
-    """What the points of one end say before it is weighed: 40 numbers, their covariance, and that by the pose alone.
+    """What the points of one end say before it is weighed: 40 numbers and their covariance.
 
-    ``half`` (3,) is half of the joint's size, ``outward`` +1 where the part ends at the joint.
+    ``moves`` (40, 6) is how the part's registration moves them, ``pose`` (6, 6) the covariance of that; ``half`` (3,)
+    is half of the joint's size, ``outward`` +1 where the part ends at the joint.
     """
 
     number: Floats
     covariance: Floats
-    by_pose: Floats
+    moves: Floats
+    pose: Floats
     half: Floats
     outward: float
     sigma_mm: float
@@ -76,7 +82,7 @@ class Observed:
 
 def nothing(trouble: str) -> JointEnd:
     """Return the end of which nothing is known."""
-    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), float("nan"), trouble)
+    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), np.full((24, 6), np.nan), float("nan"), trouble)
 
 
 def observe(
@@ -143,7 +149,7 @@ def observe(
     ]
     trouble = f"the {' and the '.join(doubtful)} face may be the plate's inner side" if doubtful else ""
     covariance = block_diag(*(block for _, block in fits))
-    return Observed(number, covariance, _by_pose(T_bridge_joint, half, outward, pose), half, outward, sigma, trouble)
+    return Observed(number, covariance, _moves(T_bridge_joint, half, outward), pose, half, outward, sigma, trouble)
 
 
 def judged(ends: Sequence[Observed]) -> list[JointEnd]:
@@ -156,7 +162,8 @@ def _corners_of(end: Observed, believed: Believed) -> JointEnd:
     moved, derivative = _corners(end.half, end.outward, believed.mean)
     second_order = np.repeat(SECOND_ORDER * np.linalg.norm(moved.reshape(8, 3), axis=1), 3)
     covariance = derivative @ believed.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
-    return JointEnd(moved.reshape(8, 3), covariance, end.sigma_mm, end.trouble)
+    by_pose = derivative @ believed.left_of(end.moves)
+    return JointEnd(moved.reshape(8, 3), covariance, by_pose, end.sigma_mm, end.trouble)
 
 
 def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Floats:
@@ -219,7 +226,7 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
     The faces' shifts are of one unknown size, how they lie of another, how they bend of a third; so are the ring's
     plane and its bends.
     """
-    found = [Believed(np.zeros(COUNT), np.zeros((COUNT, COUNT))) for _ in ends]
+    found = [Believed(np.zeros(COUNT), *np.zeros((2, COUNT, COUNT))) for _ in ends]
     faces = [
         (before, np.tile(np.repeat([shift, tilt, bend], (1, 3, 4)), 4))
         for shift in SIZES_MM
@@ -238,14 +245,15 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
         logs = np.array([explained(*one) for one in seen])
         for one, log, weights, into in zip(seen, logs, by_the_others(logs, before), found, strict=True):
             own = _of_rows(one, log, sizes, before, weights)
-            into.mean[rows], into.covariance[rows, rows] = own.mean, own.covariance
+            into.mean[rows], into.covariance[rows, rows], into.gain[rows, rows] = own.mean, own.covariance, own.gain
     return found
 
 
 def _rows(end: Observed, rows: slice, sizes: Floats) -> tuple[Floats, Floats, list[Floats]]:
     """Return some numbers of an end, their noise, and the covariance of departures by each of ``sizes`` (h, n)."""
     noise = end.covariance[rows, rows] + FLOOR_MM**2 * np.eye(sizes.shape[1])
-    return end.number[rows], noise, [end.by_pose[rows, rows] + np.diag(size**2) for size in sizes]
+    by_pose = end.moves[rows] @ end.pose @ end.moves[rows].T
+    return end.number[rows], noise, [by_pose + np.diag(size**2) for size in sizes]
 
 
 def _of_rows(
@@ -267,8 +275,8 @@ def _of_rows(
     return either(weighed(designed, weights), departing)
 
 
-def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats) -> Floats:
-    """Covariance (40, 40) of an end's numbers by that of the part's registration, (6, 6) about the bridge's origin."""
+def _moves(T_bridge_joint: Floats, half: Floats, outward: float) -> Floats:
+    """Return how an end's numbers follow a motion of the part about the bridge's origin, (40, 6)."""
     rows = []
     x, w = (a.ravel() for a in np.meshgrid([0.0, -outward * ZONE_MM], [-1.0, 1.0]))
     for _, axis, sense in FACES:
@@ -282,9 +290,7 @@ def _by_pose(T_bridge_joint: Floats, half: Floats, outward: float, pose: Floats)
     local = np.stack([np.zeros(3), u * half[1], v * half[2]], axis=1)
     field = outward * np.einsum("i,nij->nj", T_bridge_joint[:3, 0], rigid.motion(rigid.apply(T_bridge_joint, local)))
     rows.append(np.linalg.solve(_ring_basis(u, v)[:, :3], field))
-    moves = np.vstack([*rows, np.zeros((RING - 3, 6))])
-    found: Floats = moves @ pose @ moves.T
-    return found
+    return np.vstack([*rows, np.zeros((RING - 3, 6))])
 
 
 def _corners(half: Floats, outward: float, number: Floats) -> tuple[Floats, Floats]:

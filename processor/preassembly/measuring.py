@@ -39,7 +39,6 @@ class Measured:
     status: str  # ok | ambiguous | weak | failed
     message: str
     T_bridge_scan: Floats
-    covariance: Floats
     member: network.Member
     shrink: float  # lengths at the reference temperature by lengths as scanned
     T_rival: Floats  # (4, 4) of an ambiguous part: the other pose that fits as well; NaN of others
@@ -129,13 +128,13 @@ def see(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, do
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
     edges = bottom_edges.measure(moved, shape.mesh, outer, *lines, first.fitted.sigma_mm, pose)
     edges = systematic.of_edges(edges, doubts, apart * between.share(station))
-    member = network.Member((None, None), edges, part.vertices.mean(axis=0))
+    member = network.Member((None, None), edges, part.vertices.mean(axis=0), pose)
     said_of += [_unheld(first)] if first.fitted.weak else []
     said_of += _without_mesh(part, design)
     weak = bool(first.fitted.weak) or any(end is not None and end.trouble for end in ends)
     status = "ambiguous" if first.found.status == "ambiguous" else "weak" if weak else "ok"
     measured = Measured(
-        part.name, tuple(one.scan for one in used), status, "; ".join(said_of), first.fitted.T_bridge_scan, pose,
+        part.name, tuple(one.scan for one in used), status, "; ".join(said_of), first.fitted.T_bridge_scan,
         member, shrink, first.found.T_rival, *_residuals(moved, shape.mesh),
     )  # fmt: skip
     return Seen(part, measured, tuple(ends))
@@ -227,10 +226,10 @@ def _failed(part: DesignPart, scans: Sequence[Scan], joints: Sequence[int | None
     ends = tuple(None if joint is None else joint_ends.nothing(message) for joint in joints)
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
     edges = bottom_edges.unseen(*lines)
-    member = network.Member((None, None), edges, part.vertices.mean(axis=0))
-    nowhere, nothing = np.full((4, 4), np.nan), np.full((6, 6), np.nan)
+    member = network.Member((None, None), edges, part.vertices.mean(axis=0), np.zeros((6, 6)))
+    nowhere = np.full((4, 4), np.nan)
     no_points = np.empty((0, 3))
     measured = Measured(
-        part.name, (scans[0],), "failed", message, nowhere, nothing, member, shrink, nowhere, no_points, np.empty(0)
+        part.name, (scans[0],), "failed", message, nowhere, member, shrink, nowhere, no_points, np.empty(0)
     )
     return Seen(part, measured, ends)

@@ -4,7 +4,8 @@ Every part i, registered to its design, is moved by a small motion x_i (turn abo
 
     sum of squared gaps + lambda sum of squared departures of the bottom edges
 
-is least: gaps of eight pairs a joint along three axes, departures sideways and up at stations of both edges. Where a
+is least: gaps of eight pairs a joint along three axes, departures sideways and up at stations of both edges. What the
+registration of a part is wrong by moves both its ends and its edges alike, and the adjustment takes it back. Where a
 joint is not known its parts could slide along themselves: then the square of every part's movement along its chord
 counts too, by a weight of HOLD. The gap of parts that are not perfect depends on lambda, so it is stated, and the curve
 over lambda is part of the answer. All is linear in what was measured; its covariance goes through.
@@ -28,23 +29,29 @@ HOLD = 1e-3  # of a part where its registration has it
 
 @dataclass(frozen=True)
 class Member:
-    """A part in the network: its ends (start, end; None without a joint), its edges, and the middle it turns about."""
+    """A part in the network: its ends (start, end; None without a joint), its edges, and the middle it turns about.
+
+    ``pose`` (6, 6) is the covariance of its registration, about the bridge's origin.
+    """
 
     ends: tuple[JointEnd | None, JointEnd | None]
     edges: EdgeStations
     middle: Floats
+    pose: Floats
 
 
 @dataclass(frozen=True)
 class Adjusted:
     """Motions T (c, 4, 4) of the registered parts, with covariance (6 c, 6 c) about the parts' middles, and the gaps.
 
+    ``motion_with_pose`` (6 c, 6 c) is the covariance of the motions with the parts' registrations.
     ``gaps`` (j, 8, 3) in bridge axes with covariance (j, 24, 24); ``departures`` (k, 2) a part, sideways and up, after
     the adjustment, with variances (k, 2).
     """
 
     motions: Floats
     motion_covariance: Floats
+    motion_with_pose: Floats
     gaps: Floats
     gap_covariance: Floats
     departures: tuple[Floats, ...]
@@ -55,6 +62,7 @@ class Adjusted:
 class _Observations:
     """What was measured: values (n,) and covariance (n, n); A (n, p) is how they change with the parts' motions.
 
+    ``with_pose`` (n, p) is their covariance with the parts' registrations.
     First the known joints' gaps, 24 rows each, then the edges' departures, then each part's movement along its chord;
     ``gap_row`` of joints without an answer is -1, ``edge_rows`` are those of each part.
     """
@@ -62,6 +70,7 @@ class _Observations:
     A: Floats
     value: Floats
     covariance: Floats
+    with_pose: Floats
     gap_row: Ints
     edge_rows: tuple[slice, ...]
 
@@ -102,6 +111,7 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
     return Adjusted(
         np.array([_as_motion(x[block], member.middle) for block, member in zip(blocks, members, strict=True)]),
         to_motion @ seen.covariance @ to_motion.T,
+        to_motion @ seen.with_pose,
         gaps,
         gap_covariance,
         tuple(departures),
@@ -112,34 +122,40 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
 def _observations(members: Sequence[Member], joint_points: Floats, joint_frames: Floats) -> _Observations:
     count, joints = len(members), len(joint_points)
     rows: list[Floats] = []
-    values, blocks = [], []
+    values, blocks, by_pose = [], [], []
     gap_row = np.full(joints, -1, np.int64)
     for j in range(joints):
         left, right = members[j].ends[1], members[j + 1].ends[0]
         if left is None or right is None or not (_known(left) and _known(right)):
             continue
         gap_row[j] = 24 * len(rows)
-        A = np.zeros((24, 6 * count))
-        for part, sign in ((j, -1.0), (j + 1, 1.0)):
-            A[:, 6 * part : 6 * part + 6] = sign * rigid.motion(joint_points[j] - members[part].middle).reshape(24, 6)
+        A, follows = np.zeros((2, 24, 6 * count))
         turn = np.kron(np.eye(8), joint_frames[j][:3, :3])
+        for part, end, sign in ((j, left, -1.0), (j + 1, right, 1.0)):
+            own = slice(6 * part, 6 * part + 6)
+            A[:, own] = sign * rigid.motion(joint_points[j] - members[part].middle).reshape(24, 6)
+            follows[:, own] = sign * turn @ end.by_pose
         rows.append(A)
         values.append(turn @ (right.moved - left.moved).ravel())
-        blocks.append(turn @ (left.covariance + right.covariance) @ turn.T)
+        own_noise = _of_itself(left, members[j].pose) + _of_itself(right, members[j + 1].pose)
+        blocks.append(turn @ own_noise @ turn.T)
+        by_pose.append(follows)
     edge_rows = []
     start = 24 * len(rows)
     for i, member in enumerate(members):
         edges = member.edges
         known = np.isfinite(edges.departure).ravel()
-        A = np.zeros((int(known.sum()), 6 * count))
+        A, follows = np.zeros((2, int(known.sum()), 6 * count))
         motion = rigid.motion(edges.points - member.middle)
         A[:, 6 * i : 6 * i + 6] = np.einsum("kai,kij->kaj", edges.axes, motion).reshape(-1, 6)[known]
+        follows[:, 6 * i : 6 * i + 6] = edges.by_pose.reshape(-1, 6)[known]
         whole = np.zeros((len(edges.points), 2, len(edges.points), 2))
         for k in range(2):
             whole[:, k, :, k] = edges.covariance[k]
         rows.append(A)
         values.append(edges.departure.ravel()[known])
         blocks.append(whole.reshape(len(known), len(known))[np.ix_(known, known)])
+        by_pose.append(follows)
         edge_rows.append(slice(start, start + len(A)))
         start += len(A)
     held = np.zeros((count, count, 6))
@@ -149,11 +165,20 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
     rows.append(held.reshape(count, 6 * count))
     values.append(np.zeros(count))
     blocks.append(np.zeros((count, count)))
-    return _Observations(np.vstack(rows), np.concatenate(values), block_diag(*blocks), gap_row, tuple(edge_rows))
+    by_pose.append(np.zeros((count, 6 * count)))
+    with_pose = np.vstack(by_pose) @ block_diag(*(member.pose for member in members))
+    covariance = block_diag(*blocks) + with_pose @ np.vstack(by_pose).T
+    return _Observations(np.vstack(rows), np.concatenate(values), covariance, with_pose, gap_row, tuple(edge_rows))
 
 
 def _known(end: JointEnd) -> bool:
     return bool(np.isfinite(end.moved).all())
+
+
+def _of_itself(end: JointEnd, pose: Floats) -> Floats:
+    """Return the covariance (24, 24) of an end beyond what the registration's error, ``pose`` (6, 6), brings to it."""
+    found: Floats = end.covariance - end.by_pose @ pose @ end.by_pose.T
+    return found
 
 
 def _as_motion(x: Floats, middle: Floats) -> Floats:

@@ -18,7 +18,8 @@ def smooth(arc: Floats, value: Floats, variance: Floats, pose: Floats) -> Believ
     """
     known = np.isfinite(value) & np.isfinite(variance)
     if known.sum() < LEAST_VALUES:
-        return Believed(np.full(len(arc), np.nan), np.full((len(arc),) * 2, np.nan))
+        nothing = np.full((len(arc),) * 2, np.nan)
+        return Believed(np.full(len(arc), np.nan), nothing, nothing)
     x = (arc - 0.5 * (arc[0] + arc[-1])) / max(0.5 * float(np.ptp(arc)), 1.0)
     line = 1.0 + np.outer(x, x)
     apart = np.sqrt(3.0) * np.abs(arc[:, None] - arc)

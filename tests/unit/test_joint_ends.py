@@ -1,9 +1,11 @@
 """Ends of a straight box whose corners were built elsewhere, by points made with numpy: closed forms throughout."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from processor.geometry import mesh_surface
+from processor.geometry import mesh_surface, rigid
 from processor.preassembly import features, form, joint_ends, layers, network, outer_faces
 from processor.preassembly.bottom_edges import EdgeStations
 from processor.preassembly.evidence import Believed, by_the_others, either, no_surer, weigh
@@ -150,9 +152,9 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
     noise = 0.02 * rng.standard_normal((120, 2))
     edges = EdgeStations(
         ("left",) * 60 + ("right",) * 60, np.tile(arc, 2), np.vstack(points), np.vstack(axes), noise,
-        np.stack([0.02**2 * np.eye(120)] * 2),
+        np.stack([0.02**2 * np.eye(120)] * 2), np.zeros((120, 2, 6)),
     )  # fmt: skip
-    member = network.Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]))
+    member = network.Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]), np.zeros((6, 6)))
     adjusted = network.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
     assert np.abs(adjusted.motions[0][:3, 3]).max() < 1.0 + 60_000.0 * 2e-5  # its turn is about the middle
     moved = adjusted.motions[0] @ np.array([0.0, 0.0, 60_000.0, 1.0])
@@ -162,17 +164,18 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
 def test_a_belief_is_no_surer_than_the_values_in_any_direction():
     rng = np.random.default_rng(4)
     least, own = (a @ a.T + 0.1 * np.eye(5) for a in rng.normal(size=(2, 5, 5)))
-    raised = no_surer(Believed(np.arange(5.0), own), least)
+    raised = no_surer(Believed(np.arange(5.0), own, np.eye(5)), least)
     for floor in (own, least):
         assert np.linalg.eigvalsh(raised.covariance - floor).min() > -1e-9
     np.testing.assert_array_equal(raised.mean, np.arange(5.0))
     # Where it is less sure already, nothing changes.
-    np.testing.assert_allclose(no_surer(Believed(np.zeros(5), 2.0 * least), least).covariance, 2.0 * least, rtol=1e-12)
+    same = no_surer(Believed(np.zeros(5), 2.0 * least, np.eye(5)), least)
+    np.testing.assert_allclose(same.covariance, 2.0 * least, rtol=1e-12)
 
 
 def test_what_is_surely_nothing_may_stay_so():
     least = np.diag([0.5, 0.0])  # of a scan without noise bends are known not to be there
-    raised = no_surer(Believed(np.zeros(2), np.diag([0.1, 0.0])), least)
+    raised = no_surer(Believed(np.zeros(2), np.diag([0.1, 0.0]), np.eye(2)), least)
     np.testing.assert_allclose(raised.covariance, least, atol=2e-8)
 
 
@@ -186,6 +189,8 @@ def test_what_two_sets_of_hypotheses_say_is_what_all_of_them_say():
         found = either(*(weigh(value, noise, part) for part in parts))
         np.testing.assert_allclose(found.mean, whole.mean, rtol=1e-10)
         np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-10, atol=1e-14)
+        np.testing.assert_allclose(found.gain @ value, whole.mean, rtol=1e-10)
+        np.testing.assert_allclose(found.gain, whole.gain, rtol=1e-10, atol=1e-14)
         assert found.evidence == pytest.approx(whole.evidence)
 
 
@@ -204,3 +209,51 @@ def test_others_say_how_large_departures_are():
     # One by itself, and things that say nothing, leave all as it was.
     np.testing.assert_allclose(by_the_others(logs[:1], before), [[0.25, 0.25, 0.5]])
     np.testing.assert_allclose(by_the_others(np.zeros((3, 3)), before), np.tile([0.25, 0.25, 0.5], (3, 1)))
+
+
+def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
+    """Drawn 400 times: intervals of gaps and movements are those of what was drawn, registrations' errors included."""
+    rng = np.random.default_rng(8)
+    corners = np.array([[0.0, y, z] for y, z in ((700, -900), (-700, -900), (-700, 900), (700, 900))], float)
+    joints = np.array([np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])])
+    along = np.linspace(100.0, 5900.0, 12)
+    axes = np.tile(np.eye(3)[1:], (24, 1, 1))
+    turned, shifted, noise = 2e-5, 0.1, 0.003
+    pose = np.diag([turned**2] * 3 + [shifted**2] * 3)
+    parts = []
+    for sense in (-1.0, 1.0):
+        points = np.array([[sense * x, y, -900.0] for y in (700.0, -700.0) for x in along])
+        moves = np.einsum("kai,kij->kaj", axes, rigid.motion(points))
+        edges = EdgeStations(
+            ("left",) * 12 + ("right",) * 12, np.tile(along, 2), points, axes, np.zeros((24, 2)),
+            np.stack([noise**2 * np.eye(24)] * 2), moves,
+        )  # fmt: skip
+        at_joint = rigid.motion(joints[0]).reshape(24, 6)
+        covariance = at_joint @ pose @ at_joint.T + noise**2 * np.eye(24)
+        end = joint_ends.JointEnd(np.zeros((8, 3)), covariance, at_joint, 0.0, "")
+        middle = np.array([3000.0 * sense, 0.0, 0.0])
+        parts.append(network.Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
+    stated = network.adjust(parts, joints, np.eye(4)[None], 0.1)
+    gaps, moved = [], []
+    for _ in range(400):
+        wrong = np.sqrt(np.diag(pose)) * rng.standard_normal((2, 6))
+        drawn = []
+        for part, own in zip(parts, wrong, strict=True):
+            departure = -part.edges.by_pose @ own + noise * rng.standard_normal((24, 2))
+            ends = tuple(
+                one and replace(one, moved=(-one.by_pose @ own + noise * rng.standard_normal(24)).reshape(8, 3))
+                for one in part.ends
+            )
+            drawn.append(replace(part, ends=ends, edges=replace(part.edges, departure=departure)))
+        found = network.adjust(drawn, joints, np.eye(4)[None], 0.1)
+        gaps.append(found.gaps.ravel())
+        # Where the outer end of the last part comes to lie: by its movement, and by what it was wrong.
+        at = np.array([[6000.0, 0.0, 0.0]])
+        moved.append((rigid.apply(found.motions[1], at) - at)[0] - rigid.motion(at)[0] @ wrong[1])
+    assert np.sqrt(np.diag(stated.gap_covariance[0])).max() < 2.0 * noise  # of 0.14 mm that both ends are wrong by
+    pulls = np.array(gaps) / np.sqrt(np.diag(stated.gap_covariance[0]))
+    np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)
+    J, own = rigid.motion(at - parts[1].middle)[0], rigid.motion(at)[0]
+    both = J @ stated.motion_with_pose[6:, 6:] @ own.T
+    covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T
+    np.testing.assert_allclose(np.std(moved, axis=0), np.sqrt(np.diag(covariance)), rtol=0.2)
