@@ -28,6 +28,7 @@ from processor.records import names as names
 from processor.records import newer as newer
 from processor.records import optional as optional
 
+NORMAL_95 = 1.959963984540054  # standard deviations of a normal value that hold it in 95 % of cases
 KEY_POINTS = ("P1", "P2", "P3", "P4", "P5", "P6", "P7", "P8")
 ENDS = ("start", "end")
 KINDS = ("arch-bridge", "space-frame", "structure")

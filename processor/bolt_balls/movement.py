@@ -15,10 +15,9 @@ import numpy as np
 from processor.bolt_balls.match_odds import Found
 from processor.bolt_balls.matching import SAME, Matching
 from processor.geometry import rigid
-from processor.model import Checked, Floats, FrameDesign, Ints, column
+from processor.model import NORMAL_95, Checked, Floats, FrameDesign, Ints, column
 
 FRAME, BEST_FIT = "design frame", "best fit"
-NORMAL_95 = 1.959963984540054
 CHI2_95_OF_3 = 7.814727903251179
 
 

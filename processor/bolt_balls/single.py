@@ -19,7 +19,7 @@ from processor.geometry.merging import MergedCloud
 from processor.geometry.sphere import Mask, Sphere, algebraic, visible_fraction
 from processor.geometry.sphere_ransac import ransac
 from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
-from processor.model import Floats, FrameDesign, Tolerance
+from processor.model import NORMAL_95, Floats, FrameDesign, Tolerance
 from processor.preassembly import tolerance
 
 LEAST_VISIBLE = 0.05  # share of the sphere
@@ -108,7 +108,7 @@ def _judged(
     below, above = _blank_tolerance(nominal, limits)
     if not doubts and not np.isnan(nominal) and not -below <= error <= above:
         # The interval is formal; what the method is known to reach decides whether it may call a size wrong.
-        margin = max(1.96 * sd, PAPER_RADIUS_ERROR_MM)
+        margin = max(NORMAL_95 * sd, PAPER_RADIUS_ERROR_MM)
         if params.method == "ransac" and not -below - margin <= error <= above + margin:
             flag = "wrong-size"
             doubts = [

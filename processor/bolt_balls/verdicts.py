@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.bolt_balls.movement import NORMAL_95
 from processor.bolt_balls.result import Result
-from processor.model import Floats
+from processor.model import NORMAL_95, Floats
 
 PASS, FAIL, INDETERMINATE, NO_LIMIT = "pass", "fail", "indeterminate", "no limit"
 

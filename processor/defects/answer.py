@@ -20,9 +20,8 @@ from processor.defects.result import Result
 from processor.defects.scan_statistic import Levels
 from processor.defects.small import Near
 from processor.defects.surface import DesignSurface
-from processor.model import Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints
 
-NORMAL_95 = 1.959964
 CURVE_STRIPS = 40
 SMALL_CELLS = 8.0  # of diameter, below which points are fitted and not cells
 SHALLOW_SHARE = 0.1  # of a component's shape that a model of it may be wrong by

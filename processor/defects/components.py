@@ -14,7 +14,7 @@ from processor.defects.alignment import Alignment, chart_of_cells
 from processor.defects.fields import Field, component_of_cells
 from processor.defects.scan_statistic import Levels
 from processor.defects.surface import DesignSurface
-from processor.model import Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints
 
 BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at the least
 MOST_BLOCKS = 3000
@@ -25,7 +25,6 @@ APART_GAIN = 100.0  # of chi-square
 JUMP_CELLS = 1.5
 LEAST_Z = 4.5  # of a shape: what stations share is known from few of them
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
-NORMAL_95 = 1.959964
 
 
 @dataclass(frozen=True)

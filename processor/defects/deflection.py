@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.model import Floats
+from processor.model import NORMAL_95, Floats
 
 
 def by_strips(along: Floats, deviation: Floats, variance: Floats, strips: int) -> tuple[Floats, Floats, Floats]:
@@ -19,7 +19,7 @@ def by_strips(along: Floats, deviation: Floats, variance: Floats, strips: int) -
     used = total > 0.0
     some = np.where(used, total, 1.0)
     at, mean = np.bincount(index, w * along, strips) / some, np.bincount(index, w * deviation, strips) / some
-    return at[used], mean[used], 1.959964 / np.sqrt(some[used])
+    return at[used], mean[used], NORMAL_95 / np.sqrt(some[used])
 
 
 def by_slopes(along: Floats, deviation: Floats, strips: int) -> tuple[Floats, Floats]:

@@ -12,9 +12,8 @@ from processor.defects.alignment import Alignment
 from processor.defects.fields import Field
 from processor.defects.regions import Region, flat
 from processor.defects.surface import CYLINDER, DesignSurface
-from processor.model import Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints
 
-NORMAL_95 = 1.959964
 FIT_SHARE = 0.45  # of a region's radius, within which a paraboloid is fitted for its depth
 CURVE_SHARE = 0.65  # of a region's radius, for its curvature
 FEWEST_CELLS = 9

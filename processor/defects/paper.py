@@ -25,7 +25,7 @@ from processor.deviation import clouds
 from processor.geometry import icp, pfh, rigid
 from processor.geometry.merging import merged
 from processor.geometry.neighbors import surface_spacing, voxel_means
-from processor.model import Floats, Ints, Scene
+from processor.model import NORMAL_95, Floats, Ints, Scene
 
 VOXEL_SPACINGS = 1.5
 RADIUS_VOXELS = 2.5  # of a neighbourhood that density is told by
@@ -215,7 +215,7 @@ def _result(
             "components": f"component-{int(np.bincount(component[inside]).argmax()) + 1}", "centres": middle + origin,
             "axes": np.stack([axes[:, 2], np.cross(out, axes[:, 2]), out]),
             "extent": [np.ptp(along) + size, np.ptp(across) + size], "area_mm2": area, "depth_max": -d[top],
-            "depth_ci95": 1.96 * cloud[1], "depth_mean": -d.mean(), "volume_mm3": -d.mean() * area,
+            "depth_ci95": NORMAL_95 * cloud[1], "depth_mean": -d.mean(), "volume_mm3": -d.mean() * area,
             "volume_ci95": np.nan, "edge_mm": np.nan, "curvature_per_m": np.nan, "lod95": threshold,
             "z": abs(d[top]) / max(cloud[1], 1e-12), "remarks": "",
         })  # fmt: skip

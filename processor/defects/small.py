@@ -10,11 +10,11 @@ from scipy.optimize import least_squares
 
 from processor.defects.alignment import Alignment, rays_to
 from processor.defects.fields import Field
-from processor.defects.measures import NORMAL_95, Measures
+from processor.defects.measures import Measures
 from processor.defects.observed import Observed, cells_of
 from processor.defects.regions import Region, flat
 from processor.defects.surface import DesignSurface
-from processor.model import Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints
 
 MARGIN_CELLS = 2
 FEWEST_POINTS = 12

@@ -14,9 +14,8 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.geometry.lines import Polyline
-from processor.model import ArchDesign, Floats, Scan, Scene, Tolerance
+from processor.model import NORMAL_95, ArchDesign, Floats, Scan, Scene, Tolerance
 from processor.preassembly import chain_figures, features, joint_measures, network, registration, tolerance
-from processor.preassembly.joint_measures import NORMAL_95
 from processor.preassembly.joint_verdicts import Verdict, judge
 from processor.preassembly.measuring import Measured, finished, see
 from processor.preassembly.params import Params

@@ -14,9 +14,8 @@ from scipy.optimize import least_squares
 from processor.geometry import rigid
 from processor.geometry.error_figures import signed
 from processor.geometry.lines import Polyline
-from processor.model import ArchDesign, ArchTruth, Floats, Metric, Scene, Truth
+from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Truth
 from processor.preassembly import errors
-from processor.preassembly.joint_measures import NORMAL_95
 from processor.preassembly.result import Result
 
 WRONG_POSE_RAD = 0.1

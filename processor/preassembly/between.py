@@ -10,8 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.special import stdtrit
 
-from processor.model import Floats, Ints
-from processor.preassembly.joint_measures import NORMAL_95
+from processor.model import NORMAL_95, Floats, Ints
 
 LEAST_POINTS = 25  # of a station on a face
 

@@ -8,9 +8,8 @@ import numpy as np
 from scipy.linalg import block_diag
 
 from processor.geometry import rigid
-from processor.model import KEY_POINTS, ArchDesign, Floats
+from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats
 from processor.preassembly import network
-from processor.preassembly.joint_measures import NORMAL_95
 from processor.preassembly.measuring import Measured
 from processor.preassembly.network import Adjusted
 

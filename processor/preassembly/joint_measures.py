@@ -19,9 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Checked, Floats, Ints, column, names
+from processor.model import NORMAL_95, Checked, Floats, Ints, column, names
 
-NORMAL_95 = 1.959964
 RAYLEIGH_95 = 2.447747  # radius that holds 95 % of a round normal distribution in the plane, in sd
 DRAWS = 4000
 SEED = 20

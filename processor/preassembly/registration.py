@@ -10,7 +10,7 @@ import numpy.typing as npt
 from processor.geometry import icp, rigid
 from processor.geometry.mesh_surface import MeshSurface, on_face
 from processor.geometry.neighbors import thinned
-from processor.model import Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints
 
 Bools = npt.NDArray[np.bool_]
 
@@ -145,7 +145,7 @@ def _scatter(gradient: Floats, cell: Ints) -> Floats:
 def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[str, ...]:
     """Name the motions about the part's middle and its axes that may move its ends by more than WEAK_MM."""
     turned = np.kron(np.eye(2), axes.T)
-    spread = 1.96 * np.sqrt(np.diag(turned @ covariance @ turned.T))
+    spread = NORMAL_95 * np.sqrt(np.diag(turned @ covariance @ turned.T))
     arms = np.array([0.1 * half_length, half_length, half_length, 1.0, 1.0, 1.0])
     order = (0, 2, 1, 3, 4, 5)  # a turn about the third axis is sideways where the second one is
     return tuple(name for name, k in zip(MOTIONS, order, strict=True) if spread[k] * arms[k] > WEAK_MM)

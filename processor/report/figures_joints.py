@@ -11,8 +11,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 
-from processor.model import KEY_POINTS, Floats, StepRun
-from processor.preassembly.joint_measures import NORMAL_95, RAYLEIGH_95, Measures
+from processor.model import KEY_POINTS, NORMAL_95, Floats, StepRun
+from processor.preassembly.joint_measures import RAYLEIGH_95, Measures
 from processor.report.drawing import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, label, png, rounded
 from processor.steps import preassemble
 

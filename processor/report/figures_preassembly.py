@@ -10,8 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from processor.model import Floats, Scene, StepRun
-from processor.preassembly.joint_measures import NORMAL_95, RAYLEIGH_95
+from processor.model import NORMAL_95, Floats, Scene, StepRun
+from processor.preassembly.joint_measures import RAYLEIGH_95
 from processor.report import figures_residuals
 from processor.report.drawing import (
     BEHIND_TEXT,

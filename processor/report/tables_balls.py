@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from processor.bolt_balls import verdicts
-from processor.bolt_balls.movement import NORMAL_95
 from processor.bolt_balls.result import Result
 from processor.evaluate import ErrorReport
-from processor.model import Floats, StepRun
+from processor.model import NORMAL_95, Floats, StepRun
 from processor.report.table import NAN, Table
 
 XYZ = ("x", "y", "z")

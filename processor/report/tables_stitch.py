@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from processor.evaluate import ErrorReport
-from processor.model import StepRun
+from processor.model import NORMAL_95, StepRun
 from processor.report.table import Table
 from processor.stitching.result import Result
 
-NORMAL_95 = 1.96
 FRAMES_NOTE = (
     "SOCS: the scanner's own coordinate system, that of a scan's file. PRCS: the project's, in which all scans are put "
     "together: that of the reference scan, or the one its given pose leads to. GLCS: a global one: nothing "

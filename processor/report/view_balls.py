@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import Scene, StepRun
+from processor.model import NORMAL_95, Scene, StepRun
 from processor.report.drawing import DIVERGING_STOPS
 from processor.report.printing import shown
 from processor.report.results_json import plain
@@ -17,7 +17,6 @@ FLAGS = ("ok", "low-confidence", "wrong-size")
 TONES = ("#0072B2", "#D55E00", "#000000")  # of FLAGS
 MOST_BALLS = 5_000  # about 1 MB of the page; those to look at are always among them
 MOST_TUBES = 15_000
-NORMAL_95 = 1.959964
 
 
 def of_runs(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:

@@ -10,11 +10,10 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid, threads
-from processor.model import Floats, Scan, Scene, StepRun
+from processor.model import NORMAL_95, Floats, Scan, Scene, StepRun
 from processor.report.drawing import DIVERGING_STOPS, colour_limit
 from processor.report.printing import shown
 from processor.report.results_json import plain
-from processor.report.tables_stitch import NORMAL_95
 from processor.report.view_points import spacing
 from processor.stitching.result import Result
 

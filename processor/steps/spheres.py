@@ -19,7 +19,7 @@ from processor.bolt_balls.result import Result
 from processor.bolt_balls.scene_source import PointReader
 from processor.geometry.error_figures import signed
 from processor.geometry.merging import merged
-from processor.model import Floats, FrameTruth, InputError, Ints, Metric, Scene, Tolerance, Truth
+from processor.model import NORMAL_95, Floats, FrameTruth, InputError, Ints, Metric, Scene, Tolerance, Truth
 from processor.preassembly import tolerance
 
 __all__ = ["KIND", "METHODS", "NEEDS", "STREAMS", "Params", "Result", "check", "run"]
@@ -155,7 +155,7 @@ def _honesty(name: str, off: Floats, sd: Floats, ok: npt.NDArray[np.bool_]) -> l
         Metric(
             "spheres",
             f"{name} within their 95 % intervals",
-            _share(int((np.abs(pull) < 1.96).sum()), len(pull)),
+            _share(int((np.abs(pull) < NORMAL_95).sum()), len(pull)),
             NAN,
             "%",
         ),

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Floats, Metric, Scene, Truth
+from processor.model import NORMAL_95, Floats, Metric, Scene, Truth
 from processor.stitching import frames
 from processor.stitching.result import Result
 
 POSITION_MM, ROTATION_MRAD = 0.5, 0.02
 WRONG_MM = 50.0
-NORMAL_95 = 1.96
 NAN = float("nan")
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Floats, Scan
+from processor.model import NORMAL_95, Floats, Scan
 from processor.stitching import frames, pairs
 from processor.stitching.pairs import Pair
 from processor.stitching.params import Params
@@ -106,7 +106,8 @@ def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params:
     if not np.isfinite(place_sd).all():
         return "weak", "nothing tells how sure its pose is"
     if place_sd.max() > params.weak_mm or 1e3 * turn_sd.max() > params.weak_mrad:
-        return "weak", f"its pose is sure to {1.96 * place_sd.max():.2g} mm and {1960.0 * turn_sd.max():.2g} mrad only"
+        place, turn = NORMAL_95 * place_sd.max(), 1e3 * NORMAL_95 * turn_sd.max()
+        return "weak", f"its pose is sure to {place:.2g} mm and {turn:.2g} mrad only"
     return "ok", ""
 
 

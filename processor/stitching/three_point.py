@@ -13,7 +13,7 @@ from scipy.stats import f
 from scipy.stats import t as student
 
 from processor.geometry import rigid
-from processor.model import Floats
+from processor.model import NORMAL_95, Floats
 from processor.stitching import frames
 from processor.stitching.pairs import Pair
 
@@ -29,7 +29,6 @@ UNIT_SLIPS = (
     (3.28084, "feet and m"),
 )
 BY_CHANCE = 1e-3  # that picks of a network scatter so much in one pair
-NORMAL_95 = 1.96
 LEAST_HEIGHT = 1e-3  # of a triangle, by its longest side: nearer to a line than that is a line
 
 
