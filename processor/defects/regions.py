@@ -9,6 +9,7 @@ from scipy import ndimage
 from scipy.spatial import cKDTree
 
 from processor.defects.absence import Expected
+from processor.defects.classes import CRACK_RATIO
 from processor.defects.fields import Field
 from processor.defects.scan_statistic import Finding
 from processor.defects.surface import CYLINDER, Charts, DesignSurface
@@ -16,6 +17,7 @@ from processor.model import Floats, Ints
 
 ROUND = np.ones((3, 3))
 ABSENT_SHARE = 0.15  # of the points expected, below which a cell is empty
+IN_LINE_CELLS = 1.6  # that a piece of a crack may be off its line
 DOUBT = 0.5  # of the points expected that are counted on: scanners thin out where a surface reflects badly
 
 
@@ -107,7 +109,49 @@ def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> lis
         else:
             groups.append([region])
             trees.append(cKDTree(places))
-    return [_joined(group) for group in groups]
+    return _in_line([_joined(group) for group in groups], surface)
+
+
+def _in_line(groups: list[list[Region]], surface: DesignSurface) -> list[list[Region]]:
+    """Put the pieces of a crack together, for a scan sees one as a dashed line.
+
+    A piece is what lies in line with a slim place, within it or as far from its end as that is long at most.
+    """
+    left = groups
+    found: list[list[Region]] = []
+    while left:
+        group, *left = left
+        line = _line_of(group[0], surface)
+        others = left + found
+        piece = line and next((one for one in others if _is_on(line, one[0], group[0], surface)), None)
+        if not piece:
+            found.append(group)
+            continue
+        # A longer line may reach one that it did not reach before.
+        left, found = [_joined([*group, *piece]), *(one for one in others if one is not piece)], []
+    return found
+
+
+def _line_of(region: Region, surface: DesignSurface) -> tuple[Floats, Floats, float] | None:
+    """Return middle (2,), direction (2,) and half the length of a slim place on its face; None of any other."""
+    uv, cell = flat(surface, region), surface.charts.cell_mm
+    middle = uv.mean(axis=0)
+    direction = np.linalg.eigh((uv - middle).T @ (uv - middle))[1][:, 1]
+    along = (uv - middle) @ direction
+    length = float(np.ptp(along)) + cell
+    width = len(uv) * cell**2 / length
+    if region.sign > 0 or length < CRACK_RATIO * width or width > 2.0 * IN_LINE_CELLS * cell:
+        return None
+    return middle + 0.5 * (along.min() + along.max()) * direction, direction, 0.5 * length
+
+
+def _is_on(line: tuple[Floats, Floats, float], region: Region, slim: Region, surface: DesignSurface) -> bool:
+    if region.chart != slim.chart or region.sign > 0:
+        return False
+    middle, direction, half = line
+    uv = flat(surface, region) - middle
+    along, across = np.abs(uv @ direction), np.abs(uv @ [-direction[1], direction[0]])
+    return bool(across.max() < IN_LINE_CELLS * surface.charts.cell_mm and along.min() < 3.0 * half)
 
 
 def _joined(group: list[Region]) -> list[Region]:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.defects import deflection, facets, fields, paper, scan_statistic, shapes, surface
+from processor.defects import deflection, facets, fields, paper, regions, scan_statistic, shapes, surface
 from processor.defects.measures import thickness_at
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.pipeline import as_json
@@ -355,3 +355,28 @@ def test_one_shape_is_chosen(kind, height):
     if kind:
         value = fitted.shapes[0].values(frame, points, outward)
         np.testing.assert_allclose(value, height(points), atol=0.06 if kind != "step" else 0.7)
+
+
+def test_the_pieces_of_a_crack_are_one_and_what_lies_beside_it_is_not():
+    """Cells by their places on the front of a plate: a slim piece, others in its line, one that lies 4 cells off."""
+    design = design_of(1)
+    whole = surface.gridded(surface.of_mesh(design.vertices, design.faces, 60.0), 10.0)
+    (chart,) = {
+        int(k) for k in range(len(whole.charts.kind)) if whole.outward[whole.charts.first[k]] @ [0.0, -1.0, 0.0] > 0.9
+    }
+    rows = np.arange(*whole.charts.cells(chart).indices(len(whole.centres))[:2])
+
+    def piece(low, high, x=305.0, sign=-1):
+        at = whole.centres[rows]
+        own = rows[(np.abs(at[:, 0] - x) < 5.0) & (at[:, 2] > low) & (at[:, 2] < high)]
+        return regions.Region(chart, own, sign, 9.0)
+
+    slim, inside, beyond, far = piece(300, 380), piece(410, 425), piece(100, 200), piece(520, 590)
+    beside, raised = piece(410, 425, x=345.0), piece(440, 470, sign=1)
+    first, *others = regions.united([raised, far, beside, beyond, inside, slim], whole, 25.0)
+    # The slim one reaches 80 mm to either side: the piece below is farther, but not than all that lies above it.
+    assert [one.sign for one in first] == [-1]
+    joined = np.concatenate([piece.cells for piece in (slim, inside, beyond, far)])
+    np.testing.assert_array_equal(first[0].cells, np.unique(joined))
+    assert sorted(len(group) for group in others) == [1, 1]
+    assert {id(group[0]) for group in others} == {id(beside), id(raised)}
