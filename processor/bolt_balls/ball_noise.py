@@ -46,7 +46,7 @@ def noise_model(
         return start, 10.0
     whole = float(MAD * np.median(e))
     band = np.floor(np.log(np.maximum(L, NEAREST_MM) / NEAREST_MM) / np.log(RATIO)).astype(np.int64)
-    cell = band * len(COSINES) + np.searchsorted(COSINES, c, side="right")
+    cell = (band * len(COSINES) + np.searchsorted(COSINES, c, side="right")).astype(np.int16)  # sorted in one pass
     order = np.argsort(cell, kind="stable")
     edges = np.flatnonzero(np.diff(cell[order])) + 1
     rows, variances, counts = [], [], []

@@ -24,7 +24,7 @@ CELL_MM = 200.0
 FIELD = 21  # bits for each coordinate of a point less its line's middle
 HALF = 1 << (FIELD - 1)  # 10.5 m in steps of 0.01 mm
 CELL_FIELD = 20
-LEAST_RANGE = 100_000  # points a thread takes at once
+LEAST_RANGE = 50_000  # points a thread takes at once
 
 
 @dataclass(frozen=True)

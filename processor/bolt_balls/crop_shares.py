@@ -3,11 +3,14 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
 from processor.bolt_balls.thinning import WHOLE, hashed
+from processor.geometry.threads import over_ranges
 from processor.model import Labels
 
 STEPS_PER_MM = 1000.0  # gathered coordinates are whole micrometres: sorting them is exact
@@ -17,8 +20,8 @@ THRESHOLDS = np.append(WHOLE * 2.0 ** (-0.25 * np.arange(120)), 0.0).astype(np.u
 class Kept:
     """What has been gathered so far, as pairs of a node and a point, and what each node still takes."""
 
-    def __init__(self, nodes: int, room: int) -> None:
-        self.room = room
+    def __init__(self, nodes: int, room: int, threads: int = 0) -> None:
+        self.room, self.threads = room, threads
         self.rank = np.zeros(nodes, np.int64)  # of each node's threshold
         self.counts = np.zeros(nodes, np.int64)
         self.pieces = [(np.empty(0, np.int32), np.empty((0, 3), np.int32), np.empty(0, np.int32))]
@@ -42,18 +45,18 @@ class Kept:
         owner, steps, station = (np.concatenate(parts) for parts in zip(*self.pieces, strict=True))
         self.loose = 0
         if (self.counts > self.room).any():
-            rank = _ranks(steps, THRESHOLDS)
+            rank = np.empty(len(steps), np.int64)
+            over_ranges(partial(_ranks, steps, THRESHOLDS, rank), len(steps), self.threads)
             self.rank, self.counts = _lowered(owner, rank, self.rank, self.room, len(THRESHOLDS))
-            held = rank >= self.rank[owner]
-            owner, steps, station = owner[held], steps[held], station[held]
+            held = np.flatnonzero(rank >= self.rank[owner])
+            owner, steps, station = (np.take(one, held, axis=0) for one in (owner, steps, station))
         return owner, steps, station
 
 
 @njit(cache=True, nogil=True)
-def _ranks(steps, thresholds):  # type: ignore[no-untyped-def]
-    """Rank (n,) of the lowest threshold that each hash still lies below."""
-    found = np.empty(len(steps), np.int64)
-    for i in range(len(steps)):
+def _ranks(steps, thresholds, found, first, last):  # type: ignore[no-untyped-def]
+    """Write the rank (n,) of the lowest threshold that each hash, first..last, still lies below."""
+    for i in range(first, last):
         value = hashed(steps[i, 0], steps[i, 1], steps[i, 2])
         low, high = 0, len(thresholds) - 1  # below the first, and never below the last
         while high - low > 1:
@@ -63,7 +66,6 @@ def _ranks(steps, thresholds):  # type: ignore[no-untyped-def]
             else:
                 high = mid
         found[i] = low
-    return found
 
 
 @njit(cache=True, nogil=True)

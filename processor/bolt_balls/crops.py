@@ -53,7 +53,7 @@ def gather(source: Source, nodes: Floats, reach_mm: float, threads: int = 0, mos
     lower = nodes.min(axis=0) - reach_mm
     upper = nodes.max(axis=0) + reach_mm
     table, cells = _cells(nodes, lower, reach_mm)
-    kept = Kept(len(nodes), max(most // len(nodes), LEAST_ROOM))
+    kept = Kept(len(nodes), max(most // len(nodes), LEAST_ROOM), threads)
     for chunk in source.chunks():
         kept.add(
             *_near(

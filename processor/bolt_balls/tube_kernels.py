@@ -17,7 +17,7 @@ LEAST_CUT_MM = 4.0  # of rough fits, where stations may be off each other
 ROUGH_MM = 2.0  # by which a straight axis and what is wrong with stations may be off, beside the noise
 NEAR_M = 20.0  # of a station; what is wrong with its attitude shows in the others
 FINE_MM = 0.7  # and a bowed axis
-SMALL_STEP_MM = 0.02  # a tenth of what noise moves an axis by; what is left after it is smaller yet
+LEFT_MM = 0.02  # by the last step: a tenth of what noise moves an axis by
 TRIM_MM = 8.0  # taken off each end: where a cone begins is not seen that sharply
 LEAST_SIGMA_MM = 0.05
 ROUGH_COS = 0.5  # of incidence, in rough fits
@@ -155,7 +155,7 @@ def improve(p, h, P, U, seen, bounds, shifts, station_sd, least_cos, sigma, slac
     ``slack`` is what the start may be off by, for the first step.
     """
     sizes = np.empty(len(P))
-    good, count, assumed = True, 0, sigma
+    good, count, assumed, before = True, 0, sigma, 0.0
     for turn in range(turns):
         cut = max(CUT_SIGMAS * (np.sqrt(sigma**2 + slack**2) if turn == 0 else sigma), 0.5)
         assumed = sigma
@@ -166,8 +166,10 @@ def improve(p, h, P, U, seen, bounds, shifts, station_sd, least_cos, sigma, slac
         if not good:
             break
         sigma = max(np.sqrt(total / max(count - NP, 1)), LEAST_SIGMA_MM)
-        if turn > 0 and shift < SMALL_STEP_MM:
+        # Steps that get shorter by the same factor again and again have this left to go, all in all.
+        if turn > 0 and (shift < LEFT_MM or shift * shift < LEFT_MM * (before - shift)):
             break
+        before = shift
     return good, count, assumed, sigma
 
 
