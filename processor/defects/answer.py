@@ -190,6 +190,8 @@ def _places(found: Found) -> Iterator[Row]:
         if main.sign != 0 and got.diameter < SMALL_CELLS * surface.charts.cell_mm and named.kind != "crack":
             got = small.refined(got, main, found.near, found.field, found.shape_values)
             depth = got.depth
+        if main.sign != 0 and not abs(depth) > got.lod95:
+            continue  # crumbs about a defect, which only its nearness made significant
         if named.kind == "crack" and main.sign != 0:
             there = (found.field.count + found.field.stray)[main.cells].sum()
             hoped = found.hoped.points[main.cells].sum()
