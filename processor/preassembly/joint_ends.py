@@ -224,7 +224,7 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
     """Weigh the numbers (40,) of ends against ends as designed, which the registration alone moves.
 
     The faces' shifts are of one unknown size, how they lie of another, how they bend of a third; so are the ring's
-    plane and its bends.
+    plane and its bends. Faces and ring have in common what the registration is wrong by.
     """
     found = [Believed(np.zeros(COUNT), *np.zeros((2, COUNT, COUNT))) for _ in ends]
     faces = [
@@ -238,7 +238,8 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
         for plane in SIZES_MM
         for bend, before in zip(BENDS_MM, STRAIGHT, strict=True)
     ]
-    for rows, hypotheses in ((slice(0, COUNT - RING), faces), (slice(COUNT - RING, COUNT), ring)):
+    of_faces, of_ring = slice(0, COUNT - RING), slice(COUNT - RING, COUNT)
+    for rows, hypotheses in ((of_faces, faces), (of_ring, ring)):
         before = np.array([weight for weight, _ in hypotheses])
         sizes = np.array([size for _, size in hypotheses])
         seen = [_rows(end, rows, sizes) for end in ends]
@@ -246,6 +247,10 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
         for one, log, weights, into in zip(seen, logs, by_the_others(logs, before), found, strict=True):
             own = _of_rows(one, log, sizes, before, weights)
             into.mean[rows], into.covariance[rows, rows], into.gain[rows, rows] = own.mean, own.covariance, own.gain
+    for end, into in zip(ends, found, strict=True):
+        left = into.left_of(end.moves)
+        both = left[of_faces] @ end.pose @ left[of_ring].T
+        into.covariance[of_faces, of_ring], into.covariance[of_ring, of_faces] = both, both.T
     return found
 
 
