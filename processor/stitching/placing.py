@@ -101,28 +101,39 @@ def ranking(
     asked: Asked,
     own: Floats | None = None,
 ) -> list[tuple[float, Floats]]:
-    """Poses of scan j with the score that all of ``done`` give them together, the best first."""
-    poses: list[tuple[Floats, float]] = [] if own is None else [(own, np.inf)]
+    """Poses of scan j with the score that all of ``done`` give them together, the best first.
+
+    Each scan has a pose a little elsewhere: by that from one alone, a decimetre off, the right one may look wrong to
+    the others. A pose is worth what the best of them is.
+    """
+    poses: list[tuple[list[Floats], float]] = [] if own is None else [([own], np.inf)]
     for i in done:
         for T_i_j, score in towards(candidates, i, j):
             pose = T[i] @ T_i_j
-            for row, (other, sum_) in enumerate(poses):
-                if coarse.same(other, pose, views[0].side_mm, views[j]):
-                    poses[row] = (other, sum_ + score)
+            for row, (alike, sum_) in enumerate(poses):
+                if coarse.same(alike[0], pose, views[0].side_mm, views[j]):
+                    poses[row] = ([*alike, pose], sum_ + score)
                     break
             else:
-                poses.append((pose, score))
+                poses.append(([pose], score))
     poses.sort(key=lambda one: -one[1])
     found = []
-    for pose, _ in poses[:MOST_TRIED]:
-        agree, against, total = 0.0, 0.0, 0.0
-        for i in done:
-            one = held(views, T, i, j, pose, asked)
-            against += one.against
-            if one.overlap > LEAST_OVERLAP:
-                agree += one.agree
-                total += one.agree / one.overlap
-        if agree > 0.0:
-            found.append((coarse.score(agree, against, total), pose))
+    for alike, _ in poses[:MOST_TRIED]:
+        scores = [together(views, T, done, j, one, asked) for one in alike]
+        best = int(np.argmax(scores))
+        if scores[best] > 0.0:
+            found.append((scores[best], alike[best]))
     found.sort(key=lambda one: -one[0])
     return found
+
+
+def together(views: list[View], T: Floats, done: list[int], j: int, pose: Floats, asked: Asked) -> float:
+    """Return the score that all of ``done`` give a pose (4, 4) of scan j together; 0 where none agrees."""
+    agree, against, total = 0.0, 0.0, 0.0
+    for i in done:
+        one = held(views, T, i, j, pose, asked)
+        against += one.against
+        if one.overlap > LEAST_OVERLAP:
+            agree += one.agree
+            total += one.agree / one.overlap
+    return coarse.score(agree, against, total)

@@ -1,0 +1,34 @@
+"""Where a scan is placed by all that stand already, by made-up scores."""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.stitching import coarse, placing
+
+
+def test_a_pose_is_worth_what_the_best_of_its_versions_is(monkeypatch):
+    """By scan 0 the right pose of scan 2 is 250 mm off, and the others speak against it; by scan 1 it is right."""
+    right, turned = (rigid.transform(np.eye(3), np.array([x, 0.0, 0.0])) for x in (0.0, 50_000.0))
+    near = rigid.transform(np.eye(3), np.array([250.0, 0.0, 0.0]))
+
+    def apart(pose, other):
+        return float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
+
+    def held(views, T, i, j, pose, asked):
+        against = 10.0 if apart(pose, turned) < 1.0 else 0.05 * apart(pose, right)
+        return coarse.Placing(pose, 600.0, against, 0.4)
+
+    monkeypatch.setattr(placing, "held", held)
+    monkeypatch.setattr(coarse, "same", lambda T, S, side, b: apart(T, S) < 500.0)
+    candidates = {
+        (0, 2): [coarse.Placing(near, 1.0, 0.0, 0.4), coarse.Placing(turned, 0.9, 0.0, 0.4)],
+        (1, 2): [coarse.Placing(right, 1.0, 0.0, 0.4), coarse.Placing(turned, 0.9, 0.0, 0.4)],
+    }
+    assert placing.together([], np.zeros(0), [0], 2, near, {}) < placing.together([], np.zeros(0), [0], 2, turned, {})
+    views = [SimpleNamespace(side_mm=700.0)] * 3
+    ranked = placing.ranking(views, candidates, np.tile(np.eye(4), (3, 1, 1)), [0, 1], 2, {})
+    np.testing.assert_array_equal(ranked[0][1], right)
+    np.testing.assert_array_equal(ranked[1][1], turned)
+    assert ranked[0][0] > 0.9 > 0.1 > ranked[1][0]
