@@ -308,8 +308,8 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
     assert np.isnan(result.gaps[1:]).all()
 
 
-def test_a_temperature_that_is_not_corrected_is_said(bridge):
-    scene, _ = bridge
+def test_a_temperature_that_is_not_corrected_is_said():
+    scene, _ = arch_clouds.bridge(spacing_mm=25.0, sigma_mm=1.0, seed=1)
     result = preassemble.run(dataclasses.replace(scene, temperature_C=31.5), preassemble.Params(method="corner"))
     assert "temperature (31.5 C) is not corrected" in result.message
 

@@ -64,7 +64,10 @@ def test_many_scans_keep_the_page_small(made):
     assert sum(len(part["residual"]) for part in data["parts"]) <= view_stitch.MOST_POINTS
 
 
-@pytest.mark.parametrize(("lang", "unit"), [("en", "mm from the other scans at"), ("zh", "相对其他扫描")])
+@pytest.mark.parametrize(
+    ("lang", "unit"),
+    [("en", "mm from the other scans at"), pytest.param("zh", "相对其他扫描", marks=pytest.mark.slow)],
+)
 def test_scans_in_space_react(made, tmp_path, lang, unit):
     report = ErrorReport()
     (tmp_path / "page.html").write_text(page.html(made, report, figures.of_run(made, report), lang), "utf-8")
