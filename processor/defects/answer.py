@@ -182,25 +182,16 @@ def _places(found: Found) -> Iterator[Row]:
         length, width = float(got.extent[0]), float(got.extent[1])
         if main.sign == 0:
             named = classes.of_missing(got.borders, length, width, known, main.z)
+            depth, remark = got.depth, "" if np.isfinite(thick) else "the design says no thickness here"
         else:
             if abs(got.depth) < SHALLOW_SHARE * peaks.get(component, 0.0):
                 continue
             named = classes.of_deviation(main.sign, got.diameter, length, width, known, main.z)
-        depth, remark = got.depth, ""
-        if main.sign != 0 and got.diameter < SMALL_CELLS * surface.charts.cell_mm and named.kind != "crack":
-            got = small.refined(got, main, found.near, found.field, found.shape_values)
-            depth = got.depth
-        if main.sign != 0 and not abs(depth) > got.lod95:
-            continue  # crumbs about a defect, which only its nearness made significant
-        if named.kind == "crack" and main.sign != 0:
-            there = (found.field.count + found.field.stray)[main.cells].sum()
-            hoped = found.hoped.points[main.cells].sum()
-            if hoped > 0.0 and there < THROUGH_SHARE * hoped and np.isfinite(thick):
-                depth, remark = thick, "rays went through: as deep as the plate is thick"
-            else:
-                remark = "at least so deep: too narrow for a beam to see its ground"
-        if main.sign == 0 and not np.isfinite(thick):
-            remark = "the design says no thickness here"
+            if got.diameter < SMALL_CELLS * surface.charts.cell_mm and named.kind != "crack":
+                got = small.refined(got, main, found.near, found.field, found.shape_values)
+            if not abs(got.depth) > got.lod95:
+                continue  # crumbs about a defect, which only its nearness made significant
+            depth, remark = _depth_of_crack(found, main, got.depth, thick) if named.kind == "crack" else (got.depth, "")
         columns = {
             "centres": got.centre, "axes": got.axes, "extent": got.extent, "area_mm2": got.area,
             "depth_max": depth, "depth_ci95": got.depth_ci95, "depth_mean": got.mean,
@@ -210,3 +201,12 @@ def _places(found: Found) -> Iterator[Row]:
         yield Row(
             named, component, columns, np.unique(np.concatenate([one.cells for one in group])), found.left, remark
         )
+
+
+def _depth_of_crack(found: Found, main: Region, depth: float, thick: float) -> tuple[float, str]:
+    """Return how deep a crack is, mm, and what that rests on; ``depth`` is what beams saw of it."""
+    there = (found.field.count + found.field.stray)[main.cells].sum()
+    hoped = found.hoped.points[main.cells].sum()
+    if hoped > 0.0 and there < THROUGH_SHARE * hoped and np.isfinite(thick):
+        return thick, "rays went through: as deep as the plate is thick"
+    return depth, "at least so deep: too narrow for a beam to see its ground"

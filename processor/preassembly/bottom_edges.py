@@ -55,7 +55,7 @@ def measure(
     ``outer`` are the outer faces of ``surface``.
     """
     sides: list[str] = []
-    arcs, places, axes, smoothed, by_pose = [], [], [], [], []
+    arcs, places, axes, departures, own_noise, by_pose = [], [], [], [], [], []
     for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
         count = max(1, int(line.length / STATION_MM))
         arc = STATION_MM * (np.arange(count, dtype=np.float64) + 0.5)
@@ -94,26 +94,19 @@ def measure(
         frame = _frame(line, other, arc, sense)
         axes.append(np.stack([frame[1], frame[2]], axis=1))
         moves = [np.einsum("ki,kij->kj", frame[k], rigid.motion(line.at(arc))) for k in (1, 2)]
-        smoothed.append([smooth(arc, *one, moved @ pose @ moved.T) for one, moved in zip(found, moves, strict=True)])
-        by_pose.append([one.left_of(moved) for one, moved in zip(smoothed[-1], moves, strict=True)])
+        both = [smooth(arc, *one, moved @ pose @ moved.T) for one, moved in zip(found, moves, strict=True)]
+        left_over = [one.left_of(moved) for one, moved in zip(both, moves, strict=True)]
+        departures.append(np.stack([one.mean for one in both], axis=1))
+        own_noise.append([one.covariance - F @ pose @ F.T for one, F in zip(both, left_over, strict=True)])
+        by_pose.append(np.stack(left_over, axis=1))
     return EdgeStations(
         tuple(sides),
         np.concatenate(arcs),
         np.concatenate(places),
         np.concatenate(axes),
-        np.concatenate([np.stack([one.mean for one in both], axis=1) for both in smoothed]),
-        np.array(
-            [
-                block_diag(
-                    *(
-                        both[k].covariance - follows[k] @ pose @ follows[k].T
-                        for both, follows in zip(smoothed, by_pose, strict=True)
-                    )
-                )
-                for k in range(2)
-            ]
-        ),
-        np.concatenate([np.stack(both, axis=1) for both in by_pose]),
+        np.concatenate(departures),
+        np.array([block_diag(*sides_of_axis) for sides_of_axis in zip(*own_noise, strict=True)]),
+        np.concatenate(by_pose),
     )
 
 

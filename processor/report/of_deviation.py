@@ -9,7 +9,8 @@ import numpy as np
 
 from processor.deviation.result import Result
 from processor.evaluate import ErrorReport
-from processor.model import NORMAL_95, Ints, Scene, StepRun
+from processor.geometry.m3c2 import Z95
+from processor.model import Ints, Scene, StepRun
 from processor.pipeline import Execution
 from processor.report import core_points, figures_deviation, results_deviation, view_points
 from processor.report.drawing import Drawn
@@ -28,7 +29,7 @@ def _summary(result: Result) -> tuple[str, str]:
     low, high, near = (
         _percent(one) for one in (result.significant_low, result.significant_high, found["within_10mm_share"])
     )
-    registration = shown(NORMAL_95 * result.registration_error)
+    registration = shown(Z95 * result.registration_error)
     said = (
         f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; "
         f"median LOD95 {shown(found['lod95_median'])} mm, {registration} mm of it registration. "
