@@ -10,6 +10,7 @@ import numpy as np
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Scan
 from processor.stitching import frames, pairs
+from processor.stitching.dissent import Dissent
 from processor.stitching.pairs import Pair
 from processor.stitching.params import Params
 from processor.stitching.placing import AMBIGUOUS
@@ -36,6 +37,7 @@ class Network:
     messages: list[str]
     scale: Floats = field(default_factory=lambda: np.empty(0))
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
+    dissent: Sequence[Dissent] = ()  # about each scan's pose, where faces hold it
     spread: tuple[float, ...] = (float("nan"),) * 3  # noise, patches, ends
 
 
@@ -99,6 +101,13 @@ def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params:
     rivalry = float(network.rivalry[s])
     if network.contrary[s] > CONTRARY:
         return "weak", f"much speaks against its pose ({100.0 * network.contrary[s]:.0f} % of what speaks for it)"
+    if network.dissent and network.dissent[s].counts:
+        other = network.dissent[s]
+        where = f"{other.shift_mm:.2g} mm and {other.turn_mrad:.2g} mrad elsewhere"
+        return "weak", (
+            f"{other.agree} faces agree that it stands {where}, {other.hold} speak against that: "
+            "something moved in between, or the scan is bent"
+        )
     if network.shared[s] < LITTLE:
         return "weak", f"it shares little with any other scan ({100.0 * network.shared[s]:.0f} %)"
     if rivalry > AMBIGUOUS:

@@ -11,10 +11,23 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.model import Floats, Scan
-from processor.stitching import bounding, bundle, clouds, coarse, joint, pairs, picks, placing, regional, three_point
+from processor.stitching import (
+    bounding,
+    bundle,
+    clouds,
+    coarse,
+    dissent,
+    joint,
+    pairs,
+    picks,
+    placing,
+    regional,
+    three_point,
+)  # fmt: skip
 from processor.stitching.bundle import Solution
 from processor.stitching.clouds import Cloud
 from processor.stitching.coarse import Placing, View
+from processor.stitching.dissent import Dissent
 from processor.stitching.joint import Blocks
 from processor.stitching.pairs import Pair
 from processor.stitching.params import Params
@@ -38,6 +51,7 @@ class Found:
     overlap: list[float]
     elsewhere: list[bool]
     gross: list[bool]
+    dissent: list[Dissent]  # about each scan's pose
 
 
 def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: picks.Picked, threads: int = 0) -> Found:
@@ -65,7 +79,8 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: picks.
         overlap.append(held.overlap)
         first = candidates[pair.a, pair.b][:1]
         elsewhere.append(not first or not coarse.same(first[0].T_a_b, T, side, views[pair.b]))
-    return Found(own, placed, solution, blocks, measured, overlap, elsewhere, gross)
+    apart = dissent.of_scans(own, solution, GATES[0] * max(cloud.cell_mm for cloud in own))
+    return Found(own, placed, solution, blocks, measured, overlap, elsewhere, gross, apart)
 
 
 def _usable() -> int:

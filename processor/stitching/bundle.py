@@ -20,6 +20,7 @@ from processor.stitching.joint import Blocks
 
 HUBER = 2.5
 DROPPED = 6.0  # standard deviations of a scan's misfit on a piece
+ASIDE, SETTLED = 1e-3, 8  # a weight below which a piece is left aside; rounds until weights have settled
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # keep what nothing tells where it is
 MEDIAN = 0.6745  # of |z|, z normal
 KINDS = 2
@@ -95,6 +96,14 @@ def solve(
     )
 
 
+def weights_at(blocks: Blocks, T: Floats, tau: tuple[float, ...]) -> Floats:
+    """Return the weights (b,) that blocks have where poses T (k, 4, 4) are held."""
+    weight = np.ones(len(blocks.piece))
+    for _ in range(SETTLED):
+        weight = _robust(blocks, _normal(blocks, T, np.array(tau), weight)[3])
+    return weight
+
+
 def step_without(
     blocks: Blocks, solution: Solution, reference: int, out: npt.NDArray[np.bool_], almost_none: float
 ) -> Floats:
@@ -131,7 +140,7 @@ def _robust(blocks: Blocks, z: Floats) -> Floats:
     One of two scans cannot be told to be the wrong one, and alone it would seem to fit without a misfit.
     """
     weight = np.where(np.abs(z) > DROPPED, 1e-6, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)))
-    left = np.bincount(blocks.piece, weight > 1e-3, blocks.pieces)
+    left = np.bincount(blocks.piece, weight > ASIDE, blocks.pieces)
     least = np.ones(blocks.pieces)
     np.minimum.at(least, blocks.piece, weight)
     found: Floats = np.where(left[blocks.piece] < 2, least[blocks.piece], weight)
