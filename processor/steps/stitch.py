@@ -64,7 +64,7 @@ def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, pa
         found.solution.T, found.solution.covariance, origins, found.placed.rivalry, found.placed.T_rival,
         found.placed.contrary, found.placed.overlap, found.pairs,
         np.array(found.overlap), [not bad for bad in found.gross], messages,
-        dissent=found.dissent,
+        dissent=found.dissent, refuted=found.refuted,
         spread=(float(np.median([cloud.sigma_mm for cloud in found.clouds])), *found.solution.tau[:2]),
     )  # fmt: skip
     return answer.result(scans, network, reference, params)

@@ -37,6 +37,7 @@ class Network:
     messages: list[str]
     scale: Floats = field(default_factory=lambda: np.empty(0))
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
+    refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`placing.refuted`
     dissent: Sequence[Dissent] = ()  # about each scan's pose, where faces hold it
     spread: tuple[float, ...] = (float("nan"),) * 3  # noise, patches, ends
 
@@ -103,10 +104,9 @@ def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params:
         return "weak", f"much speaks against its pose ({100.0 * network.contrary[s]:.0f} % of what speaks for it)"
     if network.dissent and network.dissent[s].counts:
         other = network.dissent[s]
-        where = f"{other.shift_mm:.2g} mm and {other.turn_mrad:.2g} mrad elsewhere"
         return "weak", (
-            f"{other.agree} faces agree that it stands {where}, {other.hold} speak against that: "
-            "something moved in between, or the scan is bent"
+            f"{other.agree} faces agree that it stands {other.shift_mm:.2g} mm and {other.turn_mrad:.2g} mrad "
+            f"elsewhere, {other.hold} speak against that: something moved in between, or the scan is bent"
         )
     if network.shared[s] < LITTLE:
         return "weak", f"it shares little with any other scan ({100.0 * network.shared[s]:.0f} %)"
@@ -117,6 +117,11 @@ def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params:
     if place_sd.max() > params.weak_mm or 1e3 * turn_sd.max() > params.weak_mrad:
         place, turn = NORMAL_95 * place_sd.max(), 1e3 * NORMAL_95 * turn_sd.max()
         return "weak", f"its pose is sure to {place:.2g} mm and {turn:.2g} mrad only"
+    if len(network.refuted) and network.refuted[s] > 0.0:
+        return "ambiguous", (
+            f"{100.0 * network.refuted[s]:.2g} % of what it shares with the only scan beside it was looked through, as "
+            "where a structure repeats itself or things moved: a third scan, common points or control would tell"
+        )
     return "ok", ""
 
 

@@ -52,6 +52,7 @@ class Found:
     elsewhere: list[bool]
     gross: list[bool]
     dissent: list[Dissent]  # about each scan's pose
+    refuted: Floats  # (k,), see placing.refuted
 
 
 def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: picks.Picked, threads: int = 0) -> Found:
@@ -72,15 +73,20 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: picks.
         blocks = _without(blocks, bad)
         solution = bundle.solve(blocks, solution.T, reference)
     solution = regional.honest(blocks, solution, reference)
-    overlap, elsewhere = [], []
+    standing = {key: rigid.invert(solution.T[key[0]]) @ solution.T[key[1]] for key in keys}
+    held = {
+        (a, b): coarse.held(views[a], views[b], T, coarse.NEAR * side, coarse.MARGIN * side)
+        for (a, b), T in standing.items()
+        if np.isfinite(T).all()
+    }
+    elsewhere = []
     for pair in measured:
-        T = rigid.invert(solution.T[pair.a]) @ solution.T[pair.b]
-        held = coarse.held(views[pair.a], views[pair.b], T, coarse.NEAR * side, coarse.MARGIN * side)
-        overlap.append(held.overlap)
         first = candidates[pair.a, pair.b][:1]
-        elsewhere.append(not first or not coarse.same(first[0].T_a_b, T, side, views[pair.b]))
+        elsewhere.append(not first or not coarse.same(first[0].T_a_b, standing[pair.a, pair.b], side, views[pair.b]))
+    overlap = [held[pair.a, pair.b].overlap for pair in measured]
     apart = dissent.of_scans(own, solution, GATES[0] * max(cloud.cell_mm for cloud in own))
-    return Found(own, placed, solution, blocks, measured, overlap, elsewhere, gross, apart)
+    refuted = placing.refuted(held, len(own), reference)
+    return Found(own, placed, solution, blocks, measured, overlap, elsewhere, gross, apart, refuted)
 
 
 def _usable() -> int:

@@ -26,6 +26,7 @@ INSIDE = 0.75  # of the width between two rays, half of it to either side and ha
 MOST_NODES_MM = 4000.0
 UNIFORM = 1.0 / 12.0  # variance of a place anywhere in a gap, in gaps
 RUN_JUMP = 0.1  # gaps: ends of one run are no farther apart
+HARMONICS = 16  # of the pattern that an edge makes with the scanner's rows and columns
 
 LOOSE_MM = 1.0  # standard deviation of a motion that faces alone do not tell
 LEVER_MM = 1e4  # a turn counts by what it moves so far off
@@ -39,7 +40,7 @@ class Matches:
     """Ends (n, 3) of scans (n,), in their clouds' frames, on pieces (n,) that bound them.
 
     ``off`` (n,) is how far beyond the piece each lies, ``width`` (n,) the room between its two rays, both across the
-    piece; ``normal`` (n, 3) the piece's; ``gap`` (n,) as of :class:`Ends`.
+    piece; ``normal`` (n, 3) the piece's; ``gap`` and ``edge`` (n,) as of :class:`Ends`.
     """
 
     piece: Ints
@@ -49,6 +50,7 @@ class Matches:
     width: Floats
     normal: Floats
     gap: Ints
+    edge: Ints
 
 
 def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear: bool = False) -> Matches:
@@ -66,7 +68,7 @@ def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clea
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
     normal = planes.normal * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     half = REACH * np.sqrt(planes.variance[:, 1:]) + 2.0 * clouds[0].cell_mm
-    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, Ints]] = []
+    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, Ints, Ints]] = []
     for s, cloud in enumerate(clouds):
         if not len(cloud.ends.points) or not np.isfinite(T[s]).all():
             continue
@@ -103,12 +105,12 @@ def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clea
         piece = q[rows, best[rows]]
         found.append(
             (piece, np.full(len(rows), s), cloud.ends.points[rows], off[rows, best[rows]], width[rows, best[rows]],
-             normal[piece], cloud.ends.gap[rows])
+             normal[piece], cloud.ends.gap[rows], cloud.ends.edge[rows])
         )  # fmt: skip
     if not found:
         none = np.empty(0, np.int64)
-        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)), none)
-    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(7)))
+        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)), none, none)
+    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(8)))
 
 
 def variance(ends: Matches) -> Floats:
@@ -116,7 +118,8 @@ def variance(ends: Matches) -> Floats:
 
     An end is anywhere in its gap, of variance 1/12 in gaps. But an edge along the scanner's rows or columns, as a post
     is, lies at the same part of one gap all its way: its many ends tell no more than one. What the ends of a run do not
-    scatter by within the gap, of the 1/12, they have in common.
+    scatter by within the gap, of the 1/12, they have in common. One that crosses rows and columns in step, as at 45
+    degrees, lies at the same part of each gap: see :func:`in_step`. What says more is taken.
     """
     share = ends.off / np.maximum(ends.width, 1e-9)
     order = np.lexsort([share, ends.gap, ends.scan])
@@ -129,7 +132,25 @@ def variance(ends: Matches) -> Floats:
     mean = np.bincount(run, share) / count
     scatter = np.bincount(run, (share - mean[run]) ** 2) / np.maximum(count - 1.0, 1.0)
     of_mean = np.maximum(UNIFORM - scatter, UNIFORM / count)
-    found: Floats = ends.width**2 * (count * of_mean)[run]
+    key = np.stack([ends.scan, ends.piece, ends.edge])
+    _, edge = np.unique(key, axis=1, return_inverse=True)
+    found: Floats = ends.width**2 * np.maximum((count * of_mean)[run], in_step(share, edge.ravel()))
+    return found
+
+
+def in_step(share: Floats, edge: Ints) -> Floats:
+    """Variance (n,), in gaps^2, of the mean of an edge's ends, times their number: those at shares (n,) of their gaps.
+
+    Were the edge moved, all shares would move alike and begin anew at the gap's other end. Over all such moves, two
+    ends whose shares differ by d have the covariance 1/12 - d (1 - d) / 2, which is the sum over k of
+    cos(2 pi k d) / (2 pi^2 k^2). Ends anywhere in their gaps come to 1/12 each, all at one place to 1/12 together.
+    """
+    count = np.bincount(edge).astype(float)
+    total = np.zeros(len(count))
+    for k in range(1, HARMONICS + 1):
+        turn = 2.0 * np.pi * k * share
+        total += (np.bincount(edge, np.cos(turn)) ** 2 + np.bincount(edge, np.sin(turn)) ** 2) / (k * k)
+    found: Floats = np.maximum(total / (2.0 * np.pi**2 * count), UNIFORM)[edge]
     return found
 
 

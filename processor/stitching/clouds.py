@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import Floats, Ints, Scan
-from processor.stitching import grouping, octree
+from processor.stitching import borders, grouping, octree
 from processor.stitching import rays as grid_rays
-from processor.stitching.ends import Ends, ends_of
+from processor.stitching.ends import Ends, ends_of, grid_of
 from processor.stitching.octree import Planes
 from processor.stitching.sight import Sight
 
@@ -75,7 +75,14 @@ def prepared(scan: Scan, cell_mm: float = 0.0) -> Cloud:
     cells = cells[first]
     sigma = _scatter(cells, sums, size, scan.sigma_mm)
     piece, level = octree.flat_pieces(cells, sums, size, LIMIT_SIGMAS * sigma, LEVELS)
-    on = np.flatnonzero(piece >= 0)
+    on_grid = known and len(scan.grid_row) > 0
+    if on_grid:
+        row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
+        held = np.flatnonzero(piece >= 0)
+        rough = octree.planes_of(grouping.summed(sums[held], piece[held], len(level)))
+        sure = borders.inside(points, grid_of(row, column), piece[of_point], rough)
+        sums = grouping.sums_of_points(points[sure], of_point[sure], len(first))
+    on = np.flatnonzero((piece >= 0) & (sums[:, 9] > 0.0))
     # Cells of large pieces are put together: there are many, and they say little that a coarser one does not.
     down = np.maximum(level[piece[on]] - KEPT_BELOW, 0)
     key = octree.packed(cells[on] >> down[:, None])
@@ -92,8 +99,7 @@ def prepared(scan: Scan, cell_mm: float = 0.0) -> Cloud:
         turn = np.ones(len(planes.normal))
     planes = Planes(planes.count, planes.mean, planes.normal * turn[:, None], planes.variance, planes.axes)
     ends, lost = Ends(), np.empty((0, 3))
-    if known and len(scan.grid_row):
-        row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
+    if on_grid:
         rays = grid_rays.fitted(points, row, column)
         if rays is not None:
             ends = ends_of(points, row, column, piece[of_point], planes, sigma, rays)

@@ -18,8 +18,19 @@ SIDES = 48.0  # a view's coarse cubes: so many along the reach of the points
 LIKE_COS = float(np.cos(np.radians(15.0)))
 FEWEST = 6  # faces
 FINE = 0.3  # of the cubes' side
-CHECKED = 60  # poses of a pair that are held against the rays
-REFINED = 8  # poses of a pair that are refined
+
+
+@dataclass(frozen=True)
+class Search:
+    """How far to look: shifts of a turn, least votes by the most, poses held against the rays, and poses refined."""
+
+    peaks: int
+    least_of_best: float
+    checked: int
+    refined: int
+
+
+QUICK, WIDE = Search(votes.PEAKS, votes.LEAST_OF_BEST, 60, 8), Search(15, 0.3, 150, 20)
 GATES = (0.7, 0.35, 0.2, 0.12)  # of the cubes' side
 FEW_ABOVE = 0.3  # of the cubes' side: wider gates ask the faces that vote alone
 STEPS = 4
@@ -31,6 +42,8 @@ SLID, SLIDES = 3, (-1.2, -0.9, -0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.9, 1.2)  # pos
 LOOSE = 0.01  # of the strength of the strongest direction
 ENOUGH = 0.08  # overlap that two scans should have; less is a weak sign
 AGAINST_SHARE = 0.007
+SURE = 0.5  # score of a pose that rays do not speak against; right ones have over 0.7, a truss turned round under 0.3
+LITTLE_AGAINST = AGAINST_SHARE * math.log(1.0 / SURE)
 SAME_MM, SAME_RAD = 0.7, 0.03  # of the cubes' side; poses closer than that are one
 
 
@@ -100,18 +113,28 @@ def view(cloud: Cloud, side_mm: float) -> View:
 
 
 def placings(a: View, b: View, most_tilt_rad: float, most: int = 4) -> list[Placing]:
-    """Poses of b to a, the best first; none where nothing is alike."""
+    """Poses of b to a, the best first; none where nothing is alike.
+
+    Where rays speak against all that a quick look finds, as on a structure that repeats itself, a wider one follows.
+    """
     if min(len(a.coarse.points), len(b.coarse.points)) < FEWEST:
         return []
+    found = _searched(a, b, most_tilt_rad, most, QUICK)
+    return found if found and found[0].score > SURE else _searched(a, b, most_tilt_rad, most, WIDE)
+
+
+def _searched(a: View, b: View, most_tilt_rad: float, most: int, search: Search) -> list[Placing]:
     tried: list[tuple[float, Floats]] = []
     for R in directions.turns(a.modes, b.modes, most_tilt_rad):
-        for t, score in zip(*votes.shifts(*a.voters, *b.voters, R, a.side_mm), strict=True):
+        found_of_turn = votes.shifts(*a.voters, *b.voters, R, a.side_mm, search.peaks, search.least_of_best)
+        for t, score in zip(*found_of_turn, strict=True):
             tried.append((float(score), rigid.transform(R, t)))
-    tried = sorted(tried, key=lambda one: -one[0])[:CHECKED]
+    tried = sorted(tried, key=lambda one: -one[0])[: search.checked]
     checked = [held(a, b, T, 0.7 * a.side_mm, a.side_mm, few=True) for _, T in tried]
     checked.sort(key=lambda one: -one.score)
     refined = [
-        held(a, b, refine(a, b, one.T_a_b)[0], NEAR * a.side_mm, MARGIN * a.side_mm) for one in checked[:REFINED]
+        held(a, b, refine(a, b, one.T_a_b)[0], NEAR * a.side_mm, MARGIN * a.side_mm)
+        for one in checked[: search.refined]
     ]
     refined.sort(key=lambda one: (-one.score, -one.agree))
     refined = [slid(a, b, one) for one in refined[:SLID]] + refined[SLID:]

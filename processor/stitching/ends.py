@@ -27,13 +27,15 @@ WIDEST = 0.02  # of the range: a step between rays, along the face, beyond which
 class Ends:
     """Ends (n, 3) in the cloud's frame, the way across each from ray to ray (n, 3), and the faces' normals (n, 3).
 
-    ``gap`` (n,) numbers the two rows or columns of the scanner's grid that an end lies between.
+    ``gap`` (n,) numbers the two rows or columns of the scanner's grid that an end lies between, ``edge`` (n,) the face
+    and the way that its ray leaves it.
     """
 
     points: Floats = field(default_factory=lambda: np.empty((0, 3)))
     across: Floats = field(default_factory=lambda: np.empty((0, 3)))
     normals: Floats = field(default_factory=lambda: np.empty((0, 3)))
     gap: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    edge: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 def grid_of(row: Ints, column: Ints) -> Ints:
@@ -101,8 +103,11 @@ def ends_of(points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes
         behind = (j < 0) | (np.linalg.norm(points[j], axis=1) - far > np.maximum(JUMP_SIGMAS * sigma_mm, 0.3 * width))
         good = on & behind & (near > 0.0) & (far > 0.0) & (width < WIDEST * np.linalg.norm(points[i], axis=1))
         gap = len(WAYS) * (row[i] if up else column[i]) + way
-        found.append((0.5 * (a + b)[good], (b - a)[good], n[good], gap[good]))
-    return Ends(*(np.concatenate([one[m] for one in found]) for m in range(4)))
+        # Rays part evenly by angle, not along a face that leans away: the gaps beyond an edge are wider than before it.
+        a, b, near, far = a[good], b[good], near[good], far[good]
+        middle = 0.5 * (a + b) - (b - a) * (2.0 / 3.0 * (far - near) / (far + near))[:, None]
+        found.append((middle, b - a, n[good], gap[good], len(WAYS) * face[good] + way))
+    return Ends(*(np.concatenate([one[m] for one in found]) for m in range(5)))
 
 
 def _leaving(grid: Ints, on_face: Ints, up: int, left: int) -> tuple[Ints, Ints, Ints]:

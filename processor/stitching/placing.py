@@ -80,6 +80,22 @@ def place(views: list[View], candidates: Candidates, reference: int) -> Placed:
     return Placed(T, rivalry, T_rival, contrary, overlap)
 
 
+def refuted(held: dict[tuple[int, int], Placing], count: int, reference: int) -> Floats:
+    """Return what speaks against poses as found (count,), of what speaks for them; 0 where they are sure enough.
+
+    ``held`` is what each pair has to say. Asked only of scans that rest on one other alone: a structure that repeats
+    itself looks so, one bay on or turned round. Where several tell the same, they would all have to be wrong.
+    """
+    found = np.zeros(count)
+    for j in set(range(count)) - {reference}:
+        own = [one for pair, one in held.items() if j in pair]
+        supporting = [one for one in own if one.overlap > LEAST_OVERLAP]
+        against = sum(one.against for one in own)
+        if len(supporting) == 1 and against > coarse.LITTLE_AGAINST * supporting[0].agree:
+            found[j] = against / supporting[0].agree
+    return found
+
+
 def held(views: list[View], T: Floats, i: int, j: int, pose: Floats, asked: Asked) -> Placing:
     """Count what speaks for and against a pose (4, 4) of scan j, beside scan i at its pose in T (k, 4, 4).
 

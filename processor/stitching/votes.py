@@ -10,8 +10,7 @@ from processor.model import Floats
 from processor.stitching.elements import Elements, facing
 
 LIKE_COS = float(np.cos(np.radians(10.0)))
-PEAKS = 6  # shifts kept of a turn
-LEAST_OF_BEST = 0.5
+PEAKS, LEAST_OF_BEST = 6, 0.5  # shifts kept of a turn, by votes
 MOST_VOTERS = 350  # faces of a scan that look one way
 SPARE = 20.0  # a direction with few faces votes with less weight
 
@@ -67,7 +66,16 @@ def weights(normals: Floats) -> Floats:
     return found
 
 
-def shifts(a: Elements, wa: Floats, b: Elements, wb: Floats, R: Floats, bin_mm: float) -> tuple[Floats, Floats]:
+def shifts(
+    a: Elements,
+    wa: Floats,
+    b: Elements,
+    wb: Floats,
+    R: Floats,
+    bin_mm: float,
+    peaks: int = PEAKS,
+    least_of_best: float = LEAST_OF_BEST,
+) -> tuple[Floats, Floats]:
     """Shifts (k, 3) of b turned by R (3, 3) that most like faces agree with, and their votes (k,), the most first."""
     moved, normals = b.points @ R.T, b.normals @ R.T
     low = a.points.min(axis=0) - moved.max(axis=0) - 2.0 * bin_mm
@@ -76,7 +84,7 @@ def shifts(a: Elements, wa: Floats, b: Elements, wb: Floats, R: Floats, bin_mm: 
     votes, total = np.zeros(shape), np.zeros(shape)
     cast(a.points, a.normals, wa, moved, normals, wb, LIKE_COS, low, bin_mm, votes)
     most = smooth(votes, total)
-    where = np.argwhere(total >= LEAST_OF_BEST * most) if most > 0.0 else np.empty((0, 3), int)
+    where = np.argwhere(total >= least_of_best * most) if most > 0.0 else np.empty((0, 3), int)
     score = total[tuple(where.T)]
     order = np.argsort(-score, kind="stable")
     where, score = where[order], score[order]
@@ -86,7 +94,7 @@ def shifts(a: Elements, wa: Floats, b: Elements, wb: Floats, R: Floats, bin_mm: 
         if free[row]:
             found.append(row)
             free &= (np.abs(where - where[row]) > 2).any(axis=1)
-            if len(found) >= PEAKS:
+            if len(found) >= peaks:
                 break
     at = []
     for row in found:  # the middle of the votes around the peak

@@ -211,7 +211,7 @@ def test_a_run_is_reported_whole(room, tmp_path):
     rows = (tmp_path / "out" / "stitch.csv").read_text().splitlines()
     poses = np.array([[float(x) for x in row.split(",")[2:]] for row in rows[1:]]).reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, execution.runs[0].result.T_project_scan)
-    np.testing.assert_allclose(poses, result.T_project_scan, atol=1e-3)  # a scene file rounds to 0.01 mm
+    np.testing.assert_allclose(poses, result.T_project_scan, atol=1e-2)  # a scene file rounds to 0.01 mm
     names = {one.name for one in (tmp_path / "out").rglob("*")}
     assert names >= {
         "stitch-scans.csv",

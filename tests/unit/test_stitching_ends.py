@@ -59,7 +59,7 @@ def matches(share, gap, scan_row=None):
     width = np.full(n, 60.0)
     return bounding.Matches(
         zeros, zeros if scan_row is None else scan_row, np.zeros((n, 3)), share * width, width,
-        np.tile([0.0, 1.0, 0.0], (n, 1)), gap,
+        np.tile([0.0, 1.0, 0.0], (n, 1)), gap, zeros,
     )  # fmt: skip
 
 
@@ -68,7 +68,65 @@ def test_ends_in_one_gap_tell_no_more_than_one_others_as_many_as_they_are():
     rng = np.random.default_rng(0)
     post_ends = bounding.variance(matches(0.3 + rng.normal(0.0, 0.005, 200), np.zeros(200, np.int64)))
     assert 1.0 / (1.0 / post_ends).sum() > 0.98 * 60.0**2 / 12.0
-    slanting = bounding.variance(matches(rng.uniform(-0.5, 0.5, 200), np.arange(200)))
+    anywhere = (0.618034 * np.arange(200)) % 1.0 - 0.5
+    slanting = bounding.variance(matches(anywhere, np.arange(200)))
     np.testing.assert_allclose(slanting, 60.0**2 / 12.0)
     steep = bounding.variance(matches(np.linspace(-0.5, 0.5, 200), np.zeros(200, np.int64)))
     np.testing.assert_allclose(1.0 / (1.0 / steep).sum(), 60.0**2 / 12.0 / 200, rtol=0.3)
+
+
+def test_ends_of_an_edge_in_step_with_the_grid_by_moving_the_edge():
+    """The mean of all shares, the edge moved over a whole gap: its variance, worked out move by move."""
+    rng = np.random.default_rng(1)
+    moves = (np.arange(1000) + 0.5) / 1000.0
+    for share in (np.full(40, 0.2), np.tile([-0.4, 0.1], 20), 0.1 * rng.standard_normal(40) - 0.2, np.array([0.37])):
+        moved = (share[None] - moves[:, None] + 0.5) % 1.0 - 0.5
+        want = np.mean(moved.mean(axis=1) ** 2) * len(share)
+        found = bounding.in_step(share, np.zeros(len(share), np.int64))
+        np.testing.assert_allclose(found, max(want, 1.0 / 12.0), rtol=0.08)  # 16 harmonics, of which two in step have 8
+
+
+def test_far_edges_of_a_face_seen_at_a_slant_are_without_bias():
+    """A floor that ends 9 m ahead of a scanner 1.5 m above it: rays part evenly by angle, so gaps widen outward."""
+    height, edge, step = 1500.0, 9000.0, 2e-3
+    off, width = [], []
+    for phase in np.linspace(0.0, 1.0, 50, endpoint=False):
+        column, row = np.meshgrid(np.arange(60), np.arange(300))
+        turn, up = (column.ravel() - 30.3) * step, -0.4507 + (row.ravel() + phase) * step
+        u = np.stack([np.cos(up) * np.cos(turn), np.cos(up) * np.sin(turn), np.sin(up)], axis=1)
+        p = u * (-height / u[:, 2])[:, None]
+        hit = (u[:, 2] < 0.0) & (p[:, 0] < edge)
+        beside = ~hit & (row.ravel() > 280)  # something above gives the grid its rows
+        p[beside] = 20_000.0 * u[beside]
+        keep = hit | beside
+        plane = Planes(
+            np.ones(1), np.array([[0.0, 0.0, -height]]), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3)), np.eye(3)[None]
+        )
+        r, c = row.ravel()[keep], column.ravel()[keep]
+        found = ends.ends_of(p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, rays.fitted(p[keep], r, c))
+        far = (found.across[:, 0] > 0.0) & (np.abs(found.across[:, 1]) < 0.5 * found.across[:, 0])
+        assert far.sum() >= 40
+        off += (found.points[far, 0] - edge).tolist()
+        width += found.across[far, 0].tolist()
+    # Half way along the face would be 2 e-3 / 3 times 6, the tangent of the slant: 0.4 % of the gap too far out.
+    assert abs(np.mean(off)) < 0.001 * np.mean(width)
+
+
+def test_points_beside_the_next_face_are_left_out():
+    """A box corner: the front 5 m ahead ends at y = 0, and its side runs away from there."""
+    from processor.stitching import borders
+
+    y = np.linspace(-500.0, 200.0, 15) + 3.0
+    front = np.stack([np.full(15, 5000.0), y, np.zeros(15)], axis=1)
+    side = y > 0.0
+    front[side, 0] += 1.5 * y[side]
+    points = np.vstack([front + np.array([0.0, 0.0, 40.0 * i]) for i in range(3)])
+    grid = np.arange(45).reshape(3, 15)
+    piece = np.where(points[:, 1] < 60.0, 0, -1)  # two columns of the side's were taken in
+    plane = Planes(
+        np.ones(1), np.array([[5000.0, 0.0, 0.0]]), np.array([[-1.0, 0.0, 0.0]]), np.full((1, 3), 4.0), np.eye(3)[None]
+    )
+    kept = borders.inside(points, grid, piece, plane).reshape(3, 15)
+    ends_at = int((y < 0.0).sum())  # the first column there lies 4.5 mm behind the front: as noise may
+    assert not kept[:, ends_at:].any()
+    assert kept[:, 1:ends_at].all()

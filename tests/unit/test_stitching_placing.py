@@ -32,3 +32,16 @@ def test_a_pose_is_worth_what_the_best_of_its_versions_is(monkeypatch):
     np.testing.assert_array_equal(ranked[0][1], right)
     np.testing.assert_array_equal(ranked[1][1], turned)
     assert ranked[0][0] > 0.9 > 0.1 > ranked[1][0]
+
+
+def test_a_pose_that_rests_on_one_scan_is_refuted_by_what_was_looked_through():
+    """A bridge turned end for end: much agrees, and a few faces stand where the other scanner saw through."""
+    T = np.eye(4)
+    right, turned, apart = (coarse.Placing(T, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
+    np.testing.assert_array_equal(placing.refuted({(0, 1): right}, 2, 0), [0.0, 0.0])
+    np.testing.assert_allclose(placing.refuted({(0, 1): turned}, 2, 0), [0.0, 1.1 / 50.0])
+    # Two scans that tell the same would have to be wrong together; one that shares next to nothing tells nothing.
+    both = {(0, 1): right, (0, 2): turned, (1, 2): turned}
+    np.testing.assert_array_equal(placing.refuted(both, 3, 0), [0.0, 0.0, 0.0])
+    alone = {(0, 1): right, (0, 2): turned, (1, 2): apart}
+    np.testing.assert_allclose(placing.refuted(alone, 3, 0), [0.0, 2.02 / 50.0, 3.1 / 50.0])
