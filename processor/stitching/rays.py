@@ -15,7 +15,7 @@ class Rays:
     """Rays by rows and columns: ``height`` (rows,) along the axis a scanner turns about, ``turn`` (columns,) about it.
 
     ``axes`` (3, 3) has two directions across and the axis as columns. A column without points has no turn: NaN. A row
-    without points has the height between its neighbours'.
+    without points has the angle between its neighbours'.
     """
 
     axes: Floats
@@ -51,7 +51,8 @@ def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
     held = number > 0
     if held.sum() < 2:
         return None
-    heights = np.interp(np.arange(rows), np.flatnonzero(held), (mean @ axis)[held], left=np.nan, right=np.nan)
+    angles = np.arcsin(np.clip((mean @ axis)[held], -1.0, 1.0))  # scanners step by equal angles
+    heights = np.sin(np.interp(np.arange(rows), np.flatnonzero(held), angles, left=np.nan, right=np.nan))
     e1 = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(axis, e1)
