@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from processor import cad, readers, store
+from processor import cad, readers, scan_grids, store
 from processor.control_files import CONTROL, Measured, control_points, read_control
 from processor.design_files import MESH_SUFFIXES, read_design, read_json, read_surface
 from processor.fields import Table, inside
@@ -336,12 +336,15 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], places: Stati
             f"{entry.path}: its points name stations {raw.station.min()} to {raw.station.max()}, "
             f"but {STATIONS} has {len(places.ids)}, counted from 1"
         )
+    scanner = position if position.size else np.zeros(3)
+    grid = scan_grids.of_scanner(raw.points, raw.grid_row, raw.grid_column, scanner - raw.origin)
     return Scan(
         raw.name,
         used_up(raw, scale),
         origin,
         raw.intensity,
         station.astype(np.int32),
+        *grid,
         component=entry.component or (raw.name if raw.name in parts else ""),
         station=entry.station,
         position=position * scale,
