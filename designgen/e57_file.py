@@ -92,7 +92,8 @@ def _write_scan(image: Any, scans: Any, scan: Scan, number: int, *, spherical: b
         columns["intensity"] = scan.intensity
         low, high = float(scan.intensity.min()), float(scan.intensity.max())
         types["intensity"] = libe57.FloatNode(image, low, libe57.E57_SINGLE, low, high)
-    if len(scan.grid_row):
+    # Scans that were put into one cloud have the same numbers, which are no grid of the cloud's.
+    if len(scan.grid_row) and not len(scan.point_station):
         for name, cells in (("rowIndex", scan.grid_row), ("columnIndex", scan.grid_column)):
             columns[name] = cells.astype(np.longlong)  # of 64 bits by that name; the library takes "long" for 32
             least, most = int(cells.min()), int(cells.max())

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from processor import cad, readers, store
+from processor import cad, readers, scan_grids, store
 from processor.control_files import CONTROL, Measured, control_points, read_control
 from processor.design_files import MESH_SUFFIXES, read_design, read_json, read_surface
 from processor.fields import Table, inside
@@ -32,7 +32,7 @@ from processor.preassembly import tolerance
 from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.raw import decoded, stem, text_of, used_up
-from processor.units import MM_PER_UNIT, known_unit
+from processor.units import MM_PER_UNIT, STRAY, check_extent, known_unit
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -119,6 +119,10 @@ def _read_folder(folder: Path, asked: str) -> Scene:
         else:
             design = read_design(folder, project.design, project.design_units or asked or project.units or "m")
     scene = _scene(project, design, asked, _places(folder, project.units or asked or "m"))
+    if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
+        said = PROJECT if project.design_units or project.units else "--units" if asked else "nothing, so metres"
+        correct = f"say which it is by 'design_units' or 'units' in {PROJECT}"
+        check_extent(f"{project.design}: the design", scene.structure.vertices, unit, f"said by {said}", correct)
     if not (folder / PICKS).exists():
         return scene
     # Picks are in their scans' own units; where formats differ in these, --units says what all are in.
@@ -285,6 +289,8 @@ def _scene(
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
             _check_size(entry.path, scan, unit, reason, design)
+            correct = f"say which it is by --units or in {PROJECT}"
+            check_extent(f"{entry.path}: scan {scan.name!r}", scan.points, unit, reason, correct, STRAY)
             scans.append(scan)
             units.append(unit)
     where = places or _stations(scans)
@@ -336,12 +342,15 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], places: Stati
             f"{entry.path}: its points name stations {raw.station.min()} to {raw.station.max()}, "
             f"but {STATIONS} has {len(places.ids)}, counted from 1"
         )
+    scanner = position if position.size else np.zeros(3)
+    grid = scan_grids.of_scanner(raw.points, raw.grid_row, raw.grid_column, scanner - raw.origin)
     return Scan(
         raw.name,
         used_up(raw, scale),
         origin,
         raw.intensity,
         station.astype(np.int32),
+        *grid,
         component=entry.component or (raw.name if raw.name in parts else ""),
         station=entry.station,
         position=position * scale,

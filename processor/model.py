@@ -60,8 +60,8 @@ class Scan(Checked):
     )
     intensity: Floats = column("n")
     point_station: Labels = column("n", dtype=np.int32)  # row of Scene.stations a point was seen from, -1 = unknown
-    grid_row: Labels = column("n", dtype=np.int32)  # of the scanner's grid, upward; -1 = not on a grid
-    grid_column: Labels = column("n", dtype=np.int32)  # of the scanner's grid, counter-clockwise from above
+    grid_row: Labels = column("n", dtype=np.int32)  # of the scanner's grid: of one height; -1 = not on a grid
+    grid_column: Labels = column("n", dtype=np.int32)  # of one direction about the scanner's axis
     component: str = ""  # arch bridge: the part this is a scan of
     station: str = ""
     position: Floats = optional(3)  # of the scanner, in the scan's frame

@@ -78,8 +78,9 @@ def _las(version, form, suffix):
 def _e57(folder, spherical):
     pose = np.eye(4)
     pose[:3, 3] = 1_000.0
+    grid = {"grid_row": np.arange(COUNT) % 6, "grid_column": np.arange(COUNT) // 6}
     scans = [
-        Scan("S1", 1_000.0 * POINTS, intensity=np.arange(COUNT) % 9.0, T_project_scan=pose),
+        Scan("S1", 1_000.0 * POINTS, intensity=np.arange(COUNT) % 9.0, T_project_scan=pose, **grid),
         Scan("S2", 1_000.0 * POINTS),
     ]
     e57_file.write(folder / "a.e57", scans, spherical=spherical)

@@ -26,8 +26,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from processor.model import Floats, InputError
+from processor.model import InputError
 from processor.readers import raw
 from processor.readers.raw import RawScan
 
@@ -35,7 +36,7 @@ SLACK_BYTES = 1 << 30
 LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # no library for a format is nearly as slow
 PATIENCE = 4.0  # times as long by the clock: the machine may be busy with other work
 START_S = 120.0
-ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station")
+ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column")
 SMALL = 1 << 16
 START = "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from processor.readers import apart; apart.serve()"
 
@@ -208,16 +209,16 @@ class _Shared:
             with tempfile.TemporaryFile() as file:
                 self.descriptor = os.dup(file.fileno())
 
-    def new(self, shape: tuple[int, ...]) -> Floats:
+    def new(self, shape: tuple[int, ...], dtype: type) -> npt.NDArray[Any]:
         """Return an array in the shared memory, and allow the process as much more."""
-        size = 8 * math.prod(shape)
+        size = np.dtype(dtype).itemsize * math.prod(shape)
         if size < SMALL:
-            return np.empty(shape)
+            return np.empty(shape, dtype)
         _allow(size)
         offset = self.end
         self.end += -(-size // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
         os.ftruncate(self.descriptor, self.end)
-        array = np.frombuffer(mmap.mmap(self.descriptor, size, offset=offset), np.float64).reshape(shape)
+        array: npt.NDArray[Any] = np.frombuffer(mmap.mmap(self.descriptor, size, offset=offset), dtype).reshape(shape)
         self.blocks.append((_address(array), size, offset))
         return array
 

@@ -1,6 +1,7 @@
 """E57 (ASTM E2807): several scans a file, each named and with the pose of its scanner, in whose frame points stay.
 
-Points whose invalid state is set are no returns and are left out. SI metres.
+Points whose invalid state is set are no returns and are left out; the others keep the row and column of the scanner's
+grid, where the scan has both. SI metres.
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ XML_LIMIT = 64 << 20
 PIECE = 1 << 18
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 LONGEST_NAME = 100
+GRID = ("rowIndex", "columnIndex")
+MOST_LINES = 2**31 - 1  # of a grid whose rows and columns fit their type
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
@@ -123,6 +126,8 @@ def _read_scan(path: Path, file: Any, index: int, called: Sequence[str]) -> RawS
     points = room_for(declared, 3)
     intensity = room_for(declared if "intensity" in fields else 0)
     data, buffers = file.make_buffers(wanted, min(declared, PIECE) or 1)
+    grid = _grid_buffers(file, header, data, buffers, min(declared, PIECE) or 1)
+    cells = [room_for(declared, dtype=np.int32) for _ in grid]
     reader = header.points.reader(buffers)
     read = found = 0
     while declared and (rows := reader.read()):
@@ -140,6 +145,13 @@ def _read_scan(path: Path, file: Any, index: int, called: Sequence[str]) -> RawS
             xyz[:] = cartesian_from_spherical(*columns)
         if len(intensity):
             intensity[found : found + kept] = data["intensity"][:rows][valid]
+        for field, lines in zip(grid, cells, strict=True):
+            numbers = data[field][:rows][valid]
+            # Written so that NaN is refused as well.
+            if kept and not (numbers.min() >= 0 and numbers.max() < MOST_LINES):
+                grid, cells = (), []
+                break
+            lines[found : found + kept] = numbers
         found += kept
     if read != declared:
         raise InputError(f"{path}: scan {name!r} declares {declared} points but holds {read}; copy it again")
@@ -156,8 +168,26 @@ def _read_scan(path: Path, file: Any, index: int, called: Sequence[str]) -> RawS
         intensity=intensity[:found],
         position=np.zeros(3) if posed else (),
         T_project_scan=pose,
+        grid=(cells[0][:found], cells[1][:found]) if cells else None,
         single=_is_single(header, axes[0]),
     )
+
+
+def _grid_buffers(file: Any, header: Any, data: dict[str, Any], buffers: Any, capacity: int) -> tuple[str, ...]:
+    """Have the grid's fields read along, and return their names: none where one is missing or is no number.
+
+    The library's own buffers of 16 bits refuse larger numbers, and the file with them; doubles hold whatever comes.
+    """
+    from pye57 import libe57
+
+    prototype = libe57.StructureNode(header.points.prototype())
+    numbers = (libe57.IntegerNode, libe57.ScaledIntegerNode, libe57.FloatNode)
+    if not all(prototype.isDefined(name) and isinstance(prototype[name], numbers) for name in GRID):
+        return ()
+    for name in GRID:
+        data[name] = np.empty(capacity)
+        buffers.append(libe57.SourceDestBuffer(file.image_file, name, data[name], capacity, True, True))
+    return GRID
 
 
 def _is_single(header: Any, field: str) -> bool:

@@ -1,7 +1,8 @@
 """PTX: a grid a scan, each with its scanner's pose; points stay in the scanner's frame. Metres.
 
 A scan is: columns, rows; the scanner's position; its three axes; the 4x4 matrix for row vectors, so it is transposed
-here; then a line a grid cell ``x y z intensity [r g b]``. A cell of ``0 0 0`` had no return and is left out.
+here; then a line a grid cell ``x y z intensity [r g b]``, column by column. A cell of ``0 0 0`` had no return and is
+left out; the others keep their row and column.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from processor.readers.rows import Rows
 SUFFIXES = (".ptx",)
 UNIT = "m"
 SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
+MOST_LINES = 2**31 - 1  # of a grid whose rows and columns fit their type
 RIGID_TOLERANCE = 1e-3  # of R^T R from the identity: matrices are often written with few digits
 
 
@@ -60,18 +62,17 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     check_room(path, "PTX", cells, SHORTEST_ROW, size)
     T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
     with parsing(path, "PTX"):
+        from processor.readers.returns import keep
+
         wide = rows.width() in (4, 7)
         points, intensity = room_for(cells, 3), room_for(cells if wide else 0)
+        # A cloud without a grid is often written as a single row or column.
+        gridded = cells if min(columns, lines) > 1 and max(columns, lines) <= MOST_LINES else 0
+        row, column = (room_for(gridded, dtype=np.int32) for _ in range(2))
         read = found = 0
         for piece in rows.pieces((0, 1, 2, 3) if wide else (0, 1, 2), cells):
+            found = keep(piece, read, lines, found, points, intensity, row, column)
             read += len(piece)
-            x, y, z = piece.T[:3]
-            hit = (x != 0.0) | (y != 0.0) | (z != 0.0)
-            returned = piece if hit.all() else piece[hit]
-            points[found : found + len(returned)] = returned[:, :3]
-            if wide:
-                intensity[found : found + len(returned)] = returned[:, 3]
-            found += len(returned)
     if read != cells:
         raise InputError(f"{path}: scan {number} declares {cells} cells, found {read}; copy or export it again")
     if not found:
@@ -85,6 +86,7 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         intensity=intensity[: found if wide else 0],
         position=position,
         T_project_scan=T_project_scan,
+        grid=(row[:found], column[:found]) if gridded else None,
     )
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Checked, Floats, InputError, Ints, column, optional
+from processor.model import Checked, Floats, InputError, Ints, Labels, column, optional
 
 FAR = 10_000.0  # units; beyond this an origin is taken off
 ORIGIN_STEP = 1_000.0
@@ -34,19 +34,21 @@ class RawScan(Checked):
     T_project_scan: Floats = optional(4, 4)
     unit: str = ""  # "" = the format does not say
     station: Ints = column("n", dtype=np.int64)  # number of the station a point was seen from, from 1; 0 = unknown
+    grid_row: Labels = column("n", dtype=np.int32)  # as the file has them: whether they are a scanner's is not known
+    grid_column: Labels = column("n", dtype=np.int32)
     step: float = 0.0  # what two coordinates differ by at least, in the type the file has them in; 0 = nothing
 
 
 # How readers get the arrays they fill: in a process of its own (see apart) they lie in memory shared with the other.
-_new_array: Callable[[tuple[int, ...]], Floats] = np.empty
+_new_array: Callable[[tuple[int, ...], type], npt.NDArray[Any]] = np.empty
 
 
-def room_for(*shape: int) -> Floats:
+def room_for(*shape: int, dtype: type = np.float64) -> npt.NDArray[Any]:
     """Return an array to be filled; of what is never written no memory is taken."""
-    return _new_array(shape)
+    return _new_array(shape, dtype)
 
 
-def give_room_by(new_array: Callable[[tuple[int, ...]], Floats]) -> None:
+def give_room_by(new_array: Callable[[tuple[int, ...], type], npt.NDArray[Any]]) -> None:
     """Let another function make the arrays of ``room_for``."""
     global _new_array
     _new_array = new_array
@@ -76,12 +78,13 @@ def make(
     position: npt.ArrayLike = (),
     T_project_scan: npt.ArrayLike = (),
     station: npt.ArrayLike = (),
+    grid: tuple[Labels, Labels] | None = None,
     single: bool = False,
 ) -> RawScan:
     """Make the record from coordinates (n, 3), taking off an origin of whole thousands, in place, where they are far.
 
-    ``single``: the file has the coordinates in 32 bits. Raises InputError for no points, and for coordinates that are
-    not finite.
+    ``grid``: rows and columns (n,) of the scanner's grid. ``single``: the file has the coordinates in 32 bits. Raises
+    InputError for no points, and for coordinates that are not finite.
     """
     if not len(points):
         raise InputError(f"{path}: scan {name!r} holds no points")
@@ -110,6 +113,7 @@ def make(
         np.asarray(T_project_scan, np.float64),
         unit,
         np.asarray(station, np.int64),
+        *(grid or (np.empty(0, np.int32),) * 2),
         step,
     )
 

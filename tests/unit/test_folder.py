@@ -187,6 +187,33 @@ def test_a_turned_part_is_no_wrong_unit(bridge):
     assert len(folder.read_input(bridge).scans) == 2
 
 
+def test_a_scan_larger_than_any_structure_has_a_wrong_unit(tmp_path):
+    """Design and scan in mm, both read as metres: their ratio says nothing."""
+    write_ply(tmp_path / "design.ply", BOX * 10_000.0)
+    write_ply(tmp_path / "scans/hall.ply", surface() * 10_000.0)
+    text = 'kind = "structure"\nunits = "{}"\ndesign = "design.ply"\n[[scan]]\nfile = "scans/hall.ply"\n'
+    project(tmp_path, text.format("m"))
+    why = r"hall\.ply: scan 'hall' is .* km across .*read as m \(said by project\.toml\).* m if it were mm: say"
+    with pytest.raises(InputError, match=why):
+        folder.read_input(tmp_path)
+    project(tmp_path, text.format("mm"))
+    assert len(folder.read_input(tmp_path).scans) == 1
+    with pytest.raises(InputError, match=r"scan 'hall' is .*read as m \(asked for by --units\)"):
+        folder.read_input(tmp_path, "m")
+    # The scan is right and of a piece only; the design alone is not.
+    write_ply(tmp_path / "scans/hall.ply", surface() * 500.0)
+    project(tmp_path, 'design_units = "m"\n' + text.format("mm"))
+    with pytest.raises(InputError, match=r"design\.ply: the design is 40 km across .*'design_units' or 'units'"):
+        folder.read_input(tmp_path)
+
+
+def test_a_place_on_the_map_and_a_stray_point_are_no_wrong_unit(tmp_path):
+    points = surface() + np.array([512_345.0, 4_400_000.0, 0.0])
+    points[7] += 50_000.0
+    write_xyz(tmp_path / "lone.xyz", points)
+    assert len(folder.read_input(tmp_path / "lone.xyz").scans[0].points) == len(points)
+
+
 def test_a_wrong_unit_of_a_frame_is_noticed(tmp_path):
     nodes = [{"id": i, "centre": [3 * (i % 5), 3 * (i // 5), 0], "radius": 0.1} for i in range(25)]
     (tmp_path / "design.json").write_text(json.dumps({"units": "m", "kind": "space-frame", "nodes": nodes}))
