@@ -42,8 +42,10 @@ def as_json(found: Comparison) -> dict[str, Any]:
     figures = {
         field.name: getattr(summary, field.name)
         for field in dataclasses.fields(summary)
-        if field.name != "significant_share"
+        if field.name not in ("significant_share", "min_lod95", "max_lod95")
     }
+    for end, half in (("min", summary.min_lod95), ("max", summary.max_lod95)):
+        figures[f"{end}_ci95"] = [figures[end] - half, figures[end] + half]
     written: dict[str, Any] = json.loads(
         pipeline.as_json(
             {
@@ -124,6 +126,10 @@ def lines(record: dict[str, Any]) -> list[str]:
     def number(key: str) -> str:
         return "–" if summary[key] is None else f"{summary[key]:.6g}{unit}"
 
+    def end(key: str) -> str:
+        low, high = summary.get(f"{key}_ci95") or (None, None)
+        return number(key) if low is None else f"{summary[key]:.6g} ± {0.5 * (high - low):.3g}{unit}"
+
     known = summary["core_points"] - summary["without_lod"]
     found = [f"{summary['core_points']} core points, {known} with a level of detection"]
     if known:
@@ -131,7 +137,7 @@ def lines(record: dict[str, Any]) -> list[str]:
         found += [
             f"beyond it: {summary['significant']}, {100.0 * summary['significant_share']:.1f} % (95 %: {low}-{high})",
             f"distance: mean {number('mean')}, median {number('median')}, sd {number('sd')}, "
-            f"from {number('min')} to {number('max')}",
+            f"from {end('min')} to {end('max')}",
             f"median level of detection {number('lod95_median')}",
         ]
     return found + [note for note in (record.get("unit_note"), record.get("normals_note")) if note]
