@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from processor import __version__, cli_folders
+from processor import __version__, cli_compare, cli_folders
 from processor.cli_shared import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, named, say
 from processor.model import InputError, Metric
 from processor.progress import stage
@@ -29,6 +29,7 @@ def commands() -> None:
 
 commands.add_command(cli_folders.batch)
 commands.add_command(cli_folders.init)
+commands.add_command(cli_compare.compare)
 
 
 @commands.command()
@@ -96,57 +97,6 @@ def _show(context: click.Context, output: Path, execution: Execution, report: Er
         click.echo(f"report: {output / 'report.html'}")
     complete = all(one.result.status == "ok" for one, _ in tables.grouped(execution.runs))
     context.exit(LIMIT_MISSED if not report.passed else DONE if complete else IN_PART)
-
-
-LENGTH = click.FloatRange(min=0.0, min_open=True)
-FILE = click.Path(path_type=Path)
-
-
-@commands.command()
-@click.argument("reference", type=FILE)
-@click.argument("compared", type=FILE)
-@click.option("-o", "--output", required=True, type=FILE, help="folder of the results")
-@click.option("--core", type=FILE, help="cloud of core points  [default: every point of REFERENCE]")
-@click.option("--normal-diameter", type=LENGTH, help="of the sphere that a normal is fitted in")
-@click.option("--projection-diameter", type=LENGTH, help="of the cylinder along the normal")
-@click.option("--max-depth", type=LENGTH, help="of the cylinder, to either side of the core point")
-@click.option("--registration-error", type=click.FloatRange(min=0.0), default=0.0, help="a length, part of the LOD95")
-@click.option("--normals", type=FILE, help="nx, ny, nz of every core point, PLY or text, instead of fitted ones")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
-@click.option("--json", "as_json", is_flag=True, help="print compare.json")
-@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
-def compare(
-    reference: Path,
-    compared: Path,
-    output: Path,
-    core: Path | None,
-    normal_diameter: float | None,
-    projection_diameter: float | None,
-    max_depth: float | None,
-    registration_error: float,
-    normals: Path | None,
-    lang: str,
-    as_json: bool,
-) -> None:
-    """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
-
-    All lengths are in the clouds' own unit; what is not given is made from their density.
-    """
-    from processor import compare as comparing
-    from processor.report import comparison
-
-    comparison.check_output(output, (reference, compared, core, normals))
-    request = comparing.Request(
-        reference, compared, core, normals, normal_diameter or 0.0, projection_diameter or 0.0, max_depth or 0.0,
-        registration_error,
-    )  # fmt: skip
-    record = comparison.write(output, comparing.compare(request, say), lang)
-    if as_json:
-        click.echo(json.dumps(record, ensure_ascii=False))
-        return
-    for line in comparison.lines(record):
-        click.echo(line)
-    click.echo(f"report: {output / comparison.PAGE}")
 
 
 @commands.command()

@@ -3,25 +3,28 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from processor import normals_file, readers, store
+from processor import compare_doubts, normals_file, readers, store
 from processor.deviation import scales, summary
 from processor.deviation.scales import Scales
 from processor.deviation.summary import Summary
-from processor.geometry import m3c2, point_neighbors
-from processor.geometry.m3c2 import Distances
+from processor.geometry import m3c2, orientation, point_neighbors
+from processor.geometry.m3c2 import CloudNormals, Distances
+from processor.geometry.orientation import Turned
 from processor.geometry.point_grid import PointGrid
 from processor.model import Floats, InputError, UsageError
 from processor.readers import RawScan
 
 FAR = 10_000.0  # units; beyond this an origin is taken off before any algebra
 ORIGIN_STEP = 1_000.0
-UP = np.array([0.0, 0.0, 1.0])
+CLOUDS = ("reference", "compared", "core")
 
 
 @dataclass(frozen=True)
@@ -55,10 +58,12 @@ class Comparison:
     distances: Distances
     scales: Scales
     summary: Summary
-    unit: str  # "" = the files do not say
+    unit: str  # "" = neither the reference nor the compared cloud says
+    units: dict[str, str]  # what each file says
     points: dict[str, int]
     hashes: dict[str, str]
     normals_from: str
+    turned: Turned | None  # None: the normals were given with their signs
 
 
 @dataclass(frozen=True)
@@ -88,6 +93,15 @@ class _Cloud:
         """Points (n, 3) of all scans less an origin; offsets are taken from each other before they meet a point."""
         return np.concatenate([self._placed(scan, origin) for scan in self.scans])
 
+    def scanners(self, origin: Floats) -> list[Floats]:
+        """Where each scan (3,) was seen from, less an origin; NaN where the file does not say."""
+        return [
+            self._placed(replace(scan, points=np.zeros((1, 3)), origin=scan.position), origin)[0]
+            if scan.position.size
+            else np.full(3, np.nan)
+            for scan in self.scans
+        ]
+
     @staticmethod
     def _placed(scan: RawScan, origin: Floats) -> Floats:
         if not scan.T_project_scan.size:
@@ -101,40 +115,79 @@ def compare(request: Request, say: Callable[[str], None] = lambda _: None) -> Co
     """Measure from the reference to the compared cloud at every core point, in the core points' order.
 
     Without a core file every point of the reference is one; without a file of normals they are those of the
-    reference's planes, turned to look up. Raises InputError for a file that cannot be used.
+    reference's planes, turned to look up, or as :mod:`processor.geometry.orientation` says where they are upright.
+    Raises InputError for a file that cannot be used, and where no core point at all has an answer.
     """
     reference, compared = _read(request.reference), _read(request.compared)
     core_cloud = reference if request.core is None else _read(request.core)
     clouds = [reference, compared] if request.core is None else [reference, compared, core_cloud]
+    for one in (reference, compared):
+        if one.count < m3c2.FEWEST_FOR_LOD:
+            raise InputError(
+                f"{one.path}: holds {one.count} point{'s' * (one.count > 1)}; expected a cloud: with fewer than "
+                f"{m3c2.FEWEST_FOR_LOD} there is no level of detection"
+            )
     unit = _unit(clouds)
     origin = _origin(reference)
     core = np.ascontiguousarray(core_cloud.less(origin))
     first, second = (point_neighbors.of_spacing(one.less(origin)) for one in (reference, compared))
     used = scales.derived(first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth)
-    _say_scales(request, used, unit, say)
+    if why := compare_doubts.other_unit(first.cells.points, second.cells.points, used):
+        raise InputError(f"{request.reference} and {request.compared}: {why}")
+    units = {name: one.unit for name, one in zip(CLOUDS, clouds, strict=False)}
+    _say_scales(request, used, unit, units, say)
+    turned = None
     if request.normals is not None:
-        given = normals_file.read(request.normals, core, origin, used.projection_diameter_mm)
-        said, turned = f"file {request.normals.name}", given
+        normals = normals_file.read(request.normals, core, origin, used.projection_diameter_mm)
+        said = f"file {request.normals.name}"
     else:
-        fitted = m3c2.normals(_sorted(first, used.normal_diameter_mm), core, used.normal_diameter_mm).normals
-        said, turned = "planes of the reference, turned towards +z", m3c2.oriented(fitted, UP)
+        fitted = m3c2.normals(_sorted(first, used.normal_diameter_mm), core, used.normal_diameter_mm)
+        scanner = _seen_from(reference, core, fitted, used.normal_diameter_mm, origin)
+        turned = orientation.turned(fitted, core, used.normal_diameter_mm, scanner)
+        normals = turned.normals
+        said = "planes of the reference, turned towards +z" + (", upright ones otherwise" if turned.upright else "")
     found = m3c2.distances(
         _sorted(first, used.projection_diameter_mm),
         _sorted(second, used.projection_diameter_mm),
         core,
-        turned,
+        normals,
         projection_diameter_mm=used.projection_diameter_mm,
         max_depth_mm=used.max_depth_mm,
         registration_error_mm=request.registration_error,
     )
-    total = summary.of_distances(found, core, turned, used.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER)
+    total = summary.of_distances(found, core, normals, used.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER)
+    if not np.isfinite(found.distance).any():
+        why = compare_doubts.no_answer(first.cells.points, second.cells.points, core, total.without_normal, used)
+        raise InputError(f"{request.reference} and {request.compared}: no core point has an answer: {why}")
+    if turned is not None and (note := turned_note(turned)):
+        say(note)
     _say_doubts(total, used, say)
-    names = ("reference", "compared", "core")
-    hashes = {name: one.sha256 for name, one in zip(names, clouds, strict=False)}
+    hashes = {name: one.sha256 for name, one in zip(CLOUDS, clouds, strict=False)}
     if request.normals is not None:
         hashes["normals"] = _sha256(request.normals)
-    points = {name: one.count for name, one in zip(names, clouds, strict=False)}
-    return Comparison(request, origin, core, turned, found, used, total, unit, points, hashes, said)
+    points = {name: one.count for name, one in zip(CLOUDS, clouds, strict=False)}
+    return Comparison(request, origin, core, normals, found, used, total, unit, units, points, hashes, said, turned)
+
+
+def _seen_from(
+    reference: _Cloud, core: Floats, fitted: CloudNormals, normal_diameter: float, origin: Floats
+) -> Floats | None:
+    """Return where the reference was seen from (k, 3) at the core points whose normals need it, NaN elsewhere.
+
+    None where the file knows no scanner.
+    """
+    scanners = reference.scanners(origin)
+    rows = np.flatnonzero(orientation.undecided(fitted, normal_diameter))
+    if not len(rows) or not any(np.isfinite(one).all() for one in scanners):
+        return None
+    found = np.full(core.shape, np.nan)
+    if len(scanners) == 1:
+        found[rows] = scanners[0]
+        return found
+    _, nearest = cKDTree(reference.less(origin)).query(core[rows], workers=-1)
+    ends = np.cumsum([len(scan.points) for scan in reference.scans])
+    found[rows] = np.array(scanners)[np.searchsorted(ends, nearest, side="right")]
+    return found
 
 
 def _sorted(grid: PointGrid, diameter: float) -> PointGrid:
@@ -146,7 +199,10 @@ def _sorted(grid: PointGrid, diameter: float) -> PointGrid:
 def _read(path: Path) -> _Cloud:
     if path.suffix.lower() == ".h5" and path.is_file():
         scans = store.read_scene(path).scans
-        raws = [RawScan(s.name, s.points, s.origin, T_project_scan=s.T_project_scan, unit="mm") for s in scans]
+        raws = [
+            RawScan(s.name, s.points, s.origin, position=s.position, T_project_scan=s.T_project_scan, unit="mm")
+            for s in scans
+        ]
     else:
         raws = readers.read(path)
     if not sum(len(scan.points) for scan in raws):
@@ -163,14 +219,17 @@ def _sha256(path: Path) -> str:
 
 
 def _unit(clouds: list[_Cloud]) -> str:
-    """Return the unit that the files say, "" where none does. Raises InputError where they say different ones."""
+    """Return the unit that the reference or the compared file says, "" where neither does: a core file cannot for them.
+
+    Raises InputError where files say different ones.
+    """
     said = {one.unit: one.path for one in clouds if one.unit}
     if len(said) > 1:
         (a, first), (b, second) = list(said.items())[:2]
         raise InputError(
             f"{second}: is in {b}, but {first} is in {a}; expected clouds in one unit: convert one of them"
         )
-    return next(iter(said), "")
+    return next((one.unit for one in clouds[:2] if one.unit), "")
 
 
 def _origin(reference: _Cloud) -> Floats:
@@ -181,25 +240,57 @@ def _origin(reference: _Cloud) -> Floats:
     return found
 
 
-def _say_scales(request: Request, used: Scales, unit: str, say: Callable[[str], None]) -> None:
+def _say_scales(request: Request, used: Scales, unit: str, units: dict[str, str], say: Callable[[str], None]) -> None:
     spacing = max(used.reference_spacing_mm, used.compared_spacing_mm)
     say(
         f"lengths are in the files' unit{f' ({unit})' if unit else ', which they do not say'}; "
         f"spacing {used.reference_spacing_mm:.4g} (reference), {used.compared_spacing_mm:.4g} (compared)"
     )
+    if note := unit_note(units, {"reference": request.reference, "compared": request.compared, "core": request.core}):
+        say(note)
     held = np.pi / 4.0 * (used.projection_diameter_mm / spacing) ** 2
-    for name, value, given, why in (
-        (
-            "normal diameter",
-            used.normal_diameter_mm,
-            request.normal_diameter or request.normals,
-            "of spacing and roughness",
-        ),
-        ("projection diameter", used.projection_diameter_mm, request.projection_diameter, "of the spacing"),
-        ("max depth to either side", used.max_depth_mm, request.max_depth, "of how far apart the clouds are"),
-    ):
-        say(f"{name} {value:.6g}, {'given' if given else f'made {why}'}")
+    if request.normals is not None:
+        unused = "; --normal-diameter is not used" if request.normal_diameter else ""
+        say(f"normals of file {request.normals.name}{unused}")
+    else:
+        say(f"normal diameter {used.normal_diameter_mm:.6g}, {_how(request.normal_diameter, 'spacing and roughness')}")
+    say(f"projection diameter {used.projection_diameter_mm:.6g}, {_how(request.projection_diameter, 'the spacing')}")
+    say(f"max depth to either side {used.max_depth_mm:.6g}, {_how(request.max_depth, 'how far apart the clouds are')}")
     say(f"a cylinder holds about {held:.3g} points of the sparser cloud")
+
+
+def turned_note(turned: Turned) -> str:
+    """Say how upright normals got their signs; nothing where +z decided all."""
+    if not turned.upright:
+        return ""
+    said = [
+        f"{turned.upright} of {turned.up + turned.upright} normals are of upright surfaces, whose side +z does not tell"
+    ]
+    if turned.scanner:
+        said.append(f"{turned.scanner} look towards the scanner")
+    if turned.neighbours:
+        said.append(f"{turned.neighbours} look the way of the surface that theirs joins")
+    if turned.convention:
+        said.append(
+            f"{turned.convention}, of {turned.surfaces} connected surfaces, by convention: {orientation.CONVENTION}"
+        )
+    return "; ".join(said)
+
+
+def unit_note(units: Mapping[str, str], files: Mapping[str, Any]) -> str:
+    """Say which of the files says the unit where not all do; nothing where all or none do."""
+    saying = [name for name, one in units.items() if one]
+    silent = [name for name, one in units.items() if not one]
+    if not (saying and silent):
+        return ""
+    return (
+        f"the unit {units[saying[0]]} is said by {', '.join(str(files[name]) for name in saying)} alone; not by "
+        f"{', '.join(str(files[name]) for name in silent)}, whose coordinates must be in it too"
+    )
+
+
+def _how(given: float, made_of: str) -> str:
+    return "given" if given else f"made of {made_of}"
 
 
 def _say_doubts(total: Summary, used: Scales, say: Callable[[str], None]) -> None:

@@ -13,21 +13,23 @@ from processor.readers.raw import first_named, parsing
 
 NAMES = tuple(rf"(n|normal_?){axis}" for axis in "xyz")
 PLACES = tuple("xyz")
+UNIT_LENGTH = 0.1  # how far from 1 the length of a normal may be in columns without names
 
 
 def read(path: Path, core: Floats, origin: Floats, tolerance: float) -> Floats:
     """Read unit normals (k, 3) for core points (k, 3), which are coordinates less ``origin``, in their order.
 
     PLY or a table as text: columns nx, ny, nz by name, or three columns, or six after x, y, z. Raises InputError where
-    they are not as many as the core points, have no length, or lie farther than ``tolerance`` from them.
+    they are not as many as the core points, have no length, or lie farther than ``tolerance`` from them; without names
+    also where they are no unit vectors: coordinates or colours would be taken for normals.
     """
     if not path.is_file():
         raise InputError(f"{path}: there is no such file")
     suffix = path.suffix.lower()
     if suffix == ".ply":
-        places, found = _of_ply(path)
+        named, (places, found) = True, _of_ply(path)
     elif suffix in text.SUFFIXES:
-        places, found = _of_text(path)
+        named, places, found = _of_text(path)
     else:
         raise InputError(f"{path}: expected normals as PLY or text ({', '.join(text.SUFFIXES)}), found {suffix!r}")
     if len(found) != len(core):
@@ -41,6 +43,12 @@ def read(path: Path, core: Floats, origin: Floats, tolerance: float) -> Floats:
     bad = np.flatnonzero(~(length > 0.0) & ~np.isnan(length) | np.isinf(length))
     if len(bad):
         raise InputError(f"{path}: the normal in row {bad[0] + 1} has no direction; expected nx, ny, nz")
+    far = np.flatnonzero(np.abs(length - 1.0) > UNIT_LENGTH)
+    if len(far) and not named:
+        raise InputError(
+            f"{path}: row {far[0] + 1} has the length {length[far[0]]:.6g}; expected unit normals nx, ny, nz (length "
+            "1), not coordinates; columns named nx, ny, nz may have any length"
+        )
     with np.errstate(invalid="ignore"):
         unit: Floats = found / length[:, None]
     return unit
@@ -54,16 +62,17 @@ def _of_ply(path: Path) -> tuple[Floats | None, Floats]:
     return _picked(path, data.dtype.names, lambda name: np.asarray(data[name], np.float64))
 
 
-def _of_text(path: Path) -> tuple[Floats | None, Floats]:
+def _of_text(path: Path) -> tuple[bool, Floats | None, Floats]:
+    """Return whether columns have names, places (k, 3) if there are any, and normals (k, 3)."""
     layout = text.sniff(path)
     data = text.numbers(path, layout)
     names = [name.strip("\"' ") for name in layout.header]
     if len(names) == layout.columns and any(first_named(names, one) for one in NAMES):
-        return _picked(path, names, lambda name: data[:, names.index(name)])
+        return True, *_picked(path, names, lambda name: data[:, names.index(name)])
     if layout.columns == 3:
-        return None, data
+        return False, None, data
     if layout.columns == 6:
-        return data[:, :3], data[:, 3:]
+        return False, data[:, :3], data[:, 3:]
     raise InputError(f"{path}: expected columns nx, ny, nz by name, 3 columns or 6; found {layout.columns}")
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.deviation import attitude
 from processor.deviation.result import Result
 from processor.geometry import rigid
 from processor.geometry.error_figures import signed
@@ -21,12 +22,16 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     """Hold deviations against the true movement, in the frame that the result is in.
 
     The truth is in the design's frame. Where the scan was moved to fit, the truth is moved along: what is true of a
-    best fit is what is left after it. Nothing is checked where scans came without a pose.
+    best fit is what is left after it. Nothing is checked where scans came without a pose, or where a structure that is
+    about symmetric was found in another attitude, and called ambiguous: its core points have other places' truth.
     """
     if truth.structure is None or not len(truth.structure.points) or result.status == "failed":
         return []
     if any(not scan.T_project_scan.size for scan in scene.scans) and len(scene.scans) > 1:
         return []
+    if result.status == "ambiguous" and (turn := _otherwise(result)) is not None:
+        said = "not compared with the truth: the pose found is another of those that fit about as well, turned by"
+        return [Metric("deviation", said, turn, NAN, "deg")]
     true = true_deviation(result, truth.structure)
     error = result.distance - true
     known = np.isfinite(error) & np.isfinite(result.lod95)
@@ -49,6 +54,18 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("deviation", "LOD95, median", float(np.median(result.lod95[known])), NAN, "mm"),
         *signed("deviation", "deviations", error[known]),
     ]
+
+
+def _otherwise(result: Result) -> float | None:
+    """By what the pose found is turned, degrees, where it is another one than the design's; else nothing."""
+    if not len(result.core):
+        return None
+    T = result.T_design_scan
+    centre = result.origin + result.core.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(result.core, axis=0)))
+    if not attitude.differ(T, np.eye(4), centre, size):
+        return None
+    return float(np.degrees(rigid.rotation_angle(T[:3, :3])))
 
 
 def true_deviation(result: Result, truth: StructureTruth) -> Floats:

@@ -52,7 +52,7 @@ def coarse(points: Floats, design: Samples, axes: principal.PrincipalAxes) -> At
         found.append((left(few, design, tree, T, gates[-1]), T))
     order = sorted(range(len(found)), key=lambda k: (found[k][0], k))
     error, best = found[order[0]]
-    rivals = (found[k][0] for k in order[1:] if _differ(found[k][1], best, own.centre, size))
+    rivals = (found[k][0] for k in order[1:] if differ(found[k][1], best, own.centre, size))
     return Attitude(best, error, next(rivals, NAN) / max(error, 1e-9))
 
 
@@ -86,7 +86,8 @@ def _alike(a: float, b: float) -> bool:
     return max(a, b) <= CLOSE * min(a, b)
 
 
-def _differ(one: Floats, other: Floats, centre: Floats, size: float) -> bool:
+def differ(one: Floats, other: Floats, centre: Floats, size: float) -> bool:
+    """Whether two poses (4, 4) of what lies about ``centre`` (3,) and is of a ``size`` are two and not one."""
     turn = rigid.rotation_angle(one[:3, :3] @ other[:3, :3].T)
     shift = float(np.linalg.norm(rigid.apply(one, centre) - rigid.apply(other, centre)))
     return turn > SAME_TURN or shift > SAME_SHIFT * size

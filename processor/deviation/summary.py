@@ -40,6 +40,8 @@ class Summary:
     min: float
     max: float
     lod95_median: float
+    min_lod95: float = float("nan")  # of the core points where the least and the greatest distance are
+    max_lod95: float = float("nan")
 
 
 def of_distances(found: Distances, core: Floats, normals: Floats, projection_diameter_mm: float, few: int) -> Summary:
@@ -65,6 +67,8 @@ def of_distances(found: Distances, core: Floats, normals: Floats, projection_dia
         min=figure("min"),
         max=figure("max"),
         lod95_median=float(np.median(found.lod95[known])) if known.any() else float("nan"),
+        min_lod95=float(found.lod95[known][np.argmin(distance)]) if len(distance) else float("nan"),
+        max_lod95=float(found.lod95[known][np.argmax(distance)]) if len(distance) else float("nan"),
     )
 
 

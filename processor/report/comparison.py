@@ -11,8 +11,9 @@ from typing import Any
 import matplotlib as mpl
 
 from processor import pipeline
-from processor.compare import Comparison
+from processor.compare import Comparison, turned_note, unit_note
 from processor.geometry.m3c2 import FEWEST_FOR_LOD
+from processor.geometry.orientation import CONVENTION, Turned
 from processor.language import language
 from processor.report import core_points, figures_deviation, writing
 
@@ -41,8 +42,10 @@ def as_json(found: Comparison) -> dict[str, Any]:
     figures = {
         field.name: getattr(summary, field.name)
         for field in dataclasses.fields(summary)
-        if field.name != "significant_share"
+        if field.name not in ("significant_share", "min_lod95", "max_lod95")
     }
+    for end, half in (("min", summary.min_lod95), ("max", summary.max_lod95)):
+        figures[f"{end}_ci95"] = [figures[end] - half, figures[end] + half]
     written: dict[str, Any] = json.loads(
         pipeline.as_json(
             {
@@ -54,8 +57,11 @@ def as_json(found: Comparison) -> dict[str, Any]:
                     if path is not None
                 },
                 "unit": found.unit or "that of the files, which do not say it",
+                "unit_note": unit_note(found.units, {name: path.name for name, path in files.items() if path}) or None,
                 "definition": DEFINITION,
                 "normals": found.normals_from,
+                "normals_note": None if found.turned is None else turned_note(found.turned) or None,
+                "normals_turned": None if found.turned is None else _turned(found.turned),
                 "parameters": {
                     "normal_diameter": None if request.normals else scales.normal_diameter_mm,
                     "projection_diameter": scales.projection_diameter_mm,
@@ -64,7 +70,7 @@ def as_json(found: Comparison) -> dict[str, Any]:
                     "given": [
                         name
                         for name in ("normal_diameter", "projection_diameter", "max_depth", "registration_error")
-                        if getattr(request, name)
+                        if getattr(request, name) and not (name == "normal_diameter" and request.normals)
                     ],
                 },
                 "spacing": {"reference": scales.reference_spacing_mm, "compared": scales.compared_spacing_mm},
@@ -78,6 +84,17 @@ def as_json(found: Comparison) -> dict[str, Any]:
         )
     )
     return written
+
+
+def _turned(turned: Turned) -> dict[str, Any]:
+    return {
+        "by_up": turned.up,
+        "by_scanner": turned.scanner,
+        "by_neighbours": turned.neighbours,
+        "by_convention": turned.convention,
+        "surfaces_by_convention": turned.surfaces,
+        "convention": CONVENTION,
+    }
 
 
 def write(out: Path, found: Comparison, lang: str = "en") -> dict[str, Any]:
@@ -109,6 +126,10 @@ def lines(record: dict[str, Any]) -> list[str]:
     def number(key: str) -> str:
         return "–" if summary[key] is None else f"{summary[key]:.6g}{unit}"
 
+    def end(key: str) -> str:
+        low, high = summary.get(f"{key}_ci95") or (None, None)
+        return number(key) if low is None else f"{summary[key]:.6g} ± {0.5 * (high - low):.3g}{unit}"
+
     known = summary["core_points"] - summary["without_lod"]
     found = [f"{summary['core_points']} core points, {known} with a level of detection"]
     if known:
@@ -116,10 +137,10 @@ def lines(record: dict[str, Any]) -> list[str]:
         found += [
             f"beyond it: {summary['significant']}, {100.0 * summary['significant_share']:.1f} % (95 %: {low}-{high})",
             f"distance: mean {number('mean')}, median {number('median')}, sd {number('sd')}, "
-            f"from {number('min')} to {number('max')}",
+            f"from {end('min')} to {end('max')}",
             f"median level of detection {number('lod95_median')}",
         ]
-    return found
+    return found + [note for note in (record.get("unit_note"), record.get("normals_note")) if note]
 
 
 def _page(record: dict[str, Any], drawn: list[tuple[str, bytes]], lang: str) -> str:

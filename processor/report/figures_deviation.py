@@ -8,6 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
 from matplotlib.colors import TwoSlopeNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from processor.geometry.m3c2 import Distances
 from processor.model import Floats, Ints
@@ -16,6 +17,8 @@ from processor.report.drawing import COLOURS, DIVERGING, HATCHES, png
 MOST_DRAWN = 60_000
 COLOUR_QUANTILE = 0.98  # of |distance|: what is beyond has the colours of the ends
 AXES = "xyz"
+WITHIN_SIZE, BEYOND_SIZE = 2.0, 9.0  # of dots, points squared
+LEGEND_COLOUR = "#404040"
 BOTH_SIDES = 0.1  # share of core points that look away from which they get a panel of their own
 
 
@@ -55,19 +58,30 @@ def _panel(axes: Axes, places: Floats, rows: Ints, found: Distances, norm: TwoSl
     distance, known = found.distance[rows], np.isfinite(found.lod95[rows])
     beyond = found.significant[rows]
     u, v = places.T
-    axes.scatter(u[~known], v[~known], s=2.0, marker="x", linewidths=0.4, color="0.6", label="no level of detection")
-    for which, size, label in ((known & ~beyond, 2.0, "within the level of detection"), (beyond, 9.0, "beyond")):
+    axes.scatter(u[~known], v[~known], s=2.0, marker="x", linewidths=0.4, color="0.6")
+    for which, size in ((known & ~beyond, WITHIN_SIZE), (beyond, BEYOND_SIZE)):
         order = np.flatnonzero(which)
         order = order[np.argsort(np.abs(distance[order]), kind="stable")]
         shown = np.clip(distance[order], norm.vmin, norm.vmax)
-        axes.scatter(
-            u[order], v[order], c=shown, s=size, cmap=DIVERGING, norm=norm, linewidths=0.0,
-            label=f"{label} ({which.sum()})",
-        )  # fmt: skip
+        axes.scatter(u[order], v[order], c=shown, s=size, cmap=DIVERGING, norm=norm, linewidths=0.0)
     axes.ticklabel_format(useOffset=True, style="plain")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
-    axes.legend(fontsize=7, loc="upper right")
+    counts = int((~known).sum()), int((known & ~beyond).sum()), int(beyond.sum())
+    axes.legend(handles=_legend(*counts), fontsize=7, loc="upper right")
+
+
+def _legend(unknown: int, within: int, beyond: int) -> list[Line2D]:
+    """Make marks large and dark enough to be seen: those drawn are too small, and pale in the middle of the colours."""
+    marks = (
+        ("x", 4.0, f"no level of detection ({unknown})"),
+        ("o", 2.5, f"within the level of detection ({within})"),
+        ("o", 2.5 * (BEYOND_SIZE / WITHIN_SIZE) ** 0.5, f"beyond ({beyond})"),
+    )
+    return [
+        Line2D([], [], linestyle="", marker=mark, markersize=size, color=LEGEND_COLOUR, label=label)
+        for mark, size, label in marks
+    ]
 
 
 def histogram(found: Distances, unit: str) -> tuple[str, bytes]:

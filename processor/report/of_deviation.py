@@ -31,7 +31,8 @@ def _summary(result: Result) -> tuple[str, str]:
     )
     registration = shown(Z95 * result.registration_error)
     said = (
-        f"95 %: {low} to {high} %. From {shown(found['min'])} to {shown(found['max'])} mm, {near} % within 10 mm; "
+        f"95 %: {low} to {high} %. From {shown(found['min'])} ± {shown(found['min_lod95'])} to "
+        f"{shown(found['max'])} ± {shown(found['max_lod95'])} mm (95 %), {near} % within 10 mm; "
         f"median LOD95 {shown(found['lod95_median'])} mm, {registration} mm of it registration. "
         f"{found['measured']:.0f} of {len(result.core)} core points were measured."
     )
@@ -62,7 +63,9 @@ def _column(result: Result) -> dict[str, tuple[Any, str]]:
         "mean": (found["mean"], "mm"),
         "median": (found["median"], "mm"),
         "least": (found["min"], "mm"),
+        "least, its LOD95": (found["min_lod95"], "mm"),
         "greatest": (found["max"], "mm"),
+        "greatest, its LOD95": (found["max_lod95"], "mm"),
         "LOD95, median": (found["lod95_median"], "mm"),
         "registration error, one sd": (result.registration_error, "mm"),
         "from": (result.registration_error_from, ""),

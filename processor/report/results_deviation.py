@@ -14,7 +14,10 @@ NAN = float("nan")
 
 
 def figures(result: Result) -> dict[str, float]:
-    """Return what the core points that have a level of detection say together, by name."""
+    """Return what the core points that have a level of detection say together, by name.
+
+    ``min_lod95`` and ``max_lod95`` are those of the two core points that ``min`` and ``max`` are of.
+    """
     known = np.isfinite(result.lod95)
     distance, lod95 = result.distance[known], result.lod95[known]
     return {
@@ -23,6 +26,8 @@ def figures(result: Result) -> dict[str, float]:
         "sd": _of(np.std, distance),
         "min": _of(np.min, distance),
         "max": _of(np.max, distance),
+        "min_lod95": float(lod95[np.argmin(distance)]) if len(distance) else NAN,
+        "max_lod95": float(lod95[np.argmax(distance)]) if len(distance) else NAN,
         "within_10mm_share": _of(np.mean, (np.abs(distance) <= NEAR_MM).astype(np.float64)),
         "lod95_median": _of(np.median, lod95),
         "measured": float(len(distance)),
@@ -37,6 +42,8 @@ def written(result: Result) -> dict[str, Any]:
     """Return the step's object."""
     found = figures(result)
     measured = int(found.pop("measured"))
+    lod95 = {end: found.pop(f"{end}_lod95") for end in ("min", "max")}
+    ends = {f"{end}_ci95": [found[end] - half, found[end] + half] for end, half in lod95.items()}
     return {
         "status": result.status,
         "method": result.method,
@@ -53,6 +60,7 @@ def written(result: Result) -> dict[str, Any]:
         "significant_share": result.significant_share,
         "significant_share_ci95": [result.significant_low, result.significant_high],
         **found,
+        **ends,
         "spacing": result.spacing,
         "sigma": result.sigma,
         "points": {"read": result.points_read, "kept": result.points_kept, "on_surface": result.on_surface_share},

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -9,12 +10,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processor import compare
+from processor import compare, store
 from processor.__main__ import main
 from processor.compare import Request
 from processor.geometry.m3c2 import Distances
-from processor.model import InputError, UsageError
-from processor.report import core_points
+from processor.model import InputError, Scan, Scene, UsageError
+from processor.report import comparison, core_points
 from processor.report.core_points import COLUMNS
 from tests.unit.test_m3c2 import brute, wavy
 
@@ -127,20 +128,133 @@ def test_normals_come_from_a_file(clouds, tmp_path):
     normals = np.tile([0.6, 0.0, -0.8], (len(core), 1)) * 2.0
     request = {"projection_diameter": 0.08, "max_depth": 0.06}
     tables = [
-        written(tmp_path / "three.txt", normals),
-        written(tmp_path / "six.txt", np.hstack([core, normals])),
+        written(tmp_path / "three.txt", normals / 2.0),
+        written(tmp_path / "six.txt", np.hstack([core, normals / 2.0])),
         written(tmp_path / "named.csv", np.hstack([normals, core]), "nx ny nz x y z"),
     ]
     results = [compare.compare(Request(first, second, core_file, one, **request)) for one in tables]
     for one in results:
         np.testing.assert_allclose(one.normals, normals / 2.0)
         np.testing.assert_array_equal(one.distances.distance, results[0].distances.distance)
-    for rows, said in [(normals[:-1], "for each of 50"), (normals * 0.0, "no direction")]:
+    for rows, said in [
+        (normals[:-1], "for each of 50"), (normals * 0.0, "no direction"), (core, "expected unit normals"),
+        (np.hstack([core, 100.0 * normals]), "expected unit normals"),
+    ]:  # fmt: skip
         with pytest.raises(InputError, match=said):
             compare.compare(Request(first, second, core_file, written(tmp_path / "bad.txt", rows), **request))
     moved = written(tmp_path / "moved.txt", np.hstack([core[::-1], normals]))
     with pytest.raises(InputError, match="elsewhere"):
         compare.compare(Request(first, second, core_file, moved, **request))
+
+
+def test_a_normal_diameter_that_is_not_used_is_not_said(clouds, tmp_path):
+    first, second, core_file = clouds
+    normals = written(tmp_path / "up.txt", np.tile([0.0, 0.0, 1.0], (50, 1)))
+    for given in (0.0, 0.08):
+        said = []
+        found = compare.compare(Request(first, second, core_file, normals, normal_diameter=given), said.append)
+        text = "\n".join(said)
+        assert not re.search(r"normal diameter \d", text)
+        assert "normals of file up.txt" in text
+        assert ("--normal-diameter is not used" in text) == (given > 0.0)
+        parameters = comparison.as_json(found)["parameters"]
+        assert parameters["normal_diameter"] is None
+        assert "normal_diameter" not in parameters["given"]
+
+
+def wall(seed, off=0.0, count=6000):
+    """An upright wall of 3 m along x, with 2 mm of noise; metres."""
+    rng = np.random.default_rng(seed)
+    x, z = rng.uniform(0.0, 3.0, (2, count))
+    return np.column_stack([x, off + rng.normal(0.0, 0.002, count), z])
+
+
+def test_a_wall_that_moved_has_moved_one_way(tmp_path, monkeypatch, capsys):
+    first, second = written(tmp_path / "a.xyz", wall(1)), written(tmp_path / "b.xyz", wall(2, 0.05))
+    assert called(monkeypatch, first, second, "-o", tmp_path / "out") == 0
+    found = table(tmp_path / "out")
+    assert np.nanmean(found["distance"]) == pytest.approx(0.05, abs=1e-3)
+    assert (found["distance"] > 0.0).all()
+    assert (found["ny"] > 0.0).all()
+    said = "6000 of 6000 normals are of upright surfaces"
+    assert said in capsys.readouterr().out
+    assert said in (tmp_path / "out" / "report.html").read_text()
+    turned = json.loads((tmp_path / "out" / "compare.json").read_text())["normals_turned"]
+    assert (turned["by_up"], turned["by_convention"], turned["surfaces_by_convention"]) == (0, 6000, 1)
+
+
+def test_an_upright_wall_looks_at_the_scanners_that_the_reference_knows(tmp_path):
+    """Two scanners on either side of two walls, each with a pose of its own."""
+    scans = []
+    for i, side in enumerate((-1.0, 1.0)):
+        points = 1000.0 * wall(i) + [0.0, 2000.0 * side, 0.0]  # seen from the middle
+        T = np.eye(4)
+        T[:3, 3] = [1500.0, 100.0 * side, 1500.0]
+        scans.append(Scan(f"S{i}", points - T[:3, 3], position=np.zeros(3), T_project_scan=T))
+    store.write_scene(tmp_path / "a.h5", Scene("a", "structure", tuple(scans), units="mm"), None, {})
+    nearer = [1000.0 * wall(i + 2) + [0.0, 1950.0 * side, 0.0] for i, side in enumerate((-1.0, 1.0))]
+    moved = written(tmp_path / "b.csv", np.vstack(nearer), "x[mm] y[mm] z[mm]")
+    core = np.array([[1500.0, -2000.0, 1500.0], [1500.0, 2000.0, 1500.0], [700.0, 2000.0, 1500.0]])
+    core_file = written(tmp_path / "core.csv", core, "x[mm] y[mm] z[mm]")
+    for given in (core_file, None):
+        found = compare.compare(Request(tmp_path / "a.h5", moved, given))
+        np.testing.assert_array_equal(np.sign(found.normals[:, 1]), -np.sign(found.core[:, 1]))
+        np.testing.assert_allclose(found.distances.distance, 50.0, atol=2.0)
+        assert found.turned.scanner == len(found.core)
+
+
+def test_nothing_in_common_is_bad_input_and_why(clouds, tmp_path):
+    first, second, _ = clouds
+    cloud = np.loadtxt(second) - UTM
+    small = {"projection_diameter": 1e-6, "max_depth": 1e-5}
+    near = written(tmp_path / "near.xyz", np.loadtxt(first) - UTM)
+    cases = [
+        (first, written(tmp_path / "mm.xyz", 1000.0 * np.loadtxt(second)), {}, "about 1000: .* different units"),
+        (near, written(tmp_path / "ft.xyz", cloud / 0.3048), {}, None),
+        (near, written(tmp_path / "inch.xyz", cloud * 39.37), {}, "about 39.37"),
+        (near, written(tmp_path / "ten.xyz", cloud * 10.0 + 700.0), {}, "about 10: "),
+        (first, written(tmp_path / "far.xyz", cloud + UTM + [1000.0, 0.0, 0.0]), {}, "compared cloud .* lie 999"),
+        (first, second, {"core": near}, "core points .* apart"),
+        (first, written(tmp_path / "up.xyz", cloud + UTM + [0.0, 0.0, 0.5]), {"max_depth": 0.1}, "--max-depth"),
+        (first, second, {"normal_diameter": 1e-6}, "normal-diameter"),
+        (first, second, {**small, "normal_diameter": 0.1}, "projection-diameter"),
+        (first, written(tmp_path / "one.xyz", cloud[:1] + UTM), {}, "holds 1 point;"),
+        (written(tmp_path / "two.xyz", cloud[:2] + UTM), first, {}, "holds 2 points;"),
+    ]  # fmt: skip
+    for one, other, given, said in cases:
+        if said is None:
+            assert len(compare.compare(Request(one, other, **given)).core)
+            continue
+        with pytest.raises(InputError, match=said):
+            compare.compare(Request(one, other, **given))
+
+
+def test_a_unit_is_claimed_for_those_that_say_it_alone(tmp_path, monkeypatch, capsys):
+    plane = np.array([[x, y, 0.0] for x in range(20) for y in range(20)])
+    a, b = written(tmp_path / "a.xyz", plane), written(tmp_path / "b.xyz", plane + np.array([0.0, 0.0, 0.5]))
+    core = written(tmp_path / "core.csv", plane, "x[m] y[m] z[m]")
+    for named, options, unit in ((a, ("--core", core), ""), (core, (), "m")):
+        assert called(monkeypatch, named if unit else a, b, "-o", tmp_path / "out", *options) == 0
+        out, err = capsys.readouterr()
+        record = json.loads((tmp_path / "out" / "compare.json").read_text())
+        assert (record["unit"] == "m") == bool(unit)
+        assert (" m," in out) == bool(unit)
+        assert "the unit m is said by core.csv alone; not by " in out
+        assert "the unit m is said by" in err
+    found = compare.compare(Request(a, b))
+    assert comparison.as_json(found)["unit_note"] is None
+
+
+@pytest.mark.parametrize(
+    "option", ["--radius", "--cylinder-radius", "--cyl-radius", "--normal-radius", "--projection-radius", "--rad"]
+)
+def test_who_gives_a_radius_is_told_of_diameters(clouds, tmp_path, monkeypatch, capsys, option):
+    for given in ((option, "0.1"), (f"{option}=0.1",)):
+        assert called(monkeypatch, *clouds[:2], "-o", tmp_path / "out", *given) == 2
+        said = capsys.readouterr().err
+        assert f"No such option: {option}" in said
+        assert "--projection-diameter" in said
+        assert "twice the radius" in said
 
 
 def test_what_has_no_answer_is_nan(tmp_path):
@@ -166,8 +280,8 @@ def test_bad_input_is_one_line_and_exit_3(clouds, tmp_path, monkeypatch, capsys)
     text.write_text("no numbers here\n")
     one.write_text("1 2 3\n1 2 3\n1 2 3\n")
     cases = [
-        (tmp_path / "none.xyz", second), (first, empty), (text, second), (one, one), (first, tmp_path),
-        (first, second, "--core", text), (first, second, "--normals", tmp_path / "none.txt"),
+        (tmp_path / "none.xyz", second), (first, empty), (text, second), (one, one), (one, first), (first, one),
+        (first, tmp_path), (first, second, "--core", text), (first, second, "--normals", tmp_path / "none.txt"),
     ]  # fmt: skip
     for case in cases:
         assert called(monkeypatch, *case, "-o", out) == 3

@@ -1,8 +1,10 @@
 """Step deviation on a bracket that moved in a known way, in the design's frame and in any other."""
 
+import dataclasses
 import json
 from types import SimpleNamespace
 
+import matplotlib as mpl
 import numpy as np
 import pytest
 import trimesh
@@ -10,11 +12,23 @@ import trimesh
 from designgen import recipes
 from designgen.scene import make
 from processor import pipeline
+from processor.deviation import paper
 from processor.evaluate import ErrorReport
 from processor.geometry import rigid
-from processor.model import InputError, Scan, Scene, Stations, StructureDesign, StructureTruth, Truth, UsageError
+from processor.language import language
+from processor.model import (
+    InputError,
+    Scan,
+    Scene,
+    Stations,
+    StepRun,
+    StructureDesign,
+    StructureTruth,
+    Truth,
+    UsageError,
+)
 from processor.pipeline import Execution
-from processor.report import results_json, writing
+from processor.report import figures_deviation, of_deviation, results_deviation, results_json, writing
 from processor.steps import deviation
 from tests.unit.test_deviation_parts import bracket
 
@@ -168,6 +182,98 @@ def test_the_papers_chain_says_what_its_scales_leave(tmp_path):
     )
     np.testing.assert_allclose(result.lod95[known], expected, rtol=1e-12)
     assert all(np.isnan(one.limit) for one in metrics(scene, result, truth).values())
+
+
+def arch(seed=11, count=20_000):
+    """A portal that looks the same half a turn on, but for a block of 35 mm on one foot."""
+    boxes = [((4000, 300, 300), (0, 0, 0)), ((300, 1200, 900), (1850, 0, -600)), ((300, 1200, 900), (-1850, 0, -600)),
+             ((35, 300, 300), (2017.5, 0, -900))]  # fmt: skip
+    mesh = trimesh.util.concatenate(
+        [trimesh.creation.box(extents, trimesh.transformations.translation_matrix(at)) for extents, at in boxes]
+    )
+    points = np.asarray(trimesh.sample.sample_surface(mesh, count, seed=seed)[0])
+    scan = Scan("scan", points)
+    design = StructureDesign("portal", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    at = np.asarray(trimesh.sample.sample_surface(mesh, 3000, seed=99)[0])
+    truth = Truth(structure=StructureTruth(at, np.zeros_like(at), 0.0 * at))
+    return Scene("portal", "structure", (scan,), structure=design, units="mm"), truth
+
+
+def test_the_papers_attitude_is_called_ambiguous_where_another_fits_as_well():
+    scene, _ = arch()
+    result = deviation.run(scene, deviation.Params(method="paper", register="coarse"))
+    assert result.status == "ambiguous"
+    assert 1.0 <= result.ambiguity < 1.3
+    assert "Another attitude" in result.message
+    bracket_scene, _ = scene_of(12, lambda p: 0.0 * p, count=20_000)
+    sure = deviation.run(bracket_scene, deviation.Params(method="paper", register="coarse"))
+    assert sure.status == "ok"
+    assert sure.ambiguity > 2.0
+    assert rigid.rotation_angle(sure.T_design_scan[:3, :3]) < 0.01
+
+
+@pytest.mark.parametrize(("width", "knob"), [(1980, (500, -900)), (1700, (0, 900))])
+def test_cases_are_compared_after_they_were_refined_and_alike_axes_are_swapped(width, knob):
+    """Seen more in two corners, a plate nearly as wide as long has other axes than its design."""
+    plate, pin = (
+        trimesh.creation.box((2000, width, 20)),
+        trimesh.creation.box((80, 80, 300), np.eye(4) + _at(*knob, 160)),
+    )
+    mesh = trimesh.util.concatenate([plate, pin])
+    target, seen = (np.asarray(trimesh.sample.sample_surface(mesh, 15_000, seed=seed)[0]) for seed in (1, 2))
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, -0.2, 1.5])), np.array([500.0, -80.0, 7.0]))
+    kept = np.random.default_rng(1).random(len(seen)) < np.where(seen[:, 0] * seen[:, 1] > 0.0, 1.0, 0.8)
+    found, ambiguity = paper.coarse(rigid.apply(rigid.invert(T), seen[kept]), target)
+    assert rigid.rotation_angle(found[:3, :3] @ T[:3, :3].T) < 0.15
+    assert ambiguity > 1.3
+
+
+def _at(x, y, z):
+    shift = np.zeros((4, 4))
+    shift[:3, 3] = x, y, z
+    return shift
+
+
+def test_a_pose_that_is_another_of_those_that_fit_is_not_held_against_the_truth():
+    scene, truth = arch()
+    result = deviation.run(scene, deviation.Params(register="none"))
+    half = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, np.pi])), np.zeros(3))
+    turned = dataclasses.replace(result, T_design_scan=half, status="ambiguous")
+    (said,) = deviation.check(scene, turned, truth)
+    assert said.name.startswith("not compared")
+    assert said.value == pytest.approx(180.0)
+    assert said.passed
+    assert len(metrics(scene, dataclasses.replace(result, status="ambiguous"), truth)) > 3  # ambiguous, but right
+    assert len(metrics(scene, dataclasses.replace(turned, status="ok"), truth)) > 3  # nobody was warned of that one
+
+
+def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
+    scene, _ = scene_of(14, count=20_000)
+    result = deviation.run(scene, deviation.Params())
+    written = results_deviation.written(result)
+    known = np.isfinite(result.lod95)
+    for end, row in (("min", np.argmin(result.distance[known])), ("max", np.argmax(result.distance[known]))):
+        value, lod95 = result.distance[known][row], result.lod95[known][row]
+        assert written[end] == value
+        np.testing.assert_allclose(written[f"{end}_ci95"], [value - lod95, value + lod95])
+        said = of_deviation.REPORT.summary(result)[1]
+        assert f"{value:.3f} ± {lod95:.3f}" in said
+        assert "±" not in language("zh").say(said) or "至" in language("zh").say(said)
+    run = StepRun("deviation", "default", "{}", result)
+    (table,) = of_deviation.REPORT.tables([run], ErrorReport())
+    rows = {row[0]: row[1] for row in table.rows}
+    assert rows["least"] + rows["least, its LOD95"] == pytest.approx(written["min_ci95"][1])
+    assert rows["greatest"] + rows["greatest, its LOD95"] == pytest.approx(written["max_ci95"][1])
+
+
+def test_marks_of_the_legend_can_be_seen():
+    legend = figures_deviation._legend(3, 5, 7)
+    assert [one.get_label().rsplit("(", 1)[1] for one in legend] == ["3)", "5)", "7)"]
+    for one in legend:
+        assert max(mpl.colors.to_rgb(one.get_color())) < 0.5  # white is 1
+        assert one.get_markersize() >= 2.5
+        assert one.get_linestyle() == "None"
+    assert legend[2].get_markersize() > 1.5 * legend[1].get_markersize()
 
 
 def test_it_is_written_as_the_interface_says(tmp_path):

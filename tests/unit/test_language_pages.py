@@ -6,9 +6,10 @@ import importlib.resources
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from processor import language
+from processor import compare, language
 from processor.batch import figures as batch_figures
 from processor.batch import summary
 from processor.batch.job import Job
@@ -16,6 +17,7 @@ from processor.batch.record import Record
 from processor.defects.result import CLASSES
 from processor.defects.result import Result as Defects
 from processor.evaluate import ErrorReport
+from processor.geometry.orientation import Turned
 from processor.model import Metric
 from processor.report import comparison, figures, page
 from processor.validation import changes, night
@@ -297,6 +299,10 @@ def test_a_comparison_in_chinese():
     for unit in ("mm", "that of the files, which do not say it"):
         for known in (2, 10):
             record = {"summary": {**share, "without_lod": known}, "unit": unit, "inputs": inputs}
+            record["normals_note"] = compare.turned_note(Turned(np.empty((0, 3)), 1, 2, 3, 4, 2))
+            record["unit_note"] = compare.unit_note(
+                {"reference": "m", "compared": "", "core": ""}, dict.fromkeys(compare.CLOUDS, "a.ply")
+            )
             drawn = [("Deviations; the outermost bars hold all beyond", b"")]
             seen = Visible(comparison._page(record, drawn, "zh"))
             assert seen.lang == "zh"
