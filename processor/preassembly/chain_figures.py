@@ -20,8 +20,11 @@ AXES = ("end face", "webs", "bottom and top")  # what places a joint end along i
 def span(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> tuple[float, float]:
     """How much farther apart the bridge's outer ends are than designed, mm, and the half-width of its interval.
 
-    Nothing in the adjustment holds the span: parts that are too short bring the feet nearer to each other.
+    Nothing in the adjustment holds the span: parts that are too short bring the feet nearer to each other. NaN where
+    a joint has no answer: then nothing says how far apart the parts beside it are.
     """
+    if not np.isfinite(adjusted.gaps).all():
+        return float("nan"), float("nan")
     ends = _outer_ends(design)
     chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
     found, D, own = 0.0, *np.zeros((2, 1, len(adjusted.motion_covariance)))
@@ -92,6 +95,12 @@ def _covariance(parts: Sequence[Measured], adjusted: Adjusted, by_motion: Floats
     registered = by_pose @ block_diag(*(part.member.pose for part in parts)) @ by_pose.T
     found: Floats = by_motion @ adjusted.motion_covariance @ by_motion.T + both + both.T + registered
     return found
+
+
+def design_span(design: ArchDesign) -> float:
+    """Distance of the bridge's outer ends as designed, mm."""
+    ends = _outer_ends(design)
+    return float(np.linalg.norm(ends[1] - ends[0]))
 
 
 def _outer_ends(design: ArchDesign) -> Floats:
