@@ -22,6 +22,7 @@ from processor.preassembly import (
     joint_measures,
     network,
     registration,
+    systematic,
     tolerance,
 )
 from processor.preassembly.joint_verdicts import Verdict, judge
@@ -29,7 +30,7 @@ from processor.preassembly.measuring import Measured, finished, see
 from processor.preassembly.params import Params
 from processor.preassembly.proposals import propose
 from processor.preassembly.result import Result
-from processor.preassembly.systematic import EXPANSION_PER_K
+from processor.preassembly.systematic import EXPANSION_PER_K, SystematicParams
 from processor.progress import tracked
 
 REFERENCE_C = 20.0
@@ -81,7 +82,7 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     closure, closure_ci95 = chain_figures.closure(parts, members, design, frames)
     limiting, advice = chain_figures.limiting(parts, adjusted, design, frames)
     budget = params.systematic.budget(max(Polyline.through(part.bottom_edge_left).length for part in design.parts))
-    noise = float(np.nanmedian(key_sd)) if np.isfinite(key_sd).any() else float("nan")
+    measured = _median_sd(parts, design, params.systematic)
     statuses = [part.status for part in parts]
     mean, largest = _mean_max(np.abs(gaps))
     return Result(
@@ -133,8 +134,8 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         closure_ci95=closure_ci95,
         limiting=limiting,
         advice=advice,
-        budget_source=("noise of the points, median", *budget),
-        budget_sd=np.array([noise, *budget.values()]),
+        budget_source=("ends as measured, median", *budget),
+        budget_sd=np.array([measured, *budget.values()]),
         residual_points=np.vstack([part.residual_points for part in parts]),
         residual=np.concatenate([part.residuals for part in parts]),
         residual_component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
@@ -171,8 +172,8 @@ def _if_told(verdict: Verdict, unsure: str) -> Verdict:
 def _unsure_of_all(parts: Sequence[Measured], adjusted: network.Adjusted, design: ArchDesign) -> str:
     """Say why the chain as a whole is not known well enough to be judged; empty where it is."""
     said = [f"{part.name} may lie the other way round" for part in parts if part.status == "ambiguous"]
-    unknown = np.isnan(adjusted.gaps).any(axis=(1, 2))
-    said += [f"{name} has no answer" for name, lost in zip(design.joint_names, unknown, strict=True) if lost]
+    both = zip(design.joint_names, adjusted.gaps, strict=True)
+    said += [f"{name} has no answer" for name, gaps in both if not np.isfinite(gaps).all()]
     return "; ".join(said)
 
 
@@ -213,6 +214,17 @@ def _key_points(
                 block = end.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
                 spreads[i, e, k] = np.sqrt(np.diag(turn @ block @ turn.T)) / part.shrink
     return points, spreads
+
+
+def _median_sd(parts: Sequence[Measured], design: ArchDesign, stated: SystematicParams) -> float:
+    """Median sd of a coordinate of the ends, mm: noise, form and what stations differ by, without what was stated."""
+    variances = [
+        np.diag(end.covariance) - systematic.same_of_end(stated, own)
+        for part, own in zip(parts, design.parts, strict=True)
+        for end in part.member.ends
+        if end is not None and np.isfinite(end.covariance).all()
+    ]
+    return float(np.sqrt(max(np.median(variances), 0.0))) if variances else float("nan")
 
 
 def _size(departure: Floats) -> Floats:

@@ -99,12 +99,11 @@ def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth
     if not known.any():
         return []
     rows = [true[name] for name in result.components]
-    placed = np.isfinite(result.T_bridge_scan).all(axis=(1, 2))
-    edges = np.where(placed[:, None, None, None], truth.edges_bridge[rows], np.nan)
-    joined = np.where(known.all(axis=(1, 2))[:, None, None], 0.0, np.nan)
-    ends = truth.key_points_bridge[rows].copy()
-    ends[1:, 0] += joined
-    ends[:-1, 1] += joined
+    edges, ends = truth.edges_bridge[rows], truth.key_points_bridge[rows]
+    edges[~np.isfinite(result.T_bridge_scan[:, 0, 0])] = np.nan
+    for j, there in enumerate(known):
+        if not there.all():
+            ends[j, 1] = ends[j + 1, 0] = np.nan
     off = (result.gaps - gaps_by_objective(design, ends, edges, result.weight))[known]
     share = 100.0 * float((np.abs(off) <= result.gap_ci95[known]).mean())
     none = float("nan")

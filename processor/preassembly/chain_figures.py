@@ -77,8 +77,12 @@ def limiting(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign, 
         return missing, missing
     j, point, axis = where
     ends = {"end": parts[j].member.ends[1], "start": parts[j + 1].member.ends[0]}
+    # What an end follows of its part's registration is the same at the other end: it cancels, so it limits nothing.
+    poses = {"end": parts[j].member.pose, "start": parts[j + 1].member.pose}
     own = {
-        side: float(end.covariance[3 * point + axis, 3 * point + axis]) for side, end in ends.items() if end is not None
+        side: float(np.diag(network.of_itself(end, poses[side]))[3 * point + axis])
+        for side, end in ends.items()
+        if end is not None
     }
     side = max(own, key=lambda one: own[one])
     part = parts[j].name if side == "end" else parts[j + 1].name
