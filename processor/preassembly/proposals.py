@@ -10,7 +10,7 @@ the gap by its depth and takes nothing on, so its least depth is 0 or more. The 
 
 Planes that would cut a corner wider than the groove's limit are left out: nothing is cut to be filled again. The last
 two also with shims or weld build-up where the gap is wider than wanted, and these without a cut. Proposed is what keeps
-the groove gap most probably, if more probably than not; of works alike the lesser. A cut must be worth its while,
+the groove gap most probably, if it does with HOLDS at all; of works alike the lesser. A cut must be worth its while,
 build-up more so. No cut mends what is misaligned across the joint: that is said with it. Where a part may lie the other
 way round, or the end may be another one, nothing is proposed.
 """
@@ -34,7 +34,7 @@ PLACES = ("bottom left", "bottom right", "top right", "top left", "bottom", "rig
 SHOWN_MM = 0.1  # amounts are said to this
 ALIKE = 0.01  # probabilities that differ by less are alike
 CUT_GAIN, BUILD_UP_GAIN = 0.05, 0.1  # of probability, for which a cut, and for which build-up is worth its while
-HOLDS = 0.5  # probability from which the groove gap may be said to hold
+HOLDS = 0.1  # probability of the groove gap below which a work is no proposal
 SURELY_NOT = 0.005  # less is said to be no proposal: it would print as 0 %
 SIDES = {(1, False): "to the left", (1, True): "to the right", (2, False): "up", (2, True): "down"}
 

@@ -9,13 +9,14 @@ from html.parser import HTMLParser
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from processor.evaluate import ErrorReport
 from processor.geometry import rigid
 from processor.model import Limit, StepRun, Tolerance
 from processor.pipeline import Execution
 from processor.preassembly import chain_verdicts, joint_measures, joint_verdicts, proposals
-from processor.report import figures, figures_residuals, page, printing, results_json, tables
+from processor.report import figures, figures_joints, figures_residuals, page, printing, results_json, tables
 from processor.report.drawing import rounded
 from tests.unit.test_report import PROVENANCE, arch_scene, assembled
 
@@ -378,3 +379,29 @@ def test_parts_unroll_face_by_face():
     np.testing.assert_allclose(flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1], atol=0.01)
     np.testing.assert_allclose(flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0], atol=0.01)
     np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
+
+
+def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps_says_so(monkeypatch):
+    drawn = []
+
+    def kept(figure):
+        FigureCanvasAgg(figure).draw()
+        drawn.append(figure)
+        return b""
+
+    monkeypatch.setattr(figures_joints, "png", kept)
+    result = unknown(adjusted(), [1], ())
+    wide = joint_measures.measure(np.outer(np.arange(8.0), [-6.6, 3.0, 3.0]), 0.2 * np.eye(24), np.eye(4), SECTION)
+    figures_joints.gap_vectors(dataclasses.replace(result, measures=(wide, result.measures[1])))
+    shown, silent = drawn[0].axes
+    numbers = [one for one in shown.texts if one.get_text().startswith("P")]
+    assert len(numbers) == 8
+    frame = shown.get_window_extent()
+    for one in numbers:
+        box = one.get_window_extent()
+        assert frame.x0 <= box.x0, one.get_text()
+        assert box.x1 <= frame.x1, one.get_text()
+        assert frame.y0 <= box.y0, one.get_text()
+        assert box.y1 <= frame.y1, one.get_text()
+    assert [one.get_text() for one in silent.texts] == ["no answer: the gaps are not known"]
+    assert silent.get_title() == "J2: indeterminate"
