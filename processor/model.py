@@ -134,7 +134,8 @@ class Limit(Checked):
 
     ``low_ratio`` and ``high_ratio`` are multiples of the size named by ``of``; by ``rule`` the smaller of number and
     multiple counts, or their sum. The row is for sizes above ``above_mm`` up to ``up_to_mm``. ``measure`` is what of a
-    joint is held against it: misalignment | groove_gap | eccentricity, or nothing.
+    joint is held against it: misalignment | groove_gap | eccentricity; or of a whole chain: span | unit_length |
+    inner_arc | lateral_axis | elevation; or nothing.
     """
 
     key: str

@@ -15,13 +15,22 @@ import numpy as np
 from processor.geometry import rigid
 from processor.geometry.lines import Polyline
 from processor.model import NORMAL_95, ArchDesign, Floats, Scan, Scene, Tolerance
-from processor.preassembly import chain_figures, features, joint_measures, network, registration, tolerance
+from processor.preassembly import (
+    chain_figures,
+    chain_verdicts,
+    features,
+    joint_measures,
+    network,
+    registration,
+    systematic,
+    tolerance,
+)
 from processor.preassembly.joint_verdicts import Verdict, judge
 from processor.preassembly.measuring import Measured, finished, see
 from processor.preassembly.params import Params
 from processor.preassembly.proposals import propose
 from processor.preassembly.result import Result
-from processor.preassembly.systematic import EXPANSION_PER_K
+from processor.preassembly.systematic import EXPANSION_PER_K, SystematicParams
 from processor.progress import tracked
 
 REFERENCE_C = 20.0
@@ -56,19 +65,30 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         for one in zip(gaps, adjusted.gap_covariance, frames, design.joint_points, strict=True)
     ]
     sides = list(pairwise(parts))
-    judged = [_if_told(judge(one, limits), *both) for one, both in zip(measures, sides, strict=True)]
-    proposals = [propose(*one, limits, params.trim) for one in zip(design.joint_names, measures, strict=True)]
+    unsure = [_unsure(*both) for both in sides]
+    judged = [_if_told(judge(one, limits), why) for one, why in zip(measures, unsure, strict=True)]
+    proposals = [
+        propose(name, one, limits, params.trim, unsure=why, rests_on=_weak(*both))
+        for name, one, why, both in zip(design.joint_names, measures, unsure, sides, strict=True)
+    ]
     span, span_ci95 = chain_figures.span(parts, adjusted, design)
+    chain = chain_verdicts.judge(
+        chain_verdicts.quantities(members, adjusted, span, span_ci95),
+        limits,
+        chain_figures.design_span(design),
+        _unsure_of_all(parts, adjusted, design),
+    )
+    idle = chain_verdicts.not_held(limits)
     closure, closure_ci95 = chain_figures.closure(parts, members, design, frames)
     limiting, advice = chain_figures.limiting(parts, adjusted, design, frames)
     budget = params.systematic.budget(max(Polyline.through(part.bottom_edge_left).length for part in design.parts))
-    noise = float(np.nanmedian(key_sd)) if np.isfinite(key_sd).any() else float("nan")
+    measured = _median_sd(parts, design, params.systematic)
     statuses = [part.status for part in parts]
     mean, largest = _mean_max(np.abs(gaps))
     return Result(
         status=_overall(statuses),
         method="adjustment",
-        message=_message(params, limits, degrees, judged),
+        message=_message(params, limits, degrees, [*judged, chain]),
         components=tuple(part.name for part in parts),
         component_status=tuple(statuses),
         component_message=tuple(part.message for part in parts),
@@ -103,6 +123,9 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         measures=tuple(measures),
         judged=tuple(judged),
         proposals=tuple(proposals),
+        chain_judged=(chain,),
+        not_held=tuple(limit.key for limit in idle),
+        not_held_what=tuple(limit.what for limit in idle),
         linear_offset=np.vstack(adjusted.departures),
         linear_offset_ci95=NORMAL_95 * np.sqrt(np.maximum(np.vstack(adjusted.departure_variance), 0.0)),
         span_departure=span,
@@ -111,22 +134,47 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         closure_ci95=closure_ci95,
         limiting=limiting,
         advice=advice,
-        budget_source=("noise of the points, median", *budget),
-        budget_sd=np.array([noise, *budget.values()]),
+        budget_source=("ends as measured, median", *budget),
+        budget_sd=np.array([measured, *budget.values()]),
         residual_points=np.vstack([part.residual_points for part in parts]),
         residual=np.concatenate([part.residuals for part in parts]),
         residual_component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
     )
 
 
-def _if_told(verdict: Verdict, left: Measured, right: Measured) -> Verdict:
-    """Leave a joint open where a part may lie the other way round, or an end may have been taken for another side."""
-    unsure = [f"{part.name} may lie the other way round" for part in (left, right) if part.status == "ambiguous"]
+def _unsure(left: Measured, right: Measured) -> str:
+    """Say why a joint's gaps may be wrong: a part the other way round, an end taken for another side; or nothing."""
+    said = [f"{part.name} may lie the other way round" for part in (left, right) if part.status == "ambiguous"]
     for part, end in ((left, left.member.ends[1]), (right, right.member.ends[0])):
-        unsure += [f"{part.name}: {end.trouble}"] if end is not None and end.trouble else []
+        said += [f"{part.name}: {end.trouble}"] if end is not None and end.trouble else []
+    return "; ".join(said)
+
+
+def _weak(left: Measured, right: Measured) -> str:
+    """Name the parts beside a joint that are weak, and why."""
+    return ", ".join(f"{part.name} ({part.message})" for part in (left, right) if part.status == "weak")
+
+
+def _if_told(verdict: Verdict, unsure: str) -> Verdict:
+    """Leave a joint open, and each of its limits, where its gaps may be wrong."""
     if not unsure:
         return verdict
-    return replace(verdict, verdict="indeterminate", probability=float("nan"), said="; ".join(unsure))
+    return replace(
+        verdict,
+        verdict="indeterminate",
+        probability=float("nan"),
+        each=("indeterminate",) * len(verdict.each),
+        each_probability=np.full_like(verdict.each_probability, np.nan),
+        said=unsure,
+    )
+
+
+def _unsure_of_all(parts: Sequence[Measured], adjusted: network.Adjusted, design: ArchDesign) -> str:
+    """Say why the chain as a whole is not known well enough to be judged; empty where it is."""
+    said = [f"{part.name} may lie the other way round" for part in parts if part.status == "ambiguous"]
+    both = zip(design.joint_names, adjusted.gaps, strict=True)
+    said += [f"{name} has no answer" for name, gaps in both if not np.isfinite(gaps).all()]
+    return "; ".join(said)
 
 
 def _pose_covariances(parts: Sequence[Measured], adjusted: network.Adjusted, placed: Floats) -> Floats:
@@ -166,6 +214,17 @@ def _key_points(
                 block = end.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
                 spreads[i, e, k] = np.sqrt(np.diag(turn @ block @ turn.T)) / part.shrink
     return points, spreads
+
+
+def _median_sd(parts: Sequence[Measured], design: ArchDesign, stated: SystematicParams) -> float:
+    """Median sd of a coordinate of the ends, mm: noise, form and what stations differ by, without what was stated."""
+    variances = [
+        np.diag(end.covariance) - systematic.same_of_end(stated, own)
+        for part, own in zip(parts, design.parts, strict=True)
+        for end in part.member.ends
+        if end is not None and np.isfinite(end.covariance).all()
+    ]
+    return float(np.sqrt(max(np.median(variances), 0.0))) if variances else float("nan")
 
 
 def _size(departure: Floats) -> Floats:
@@ -211,6 +270,9 @@ def _message(params: Params, limits: Tolerance, degrees: float, judged: Sequence
     said.append("temperature corrected" if degrees else "no temperature given: taken as the reference")
     unverified = any(not verified for one in judged for verified in one.verified)
     said.append(f"limits of {limits.standard or 'the project'}{', not verified' if unverified else ''}")
+    idle = chain_verdicts.not_held(limits)
+    if idle:
+        said.append(f"limits that nothing is held against: {', '.join(limit.key for limit in idle)}")
     if not params.systematic.known:
         said.append("intervals hold noise and what stations differ by: state what they share, offset and scale")
     return "; ".join(said)

@@ -1,7 +1,8 @@
 """An assembly held against the truth of the parts that were scanned.
 
 The gaps of parts that are not perfect depend on the objective: they are held against those that the same objective has
-on the true key points and edges, found by a general minimiser that shares nothing with the adjustment.
+on the true key points and edges, found by a general minimiser that shares nothing with the adjustment. Joints and parts
+of which the answer knows nothing do not pull in it, so they do not pull in the truth either.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from processor.geometry.error_figures import signed
 from processor.geometry.lines import Polyline
 from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Truth
 from processor.preassembly import errors
+from processor.preassembly.network import HOLD
 from processor.preassembly.result import Result
 
 WRONG_POSE_RAD = 0.1
@@ -91,20 +93,24 @@ def _gaps_of_truth(result: Result, truth: ArchTruth, true: dict[str, int], true_
 
 def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
     """Hold the gaps of an adjustment against those of the truth under its objective."""
-    if not np.isfinite(result.weight) or not np.isfinite(result.T_bridge_scan).all():
+    if not np.isfinite(result.weight):
         return []
-    rows = [true[name] for name in result.components]
-    expected = gaps_by_objective(design, truth.key_points_bridge[rows], truth.edges_bridge[rows], result.weight)
-    off = result.gaps - expected
-    known = np.isfinite(off) & np.isfinite(result.gap_ci95)
+    known = np.isfinite(result.gaps) & np.isfinite(result.gap_ci95)
     if not known.any():
         return []
-    share = 100.0 * float((np.abs(off[known]) <= result.gap_ci95[known]).mean())
+    rows = [true[name] for name in result.components]
+    edges, ends = truth.edges_bridge[rows], truth.key_points_bridge[rows]
+    edges[~np.isfinite(result.T_bridge_scan[:, 0, 0])] = np.nan
+    for j, there in enumerate(known):
+        if not there.all():
+            ends[j, 1] = ends[j + 1, 0] = np.nan
+    off = (result.gaps - gaps_by_objective(design, ends, edges, result.weight))[known]
+    share = 100.0 * float((np.abs(off) <= result.gap_ci95[known]).mean())
     none = float("nan")
     return [
-        Metric("preassemble", "gaps against the truth's, rms", float(np.sqrt(np.mean(off[known] ** 2))), none, "mm"),
+        Metric("preassemble", "gaps against the truth's, rms", float(np.sqrt(np.mean(off**2))), none, "mm"),
         Metric("preassemble", "gaps within their 95 % intervals", share, none, "%"),
-        *signed("preassemble", "gaps", off[known]),
+        *signed("preassemble", "gaps", off),
     ]
 
 
@@ -112,10 +118,17 @@ def gaps_by_objective(design: ArchDesign, key_points: Floats, edges: Floats, wei
     """Gaps (j, 8, 3) where the sum of squared gaps and ``weight`` times that of the edges' departures is least.
 
     ``key_points`` (c, 2, 8, 3) and ``edges`` (c, 2, e, 3) of the parts, near where the design has them; bridge frame.
+    Joints with an end that is NaN do not pull, nor do edges that are; then parts are held along their chords as the
+    adjustment holds them.
     """
     lines = [(Polyline.through(p.bottom_edge_left), Polyline.through(p.bottom_edge_right)) for p in design.parts]
     middles = [part.vertices.mean(axis=0) for part in design.parts]
-    stations = [[_at_stations(edges[i, k], lines[i][k]) for k in range(2)] for i in range(len(lines))]
+    joined = np.isfinite(key_points[1:, 0] - key_points[:-1, 1]).all(axis=(1, 2))
+    seen = [i for i in range(len(lines)) if np.isfinite(edges[i]).all()]
+    stations = {(i, k): _at_stations(edges[i, k], lines[i][k]) for i in seen for k in range(2)}
+    chords = np.array([right.at(np.array([right.length]))[0] - left.at(np.array([0.0]))[0] for left, right in lines])
+    chords /= np.linalg.norm(chords, axis=1)[:, None]
+    hold = 0.0 if joined.all() else np.sqrt(HOLD)
 
     def placed(x: Floats, i: int, points: Floats) -> Floats:
         R = rigid.rotation_from_vector(1e-3 * x[6 * i : 6 * i + 3])
@@ -127,10 +140,9 @@ def gaps_by_objective(design: ArchDesign, key_points: Floats, edges: Floats, wei
         return np.array([placed(x, i + 1, key_points[i + 1, 0]) - placed(x, i, key_points[i, 1]) for i in pairs])
 
     def objective(x: Floats) -> Floats:
-        off = [
-            lines[i][k].nearest(placed(x, i, stations[i][k]))[1].ravel() for i in range(len(lines)) for k in range(2)
-        ]
-        return np.concatenate([gaps(x).ravel(), np.sqrt(weight) * np.concatenate(off)])
+        off = [np.zeros(0), *(lines[i][k].nearest(placed(x, i, at))[1].ravel() for (i, k), at in stations.items())]
+        along = np.einsum("ci,ci->c", chords, x.reshape(-1, 6)[:, 3:])
+        return np.concatenate([gaps(x)[joined].ravel(), np.sqrt(weight) * np.concatenate(off), hold * along])
 
     found = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12)
     return gaps(found.x)

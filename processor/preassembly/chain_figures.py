@@ -20,8 +20,11 @@ AXES = ("end face", "webs", "bottom and top")  # what places a joint end along i
 def span(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> tuple[float, float]:
     """How much farther apart the bridge's outer ends are than designed, mm, and the half-width of its interval.
 
-    Nothing in the adjustment holds the span: parts that are too short bring the feet nearer to each other.
+    Nothing in the adjustment holds the span: parts that are too short bring the feet nearer to each other. NaN where
+    a joint has no answer: then nothing says how far apart the parts beside it are.
     """
+    if not np.isfinite(adjusted.gaps).all():
+        return float("nan"), float("nan")
     ends = _outer_ends(design)
     chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
     found, D, own = 0.0, *np.zeros((2, 1, len(adjusted.motion_covariance)))
@@ -74,8 +77,12 @@ def limiting(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign, 
         return missing, missing
     j, point, axis = where
     ends = {"end": parts[j].member.ends[1], "start": parts[j + 1].member.ends[0]}
+    # What an end follows of its part's registration is the same at the other end: it cancels, so it limits nothing.
+    poses = {"end": parts[j].member.pose, "start": parts[j + 1].member.pose}
     own = {
-        side: float(end.covariance[3 * point + axis, 3 * point + axis]) for side, end in ends.items() if end is not None
+        side: float(np.diag(network.of_itself(end, poses[side]))[3 * point + axis])
+        for side, end in ends.items()
+        if end is not None
     }
     side = max(own, key=lambda one: own[one])
     part = parts[j].name if side == "end" else parts[j + 1].name
@@ -92,6 +99,12 @@ def _covariance(parts: Sequence[Measured], adjusted: Adjusted, by_motion: Floats
     registered = by_pose @ block_diag(*(part.member.pose for part in parts)) @ by_pose.T
     found: Floats = by_motion @ adjusted.motion_covariance @ by_motion.T + both + both.T + registered
     return found
+
+
+def design_span(design: ArchDesign) -> float:
+    """Distance of the bridge's outer ends as designed, mm."""
+    ends = _outer_ends(design)
+    return float(np.linalg.norm(ends[1] - ends[0]))
 
 
 def _outer_ends(design: ArchDesign) -> Floats:

@@ -11,6 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -38,7 +39,9 @@ class Verdict(Checked):
     high: Floats = column("v")
     each: tuple[str, ...] = names("v")  # pass | fail | indeterminate
     each_probability: Floats = column("v")
-    clause: tuple[str, ...] = names("v")
+    clause: tuple[str, ...] = names("v")  # of its standard; where there is none, the source
+    edition: tuple[str, ...] = names("v")
+    source: tuple[str, ...] = names("v")
     verified: Codes = column("v", dtype=np.uint8)
     said: str = ""  # one line, in words
 
@@ -87,10 +90,24 @@ def judge(measures: Measures, tolerance: Tolerance, sizes_mm: Mapping[str, float
         np.array(highs),
         each,
         np.array(probabilities),
-        tuple(f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source for limit in rows),
-        np.array([limit.verified for limit in rows], np.uint8),
-        _said(rows, found),
+        **cited(rows, tolerance),
+        said=in_words(rows, found),
     )
+
+
+def cited(rows: Sequence[Limit], tolerance: Tolerance) -> dict[str, Any]:
+    """Return where limits stand, as the fields of a Verdict."""
+    return {
+        "clause": tuple(f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source for limit in rows),
+        "edition": tuple("" if own(limit) else tolerance.edition for limit in rows),
+        "source": tuple(limit.source for limit in rows),
+        "verified": np.array([limit.verified for limit in rows], np.uint8),
+    }
+
+
+def own(limit: Limit) -> bool:
+    """Whether a project gave the limit itself: of a standard's rows only those are verified that have a clause."""
+    return limit.verified and not limit.clause
 
 
 def _held(measures: Measures, limit: Limit, low: float, high: float, root_gap_mm: float) -> tuple[float, float, str]:
@@ -132,7 +149,8 @@ def keeps(gaps: Floats, points: Floats, limit: Limit, low: float, high: float, r
     return np.asarray(kept, bool)
 
 
-def _said(rows: Sequence[Limit], found: Sequence[tuple[float, float, float, float, str, float]]) -> str:
+def in_words(rows: Sequence[Limit], found: Sequence[tuple[float, float, float, float, str, float]]) -> str:
+    """Say each limit with what is held against it: value, half-width, bounds, verdict and probability."""
     parts = []
     for limit, (value, half, low, high, verdict, probability) in zip(rows, found, strict=True):
         within = f"{low:g} to {high:g}" if math.isfinite(low) else f"at most {high:g}"

@@ -137,7 +137,7 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
             follows[:, own] = sign * turn @ end.by_pose
         rows.append(A)
         values.append(turn @ (right.moved - left.moved).ravel())
-        own_noise = _of_itself(left, members[j].pose) + _of_itself(right, members[j + 1].pose)
+        own_noise = of_itself(left, members[j].pose) + of_itself(right, members[j + 1].pose)
         blocks.append(turn @ own_noise @ turn.T)
         by_pose.append(follows)
     edge_rows = []
@@ -175,7 +175,7 @@ def _known(end: JointEnd) -> bool:
     return bool(np.isfinite(end.moved).all())
 
 
-def _of_itself(end: JointEnd, pose: Floats) -> Floats:
+def of_itself(end: JointEnd, pose: Floats) -> Floats:
     """Return the covariance (24, 24) of an end beyond what the registration's error, ``pose`` (6, 6), brings to it."""
     found: Floats = end.covariance - end.by_pose @ pose @ end.by_pose.T
     return found

@@ -1,15 +1,18 @@
 """What to do at a joint: nothing, cut the right part's end, or build it up, and how likely it then keeps its limits.
 
-A cut is a plane: an offset and a tilt about two axes. It opens the gap by its depth and takes nothing on, so its least
-depth is 0 or more. The assembled pose stays as it is. Three cuts are tried:
+A cut is a plane, an offset and a tilt about two axes, or goes straight along each plate from corner to corner. It opens
+the gap by its depth and takes nothing on, so its least depth is 0 or more. The assembled pose stays as it is. Tried are
 
-* the even one: the ends are parallel after it, the gap as near to the wanted one as a cut can bring it;
-* the nearest one: the squared differences from the wanted gap are least;
-* the least one with which the gap is nowhere narrower than wanted.
+* the even plane: the ends are parallel after it, the gap as near to the wanted one as a cut can bring it;
+* the nearest plane: the squared differences from the wanted gap are least;
+* the least plane with which the gap is nowhere narrower than wanted;
+* what each corner lacks by itself.
 
-The last also with shims or weld build-up where the gap is wider than wanted, and these without a cut. Proposed is what
-keeps the groove gap most probably; of works alike the lesser. A cut must be worth its while, build-up more so.
-No cut mends what is misaligned across the joint: that is said with it.
+Planes that would cut a corner wider than the groove's limit are left out: nothing is cut to be filled again. The last
+two also with shims or weld build-up where the gap is wider than wanted, and these without a cut. Proposed is what keeps
+the groove gap most probably, if it does with HOLDS at all; of works alike the lesser. A cut must be worth its while,
+build-up more so. No cut mends what is misaligned across the joint: that is said with it. Where a part may lie the other
+way round, or the end may be another one, nothing is proposed.
 """
 
 from __future__ import annotations
@@ -31,6 +34,8 @@ PLACES = ("bottom left", "bottom right", "top right", "top left", "bottom", "rig
 SHOWN_MM = 0.1  # amounts are said to this
 ALIKE = 0.01  # probabilities that differ by less are alike
 CUT_GAIN, BUILD_UP_GAIN = 0.05, 0.1  # of probability, for which a cut, and for which build-up is worth its while
+HOLDS = 0.1  # probability of the groove gap below which a work is no proposal
+SURELY_NOT = 0.005  # less is said to be no proposal: it would print as 0 %
 SIDES = {(1, False): "to the left", (1, True): "to the right", (2, False): "up", (2, True): "down"}
 
 
@@ -52,7 +57,8 @@ class TrimParams:
 class Proposal(Checked):
     """What to do at one joint. NaN where the gaps are not known. Lengths mm, amounts at P1..P8 of the right part's end.
 
-    ``plane`` of the cut: depth at the joint's middle (mm), and by how much it grows to the left and upward (mm per m).
+    ``plane`` of the cut: depth at the joint's middle (mm), and by how much it grows to the left and upward (mm per m);
+    NaN of a cut that goes from corner to corner and is no plane.
     """
 
     action: str = "unknown"  # nothing | trim | build up | trim and build up | unknown
@@ -102,15 +108,22 @@ def propose(
     tolerance: Tolerance,
     params: TrimParams | None = None,
     sizes_mm: Mapping[str, float] = NO_SIZES,
+    unsure: str = "",
+    rests_on: str = "",
 ) -> Proposal:
     """Propose what to do at a joint so that it keeps the limits of ``tolerance``; ``joint`` is its name.
 
-    The probabilities are shares of draws of the gaps and of the cut's errors, NaN where a limit hangs on a size that is
-    not among ``sizes_mm``. Limits without a groove gap leave nothing to cut for.
+    ``unsure`` says why the gaps may be wrong altogether: then nothing is proposed. ``rests_on`` says which part beside
+    the joint is weak: that is said with what is proposed. The probabilities are shares of draws of the gaps and of the
+    cut's errors, NaN where a limit hangs on a size that is not among ``sizes_mm``. Limits without a groove gap leave
+    nothing to cut for.
     """
     params = params or TrimParams()
-    if not (np.isfinite(measures.gaps).all() and np.isfinite(measures.covariance).all()):
+    known = bool(np.isfinite(measures.gaps).all() and np.isfinite(measures.covariance).all())
+    if unsure or not known:
         no, said = np.full(8, np.nan), "the gaps are not known, so nothing is proposed: scan both ends of the joint"
+        if known:
+            said = f"nothing proposed until this is settled: {unsure}"
         return Proposal("unknown", no, no, no[:3], no, no, misaligned_by=no, sentence=f"{joint}: {said}.")
     limits = {limit.measure: limit for limit in reversed(held(tolerance))}
     drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
@@ -131,7 +144,8 @@ def propose(
         error = _cut_errors(measures.points, params.cut_sd_mm, len(drawn))
         works = [nothing]
         if _verdict(measures, tolerance, groove, sizes_mm) != "pass":
-            works += _works(measures, wanted, max(params.least_mm, SHOWN_MM))
+            room = limits_of.bounds(groove, sizes_mm)[1] - params.aim_mm
+            works += _works(measures, wanted, max(params.least_mm, SHOWN_MM), room)
         marks = [kept(groove, work.on(drawn, error)) for work in works]
         chosen = _chosen(works, [_share([one]) for one in marks])
         best, before, after = works[chosen], marks[:1], [marks[chosen]]
@@ -149,7 +163,7 @@ def propose(
         _share(across),
         _misaligned_by(measures, limits.get("misalignment"), sizes_mm).max(axis=1),
     )
-    return replace(found, sentence=_sentence(joint, found, measures, limits, sizes_mm, params.cut_sd_mm))
+    return replace(found, sentence=_sentence(joint, found, measures, limits, sizes_mm, params.cut_sd_mm, rests_on))
 
 
 def _verdict(measures: Measures, tolerance: Tolerance, limit: Limit, sizes_mm: Mapping[str, float]) -> str:
@@ -180,27 +194,47 @@ def _chosen(works: Sequence[_Work], shares: Sequence[float]) -> int:
         top = max((shares[k] for k in rows), default=0.0)
         if top >= shares[best] + gain:
             best = min((k for k in rows if shares[k] >= top - ALIKE), key=lambda k: works[k].amount)
-    return best
+    return best if shares[best] >= HOLDS else 0
 
 
-def _works(measures: Measures, wanted: float, least_mm: float) -> Iterator[_Work]:
-    """Yield what could be done: the three cuts, build-up after the third, and build-up alone."""
+def _works(measures: Measures, wanted: float, least_mm: float, room: float) -> Iterator[_Work]:
+    """Yield what could be done: the cuts, build-up after the last two, and build-up alone.
+
+    ``room`` is by how much a gap may be wider than wanted.
+    """
     A = np.column_stack([np.ones(8), measures.points[:, 1:]])
     lacking = wanted - measures.gaps[:, 0]
-    nothing = np.zeros(3)
+    nothing, no_plane = np.zeros(3), np.full(3, np.nan)
+    corners = _from_corner_to_corner(np.maximum(lacking[:4], 0.0))
     for plane, fill in (
         (_even(A, lacking), False),
         (_nearest(A, lacking), False),
         (_covering(A, lacking), False),
+        (no_plane, False),
         (_covering(A, lacking), True),
+        (no_plane, True),
         (nothing, True),
     ):
-        cut = np.maximum(A @ plane, 0.0)
+        cut = corners if np.isnan(plane).any() else np.maximum(A @ plane, 0.0)
         if cut.max() < least_mm:
             plane, cut = nothing, np.zeros(8)
+        at_corner = cut[:4]
         put = np.maximum(cut - lacking, 0.0) if fill else np.zeros(8)
+        if ((at_corner > np.maximum(lacking[:4] + room, 0.0) + SHOWN_MM) | _both(at_corner, put[:4])).any():
+            continue
         if put.max() >= least_mm or (cut.any() and not fill):
             yield _Work(plane, cut, put)
+
+
+def _both(cut: Floats, put: Floats) -> Marks:
+    """Mark where something would be cut in order to be filled again."""
+    found: Marks = np.minimum(cut, put) > SHOWN_MM
+    return found
+
+
+def _from_corner_to_corner(corners: Floats) -> Floats:
+    """Amounts (8,) at P1..P8 of what is straight between P1..P4."""
+    return np.concatenate([corners, 0.5 * (corners + np.roll(corners, -1))])
 
 
 def _even(A: Floats, lacking: Floats) -> Floats:
@@ -253,15 +287,23 @@ def _sentence(
     limits: Mapping[str, Limit],
     sizes_mm: Mapping[str, float],
     cut_sd_mm: float,
+    rests_on: str,
 ) -> str:
+    said = [f"rests on a weak part: {rests_on}"] if rests_on else []
     if "groove_gap" not in limits:
-        said = ["nothing proposed, for the limits name no groove gap (groove_gap_mm)"]
+        said.append("nothing proposed, for the limits name no groove gap (groove_gap_mm)")
     elif found.action == "nothing":
         fits = "nothing to cut" if found.misalignment_probability < 0.95 else "nothing to do"
         unsure = "nothing proposed, for no cut or build-up makes the groove gap much surer"
-        said = [unsure if found.groove_probability < 0.95 else fits]
+        if found.groove_probability < HOLDS:
+            unsure = "nothing proposed, for no cut or build-up makes the groove gap hold"
+        said.append(unsure if found.groove_probability < 0.95 else fits)
     else:
-        said = [" and ".join(_works_in_words(found))]
+        works = " and ".join(_works_in_words(found))
+        if found.probability < SURELY_NOT:
+            said.append("no cut or build-up makes all limits hold")
+            works = f"for the groove gap alone, {works}"
+        said.append(works)
     said.append(_chances(found, cut_sd_mm))
     high = limits_of.bounds(limits["misalignment"], sizes_mm)[1] if "misalignment" in limits else math.nan
     off = _misaligned_by(measures, limits.get("misalignment"), sizes_mm)
@@ -285,18 +327,24 @@ def _works_in_words(found: Proposal) -> Iterator[str]:
         least, most = int(np.argmin(by)), int(np.argmax(by))
         if by[most] - by[least] < SHOWN_MM:
             yield f"{what} {by.mean():.1f} mm all round"
-        else:
+        elif abs(by[0] - by[1] + by[2] - by[3]) < SHOWN_MM:  # corners in a plane
             yield (
                 f"{what} {by[most]:.1f} mm at {KEY_POINTS[most]} {PLACES[most]} down to {by[least]:.1f} mm at "
                 f"{KEY_POINTS[least]} {PLACES[least]}"
             )
+        else:
+            amounts = " / ".join(f"{one:.1f}" for one in by[:4])
+            yield f"{what} {amounts} mm at P1 / P2 / P3 / P4, straight between them"
 
 
 def _chances(found: Proposal, cut_sd_mm: float) -> str:
     if math.isnan(found.probability):
         return "the probability that all limits hold is not known, for a limit is missing or hangs on an unknown size"
     if found.action == "nothing":
-        return f"all limits hold with {found.probability:.0%}"
+        known = f"all limits hold with {found.probability:.0%}"
+        return known if found.probability >= SURELY_NOT else "as it is not all limits hold"
+    if found.probability < SURELY_NOT:
+        return f"done to {cut_sd_mm:g} mm (one sd), the groove gap then holds with {found.groove_probability:.0%}"
     return (
         f"done to {cut_sd_mm:g} mm (one sd), all limits then hold with {found.probability:.0%} "
         f"(groove gap {found.groove_probability:.0%}), "

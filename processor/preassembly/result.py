@@ -52,6 +52,9 @@ class Result(Checked):
     measures: tuple[Measures, ...] = ()  # a record a joint
     judged: tuple[Verdict, ...] = ()
     proposals: tuple[Proposal, ...] = ()
+    chain_judged: tuple[Verdict, ...] = ()  # one: span and edges against the limits of the whole chain
+    not_held: tuple[str, ...] = names("n")  # keys of limits that the project states and nothing is held against
+    not_held_what: tuple[str, ...] = names("n")
     linear_offset: Floats = column("o", 2)  # at each station: to the left and up, as assembled
     linear_offset_ci95: Floats = column("o", 2)
     span_departure: float = float("nan")  # of the outer ends' distance from the design's, mm

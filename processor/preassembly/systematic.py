@@ -49,11 +49,16 @@ class SystematicParams:
 
 def of_end(end: JointEnd, params: SystematicParams, part: DesignPart) -> JointEnd:
     """Add what is systematic to an end's covariance; ``part`` says how long the part is."""
+    same = np.kron(np.ones((8, 8)), np.diag(same_of_end(params, part)[:3]))
+    return replace(end, covariance=end.covariance + same)
+
+
+def same_of_end(params: SystematicParams, part: DesignPart) -> Floats:
+    """Return the variances (24,) of an end's coordinates by what is systematic, the same for all of its points."""
     terms = params.budget(_length(part))
     any_axis = terms["registration of stations"] ** 2 + terms["scanner offset"] ** 2
     along = terms["scanner scale"] ** 2 + terms["temperature of the steel"] ** 2
-    same = np.kron(np.ones((8, 8)), np.diag([any_axis + along, any_axis, any_axis]))
-    return replace(end, covariance=end.covariance + same)
+    return np.tile([any_axis + along, any_axis, any_axis], 8)
 
 
 def of_edges(edges: EdgeStations, params: SystematicParams, between_stations: float) -> EdgeStations:

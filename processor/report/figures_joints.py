@@ -24,16 +24,20 @@ ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
 
 
 def gap_vectors(result: preassemble.Result) -> tuple[str, bytes]:
-    """Draw every joint with known gaps, up to MOST_JOINTS of them, all arrows to one scale."""
-    known = [j for j, one in enumerate(result.measures) if np.isfinite(one.gaps).all()]
-    shown = known[:MOST_JOINTS]
+    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without an answer says so."""
+    shown = range(len(result.measures))[:MOST_JOINTS]
+    known = [j for j in shown if np.isfinite(result.measures[j].gaps).all()]
     across = min(2, len(shown))
     down = math.ceil(len(shown) / across)
     figure = Figure(figsize=(4.6 * across, 4.3 * down + 0.5), layout="constrained")
     panels = np.atleast_1d(figure.subplots(down, across, squeeze=False).ravel())
-    times = _times([result.measures[j] for j in shown])
+    times = _times([result.measures[j] for j in known])
     for axes, j in zip(panels, shown, strict=False):
-        _section(axes, result.measures[j], times)
+        if j in known:
+            _section(axes, result.measures[j], times)
+        else:
+            axes.set(xticks=[], yticks=[])
+            axes.text(0.5, 0.5, "no answer: the gaps are not known", ha="center", transform=axes.transAxes, fontsize=9)
         axes.set_title(f"{label(result.joints[j], j)}: {result.verdict[j]}", fontsize=11)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
@@ -44,7 +48,8 @@ def gap_vectors(result: preassemble.Result) -> tuple[str, bytes]:
         Line2D([], [], color="black", marker="s", linestyle="", label="dx −: overlap"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
-    more = f"; the first {len(shown)} of {len(known)} joints" if len(shown) < len(known) else ""
+    count = len(result.measures)
+    more = f"; the first {len(shown)} of {count} joints" if len(shown) < count else ""
     return (
         "Gaps at the joints, right part minus left, in the joint's axes, seen along the bridge; numbers are dx with "
         f"its 95 % interval, mm{more}",
@@ -81,7 +86,7 @@ def by_axis(runs: Sequence[StepRun]) -> tuple[str, bytes]:
     return "Gaps by every method along each axis, right part minus left", png(figure)
 
 
-def _times(measures: list[Measures]) -> float:
+def _times(measures: Sequence[Measures]) -> float:
     """By how much arrows are enlarged; intervals count, lest noise look like a gap."""
     longest, size = LEAST_SHOWN_MM, 0.0
     for one in measures:
@@ -117,7 +122,7 @@ def _section(axes: Axes, measures: Measures, times: float) -> None:
         side, up = OUTWARD[k]
         # Left of the bridge is +y and stands on the left: the axis is turned round below.
         axes.annotate(
-            f"{KEY_POINTS[k]}\n{round(gaps[k, 0], 2) + 0.0:+.2f} ± {half[k]:.2f}",
+            f"{KEY_POINTS[k]}\n{round(gaps[k, 0], 2) + 0.0:+.2f}\n± {half[k]:.2f}",
             (at[k, 0], at[k, 1]),
             xytext=(30 * side, 26 * up),
             textcoords="offset points",

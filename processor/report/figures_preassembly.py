@@ -176,7 +176,9 @@ def linear_band(result: preassemble.Result) -> Floats:
 
 
 def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
-    """Linear error of all methods along both bottom edges, by both gauges."""
+    """Linear error of all methods that have an answer along both bottom edges, by both gauges."""
+    silent = [run.method for run in runs if not np.isfinite(run.result.linear_deviation).any()]
+    styled = [(k, run) for k, run in enumerate(runs) if run.method not in silent]
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, sharey=True)
     means: list[float] = []
@@ -189,7 +191,7 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
         ),
         strict=True,
     ):
-        for k, run in enumerate(runs):
+        for k, run in styled:
             deviation: Floats = getattr(run.result, values)
             means += [float(np.median(deviation[np.isfinite(deviation)]))] if np.isfinite(deviation).any() else []
             band = linear_band(run.result) if values == "linear_deviation" else np.empty(0)
@@ -220,9 +222,17 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
     for axes in panels:
         _mark_joints(axes, scene, runs[0].result.joints)
     panels[1].set_xlabel("station along the bottom edge, m")
-    panels[1].legend(fontsize=8, ncols=max(len(runs), 2), loc="upper center", bbox_to_anchor=(0.5, -0.2))
+    if styled:
+        panels[1].legend(fontsize=8, ncols=max(len(styled), 2), loc="upper center", bbox_to_anchor=(0.5, -0.2))
     caption = "Linear error: distance of the assembled bottom edges from the design's; dotted lines are joints"
-    return caption + ("; the shaded band holds 95 % or more" if banded else ""), png(figure)
+    if banded:
+        caption += (
+            "; the shaded band holds 95 % or more, above alone, for moved with Foot 1 it has that part's error too"
+        )
+    bare = [run.method for _, run in styled if not np.isfinite(linear_band(run.result)).any()]
+    caption += f"; without a band, for they state no uncertainty: {', '.join(bare)}" if banded and bare else ""
+    caption += f"; without an answer, so not drawn: {', '.join(silent)}" if silent else ""
+    return caption, png(figure)
 
 
 def _linear_offset(scene: Scene, run: StepRun) -> tuple[str, bytes]:

@@ -21,8 +21,9 @@ def _summary(result: preassemble.Result) -> tuple[str, str]:
     head = f"{result.status}, {placed} of {len(result.components)} parts placed"
     if result.judged:
         head = f"of {len(result.joints)} joints {judged}; assembly {head}"
-    unverified = any((one.verified == 0).any() for one in result.judged)
+    unverified = any((one.verified == 0).any() for one in (*result.judged, *result.chain_judged))
     said = f"Splicing error {splicing}. Linear error {linear}. Joints: {judged or 'none'}."
+    said += "".join(f" Whole chain: {one.verdict}." for one in result.chain_judged if one.key)
     return head, said + (" The limits are NOT VERIFIED against the standard's text." if unverified else "")
 
 

@@ -19,7 +19,7 @@ from processor.report.drawing import Drawn
 from processor.report.printing import headings, numeric, shown
 
 GOOD = "ok"
-LEAD = ("what-to-do", "limits")  # tables above the figures
+LEAD = ("what-to-do", "limits", "limits-chain", "limits-not-held")  # tables above the figures
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
 NAMES = (
     "method",
@@ -34,6 +34,7 @@ NAMES = (
     "b",
     "loop",
     "matrix",
+    "key",
 )  # columns that no language translates
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
@@ -94,7 +95,8 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]
 
 
 def _tone(run: StepRun) -> str:
-    verdicts = getattr(run.result, "verdict", ())
+    chain = (one.verdict for one in getattr(run.result, "chain_judged", ()) if one.key)
+    verdicts = (*getattr(run.result, "verdict", ()), *chain)
     if run.result.status != GOOD or "fail" in verdicts:
         return "bad"
     return "" if getattr(run.result, "judged", ()) and "indeterminate" in verdicts else "good"

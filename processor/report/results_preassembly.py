@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import ENDS, KEY_POINTS, Floats
+from processor.model import ENDS, KEY_POINTS, NORMAL_95, Floats
+from processor.preassembly.joint_verdicts import Verdict
 from processor.steps import preassemble
 
 TRADE_OFF = ("splicing_mean", "splicing_max", "linear_mean", "linear_max")
@@ -74,20 +75,17 @@ def _adjusted(result: preassemble.Result) -> dict[str, Any]:
         rows = zip(
             measures.name, measures.value, measures.ci95, measures.low, measures.high, measures.unit, strict=True
         )
-        limits = zip(
-            verdict.key, verdict.what, verdict.value, verdict.ci95, verdict.low, verdict.high, verdict.each,
-            verdict.each_probability, verdict.clause, verdict.verified, strict=True,
-        )  # fmt: skip
-        keys = ("limit", "what", "value", "ci95", "low", "high", "verdict", "probability", "clause")
+        half = NORMAL_95 * np.sqrt(np.maximum(np.diag(measures.covariance), 0.0)).reshape(8, 3)
         judged.append(
             {
                 "name": joint,
                 "gaps_joint_axes": dict(zip(KEY_POINTS, measures.gaps, strict=True)),
+                "gaps_joint_axes_ci95": dict(zip(KEY_POINTS, half, strict=True)),
                 "measures": {
                     name: {"value": value, "ci95": ci95, "low": low, "high": high, "unit": unit}
                     for name, value, ci95, low, high, unit in rows
                 },
-                "limits": [{**dict(zip(keys, row[:-1], strict=True)), "verified": bool(row[-1])} for row in limits],
+                "limits": _limits(verdict),
                 "probability": verdict.probability,
                 "proposal": {
                     "action": proposal.action,
@@ -103,6 +101,10 @@ def _adjusted(result: preassemble.Result) -> dict[str, Any]:
     return {
         "lambda": result.weight,
         "joint_measures": judged,
+        "chain_limits": [
+            {"verdict": one.verdict, "limits": _limits(one), "said": one.said} for one in result.chain_judged
+        ],
+        "limits_not_held": list(result.not_held),
         "span": {"departure": result.span_departure, "ci95": result.span_ci95},
         "closure": {
             "mm": result.closure[:3],
@@ -116,6 +118,18 @@ def _adjusted(result: preassemble.Result) -> dict[str, Any]:
         "advice": result.advice,
         "budget_sd": dict(zip(result.budget_source, result.budget_sd, strict=True)),
     }
+
+
+def _limits(verdict: Verdict) -> list[dict[str, Any]]:
+    """Write what was held against each limit."""
+    keys = (
+        "limit", "what", "value", "ci95", "low", "high", "verdict", "probability", "clause", "edition", "source",
+    )  # fmt: skip
+    rows = zip(
+        verdict.key, verdict.what, verdict.value, verdict.ci95, verdict.low, verdict.high, verdict.each,
+        verdict.each_probability, verdict.clause, verdict.edition, verdict.source, verdict.verified, strict=True,
+    )  # fmt: skip
+    return [{**dict(zip(keys, row[:-1], strict=True)), "verified": bool(row[-1])} for row in rows]
 
 
 def _ends(points: Floats) -> dict[str, Any]:

@@ -6,10 +6,15 @@ import math
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+
+from processor.geometry import rigid
+from processor.preassembly.joint_verdicts import Verdict
 from processor.preassembly.result import Result
 from processor.report.table import NAN, Table
 
-TO_DO, LIMITS = "what-to-do", "limits"
+TO_DO, LIMITS, CHAIN = "what-to-do", "limits", "limits-chain"
+NOWHERE = np.full((4, 4), NAN)
 CLOSURE = (
     "along the span",
     "across, to the left",
@@ -39,6 +44,19 @@ LIMITS_NOTE = (
 )
 
 
+CHAIN_NOTE = (
+    "Span and length of a unit: the distance of the outer ends, less the design's. Inner arc, axis and elevation: the "
+    "bottom edges at all stations, of which the one nearer to its limit is shown, its interval widened for their "
+    "number; height over a place of the span. Probabilities are of single values."
+)
+BUDGET_NOTE = (
+    "Standard deviations of one coordinate. Of the ends as measured: the median over all coordinates of key points, "
+    "from the points' noise, form that the fits do not follow and what stations differ by together. The others are of "
+    "an end of the longest part."
+)
+AS_ASSEMBLED, OTHER_POSE = "as assembled", "the other pose"
+
+
 def adjusted(result: Result, method: str) -> list[Table]:
     """Tables of the adjustment's own records, what to do first; none for a result without them."""
     if not result.measures:
@@ -57,6 +75,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
         ),
         Table("Proposals", ("joint", "proposal"), tuple((row[0], row[PROPOSAL]) for row in todo), on_page=False),
         _limits(result, method),
+        *_chain(result, method),
         Table(
             f"Measures of the joints, method {method}",
             ("joint", "measure", "value", "ci95", "low95", "high95", "unit"),
@@ -77,8 +96,16 @@ def adjusted(result: Result, method: str) -> list[Table]:
             ("source", "sd_mm"),
             tuple(zip(result.budget_source, result.budget_sd.tolist(), strict=True)),
             "budget",
-            "Standard deviations of one coordinate of an end of the longest part.",
+            BUDGET_NOTE,
         ),
+        Table(
+            "What limits the accuracy, and which scan would help",
+            ("question", "answer"),
+            (("what limits the accuracy", result.limiting), ("which scan would help", result.advice)),
+            "accuracy",
+            on_page=False,
+        ),
+        *_candidates(result),
         Table(
             f"Trade-off over lambda, method {method} (mm)",
             ("lambda", "splicing_mean_mm", "splicing_max_mm", "linear_mean_mm", "linear_max_mm"),
@@ -111,9 +138,7 @@ def _limits(result: Result, method: str) -> Table:
     for joint, one in zip(result.joints, result.judged, strict=True):
         for k, what in enumerate(one.what):
             low, high = float(one.low[k]), float(one.high[k])
-            standing = "verified" if one.verified[k] else "NOT VERIFIED"
-            if math.isnan(low) or math.isnan(high):
-                standing += "; hangs on a size that is not known"
+            standing = _standing(one, k)
             rows.append(
                 (
                     joint, what, one.each[k], standing, float(one.value[k]), float(one.ci95[k]), low, high,
@@ -125,6 +150,69 @@ def _limits(result: Result, method: str) -> Table:
         "clause",
     )  # fmt: skip
     return Table(f"Limits, method {method} (mm)", columns, tuple(rows), LIMITS, LIMITS_NOTE)
+
+
+def _standing(one: Verdict, k: int) -> str:
+    standing = "verified" if one.verified[k] else "NOT VERIFIED"
+    unknown = math.isnan(one.low[k]) or math.isnan(one.high[k])
+    return f"{standing}; hangs on a size that is not known" if unknown else standing
+
+
+def _chain(result: Result, method: str) -> Iterator[Table]:
+    """Yield the limits of the whole chain, and those stated ones that nothing is held against."""
+    columns = (
+        "limit", "verdict", "standing", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability", "clause",
+        "edition", "source",
+    )  # fmt: skip
+    rows = [
+        (
+            what, one.each[k], _standing(one, k), float(one.value[k]), float(one.ci95[k]), float(one.low[k]),
+            float(one.high[k]), float(one.each_probability[k]), one.clause[k], one.edition[k], one.source[k],
+        )
+        for one in result.chain_judged
+        for k, what in enumerate(one.what)
+    ]  # fmt: skip
+    if rows:
+        yield Table(f"Limits of the whole chain, method {method} (mm)", columns, tuple(rows), CHAIN, CHAIN_NOTE)
+    if result.not_held:
+        yield Table(
+            "Limits that nothing is held against",
+            ("key", "limit"),
+            tuple(zip(result.not_held, result.not_held_what, strict=True)),
+            "limits-not-held",
+            "They were stated for this project, and nothing that is measured here answers to them.",
+        )
+
+
+def _candidates(result: Result) -> Iterator[Table]:
+    """Yield both poses of ambiguous parts, to read and as matrices."""
+    rows, matrices = [], []
+    for i, name in enumerate(result.components):
+        both = result.T_bridge_scan[i], result.T_rival_scan[i] if len(result.T_rival_scan) else NOWHERE
+        if not np.isfinite(both).all():
+            continue
+        turn = math.degrees(rigid.rotation_angle(both[1][:3, :3] @ both[0][:3, :3].T))
+        for candidate, pose, turned in ((AS_ASSEMBLED, both[0], 0.0), (OTHER_POSE, both[1], turn)):
+            rows.append((name, candidate, turned, result.component_message[i]))
+            matrices.append((name, candidate, turned, *pose[:3].ravel().tolist(), result.component_message[i]))
+    if not rows:
+        return
+    title = "Parts that fit in two poses"
+    yield Table(
+        title,
+        ("component", "candidate", "turned_deg", "what_would_tell"),
+        tuple(rows),
+        note="Both fit the design alike. The matrices of both, scan to bridge, are in candidates.csv, mm.",
+    )
+    places = tuple(f"{row}{column}" + ("_mm" if column == "t" else "") for row in "xyz" for column in "xyzt")
+    yield Table(
+        title,
+        ("component", "candidate", "turned_deg", *places, "what_would_tell"),
+        tuple(matrices),
+        "candidates",
+        on_page=False,
+        on_terminal=False,
+    )
 
 
 def _measures(result: Result) -> Iterator[tuple[Any, ...]]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from processor.evaluate import ErrorReport
-from processor.model import KEY_POINTS, Floats, StepRun
+from processor.model import KEY_POINTS, NORMAL_95, Floats, StepRun
 from processor.report.table import NAN, Table
 from processor.report.tables_adjusted import adjusted
 
@@ -68,6 +68,7 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
             ("", *["splicing error"] * 2, *["linear error, as assembled"] * 2, *["linear error, Foot 1 best-fit"] * 2),
         ),
         Table("Components", ("component", "status", "remark"), parts, "components"),
+        *_others(runs[1:]),
         Table(
             f"Joints, method {method} (mm)",
             ("joint", "left_part", "right_part", "mean_mm", "largest_mm", "at", "verdict"),
@@ -95,15 +96,37 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     ]
 
 
+def _others(runs: Sequence[StepRun]) -> list[Table]:
+    """Say of the methods compared which parts have no sure answer, and why."""
+    rows = tuple(
+        (run.method, name, run.result.component_status[i], run.result.component_message[i])
+        for run in runs
+        for i, name in enumerate(run.result.components)
+        if run.result.component_status[i] != "ok" or run.result.component_message[i]
+    )
+    columns = ("method", "component", "status", "remark")
+    return [Table("Components by the methods compared", columns, rows, "components-compared")] if rows else []
+
+
 def _gaps(run: StepRun, name: str) -> Table:
     result = run.result
-    rows = tuple(
+    rows = [
         (joint, key, *result.gaps[j, k], *result.gap_ci95[j, k])
         for j, joint in enumerate(result.joints)
         for k, key in enumerate(KEY_POINTS)
+    ]
+    columns: tuple[str, ...] = ("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm")
+    if result.measures:  # in the joint's own axes as well
+        axes = ("along", "left", "up")
+        columns = (*columns, *(f"{one}_mm" for one in axes), *(f"ci95_{one}_mm" for one in axes))
+        spread = np.array([np.diag(one.covariance).reshape(8, 3) for one in result.measures])
+        local = np.concatenate(
+            [[one.gaps for one in result.measures], NORMAL_95 * np.sqrt(np.maximum(spread, 0.0))], axis=2
+        )
+        rows = [(*row, *own) for row, own in zip(rows, local.reshape(-1, 6), strict=True)]
+    return Table(
+        f"Gaps at the joints, method {run.method}", columns, tuple(rows), name, on_page=False, on_terminal=False
     )
-    columns = ("joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm")
-    return Table(f"Gaps at the joints, method {run.method}", columns, rows, name, on_page=False, on_terminal=False)
 
 
 def _joint(result: Any, j: int) -> tuple[Any, ...]:

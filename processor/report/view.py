@@ -49,7 +49,9 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
             for j, name in enumerate(result.joints)
         ],
         "limit": colour_limit(result.residual) if np.isfinite(result.residual).any() else 1.0,
-        "linear": [_linear(run) for run in runs],
+        "linear": [
+            _linear(run) for k, run in enumerate(runs) if not k or np.isfinite(run.result.linear_deviation).any()
+        ],
         "trade": {
             "weight": result.weight,
             "lambda": result.trade_lambda,

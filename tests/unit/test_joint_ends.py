@@ -234,6 +234,9 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
         middle = np.array([3000.0 * sense, 0.0, 0.0])
         parts.append(network.Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
     stated = network.adjust(parts, joints, np.eye(4)[None], 0.1)
+    for end in (parts[0].ends[1], parts[1].ends[0]):
+        left = np.sqrt(np.diag(network.of_itself(end, pose)))
+        np.testing.assert_allclose(left, noise, rtol=1e-3)  # what limits the gap: the rest cancels in it
     gaps, moved = [], []
     for _ in range(400):
         wrong = np.sqrt(np.diag(pose)) * rng.standard_normal((2, 6))

@@ -124,8 +124,9 @@ IN_FILES = {
     "csv",
     "json",
     "plausible",
+    "candidates",
 }
-SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm"}
+SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm"}
 STAYS = UNITS | METHODS | STANDARDS | IN_FILES | SYMBOLS
 
 
@@ -174,7 +175,7 @@ def a_bridge():
         limiting="J1 P1: +-0.087 mm (95 %), 69% of the variance from the end face at the end of rib1",
         advice="no answer at J2: scan both ends there; a scan of rib1 that shows more of the end face at its end: "
         "four times the points halve its part",
-        budget_source=("noise of the points, median", "scanner offset"),
+        budget_source=("ends as measured, median", "scanner offset"),
         message="lambda 0.1; no temperature given: taken as the reference; limits of GB 50205-2020, not verified",
         gauge="all joints and the design's curve at once, lambda 0.1",
     )

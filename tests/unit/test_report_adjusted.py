@@ -9,12 +9,14 @@ from html.parser import HTMLParser
 import matplotlib.image
 import numpy as np
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from processor.evaluate import ErrorReport
+from processor.geometry import rigid
 from processor.model import Limit, StepRun, Tolerance
 from processor.pipeline import Execution
-from processor.preassembly import joint_measures, joint_verdicts, proposals
-from processor.report import figures, figures_residuals, page, printing, results_json, tables
+from processor.preassembly import chain_verdicts, joint_measures, joint_verdicts, proposals
+from processor.report import figures, figures_joints, figures_residuals, page, printing, results_json, tables
 from processor.report.drawing import rounded
 from tests.unit.test_report import PROVENANCE, arch_scene, assembled
 
@@ -30,6 +32,9 @@ LIMITS = Tolerance(
         Limit("groove_gap_mm", "groove gap", measure="groove_gap", low=-1.0, high=2.0, clause="9.2.3", verified=True),
     ),
 )
+
+
+SPAN = Tolerance("own", "1", (Limit("span_mm", "span", low=-1.0, high=1.0, measure="span", source="project.toml"),))
 
 
 def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600):
@@ -56,7 +61,10 @@ def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600
         measures=tuple(records),
         judged=tuple(judged),
         proposals=tuple(proposals.propose(j, one, LIMITS) for j, one in zip(joints, records, strict=True)),
-        T_rival_scan=np.full((3, 4, 4), NAN),
+        chain_judged=(chain_verdicts.judge({"span": (np.array([-1.25]), np.array([0.25]))}, SPAN, 12_000.0),),
+        not_held=("bow_mm",),
+        not_held_what=("bow of a unit preassembled",),
+        T_rival_scan=np.stack([rigid.transform(np.diag([-1.0, -1.0, 1.0]), [5.0, 0, 0]), *np.full((2, 4, 4), NAN)]),
         linear_offset=np.column_stack([base.linear_deviation, np.zeros(120)]),
         linear_offset_ci95=np.full((120, 2), 0.3),
         span_departure=-1.25,
@@ -180,6 +188,79 @@ def test_limits_say_clause_and_whether_they_were_verified():
     assert {row["standing"] for row in rows} == {"verified", "NOT VERIFIED"}
 
 
+def test_limits_of_the_chain_stand_beside_those_of_joints():
+    execution = of_bridge()
+    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    (chain,) = step["chain_limits"]
+    (limit,) = chain["limits"]
+    (row,) = of_file(execution, "limits-chain")
+    assert chain["verdict"] == row["verdict"] == limit["verdict"] == "indeterminate"
+    assert (limit["limit"], limit["source"], limit["edition"], limit["verified"]) == (
+        "span_mm", "project.toml", "1", False,
+    )  # fmt: skip
+    assert [float(row[f"{name}_mm"]) for name in ("value", "least", "greatest")] == [-1.25, -1.0, 1.0]
+    assert (row["standing"], row["source"]) == ("NOT VERIFIED", "project.toml")
+    parsed = Page(rendered(execution))
+    assert "Whole chain: indeterminate" in parsed.text
+    assert parsed.tables["Limits of the whole chain, method adjustment (mm)"][1][1] == "indeterminate"
+    # What was stated and is held against nothing is said.
+    assert step["limits_not_held"] == ["bow_mm"]
+    assert of_file(execution, "limits-not-held") == [{"key": "bow_mm", "limit": "bow of a unit preassembled"}]
+    on_terminal = [table.title for table in tables.all_of(execution, ErrorReport()) if table.on_terminal]
+    assert {"Limits of the whole chain, method adjustment (mm)", "Limits that nothing is held against"} <= set(
+        on_terminal
+    )
+
+
+def test_gaps_have_intervals_in_the_joints_axes_too():
+    execution = of_bridge()
+    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    rows = of_file(execution, "gaps")
+    assert list(rows[0])[:8] == ["joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"]
+    for j, joint in enumerate(step["joint_measures"]):
+        for k, key in enumerate(f"P{i}" for i in range(1, 9)):
+            assert joint["gaps_joint_axes_ci95"][key] == pytest.approx([0.196] * 3, abs=1e-4)
+            row = rows[8 * j + k]
+            assert [float(row[f"{one}_mm"]) for one in ("along", "left", "up")] == pytest.approx(
+                joint["gaps_joint_axes"][key], abs=1e-6
+            )
+            assert [float(row[f"ci95_{one}_mm"]) for one in ("along", "left", "up")] == pytest.approx(
+                joint["gaps_joint_axes_ci95"][key], abs=1e-6
+            )
+    assert len(of_file(execution, "gaps-line")[0]) == 8
+
+
+def test_both_poses_of_an_ambiguous_part_and_what_would_tell():
+    rows = of_file(of_bridge(), "candidates")
+    assert [row["candidate"] for row in rows] == ["as assembled", "the other pose"]
+    assert [float(row["turned_deg"]) for row in rows] == [0.0, 180.0]
+    assert [float(row["xt_mm"]) for row in rows] == [0.0, 5.0]
+    assert len(Page(rendered(of_bridge())).tables["Parts that fit in two poses"]) == 3
+
+
+def test_what_limits_the_accuracy_has_a_file_and_stands_on_the_terminal():
+    rows = of_file(of_bridge(), "accuracy")
+    assert [row["answer"] for row in rows] == ["J1 P1: the end face", "a scan of rib1"]
+    assert any(table.file == "accuracy" and table.on_terminal for table in tables.all_of(of_bridge(), ErrorReport()))
+
+
+def test_why_a_method_failed_is_said_and_it_is_not_drawn():
+    execution = of_bridge()
+    (row,) = of_file(execution, "components-compared")
+    assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
+    answered = figures.of_run(execution, ErrorReport())["preassemble"]["linear-error.png"]
+    assert "without a band, for they state no uncertainty: line" in answered[0]
+    line = execution.runs[1]
+    nothing = np.full(120, NAN)
+    result = dataclasses.replace(line.result, linear_deviation=nothing, best_fit_linear_deviation=nothing)
+    silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
+    caption, picture = figures.of_run(silent, ErrorReport())["preassemble"]["linear-error.png"]
+    assert "without an answer, so not drawn: line" in caption
+    assert picture != answered[1]
+    data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
+    assert [one["method"] for one in data["linear"]] == ["adjustment"]
+
+
 def test_span_closure_budget_and_trade_off_as_tables():
     execution = of_bridge()
     span, along, *rest = of_file(execution, "span")
@@ -298,3 +379,29 @@ def test_parts_unroll_face_by_face():
     np.testing.assert_allclose(flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1], atol=0.01)
     np.testing.assert_allclose(flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0], atol=0.01)
     np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
+
+
+def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps_says_so(monkeypatch):
+    drawn = []
+
+    def kept(figure):
+        FigureCanvasAgg(figure).draw()
+        drawn.append(figure)
+        return b""
+
+    monkeypatch.setattr(figures_joints, "png", kept)
+    result = unknown(adjusted(), [1], ())
+    wide = joint_measures.measure(np.outer(np.arange(8.0), [-6.6, 3.0, 3.0]), 0.2 * np.eye(24), np.eye(4), SECTION)
+    figures_joints.gap_vectors(dataclasses.replace(result, measures=(wide, result.measures[1])))
+    shown, silent = drawn[0].axes
+    numbers = [one for one in shown.texts if one.get_text().startswith("P")]
+    assert len(numbers) == 8
+    frame = shown.get_window_extent()
+    for one in numbers:
+        box = one.get_window_extent()
+        assert frame.x0 <= box.x0, one.get_text()
+        assert box.x1 <= frame.x1, one.get_text()
+        assert frame.y0 <= box.y0, one.get_text()
+        assert box.y1 <= frame.y1, one.get_text()
+    assert [one.get_text() for one in silent.texts] == ["no answer: the gaps are not known"]
+    assert silent.get_title() == "J2: indeterminate"

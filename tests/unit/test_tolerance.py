@@ -11,9 +11,9 @@ import pytest
 from processor import folder, store
 from processor.bolt_balls import single
 from processor.model import InputError, Limit, Scan, Scene, Tolerance
-from processor.preassembly import tolerance
+from processor.preassembly import chain_verdicts, joint_verdicts, tolerance
 
-MEASURES = ("", "misalignment", "groove_gap", "eccentricity")
+MEASURES = ("", *joint_verdicts.MEASURES, *chain_verdicts.MEASURES)
 
 
 def limit(standard, key):

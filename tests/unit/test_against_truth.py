@@ -1,0 +1,95 @@
+"""Gaps held against those of the truth, with members made by hand: exact ends and edges, no points."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from processor.geometry import rigid
+from processor.geometry.lines import Polyline
+from processor.model import ArchTruth, Scene, Truth
+from processor.preassembly import against_truth, bottom_edges, features, joint_ends, network
+from processor.preassembly.result import Result
+from tests import arch_clouds
+
+DESIGN = arch_clouds.design()
+FRAMES = np.array([features.joint_frame(points) for points in DESIGN.joint_points])
+WEIGHT = 0.1
+
+
+def as_built(seed=5):
+    """True key points (c, 2, 8, 3) some millimetres off the design's in each part's own way, and its bottom edges."""
+    rng = np.random.default_rng(seed)
+    ends, edges = [], []
+    for i, part in enumerate(DESIGN.parts):
+        turn = rigid.transform(rigid.rotation_from_vector(rng.normal(0.0, 2e-4, 3)), rng.normal(0.0, 1.0, 3))
+        there = [
+            DESIGN.joint_points[j] + rng.normal(0.0, 4.0, (8, 3)) if 0 <= j < 4 else np.full((8, 3), np.nan)
+            for j in (i - 1, i)
+        ]
+        middle = part.vertices.mean(axis=0)
+        ends.append([rigid.apply(turn, end - middle) + middle for end in there])
+        both = (part.bottom_edge_left, part.bottom_edge_right)
+        edges.append([rigid.apply(turn, edge - middle) + middle for edge in both])
+    return np.array(ends), np.array(edges)
+
+
+def member(i, ends, edges, unseen, without):
+    """Return what a scan without noise says of part i.
+
+    Nothing is known of the ends (part, 0 or 1) ``unseen`` and of the parts ``without``.
+    """
+    part = DESIGN.parts[i]
+    lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
+    stations = bottom_edges.unseen(*lines)
+    own = []
+    for e, joint in enumerate((i - 1, i)):
+        if not 0 <= joint < 4:
+            own.append(None)
+        elif (i, e) in unseen or i in without:
+            own.append(joint_ends.nothing("too few points on the end face"))
+        else:
+            moved = (ends[i, e] - DESIGN.joint_points[joint]) @ FRAMES[joint][:3, :3]
+            own.append(joint_ends.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), 0.01, ""))
+    middle = part.vertices.mean(axis=0)
+    if i in without:
+        return network.Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))
+    count = len(stations.arc) // 2
+    at = np.vstack([against_truth._at_stations(edges[i, k], lines[k]) for k in range(2)])
+    departure = np.einsum("kai,ki->ka", stations.axes, at - stations.points)
+    measured = dataclasses.replace(
+        stations,
+        departure=departure,
+        covariance=np.stack([1e-4 * np.eye(2 * count)] * 2),
+        by_pose=np.zeros((2 * count, 2, 6)),
+    )
+    return network.Member((own[0], own[1]), measured, middle, np.zeros((6, 6)))
+
+
+def checked(unseen, without):
+    """Checks of the answer from exact members; ``without`` are parts that were not placed."""
+    ends, edges = as_built()
+    members = [member(i, ends, edges, unseen, without) for i in range(5)]
+    adjusted = network.adjust(members, DESIGN.joint_points, FRAMES, WEIGHT)
+    pose = np.tile(np.eye(4), (5, 1, 1))
+    pose[list(without)] = np.nan
+    result = Result(
+        "ok", "adjustment",
+        components=arch_clouds.NAMES, component_status=("ok",) * 5, component_message=("",) * 5,
+        component_scans=arch_clouds.NAMES, T_bridge_scan=pose, covariance=np.zeros((5, 6, 6)),
+        key_points_scan=ends, key_points_sd=np.full(ends.shape, 0.1), joints=DESIGN.joint_names,
+        gaps=adjusted.gaps, gap_ci95=np.where(np.isfinite(adjusted.gaps), 0.05, np.nan), weight=WEIGHT,
+        joint_left=DESIGN.joint_left, joint_right=DESIGN.joint_right, verdict=("indeterminate",) * 4,
+    )  # fmt: skip
+    truth = ArchTruth(arch_clouds.NAMES, np.tile(np.eye(4), (5, 1, 1)), ends, ends, edges)
+    scene = Scene("b", "arch-bridge", arch=DESIGN)
+    return {one.name: one.value for one in against_truth.check(scene, result, Truth(arch=truth, spacing_mm=10.0))}
+
+
+@pytest.mark.parametrize(("unseen", "without", "joints"), [((), (), 4), (((4, 0),), (), 3), ((), (2,), 2)])
+def test_gaps_are_held_against_what_the_answer_could_know(unseen, without, joints):
+    """A joint without an answer pulls nowhere: the other gaps are not those of a chain that it holds together."""
+    found = checked(unseen, without)
+    assert found["gaps, number"] == 24 * joints
+    assert found["gaps against the truth's, rms"] < 0.03
+    assert found["gaps within their 95 % intervals"] > 95.0

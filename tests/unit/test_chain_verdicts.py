@@ -1,0 +1,134 @@
+"""Limits of the whole chain: guard bands by hand, extremes by draws, what is stated and not held, and unsure chains."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from processor.model import ArchDesign, DesignPart, Tolerance
+from processor.preassembly import adjustment, chain_figures, chain_verdicts, joint_verdicts, network, tolerance
+from processor.preassembly.bottom_edges import EdgeStations
+
+GB, JTG = tolerance.load("GB 50205-2020"), tolerance.load("JTG arch rib")
+NAN = float("nan")
+
+
+def own(**limits):
+    return tolerance.with_own(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
+
+
+def chord(value, sd):
+    return {name: (np.array([value]), np.array([sd])) for name in ("span", "unit_length")}
+
+
+@pytest.mark.parametrize(
+    ("value", "sd", "verdict"),
+    [
+        (0.0, 0.4, "pass"),
+        (0.5, 0.4, "indeterminate"),
+        (1.5, 0.4, "indeterminate"),
+        (-2.0, 0.4, "fail"),
+        (2, 0.1, "fail"),
+    ],
+)
+def test_a_span_is_held_against_the_projects_limit(value, sd, verdict):
+    found = chain_verdicts.judge(chord(value, sd), own(span_mm=[-1.0, 1.0]), 24_000.0)
+    assert (found.verdict, found.each) == (verdict, (verdict,))
+    assert (found.key, found.clause, found.source, found.edition) == (
+        ("span_mm",), ("project.toml",), ("project.toml",), ("",),
+    )  # fmt: skip
+    np.testing.assert_allclose([found.value[0], found.ci95[0]], [value, 1.959964 * sd], rtol=1e-5)
+    np.testing.assert_allclose([found.low[0], found.high[0]], [-1.0, 1.0])
+    draws = np.random.default_rng(1).normal(value, sd, 400_000)
+    assert found.each_probability[0] == pytest.approx((np.abs(draws) <= 1.0).mean(), abs=0.003)
+
+
+def test_a_standard_is_cited():
+    found = chain_verdicts.judge(chord(-30.0, 0.5), GB, 24_000.0)
+    assert found.key == ("unit_length_mm", "span_mm")
+    assert found.each == ("fail", "fail")
+    assert set(found.clause) == {"GB 50205-2020 table 9.2.3"}
+    assert (set(found.edition), set(found.source), set(found.verified)) == ({"2020"}, {"from memory"}, {0})
+    assert "not verified" in found.said
+
+
+def test_edges_are_held_all_along_and_limits_hang_on_the_span():
+    rng = np.random.default_rng(2)
+    values, sd = rng.uniform(-2.0, 2.0, 300), np.full(300, 0.1)
+    values[17] = 4.5  # 30 m / 6000 = 5 mm
+    quantities = dict.fromkeys(("inner_arc", "lateral_axis", "elevation"), (values, sd))
+    found = chain_verdicts.judge(quantities, JTG, 30_000.0)
+    by_key = dict(zip(found.key, found.each, strict=True))
+    assert by_key == {"inner_arc_mm": "pass", "lateral_axis_mm": "pass", "elevation_mm": "pass"}
+    np.testing.assert_allclose(found.high, [8.0, 5.0, 10.0])
+    np.testing.assert_allclose(found.value, 4.5)
+    np.testing.assert_allclose(found.ci95, 1.96 * 0.1, rtol=1e-3)  # no other station may be the extreme
+    values[17] = 4.9
+    assert chain_verdicts.judge(quantities, JTG, 30_000.0).each[1] == "indeterminate"
+    values[17] = -5.4
+    assert chain_verdicts.judge(quantities, JTG, 30_000.0).each[1] == "fail"
+    # Where many may be it, the band holds all of them.
+    low, high = [], []
+    for _ in range(400):
+        _, bottom, top = chain_verdicts._greatest(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
+        low.append(bottom)
+        high.append(top)
+    assert np.mean((np.array(low) <= 0.0) & (np.array(high) >= 0.0)) >= 0.95
+
+
+def test_what_the_stations_say():
+    """Both edges 3 mm to the left and 2 mm up from an arch as steep as 3 : 4; height over a place is 2.5 mm."""
+    axes = np.tile(np.array([[0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]), (4, 1, 1))
+    edges = EdgeStations(
+        ("left", "left", "right", "right"), np.zeros(4), np.zeros((4, 3)), axes, np.zeros((4, 2)),
+        np.zeros((2, 4, 4)), np.zeros((4, 2, 6)),
+    )  # fmt: skip
+    member = network.Member((None, None), edges, np.zeros(3), np.zeros((6, 6)))
+    adjusted = SimpleNamespace(
+        departures=(np.tile([3.0, 2.0], (4, 1)),), departure_variance=(np.tile([0.04, 0.01], (4, 1)),)
+    )
+    found = chain_verdicts.quantities([member], adjusted, -1.0, 0.196)
+    expected = {"span": (-1.0, 0.1), "unit_length": (-1.0, 0.1), "inner_arc": (2.0, 0.1), "lateral_axis": (3.0, 0.2),
+                "elevation": (2.5, 0.125)}  # fmt: skip
+    for name, (value, sd) in expected.items():
+        np.testing.assert_allclose(found[name][0], value)
+        np.testing.assert_allclose(found[name][1], sd, rtol=1e-4)
+    assert [len(found[name][0]) for name in ("inner_arc", "lateral_axis")] == [4, 2]
+
+
+def test_a_limit_that_nothing_is_held_against_is_said():
+    assert chain_verdicts.not_held(GB) == []
+    mixed = tolerance.with_own(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
+    assert [limit.key for limit in chain_verdicts.not_held(mixed)] == ["bow_mm"]
+    params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
+    assert "limits that nothing is held against: bow_mm" in adjustment._message(params, mixed, 0.0, [])
+
+
+def test_an_unsure_chain_is_left_open():
+    found = chain_verdicts.judge(chord(-30.0, 0.5), GB, 24_000.0, "J4 has no answer")
+    assert (found.verdict, found.each) == ("indeterminate", ("indeterminate", "indeterminate"))
+    assert np.isnan(found.each_probability).all()
+    assert found.said.startswith("J4 has no answer")
+    none = chain_verdicts.judge(chord(0.0, 0.1), own(misalignment_mm=[2.0]), 24_000.0)
+    assert (none.verdict, none.key) == ("indeterminate", ())
+    assert "no limit for the whole chain" in none.said
+
+
+def test_the_span_is_not_known_where_a_joint_is_not():
+    """Nothing measured says how far apart the parts beside it are: they are held where their registration has them."""
+    line = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0]])
+    parts = tuple(DesignPart(str(i), bottom_edge_left=line, bottom_edge_right=line) for i in range(2))
+    design = ArchDesign(parts, ("J1",), ("0",), ("1",), np.zeros((1, 8, 3)))
+    adjusted = SimpleNamespace(gaps=np.full((1, 8, 3), NAN))
+    assert np.isnan(chain_figures.span([], adjusted, design)).all()
+
+
+def test_a_joint_left_open_has_no_limit_that_is_sure():
+    verdict = joint_verdicts.Verdict(
+        "fail", 0.0, ("a",), ("b",), np.ones(1), np.ones(1), np.zeros(1), np.zeros(1), ("fail",), np.zeros(1),
+        ("c",), ("",), ("s",), np.zeros(1, np.uint8), "x",
+    )  # fmt: skip
+    told = adjustment._if_told(verdict, "rib1 may lie the other way round")
+    assert (told.verdict, told.each) == ("indeterminate", ("indeterminate",))
+    assert np.isnan([told.probability, told.each_probability[0]]).all()
+    assert adjustment._if_told(verdict, "") is verdict
