@@ -22,7 +22,7 @@ def made():
     rng = np.random.default_rng(3)
     wall = np.column_stack([rng.uniform(0.0, 2000.0, 8000), np.full(8000, 3000.0), rng.uniform(0.0, 2000.0, 8000)])
     turn = rigid.transform(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), np.zeros(3))
-    poses = np.full((7, 4, 4), np.nan)
+    poses = np.full((8, 4, 4), np.nan)
     poses[:3] = np.eye(4), turn, np.eye(4)
     poses[1, :3, 3] = [500.0, 100.0, 0.0]
     in_project = [wall[:4000], wall[4000:] + np.array([0.0, APART, 0.0]), wall[:500] + np.array([0.0, 9000.0, 0.0])]
@@ -32,7 +32,7 @@ def made():
         for name, pose, points in zip(NAMES, poses, in_project, strict=False)
     ]
     scans.append(Scan(NAMES[3], wall[:100], np.zeros(3)))
-    stitched = step_results.stitching((*NAMES, "S5", "S6", "S7"))
+    stitched = step_results.stitching((*NAMES, "S5", "S6", "S7", "S8"))
     result = dataclasses.replace(stitched, T_project_scan=poses, position=poses[:, :3, 3])
     execution = step_results.execution(("stitch", "automatic", "{}", result), names=NAMES)
     return dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, scans=tuple(scans)))
