@@ -75,6 +75,7 @@ def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Par
         raise InputError(f"{scene.name}: method three-point needs common points; expected picks.csv in the scan folder")
     scans = scene.scans
     found, messages, scales, said = [], [], [], []
+    lost: list[list[str]] = [[] for _ in scans]
     ties: dict[tuple[int, int], three_point.Tie] = {}
     origins = np.stack([_origin(scan) for scan in scans])
     for (a, b), (in_a, in_b, _) in picked.items():
@@ -82,24 +83,37 @@ def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Par
             ties[a, b] = three_point.tie(in_a - origins[a], in_b - origins[b], params.scale == "free")
         except three_point.TooFewError as error:
             said.append(f"pair {scans[a].name}, {scans[b].name} not used: {error}, three that span a plane are needed")
+            lost[a].append(f"{error} with {scans[b].name}")
+            lost[b].append(f"{error} with {scans[a].name}")
     for (a, b), one in zip(ties, three_point.pooled(list(ties.values())), strict=True) if ties else ():
-        warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm)
+        warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm, one.left_free)
         if one.apart and not warning:
             warning = f"its picks scatter by {one.sd_mm:.2g} mm, far more than the others': a blunder among them"
         if warning:
             said.append(f"pair {scans[a].name}, {scans[b].name}: {warning}")
         found.append(three_point.as_pair(a, b, one))
         messages.append(warning)
-        scales.append((one.scale, one.scale_sd))
+        scales.append((one.scale, three_point.widened(one.scale_sd, one.left_free)))
     T, covariance = three_point.adjusted(found, len(scans), reference)
     none = np.full((len(scans), 4, 4), np.nan)
     scale = np.array(scales).reshape(-1, 2)
     network = answer.Network(
         T, covariance, origins, np.zeros(len(scans)), none, np.zeros(len(scans)), np.ones(len(scans)), found,
         np.full(len(found), np.nan), [True] * len(found),
-        messages, scale[:, 0], scale[:, 1],
+        messages, scale[:, 0], scale[:, 1], lost=_unplaced(lost, {row for key in ties for row in key}),
     )  # fmt: skip
     return answer.result(scans, network, reference, params, said)
+
+
+def _unplaced(too_few: list[list[str]], tied: set[int]) -> list[str]:
+    """Say why a scan of three-point may be without a pose: the pairs it has too few picks in, or no pairs at all."""
+    found = []
+    for row, said in enumerate(too_few):
+        if said:
+            found.append(f"{', '.join(said)}, three that span a plane are needed")
+        else:
+            found.append("its picks lead to scans that are not placed" if row in tied else "no picks with other scans")
+    return found
 
 
 def _origin(scan: Scan) -> Floats:

@@ -17,6 +17,7 @@ from processor.stitching.placing import AMBIGUOUS
 from processor.stitching.result import Result
 
 CONTRARY = 0.25  # of what speaks for a pose; people and cars that moved make some
+LOST = "shares too little with the others to be placed"
 LITTLE = 0.1  # of both scans' faces
 
 
@@ -39,6 +40,7 @@ class Network:
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
     dissent: Sequence[Dissent] = ()  # about each scan's pose, where faces hold it
     spread: tuple[float, ...] = (float("nan"),) * 3  # noise, patches, ends
+    lost: Sequence[str] = ()  # why each scan that has no pose has none
 
 
 def result(scans: Sequence[Scan], network: Network, reference: int, params: Params, said: Sequence[str] = ()) -> Result:
@@ -55,7 +57,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
     for s in range(k):
         if not np.isfinite(network.T[s]).all():
             status.append("failed")
-            message.append("shares too little with the others to be placed")
+            message.append((network.lost[s] if network.lost else "") or LOST)
             continue
         posed = base @ network.T[s]
         T[s] = frames.of_file(posed, network.origins[s])
@@ -103,10 +105,9 @@ def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params:
         return "weak", f"much speaks against its pose ({100.0 * network.contrary[s]:.0f} % of what speaks for it)"
     if network.dissent and network.dissent[s].counts:
         other = network.dissent[s]
-        where = f"{other.shift_mm:.2g} mm and {other.turn_mrad:.2g} mrad elsewhere"
         return "weak", (
-            f"{other.agree} faces agree that it stands {where}, {other.hold} speak against that: "
-            "something moved in between, or the scan is bent"
+            f"{other.agree} faces agree that it stands {other.shift_mm:.2g} mm and {other.turn_mrad:.2g} mrad "
+            f"elsewhere, {other.hold} speak against that: something moved in between, or the scan is bent"
         )
     if network.shared[s] < LITTLE:
         return "weak", f"it shares little with any other scan ({100.0 * network.shared[s]:.0f} %)"
