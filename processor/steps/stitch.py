@@ -2,7 +2,8 @@
 
 ``automatic`` places the scans by the flat faces they share and by what each scanner looked through, then adjusts all of
 them at once on these faces and their ends. ``three-point`` takes three or more picked points a pair (picks.csv), as in
-paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``.
+paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``. Where control points are
+given, three or more that span a plane, what either found is laid into their frame, and corrected by them.
 """
 
 from __future__ import annotations
@@ -47,11 +48,14 @@ def run(scene: Scene, params: Params) -> Result:
     reference = names.index(params.reference) if params.reference else 0
     picked = picks.by_pair(scene.picks, scene.scans)
     if params.method == "three-point":
-        return _three_point(scene, picked, reference, params)
-    return _automatic(scene.scans, picked, reference, params)
+        network, said = _three_point(scene, picked, reference, params)
+    else:
+        network, said = _automatic(scene.scans, picked, reference, params), []
+    network, more = answer.controlled(network, scene)
+    return answer.result(scene.scans, network, reference, params, [*more, *said])
 
 
-def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, params: Params) -> Result:
+def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, params: Params) -> answer.Network:
     from processor.stitching import automatic
 
     found = automatic.stitch(scans, params, reference, picked)
@@ -60,17 +64,19 @@ def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, pa
         "its own pose contradicts the others" if bad else "by itself it would stand elsewhere" if other else ""
         for bad, other in zip(found.gross, found.elsewhere, strict=True)
     ]
-    network = answer.Network(
+    tau = found.solution.tau
+    return answer.Network(
         found.solution.T, found.solution.covariance, origins, found.placed.rivalry, found.placed.T_rival,
         found.placed.contrary, found.placed.overlap, found.pairs,
         np.array(found.overlap), [not bad for bad in found.gross], messages,
         dissent=found.dissent,
-        spread=(float(np.median([cloud.sigma_mm for cloud in found.clouds])), *found.solution.tau[:2]),
+        spread=(float(np.median([cloud.sigma_mm for cloud in found.clouds])), tau[0], tau[1]),
     )  # fmt: skip
-    return answer.result(scans, network, reference, params)
 
 
-def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Params) -> Result:
+def _three_point(
+    scene: Scene, picked: picks.Picked, reference: int, params: Params
+) -> tuple[answer.Network, list[str]]:
     if not picked:
         raise InputError(f"{scene.name}: method three-point needs common points; expected picks.csv in the scan folder")
     scans = scene.scans
@@ -102,7 +108,7 @@ def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Par
         np.full(len(found), np.nan), [True] * len(found),
         messages, scale[:, 0], scale[:, 1], lost=_unplaced(lost, {row for key in ties for row in key}),
     )  # fmt: skip
-    return answer.result(scans, network, reference, params, said)
+    return network, said
 
 
 def _unplaced(too_few: list[list[str]], tied: set[int]) -> list[str]:
