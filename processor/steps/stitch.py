@@ -64,13 +64,13 @@ def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, pa
         "its own pose contradicts the others" if bad else "by itself it would stand elsewhere" if other else ""
         for bad, other in zip(found.gross, found.elsewhere, strict=True)
     ]
-    tau = found.solution.tau
+    tau, noise = found.solution.tau, float(np.median([cloud.sigma_mm for cloud in found.clouds]))
     return answer.Network(
         found.solution.T, found.solution.covariance, origins, found.placed.rivalry, found.placed.T_rival,
         found.placed.contrary, found.placed.overlap, found.pairs,
         np.array(found.overlap), [not bad for bad in found.gross], messages,
         dissent=found.dissent,
-        spread=(float(np.median([cloud.sigma_mm for cloud in found.clouds])), tau[0], tau[1]),
+        spread=(noise, tau[0], tau[1]), point_mm=noise,
     )  # fmt: skip
 
 
@@ -91,7 +91,8 @@ def _three_point(
             said.append(f"pair {scans[a].name}, {scans[b].name} not used: {error}, three that span a plane are needed")
             lost[a].append(f"{error} with {scans[b].name}")
             lost[b].append(f"{error} with {scans[a].name}")
-    for (a, b), one in zip(ties, three_point.pooled(list(ties.values())), strict=True) if ties else ():
+    pooled = three_point.pooled(list(ties.values())) if ties else []
+    for (a, b), one in zip(ties, pooled, strict=True):
         warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm, one.left_free)
         if one.apart and not warning:
             warning = f"its picks scatter by {one.sd_mm:.2g} mm, far more than the others': a blunder among them"
@@ -107,6 +108,7 @@ def _three_point(
         T, covariance, origins, np.zeros(len(scans)), none, np.zeros(len(scans)), np.ones(len(scans)), found,
         np.full(len(found), np.nan), [True] * len(found),
         messages, scale[:, 0], scale[:, 1], lost=_unplaced(lost, {row for key in ties for row in key}),
+        point_mm=float(np.median([one.sd_mm for one in pooled])) if pooled else float("nan"),
     )  # fmt: skip
     return network, said
 

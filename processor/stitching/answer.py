@@ -42,6 +42,7 @@ class Network:
     spread: tuple[float, float, float] = (float("nan"),) * 3  # noise, patches, ends
     lost: Sequence[str] = ()  # why each scan that has no pose has none
     against: Sequence[str] = ()  # what control points have against each scan's pose
+    point_mm: float = float("nan")  # standard deviation of a single point, or of a pick
     base: Floats | None = None  # (4, 4) where poses lead to in the project; None: from the reference's frame
     held: Held | None = None
 
@@ -52,7 +53,7 @@ def controlled(network: Network, scene: Scene) -> tuple[Network, tuple[str, ...]
         return network, ()
     names = [scan.name for scan in scene.scans]
     try:
-        found = control.hold(scene.control, names, network.T, network.covariance, network.origins)
+        found = control.hold(scene.control, names, network.T, network.covariance, network.origins, network.point_mm)
     except InputError as error:
         raise InputError(f"{scene.name}: {error}") from None
     if not found.held.holds:

@@ -24,9 +24,9 @@ Bools = npt.NDArray[np.bool_]
 
 LEAST_POINTS = 3
 CLEAR = 10.0  # standard deviations that points must lie off a line by, or the scans might be laid round it either way
-LEAST_SD_MM = 1e-3  # of a sighting whose standard deviation is not stated, or no matrix can be inverted
+LEAST_SD_MM = 1e-3  # of a sighting, or no matrix could be inverted
 ROUNDS, STILL = 12, 1e-10
-MOST = 2000  # sightings; the equations are dense
+MOST = 1000  # sightings; the equations are dense
 LOOSENED = 30  # rounds at most
 
 
@@ -103,10 +103,14 @@ class Placed:
     against: tuple[str, ...]
 
 
-def hold(control: Control, names: Sequence[str], T: Floats, covariance: Floats, origins: Floats) -> Placed:
+def hold(
+    control: Control, names: Sequence[str], T: Floats, covariance: Floats, origins: Floats, point_mm: float
+) -> Placed:
     """Lay a network of poses T (k, 4, 4), covariance (6k, 6k), to the control points that its scans saw.
 
-    ``origins`` (k, 3) were taken off the scans' coordinates. Raises InputError where units are mixed up.
+    ``origins`` (k, 3) were taken off the scans' coordinates; ``point_mm`` is the standard deviation of a sighting that
+    comes without its own: none is exact, and taken so it would be contradicted by any other. Raises InputError where
+    units are mixed up.
     """
     if len(control.scan) > MOST:
         raise InputError(f"{len(control.scan)} sightings of control points; expected {MOST} at most")
@@ -114,8 +118,10 @@ def hold(control: Control, names: Sequence[str], T: Floats, covariance: Floats, 
     sure = np.array([np.isfinite(T[s]).all() and np.isfinite(_block(covariance, s)).all() for s in range(k)])
     there = sure[control.scan]
     centre = control.positions[control.point[there]].mean(axis=0) if there.any() else np.zeros(3)
+    point_mm = max(point_mm, LEAST_SD_MM)  # also where it is not known
+    seen_sd = np.where(control.seen_sd > 0.0, control.seen_sd, point_mm)
     every = Sightings(
-        control.point, control.scan, control.seen - origins[control.scan], np.maximum(control.seen_sd, LEAST_SD_MM),
+        control.point, control.scan, control.seen - origins[control.scan], np.maximum(seen_sd, LEAST_SD_MM),
         control.positions[control.point] - centre, control.sd[control.point],
     )  # fmt: skip
     used = every.only(there)
@@ -135,7 +141,10 @@ def hold(control: Control, names: Sequence[str], T: Floats, covariance: Floats, 
     rms = float(np.sqrt((off[at] ** 2).mean()))
     head = [f"held by {n} control points seen {m} times: residuals {rms:.2g} mm (rms), redundancy {found.free}"]
     if not control.seen_sd[at].all():
-        head.append("control points seen without a standard deviation are taken to be seen exactly")
+        head.append(
+            f"control points seen without a standard deviation are taken to be seen to {point_mm:.2g} mm, as a single "
+            "point of the scans or a pick is"
+        )
     ratio = found.chi2 / found.free
     held = replace(
         _held(control, names), off=off, sd=sd, share=share, used=at.astype(np.uint8), holds=1, redundancy=found.free,
@@ -289,7 +298,8 @@ def _residuals(every: Sightings, at: Bools, there: Bools, found: Fit, loosened: 
     off[there] = (every.known - rigid.apply(found.M, _placed(every, found.T)))[there]
     left = found.own @ found.cofactor
     sd[at] = np.sqrt(np.maximum(np.diag(left @ found.own), 0.0)).reshape(-1, 3)
-    share[at] = np.diag(left).reshape(-1, 3).mean(axis=1)
+    # Of correlated errors: what of one's square by its own covariance is left in the misfits, from 0 to 1.
+    share[at] = (np.diag(found.cofactor) / np.diag(np.linalg.inv(found.own))).reshape(-1, 3).mean(axis=1)
     for i in np.flatnonzero(there & ~at):
         s, R = every.scan[i], found.M[:3, :3]
         arm = found.T[s, :3, :3] @ every.seen[i]

@@ -148,7 +148,8 @@ def controlled():
     )
     said = (
         "held by 2 control points seen 3 times: residuals 1.2 mm (rms), redundancy 3",
-        "control points seen without a standard deviation are taken to be seen exactly",
+        "control points seen without a standard deviation are taken to be seen to 2.1 mm, as a single point of the "
+        "scans or a pick is",
         "control point P2 left out: 52.0 mm off what the others say",
         "the sighting of control point P2 in S2 left out: 52.0 mm off what the others say",
         "what control points say is contradicted by control point P1, the sighting of control point P2 in S2, "

@@ -38,6 +38,7 @@ def room():
 def test_four_scans_of_a_room_come_together(room):
     T, _, result = room
     assert result.status == "ok"
+    assert result.frame == "PRCS"
     assert set(result.scan_status) == {"ok"}
     shift, turn = errors(result, T)
     # 78 thousand points of 2 mm a scan: the walls alone hold a scan to a few hundredths of a millimetre.
@@ -148,6 +149,7 @@ def test_a_given_pose_of_the_reference_leads_to_the_project():
     result = stitch.run(scene, stitch.Params())
     want = given @ np.linalg.inv(T[0]) @ T[2]
     np.testing.assert_allclose(result.T_project_scan[0], given)
+    assert result.frame == "GLCS"
     np.testing.assert_allclose(result.position[2], want[:3, 3], atol=0.5)
 
 

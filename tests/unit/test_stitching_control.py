@@ -58,8 +58,8 @@ def toy(seed, count=6, wrong=None, known_sd=0.5, seen_sd=0.8, each=2):
     return T, C, true, Control(tuple(f"P{i}" for i in range(count)), known, np.full(count, known_sd), *rows)
 
 
-def held(T, C, points, origins=None):
-    return control.hold(points, NAMES[: len(T)], T, C, np.zeros((len(T), 3)) if origins is None else origins)
+def held(T, C, points, point_mm=1.0):
+    return control.hold(points, NAMES[: len(T)], T, C, np.zeros((len(T), 3)), point_mm)
 
 
 def in_site(found):
@@ -215,6 +215,17 @@ def test_where_it_cannot_be_told_which_point_is_wrong_intervals_hold_it():
     assert (np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]) < 3.0 * sd).all()
 
 
+def test_sightings_that_do_not_say_how_sure_they_are_count_as_single_points():
+    """Taken as exact, they would contradict one another; as sure as stated, they give what stated ones do."""
+    T, C, _, points = toy(3, seen_sd=0.8)
+    blank = dataclasses.replace(points, seen_sd=np.zeros(len(points.seen_sd)))
+    stated, found = held(T, C, points), held(T, C, blank, point_mm=0.8)
+    np.testing.assert_array_equal(found.T, stated.T)
+    assert "taken to be seen to 0.8 mm" in found.said[1]
+    assert (found.held.share > 0.0).all()
+    assert (found.held.share < 1.0).all()
+
+
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_or_two_points_hold_nothing(count):
     T, C, _, points = toy(0, count=count)
@@ -315,7 +326,7 @@ def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
     known[3] += [0.0, 0.0, 70.0]
     rows = [("name", "scan", "x", "y", "z", "sd_mm")]
     rows += [(name, "", *(place / 1000.0), 0.3) for name, place in zip(points.ids, known, strict=True)]
-    rows += [(points.ids[p], f"S{s + 1}", *(seen / 1000.0), 0.5)
+    rows += [(points.ids[p], f"S{s + 1}", *(seen / 1000.0), "" if p == 1 else 0.5)
              for p, s, seen in zip(points.point, points.scan, points.seen, strict=True)]  # fmt: skip
     folder = tmp_path / "room"
     folder.mkdir()
@@ -329,6 +340,8 @@ def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
     said = ran.output.replace("\n", " ")
     assert "held by 5 control points seen 20 times" in said
     assert "control point T3 left out: 7" in said
+    assert "without a standard deviation are taken to be seen to 1." in said  # noise of 2 mm, along the rays
+    assert "cannot be told" not in said
     found = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
     at = np.array([one["T_project_scan"] for one in found["scans"]])
     np.testing.assert_allclose(at[:, :3, 3], (SITE @ T)[:, :3, 3], atol=1.5)
