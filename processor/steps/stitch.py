@@ -2,7 +2,8 @@
 
 ``automatic`` places the scans by the flat faces they share and by what each scanner looked through, then adjusts all of
 them at once on these faces and their ends. ``three-point`` takes three or more picked points a pair (picks.csv), as in
-paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``.
+paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``. Where control points are
+given, three or more that span a plane, what either found is laid into their frame, and corrected by them.
 """
 
 from __future__ import annotations
@@ -47,11 +48,14 @@ def run(scene: Scene, params: Params) -> Result:
     reference = names.index(params.reference) if params.reference else 0
     picked = picks.by_pair(scene.picks, scene.scans)
     if params.method == "three-point":
-        return _three_point(scene, picked, reference, params)
-    return _automatic(scene.scans, picked, reference, params)
+        network, said = _three_point(scene, picked, reference, params)
+    else:
+        network, said = _automatic(scene.scans, picked, reference, params), []
+    network, more = answer.controlled(network, scene)
+    return answer.result(scene.scans, network, reference, params, [*more, *said])
 
 
-def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, params: Params) -> Result:
+def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, params: Params) -> answer.Network:
     from processor.stitching import automatic
 
     found = automatic.stitch(scans, params, reference, picked)
@@ -60,21 +64,24 @@ def _automatic(scans: tuple[Scan, ...], picked: picks.Picked, reference: int, pa
         "its own pose contradicts the others" if bad else "by itself it would stand elsewhere" if other else ""
         for bad, other in zip(found.gross, found.elsewhere, strict=True)
     ]
-    network = answer.Network(
+    tau, noise = found.solution.tau, float(np.median([cloud.sigma_mm for cloud in found.clouds]))
+    return answer.Network(
         found.solution.T, found.solution.covariance, origins, found.placed.rivalry, found.placed.T_rival,
         found.placed.contrary, found.placed.overlap, found.pairs,
         np.array(found.overlap), [not bad for bad in found.gross], messages,
         dissent=found.dissent, refuted=found.refuted,
-        spread=(float(np.median([cloud.sigma_mm for cloud in found.clouds])), *found.solution.tau[:2]),
+        spread=(noise, tau[0], tau[1]), point_mm=noise,
     )  # fmt: skip
-    return answer.result(scans, network, reference, params)
 
 
-def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Params) -> Result:
+def _three_point(
+    scene: Scene, picked: picks.Picked, reference: int, params: Params
+) -> tuple[answer.Network, list[str]]:
     if not picked:
         raise InputError(f"{scene.name}: method three-point needs common points; expected picks.csv in the scan folder")
     scans = scene.scans
     found, messages, scales, said = [], [], [], []
+    lost: list[list[str]] = [[] for _ in scans]
     ties: dict[tuple[int, int], three_point.Tie] = {}
     origins = np.stack([_origin(scan) for scan in scans])
     for (a, b), (in_a, in_b, _) in picked.items():
@@ -82,24 +89,39 @@ def _three_point(scene: Scene, picked: picks.Picked, reference: int, params: Par
             ties[a, b] = three_point.tie(in_a - origins[a], in_b - origins[b], params.scale == "free")
         except three_point.TooFewError as error:
             said.append(f"pair {scans[a].name}, {scans[b].name} not used: {error}, three that span a plane are needed")
-    for (a, b), one in zip(ties, three_point.pooled(list(ties.values())), strict=True) if ties else ():
-        warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm)
+            lost[a].append(f"{error} with {scans[b].name}")
+            lost[b].append(f"{error} with {scans[a].name}")
+    pooled = three_point.pooled(list(ties.values())) if ties else []
+    for (a, b), one in zip(ties, pooled, strict=True):
+        warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm, one.left_free)
         if one.apart and not warning:
             warning = f"its picks scatter by {one.sd_mm:.2g} mm, far more than the others': a blunder among them"
         if warning:
             said.append(f"pair {scans[a].name}, {scans[b].name}: {warning}")
         found.append(three_point.as_pair(a, b, one))
         messages.append(warning)
-        scales.append((one.scale, one.scale_sd))
+        scales.append((one.scale, three_point.widened(one.scale_sd, one.left_free)))
     T, covariance = three_point.adjusted(found, len(scans), reference)
     none = np.full((len(scans), 4, 4), np.nan)
     scale = np.array(scales).reshape(-1, 2)
     network = answer.Network(
         T, covariance, origins, np.zeros(len(scans)), none, np.zeros(len(scans)), np.ones(len(scans)), found,
         np.full(len(found), np.nan), [True] * len(found),
-        messages, scale[:, 0], scale[:, 1],
+        messages, scale[:, 0], scale[:, 1], lost=_unplaced(lost, {row for key in ties for row in key}),
+        point_mm=float(np.median([one.sd_mm for one in pooled])) if pooled else float("nan"),
     )  # fmt: skip
-    return answer.result(scans, network, reference, params, said)
+    return network, said
+
+
+def _unplaced(too_few: list[list[str]], tied: set[int]) -> list[str]:
+    """Say why a scan of three-point may be without a pose: the pairs it has too few picks in, or no pairs at all."""
+    found = []
+    for row, said in enumerate(too_few):
+        if said:
+            found.append(f"{', '.join(said)}, three that span a plane are needed")
+        else:
+            found.append("its picks lead to scans that are not placed" if row in tied else "no picks with other scans")
+    return found
 
 
 def _origin(scan: Scan) -> Floats:

@@ -11,6 +11,7 @@ from processor.stitching.result import Result
 
 POSITION_MM, ROTATION_MRAD = 0.5, 0.02
 WRONG_MM = 50.0
+LEAST_SURE = 3  # scans without a flag that hold the datum alone
 NAN = float("nan")
 
 
@@ -40,17 +41,21 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         return metrics
     T = result.T_project_scan[rows]
     true = np.stack([known[result.scans[i]] for i in rows])
-    M = datum(T, true)
-    fitted = M @ T
+    sure = np.array([result.scan_status[i] == "ok" for i in rows])
+    # A scan that is rightly called weak may be centimetres off: it must not pull the good ones away from the truth.
+    fit = sure if sure.sum() >= LEAST_SURE else np.ones(len(rows), bool)
+    fitted = datum(T[fit], true[fit]) @ T
     off = np.linalg.norm(fitted[:, :3, 3] - true[:, :3, 3], axis=1)
     turn = 1e3 * np.array([rigid.rotation_angle(a[:3, :3] @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)])
-    sure = np.array([result.scan_status[i] == "ok" for i in rows])
     metrics += [
         Metric("stitch", "station positions after datum fit, max", float(off.max()), POSITION_MM, "mm"),
         Metric("stitch", "station positions after datum fit, rms", float(np.sqrt((off**2).mean())), NAN, "mm"),
         Metric("stitch", "rotations after datum fit, max", float(turn.max()), ROTATION_MRAD, "mrad"),
         Metric("stitch", f"scans called ok, over {WRONG_MM:g} mm off", float((off[sure] > WRONG_MM).sum()), 0.0, ""),
     ]
+    if result.by_control:
+        apart = float(np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)[fit].max())
+        metrics.append(Metric("stitch", "station positions by control points, max", apart, NAN, "mm"))
     pulls = pulls_of(result, rows, true)
     if len(pulls):
         share = 100.0 * float((np.abs(pulls) < NORMAL_95).mean())
@@ -59,14 +64,16 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
 
 
 def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:
-    """Errors by standard deviations (m,) of poses relative to the reference, which holds the datum."""
-    if result.reference not in [result.scans[i] for i in rows]:
-        return np.empty(0)
-    held = [result.scans[i] for i in rows].index(result.reference)
-    M = result.T_project_scan[rows[held]] @ rigid.invert(true[held])
+    """Errors by standard deviations (m,) of poses: relative to the reference which holds the datum, or by control."""
+    held, M = -1, np.eye(4)
+    if not result.by_control:
+        if result.reference not in [result.scans[i] for i in rows]:
+            return np.empty(0)
+        held = result.scans.index(result.reference)
+        M = result.T_project_scan[held] @ rigid.invert(true[rows.index(held)])
     found = []
     for one, i in zip(true, rows, strict=True):
-        if i == rows[held] or not np.isfinite(result.position_sd[i]).all():
+        if i == held or not np.isfinite(result.position_sd[i]).all():
             continue
         at = M @ one
         place = result.position[i]

@@ -3,20 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, Scan
-from processor.stitching import frames, pairs
+from processor.model import NORMAL_95, Floats, InputError, Scan, Scene
+from processor.stitching import control, frames, pairs
 from processor.stitching.dissent import Dissent
 from processor.stitching.pairs import Pair
 from processor.stitching.params import Params
 from processor.stitching.placing import AMBIGUOUS
-from processor.stitching.result import Result
+from processor.stitching.result import Held, Result
 
 CONTRARY = 0.25  # of what speaks for a pose; people and cars that moved make some
+LOST = "shares too little with the others to be placed"
 LITTLE = 0.1  # of both scans' faces
 
 
@@ -39,15 +40,39 @@ class Network:
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
     refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`placing.refuted`
     dissent: Sequence[Dissent] = ()  # about each scan's pose, where faces hold it
-    spread: tuple[float, ...] = (float("nan"),) * 3  # noise, patches, ends
+    spread: tuple[float, float, float] = (float("nan"),) * 3  # noise, patches, ends
+    lost: Sequence[str] = ()  # why each scan that has no pose has none
+    against: Sequence[str] = ()  # what control points have against each scan's pose
+    point_mm: float = float("nan")  # standard deviation of a single point, or of a pick
+    base: Floats | None = None  # (4, 4) where poses lead to in the project; None: from the reference's frame
+    held: Held | None = None
+
+
+def controlled(network: Network, scene: Scene) -> tuple[Network, tuple[str, ...]]:
+    """Lay a network into the frame of control points, where there are any and they are enough; and what to say."""
+    if scene.control is None or not len(scene.control.scan):
+        return network, ()
+    names = [scan.name for scan in scene.scans]
+    try:
+        found = control.hold(scene.control, names, network.T, network.covariance, network.origins, network.point_mm)
+    except InputError as error:
+        raise InputError(f"{scene.name}: {error}") from None
+    if not found.held.holds:
+        return replace(network, held=found.held), found.said
+    base = rigid.transform(np.eye(3), found.centre)
+    return replace(
+        network, T=found.T, covariance=found.covariance, T_rival=found.M @ network.T_rival,
+        against=found.against, base=base, held=found.held,
+    ), found.said  # fmt: skip
 
 
 def result(scans: Sequence[Scan], network: Network, reference: int, params: Params, said: Sequence[str] = ()) -> Result:
     """Write a result; see :class:`Result` for its frames."""
     given = scans[reference].T_project_scan
     T_project_file = given if given.size else np.eye(4)
-    # The reference's cloud frame in the project.
-    base = T_project_file @ rigid.transform(np.eye(3), network.origins[reference])
+    # The reference's cloud frame in the project, or the control points' where these hold all.
+    own_base = T_project_file @ rigid.transform(np.eye(3), network.origins[reference])
+    base = own_base if network.base is None else network.base
     k = len(scans)
     T, C = np.full((k, 4, 4), np.nan), np.full((k, 6, 6), np.nan)
     place, place_sd, turn_sd = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3), np.nan)
@@ -56,7 +81,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
     for s in range(k):
         if not np.isfinite(network.T[s]).all():
             status.append("failed")
-            message.append("shares too little with the others to be placed")
+            message.append((network.lost[s] if network.lost else "") or LOST)
             continue
         posed = base @ network.T[s]
         T[s] = frames.of_file(posed, network.origins[s])
@@ -94,7 +119,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
         network.scale_sd if len(network.scale_sd) else np.full(count, np.nan),
         tuple(" > ".join(names[i] for i in loop.rows) for loop in loops),
         np.array([loop.mm for loop in loops]), np.array([loop.mrad for loop in loops]),
-        np.array([loop.ratio for loop in loops]), *network.spread,
+        np.array([loop.ratio for loop in loops]), *network.spread, control=network.held,
     )  # fmt: skip
 
 
@@ -108,6 +133,8 @@ def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params:
             f"{other.agree} faces agree that it stands {other.shift_mm:.2g} mm and {other.turn_mrad:.2g} mrad "
             f"elsewhere, {other.hold} speak against that: something moved in between, or the scan is bent"
         )
+    if network.against and network.against[s]:
+        return "weak", network.against[s]
     if network.shared[s] < LITTLE:
         return "weak", f"it shares little with any other scan ({100.0 * network.shared[s]:.0f} %)"
     if rivalry > AMBIGUOUS:

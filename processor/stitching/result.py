@@ -4,16 +4,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from processor.model import Checked, Codes, Floats, Ints, column, names
+import numpy as np
+
+from processor.model import Checked, Codes, Floats, Ints, column, names, newer
+
+PRCS, GLCS = "PRCS", "GLCS"
+
+
+@dataclass(frozen=True)
+class Held(Checked):
+    """What control points hold the scans by, a row a sighting; project's frame, mm. NaN = not placed, or not used."""
+
+    points: tuple[str, ...] = names("c")
+    scans: tuple[str, ...] = names("c")
+    off: Floats = column("c", 3)  # known less seen place, once all is adjusted
+    sd: Floats = column("c", 3)  # of it; where a sighting was left out, as the others predict it
+    share: Floats = column("c")  # of an error of a sighting that shows in its residual; the rest goes into the poses
+    used: Codes = column("c", dtype="uint8")  # type: ignore[arg-type]
+    holds: int = 0  # 1 = the project's frame is theirs; 0 = too few, and it is the reference scan's
+    redundancy: int = 0  # freedoms
+    ratio: float = float("nan")  # squares of misfits by covariances, by the redundancy: 1 is usual
+    loosened: float = 1.0  # standard deviations of control points were taken so many times as large
 
 
 @dataclass(frozen=True)
 class Result(Checked):
-    """All scans in one frame, the project's (PRCS). NaN = no answer.
+    """All scans in one frame, the project's. NaN = no answer.
 
-    The project's frame is that of the reference scan (its scanner's own, SOCS), or the one that scan's given pose
-    leads to. Covariances: order (turn about x, y, z of the project's frame in rad; translation in mm), left
-    perturbation T = exp(xi) T_project_scan, relative to the reference.
+    The project's frame is that of the reference scan (PRCS), or one given from outside (GLCS): that of the control
+    points, or the one that scan's given pose leads to. Covariances: order (turn about x, y, z of the project's frame in
+    rad; translation in mm), left perturbation T = exp(xi) T_project_scan, relative to the reference, which is held,
+    unless control points hold all.
     """
 
     status: str  # ok | partial | failed
@@ -51,3 +72,21 @@ class Result(Checked):
     noise_mm: float = float("nan")  # of single points along the ray, as found
     patch_mm: float = float("nan")  # of what neighbouring points have in common, as found
     ends_share: float = float("nan")  # the same of ends of faces, by the standard deviation of a single one
+    control: Held | None = newer()
+
+    @property
+    def by_control(self) -> bool:
+        """Whether control points hold the frame."""
+        return self.control is not None and bool(self.control.holds)
+
+    @property
+    def frame(self) -> str:
+        """Name of the frame that T_project_scan leads to: PRCS, the reference scan's, or GLCS, given from outside."""
+        given = self.reference in self.scans and not np.array_equal(self.reference_pose, np.eye(4))
+        return GLCS if self.by_control or given else PRCS
+
+    @property
+    def reference_pose(self) -> Floats:
+        """Pose (4, 4) of the reference scan, and so of PRCS, in the project's frame."""
+        found: Floats = self.T_project_scan[self.scans.index(self.reference)]
+        return found

@@ -29,6 +29,7 @@ UNIT_SLIPS = (
     (3.28084, "feet and m"),
 )
 BY_CHANCE = 1e-3  # that picks of a network scatter so much in one pair
+SCALE_BY_CHANCE = 2.7e-3  # that a scale of 1 is doubted: beyond three standard deviations, were these known
 LEAST_HEIGHT = 1e-3  # of a triangle, by its longest side: nearer to a line than that is a line
 
 
@@ -47,6 +48,8 @@ class Tie:
     sd_mm: float  # of a picked coordinate of one scan
     covariance: Floats
     free: int  # freedoms that the standard deviation is known by
+    left_mm: float  # the same of a difference of two scans' picks, by what a free scale leaves
+    left_free: int
     apart: bool = False  # its picks scatter more than those of the other pairs, beyond chance
 
 
@@ -76,8 +79,8 @@ def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
     free = 3 * n - 6 - scale_free
     both = max(float(np.sqrt((residuals**2).sum() / free)), LEAST_SD_MM)  # of a difference: both scans' picks are in it
     sd = both / np.sqrt(2.0)
-    # The scale's own standard deviation by what six or seven parameters leave; with it free, 3n - 7 in any case.
-    left = float(np.sqrt(((a - scale * moved) ** 2).sum() / max(3 * n - 7, 1)))
+    # The scale's own standard deviation by what seven parameters leave: what a scale is off by is not in it.
+    left = max(float(np.sqrt(((a - scale * moved) ** 2).sum() / (3 * n - 7))), LEAST_SD_MM)
     scale_sd = left / float(np.sqrt((moved**2).sum()))
     J = rigid.motion(moved).reshape(-1, 6)
     own = np.linalg.inv(J.T @ J) * both**2
@@ -87,7 +90,7 @@ def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
     if scale_free:  # what the scale takes up of the way from b's origin to the points, the shift has to answer for
         way = R @ middle_b
         covariance[3:, 3:] += (both**2 / float((moved**2).sum())) * np.outer(way, way)
-    return Tie(T, scale, scale_sd, residuals, sd, covariance, free)
+    return Tie(T, scale, scale_sd, residuals, sd, covariance, free, left, 3 * n - 7)
 
 
 def pooled(ties: list[Tie]) -> list[Tie]:
@@ -110,28 +113,46 @@ def pooled(ties: list[Tie]) -> list[Tie]:
             break
         del used[int(np.argmax(beyond))]
     kept = {id(one) for one in used}
+    left_free = sum(one.left_free for one in used)
+    left = float(np.sqrt(sum(one.left_free * one.left_mm**2 for one in used) / left_free))
     found = []
     for one in ties:
         apart = id(one) not in kept
         freedoms, of = (one.free, one.sd_mm) if apart else (free, sd)
         factor = of / one.sd_mm * float(student.isf(0.025, freedoms)) / NORMAL_95
-        scale_sd = of / one.sd_mm * one.scale_sd
-        found.append(replace(one, sd_mm=of, scale_sd=scale_sd, covariance=one.covariance * factor**2, apart=apart))
+        own = (one.left_mm, one.left_free) if apart else (left, left_free)
+        found.append(
+            replace(
+                one, sd_mm=of, scale_sd=own[0] / one.left_mm * one.scale_sd, covariance=one.covariance * factor**2,
+                left_mm=own[0], left_free=own[1], apart=apart,
+            )
+        )  # fmt: skip
     return found
 
 
-def verdict(scale: float, sd: float, limit_ppm: float) -> str:
-    """Say what a scale other than 1 means, or nothing."""
+def verdict(scale: float, sd: float, limit_ppm: float, free: float = np.inf) -> str:
+    """Say what a scale other than 1 means, or nothing; ``free`` are the freedoms that ``sd`` is known by."""
     off = 1e6 * abs(scale - 1.0)
-    for factor, units in UNIT_SLIPS:
-        if min(abs(scale / factor - 1.0), abs(scale * factor - 1.0)) < 0.02:
-            return f"scale {scale:.5g}: units mixed up ({units})?"
-    if off <= 3.0 * 1e6 * sd:
+    slip = units_slip(scale)
+    if slip:
+        return f"scale {scale:.5g}: units mixed up ({slip})?"
+    if off <= float(student.isf(0.5 * SCALE_BY_CHANCE, free)) * 1e6 * sd:
         return ""
     if off > limit_ppm:
         return f"scale {scale:.6f}: a blunder in the picks"
-    return (
-        f"scale {1e6 * (scale - 1.0):+.0f} ± {1.96e6 * sd:.0f} ppm: temperature (12 ppm a kelvin), instrument or picks"
+    width = 1e6 * NORMAL_95 * widened(sd, free)
+    return f"scale {1e6 * (scale - 1.0):+.0f} ± {width:.0f} ppm: temperature (12 ppm a kelvin), instrument or picks"
+
+
+def widened(sd: float, free: float) -> float:
+    """Return a standard deviation such that 1.96 of it hold 95 %, of one that is known by a few freedoms alone."""
+    return float(student.isf(0.025, free)) / NORMAL_95 * sd
+
+
+def units_slip(scale: float) -> str:
+    """Name the two units that a scale is the ratio of, to 2 %, or nothing."""
+    return next(
+        (units for ratio, units in UNIT_SLIPS if min(abs(scale / ratio - 1.0), abs(scale * ratio - 1.0)) < 0.02), ""
     )
 
 

@@ -20,6 +20,7 @@ from processor.evaluate import ErrorReport
 from processor.geometry.orientation import Turned
 from processor.model import Metric
 from processor.report import comparison, figures, page
+from processor.stitching.result import Held
 from processor.validation import changes, night
 from processor.validation import summary as nights_summary
 from tests import nights, step_results
@@ -30,12 +31,12 @@ NAMES = {
     *(f"S{i}" for i in range(9)),
     *("site", "scan", "made", "component", "ply", "summary", "timings"),
     *("automatic", "default", "paper", "three", "point", "stitch", "deviation", "spheres"),
-    *("PRCS", "SOCS", "GLCS", "T_PRCS_SOCS", "LOD95", "lod95", "ppm", "rms"),
+    *("PRCS", "SOCS", "GLCS", "T_PRCS_SOCS", "GLCS_PRCS", "LOD95", "lod95", "ppm", "rms"),
 }
 
 
 def left_in_english(text, *more):
-    seen = Visible(re.sub(r"T_PRCS_SOCS\(.*?\)", "", text))
+    seen = Visible(re.sub(r"T_(PR|GL)CS_SOCS\(.*?\)", "", text))
     assert seen.lang == "zh"
     assert len(seen.texts) > 20
     return latin(seen.texts, STAYS | NAMES | set(more))
@@ -117,6 +118,7 @@ def checks_of(step, *names):
 STITCH_CHECKS = (
     "scans not placed", "station positions after datum fit, max", "station positions after datum fit, rms",
     "rotations after datum fit, max", "scans called ok, over 50 mm off", "pose components within their 95 % intervals",
+    "station positions by control points, max",
     "three-point: scans not placed",
 )  # fmt: skip
 DEFECT_CHECKS = (
@@ -134,6 +136,48 @@ def stitched():
     return made, ErrorReport(checks_of("stitch", *STITCH_CHECKS))
 
 
+def controlled():
+    """Scans held by control points, with all that is said of these."""
+    first = step_results.stitching()
+    seen = (
+        ("P1", "P2", "P2"),
+        ("S1", "S1", "S2"),
+        np.ones((3, 3)),
+        np.ones((3, 3)),
+        np.full(3, 0.4),
+        np.array([1, 1, 0]),
+    )
+    said = (
+        "held by 2 control points seen 3 times: residuals 1.2 mm (rms), redundancy 3",
+        "control points seen without a standard deviation are taken to be seen to 2.1 mm, as a single point of the "
+        "scans or a pick is",
+        "control point P2 left out: 52.0 mm off what the others say",
+        "the sighting of control point P2 in S2 left out: 52.0 mm off what the others say",
+        "what control points say is contradicted by control point P1, the sighting of control point P2 in S2, "
+        "the pose of S2, and it cannot be told by which: their standard deviations are taken to be 5.1 times as large",
+        "control points scatter more than they should: their standard deviations are taken to be 1.7 times as large",
+        "control points not used: 2 of them seen in scans that were placed, three that span a plane are needed",
+        "control points not used: all of them nearly on a line, three that span a plane are needed",
+    )
+    scans = (*first.scan_message[:4], "its control points say that it stands 170.0 mm elsewhere",
+             "2 common points with S1, all common points on a line with S2, three that span a plane are needed",
+             "no picks with other scans", "its picks lead to scans that are not placed")  # fmt: skip
+    first = dataclasses.replace(first, control=Held(*seen, 1, 3, 0.9), message="; ".join(said), scan_message=scans)
+    made = step_results.execution(("stitch", "automatic", "{}", first), names=first.scans)
+    return made, ErrorReport(checks_of("stitch", *STITCH_CHECKS))
+
+
+def given():
+    """Scans in the frame that the reference's given pose leads to."""
+    first = step_results.stitching()
+    pose = np.array(first.T_project_scan)
+    pose[:, :3, 3] += 5e5
+    made = step_results.execution(
+        ("stitch", "automatic", "{}", dataclasses.replace(first, T_project_scan=pose)), names=first.scans
+    )
+    return made, ErrorReport()
+
+
 def searched():
     said = "placed by step deviation (as given); 1.2 m2 examined of 2.4 m2 of the design's surface"
     paper = dataclasses.replace(
@@ -146,7 +190,7 @@ def searched():
     return made, ErrorReport(checks_of("defects", *DEFECT_CHECKS))
 
 
-@pytest.mark.parametrize("made", [stitched, searched])
+@pytest.mark.parametrize("made", [stitched, controlled, given, searched])
 def test_nothing_but_names_and_units_is_left_in_english(made):
     execution, report = made()
     text = page.html(execution, report, figures.of_run(execution, report), "zh")

@@ -10,9 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from processor import folder, pipeline, store
 from processor.evaluate import ErrorReport
-from processor.model import InputError, Scan, Scene, UsageError
+from processor.model import InputError, Scan, Scene, StationTruth, Truth, UsageError
 from processor.report import writing
 from processor.steps import stitch
+from processor.stitching.result import Held
 from tests import stitch_clouds
 from tests.stitch_clouds import four
 
@@ -37,6 +38,7 @@ def room():
 def test_four_scans_of_a_room_come_together(room):
     T, _, result = room
     assert result.status == "ok"
+    assert result.frame == "PRCS"
     assert set(result.scan_status) == {"ok"}
     shift, turn = errors(result, T)
     # 78 thousand points of 2 mm a scan: the walls alone hold a scan to a few hundredths of a millimetre.
@@ -147,6 +149,7 @@ def test_a_given_pose_of_the_reference_leads_to_the_project():
     result = stitch.run(scene, stitch.Params())
     want = given @ np.linalg.inv(T[0]) @ T[2]
     np.testing.assert_allclose(result.T_project_scan[0], given)
+    assert result.frame == "GLCS"
     np.testing.assert_allclose(result.position[2], want[:3, 3], atol=0.5)
 
 
@@ -209,7 +212,7 @@ def test_a_run_is_reported_whole(room, tmp_path):
     assert set(found["closures"][0]) >= {"loop", "mm", "mrad"}
     assert np.array(found["scans"][1]["covariance"]).shape == (6, 6)
     rows = (tmp_path / "out" / "stitch.csv").read_text().splitlines()
-    poses = np.array([[float(x) for x in row.split(",")[2:]] for row in rows[1:]]).reshape(-1, 4, 4)
+    poses = np.array([[float(x) for x in row.split(",")[2:18]] for row in rows[1:]]).reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, execution.runs[0].result.T_project_scan)
     np.testing.assert_allclose(poses, result.T_project_scan, atol=1e-2)  # a scene file rounds to 0.01 mm
     names = {one.name for one in (tmp_path / "out").rglob("*")}
@@ -223,6 +226,42 @@ def test_a_run_is_reported_whole(room, tmp_path):
     page = (tmp_path / "out" / "report.html").read_text()
     assert "T_PRCS_SOCS(S2)" in page
     assert "GLCS" in page
+
+
+def held_against(T, true, status, **more):
+    """Checks of made-up poses (k, 4, 4) against true ones."""
+    k = len(T)
+    names = tuple(f"S{i + 1}" for i in range(k))
+    made = stitch.Result(
+        "ok", "automatic", reference="S1", scans=names, scan_status=status, scan_message=("",) * k, T_project_scan=T,
+        position=T[:, :3, 3], position_sd=np.full((k, 3), 1.0), rotation_sd=np.full((k, 3), 1e-4),
+        covariance=np.zeros((k, 6, 6)), rivalry=np.zeros(k), T_rival_scan=np.full((k, 4, 4), np.nan), **more,
+    )  # fmt: skip
+    truth = Truth(stations=StationTruth(names, true))
+    return {one.name: one.value for one in stitch.check(Scene("s", "structure"), made, truth)}
+
+
+def test_a_scan_rightly_called_weak_does_not_make_the_good_ones_wrong():
+    true = np.array([stitch_clouds.pose([8000.0 * i, 3000.0 * i**2, 0.0], 50.0 * i) for i in range(5)])
+    T = true.copy()
+    T[4, :3, 3] += [0.0, 0.0, 400.0]
+    found = held_against(T, true, ("ok",) * 4 + ("weak",))
+    assert found["scans called ok, over 50 mm off"] == 0.0
+    assert found["station positions after datum fit, max"] == pytest.approx(400.0)
+    assert held_against(T, true, ("ok",) * 5)["scans called ok, over 50 mm off"] > 0.0
+
+
+def test_what_control_points_hold_is_checked_in_their_frame():
+    true = np.array([stitch_clouds.pose([8000.0 * i, 3000.0 * i**2, 0.0], 50.0 * i) for i in range(4)])
+    T = true.copy()
+    T[:, 0, 3] += 3.0  # all alike, which a datum fit would take up
+    free = held_against(T, true, ("ok",) * 4)
+    held = held_against(T, true, ("ok",) * 4, control=Held(holds=1))
+    assert "station positions by control points, max" not in free
+    assert held["station positions by control points, max"] == pytest.approx(3.0)
+    assert held["station positions after datum fit, max"] == pytest.approx(0.0, abs=1e-6)
+    assert free["pose components within their 95 % intervals"] == pytest.approx(100.0)
+    assert held["pose components within their 95 % intervals"] == pytest.approx(100.0 * 5 / 6)
 
 
 ROOMS = Path(__file__).resolve().parents[2] / "../shared/data/pcd"

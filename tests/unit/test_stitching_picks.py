@@ -194,3 +194,50 @@ def test_a_pair_with_a_blunder_does_not_make_the_others_unsure():
     assert np.nanmax(result.position_sd) < 3.0 * np.nanmax(clean.position_sd)
     want = np.linalg.inv(T[0]) @ T
     assert np.abs(result.T_project_scan[:, :3, 3] - want[:, :3, 3]).max() < 30.0
+
+
+@pytest.mark.parametrize("points", [3, 6])
+def test_a_scale_of_one_is_not_called_another(points):
+    """Picks of 5 mm without a scale: of 200 pairs few are named, for all that two freedoms a pair know little."""
+    said = [
+        message
+        for seed in range(40)
+        for message in stitch.run(
+            network(seed, 5.0, points=points)[1], stitch.Params(method="three-point")
+        ).pair_message
+    ]
+    assert sum("scale" in one for one in said) <= 0.02 * len(said)
+
+
+def test_one_pair_alone_needs_more_to_doubt_its_scale():
+    """By two freedoms a scale 5 standard deviations off is chance (Student: 19 of them), by many it is not."""
+    assert three_point.verdict(1.0005, 1e-4, 1000.0, 2) == ""
+    assert "temperature" in three_point.verdict(1.0005, 1e-4, 1000.0, 60)
+    assert "± 430 ppm" in three_point.verdict(1.003, 1e-4, 5000.0, 2)
+
+
+def test_a_scale_that_is_one_is_found_and_its_interval_holds():
+    inside, named = [], []
+    for seed in range(30):
+        result = stitch.run(network(seed, 2.0, scale=1.0 / 1.004)[1], stitch.Params(method="three-point"))
+        inside += (np.abs(result.scale - 1.004) < 1.96 * result.scale_sd).tolist()
+        named += ["scale 1.004" in one or "scale 1.003" in one for one in result.pair_message]
+    assert 0.88 < np.mean(inside) < 0.99
+    assert np.mean(named) > 0.9
+
+
+def test_a_scan_that_cannot_be_placed_says_what_it_lacks():
+    _, scene = network(1, 2.0)
+    picks = scene.picks
+    pairs = list(zip(picks.scan_a, picks.scan_b, strict=True))
+    left = {("S4", "S5"): 2, ("S1", "S5"): 1}
+    rows = [i for i, pair in enumerate(pairs) if pairs[:i].count(pair) < left.get(pair, 9)]
+    few = Picks(*([getattr(picks, name)[i] for i in rows] for name in ("scan_a", "scan_b", "points", "in_a", "in_b")))
+    lone = Scan("S6", scene.scans[0].points)
+    scene = dataclasses.replace(scene, scans=(*scene.scans, lone), picks=few)
+    result = stitch.run(scene, stitch.Params(method="three-point"))
+    assert result.scan_status[4:] == ("failed", "failed")
+    assert result.scan_message[4] == (
+        "1 common points with S1, 2 common points with S4, three that span a plane are needed"
+    )
+    assert result.scan_message[5] == "no picks with other scans"
