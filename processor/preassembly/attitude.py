@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import product
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -23,6 +24,10 @@ SAMPLE_SPACING_MM = 30.0  # of the design's surface: a mark of 0.1 m shows in te
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for those that can still win
 COARSE_POINTS, FINE_POINTS = 600, 20_000
+# Where no hypothesis of a whole part comes as near, the scan may be of a piece of it: noise and form of parts are less.
+PIECE_MM = 5.0
+PIECE_POINTS, PIECE_ITERATIONS, PIECES_KEPT = 200, 6, 24
+SAME_SIZE = 0.05  # of the size along an axis, by which a piece may differ and yet be as large as the part along it
 # After the coarse gates a hypothesis this many times worse than the best, and by so much, is dropped: the right one may
 # have come to rest some millimetres off.
 PROMISING, PROMISING_MM = 4.0, 10.0
@@ -30,7 +35,9 @@ SHORT_SHARE = 0.1  # of its length, by which a scan may be shorter than the part
 NO_FIT_MM = 25.0  # typical distance to the design, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses that move no corner of the part by more are one and the same
 TELLING_MM = 10.0  # design surface this far from the rival's design can tell two poses apart
+CORNER_SAMPLES = 12  # nearest of the rival's design: some of them on each face that meets at a corner
 LEAST_EVIDENCE = 10  # samples of telling surface that the scan shows
+SLIDE_RAD = np.radians(45.0)  # a rival turned by less has slid along the part: along an arch it turns a little
 RIVAL_RATIO = 1.5  # a pose whose misfit is within this factor of the best is a rival
 
 
@@ -57,8 +64,8 @@ class Surface:
     size: float  # diagonal of the bounding box
 
 
-def sample_surface(part: DesignPart) -> Surface:
-    """Spread samples over the part's triangles, on a fixed low-discrepancy pattern."""
+def samples_of(part: DesignPart) -> tuple[Floats, Floats]:
+    """Spread samples (n, 3), with unit normals, over the part's triangles, on a fixed low-discrepancy pattern."""
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     cross = np.cross(b - a, c - a)
     double_area = np.linalg.norm(cross, axis=1)
@@ -74,10 +81,16 @@ def sample_surface(part: DesignPart) -> Surface:
     u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
     at = a[triangle]
     points = at + u[:, None] * (b[triangle] - at) + v[:, None] * (c[triangle] - at)
+    return points, (cross / double_area[:, None])[triangle]
+
+
+def sample_surface(part: DesignPart) -> Surface:
+    """Prepare the part's surface: samples, their tree, and the mesh itself."""
+    points, normals = samples_of(part)
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     return Surface(
         points,
-        (cross / double_area[:, None])[triangle],
+        normals,
         cKDTree(points, balanced_tree=False),
         mesh_surface.of_mesh(part.vertices, part.faces),
         principal.of_mesh(part.vertices, part.faces).axes,
@@ -92,12 +105,7 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
     """
     scan = principal.of_points(points)
     design = principal.of_mesh(part.vertices, part.faces)
-    quarter_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    rotations = [
-        design.axes @ np.diag(signs) @ turn @ scan.axes.T
-        for turn in (np.eye(3), quarter_turn)
-        for signs in principal.proper_sign_choices()
-    ]
+    rotations = _rotations(scan.axes, design.axes)
     low, high = np.quantile((points - scan.centre) @ scan.axes[:, 0], [0.01, 0.99])
     whole = (part.vertices - design.centre) @ design.axes[:, 0]
     short = np.ptp(whole) - (high - low)
@@ -109,6 +117,40 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
             own = (low, high) if ahead > 0.0 else (-high, -low)
             move = 0.0 if shift == 0.0 else whole.min() - own[0] if shift < 0.0 else whole.max() - own[1]
             found.append(rigid.transform(R, design.centre + move * design.axes[:, 0] - R @ scan.centre))
+    return found
+
+
+def _rotations(scan_axes: Floats, design_axes: Floats) -> list[Floats]:
+    """Return the eight proper rotations (3, 3) that lay one long axis on the other and either cross axis on either."""
+    quarter_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
+    return [
+        design_axes @ np.diag(signs) @ turn @ scan_axes.T
+        for turn in (np.eye(3), quarter_turn)
+        for signs in principal.proper_sign_choices()
+    ]
+
+
+def piece_hypotheses(seeds: Floats, part: DesignPart) -> list[Floats]:
+    """T_bridge_scan that lay a piece of the part, as evenly seen in seeds (n, 3), to either side and amid it.
+
+    Of a half seen from above the middle is not the part's: along every axis along which it is smaller than the part it
+    is tried at the low side, in the middle and at the high side.
+    """
+    design_axes = principal.of_mesh(part.vertices, part.faces).axes
+    whole = part.vertices @ design_axes
+    low, high = whole.min(axis=0), whole.max(axis=0)
+    found = []
+    for R in _rotations(principal.of_points(seeds).axes, design_axes):
+        own = seeds @ R.T @ design_axes
+        own_low, own_high = np.quantile(own, [0.002, 0.998], axis=0)  # the odd stray point does not count
+        middle = 0.5 * (low + high - own_low - own_high)
+        moves = [
+            (m,) if abs((b - a) - (d - c)) < SAME_SIZE * (b - a) else (c_low, m, c_high)
+            for a, b, c, d, m, c_low, c_high in zip(
+                low, high, own_low, own_high, middle, low - own_low, high - own_high, strict=True
+            )
+        ]
+        found += [rigid.transform(R, design_axes @ np.array(move)) for move in product(*moves)]
     return found
 
 
@@ -124,6 +166,8 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         seeds = points
     few = thinned(seeds, COARSE_POINTS)
     coarse = each(partial(_tried, few, surface, COARSE_GATES_MM), [(T, T) for T in principal_hypotheses(points, part)])
+    if min(c[0] for c in coarse) > PIECE_MM:
+        coarse += _of_pieces(seeds, few, surface, part)
     promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + PROMISING_MM]
     # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
     seeds = thinned(points, FINE_POINTS)
@@ -148,12 +192,37 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         ours, theirs = _evidence(points, surface, best, rival)
         more, fewer = max(ours, theirs), min(ours, theirs)
         if more < LEAST_EVIDENCE or more < 2 * fewer:
-            turn = np.degrees(rigid.rotation_angle(best[:3, :3] @ rival[:3, :3].T))
-            message = f"the part fits its design as well when turned by {turn:.0f} deg; a mark on it would tell"
-            other = rival
+            message, other = _said_of(best, rival, surface), rival
         elif theirs > ours:
             best, start, message, other = rival, rival_start, "", np.full((4, 4), np.nan)
     return Attitude(start, best, "ambiguous" if message else "ok", message, other)
+
+
+def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -> list[tuple[float, Floats, Floats]]:
+    """Try the part's pieces: what stands best after a few quick steps goes through the coarse gates."""
+    quick = thinned(few, PIECE_POINTS)
+
+    def stepped(T: Floats) -> tuple[float, Floats]:
+        given = (quick, surface.points, surface.normals, T)
+        gate = COARSE_GATES_MM[:1]
+        fitted = icp.point_to_plane(
+            *given, gates_mm=gate, tree=surface.tree, axes=surface.axes, max_iterations=PIECE_ITERATIONS
+        ).T_target_source
+        return _misfit(quick, surface, fitted), fitted
+
+    best = sorted(each(stepped, piece_hypotheses(seeds, part)), key=lambda item: item[0])[:PIECES_KEPT]
+    return each(partial(_tried, few, surface, COARSE_GATES_MM), [(T, T) for _, T in best])
+
+
+def _said_of(best: Floats, rival: Floats, surface: Surface) -> str:
+    """Say what a rival's pose is against the best, T_bridge_scan (4, 4) each, and what would tell them apart."""
+    between = rival @ rigid.invert(best)
+    middle = surface.points.mean(axis=0)
+    turn = rigid.rotation_angle(between[:3, :3])
+    if turn >= SLIDE_RAD:
+        return f"the part fits its design as well when turned by {np.degrees(turn):.0f} deg; a mark on it would tell"
+    shift = abs(float((rigid.apply(between, middle) - middle) @ surface.axes[:, 0]))
+    return f"the part fits its design as well when shifted by {shift:.0f} mm along itself; an end seen would tell"
 
 
 def _tried(
@@ -191,23 +260,32 @@ def _largest_move(T: Floats, other: Floats, points: Floats) -> float:
 def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> tuple[int, int]:
     """Count the shown samples of surface that only one of the poses has, for the best and for the rival."""
     return (
-        _shown(points, best, _only_in(surface, best, rival)),
-        _shown(points, rival, _only_in(surface, rival, best)),
+        shown(points, best, only_in(surface, best, surface, rival)[0]),
+        shown(points, rival, only_in(surface, rival, surface, best)[0]),
     )
 
 
-def _only_in(surface: Surface, T: Floats, other: Floats) -> Floats:
-    """Give the samples of the design that, placed in the scan by T, are far from the design as ``other`` places it."""
-    there = rigid.apply(other, rigid.apply(rigid.invert(T), surface.points))
-    _, distance, beyond = surface.mesh.distances(there, 5.0 * TELLING_MM)
+def only_in(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> tuple[Floats, Floats]:
+    """Give the samples (k, 3) of a design that, placed in the scan by T, are far from the other design as placed there.
+
+    With their normals (k, 3). ``T`` and ``T_other`` are T_bridge_scan (4, 4); the designs may be one and the same.
+    """
+    there = rigid.apply(T_other, rigid.apply(rigid.invert(T), surface.points))
+    _, distance, beyond = other.mesh.distances(there, 5.0 * TELLING_MM)
     near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # not so where nothing is in reach: NaN
-    # Near a corner the nearest sample may be on the other face: a sample close by is surface enough.
-    near |= surface.mesh.tree.query(there, workers=-1)[0] <= 1.4 * TELLING_MM
-    telling: Floats = surface.points[~near]
-    return telling
+    far = np.flatnonzero(~near)
+    # Near a corner the nearest sample may be on the other face, from which the walk does not come round.
+    around = other.mesh.tree.query(there[far], k=CORNER_SAMPLES, workers=-1)
+    beside = around[0][:, 0] <= 1.4 * TELLING_MM
+    for k in range(CORNER_SAMPLES):
+        face = other.mesh.sample_face[around[1][:, k]]
+        _, distance, beyond = other.mesh.distances(there[far], np.inf, face)
+        beside |= (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)
+    far = far[~beside]
+    return surface.points[far], surface.normals[far]
 
 
-def _shown(points: Floats, T: Floats, samples: Floats) -> int:
+def shown(points: Floats, T: Floats, samples: Floats) -> int:
     """Count the samples that have a point within TELLING_MM, the points taken by T."""
     if len(samples) == 0:
         return 0

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from processor.geometry import icp, rigid
+from processor.geometry import icp, principal, rigid
 from processor.geometry.lines import Polyline
 from processor.geometry.mesh_surface import MeshSurface, on_face
-from processor.geometry.neighbors import by_cell, thinned
+from processor.geometry.neighbors import by_cell, thinned, voxel_means
 from processor.model import ArchDesign, DesignPart, Floats, Ints, Scan
 from processor.preassembly import (
     attitude,
@@ -23,10 +23,12 @@ from processor.preassembly import (
     registration,
     surrogate,
     systematic,
+    twins,
 )
 from processor.preassembly.systematic import SystematicParams
 
 CELL_MM = 40.0  # points of one are looked up one after the other
+SIZE_SHARE = 0.01  # of its length, within which a scan is as large as a part: noise, form and voxels move it by less
 RESIDUALS = 4_000  # points of a part whose distances from the design are kept
 
 
@@ -59,6 +61,7 @@ class _Placed:
     found: attitude.Attitude
     fitted: registration.Registration
     trouble: str
+    told: twins.Told = field(default_factory=twins.Told)
 
     @property
     def rank(self) -> tuple[bool, bool, int]:
@@ -130,23 +133,19 @@ def see(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, do
     edges = systematic.of_edges(edges, doubts, apart * between.share(station))
     member = network.Member((None, None), edges, part.vertices.mean(axis=0), pose)
     said_of += [_unheld(first)] if first.fitted.weak else []
-    said_of += _without_mesh(part, design)
+    cost = surrogate.cost(part)
+    said_of += [cost] if cost else []
+    # One scan of the part that shows its mark is enough.
+    said_of += [] if any(not one.told.open for one in used) else first.told.open
     weak = bool(first.fitted.weak) or any(end is not None and end.trouble for end in ends)
     status = "ambiguous" if first.found.status == "ambiguous" else "weak" if weak else "ok"
+    like = _looks_like(first.points, design, part) if status != "ok" else ""
+    said_of += [like] if like else []
     measured = Measured(
         part.name, tuple(one.scan for one in used), status, "; ".join(said_of), first.fitted.T_bridge_scan,
         member, shrink, first.found.T_rival, *_residuals(moved, shape.mesh),
     )  # fmt: skip
     return Seen(part, measured, tuple(ends))
-
-
-def _without_mesh(part: DesignPart, design: ArchDesign) -> list[str]:
-    """Say what it costs that a part has no mesh, and which others it may be taken for."""
-    if part.source == "mesh":
-        return []
-    twins = surrogate.alike(part, design)
-    taken = [f"of the same shape as {' and '.join(twins)}: the scan may be of either"] if twins else []
-    return [surrogate.cost(part), *taken]
 
 
 def _between_stations(moved: Floats, station: Ints, shape: attitude.Surface) -> float:
@@ -183,9 +182,13 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
     elif not registration.fits(fitted):
         trouble = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface, "
         trouble += f"the others typically {fitted.sigma_mm / 1.4826:.0f} mm"
-    return _Placed(
-        scan, points, station, found, fitted, f"{trouble}; {_looks_like(points, design, part)}" if trouble else ""
-    )
+    if trouble:
+        like = _looks_like(points, design, part) or "is this the right part, and whole?"
+        return _Placed(scan, points, station, found, fitted, f"{trouble}; {like}")
+    told = twins.tell(points, fitted.T_bridge_scan, shape, part, design)
+    # A part of another size may have its mark, by chance, where the twin has its own.
+    wrong = told.wrong and (_looks_like(points, design, part) or told.wrong)
+    return _Placed(scan, points, station, found, fitted, wrong, told)
 
 
 def _unheld(one: _Placed) -> str:
@@ -205,20 +208,19 @@ def _residuals(moved: Floats, surface: MeshSurface) -> tuple[Floats, Floats]:
 
 
 def _looks_like(points: Floats, design: ArchDesign, part: DesignPart) -> str:
-    """Say which part of the design has the size of the scan."""
+    """Name every other part of the design that has the size of the scan, where the part itself has not; or nothing."""
     size = _size_of(points)
-    apart = [float(np.abs(_size_of(one.vertices) - size).max()) for one in design.parts]
-    nearest = design.parts[int(np.argmin(apart))]
-    if nearest.name == part.name or min(apart) > 0.5 * apart[design.parts.index(part)]:
-        return "is this the right part, and whole?"
-    return f"by its size it is rather {nearest.name}"
+    same = SIZE_SHARE * float(size.max())
+    named = [o.name for o in design.parts if np.abs(_size_of(attitude.samples_of(o)[0]) - size).max() < same]
+    return f"by its size it is rather {' or '.join(named)}" if named and part.name not in named else ""
 
 
 def _size_of(points: Floats) -> Floats:
-    """Return the sizes (3,) of points (n, 3) along their principal axes."""
-    middle = points.mean(axis=0)
-    axes = np.linalg.eigh(np.cov((points - middle).T))[1]
-    found: Floats = np.sort(np.ptp((points - middle) @ axes, axis=0))
+    """Return the sizes (3,) of a surface's points (n, 3) along its principal axes; single stray points do not count."""
+    spread = float(np.linalg.norm(np.ptp(points, axis=0)))
+    even = voxel_means(points, spread / 150.0, least=2)
+    even = even if len(even) >= 50 else points
+    found: Floats = np.sort(np.ptp(even @ principal.of_points(even).axes, axis=0))
     return found
 
 

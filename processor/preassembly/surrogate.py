@@ -16,6 +16,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.interpolate import Akima1DInterpolator, make_interp_spline
 
+from processor.geometry import rigid
 from processor.model import ArchDesign, DesignPart, Floats, InputError, Ints
 
 SOURCE = "curves"
@@ -124,21 +125,26 @@ def alike(part: DesignPart, design: ArchDesign) -> tuple[str, ...]:
 
     Sections are not compared: parts of one pair of edges and of different heights are named, too.
     """
-    forward = _shape(part.bottom_edge_left, part.bottom_edge_right)
-    turned = _shape(part.bottom_edge_right[::-1], part.bottom_edge_left[::-1])
-    found = []
-    for other in design.parts:
-        own = _shape(other.bottom_edge_left, other.bottom_edge_right)
-        if other.name != part.name and min(np.abs(own - one).max() for one in (forward, turned)) < ALIKE_MM:
-            found.append(other.name)
-    return tuple(found)
+    return tuple(other.name for other in design.parts if other.name != part.name and motions(part, other))
 
 
-def _shape(left: Floats, right: Floats) -> Floats:
-    """Distances (k, k) between places of both edges, the same in every pose."""
+def motions(part: DesignPart, other: DesignPart) -> list[Floats]:
+    """Rigid T_part_other (4, 4), none of them a mirror image, that lay the other part's edges on this part's."""
     share = np.linspace(0.0, 1.0, 9)
-    points = np.vstack([Edge.through(edge).at(share) for edge in (left, right)])
-    found: Floats = np.linalg.norm(points[:, None] - points, axis=2)
+
+    def places(left: Floats, right: Floats) -> Floats:
+        return np.vstack([Edge.through(edge).at(share) for edge in (left, right)])
+
+    own = places(part.bottom_edge_left, part.bottom_edge_right)
+    found = []
+    for left, right in (
+        (other.bottom_edge_left, other.bottom_edge_right),
+        (other.bottom_edge_right[::-1], other.bottom_edge_left[::-1]),
+    ):
+        theirs = places(left, right)
+        T = rigid.fit(theirs, own)
+        if np.linalg.norm(rigid.apply(T, theirs) - own, axis=1).max() < ALIKE_MM:
+            found.append(T)
     return found
 
 

@@ -8,10 +8,10 @@ import pytest
 from designgen import recipes, sampler
 from designgen.designs import arch_bridge, arch_mesh
 from designgen.scene import make
-from processor.geometry import rigid
+from processor.geometry import principal, rigid
 from processor.geometry.neighbors import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene
-from processor.preassembly import attitude, features, measuring
+from processor.preassembly import attitude, features, measuring, twins
 from processor.preassembly.systematic import SystematicParams
 from processor.steps import preassemble
 from tests.arch_clouds import random_pose
@@ -137,6 +137,85 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
         np.degrees(rigid.rotation_angle(one[:3, :3] @ T[:3, :3].T)) for one in (found.T_bridge_scan, found.T_rival)
     ]
     assert sorted(round(turn) for turn in turns) == [0, 180]
+
+
+def test_parts_of_one_shape_are_told_apart_by_their_mark():
+    """Rib 3 turned round is rib 1 but for its mark: laid as rib 1 it fits to the noise."""
+    parts, design = bridge()
+    for asked, came in ((1, 3), (0, 4)):
+        found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
+        assert found.status == "failed"
+        assert found.message == f"by its mark it is rather {parts[came].name}"
+        found = measured(design, came, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
+        assert (found.status, found.message) == ("ok", "")
+
+
+def without_the_marks_places(part, points):
+    """Points of a part but for about its mark, and about where its twin has its own."""
+    s, u = part.pad
+    places = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
+    return points[(np.linalg.norm(points[:, None] - places, axis=2) > 400.0).all(axis=1)]
+
+
+def test_a_part_of_which_no_mark_was_seen_says_which_other_it_may_be():
+    parts, design = bridge()
+    scan, _ = scanned(without_the_marks_places(parts[1], cloud(parts[1], spacing_mm=14.0)))
+    found = measured(design, 1, scan)
+    assert (found.status, found.message) == (
+        "ok", "of the same shape as rib3: no mark was seen that tells them apart",
+    )  # fmt: skip
+
+
+def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_own():
+    parts, design = bridge()
+    part, shape = parts[1], attitude.sample_surface(design.parts[1])
+    points = cloud(part, spacing_mm=14.0)
+    s, u = part.pad
+    turned = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
+    for place in turned:  # the mark, and where rib 3 has its own: 14 mm up over half a metre
+        far = np.linalg.norm(points - place, axis=1)
+        up = part.point(np.array([s]), np.array([u]), np.array([1.0])) - part.point(np.array([s]), np.array([u]), [0.0])
+        points = points + np.where(far < 700.0, 14.0, 0.0)[:, None] * up
+    assert twins.tell(points, np.eye(4), shape, design.parts[1], design) == twins.Told()
+
+
+@pytest.mark.parametrize(
+    ("asked", "came", "said"),
+    [
+        (2, 1, "rib1 or rib3"),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, 2, "rib2"), (3, 0, "foot1 or foot2"))),
+        pytest.param(0, 3, "rib1 or rib3", marks=pytest.mark.slow),
+    ],
+)
+def test_neighbours_swapped_are_named(asked, came, said):
+    """By its size: also of scans that fit the wrong part well enough to be weak only."""
+    parts, design = bridge()
+    found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=20.0))[0])
+    assert found.status != "ok"
+    assert found.message.endswith(f"by its size it is rather {said}")
+
+
+def test_a_rival_farther_along_is_not_called_a_turn():
+    _, design = bridge()
+    surface = attitude.sample_surface(design.parts[1])
+    along = rigid.transform(np.eye(3), 240.0 * surface.axes[:, 0])
+    assert attitude._said_of(np.eye(4), along, surface) == (
+        "the part fits its design as well when shifted by 240 mm along itself; an end seen would tell"
+    )
+
+
+@pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in range(1, 8))])
+@pytest.mark.parametrize("upper", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_half_a_part_is_found_however_it_lies_in_its_file(upper, seed):
+    parts, design = bridge()
+    part, own = parts[1], principal.of_mesh(design.parts[1].vertices, design.parts[1].faces)
+    points = cloud(part, spacing_mm=14.0)
+    down = (points - own.centre) @ own.axes[:, 1] * np.sign(-own.axes[2, 1])
+    scan, T = scanned(points[down < 60.0 if upper else down > -60.0], 100 + seed)
+    found = attitude.find(scan.points, design.parts[1])
+    assert found.status in ("ok", "ambiguous")
+    turns = [rigid.rotation_angle((one @ rigid.invert(T))[:3, :3]) for one in (found.T_surface, found.T_rival)]
+    assert turns[0] < 0.01 or (found.status == "ambiguous" and turns[1] < 0.01)
 
 
 @pytest.mark.slow
