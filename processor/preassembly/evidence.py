@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
 
-from processor.model import Floats
+from processor.model import Floats, Ints
 
 SIZES_MM = (0.0, 0.1, 1.0, 3.0, 10.0, 30.0)
 LEAST_SHARE = 1e-4  # of a hypothesis, to be counted
@@ -94,11 +94,12 @@ def _all_or(known: npt.NDArray[np.bool_] | None, priors: Sequence[Floats]) -> np
     return np.ones(len(priors[0]), bool) if known is None else known
 
 
-def by_the_others(logs: Floats, before: Floats) -> Floats:
+def by_the_others(logs: Floats, before: Floats, traits: Ints) -> Floats:
     """Return the weights (e, h) of hypotheses for each of several things, by what the others of them say.
 
-    ``logs`` (e, h) is how well each hypothesis explains each thing. What is believed ``before`` (h,) counts as one
-    thing more. Nothing judges itself, and alone all is as before.
+    ``logs`` (e, h) is how well each hypothesis explains each thing; ``traits`` (t, h) number what hypotheses have in
+    common, and each trait is learned apart: how things bend, from all, however far each is shifted. What is believed
+    ``before`` (h,) counts as one thing more. Nothing judges itself, and alone all is as before.
     """
     before = before / before.sum()
     likely = np.exp(logs - logs.max(axis=1, keepdims=True))
@@ -106,7 +107,12 @@ def by_the_others(logs: Floats, before: Floats) -> Floats:
     for _ in range(ROUNDS):
         share = weights * likely
         share /= share.sum(axis=1, keepdims=True)
-        weights = (share.sum(axis=0) - share + before) / len(logs)
+        weights = np.ones_like(share)
+        for trait in traits:
+            of_trait = trait == np.arange(trait.max() + 1)[:, None]
+            own, known = share @ of_trait.T, of_trait @ before
+            weights *= ((own.sum(axis=0) - own + known) / len(logs)) @ (of_trait / of_trait.sum(axis=1)[:, None])
+        weights /= weights.sum(axis=1, keepdims=True)
     return weights
 
 

@@ -244,7 +244,10 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
         sizes = np.array([size for _, size in hypotheses])
         seen = [_rows(end, rows, sizes) for end in ends]
         logs = np.array([explained(*one) for one in seen])
-        for one, log, weights, into in zip(seen, logs, by_the_others(logs, before), found, strict=True):
+        traits = np.stack(
+            [np.unique(of, axis=0, return_inverse=True)[1].ravel() for of in (sizes[:, :2], sizes[:, -1:])]
+        )
+        for one, log, weights, into in zip(seen, logs, by_the_others(logs, before, traits), found, strict=True):
             own = _of_rows(one, log, sizes, before, weights)
             into.mean[rows], into.covariance[rows, rows], into.gain[rows, rows] = own.mean, own.covariance, own.gain
     for end, into in zip(ends, found, strict=True):

@@ -201,14 +201,29 @@ def test_a_bridge_without_an_end_that_was_seen_has_none_to_judge():
 def test_others_say_how_large_departures_are():
     before = np.array([1.0, 1.0, 2.0])
     logs = np.log(np.array([[0.9, 0.1, 1e-9], [0.8, 0.2, 1e-9], [1e-9, 1e-9, 1.0], [0.9, 0.1, 1e-9]]))
-    weights = by_the_others(logs, before)
+    one_trait = np.arange(3)[None]
+    weights = by_the_others(logs, before, one_trait)
     np.testing.assert_allclose(weights.sum(axis=1), 1.0)
     # Three say the first: so it is for each of them, and less so by the others of these than by those of the third.
     assert (weights.argmax(axis=1) == 0).all()
     assert weights[2, 0] > weights[0, 0] > 0.45
     # One by itself, and things that say nothing, leave all as it was.
-    np.testing.assert_allclose(by_the_others(logs[:1], before), [[0.25, 0.25, 0.5]])
-    np.testing.assert_allclose(by_the_others(np.zeros((3, 3)), before), np.tile([0.25, 0.25, 0.5], (3, 1)))
+    np.testing.assert_allclose(by_the_others(logs[:1], before, one_trait), [[0.25, 0.25, 0.5]])
+    silent = by_the_others(np.zeros((3, 3)), before, one_trait)
+    np.testing.assert_allclose(silent, np.tile([0.25, 0.25, 0.5], (3, 1)))
+
+
+def test_how_ends_bend_is_learned_however_far_each_is_shifted():
+    """Hypotheses are two shifts by two bends: two ends of either shift are straight, the last one's bend is unknown."""
+    traits = np.array([[0, 0, 1, 1], [0, 1, 0, 1]])
+    near, far, far_alone = np.log([[1.0, 1e-6, 1e-6, 1e-6], [1e-6, 1e-6, 1.0, 1e-6], [1e-6, 1e-6, 1.0, 1.0]])
+    logs = np.stack([near, near, far, far, far_alone])
+    weights = by_the_others(logs, np.ones(4), traits)
+    # By all other four, with what is believed before as a fifth: nine of ten for straight, whatever the shift.
+    np.testing.assert_allclose(weights[4, 2] / weights[4, 2:].sum(), 0.9, rtol=1e-3)
+    np.testing.assert_allclose(weights[4, 0] / weights[4, :2].sum(), 0.9, rtol=1e-3)
+    whole = by_the_others(logs, np.ones(4), np.arange(4)[None])
+    assert whole[4, 2] / whole[4, 2:].sum() < 0.9
 
 
 def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
