@@ -244,10 +244,8 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
         sizes = np.array([size for _, size in hypotheses])
         seen = [_rows(end, rows, sizes) for end in ends]
         logs = np.array([explained(*one) for one in seen])
-        traits = np.stack(
-            [np.unique(of, axis=0, return_inverse=True)[1].ravel() for of in (sizes[:, :2], sizes[:, -1:])]
-        )
-        for one, log, weights, into in zip(seen, logs, by_the_others(logs, before, traits), found, strict=True):
+        by_others = by_the_others(logs, before, _traits(sizes))
+        for one, log, weights, into in zip(seen, logs, by_others, found, strict=True):
             own = _of_rows(one, log, sizes, before, weights)
             into.mean[rows], into.covariance[rows, rows], into.gain[rows, rows] = own.mean, own.covariance, own.gain
     for end, into in zip(ends, found, strict=True):
@@ -255,6 +253,11 @@ def _weighed(ends: Sequence[Observed]) -> list[Believed]:
         both = left[of_faces] @ end.pose @ left[of_ring].T
         into.covariance[of_faces, of_ring], into.covariance[of_ring, of_faces] = both, both.T
     return found
+
+
+def _traits(sizes: Floats) -> Ints:
+    """Return numbers (2, h) of what hypotheses have in common: where an end lies, and how it bends."""
+    return np.stack([np.unique(of, axis=0, return_inverse=True)[1].ravel() for of in (sizes[:, :2], sizes[:, -1:])])
 
 
 def _rows(end: Observed, rows: slice, sizes: Floats) -> tuple[Floats, Floats, list[Floats]]:
