@@ -10,7 +10,7 @@ Figures = dict[str, Any]
 VERDICTS = ("fail", "indeterminate", "pass")  # the first that is there is the whole's
 COLUMNS = {
     "steps": "steps, with the status of those that did not end well",
-    "verdict": "the worst of joints and nodes against their limits",
+    "verdict": "the worst of joints, chain and nodes against their limits",
     "joints_pass": "",
     "joints_fail": "",
     "joints_indeterminate": "",
@@ -67,7 +67,7 @@ def _preassembled(step: Mapping[str, Any], found: Figures) -> Counter[str]:
     for error in ("splicing", "linear"):
         for figure in ("mean", "max"):
             found[f"{error}_{figure}_mm"] = step.get(f"{error}_error", {}).get(figure)
-    return verdicts
+    return verdicts + _count(chain.get("verdict") for chain in step.get("chain_limits", []))
 
 
 def _balls(step: Mapping[str, Any], found: Figures) -> Counter[str]:

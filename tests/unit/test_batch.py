@@ -657,6 +657,8 @@ def test_figures_of_all_steps():
     }
     moved = [{"flag": "ok", "movement": {"verdict": v}} for v in ("pass", "fail", "no limit")]
     assert of_results({"steps": {"spheres": {"balls": moved}}, "checks": []})["verdict"] == "fail"
+    chain = {"joints": [{"verdict": "pass"}], "chain_limits": [{"verdict": "fail"}]}
+    assert of_results({"steps": {"preassemble": chain}, "checks": []})["verdict"] == "fail"
 
 
 def test_names_that_are_no_text_are_shown_escaped():
