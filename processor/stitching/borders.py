@@ -16,6 +16,7 @@ from processor.model import Floats, Ints
 from processor.stitching.octree import Planes
 
 ON_SIGMAS = 3.0
+LEAST_SHARE = 0.5  # of a piece's points
 BEYOND = 0.05  # of the range: what lies so far behind is no side of the same bar
 
 
@@ -51,8 +52,16 @@ def clear_of_borders(grid, points, piece, mean, normal, limit, clear):  # type: 
 
 
 def inside(points: Floats, grid: Ints, piece: Ints, planes: Planes) -> npt.NDArray[np.bool_]:
-    """Whether points (n, 3), seen from the origin on a ``grid`` of rows, are surely of their ``piece`` (n,) or -1."""
+    """Whether points (n, 3), seen from the origin on a ``grid`` of rows, are to stand for their ``piece`` (n,) or -1.
+
+    A piece that would lose most of its points, as a bar that few rays met, keeps them all.
+    """
     limit = ON_SIGMAS * np.sqrt(planes.variance[:, 0])
     clear = np.zeros(len(points), np.bool_)
     clear_of_borders(grid, np.ascontiguousarray(points), piece, planes.mean, planes.normal, limit, clear)
-    return clear
+    count = len(planes.count)
+    held = piece >= 0
+    whole = np.bincount(piece[held], minlength=count)
+    few = np.bincount(piece[clear], minlength=count) < LEAST_SHARE * whole
+    found: npt.NDArray[np.bool_] = clear | (held & few[piece])
+    return found

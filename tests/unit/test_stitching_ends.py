@@ -130,3 +130,10 @@ def test_points_beside_the_next_face_are_left_out():
     ends_at = int((y < 0.0).sum())  # the first column there lies 4.5 mm behind the front: as noise may
     assert not kept[:, ends_at:].any()
     assert kept[:, 1:ends_at].all()
+    # Of a bar that two columns of rays met, between others that lie behind it, all would go: it keeps its points.
+    bar = np.stack([np.full(8, 5000.0), np.tile([0.0, 40.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
+    behind = np.stack([np.full(8, 5080.0), np.tile([-40.0, 80.0], 4), np.repeat(40.0 * np.arange(4), 2)], axis=1)
+    places = np.stack([np.arange(8, 16, 2), np.arange(0, 8, 2), np.arange(1, 8, 2), np.arange(9, 16, 2)], axis=1)
+    kept = borders.inside(np.vstack([bar, behind]), places, np.repeat([0, -1], 8), plane)
+    assert kept[:8].all()
+    assert not kept[8:].any()
