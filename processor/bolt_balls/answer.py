@@ -25,7 +25,7 @@ def of_frame(scene: Scene, params: Params, points: PointReader | None = None) ->
     degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
     found = frame.extract(
         source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
-        control_of(scene, source), params.register_stations, params.datum_mm,
+        control_of(scene, source), params.register_stations, params.datum_mm, tolerance.default_for(scene.tolerance),
     )  # fmt: skip
     return None if found is None else _result(found, source, scene)
 

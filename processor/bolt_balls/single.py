@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.bolt_balls.blanks import beyond, blank_tolerance
 from processor.bolt_balls.params import NAN, Params
 from processor.bolt_balls.result import Result
 from processor.geometry.crops import nearest_crops
@@ -20,7 +21,6 @@ from processor.geometry.sphere import Mask, Sphere, algebraic, visible_fraction
 from processor.geometry.sphere_ransac import ransac
 from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
 from processor.model import NORMAL_95, Floats, FrameDesign, Tolerance
-from processor.preassembly import tolerance
 
 LEAST_VISIBLE = 0.05  # share of the sphere
 LEAST_INLIERS = 0.3  # share of the crop
@@ -105,32 +105,17 @@ def _judged(
     ]
     flag = "low-confidence" if doubts else "ok"
     error = sphere.radius - nominal
-    below, above = _blank_tolerance(nominal, limits)
+    below, above = blank_tolerance(nominal, limits)
     if not doubts and not np.isnan(nominal) and not -below <= error <= above:
         # The interval is formal; what the method is known to reach decides whether it may call a size wrong.
         margin = max(NORMAL_95 * sd, PAPER_RADIUS_ERROR_MM)
-        if params.method == "ransac" and not -below - margin <= error <= above + margin:
-            flag = "wrong-size"
-            doubts = [
-                f"radius {error:+.1f} mm from nominal, beyond the blank's +{above:g}/-{below:g} by {margin:.1f} mm"
-            ]
+        said = beyond(sphere.radius, nominal, margin, limits)
+        if params.method == "ransac" and said:
+            flag, doubts = "wrong-size", [said]
         elif params.method == "least-squares":
             flag = "low-confidence"
             doubts = [f"radius {error:+.1f} mm from nominal: this method cannot tell a wrong size from sleeves"]
     return _Ball(id_, nominal, sphere, len(points), visible, rms, flag, "; ".join(doubts))
-
-
-def _blank_tolerance(radius: float, limits: Tolerance) -> tuple[float, float]:
-    """How much smaller and larger in mm a ball's radius may be: half of the limits on the blank's diameter.
-
-    Limits that do not speak of balls leave them to those of the default standard.
-    """
-    for one in (limits, tolerance.load(tolerance.DEFAULT)):
-        for limit in one.limits:
-            if limit.key.startswith("ball_blank_diameter_") and tolerance.applies(limit, 2.0 * radius):
-                low, high = tolerance.bounds(limit, {"diameter": 2.0 * radius})
-                return -0.5 * low, 0.5 * high
-    return NAN, NAN
 
 
 # --- without a design ----------------------------------------------------------------------------------------------
