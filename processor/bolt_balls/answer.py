@@ -104,6 +104,7 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         station_said=() if stations is None else stations.weak,
         datum="" if stations is None else stations.datum,
         control_names=() if stations is None else stations.control,
+        control_scan=() if stations is None else stations.control_scan,
         control_off=np.empty((0, 3)) if stations is None else stations.control_off,
         control_used=np.empty(0, np.int64) if stations is None else stations.control_used,
     )

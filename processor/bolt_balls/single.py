@@ -12,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.bolt_balls import units
 from processor.bolt_balls.blanks import beyond, blank_tolerance
 from processor.bolt_balls.params import NAN, Params
 from processor.bolt_balls.result import Result
@@ -92,6 +93,7 @@ def _judged(
     visible = visible_fraction(points, sphere.centre)
     rms = float(np.sqrt(np.mean(sphere.residuals(points) ** 2)))
     sd = float(np.sqrt(sphere.covariance[3, 3]))
+    strange = units.implausible(sphere.radius)
     doubts = [
         text
         for doubtful, text in (
@@ -99,6 +101,7 @@ def _judged(
             (visible < LEAST_VISIBLE, f"{visible:.0%} of the surface seen"),
             (share < LEAST_INLIERS, f"{share:.0%} of the points around lie on it"),
             (not sd <= LARGEST_SD * sphere.radius, f"ill-conditioned: sd of the radius {sd:.1f} mm"),
+            (bool(strange), strange),
             (rms > LARGEST_RMS * sphere.radius, f"not round: residuals of {rms:.1f} mm rms"),
         )
         if doubtful

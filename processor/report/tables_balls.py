@@ -309,10 +309,11 @@ def _stations(result: Result) -> list[Table]:
 
 
 def _control(result: Result) -> list[Table]:
+    sightings = zip(result.control_names, result.control_off, result.control_used, result.control_scan, strict=True)
     rows = tuple(
-        (name, *off.tolist(), float(np.linalg.norm(off)), "yes" if used else "no, the others speak against it")
-        for name, off, used in zip(result.control_names, result.control_off, result.control_used, strict=True)
+        (name, *off.tolist(), float(np.linalg.norm(off)), "yes" if used else "no, the others speak against it", scan)
+        for name, off, used, scan in sightings
     )
-    columns = ("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used")
+    columns = ("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used", "scan")
     note = "Known place minus where the scans have it after the stations were moved; a row a sighting."
     return [Table("Control points (mm)", columns, rows, "control", note)] if rows else []

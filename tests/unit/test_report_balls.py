@@ -435,15 +435,20 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
     made = whole(
         datum="2 control points", control_names=("T1", "T2"), control_off=[[0.3, 0.0, -0.4], [30.0, 0.0, 0.0]],
         control_used=[1, 0],
+        control_scan=("S1", "S2"),
     )  # fmt: skip
     (table,) = (one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
                 if one.file == "control")  # fmt: skip
     assert table.columns[0] == "control_point"
-    assert table.rows[0] == ("T1", 0.3, 0.0, -0.4, pytest.approx(0.5), "yes")
-    assert table.rows[1][-1].startswith("no, ")
+    assert table.rows[0] == ("T1", 0.3, 0.0, -0.4, pytest.approx(0.5), "yes", "S1")
+    assert table.columns[-1] == "scan"
+    assert table.rows[1][-2].startswith("no, ")
     written = results_balls.written(made)
     assert written["datum"] == "2 control points"
-    assert [(one["name"], one["used"]) for one in written["control"]] == [("T1", True), ("T2", False)]
+    assert [(one["name"], one["scan"], one["used"]) for one in written["control"]] == [
+        ("T1", "S1", True),
+        ("T2", "S2", False),
+    ]
     assert not {"datum", "control"} & set(results_balls.written(whole()))
 
 

@@ -209,6 +209,17 @@ def test_search_without_a_design_uses_known_scanners():
     assert "orthogonal" in unknown.message
 
 
+@pytest.mark.parametrize(("scale", "said"), [(1000.0, "1/1000"), (1e-3, "1000 of it"), (1e6, "")])
+def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, said):
+    rng = np.random.default_rng(5)
+    points = scale * (target(rng) + rng.normal(0.0, 0.3, (800, 3)))
+    result = spheres.run(Scene("t", "structure", (Scan("s", points),)), Params())
+    assert result.flag == ("low-confidence",)
+    assert "no ball or target has a radius" in result.reason[0]
+    assert said in result.reason[0]
+    assert ("unit" in result.reason[0]) == bool(said)
+
+
 def test_search_says_when_it_stopped_early_and_when_there_is_nothing():
     rng = np.random.default_rng(6)
     points = np.vstack([target(rng) + np.array([500.0 * i, 0.0, 0.0]) for i in range(3)]) + rng.normal(
