@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.bolt_balls import catalogue, frame
+from processor.bolt_balls import ball_baselines, catalogue, frame
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.frame import Extracted
 from processor.bolt_balls.params import Params
@@ -22,12 +22,26 @@ UNUSED = "control points were not used: that takes members that meet, scanner po
 def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
     """Find every ball of a frame's scene; None where the cloud has no members that meet."""
     source = of_scene(scene, points)
+    found = _extracted(source, scene, params)
+    return None if found is None else _result(found, source, scene)
+
+
+def of_same_points(scene: Scene, params: Params) -> Result | None:
+    """Fit the balls that method ``ray`` finds by one of the paper's methods to the same points; None as above."""
+    found = _extracted(of_scene(scene), scene, params)
+    if found is None:
+        return None
+    return ball_baselines.compared(
+        found, _ids(found.design_row, scene.frame), params, tolerance.default_for(scene.tolerance)
+    )
+
+
+def _extracted(source: SceneSource, scene: Scene, params: Params) -> Extracted | None:
     degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
-    found = frame.extract(
+    return frame.extract(
         source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
         control_of(scene, source), params.register_stations, params.datum_mm, tolerance.default_for(scene.tolerance),
     )  # fmt: skip
-    return None if found is None else _result(found, source, scene)
 
 
 def _catalogue(params: Params) -> Catalogue:

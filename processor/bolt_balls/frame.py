@@ -40,9 +40,10 @@ class Extracted:
 
     Rows are nodes: found blind, or those of the design in its order and then what else was found. ``design_row`` (k,)
     is the row of the design, -1 = none. ``datum`` (k, 3, 3) is the part of a centre's covariance that all nodes have in
-    common; the balls' own does not hold it.
+    common; the balls' own does not hold it. ``source`` has the points as the stations' corrections put them.
     """
 
+    source: Source
     nodes: Nodes
     tubes: Tubes
     balls: Balls
@@ -129,7 +130,9 @@ def extract(
             expansion,
             datum_mm,
         )
-    return Extracted(nodes, measured.tubes, found, design_row, datum + beside, registered, matched, moved, tuple(said))
+    return Extracted(
+        source, nodes, measured.tubes, found, design_row, datum + beside, registered, matched, moved, tuple(said)
+    )
 
 
 def _blind(source: Source, params: members.Params) -> _Start | None:

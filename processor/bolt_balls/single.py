@@ -21,7 +21,7 @@ from processor.geometry.merging import MergedCloud
 from processor.geometry.sphere import Mask, Sphere, algebraic, visible_fraction
 from processor.geometry.sphere_ransac import ransac
 from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
-from processor.model import NORMAL_95, Floats, FrameDesign, Tolerance
+from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Tolerance
 
 LEAST_VISIBLE = 0.05  # share of the sphere
 LEAST_INLIERS = 0.3  # share of the crop
@@ -60,6 +60,24 @@ def fit_nodes(cloud: MergedCloud, design: FrameDesign, params: Params, limits: T
         for i, rows in enumerate(crops)
     ]
     return _result(balls, cloud.origin, params, "covariances are formal: bias by sleeves and mixed pixels is left out")
+
+
+def fit_points(
+    points: list[Floats],
+    nodes: Floats,
+    ids: Ints,
+    nominal: Floats,
+    origin: Floats,
+    params: Params,
+    limits: Tolerance,
+    message: str,
+) -> Result:
+    """Fit a ball to each set of points (n, 3), given less nodes (k, 3), by one of the paper's methods."""
+    balls = [
+        _fit_node(id_, node, size, own + node, params, limits)
+        for id_, node, size, own in zip(ids.tolist(), nodes, nominal.tolist(), points, strict=True)
+    ]
+    return _result(balls, origin, params, message)
 
 
 def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Params, limits: Tolerance) -> _Ball:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from processor.bolt_balls import verdicts
+from processor.bolt_balls.ball_baselines import SAME
 from processor.bolt_balls.result import Result
 from processor.evaluate import ErrorReport
 from processor.model import NORMAL_95, Floats, StepRun
@@ -161,9 +162,16 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
         error = np.abs(run.result.radii - report.true_radii[run.method])
         known = error[np.isfinite(error)]
         figures = np.quantile(known, [0.5, 0.95, 1.0]).tolist() if len(known) else [NAN] * 3
-        rows.append((run.method, len(known), len(error), *figures))
-    columns = ("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm")
+        rows.append((run.method, len(known), len(error), *figures, _points_used(run)))
+    columns = ("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm", "points_used")
     return Table("|radius error| by method (mm)", columns, tuple(rows), "summary")
+
+
+def _points_used(run: StepRun) -> str:
+    """Which points a method fitted: errors of methods compare only on the same ones."""
+    if run.method == "ray":
+        return "its own choice"
+    return "those of ray" if SAME in run.result.message else "all of its crop"
 
 
 def _sd(result: Result) -> Floats:

@@ -7,7 +7,8 @@ import pytest
 
 from designgen import recipes
 from designgen.scene import make
-from processor.bolt_balls import answer, threads
+from processor import pipeline
+from processor.bolt_balls import answer, ball_baselines, threads
 from processor.bolt_balls.scene_source import of_scene
 from processor.geometry import rigid
 from processor.steps import spheres
@@ -179,6 +180,26 @@ def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(s
     assert all("ambiguous" in result.reason[i] for i in np.flatnonzero(disputed))
     assert not wrong_sizes(result) & set(result.ids[disputed].tolist())
     assert len(wrong_sizes(result)) > 10  # whatever the pose, they are not of the one size
+
+
+def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
+    scene, truth = square
+    params = {"spheres": {"min_points": 8}}
+    jobs = pipeline.plan(("spheres",), ("ray", "ransac", "least-squares"), params, 0)
+    runs = pipeline.execute(tmp_path / "s.h5", scene, jobs).runs
+    ray = runs[0].result
+    error = {run.method: np.abs(run.result.radii - truth.frame.radii)[ray.points > 30] for run in runs}
+    alone = spheres.run(scene, spheres.Params(method="least-squares"))
+    for run in runs[1:]:
+        np.testing.assert_array_equal(run.result.ids, ray.ids)
+        assert ball_baselines.SAME in run.result.message
+        # tens of points of a ball and sleeves beside: hundreds are in the crop
+        assert (run.result.points <= 1.3 * ray.points + 10).all()
+        assert run.result.points.sum() < 0.8 * alone.points.sum()
+    assert np.median(error["least-squares"]) < 0.7 * np.median(np.abs(alone.radii - truth.frame.radii)[ray.points > 30])
+    assert np.median(error["ray"]) < np.median(error["least-squares"])
+    again = pipeline.execute(tmp_path / "s.h5", scene, jobs[1:]).runs[0].result
+    assert ball_baselines.SAME not in again.message
 
 
 def test_a_wrong_size_is_told_without_a_catalogue(square):
