@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.bolt_balls import ball_flags, balls, junctions, matching, members, movement, stations
+from processor.bolt_balls import ball_flags, balls, junctions, matching, members, movement, stations, unseen
 from processor.bolt_balls.ball_flags import Bools
 from processor.bolt_balls.ball_records import Balls
 from processor.bolt_balls.catalogue import Catalogue
@@ -109,7 +109,8 @@ def extract(
     trusted = registered is not None and registered.status in ("ok", "weak")
     between = registered.between if registered is not None and trusted else None
     found = balls.find_balls(source, nodes, measured.tubes, catalogue, expected, between, limits=limits)
-    found = ball_flags.ambiguous(found, disputed)
+    smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
+    found = unseen.told(ball_flags.ambiguous(found, disputed), source, smallest)
     beside = np.zeros((len(found.radii), 3, 3))
     datum = np.tile(datum_mm**2 * np.eye(3), (len(found.radii), 1, 1))
     if registered is not None and trusted:

@@ -8,9 +8,10 @@ import pytest
 from designgen import recipes
 from designgen.scene import make
 from processor import pipeline
-from processor.bolt_balls import answer, ball_baselines, threads
+from processor.bolt_balls import answer, ball_baselines, threads, verdicts
 from processor.bolt_balls.scene_source import of_scene
 from processor.geometry import rigid
+from processor.model import Scan
 from processor.steps import spheres
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutter=6", "scan.step_mrad=2.2"]
@@ -180,6 +181,37 @@ def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(s
     assert all("ambiguous" in result.reason[i] for i in np.flatnonzero(disputed))
     assert not wrong_sizes(result) & set(result.ids[disputed].tolist())
     assert len(wrong_sizes(result)) > 10  # whatever the pose, they are not of the one size
+
+
+def emptied(scene, truth, row, onward):
+    """The scene without what was seen within 130 mm of a ball: those rays end ``onward`` mm farther on; None = gone."""
+    scans = []
+    for scan in scene.scans:
+        T = scan.T_project_scan
+        away = np.linalg.norm(rigid.apply(T, scan.points) + T[:3, :3] @ scan.origin - truth.frame.centres[row], axis=1)
+        points, near = scan.points.copy(), away < 130.0
+        if onward is None:
+            points = points[~near]
+        else:
+            ray = points[near] - scan.position
+            points[near] += onward * ray / np.linalg.norm(ray, axis=1)[:, None]
+        scans.append(Scan(scan.name, points, scan.origin, T_project_scan=T, position=scan.position))
+    return dataclasses.replace(scene, scans=tuple(scans))
+
+
+def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_no_verdict(square):
+    scene, truth = square
+    row = int(np.argmin(np.linalg.norm(truth.frame.centres - truth.frame.centres.mean(axis=0), axis=1)))
+    for onward, flag, said in ((900.0, "not-found", "rays went through"), (None, "low-confidence", "hardly a ray"),
+                               (-900.0, "low-confidence", "hides it")):  # fmt: skip
+        result = spheres.run(emptied(scene, truth, row, onward), spheres.Params())
+        assert result.flag[row] == flag, onward
+        assert said in result.reason[row]
+        assert "8 axes" in result.reason[row]
+        held = verdicts.of_result(dataclasses.replace(result, movement_limit=1.0))
+        assert held.verdict[row] == ("" if flag == "not-found" else "indeterminate")
+        assert "fail" in held.verdict
+        assert np.isnan(result.centres[row]).all() == (flag == "not-found")
 
 
 def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):

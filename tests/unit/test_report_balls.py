@@ -75,7 +75,7 @@ def whole(limit=10.0, T=None, **changes):
         visible_fraction=np.full(5, 0.3),
         rms=np.full(5, 0.4),
         nominal_radii=np.array([45.0, 50.0, 50.0, 45.0, NAN]),
-        evidence=("fused", "ball", "axes", "axes", "fused"),
+        evidence=("fused", "ball", "axes", "fused", "fused"),
         flag=FLAG,
         reason=("", "size 60 mm instead of 50 mm", "no ball seen", "12 points, fewer than 20", "not in the design"),
         sizes=np.array([45.0, 60.0, NAN, 45.0, 50.0]),
@@ -158,6 +158,13 @@ def test_verdicts_by_hand():
 @pytest.mark.parametrize("matching", ["ambiguous", "failed"])
 def test_nothing_passes_where_it_is_not_known_which_node_is_which(matching):
     assert set(verdicts.of_result(whole(matching=matching)).verdict) == {"indeterminate", ""}
+
+
+def test_a_ball_that_was_not_seen_neither_passes_nor_fails():
+    for limit in (100.0, 0.001):
+        unseen = whole(limit=limit, evidence=("axes", "ball", "axes", "axes", "fused"))
+        assert verdicts.of_result(unseen).verdict[0] == verdicts.of_result(unseen).verdict[3] == "indeterminate"
+    assert verdicts.of_result(whole(limit=NAN, evidence=("axes",) * 5)).verdict[0] == "no limit"
 
 
 def test_a_node_that_did_not_move_has_no_direction_but_a_verdict():
