@@ -8,7 +8,7 @@ balls are searched for in the whole cloud and fitted robustly.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -20,6 +20,7 @@ from processor.geometry.crops import nearest_crops
 from processor.geometry.merging import MergedCloud
 from processor.geometry.sphere import Mask, Sphere, algebraic, visible_fraction
 from processor.geometry.sphere_ransac import ransac
+from processor.geometry.sphere_robust import bound
 from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Tolerance
 
@@ -42,6 +43,8 @@ class _Ball:
     rms: float = NAN
     flag: str = "not-found"
     reason: str = ""
+    stations: int = 0  # that saw it; 0 = unknown
+    bound: Floats = field(default_factory=lambda: np.full((4, 4), NAN))  # Cramér-Rao, of x, y, z, radius
 
 
 def _generator(params: Params, purpose: str) -> np.random.Generator:
@@ -146,7 +149,9 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     """Search a cloud for balls that stand out of it by themselves."""
     held = None if np.isnan(params.radius_mm) else params.radius_mm
     least = max(params.min_points, LEAST_POINTS)
-    found = find_balls(cloud.points, _generator(params, "search"), params.max_balls, least, held, cloud.scanner)
+    # fixed: what is found must not depend on the seed
+    fixed = _generator(replace(params, seed=0), "search")
+    found = find_balls(cloud.points, fixed, params.max_balls, least, held, cloud.scanner)
     if not found:
         message = (
             f"no ball stands out of {len(cloud.points)} points; a whole frame needs a design (design.json) with this "
@@ -167,7 +172,8 @@ def search(cloud: MergedCloud, params: Params) -> Result:
         said.append(f"radius held at {held:g} mm, its covariance is 0")
     if len(found) == params.max_balls:
         said.append(f"stopped at {len(found)} balls (max_balls), there may be more: a whole frame needs a design")
-    return _result(balls, cloud.origin, params, "; ".join(said), complete=len(found) < params.max_balls)
+    made = _result(balls, cloud.origin, params, "; ".join(said), complete=len(found) < params.max_balls)
+    return _with_bounds(made, balls) if params.method == "ray" else made
 
 
 def _searched(id_: int, found: Found, cloud: MergedCloud, params: Params) -> _Ball:
@@ -177,7 +183,13 @@ def _searched(id_: int, found: Found, cloud: MergedCloud, params: Params) -> _Ba
         sphere = algebraic(on)
     if sphere is None:
         return _Ball(id_, NAN, None, len(on), reason="the points determine no sphere")
-    return _judged(id_, NAN, sphere, on, found.inlier_share, params, Tolerance())
+    ball = _judged(id_, NAN, sphere, on, found.inlier_share, params, Tolerance())
+    if params.method == "least-squares":
+        return ball
+    seen_from = None if cloud.scanner is None else cloud.scanner[found.fit.inliers]
+    stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
+    least = bound(cloud.points, found.fit, not np.isnan(params.radius_mm), cloud.scanner)
+    return replace(ball, stations=stations, bound=least)
 
 
 def _result(balls: list[_Ball], origin: Floats, params: Params, message: str, complete: bool = True) -> Result:
@@ -203,4 +215,23 @@ def _result(balls: list[_Ball], origin: Floats, params: Params, message: str, co
         evidence=("ball",) * len(balls),
         flag=tuple(ball.flag for ball in balls),
         reason=tuple(ball.reason for ball in balls),
+    )
+
+
+def _with_bounds(found: Result, balls: list[_Ball]) -> Result:
+    """Put beside each ball what any estimate from its points could reach at best."""
+    bounds = np.array([ball.bound for ball in balls])
+    down = np.array([0.0, 0.0, 1.0, -1.0])
+    variance, least = (np.einsum("kii->ki", one) for one in (found.covariance, bounds))
+    least_lowest = np.sqrt(np.einsum("i,kij,j->k", down, bounds, down))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centre = np.sqrt(least[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1))
+        efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / found.lowest_sd], axis=1)
+    return replace(
+        found,
+        sizes=np.full(len(balls), NAN),
+        axes=np.zeros(len(balls), np.int64),
+        stations=np.array([ball.stations for ball in balls], np.int64),
+        bound_sd=np.column_stack([np.sqrt(least), least_lowest]),
+        efficiency=efficiency,
     )

@@ -46,7 +46,7 @@ def of_runs(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
 
 
 def has_bounds(result: Result) -> bool:
-    """Whether balls were found by way of members, with all that is known of them then."""
+    """Whether balls were found by method ``ray``: with the bounds of their estimates, and members if there are any."""
     return len(result.sizes) > 0
 
 
@@ -143,7 +143,8 @@ def _brief(result: Result, method: str) -> Table:
         "flag",
     )  # fmt: skip
     note = "Bounds, efficiencies and all else are in balls.csv."
-    return Table(f"Balls, method {method} (mm)", columns, rows, note=note, on_terminal=False)
+    # of a few targets the answer is their places; of a frame that is too long to be looked through
+    return Table(f"Balls, method {method} (mm)", columns, rows, note=note, on_terminal=not len(result.tube_radii))
 
 
 def _to_look_at(result: Result, method: str) -> list[Table]:

@@ -459,6 +459,18 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
     assert not {"datum", "control"} & set(results_balls.written(whole()))
 
 
+def test_targets_without_members_have_lowest_points_and_bounds():
+    nothing = {name: getattr(spheres.Result("ok", "ray"), name) for name in (
+        "movement", "movement_ci95", "movement_covariance", "gauge", "matching", "tube_start", "tube_end", "tube_radii",
+        "tube_bow", "tube_a", "tube_b", "station_names", "T_station", "station_said",
+    )}  # fmt: skip
+    made = whole(sizes=np.full(5, NAN), axes=np.zeros(5, int), nominal_radii=np.full(5, NAN), **nothing)
+    found = {one.file: one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())}
+    assert {"balls", "lowest"} <= set(found)
+    assert {"bound_sd_lowest_z_mm", "efficiency_radius"} <= set(found["balls"].columns)
+    assert any(one.on_terminal and "radius_mm" in one.columns for one in found.values())
+
+
 def test_the_expected_distribution_holds_as_many_errors_as_there_are():
     x = np.linspace(-5.0, 5.0, 1001)
     y = figures_balls._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)

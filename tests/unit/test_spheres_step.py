@@ -209,6 +209,25 @@ def test_search_without_a_design_uses_known_scanners():
     assert "orthogonal" in unknown.message
 
 
+def test_the_bound_of_a_target_is_what_its_points_allow():
+    rng = np.random.default_rng(8)
+    position = np.array([3000.0, 1000.0, 8000.0])
+    view = position / np.linalg.norm(position)
+    off, bounds, sd = [], [], []
+    for _ in range(20):
+        points = target(rng, 800, view)
+        ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
+        scan = Scan("s", points + ray * rng.normal(0.0, 0.5, (len(points), 1)), position=position)
+        result = spheres.run(Scene("t", "structure", (scan,)), Params())
+        off.append(np.append(result.centres[0], [result.radii[0] - 70.0, result.lowest[0, 2] + 70.0]))
+        bounds.append(result.bound_sd[0])
+        sd.append(np.append(np.sqrt(np.diag(result.covariance[0])), result.lowest_sd[0]))
+    by_bound = np.sqrt(np.mean((np.array(off) / bounds) ** 2, axis=0))
+    assert (by_bound > 0.7).all()
+    assert (by_bound < 1.6).all()
+    assert np.median(np.array(bounds) / sd) == pytest.approx(0.95, abs=0.15)  # the biweight's
+
+
 @pytest.mark.parametrize(("scale", "said"), [(1000.0, "1/1000"), (1e-3, "1000 of it"), (1e6, "")])
 def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, said):
     rng = np.random.default_rng(5)
