@@ -16,6 +16,7 @@ from processor.preassembly import tolerance
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
 NOWHERE = "not in the design"
+FRAME_ALONE = "balls that no member meets, such as targets beside the frame, are not looked for"
 UNUSED = "control points were not used: that takes members that meet, scanner positions, and stations that may be moved"
 
 
@@ -69,7 +70,7 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
     lost = int(missing.sum())
     tubes, stations = found.tubes, found.stations
     half = 0.5 * tubes.lengths[:, None] * tubes.directions
-    said = [*found.said, balls.message]
+    said = [*found.said, balls.message, FRAME_ALONE]
     held = stations is not None and stations.control
     said += [UNUSED] if scene.control is not None and not held else []
     said += [] if matched is None else [matched.message]

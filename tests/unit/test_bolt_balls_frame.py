@@ -36,6 +36,7 @@ def test_every_ball_is_found_blind(roof):
     assert all(metric.passed for metric in checks.values())
     assert checks["nodes found within 3 mm"].value == 100.0
     assert checks["nodes that are none"].value == 0.0
+    assert "targets beside the frame, are not looked for" in result.message
     assert 0.7 < checks["centres, rms of error by standard deviation"].value < 1.3
 
 
