@@ -211,8 +211,12 @@ def execute(
         runs: list[StepRun] = []
         answers: dict[str, Any] = {}
         for job in jobs:
-            needs = {"earlier": {name: answers[name] for name in job.module.NEEDS if name in answers}}
-            runs.append(_run(path, scene, job, {**given, **needs} if job.module.NEEDS else given, log))
+            needs: dict[str, Any] = {}
+            if job.module.NEEDS:
+                needs["earlier"] = {name: answers[name] for name in job.module.NEEDS if name in answers}
+            if job.step in answers and getattr(job.module, "COMPARES", False):
+                needs["answer_given"] = answers[job.step]
+            runs.append(_run(path, scene, job, {**given, **needs}, log))
             answers.setdefault(job.step, runs[-1].result)
         digest = store.scene_hash(scene, None if points is None else points.pieces)
     provenance = {

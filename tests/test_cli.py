@@ -71,7 +71,8 @@ def test_one_scan_file_to_results(sphere_run):
     assert ball["lowest"][2] == pytest.approx(440.0, abs=0.2)
     assert printed["checks"] == []
     assert "taken as metres" in done.stderr
-    assert {p.name for p in (folder / "out").iterdir()} == {"results.h5", "results.json", "report.html", "balls.csv"}
+    made = {"results.h5", "results.json", "report.html", "balls.csv", "lowest.csv"}
+    assert {p.name for p in (folder / "out").iterdir()} == made
     assert store.problems(folder / "out" / "results.h5") == []
 
 

@@ -53,7 +53,16 @@ def test_known_scanner(name):
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_seed_makes_no_difference(name):
     results = [spheres.run(scene(name), spheres.Params(seed=seed)) for seed in (1, 2)]
-    np.testing.assert_allclose(results[0].centres, results[1].centres, atol=1e-4)
+    assert results[0].centres.tobytes() == results[1].centres.tobytes()
+    assert results[0].covariance.tobytes() == results[1].covariance.tobytes()
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_bounds_stand_beside_the_estimate(name):
+    result = spheres.run(scene(name, position=np.zeros(3)), spheres.Params())
+    assert result.stations.tolist() == [1]
+    assert np.isfinite(result.bound_sd).all()
+    assert ((result.efficiency > 0.2) & (result.efficiency < 1.2)).all()
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

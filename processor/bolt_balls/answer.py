@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.bolt_balls import catalogue, frame
+from processor.bolt_balls import ball_baselines, catalogue, frame
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.frame import Extracted
 from processor.bolt_balls.params import Params
@@ -16,18 +16,33 @@ from processor.preassembly import tolerance
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
 NOWHERE = "not in the design"
+FRAME_ALONE = "balls that no member meets, such as targets beside the frame, are not looked for"
 UNUSED = "control points were not used: that takes members that meet, scanner positions, and stations that may be moved"
 
 
 def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
     """Find every ball of a frame's scene; None where the cloud has no members that meet."""
     source = of_scene(scene, points)
-    degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
-    found = frame.extract(
-        source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
-        control_of(scene, source), params.register_stations, params.datum_mm,
-    )  # fmt: skip
+    found = _extracted(source, scene, params)
     return None if found is None else _result(found, source, scene)
+
+
+def of_same_points(scene: Scene, params: Params) -> Result | None:
+    """Fit the balls that method ``ray`` finds by one of the paper's methods to the same points; None as above."""
+    found = _extracted(of_scene(scene), scene, params)
+    if found is None:
+        return None
+    return ball_baselines.compared(
+        found, _ids(found.design_row, scene.frame), params, tolerance.default_for(scene.tolerance)
+    )
+
+
+def _extracted(source: SceneSource, scene: Scene, params: Params) -> Extracted | None:
+    degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
+    return frame.extract(
+        source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
+        control_of(scene, source), params.register_stations, params.datum_mm, tolerance.default_for(scene.tolerance),
+    )  # fmt: skip
 
 
 def _catalogue(params: Params) -> Catalogue:
@@ -55,7 +70,7 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
     lost = int(missing.sum())
     tubes, stations = found.tubes, found.stations
     half = 0.5 * tubes.lengths[:, None] * tubes.directions
-    said = [*found.said, balls.message]
+    said = [*found.said, balls.message, FRAME_ALONE]
     held = stations is not None and stations.control
     said += [UNUSED] if scene.control is not None and not held else []
     said += [] if matched is None else [matched.message]
@@ -104,6 +119,7 @@ def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
         station_said=() if stations is None else stations.weak,
         datum="" if stations is None else stations.datum,
         control_names=() if stations is None else stations.control,
+        control_scan=() if stations is None else stations.control_scan,
         control_off=np.empty((0, 3)) if stations is None else stations.control_off,
         control_used=np.empty(0, np.int64) if stations is None else stations.control_used,
     )

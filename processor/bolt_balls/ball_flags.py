@@ -5,13 +5,18 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 from scipy.special import chdtrc
 
 from processor.bolt_balls.ball_records import AMBIGUOUS, Balls, Fits
+from processor.bolt_balls.blanks import beyond
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.nodes import Nodes
-from processor.model import Floats
+from processor.model import NORMAL_95, Floats, Tolerance
 
+Bools = npt.NDArray[np.bool_]
+
+AMBIGUOUS_DESIGN = "ambiguous which ball of the design this is, and these differ in size: none is called wrong"
 CELLS = 200
 LEAST_POINTS = 8
 LARGEST_LOWEST_SD_MM = 0.8  # 3 mm off is then nearly four standard deviations
@@ -20,6 +25,7 @@ LARGEST_SCALE = 1.6
 UNLIKELY = 1e-3  # probability below which ball and priors are said to disagree
 LEAST_NEWS = 0.02  # share of a prior's variance that points must take away to be heard against it
 SURE = 3.0  # standard deviations beyond which an offset of all radii is spoken of
+UNLISTED = 6.0  # scatters of radii, off its size: a ball is of none in the catalogue
 FEW = 30
 FEW_MARGIN = 10.0  # more that the runner-up must lose by where points are few
 
@@ -34,12 +40,14 @@ def judged(
     radius_sd: float,
     station_sd: float,
     offset: tuple[float, float],
+    limits: Tolerance,
 ) -> Balls:
     """Give every node its numbers, evidence, flag and reason.
 
     ``offset`` is what radii lie off their sizes on the whole and its standard deviation, mm: it may come from an offset
     of all ranges or from the beam's width, so it stays in the radii, and in their covariances. Seen from below the
-    surface stays where it is.
+    surface stays where it is. ``limits`` hold the tolerance of a ball's blank: what is beyond it is of another size
+    where the catalogue does not say so.
     """
     k = nodes.count
     fitted = np.asarray(fits.numbers[:, 7] > 0)
@@ -86,8 +94,13 @@ def judged(
             doubts.append(f"size ambiguous: {fits.second[i]:.0f} mm fits nearly as well ({margin[i]:.0f})")
         if fits.numbers[i, 4] > LARGEST_SCALE:
             doubts.append(f"not round: residuals {fits.numbers[i, 4]:.1f} times the noise of all balls")
+        away, off = float(np.linalg.norm(state[i, :3])), float(state[i, 3] - fits.sizes[i])
+        unlisted = not doubts and _unlisted(agreement[i] < UNLIKELY, off, radius_sd, catalogue)
+        if unlisted and (said := beyond(state[i, 3], expected[i], NORMAL_95 * float(np.sqrt(C[3, 3])), limits)):
+            flags.append("wrong-size")
+            reasons.append(said)
+            continue
         if agreement[i] < UNLIKELY:
-            away, off = float(np.linalg.norm(state[i, :3])), float(state[i, 3] - fits.sizes[i])
             sized = f" and its radius off the size by {off:+.1f} mm" if len(catalogue.radii) else ""
             doubts.append(f"ball and axes disagree: centres {away:.1f} mm apart{sized}")
         if doubts:
@@ -149,6 +162,17 @@ def judged(
     )
 
 
+def _unlisted(disagrees: bool, off: float, radius_sd: float, catalogue: Catalogue) -> bool:
+    """Whether a ball that nothing else speaks against may be of a size that is none of the catalogue's.
+
+    Without a catalogue every ball may. With one, that shows by a radius ``off`` mm from the size by far more than balls
+    scatter, which is what points and priors disagree about.
+    """
+    if not len(catalogue.radii):
+        return not disagrees
+    return disagrees and abs(off) > UNLISTED * radius_sd
+
+
 def doubted(found: Balls, beside: Floats) -> Balls:
     """Flag balls whose lowest points are no longer sure with a further covariance (k, 3, 3) of their centres."""
     sd = np.sqrt(found.lowest_sd**2 + beside[:, 2, 2])
@@ -158,6 +182,14 @@ def doubted(found: Balls, beside: Floats) -> Balls:
         flags[i] = "low-confidence"
         reasons[i] = f"what all ranges may be off alike leaves an sd of the lowest point of {sd[i]:.1f} mm"
     return replace(found, flag=tuple(flags), reason=tuple(reasons))
+
+
+def ambiguous(found: Balls, rows: Bools) -> Balls:
+    """Say of balls (k,) that poses of the design disagree on which of its balls they are: no size is wrong then."""
+    reasons = list(found.reason)
+    for i in np.flatnonzero(rows).tolist():
+        reasons[i] = "; ".join(filter(None, (reasons[i], AMBIGUOUS_DESIGN)))
+    return replace(found, reason=tuple(reasons))
 
 
 def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:

@@ -23,7 +23,8 @@ from processor.bolt_balls.crops import Crops, gather
 from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.bolt_balls.source import Source
 from processor.bolt_balls.threads import over_ranges
-from processor.model import Floats
+from processor.model import Floats, Tolerance
+from processor.preassembly import tolerance
 
 NAN = float("nan")
 MARGIN_MM = 26.0  # of a crop beyond the largest ball: sleeves are measured there
@@ -62,18 +63,20 @@ def find_balls(
     expected_mm: Floats | None = None,
     station_covariance: Floats | None = None,
     params: Params | None = None,
+    limits: Tolerance | None = None,
 ) -> Balls:
     """Fit a ball at every node; one pass over the source.
 
     ``expected_mm`` (k,) are nominal radii, NaN = none: a prior on the size alone. ``station_covariance`` (s, 3, 3) is
     that of each scanner's place as registered, mm^2; left out, it is estimated from balls that several stations saw.
+    ``limits`` hold the tolerance of a ball's blank; left out, it is the default standard's.
     """
     largest = float(catalogue.radii.max()) if len(catalogue.radii) else LARGEST_FREE_MM
     if expected_mm is not None and np.isfinite(expected_mm).any():
         largest = max(largest, float(np.nanmax(expected_mm)))
     threads = params.threads if params else 0
     crops = gather(source, nodes.positions, largest + MARGIN_MM, threads)
-    return fit_crops(crops, source.scanners, nodes, tubes, catalogue, expected_mm, station_covariance, params)
+    return fit_crops(crops, source.scanners, nodes, tubes, catalogue, expected_mm, station_covariance, params, limits)
 
 
 def fit_crops(
@@ -85,6 +88,7 @@ def fit_crops(
     expected_mm: Floats | None = None,
     station_covariance: Floats | None = None,
     params: Params | None = None,
+    limits: Tolerance | None = None,
 ) -> Balls:
     """Fit a ball to each node's gathered points; see :func:`find_balls`."""
     params = params or Params()
@@ -131,6 +135,7 @@ def fit_crops(
         setting.radius_sd,
         stations,
         offset,
+        tolerance.default_for(limits),
     )
 
 

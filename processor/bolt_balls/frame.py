@@ -9,8 +9,10 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from processor.bolt_balls import ball_flags, balls, junctions, matching, members, movement, stations
+from processor.bolt_balls import ball_flags, balls, junctions, matching, members, movement, stations, unseen
+from processor.bolt_balls.ball_flags import Bools
 from processor.bolt_balls.ball_records import Balls
 from processor.bolt_balls.catalogue import Catalogue
 from processor.bolt_balls.corrected import Corrected, corrected_gathered
@@ -24,7 +26,7 @@ from processor.bolt_balls.station_control import ControlPoints
 from processor.bolt_balls.station_records import Stations
 from processor.bolt_balls.tube_points import tube_points
 from processor.geometry import rigid
-from processor.model import Floats, FrameDesign, Ints
+from processor.model import Floats, FrameDesign, Ints, Tolerance
 
 SAME_FRAME_SHARE = 0.6  # of the design's nodes that are found where it has them: the frames are the same
 NEAR_MM = 40.0  # of a node's nominal place, in the same frame
@@ -38,9 +40,10 @@ class Extracted:
 
     Rows are nodes: found blind, or those of the design in its order and then what else was found. ``design_row`` (k,)
     is the row of the design, -1 = none. ``datum`` (k, 3, 3) is the part of a centre's covariance that all nodes have in
-    common; the balls' own does not hold it.
+    common; the balls' own does not hold it. ``source`` has the points as the stations' corrections put them.
     """
 
+    source: Source
     nodes: Nodes
     tubes: Tubes
     balls: Balls
@@ -76,13 +79,15 @@ def extract(
     control: ControlPoints | None = None,
     register_stations: bool = True,
     datum_mm: float = 0.0,
+    limits: Tolerance | None = None,
 ) -> Extracted | None:
     """Find every node of a frame; None where the cloud has no members that meet.
 
     ``expansion`` is the factor by which temperature lengthens the design. ``control`` points hold the datum; where
-    they do not, all stations share a shift of standard deviation ``datum_mm`` beside their own.
+    they do not, all stations share a shift of standard deviation ``datum_mm`` beside their own. ``limits`` say how far
+    a ball's radius may be off its nominal one, where no catalogue tells its size.
     """
-    start = _blind(source, params) if design is None else _designed(source, design, expansion, params)
+    start = _blind(source, params) if design is None else _designed(source, design, catalogue, expansion, params)
     if start is None:
         return None
     measured, said = start.measured, list(start.said)
@@ -96,14 +101,16 @@ def extract(
         measured = members.believed(measured, params.largest_scatter_mm)
         design_row = np.full(measured.nodes.count, -1, np.int64)
     known = design_row >= 0
-    expected = np.full(len(design_row), np.nan)
+    expected, disputed = np.full(len(design_row), np.nan), np.zeros(len(design_row), bool)
     nodes = measured.nodes
     if design is not None:
-        expected[known] = design.radii[design_row[known]]
+        expected, disputed = _expected(start, design, source.origin, expansion)
         nodes = _somewhere(nodes, start.starts)
     trusted = registered is not None and registered.status in ("ok", "weak")
     between = registered.between if registered is not None and trusted else None
-    found = balls.find_balls(source, nodes, measured.tubes, catalogue, expected, between)
+    found = balls.find_balls(source, nodes, measured.tubes, catalogue, expected, between, limits=limits)
+    smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
+    found = unseen.told(ball_flags.ambiguous(found, disputed), source, smallest)
     beside = np.zeros((len(found.radii), 3, 3))
     datum = np.tile(datum_mm**2 * np.eye(3), (len(found.radii), 1, 1))
     if registered is not None and trusted:
@@ -124,7 +131,9 @@ def extract(
             expansion,
             datum_mm,
         )
-    return Extracted(nodes, measured.tubes, found, design_row, datum + beside, registered, matched, moved, tuple(said))
+    return Extracted(
+        source, nodes, measured.tubes, found, design_row, datum + beside, registered, matched, moved, tuple(said)
+    )
 
 
 def _blind(source: Source, params: members.Params) -> _Start | None:
@@ -137,7 +146,9 @@ def _blind(source: Source, params: members.Params) -> _Start | None:
     return _Start(graph.nodes, graph.pairs, np.full(len(graph.nodes), -1, np.int64), measured)
 
 
-def _designed(source: Source, design: FrameDesign, expansion: float, params: members.Params) -> _Start | None:
+def _designed(
+    source: Source, design: FrameDesign, catalogue: Catalogue, expansion: float, params: members.Params
+) -> _Start | None:
     """Measure at the design's nodes in its own frame; where they are not there, find the nodes blind and match them."""
     row = {int(id_): i for i, id_ in enumerate(design.ids)}
     pairs = np.array([[row[int(a)], row[int(b)]] for a, b in zip(design.member_a, design.member_b, strict=True)])
@@ -156,7 +167,12 @@ def _designed(source: Source, design: FrameDesign, expansion: float, params: mem
         return None
     seen = members.believed(blind.measured, params.largest_scatter_mm)
     found = Found(seen.nodes.positions, source.origin, np.empty(0), np.empty(0), seen.tubes.node_a, seen.tubes.node_b)
-    pose = matching.match(found, design, expansion=expansion)
+
+    def sized() -> Found:
+        fitted = balls.find_balls(source, seen.nodes, seen.tubes, catalogue)
+        return replace(found, radii=fitted.radii, radius_sd=np.sqrt(fitted.covariance[:, 3, 3]))
+
+    pose = matching.match(found, design, expansion=expansion, sized=sized)
     if pose.status == "failed":
         lost = _Start(blind.starts, blind.pairs, blind.design_row, blind.measured)
         return replace(lost, said=(f"the design was not found in the cloud: {pose.message}",))
@@ -176,6 +192,24 @@ def _designed(source: Source, design: FrameDesign, expansion: float, params: mem
     points = members.points_near(source, starts, every, params)
     measured = members.measure(points, source.scanners, starts, every, params)
     return _Start(starts, every, rows, measured, pose)
+
+
+def _expected(start: _Start, design: FrameDesign, origin: Floats, expansion: float) -> tuple[Floats, Bools]:
+    """Nominal radii (k,) of the nodes, NaN = none or disputed; and which are: there poses that fit alike differ."""
+    rows = start.design_row
+    expected = np.where(rows >= 0, design.radii[np.maximum(rows, 0)], np.nan)
+    disputed = np.zeros(len(rows), bool)
+    if start.pose is None or not len(start.pose.rivals):
+        return expected, disputed
+    middle = design.centres.mean(axis=0)
+    tree = cKDTree((design.centres - middle) * expansion)
+    for T in start.pose.rivals:
+        # offset less offset first: added to the nodes either would cost them their digits
+        there = start.starts @ T[:3, :3].T + (T[:3, :3] @ origin + T[:3, 3] - middle)
+        distance, nearest = tree.query(there)
+        other = np.where(distance < matching.FAR * matching.TOLERANCE_MM, design.radii[nearest], np.nan)
+        disputed |= (rows >= 0) & (other != expected)
+    return np.where(disputed, np.nan, expected), disputed
 
 
 def _registered(

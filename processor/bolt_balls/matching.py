@@ -8,7 +8,8 @@ nothing does the answer is ``ambiguous`` and names every candidate.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,8 +20,10 @@ from processor.geometry import rigid
 from processor.model import Checked, Floats, FrameDesign, Ints, column
 
 SAME, REGISTERED = "same frame", "registered"
+TOLERANCE_MM = 60.0  # that a node may be off its nominal place
 LEAST_SHARE = 0.5  # of the smaller pattern's nodes that must agree
 DOUBTFUL_SHARE = 0.05  # missing and extra nodes both: another pose may explain them
+DOUBTED_SHARE = 0.1  # of the nodes: where a pose leads by no more of them, balls are asked too
 FAR = 2.0  # tolerances: a node farther from its nominal place is another node
 NODE_ODDS = 4.0  # log odds that a pose loses by a found node that is none of the design's while one of those is missing
 INDEPENDENT = 20  # nodes' distances count as at most so many: those of neighbours go together
@@ -69,10 +72,18 @@ class _Candidate:
         return int((self.assignment >= 0).sum())
 
 
-def match(found: Found, design: FrameDesign, tolerance_mm: float = 60.0, expansion: float = 1.0) -> Matching:
+def match(
+    found: Found,
+    design: FrameDesign,
+    tolerance_mm: float = TOLERANCE_MM,
+    expansion: float = 1.0,
+    sized: Callable[[], Found] | None = None,
+) -> Matching:
     """Match found nodes with a design's, each being up to about ``tolerance_mm`` off its nominal place.
 
     ``expansion`` is the factor of all lengths by temperature. Up to a good part of the nodes may be missing or extra.
+    ``sized`` gives the same nodes with their balls' radii, where ``found`` has none: it is called only where the
+    pattern leaves more than one pose.
     """
     k, middle = len(found.positions), design.centres.mean(axis=0) if len(design.centres) else np.zeros(3)
     nominal = (design.centres - middle) * expansion
@@ -89,7 +100,10 @@ def match(found: Found, design: FrameDesign, tolerance_mm: float = 60.0, expansi
             return _answer(same, [], SAME, found, design, middle, nominal, "")
     candidates = _searched(found, design, nominal, tolerance_mm) if k >= 4 and len(nominal) >= 4 else []
     candidates = [one for one in candidates if one.matched >= max(least, 4)]
+    every = [same, *candidates] if same is not None and fits else candidates
+    every = _by_radii(every, design, min(k, len(nominal)), sized)
     if same is not None and fits:
+        same, candidates = every[0], every[1:]
         apart = 5.0 * tolerance_mm
         rivals = [
             one for one in candidates
@@ -97,9 +111,27 @@ def match(found: Found, design: FrameDesign, tolerance_mm: float = 60.0, expansi
         ]  # fmt: skip
         said = "the frames agree, but another pose explains more nodes" if rivals else ""
         return _answer(same, rivals[:1], SAME, found, design, middle, nominal, said)
-    if not candidates:
+    if not every:
         return _failed(k, len(nominal), "no pose lays half of the nodes onto the design's")
-    return _chosen(candidates, found, design, middle, nominal)
+    return _chosen(every, found, design, middle, nominal)
+
+
+def _by_radii(
+    candidates: list[_Candidate], design: FrameDesign, most: int, sized: Callable[[], Found] | None
+) -> list[_Candidate]:
+    """Weigh candidates by the balls' radii too, if there are several that so many as ``most`` nodes do not decide on.
+
+    A true pose may lose to a false one by the nodes that the one lacks and the other happens to have: what few nodes
+    say is not taken for an answer before the balls were asked.
+    """
+    if sized is None or len(candidates) < 2:
+        return candidates
+    odds = np.sort([one.odds for one in candidates])
+    lacking = most - max(one.matched for one in candidates)
+    if odds[1] > odds[0] + DECISIVE + NODE_ODDS * max(lacking, DOUBTED_SHARE * most):
+        return candidates
+    found = sized()
+    return [replace(one, odds=one.odds + radius_odds(found, design, one.assignment)) for one in candidates]
 
 
 def _better_nearby(T: Floats, matched: int, positions: Floats, nominal: Floats, tolerance_mm: float) -> bool:

@@ -61,5 +61,6 @@ class Result(Checked):
     station_said: tuple[str, ...] = names("s")
     datum: str = ""  # what holds all stations together where they are
     control_names: tuple[str, ...] = names("c")  # control points, a row a sighting
+    control_scan: tuple[str, ...] = names("c")  # that it was seen in
     control_off: Floats = column("c", 3)  # known place minus the sighting after the stations were moved
     control_used: Ints = column("c", dtype=np.int64)  # 1 = yes, 0 = left out: the others speak against it

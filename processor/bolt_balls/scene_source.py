@@ -10,11 +10,12 @@ from typing import Protocol
 import numpy as np
 from numba import njit
 
+from processor.bolt_balls import units
 from processor.bolt_balls.source import CHUNK_POINTS, UNKNOWN_STATION, Chunk
 from processor.bolt_balls.station_control import ControlPoints
 from processor.geometry import rigid
 from processor.geometry.threads import over_ranges
-from processor.model import Floats, InputError, Labels, Scan, Scene
+from processor.model import Floats, InputError, Ints, Labels, Scan, Scene
 
 FARTHEST_MM = 1000.0  # control points that lie farther from where they were seen are of another frame
 
@@ -121,6 +122,12 @@ def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
     target = own.positions[own.point[held]] - source.origin
     off = float(np.median(np.linalg.norm(target - measured, axis=1)))
     if off > FARTHEST_MM:
+        factor = units.between(*_spans(own.point[held], scanner[held], target, measured))
+        if factor:
+            raise InputError(
+                f"{scene.name}: control points lie {factor} times as far apart as the scans have them: one of the two "
+                "is in another unit; correct the unit of the control points or of the scans"
+            )
         raise InputError(
             f"{scene.name}: control points lie {off / 1000.0:.3g} m from where the scans have them (median); give "
             "the scans poses in the frame of the control points, or their coordinates in the scans' frame"
@@ -133,7 +140,16 @@ def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
         np.eye(len(source.scanners))[scanner[held]],
         own.point[held],
         own.sd[own.point[held]],
+        source.names,
     )
+
+
+def _spans(point: Ints, scanner: Ints, target: Floats, measured: Floats) -> tuple[Floats, Floats]:
+    """Distances (n,) between control points that one scanner saw, as known, and as it saw them; poses play no part."""
+    a, b = np.triu_indices(len(point), 1)
+    both = (scanner[a] == scanner[b]) & (point[a] != point[b])
+    a, b = a[both], b[both]
+    return np.linalg.norm(target[a] - target[b], axis=1), np.linalg.norm(measured[a] - measured[b], axis=1)
 
 
 def _pose(scan: Scan) -> Floats:

@@ -8,19 +8,21 @@ balls are searched for in the whole cloud and fitted robustly.
 from __future__ import annotations
 
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from processor.bolt_balls import units
+from processor.bolt_balls.blanks import beyond, blank_tolerance
 from processor.bolt_balls.params import NAN, Params
 from processor.bolt_balls.result import Result
 from processor.geometry.crops import nearest_crops
 from processor.geometry.merging import MergedCloud
 from processor.geometry.sphere import Mask, Sphere, algebraic, visible_fraction
 from processor.geometry.sphere_ransac import ransac
+from processor.geometry.sphere_robust import bound
 from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
-from processor.model import NORMAL_95, Floats, FrameDesign, Tolerance
-from processor.preassembly import tolerance
+from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Tolerance
 
 LEAST_VISIBLE = 0.05  # share of the sphere
 LEAST_INLIERS = 0.3  # share of the crop
@@ -41,6 +43,8 @@ class _Ball:
     rms: float = NAN
     flag: str = "not-found"
     reason: str = ""
+    stations: int = 0  # that saw it; 0 = unknown
+    bound: Floats = field(default_factory=lambda: np.full((4, 4), NAN))  # Cramér-Rao, of x, y, z, radius
 
 
 def _generator(params: Params, purpose: str) -> np.random.Generator:
@@ -59,6 +63,24 @@ def fit_nodes(cloud: MergedCloud, design: FrameDesign, params: Params, limits: T
         for i, rows in enumerate(crops)
     ]
     return _result(balls, cloud.origin, params, "covariances are formal: bias by sleeves and mixed pixels is left out")
+
+
+def fit_points(
+    points: list[Floats],
+    nodes: Floats,
+    ids: Ints,
+    nominal: Floats,
+    origin: Floats,
+    params: Params,
+    limits: Tolerance,
+    message: str,
+) -> Result:
+    """Fit a ball to each set of points (n, 3), given less nodes (k, 3), by one of the paper's methods."""
+    balls = [
+        _fit_node(id_, node, size, own + node, params, limits)
+        for id_, node, size, own in zip(ids.tolist(), nodes, nominal.tolist(), points, strict=True)
+    ]
+    return _result(balls, origin, params, message)
 
 
 def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Params, limits: Tolerance) -> _Ball:
@@ -92,6 +114,7 @@ def _judged(
     visible = visible_fraction(points, sphere.centre)
     rms = float(np.sqrt(np.mean(sphere.residuals(points) ** 2)))
     sd = float(np.sqrt(sphere.covariance[3, 3]))
+    strange = units.implausible(sphere.radius)
     doubts = [
         text
         for doubtful, text in (
@@ -99,38 +122,24 @@ def _judged(
             (visible < LEAST_VISIBLE, f"{visible:.0%} of the surface seen"),
             (share < LEAST_INLIERS, f"{share:.0%} of the points around lie on it"),
             (not sd <= LARGEST_SD * sphere.radius, f"ill-conditioned: sd of the radius {sd:.1f} mm"),
+            (bool(strange), strange),
             (rms > LARGEST_RMS * sphere.radius, f"not round: residuals of {rms:.1f} mm rms"),
         )
         if doubtful
     ]
     flag = "low-confidence" if doubts else "ok"
     error = sphere.radius - nominal
-    below, above = _blank_tolerance(nominal, limits)
+    below, above = blank_tolerance(nominal, limits)
     if not doubts and not np.isnan(nominal) and not -below <= error <= above:
         # The interval is formal; what the method is known to reach decides whether it may call a size wrong.
         margin = max(NORMAL_95 * sd, PAPER_RADIUS_ERROR_MM)
-        if params.method == "ransac" and not -below - margin <= error <= above + margin:
-            flag = "wrong-size"
-            doubts = [
-                f"radius {error:+.1f} mm from nominal, beyond the blank's +{above:g}/-{below:g} by {margin:.1f} mm"
-            ]
+        said = beyond(sphere.radius, nominal, margin, limits)
+        if params.method == "ransac" and said:
+            flag, doubts = "wrong-size", [said]
         elif params.method == "least-squares":
             flag = "low-confidence"
             doubts = [f"radius {error:+.1f} mm from nominal: this method cannot tell a wrong size from sleeves"]
     return _Ball(id_, nominal, sphere, len(points), visible, rms, flag, "; ".join(doubts))
-
-
-def _blank_tolerance(radius: float, limits: Tolerance) -> tuple[float, float]:
-    """How much smaller and larger in mm a ball's radius may be: half of the limits on the blank's diameter.
-
-    Limits that do not speak of balls leave them to those of the default standard.
-    """
-    for one in (limits, tolerance.load(tolerance.DEFAULT)):
-        for limit in one.limits:
-            if limit.key.startswith("ball_blank_diameter_") and tolerance.applies(limit, 2.0 * radius):
-                low, high = tolerance.bounds(limit, {"diameter": 2.0 * radius})
-                return -0.5 * low, 0.5 * high
-    return NAN, NAN
 
 
 # --- without a design ----------------------------------------------------------------------------------------------
@@ -140,7 +149,9 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     """Search a cloud for balls that stand out of it by themselves."""
     held = None if np.isnan(params.radius_mm) else params.radius_mm
     least = max(params.min_points, LEAST_POINTS)
-    found = find_balls(cloud.points, _generator(params, "search"), params.max_balls, least, held, cloud.scanner)
+    # fixed: what is found must not depend on the seed
+    fixed = _generator(replace(params, seed=0), "search")
+    found = find_balls(cloud.points, fixed, params.max_balls, least, held, cloud.scanner)
     if not found:
         message = (
             f"no ball stands out of {len(cloud.points)} points; a whole frame needs a design (design.json) with this "
@@ -161,7 +172,8 @@ def search(cloud: MergedCloud, params: Params) -> Result:
         said.append(f"radius held at {held:g} mm, its covariance is 0")
     if len(found) == params.max_balls:
         said.append(f"stopped at {len(found)} balls (max_balls), there may be more: a whole frame needs a design")
-    return _result(balls, cloud.origin, params, "; ".join(said), complete=len(found) < params.max_balls)
+    made = _result(balls, cloud.origin, params, "; ".join(said), complete=len(found) < params.max_balls)
+    return _with_bounds(made, balls) if params.method == "ray" else made
 
 
 def _searched(id_: int, found: Found, cloud: MergedCloud, params: Params) -> _Ball:
@@ -171,7 +183,13 @@ def _searched(id_: int, found: Found, cloud: MergedCloud, params: Params) -> _Ba
         sphere = algebraic(on)
     if sphere is None:
         return _Ball(id_, NAN, None, len(on), reason="the points determine no sphere")
-    return _judged(id_, NAN, sphere, on, found.inlier_share, params, Tolerance())
+    ball = _judged(id_, NAN, sphere, on, found.inlier_share, params, Tolerance())
+    if params.method == "least-squares":
+        return ball
+    seen_from = None if cloud.scanner is None else cloud.scanner[found.fit.inliers]
+    stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
+    least = bound(cloud.points, found.fit, not np.isnan(params.radius_mm), cloud.scanner)
+    return replace(ball, stations=stations, bound=least)
 
 
 def _result(balls: list[_Ball], origin: Floats, params: Params, message: str, complete: bool = True) -> Result:
@@ -197,4 +215,23 @@ def _result(balls: list[_Ball], origin: Floats, params: Params, message: str, co
         evidence=("ball",) * len(balls),
         flag=tuple(ball.flag for ball in balls),
         reason=tuple(ball.reason for ball in balls),
+    )
+
+
+def _with_bounds(found: Result, balls: list[_Ball]) -> Result:
+    """Put beside each ball what any estimate from its points could reach at best."""
+    bounds = np.array([ball.bound for ball in balls])
+    down = np.array([0.0, 0.0, 1.0, -1.0])
+    variance, least = (np.einsum("kii->ki", one) for one in (found.covariance, bounds))
+    least_lowest = np.sqrt(np.einsum("i,kij,j->k", down, bounds, down))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        centre = np.sqrt(least[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1))
+        efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / found.lowest_sd], axis=1)
+    return replace(
+        found,
+        sizes=np.full(len(balls), NAN),
+        axes=np.zeros(len(balls), np.int64),
+        stations=np.array([ball.stations for ball in balls], np.int64),
+        bound_sd=np.column_stack([np.sqrt(least), least_lowest]),
+        efficiency=efficiency,
     )

@@ -36,11 +36,18 @@ class ControlPoints(Checked):
     share: Floats = column("c", "s")
     point: Ints = column("c", dtype=np.int64)
     target_sd: Floats = column("c")
+    scanners: tuple[str, ...] = ()  # names of the s stations
 
     @property
     def points(self) -> Ints:
         """Number (c,) of each sighting's target."""
         return self.point if len(self.point) else np.arange(len(self.ids))
+
+    @property
+    def scans(self) -> tuple[str, ...]:
+        """Name of the station that each sighting is of; empty where several share it."""
+        known = self.scanners or tuple(f"station {i}" for i in range(self.share.shape[1]))
+        return tuple(known[int(np.argmax(row))] if row.max() > 0.99 else "" for row in self.share)
 
     @property
     def count(self) -> int:
@@ -123,6 +130,7 @@ Solved = Callable[[ControlPoints], tuple[Floats, Floats]]
 def doubted(control: ControlPoints, x: Floats, places: Floats, solved: Solved) -> Doubt:
     """Hold each target against what all others predict of it (Baarda 1968), and leave out the one that must be wrong.
 
+    Of a target that several stations saw, single sightings are left out where that is enough, and no more than half.
     ``solved`` gives change (7 s,) and covariance of the stations' unknowns with some sightings alone. Where it cannot
     be told which target is wrong, all are kept, and what the worst lies off is returned.
     """
@@ -131,13 +139,22 @@ def doubted(control: ControlPoints, x: Floats, places: Floats, solved: Solved) -
         worst, ratio, off = _worst(control, kept, x, places, solved)
         if ratio <= 1.0:
             break
+        stray = _stray(control, kept, worst, x, places, solved)
+        if stray:
+            for row, away in stray:
+                name, scan = control.ids[row], control.scans[row]
+                said.append(
+                    f"sighting of control point {name} by {scan} left out: {away:.2g} mm off what the others say"
+                )
+                kept[row] = False
+            continue
         without = [number for number in np.unique(control.points[kept])
                    if _worst(control, kept & (control.points != number), x, places, solved)[1] <= 1.0]  # fmt: skip
         remain = len(np.unique(control.points[kept])) - 1
         if remain >= HOLD_ALL and (len(without) == 1 or (not without and remain > HOLD_ALL)):
             number = without[0] if without else worst
             name = control.ids[int(np.argmax(control.points == number))]
-            size = _apart(control, kept, number, x, places, solved)[1]
+            size = _apart(control, kept, control.points == number, x, places, solved)[1]
             said.append(f"control point {name} left out: {np.linalg.norm(size):.2g} mm off what the others say")
             kept = kept & (control.points != number)
             continue
@@ -152,17 +169,42 @@ def _worst(control: ControlPoints, kept: Bools, x: Floats, places: Floats, solve
     """Target that is least like what the others say, by how much (1 = just not likely), and what it is off (3,)."""
     found: tuple[int, float, Floats] = (-1, 0.0, np.zeros(3))
     for number in np.unique(control.points[kept]).tolist():
-        ratio, off = _apart(control, kept, number, x, places, solved)
+        ratio, off = _apart(control, kept, control.points == number, x, places, solved)
         if ratio > found[1]:
             found = (number, ratio, off)
     return found
 
 
-def _apart(
+def _stray(
     control: ControlPoints, kept: Bools, number: int, x: Floats, places: Floats, solved: Solved
+) -> list[tuple[int, float]]:
+    """Return the sightings of a target that must go for the rest of it to agree with all else, and how far off each is.
+
+    The one with the largest normalised residual against all others goes first. None where that does not help, or
+    where more than half of the sightings had to go: then the target itself may as well be wrong.
+    """
+    own, left = control.points == number, kept.copy()
+    found: list[tuple[int, float]] = []
+    count = int((kept & own).sum())
+    while 2 * (len(found) + 1) <= count:
+        alone = np.flatnonzero(left & own).tolist()
+        apart = [_apart(control, left, np.arange(len(left)) == one, x, places, solved) for one in alone]
+        (ratio, off), row = max(zip(apart, alone, strict=True), key=lambda one: one[0][0])
+        if ratio <= 1.0:
+            return []
+        found.append((row, float(np.linalg.norm(off))))
+        left[row] = False
+        if _apart(control, left, own, x, places, solved)[0] <= 1.0:
+            return found
+    return []
+
+
+def _apart(
+    control: ControlPoints, kept: Bools, which: Bools, x: Floats, places: Floats, solved: Solved
 ) -> tuple[float, Floats]:
-    own = control.only(kept & (control.points == number))
-    change, C = solved(control.only(kept & (control.points != number)))
+    """How unlikely sightings ``which`` (c,) are by all other kept ones (1 = just not), and what they are off (3,)."""
+    own = control.only(kept & which)
+    change, C = solved(control.only(kept & ~which))
     A = own.follows(places)
     off = own.off(x, places).ravel() - product(A, change[:, None])[:, 0]
     S = own.covariance() + product(product(A, C), np.ascontiguousarray(A.T))

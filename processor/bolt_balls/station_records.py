@@ -56,6 +56,7 @@ class Stations(Checked):
     axis_radii: Floats = column("m")
     datum: str = ""  # what says where all stations together lie, and how well
     control: tuple[str, ...] = names("c")  # targets as they were seen, a row a sighting
+    control_scan: tuple[str, ...] = names("c")  # the stations that saw them
     control_off: Floats = column("c", 3)  # target minus sighting after the corrections
     control_used: Ints = column("c", dtype=np.int64)  # 1 = yes
 

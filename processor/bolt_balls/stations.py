@@ -270,6 +270,7 @@ def _controlled(found: Stations, x: Floats, control: ControlPoints, doubt: Doubt
         message="; ".join([found.message, f"datum: {found.datum}", moved, *doubt.said]),
         covariance=C,
         control=control.ids,
+        control_scan=control.scans,
         control_off=control.off(x, found.places),
         control_used=doubt.kept.astype(np.int64),
     )

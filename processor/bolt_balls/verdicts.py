@@ -28,7 +28,8 @@ def of_result(result: Result) -> Judged:
     """Judge all movements of a result.
 
     Pass where size and interval keep within the limit, fail where it is beyond by more than the interval, else
-    indeterminate; that also where the design fits the nodes in other ways as well.
+    indeterminate; that also where the design fits the nodes in other ways as well, and of a ball that was not seen:
+    where its axes meet is no ball's place.
     """
     size = np.linalg.norm(result.movement, axis=1)
     along = result.movement / np.where(size > 0.0, size, 1.0)[:, None]
@@ -36,8 +37,14 @@ def of_result(result: Result) -> Judged:
     ci95 = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
     sure = result.matching == "ok"
     limit = result.movement_limit
+    seen = [one != "axes" for one in result.evidence]
     return Judged(
-        size, ci95, tuple(_verdict(s, half, limit, sure) for s, half in zip(size.tolist(), ci95.tolist(), strict=True))
+        size,
+        ci95,
+        tuple(
+            _verdict(s, half, limit, sure and ball)
+            for s, half, ball in zip(size.tolist(), ci95.tolist(), seen, strict=True)
+        ),
     )
 
 

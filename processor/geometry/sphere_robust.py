@@ -17,6 +17,7 @@ TUKEY = 4.685  # in scales: 95 % efficiency under normal noise
 WINDOW = 4.0  # in scales: the points the scale is taken from
 STEEPEST = 0.3  # cosine of the incidence: beyond it the beam is split at the limb, and angle errors rule
 ITERATIONS = 100
+UNSETTLED = 40  # steps after which the scale is held and a ray lost at the limb stays lost: else they come and go
 LEAST = 6
 
 
@@ -61,10 +62,14 @@ def robust_fit(
     scale = scale_mm
     tiny = 1e-12 * max(start.radius, 1.0) + 1e-300
     converged = False
-    for _ in range(ITERATIONS):
+    considered = np.ones(len(points), bool)
+    for turn in range(ITERATIONS):
         residual, J = _linearised(local, state, seen_from)
-        scale = min(scale_mm, max(_scale(residual, scale), tiny))
-        near = np.abs(residual) < TUKEY * scale
+        if turn < UNSETTLED:
+            scale = min(scale_mm, max(_scale(residual, scale), tiny))
+        else:
+            considered &= np.isfinite(residual)
+        near = considered & (np.abs(residual) < TUKEY * scale)
         if np.count_nonzero(near) < LEAST:
             return None
         residual, J = residual[near], J[near, :free]
@@ -87,6 +92,24 @@ def robust_fit(
     covariance[:free, :free] = _sandwich(J[:, :free], residual / scale, scale)
     inliers = np.asarray(np.abs(residual) < TUKEY * scale, bool)
     return RobustFit(Sphere(origin + state[:3], float(state[3]), covariance), inliers, scale, converged)
+
+
+def bound(points: Floats, fit: RobustFit, radius_held: bool = False, scanner: Floats | None = None) -> Floats:
+    """Return the least covariance (4, 4) that an unbiased estimate may have from the points of a fit (Cramér and Rao).
+
+    Every point on the ball counts in full, with normal noise of the fit's scale; ``points`` (n, 3) and ``scanner``
+    (n, 3) are those that were fitted. NaN where the points do not determine the sphere.
+    """
+    state = np.append(np.zeros(3), fit.sphere.radius)
+    on = fit.inliers
+    seen_from = None if scanner is None else scanner[on] - fit.sphere.centre
+    residual, J = _linearised(points[on] - fit.sphere.centre, state, seen_from)
+    free = 3 if radius_held else 4
+    J = J[np.isfinite(residual), :free]
+    found = np.zeros((4, 4))
+    N = J.T @ J
+    found[:free, :free] = fit.scale**2 * np.linalg.inv(N) if np.linalg.cond(N) < 1e12 else np.nan
+    return found
 
 
 def _linearised(points: Floats, state: Floats, scanner: Floats | None) -> tuple[Floats, Floats]:

@@ -17,7 +17,7 @@ def _summary(result: spheres.Result) -> tuple[str, str]:
 
 
 def _files(result: spheres.Result) -> dict[str, bytes]:
-    return {"nodes.dxf": dxf.drawing(result)} if tables_balls.has_bounds(result) else {}
+    return {"nodes.dxf": dxf.drawing(result)} if len(result.tube_radii) else {}
 
 
 REPORT = StepReport(

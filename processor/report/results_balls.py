@@ -67,7 +67,12 @@ def written(result: Result) -> dict[str, Any]:
         found["datum"] = result.datum
     if result.control_names:
         found["control"] = [
-            {"name": name, "off": result.control_off[i], "used": bool(result.control_used[i])}
+            {
+                "name": name,
+                "scan": result.control_scan[i],
+                "off": result.control_off[i],
+                "used": bool(result.control_used[i]),
+            }
             for i, name in enumerate(result.control_names)
         ]
     return found

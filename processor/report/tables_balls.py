@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from processor.bolt_balls import verdicts
+from processor.bolt_balls.ball_baselines import SAME
 from processor.bolt_balls.result import Result
 from processor.evaluate import ErrorReport
 from processor.model import NORMAL_95, Floats, StepRun
@@ -45,7 +46,7 @@ def of_runs(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
 
 
 def has_bounds(result: Result) -> bool:
-    """Whether balls were found by way of members, with all that is known of them then."""
+    """Whether balls were found by method ``ray``: with the bounds of their estimates, and members if there are any."""
     return len(result.sizes) > 0
 
 
@@ -142,7 +143,8 @@ def _brief(result: Result, method: str) -> Table:
         "flag",
     )  # fmt: skip
     note = "Bounds, efficiencies and all else are in balls.csv."
-    return Table(f"Balls, method {method} (mm)", columns, rows, note=note, on_terminal=False)
+    # of a few targets the answer is their places; of a frame that is too long to be looked through
+    return Table(f"Balls, method {method} (mm)", columns, rows, note=note, on_terminal=not len(result.tube_radii))
 
 
 def _to_look_at(result: Result, method: str) -> list[Table]:
@@ -161,9 +163,16 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
         error = np.abs(run.result.radii - report.true_radii[run.method])
         known = error[np.isfinite(error)]
         figures = np.quantile(known, [0.5, 0.95, 1.0]).tolist() if len(known) else [NAN] * 3
-        rows.append((run.method, len(known), len(error), *figures))
-    columns = ("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm")
+        rows.append((run.method, len(known), len(error), *figures, _points_used(run)))
+    columns = ("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm", "points_used")
     return Table("|radius error| by method (mm)", columns, tuple(rows), "summary")
+
+
+def _points_used(run: StepRun) -> str:
+    """Which points a method fitted: errors of methods compare only on the same ones."""
+    if run.method == "ray":
+        return "its own choice"
+    return "those of ray" if SAME in run.result.message else "all of its crop"
 
 
 def _sd(result: Result) -> Floats:
@@ -309,10 +318,11 @@ def _stations(result: Result) -> list[Table]:
 
 
 def _control(result: Result) -> list[Table]:
+    sightings = zip(result.control_names, result.control_off, result.control_used, result.control_scan, strict=True)
     rows = tuple(
-        (name, *off.tolist(), float(np.linalg.norm(off)), "yes" if used else "no, the others speak against it")
-        for name, off, used in zip(result.control_names, result.control_off, result.control_used, strict=True)
+        (name, *off.tolist(), float(np.linalg.norm(off)), "yes" if used else "no, the others speak against it", scan)
+        for name, off, used, scan in sightings
     )
-    columns = ("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used")
+    columns = ("control_point", "dx_mm", "dy_mm", "dz_mm", "off_mm", "used", "scan")
     note = "Known place minus where the scans have it after the stations were moved; a row a sighting."
     return [Table("Control points (mm)", columns, rows, "control", note)] if rows else []

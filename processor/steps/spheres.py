@@ -2,7 +2,8 @@
 
 Method ``ray`` takes the whole scan, with or without a design: members first, then the nodes where they meet, then the
 balls on them. Where a cloud has no members, balls are searched for by themselves. ``ransac`` and ``least-squares`` are
-the source paper's (paper 001), fitted to a crop about every node of the design.
+the source paper's (paper 001), fitted to a crop about every node of the design, or beside ``ray`` to the points that
+it took.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ __all__ = ["KIND", "METHODS", "NEEDS", "STREAMS", "Params", "Result", "check", "
 
 NEEDS: tuple[str, ...] = ()
 STREAMS = ("ray",)  # methods that take points piece by piece
+COMPARES = True  # methods run for comparison are given the answer
 KIND = "space-frame"
 NAN = float("nan")
 WRONG_MM = 10.0  # a centre farther off than this is another thing
@@ -33,16 +35,21 @@ FOUND_MM = 3.0  # a node this near to the true one is found
 LOWEST_MM = 3.0  # an unflagged lowest point farther off is a wrong answer
 
 
-def run(scene: Scene, params: Params, points: PointReader | None = None) -> Result:
+def run(scene: Scene, params: Params, points: PointReader | None = None, answer_given: Result | None = None) -> Result:
     """Find the balls of a scene: those of its design and what else there is, or those that are in the cloud.
 
     ``status``: ok = an answer for every ball, partial = for some or ``max_balls`` reached, failed = for none; the flag
-    of each ball says what its answer is worth. ``points`` reads the points of a scene that is larger than memory.
+    of each ball says what its answer is worth. Where the answer given is a frame's by ``ray``, the paper's methods are
+    run on its points, for comparison. ``points`` reads the points of a scene that is larger than memory.
     Raises UsageError for parameters that make no sense, InputError for a cloud without members larger than memory.
     """
     params.check(scene.frame is not None)
     limits = tolerance.default_for(scene.tolerance)
     if params.method != "ray":
+        if answer_given is not None and answer_given.method == "ray" and len(answer_given.tube_radii):
+            same = answer.of_same_points(scene, params)
+            if same is not None:
+                return same
         if scene.frame is None:
             return _told(scene, single.search(merged(scene, with_scanner=True), params))
         return _told(scene, single.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits))

@@ -7,9 +7,11 @@ import pytest
 
 from designgen import recipes
 from designgen.scene import make
-from processor.bolt_balls import answer, threads
+from processor import pipeline
+from processor.bolt_balls import answer, ball_baselines, threads, verdicts
 from processor.bolt_balls.scene_source import of_scene
 from processor.geometry import rigid
+from processor.model import Scan
 from processor.steps import spheres
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutter=6", "scan.step_mrad=2.2"]
@@ -34,6 +36,7 @@ def test_every_ball_is_found_blind(roof):
     assert all(metric.passed for metric in checks.values())
     assert checks["nodes found within 3 mm"].value == 100.0
     assert checks["nodes that are none"].value == 0.0
+    assert "targets beside the frame, are not looked for" in result.message
     assert 0.7 < checks["centres, rms of error by standard deviation"].value < 1.3
 
 
@@ -111,3 +114,143 @@ def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used,
         one, other = getattr(first, field.name), getattr(again, field.name)
         same = one.tobytes() == other.tobytes() if isinstance(one, np.ndarray) else repr(one) == repr(other)
         assert same, field.name
+
+
+# --- a square roof -------------------------------------------------------------------------------------------------
+
+SQUARE = [
+    "frame.nodes_x=5", "frame.nodes_y=5", "frame.shape='flat'", "frame.radii_mm=[45.0,50.0,60.0]",
+    "asbuilt.wrong_sizes=3", "scan.stations=[2,2]", "scan.clutter=4", "scan.step_mrad=2.2",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def square():
+    return make("square", recipes.overridden(recipes.load("frame-1040")[1], SQUARE), 3)
+
+
+def elsewhere(frame, without=(), extra=(), radius=50.0):
+    """A design in another frame, less some of its nodes, with others (n, 3) that were never built."""
+    R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 1.1])), np.array([5.0e8, 4.3e9, 9e4])
+    keep = ~np.isin(frame.ids, without)
+    own = ~np.isin(frame.member_a, without) & ~np.isin(frame.member_b, without)
+    return dataclasses.replace(
+        frame,
+        ids=np.append(frame.ids[keep], 900 + np.arange(len(extra))),
+        centres=np.vstack([frame.centres[keep], np.reshape(extra, (-1, 3))]) @ R.T + t,
+        radii=np.append(frame.radii[keep], np.full(len(extra), radius)),
+        member_a=frame.member_a[own],
+        member_b=frame.member_b[own],
+        tube_diameters=frame.tube_diameters[own],
+    ), R  # fmt: skip
+
+
+def wrong_sizes(result):
+    return set(result.ids[np.array(result.flag) == "wrong-size"].tolist())
+
+
+def truly_wrong(scene, truth):
+    return set(scene.frame.ids[np.abs(truth.frame.radii - scene.frame.radii) > 3.0].tolist())
+
+
+def test_the_balls_sizes_tell_how_a_square_roof_is_turned(square):
+    scene, truth = square
+    x, _, z = scene.frame.centres.max(axis=0)
+    beyond = [[x + 3000.0, 3000.0, z], [x + 3000.0, 6000.0, z], [-3000.0, 0.0, z]]
+    assert len(truly_wrong(scene, truth)) == 3
+    for without, extra in (((), ()), (scene.frame.ids[[7, 20]], beyond)):
+        design, R = elsewhere(scene.frame, without, extra)
+        result = spheres.run(dataclasses.replace(scene, frame=design), spheres.Params())
+        assert result.matching == "ok"
+        assert np.degrees(rigid.rotation_angle(result.T_design_scan[:3, :3] @ R.T)) < 0.2
+        assert wrong_sizes(result) == truly_wrong(scene, truth) - set(without)
+        assert (np.array(result.flag) == "not-found").sum() == len(extra)
+
+
+def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(square):
+    scene, _ = square
+    low = scene.frame.centres.min(axis=0)
+    corner = (np.abs(scene.frame.centres[:, :2] - low[:2]) < 100.0).all(axis=1)
+    assert corner.sum() == 1
+    # of one size but for a corner: which of four that is, one ball does not decide
+    radii = np.where(corner, 60.0, 50.0)
+    design, _ = elsewhere(dataclasses.replace(scene.frame, radii=radii))
+    result = spheres.run(dataclasses.replace(scene, frame=design), spheres.Params())
+    assert result.matching == "ambiguous"
+    disputed = np.isnan(result.nominal_radii)
+    assert disputed.sum() == len(result.T_rivals) + 1 >= 2
+    assert all("ambiguous" in result.reason[i] for i in np.flatnonzero(disputed))
+    assert not wrong_sizes(result) & set(result.ids[disputed].tolist())
+    assert len(wrong_sizes(result)) > 10  # whatever the pose, they are not of the one size
+
+
+def emptied(scene, truth, row, onward):
+    """The scene without what was seen within 130 mm of a ball: those rays end ``onward`` mm farther on; None = gone."""
+    scans = []
+    for scan in scene.scans:
+        T = scan.T_project_scan
+        away = np.linalg.norm(rigid.apply(T, scan.points) + T[:3, :3] @ scan.origin - truth.frame.centres[row], axis=1)
+        points, near = scan.points.copy(), away < 130.0
+        if onward is None:
+            points = points[~near]
+        else:
+            ray = points[near] - scan.position
+            points[near] += onward * ray / np.linalg.norm(ray, axis=1)[:, None]
+        scans.append(Scan(scan.name, points, scan.origin, T_project_scan=T, position=scan.position))
+    return dataclasses.replace(scene, scans=tuple(scans))
+
+
+def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_no_verdict(square):
+    scene, truth = square
+    row = int(np.argmin(np.linalg.norm(truth.frame.centres - truth.frame.centres.mean(axis=0), axis=1)))
+    for onward, flag, said in ((900.0, "not-found", "rays went through"), (None, "low-confidence", "hardly a ray"),
+                               (-900.0, "low-confidence", "hides it")):  # fmt: skip
+        result = spheres.run(emptied(scene, truth, row, onward), spheres.Params())
+        assert result.flag[row] == flag, onward
+        assert said in result.reason[row]
+        assert "8 axes" in result.reason[row]
+        held = verdicts.of_result(dataclasses.replace(result, movement_limit=1.0))
+        assert held.verdict[row] == ("" if flag == "not-found" else "indeterminate")
+        assert "fail" in held.verdict
+        assert np.isnan(result.centres[row]).all() == (flag == "not-found")
+
+
+def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
+    scene, truth = square
+    params = {"spheres": {"min_points": 8}}
+    jobs = pipeline.plan(("spheres",), ("ray", "ransac", "least-squares"), params, 0)
+    runs = pipeline.execute(tmp_path / "s.h5", scene, jobs).runs
+    ray = runs[0].result
+    error = {run.method: np.abs(run.result.radii - truth.frame.radii)[ray.points > 30] for run in runs}
+    alone = spheres.run(scene, spheres.Params(method="least-squares"))
+    for run in runs[1:]:
+        np.testing.assert_array_equal(run.result.ids, ray.ids)
+        assert ball_baselines.SAME in run.result.message
+        # tens of points of a ball and sleeves beside: hundreds are in the crop
+        assert (run.result.points <= 1.3 * ray.points + 10).all()
+        assert run.result.points.sum() < 0.8 * alone.points.sum()
+    assert np.median(error["least-squares"]) < 0.7 * np.median(np.abs(alone.radii - truth.frame.radii)[ray.points > 30])
+    assert np.median(error["ray"]) < np.median(error["least-squares"])
+    again = pipeline.execute(tmp_path / "s.h5", scene, jobs[1:]).runs[0].result
+    assert ball_baselines.SAME not in again.message
+
+
+def test_a_wrong_size_is_told_without_a_catalogue(square):
+    scene, truth = square
+    result = spheres.run(scene, spheres.Params(catalogue="none"))
+    said = [result.reason[i] for i, flag in enumerate(result.flag) if flag == "wrong-size"]
+    assert all("beyond the blank's" in one for one in said)
+    assert wrong_sizes(result) >= truly_wrong(scene, truth)
+    off = truth.frame.radii - scene.frame.radii
+    assert wrong_sizes(result) <= set(scene.frame.ids[(off > 1.0) | (off < -0.5)].tolist())
+    assert "low-confidence" not in {result.flag[i] for i in np.flatnonzero(result.points > 30)}
+
+
+def test_a_wrong_size_that_the_catalogue_lacks_is_told_where_the_interval_excludes_the_designed_one(square):
+    scene, truth = square
+    result = spheres.run(scene, spheres.Params(radii_mm=(45.0, 50.0)))
+    largest = scene.frame.ids[np.argmax(truth.frame.radii)]
+    assert wrong_sizes(result) == {largest}
+    assert "beyond the blank's" in result.reason[list(result.ids).index(largest)]
+    flag = dict(zip(result.ids.tolist(), result.flag, strict=True))
+    assert all(flag[one] != "ok" for one in truly_wrong(scene, truth))

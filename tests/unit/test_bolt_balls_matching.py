@@ -147,6 +147,37 @@ def test_what_distinguishes_decides(by):
         assert min(cloud.error(T) for T in (found.T_design_scan, *found.rivals)) < 4.0
 
 
+def test_balls_are_measured_where_the_pattern_leaves_several_poses_and_nowhere_else():
+    """A square roof of three sizes: two nodes were not designed, three not built, three balls are of another size."""
+    whole = design("flat", nx=5, ny=5, radii=(45.0, 50.0, 60.0))
+    asked = []
+    for seed in range(4):
+        cloud = Cloud(whole, seed, off=8.0, missing=0.0, extra=0.0)
+        cloud.radii[[3, 17, 30]] += 10.0
+        keep = ~np.isin(np.arange(len(whole.ids)), [7, 20])
+        outside = np.array([[15e3, 3e3, 6e3], [15e3, 6e3, 6e3], [-3e3, 0.0, 6e3]]) - [0.0, 0.0, 6e3]
+        outside[:, 2] = whole.centres[0, 2]
+        d = FrameDesign(
+            np.arange(keep.sum() + 3),
+            np.vstack([whole.centres[keep], outside]),
+            np.append(whole.radii[keep], [50.0] * 3),
+        )
+
+        def sized(cloud=cloud):
+            asked.append(True)
+            return cloud.found(radii=True)
+
+        assert match(cloud.found(), d).status == "ambiguous"
+        found = match(cloud.found(), d, sized=sized)
+        assert found.status == "ok"
+        assert cloud.error(found.T_design_scan) < 12.0
+        assert (found.assignment < 0).sum() == 2
+    assert len(asked) == 4
+    clear = Cloud(design(), 1)
+    assert match(clear.found(), design(), sized=sized).status == "ok"
+    assert len(asked) == 4
+
+
 def test_half_a_flat_roof_may_be_any_half():
     """What was scanned is a part that fits in several places: none of them is a guess worth giving alone."""
     d = design("flat", nx=10, ny=10, radii=(45.0,))

@@ -1,5 +1,7 @@
 """Self-registration of stations on tubes: recovery, honest covariances, datum, weak ties; tubes simulated by numpy."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.spatial import cKDTree
@@ -203,12 +205,12 @@ def test_control_points_hold_the_datum():
     assert found.before_mm < 5.0  # the 40 mm are no station's error
 
 
-def targets(seen, seed, count, sd=0.3, off=None):
+def targets(seen, seed, count, sd=0.3, off=None, sightings=2):
     """Targets about the roof, seen by two stations each, their places known to ``sd``; ``off`` is added to those."""
     rng = np.random.default_rng(seed)
     places = np.column_stack([rng.uniform(-2e3, 14e3, (count, 2)), rng.uniform(0.0, 6e3, count)])
     known = places + rng.normal(0.0, sd, places.shape) + (0.0 if off is None else off)
-    s = [rng.permutation(len(seen.scanners))[:2] for _ in range(count)]
+    s = [rng.permutation(len(seen.scanners))[:sightings] for _ in range(count)]
     point, s = np.repeat(np.arange(count), [len(one) for one in s]), np.concatenate(s)
     measured = np.array([
         tube_clouds.turn(seen.motions[k, :3]) @ (p - seen.places[k]) + seen.places[k] + seen.motions[k, 3:]
@@ -252,6 +254,26 @@ def test_a_wrong_control_point_is_left_out_and_named():
         assert "control point T2 left out" in wrong.message
         np.testing.assert_allclose(wrong.T_project_station, good.T_project_station, atol=0.02)
         np.testing.assert_allclose(wrong.control_off[4:6], np.tile(off[2], (2, 1)), atol=3.0)
+
+
+@pytest.mark.parametrize("sightings", [2, 4])
+def test_a_wrong_sighting_is_left_out_alone_and_named(sightings):
+    _, seen, _ = frame(4, 5, 5, per_pair=40)
+    right = targets(seen, 3, 5, sightings=sightings)
+    for count in range(1, sightings // 2 + 1):
+        measured = right.measured.copy()
+        rows = 2 * sightings + np.arange(count)  # of T2
+        measured[rows] += [[0.0, 30.0, 0.0], [-18.0, 0.0, 0.0]][:count]
+        names = tuple(f"S{i + 1}" for i in range(len(seen.scanners)))
+        wrong = dataclasses.replace(right, measured=measured, scanners=names)
+        found = registered(seen, np.random.default_rng(1), control=wrong)
+        np.testing.assert_array_equal(np.flatnonzero(found.control_used == 0), rows)
+        for row in rows:
+            scan = names[int(np.argmax(right.share[row]))]
+            assert f"sighting of control point T2 by {scan} left out" in found.message
+            assert found.control_scan[row] == scan
+        good = registered(seen, np.random.default_rng(1), control=right.only(~np.isin(np.arange(len(measured)), rows)))
+        np.testing.assert_allclose(found.T_project_station, good.T_project_station, atol=0.02)
 
 
 def test_control_points_that_contradict_each_other_widen_the_intervals():

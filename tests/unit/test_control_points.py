@@ -232,3 +232,15 @@ def test_coordinates_of_another_frame_are_told(tmp_path):
     scene = folder.read_input(place(tmp_path, TOML, far))
     with pytest.raises(InputError, match="control points lie 5e\\+05 m from where"):
         spheres.run(scene, spheres.Params())
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1000.0, "1000"), (1.0 / 25.4, "1/25.4"), (1.3, "")])
+def test_control_points_in_another_unit_are_told_with_the_factor(tmp_path, factor, said):
+    places = np.array([[5000.0, 2000.0, 300.0], [9000.0, 500.0, 100.0], [100.0, 7000.0, 300.0]])
+    rows = ["name,scan,x,y,z,sd_mm"]
+    for i, (x, y, z) in enumerate(places):
+        known = factor * np.array([x, y, z])
+        rows += [f"T{i},,{known[0]},{known[1]},{known[2]},1.0", f"T{i},S1,{y},{5.0 - x},{z},"]
+    scene = folder.read_input(place(tmp_path, TOML, "\n".join(rows) + "\n"))
+    with pytest.raises(InputError, match=f"lie {said} times as far apart" if said else "from where the scans"):
+        spheres.run(scene, spheres.Params())

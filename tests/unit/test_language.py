@@ -233,3 +233,22 @@ def test_no_proposal_keeps_a_word_of_english(size_mm):
         said.add(say(proposals.propose("J1", found, LIMITS).sentence))
     assert len(said) > 1
     assert latin(said) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "sighting of control point T2 by S2 left out: 30 mm off what the others say",
+        "no ball or target has a radius of 50018 mm: the unit may be wrong, 1/1000 of it would be 50.0 mm",
+        "no ball or target has a radius of 2.100 mm",
+        "ambiguous which ball of the design this is, and these differ in size: none is called wrong",
+        "radius +9.9 mm from nominal, beyond the blank's +1/-0.5 by 0.3 mm",
+        "no ball seen, known from 8 axes alone; it is missing: 23 rays went through where it should be",
+        "what stands before it hides it; hardly a ray was measured its way",
+        "fitted to the points that method ray took for each ball, off sleeves and process hole; covariances are formal",
+        "balls that no member meets, such as targets beside the frame, are not looked for",
+        "points used; its own choice; those of ray; all of its crop",
+    ],
+)
+def test_what_is_said_of_balls_is_known(text):
+    assert latin([language.language("zh").say(text)]) == []

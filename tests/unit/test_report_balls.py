@@ -75,7 +75,7 @@ def whole(limit=10.0, T=None, **changes):
         visible_fraction=np.full(5, 0.3),
         rms=np.full(5, 0.4),
         nominal_radii=np.array([45.0, 50.0, 50.0, 45.0, NAN]),
-        evidence=("fused", "ball", "axes", "axes", "fused"),
+        evidence=("fused", "ball", "axes", "fused", "fused"),
         flag=FLAG,
         reason=("", "size 60 mm instead of 50 mm", "no ball seen", "12 points, fewer than 20", "not in the design"),
         sizes=np.array([45.0, 60.0, NAN, 45.0, 50.0]),
@@ -158,6 +158,13 @@ def test_verdicts_by_hand():
 @pytest.mark.parametrize("matching", ["ambiguous", "failed"])
 def test_nothing_passes_where_it_is_not_known_which_node_is_which(matching):
     assert set(verdicts.of_result(whole(matching=matching)).verdict) == {"indeterminate", ""}
+
+
+def test_a_ball_that_was_not_seen_neither_passes_nor_fails():
+    for limit in (100.0, 0.001):
+        unseen = whole(limit=limit, evidence=("axes", "ball", "axes", "axes", "fused"))
+        assert verdicts.of_result(unseen).verdict[0] == verdicts.of_result(unseen).verdict[3] == "indeterminate"
+    assert verdicts.of_result(whole(limit=NAN, evidence=("axes",) * 5)).verdict[0] == "no limit"
 
 
 def test_a_node_that_did_not_move_has_no_direction_but_a_verdict():
@@ -435,16 +442,33 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
     made = whole(
         datum="2 control points", control_names=("T1", "T2"), control_off=[[0.3, 0.0, -0.4], [30.0, 0.0, 0.0]],
         control_used=[1, 0],
+        control_scan=("S1", "S2"),
     )  # fmt: skip
     (table,) = (one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
                 if one.file == "control")  # fmt: skip
     assert table.columns[0] == "control_point"
-    assert table.rows[0] == ("T1", 0.3, 0.0, -0.4, pytest.approx(0.5), "yes")
-    assert table.rows[1][-1].startswith("no, ")
+    assert table.rows[0] == ("T1", 0.3, 0.0, -0.4, pytest.approx(0.5), "yes", "S1")
+    assert table.columns[-1] == "scan"
+    assert table.rows[1][-2].startswith("no, ")
     written = results_balls.written(made)
     assert written["datum"] == "2 control points"
-    assert [(one["name"], one["used"]) for one in written["control"]] == [("T1", True), ("T2", False)]
+    assert [(one["name"], one["scan"], one["used"]) for one in written["control"]] == [
+        ("T1", "S1", True),
+        ("T2", "S2", False),
+    ]
     assert not {"datum", "control"} & set(results_balls.written(whole()))
+
+
+def test_targets_without_members_have_lowest_points_and_bounds():
+    nothing = {name: getattr(spheres.Result("ok", "ray"), name) for name in (
+        "movement", "movement_ci95", "movement_covariance", "gauge", "matching", "tube_start", "tube_end", "tube_radii",
+        "tube_bow", "tube_a", "tube_b", "station_names", "T_station", "station_said",
+    )}  # fmt: skip
+    made = whole(sizes=np.full(5, NAN), axes=np.zeros(5, int), nominal_radii=np.full(5, NAN), **nothing)
+    found = {one.file: one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())}
+    assert {"balls", "lowest"} <= set(found)
+    assert {"bound_sd_lowest_z_mm", "efficiency_radius"} <= set(found["balls"].columns)
+    assert any(one.on_terminal and "radius_mm" in one.columns for one in found.values())
 
 
 def test_the_expected_distribution_holds_as_many_errors_as_there_are():

@@ -209,6 +209,36 @@ def test_search_without_a_design_uses_known_scanners():
     assert "orthogonal" in unknown.message
 
 
+def test_the_bound_of_a_target_is_what_its_points_allow():
+    rng = np.random.default_rng(8)
+    position = np.array([3000.0, 1000.0, 8000.0])
+    view = position / np.linalg.norm(position)
+    off, bounds, sd = [], [], []
+    for _ in range(20):
+        points = target(rng, 800, view)
+        ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
+        scan = Scan("s", points + ray * rng.normal(0.0, 0.5, (len(points), 1)), position=position)
+        result = spheres.run(Scene("t", "structure", (scan,)), Params())
+        off.append(np.append(result.centres[0], [result.radii[0] - 70.0, result.lowest[0, 2] + 70.0]))
+        bounds.append(result.bound_sd[0])
+        sd.append(np.append(np.sqrt(np.diag(result.covariance[0])), result.lowest_sd[0]))
+    by_bound = np.sqrt(np.mean((np.array(off) / bounds) ** 2, axis=0))
+    assert (by_bound > 0.7).all()
+    assert (by_bound < 1.6).all()
+    assert np.median(np.array(bounds) / sd) == pytest.approx(0.95, abs=0.15)  # the biweight's
+
+
+@pytest.mark.parametrize(("scale", "said"), [(1000.0, "1/1000"), (1e-3, "1000 of it"), (1e6, "")])
+def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, said):
+    rng = np.random.default_rng(5)
+    points = scale * (target(rng) + rng.normal(0.0, 0.3, (800, 3)))
+    result = spheres.run(Scene("t", "structure", (Scan("s", points),)), Params())
+    assert result.flag == ("low-confidence",)
+    assert "no ball or target has a radius" in result.reason[0]
+    assert said in result.reason[0]
+    assert ("unit" in result.reason[0]) == bool(said)
+
+
 def test_search_says_when_it_stopped_early_and_when_there_is_nothing():
     rng = np.random.default_rng(6)
     points = np.vstack([target(rng) + np.array([500.0 * i, 0.0, 0.0]) for i in range(3)]) + rng.normal(
