@@ -159,7 +159,8 @@ def controlled():
         "control points not used: 2 of them seen in scans that were placed, three that span a plane are needed",
         "control points not used: all of them nearly on a line, three that span a plane are needed",
     )
-    scans = (*first.scan_message[:4], "its control points say that it stands 170.0 mm elsewhere",
+    scans = (*first.scan_message[:4], first.scan_message[-1],
+             "its control points say that it stands 170.0 mm elsewhere",
              "2 common points with S1, all common points on a line with S2, three that span a plane are needed",
              "no picks with other scans", "its picks lead to scans that are not placed")  # fmt: skip
     first = dataclasses.replace(first, control=Held(*seen, 1, 3, 0.9), message="; ".join(said), scan_message=scans)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from processor import folder, store
-from processor.bolt_balls import single
+from processor.bolt_balls import blanks
 from processor.model import InputError, Limit, Scan, Scene, Tolerance
 from processor.preassembly import chain_verdicts, joint_verdicts, tolerance
 
@@ -139,8 +139,8 @@ def test_blanks_of_balls():
     # Half of +2/-1 up to a diameter of 120 and of +3/-1.5 above.
     gb = tolerance.load("GB 50205-2020")
     for limits in (gb, Tolerance(), tolerance.load("JGJ 7-2010")):
-        assert single._blank_tolerance(60.0, limits) == (0.5, 1.0)
-        assert single._blank_tolerance(60.001, limits) == (0.75, 1.5)
+        assert blanks.blank_tolerance(60.0, limits) == (0.5, 1.0)
+        assert blanks.blank_tolerance(60.001, limits) == (0.75, 1.5)
     own = Tolerance(limits=(Limit("ball_blank_diameter_small_mm", "x", low=-4.0, high=6.0, up_to_mm=120.0),))
-    assert single._blank_tolerance(50.0, own) == (2.0, 3.0)
-    assert single._blank_tolerance(75.0, own) == (0.75, 1.5)
+    assert blanks.blank_tolerance(50.0, own) == (2.0, 3.0)
+    assert blanks.blank_tolerance(75.0, own) == (0.75, 1.5)
