@@ -19,7 +19,7 @@ from processor.stitching.clouds import Cloud
 from processor.stitching.joint import FLAT_SIGMAS, Blocks
 
 AGREES = 4.0  # standard deviations of a face's misfit once the scan has moved
-LEAST_FACES = 3  # one or two agree on something by chance
+LEAST_FACES = 4  # three of a hundred agree on something by chance: one of 90 scans of a truss
 LEAST_SHARE = 0.2  # of the faces that hold the scan where it is
 
 
