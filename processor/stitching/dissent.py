@@ -20,7 +20,7 @@ from processor.stitching.joint import FLAT_SIGMAS, Blocks
 
 AGREES = 4.0  # standard deviations of a face's misfit once the scan has moved
 LEAST_FACES = 4  # three of a hundred agree on something by chance: one of 90 scans of a truss
-LEAST_SHARE = 0.2  # of the faces that hold the scan where it is
+LEAST_SHARE = 0.14  # of the faces that hold the scan where it is
 
 
 @dataclass(frozen=True)
