@@ -17,7 +17,7 @@ from processor.model import NORMAL_95, Floats, Limit, Tolerance
 from processor.preassembly import tolerance as limits_of
 from processor.preassembly.joint_measures import CLEAR_SD, EXACT_MM
 from processor.preassembly.joint_verdicts import MEASURES as OF_JOINTS
-from processor.preassembly.joint_verdicts import Verdict, cited, guarded, in_words, own
+from processor.preassembly.joint_verdicts import Held, Verdict, guarded, in_words, own, worst, written
 from processor.preassembly.network import Adjusted, Member
 
 MEASURES = ("span", "unit_length", "inner_arc", "lateral_axis", "elevation")
@@ -66,23 +66,8 @@ def judge(found: Quantities, tolerance: Tolerance, span_mm: float, unsure: str =
     if not rows:
         return Verdict(said=f"{tolerance.standard or 'the project'} has no limit for the whole chain")
     judged = [_held(found[limit.measure], limit, span_mm, bool(unsure)) for limit in rows]
-    each = tuple(row[4] for row in judged)
-    overall = next((one for one in ("fail", "indeterminate") if one in each), "pass")
-    values, halves, lows, highs, _, probabilities = zip(*judged, strict=True)
-    return Verdict(
-        overall,
-        float("nan"),
-        tuple(limit.key for limit in rows),
-        tuple(limit.what for limit in rows),
-        np.array(values),
-        np.array(halves),
-        np.array(lows),
-        np.array(highs),
-        each,
-        np.array(probabilities),
-        **cited(rows, tolerance),
-        said="; ".join(filter(None, (unsure, in_words(rows, judged)))),
-    )
+    said = "; ".join(filter(None, (unsure, in_words(rows, judged))))
+    return written(rows, judged, tolerance, float("nan"), said)
 
 
 def not_held(tolerance: Tolerance) -> list[Limit]:
@@ -90,9 +75,7 @@ def not_held(tolerance: Tolerance) -> list[Limit]:
     return [limit for limit in tolerance.limits if own(limit) and limit.measure not in (*OF_JOINTS, *MEASURES)]
 
 
-def _held(
-    found: tuple[Floats, Floats], limit: Limit, span_mm: float, unsure: bool
-) -> tuple[float, float, float, float, str, float]:
+def _held(found: tuple[Floats, Floats], limit: Limit, span_mm: float, unsure: bool) -> Held:
     """Value nearer to its limit, its half-width, the bounds, verdict and, of a single value, the probability."""
     nan = float("nan")
     low, high = limits_of.bounds(limit, {"length": span_mm})
@@ -105,8 +88,7 @@ def _held(
     for sign, bound in ((-1.0, -low), (1.0, high)):
         value, bottom, top = _greatest(sign * values, sd)
         sides.append((bound - value, sign * value, top - value, guarded((bottom, top), -math.inf, bound)))
-    each = [side[3] for side in sides]
-    verdict = next((one for one in ("fail", "indeterminate") if one in each), "pass")
+    verdict = worst([side[3] for side in sides])
     _, value, half, _ = min(sides, key=lambda side: side[0])
     probability = nan
     if len(values) == 1 and not unsure:

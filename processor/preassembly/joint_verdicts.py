@@ -11,7 +11,6 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -22,6 +21,7 @@ from processor.preassembly.joint_measures import ACROSS, Measures, draws, motion
 
 Marks = npt.NDArray[np.bool_]
 NO_SIZES: Mapping[str, float] = MappingProxyType({})
+Held = tuple[float, float, float, float, str, float]  # value, half-width, bounds, verdict and probability
 MEASURES = ("misalignment", "groove_gap", "eccentricity")
 
 
@@ -76,12 +76,17 @@ def judge(measures: Measures, tolerance: Tolerance, sizes_mm: Mapping[str, float
         else:
             certain = False
         found.append((value, half, low, high, verdict, probability))
-    verdicts = [row[4] for row in found]
-    overall = "fail" if "fail" in verdicts else "indeterminate" if "indeterminate" in verdicts else "pass"
-    values, halves, lows, highs, each, probabilities = zip(*found, strict=True)
+    return written(rows, found, tolerance, float(every.mean()) if certain else float("nan"), in_words(rows, found))
+
+
+def written(
+    rows: Sequence[Limit], held: Sequence[Held], tolerance: Tolerance, probability: float, said: str
+) -> Verdict:
+    """Write the verdict on all limits from what was held against each, and where each stands."""
+    values, halves, lows, highs, each, probabilities = zip(*held, strict=True)
     return Verdict(
-        overall,
-        float(every.mean()) if certain else float("nan"),
+        worst(each),
+        probability,
         tuple(limit.key for limit in rows),
         tuple(limit.what for limit in rows),
         np.array(values),
@@ -90,19 +95,17 @@ def judge(measures: Measures, tolerance: Tolerance, sizes_mm: Mapping[str, float
         np.array(highs),
         each,
         np.array(probabilities),
-        **cited(rows, tolerance),
-        said=in_words(rows, found),
+        clause=tuple(f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source for limit in rows),
+        edition=tuple("" if own(limit) else tolerance.edition for limit in rows),
+        source=tuple(limit.source for limit in rows),
+        verified=np.array([limit.verified for limit in rows], np.uint8),
+        said=said,
     )
 
 
-def cited(rows: Sequence[Limit], tolerance: Tolerance) -> dict[str, Any]:
-    """Return where limits stand, as the fields of a Verdict."""
-    return {
-        "clause": tuple(f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source for limit in rows),
-        "edition": tuple("" if own(limit) else tolerance.edition for limit in rows),
-        "source": tuple(limit.source for limit in rows),
-        "verified": np.array([limit.verified for limit in rows], np.uint8),
-    }
+def worst(verdicts: Sequence[str]) -> str:
+    """Return the verdict on all: one that fails decides, then one that is indeterminate."""
+    return next((one for one in ("fail", "indeterminate") if one in verdicts), "pass")
 
 
 def own(limit: Limit) -> bool:
@@ -122,10 +125,8 @@ def _held(measures: Measures, limit: Limit, low: float, high: float, root_gap_mm
         off = value - root_gap_mm
         room = off - low if name == "groove_gap_least" else high - off
         sides.append((room, off, half, guarded((ends[0] - root_gap_mm, ends[1] - root_gap_mm), *bounds)))
-    verdicts = [side[3] for side in sides]
-    verdict = next((one for one in ("fail", "indeterminate") if one in verdicts), "pass")
     _, value, half, _ = min(sides, key=lambda side: side[0])
-    return value, half, verdict
+    return value, half, worst([side[3] for side in sides])
 
 
 def guarded(interval: tuple[float, float], low: float, high: float) -> str:
@@ -149,7 +150,7 @@ def keeps(gaps: Floats, points: Floats, limit: Limit, low: float, high: float, r
     return np.asarray(kept, bool)
 
 
-def in_words(rows: Sequence[Limit], found: Sequence[tuple[float, float, float, float, str, float]]) -> str:
+def in_words(rows: Sequence[Limit], found: Sequence[Held]) -> str:
     """Say each limit with what is held against it: value, half-width, bounds, verdict and probability."""
     parts = []
     for limit, (value, half, low, high, verdict, probability) in zip(rows, found, strict=True):

@@ -66,7 +66,8 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: picks.
         lists = list(pool.map(lambda key: _candidates(views, key, tilt, picked), keys))
     candidates = dict(zip(keys, lists, strict=True))
     placed = placing.place(views, candidates, reference)
-    solution, blocks = _adjusted(own, placed.T, reference)
+    cells = joint.gather(own)
+    solution, blocks = _adjusted(own, cells, placed.T, reference)
     measured, gross = _pairs(blocks, solution)
     if any(gross):
         bad = {(pair.a, pair.b) for pair, is_bad in zip(measured, gross, strict=True) if is_bad}
@@ -84,7 +85,7 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: picks.
         first = candidates[pair.a, pair.b][:1]
         elsewhere.append(not first or not coarse.same(first[0].T_a_b, standing[pair.a, pair.b], side, views[pair.b]))
     overlap = [held[pair.a, pair.b].overlap for pair in measured]
-    apart = dissent.of_scans(own, solution, GATES[0] * max(cloud.cell_mm for cloud in own))
+    apart = dissent.of_scans(cells, solution, GATES[0] * cells.size_mm)
     refuted = placing.refuted(held, len(own), reference)
     return Found(own, placed, solution, blocks, measured, overlap, elsewhere, gross, apart, refuted)
 
@@ -109,9 +110,8 @@ def _candidates(views: list[View], key: tuple[int, int], tilt: float, picked: pi
     return found
 
 
-def _adjusted(own: list[Cloud], T: Floats, reference: int) -> tuple[Solution, Blocks]:
+def _adjusted(own: list[Cloud], cells: joint.Gathered, T: Floats, reference: int) -> tuple[Solution, Blocks]:
     """Adjust all poses, with narrowing gates for what is one face."""
-    cells = joint.gather(own)
     if not len(cells.sums):
         empty = np.empty(0, np.int64)
         blocks = Blocks(empty, empty, np.empty((0, 10)), np.empty(0), empty, 0)

@@ -15,8 +15,7 @@ import numpy as np
 from processor.model import Floats, Ints
 from processor.stitching import bundle, grouping, joint, octree
 from processor.stitching.bundle import DROPPED, Solution
-from processor.stitching.clouds import Cloud
-from processor.stitching.joint import FLAT_SIGMAS, Blocks
+from processor.stitching.joint import FLAT_SIGMAS, Blocks, Gathered
 
 AGREES = 4.0  # standard deviations of a face's misfit once the scan has moved
 LEAST_FACES = 4  # three of a hundred agree on something by chance: one of 90 scans of a truss
@@ -48,9 +47,8 @@ class _Witnesses:
     follows: Floats  # (n, 6): turns about the scan's origin, shift
 
 
-def of_scans(clouds: list[Cloud], solution: Solution, gate_mm: float) -> list[Dissent]:
+def of_scans(cells: Gathered, solution: Solution, gate_mm: float) -> list[Dissent]:
     """Return the strongest dissent about each scan's pose; faces up to ``gate_mm`` apart count as one."""
-    cells = joint.gather(clouds)
     count = len(solution.T)
     blocks = joint.shared(joint.pieces(cells, solution.T, gate_mm)) if len(cells.sums) else None
     if blocks is None or not blocks.pieces:
