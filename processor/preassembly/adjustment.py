@@ -57,8 +57,8 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         [[rigid.apply(T, end * shrink) for end in both] for T, both in zip(placed, key_points, strict=True)]
     )
     gaps = ends[1:, 0] - ends[:-1, 1]  # the linear answer's, but for its second order
-    assembled = np.concatenate([_size(one) for one in adjusted.departures])
-    best_fit = np.concatenate(_with_first_at_rest(members, adjusted))
+    departures, first_at_rest = np.vstack(adjusted.departures), np.vstack(_with_first_at_rest(members, adjusted))
+    assembled, best_fit = _size(departures), _size(first_at_rest)
     limits = tolerance.default_for(scene.tolerance)
     measures = [
         joint_measures.measure(*one)
@@ -126,8 +126,17 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
         chain_judged=(chain,),
         not_held=tuple(limit.key for limit in idle),
         not_held_what=tuple(limit.what for limit in idle),
-        linear_offset=np.vstack(adjusted.departures),
+        linear_offset=departures,
         linear_offset_ci95=NORMAL_95 * np.sqrt(np.maximum(np.vstack(adjusted.departure_variance), 0.0)),
+        linear_ci95=_band(adjusted.departure_variance),
+        best_fit_linear_ci95=_band(adjusted.at_rest_variance),
+        errors_ci95=np.array(
+            [
+                *chain_figures.mean_max_ci95(gaps.reshape(-1, 1), np.square(sd).reshape(-1, 1)),
+                *chain_figures.mean_max_ci95(departures, np.vstack(adjusted.departure_variance)),
+                *chain_figures.mean_max_ci95(first_at_rest, np.vstack(adjusted.at_rest_variance)),
+            ]
+        ),
         span_departure=span,
         span_ci95=span_ci95,
         closure=closure,
@@ -143,8 +152,8 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
 
 
 def _unsure(left: Measured, right: Measured) -> str:
-    """Say why a joint's gaps may be wrong: a part the other way round, an end taken for another side; or nothing."""
-    said = [f"{part.name} may lie the other way round" for part in (left, right) if part.status == "ambiguous"]
+    """Say why a joint's gaps may be wrong: a part that may lie otherwise, an end taken for another side; or nothing."""
+    said = [f"{part.name} is ambiguous" for part in (left, right) if part.status == "ambiguous"]
     for part, end in ((left, left.member.ends[1]), (right, right.member.ends[0])):
         said += [f"{part.name}: {end.trouble}"] if end is not None and end.trouble else []
     return "; ".join(said)
@@ -171,7 +180,7 @@ def _if_told(verdict: Verdict, unsure: str) -> Verdict:
 
 def _unsure_of_all(parts: Sequence[Measured], adjusted: network.Adjusted, design: ArchDesign) -> str:
     """Say why the chain as a whole is not known well enough to be judged; empty where it is."""
-    said = [f"{part.name} may lie the other way round" for part in parts if part.status == "ambiguous"]
+    said = [f"{part.name} is ambiguous" for part in parts if part.status == "ambiguous"]
     both = zip(design.joint_names, adjusted.gaps, strict=True)
     said += [f"{name} has no answer" for name, gaps in both if not np.isfinite(gaps).all()]
     return "; ".join(said)
@@ -232,15 +241,21 @@ def _size(departure: Floats) -> Floats:
     return found
 
 
+def _band(variance: Sequence[Floats]) -> Floats:
+    """How far (s,) the linear error of each station may be off: the offset's error, left and up, is within it."""
+    found: Floats = joint_measures.RAYLEIGH_95 * np.sqrt(np.maximum(np.vstack(variance), 0.0).max(axis=1))
+    return found
+
+
 def _with_first_at_rest(members: Sequence[network.Member], adjusted: network.Adjusted) -> list[Floats]:
-    """Departures (k,) of every part with the whole bridge moved so that the first part lies on its design."""
+    """Departures (k, 2) of every part with the whole bridge moved so that the first part lies on its design."""
     back = rigid.invert(adjusted.motions[0])
     found = []
     for member, departure in zip(members, adjusted.departures, strict=True):
         edges = member.edges
         at = edges.points + np.einsum("ka,kai->ki", departure, edges.axes)
         moved = rigid.apply(back, at) - edges.points
-        found.append(_size(np.einsum("kai,ki->ka", edges.axes, moved)))
+        found.append(np.einsum("kai,ki->ka", edges.axes, moved))
     return found
 
 

@@ -6,10 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import block_diag
+from scipy.stats import chi2
 
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats
 from processor.preassembly import network
+from processor.preassembly.joint_measures import CLEAR_SD
 from processor.preassembly.measuring import Measured
 from processor.preassembly.network import Adjusted
 
@@ -69,10 +71,7 @@ def limiting(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign, 
         if np.isfinite(spread).all() and spread.max() > worst:
             k = int(np.argmax(spread))
             worst, where = float(spread[k]), (j, k // 3, k % 3)
-    unknown = [
-        name for name, gaps in zip(design.joint_names, adjusted.gaps, strict=True) if not np.isfinite(gaps).all()
-    ]
-    missing = f"no answer at {', '.join(unknown)}: scan both ends there" if unknown else ""
+    missing = _missing(parts, adjusted, design)
     if worst == 0.0:
         return missing, missing
     j, point, axis = where
@@ -91,6 +90,36 @@ def limiting(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign, 
     limit += f"variance from the {AXES[axis]} at the {side} of {part}"
     advice = f"a scan of {part} that shows more of the {AXES[axis]} at its {side}: four times the points halve its part"
     return limit, "; ".join(filter(None, (missing, advice)))
+
+
+def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
+    """Half-widths that hold the mean and the largest size of vectors (n, d) with 95 % or more.
+
+    ``variance`` (n, d) is of their coordinates; what goes together among them need not be known. A size is off by no
+    more than its vector, the mean by no more than the root mean square of all: of squares of normal numbers none
+    leaves 1.96**2 times its mean more often than a single one does (Szekely and Bakirov, Probab. Theory Relat. Fields
+    126 (2003)). The largest may be any that is near it, each widened as if all were independent.
+    """
+    known = np.isfinite(vectors).all(axis=1) & np.isfinite(variance).all(axis=1)
+    if not known.any():
+        return float("nan"), float("nan")
+    variance = np.maximum(variance[known], 0.0)
+    size, sd = np.linalg.norm(vectors[known], axis=1), np.sqrt(variance.max(axis=1))
+    top = int(np.argmax(size))
+    near = size >= size[top] - CLEAR_SD * (sd + sd[top])
+    reach = float(np.sqrt(chi2.ppf(0.95 ** (1.0 / near.sum()), vectors.shape[1]))) * sd[near]
+    largest = max(float((size[near] + reach).max()) - size[top], size[top] - float((size[near] - reach).max()))
+    return NORMAL_95 * float(np.sqrt(variance.sum(axis=1).mean())), float(largest)
+
+
+def _missing(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> str:
+    """Say what to scan where joints have no answer."""
+    said: dict[str, list[str]] = {}
+    for name, gaps, *beside in zip(design.joint_names, adjusted.gaps, parts, parts[1:], strict=False):
+        if not np.isfinite(gaps).all():
+            failed = " and ".join(part.name for part in beside if part.status == "failed")
+            said.setdefault(f"{failed} has no scan that fits" if failed else "scan both ends there", []).append(name)
+    return "; ".join(f"no answer at {', '.join(joints)}: {what}" for what, joints in said.items())
 
 
 def _covariance(parts: Sequence[Measured], adjusted: Adjusted, by_motion: Floats, by_pose: Floats) -> Floats:

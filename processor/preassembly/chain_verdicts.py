@@ -59,7 +59,7 @@ def quantities(members: Sequence[Member], adjusted: Adjusted, span: float, span_
 def judge(found: Quantities, tolerance: Tolerance, span_mm: float, unsure: str = "") -> Verdict:
     """Hold the chain against the limits of ``tolerance``; ``span_mm`` is the design's, for limits that hang on it.
 
-    ``unsure`` says why nothing can be sure (a part that may lie the other way round, a joint without an answer): then
+    ``unsure`` says why nothing can be sure (a part that may lie otherwise, a joint without an answer): then
     all is indeterminate.
     """
     rows = [limit for limit in tolerance.limits if limit.measure in MEASURES]

@@ -46,7 +46,8 @@ class Adjusted:
 
     ``motion_with_pose`` (6 c, 6 c) is the covariance of the motions with the parts' registrations.
     ``gaps`` (j, 8, 3) in bridge axes with covariance (j, 24, 24); ``departures`` (k, 2) a part, sideways and up, after
-    the adjustment, with variances (k, 2).
+    the adjustment, with variances (k, 2); ``at_rest_variance`` (k, 2) are those with the whole bridge moved so that the
+    first part lies where its registration has it.
     """
 
     motions: Floats
@@ -56,6 +57,7 @@ class Adjusted:
     gap_covariance: Floats
     departures: tuple[Floats, ...]
     departure_variance: tuple[Floats, ...]
+    at_rest_variance: tuple[Floats, ...]
 
 
 @dataclass(frozen=True)
@@ -100,13 +102,17 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
         if row >= 0:
             gaps[j] = left[row : row + 24].reshape(8, 3)
             gap_covariance[j] = spread[row : row + 24, row : row + 24]
-    departures, variances = [], []
+    departures, variances, at_rest = [], [], []
     for member, rows in zip(members, seen.edge_rows, strict=True):
-        departure, variance = (np.full(member.edges.departure.shape, np.nan) for _ in range(2))
+        departure, variance, first_at_rest = (np.full(member.edges.departure.shape, np.nan) for _ in range(3))
         known = np.isfinite(member.edges.departure)
         departure[known], variance[known] = left[rows], np.diag(spread)[rows]
+        # Moved with the bridge, an edge goes where the first part's own motion takes it, the other way.
+        by_first = after[rows] - _along(member.edges, members[0].middle)[known.ravel()] @ to_motion[:6]
+        first_at_rest[known] = np.einsum("ki,ij,kj->k", by_first, seen.covariance, by_first, optimize=True)
         departures.append(departure)
         variances.append(variance)
+        at_rest.append(first_at_rest)
     blocks = [slice(6 * i, 6 * i + 6) for i in range(len(members))]
     return Adjusted(
         np.array([_as_motion(x[block], member.middle) for block, member in zip(blocks, members, strict=True)]),
@@ -116,6 +122,7 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
         gap_covariance,
         tuple(departures),
         tuple(variances),
+        tuple(at_rest),
     )
 
 
@@ -146,8 +153,7 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
         edges = member.edges
         known = np.isfinite(edges.departure).ravel()
         A, follows = np.zeros((2, int(known.sum()), 6 * count))
-        motion = rigid.motion(edges.points - member.middle)
-        A[:, 6 * i : 6 * i + 6] = np.einsum("kai,kij->kaj", edges.axes, motion).reshape(-1, 6)[known]
+        A[:, 6 * i : 6 * i + 6] = _along(edges, member.middle)[known]
         follows[:, 6 * i : 6 * i + 6] = edges.by_pose.reshape(-1, 6)[known]
         whole = np.zeros((len(edges.points), 2, len(edges.points), 2))
         for k in range(2):
@@ -169,6 +175,12 @@ def _observations(members: Sequence[Member], joint_points: Floats, joint_frames:
     with_pose = np.vstack(by_pose) @ block_diag(*(member.pose for member in members))
     covariance = block_diag(*blocks) + with_pose @ np.vstack(by_pose).T
     return _Observations(np.vstack(rows), np.concatenate(values), covariance, with_pose, gap_row, tuple(edge_rows))
+
+
+def _along(edges: EdgeStations, middle: Floats) -> Floats:
+    """How departures (2 k, 6) follow a motion about ``middle``."""
+    found: Floats = np.einsum("kai,kij->kaj", edges.axes, rigid.motion(edges.points - middle)).reshape(-1, 6)
+    return found
 
 
 def _known(end: JointEnd) -> bool:

@@ -57,6 +57,9 @@ class Result(Checked):
     not_held_what: tuple[str, ...] = names("n")
     linear_offset: Floats = column("o", 2)  # at each station: to the left and up, as assembled
     linear_offset_ci95: Floats = column("o", 2)
+    linear_ci95: Floats = column("o")  # of linear_deviation: holds 95 % or more
+    best_fit_linear_ci95: Floats = column("o")
+    errors_ci95: Floats = column("e")  # of splicing mean, max; linear mean, max; the same with Foot 1: 95 % or more
     span_departure: float = float("nan")  # of the outer ends' distance from the design's, mm
     span_ci95: float = float("nan")
     closure: Floats = column("k")  # of the joints alone: mm along the bridge's axes, mrad about them

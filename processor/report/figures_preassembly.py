@@ -10,8 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from processor.model import NORMAL_95, Floats, Scene, StepRun
-from processor.preassembly.joint_measures import RAYLEIGH_95
+from processor.model import Floats, Scene, StepRun
 from processor.report import figures_residuals
 from processor.report.drawing import (
     BEHIND_TEXT,
@@ -164,17 +163,6 @@ def _all_gaps(axes: Axes, result: preassemble.Result, labels: Sequence[str]) -> 
 # --- linear error --------------------------------------------------------------------------------------------------
 
 
-def linear_band(result: preassemble.Result) -> Floats:
-    """How far (s,) the linear error of each station may be off with 95 % or more; empty where it is not known.
-
-    The offset's error, to the left and up, is within this distance, and so the offset's size is.
-    """
-    if not len(result.linear_offset_ci95):
-        return np.empty(0)
-    found: Floats = RAYLEIGH_95 / NORMAL_95 * result.linear_offset_ci95.max(axis=1)
-    return found
-
-
 def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
     """Linear error of all methods that have an answer along both bottom edges, by both gauges."""
     silent = [run.method for run in runs if not np.isfinite(run.result.linear_deviation).any()]
@@ -186,15 +174,15 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
     for axes, (values, title) in zip(
         panels,
         (
-            ("linear_deviation", "as assembled"),
-            ("best_fit_linear_deviation", "the whole bridge moved so that Foot 1 lies best on its design"),
+            ("linear", "as assembled"),
+            ("best_fit_linear", "the whole bridge moved so that Foot 1 lies best on its design"),
         ),
         strict=True,
     ):
         for k, run in styled:
-            deviation: Floats = getattr(run.result, values)
+            deviation: Floats = getattr(run.result, f"{values}_deviation")
             means += [float(np.median(deviation[np.isfinite(deviation)]))] if np.isfinite(deviation).any() else []
-            band = linear_band(run.result) if values == "linear_deviation" else np.empty(0)
+            band: Floats = getattr(run.result, f"{values}_ci95")
             for edge, width in (("left", 1.6), ("right", 0.8)):
                 on = np.array(run.result.linear_edge, dtype=object) == edge
                 station = run.result.linear_station[on] / 1000.0
@@ -226,10 +214,8 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
         panels[1].legend(fontsize=8, ncols=max(len(styled), 2), loc="upper center", bbox_to_anchor=(0.5, -0.2))
     caption = "Linear error: distance of the assembled bottom edges from the design's; dotted lines are joints"
     if banded:
-        caption += (
-            "; the shaded band holds 95 % or more, above alone, for moved with Foot 1 it has that part's error too"
-        )
-    bare = [run.method for _, run in styled if not np.isfinite(linear_band(run.result)).any()]
+        caption += "; the shaded band holds 95 % or more"
+    bare = [run.method for _, run in styled if not np.isfinite(run.result.linear_ci95).any()]
     caption += f"; without a band, for they state no uncertainty: {', '.join(bare)}" if banded and bare else ""
     caption += f"; without an answer, so not drawn: {', '.join(silent)}" if silent else ""
     return caption, png(figure)

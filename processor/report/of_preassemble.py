@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -16,8 +17,9 @@ def _summary(result: preassemble.Result) -> tuple[str, str]:
     placed = sum(status != "failed" for status in result.component_status)
     verdicts = collections.Counter(result.verdict)
     judged = ", ".join(f"{verdicts[name]} {name}" for name in ("pass", "fail", "indeterminate") if verdicts[name])
-    splicing = f"{shown(result.splicing_mean)} mm mean, {shown(result.splicing_max)} mm at most"
-    linear = f"{shown(result.linear_mean)} mm mean, {shown(result.linear_max)} mm at most"
+    halves = result.errors_ci95.tolist() or [float("nan")] * 4
+    splicing = _mean_max(result.splicing_mean, result.splicing_max, halves[:2])
+    linear = _mean_max(result.linear_mean, result.linear_max, halves[2:4])
     head = f"{result.status}, {placed} of {len(result.components)} parts placed"
     if result.judged:
         head = f"of {len(result.joints)} joints {judged}; assembly {head}"
@@ -25,6 +27,14 @@ def _summary(result: preassemble.Result) -> tuple[str, str]:
     said = f"Splicing error {splicing}. Linear error {linear}. Joints: {judged or 'none'}."
     said += "".join(f" Whole chain: {one.verdict}." for one in result.chain_judged if one.key)
     return head, said + (" The limits are NOT VERIFIED against the standard's text." if unverified else "")
+
+
+def _mean_max(mean: float, largest: float, halves: Sequence[float]) -> str:
+    shown_of = [
+        f"{shown(value)} ± {shown(half)}" if np.isfinite(half) else shown(value)
+        for value, half in zip((mean, largest), halves, strict=True)
+    ]
+    return f"{shown_of[0]} mm mean, {shown_of[1]} mm at most"
 
 
 def _further(result: preassemble.Result) -> list[tuple[str, str]]:

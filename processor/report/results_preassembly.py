@@ -44,18 +44,22 @@ def written(result: preassemble.Result) -> dict[str, Any]:
             }
             for j, name in enumerate(result.joints)
         ],
-        "splicing_error": {"mean": result.splicing_mean, "max": result.splicing_max},
+        "splicing_error": {"mean": result.splicing_mean, "max": result.splicing_max, **_halves(result, 0)},
         "linear_error": {
             "mean": result.linear_mean,
             "max": result.linear_max,
+            **_halves(result, 2),
             "gauge": result.gauge,
             "stations": result.linear_station,
             "edge": list(result.linear_edge),
             "deviation": result.linear_deviation,
+            "ci95": result.linear_ci95,
             "foot1_best_fit": {
                 "mean": result.best_fit_linear_mean,
                 "max": result.best_fit_linear_max,
+                **_halves(result, 4),
                 "deviation": result.best_fit_linear_deviation,
+                "ci95": result.best_fit_linear_ci95,
             },
         },
         "trade_off": [
@@ -138,3 +142,9 @@ def _ends(points: Floats) -> dict[str, Any]:
         end: dict(zip(KEY_POINTS, points[i], strict=True)) if np.isfinite(points[i]).any() else {}
         for i, end in enumerate(ENDS)
     }
+
+
+def _halves(result: preassemble.Result, first: int) -> dict[str, Any]:
+    """Half-widths of a mean and a largest error, of a method that states them."""
+    own = result.errors_ci95[first : first + 2]
+    return dict(zip(("mean_ci95", "max_ci95"), own, strict=True)) if len(own) else {}

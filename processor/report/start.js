@@ -11,10 +11,10 @@ function start(box, data) {
   spaceView(panel(`${say(data.title)}${say(", method")} ${data.method}`), data);
   if (!data.linear) return;
 
-  const lines = (values, banded) => data.linear.flatMap((one, m) => ["left", "right"].map((edge) => {
+  const lines = (values, band) => data.linear.flatMap((one, m) => ["left", "right"].map((edge) => {
     const rows = one.edge.map((_, i) => i).filter((i) => one.edge[i] === edge);
     const y = rows.map((i) => one[values][i]);
-    const half = banded && one.band.length ? rows.map((i) => one.band[i]) : null;
+    const half = one[band].length ? rows.map((i) => one[band][i]) : null;
     const beyond = (sign) => half && y.map((value, i) => (value === null || half[i] === null ? null : Math.max(value + sign * half[i], 1e-3)));
     const x = rows.map((i) => one.station[i] / 1000);
     return {
@@ -24,12 +24,12 @@ function start(box, data) {
     };
   }));
   const known = (values) => data.linear.some((one) => one[values].some((value) => value !== null));
-  for (const [values, title] of [
-    ["deviation", "Linear error, as assembled"],
-    ["best_fit", "Linear error, the bridge moved so that Foot 1 lies best on its design"],
+  for (const [values, band, title] of [
+    ["deviation", "band", "Linear error, as assembled"],
+    ["best_fit", "best_fit_band", "Linear error, the bridge moved so that Foot 1 lies best on its design"],
   ]) {
     if (!known(values)) continue;
-    const series = lines(values, values === "deviation");
+    const series = lines(values, band);
     lineChart(panel(say(title)), {
       xLabel: say("station along the bottom edge, m"), yLabel: say("linear error, mm"), series, logY: data.linear.length > 1,
       note: series.some((one) => one.high) ? say("The shaded band holds 95 % or more.") : "",

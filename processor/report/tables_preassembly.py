@@ -10,6 +10,7 @@ import numpy as np
 
 from processor.evaluate import ErrorReport
 from processor.model import KEY_POINTS, NORMAL_95, Floats, StepRun
+from processor.report.printing import shown
 from processor.report.table import NAN, Table
 from processor.report.tables_adjusted import adjusted
 
@@ -44,7 +45,9 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
             first.linear_edge,
             first.linear_station.tolist(),
             first.linear_deviation.tolist(),
+            _or_nan(first.linear_ci95, first.linear_deviation).tolist(),
             first.best_fit_linear_deviation.tolist(),
+            _or_nan(first.best_fit_linear_ci95, first.linear_deviation).tolist(),
             strict=True,
         )
     )
@@ -64,7 +67,7 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
             summary,
             "summary",
             f"Linear error as assembled, that is with: {gauges}. Foot 1 best-fit to the design: the whole bridge, as "
-            "assembled, is moved so that Foot 1 lies on its design.",
+            f"assembled, is moved so that Foot 1 lies on its design.{_halves(runs)}",
             ("", *["splicing error"] * 2, *["linear error, as assembled"] * 2, *["linear error, Foot 1 best-fit"] * 2),
         ),
         Table("Components", ("component", "status", "remark"), parts, "components"),
@@ -87,13 +90,28 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
         *(_gaps(run, "gaps" if run is runs[0] else f"gaps-{run.method}") for run in runs),
         Table(
             f"Linear error by station, method {method}",
-            ("edge", "station_mm", "deviation_mm", "foot1_best_fit_deviation_mm"),
+            ("edge", "station_mm", "deviation_mm", "ci95_mm", "foot1_best_fit_deviation_mm", "foot1_best_fit_ci95_mm"),
             stations,
             "linear",
             on_page=False,
             on_terminal=False,
         ),
     ]
+
+
+def _halves(runs: Sequence[StepRun]) -> str:
+    """Intervals of the figures, of the methods that state them."""
+    return "".join(
+        f" 95 % or more of the true figures of {run.method} are within ± "
+        f"{', '.join(shown(half) for half in run.result.errors_ci95)} of those stated, in the table's order."
+        for run in runs
+        if np.isfinite(run.result.errors_ci95).any()
+    )
+
+
+def _or_nan(values: Floats, like: Floats) -> Floats:
+    """Fill up what a method does not state."""
+    return values if len(values) else np.full_like(like, np.nan)
 
 
 def _others(runs: Sequence[StepRun]) -> list[Table]:

@@ -13,7 +13,6 @@ import numpy as np
 
 from processor.model import KEY_POINTS, Floats, Scene, StepRun
 from processor.report.drawing import DIVERGING_STOPS, colour_limit
-from processor.report.figures_preassembly import linear_band
 from processor.report.printing import shown
 from processor.report.results_json import plain
 from processor.report.results_preassembly import TRADE_OFF
@@ -108,12 +107,12 @@ def _thinned(edge: Floats) -> Floats:
 def _linear(run: StepRun) -> dict[str, Any]:
     result: preassemble.Result = run.result
     step = max(1, -(-len(result.linear_station) // MOST_STATIONS))
-    band = linear_band(result)
     return {
         "method": run.method,
         "edge": list(result.linear_edge[::step]),
         "station": np.round(result.linear_station[::step], 1),
         "deviation": np.round(result.linear_deviation[::step], 6),
-        "band": np.round(band[::step], 6),
+        "band": np.round(result.linear_ci95[::step], 6),
         "best_fit": np.round(result.best_fit_linear_deviation[::step], 6),
+        "best_fit_band": np.round(result.best_fit_linear_ci95[::step], 6),
     }

@@ -128,7 +128,17 @@ def test_a_joint_left_open_has_no_limit_that_is_sure():
         "fail", 0.0, ("a",), ("b",), np.ones(1), np.ones(1), np.zeros(1), np.zeros(1), ("fail",), np.zeros(1),
         ("c",), ("",), ("s",), np.zeros(1, np.uint8), "x",
     )  # fmt: skip
-    told = adjustment._if_told(verdict, "rib1 may lie the other way round")
+    told = adjustment._if_told(verdict, "rib1 is ambiguous")
     assert (told.verdict, told.each) == ("indeterminate", ("indeterminate",))
     assert np.isnan([told.probability, told.each_probability[0]]).all()
     assert adjustment._if_told(verdict, "") is verdict
+
+
+def test_mean_and_largest_of_many_alike_are_as_unsure_as_one():
+    """Of one number 1.96 sd; of a hundred that may err alike the mean still: 95 % or more holds."""
+    of = chain_figures.mean_max_ci95
+    np.testing.assert_allclose(of(np.array([[3.0]]), np.array([[0.04]])), 0.392, rtol=1e-3)
+    assert of(np.zeros((100, 1)), np.full((100, 1), 0.04))[0] == pytest.approx(0.392, rel=1e-3)
+    half = of(np.array([[3.0, 4.0], [1.0, 0.0], [np.nan, 0.0]]), np.full((3, 2), 0.04))
+    np.testing.assert_allclose(half, [0.392 * np.sqrt(2.0), 0.2 * 2.4477], rtol=1e-3)  # the second is not the largest
+    assert np.isnan(of(np.zeros((2, 1)), np.full((2, 1), np.nan))).all()

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processor.geometry import mesh_surface, rigid
-from processor.preassembly import features, form, joint_ends, layers, network, outer_faces
+from processor.preassembly import chain_figures, features, form, joint_ends, layers, network, outer_faces
 from processor.preassembly.bottom_edges import EdgeStations
 from processor.preassembly.evidence import Believed, by_the_others, either, no_surer, weigh
 
@@ -252,7 +252,7 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
     for end in (parts[0].ends[1], parts[1].ends[0]):
         left = np.sqrt(np.diag(network.of_itself(end, pose)))
         np.testing.assert_allclose(left, noise, rtol=1e-3)  # what limits the gap: the rest cancels in it
-    gaps, moved = [], []
+    gaps, moved, at_rest, largest = [], [], [], []
     for _ in range(400):
         wrong = np.sqrt(np.diag(pose)) * rng.standard_normal((2, 6))
         drawn = []
@@ -265,12 +265,23 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
             drawn.append(replace(part, ends=ends, edges=replace(part.edges, departure=departure)))
         found = network.adjust(drawn, joints, np.eye(4)[None], 0.1)
         gaps.append(found.gaps.ravel())
+        # With the first part back on its design, edges lie off by what it was registered wrong by.
+        back = rigid.invert(found.motions[0])
+        for edges, departure in zip((one.edges for one in drawn), found.departures, strict=True):
+            there = edges.points + np.einsum("ka,kai->ki", departure, edges.axes)
+            at_rest.append(np.einsum("kai,ki->ka", edges.axes, rigid.apply(back, there) - edges.points))
+        largest.append([np.abs(found.gaps).mean(), np.abs(found.gaps).max()])
         # Where the outer end of the last part comes to lie: by its movement, and by what it was wrong.
         at = np.array([[6000.0, 0.0, 0.0]])
         moved.append((rigid.apply(found.motions[1], at) - at)[0] - rigid.motion(at)[0] @ wrong[1])
     assert np.sqrt(np.diag(stated.gap_covariance[0])).max() < 2.0 * noise  # of 0.14 mm that both ends are wrong by
     pulls = np.array(gaps) / np.sqrt(np.diag(stated.gap_covariance[0]))
     np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)
+    drawn_sd = np.std(np.array(at_rest).reshape(400, 48, 2), axis=0)
+    np.testing.assert_allclose(drawn_sd, np.sqrt(np.vstack(stated.at_rest_variance)), rtol=0.2)
+    halves = chain_figures.mean_max_ci95(stated.gaps.reshape(-1, 1), np.diag(stated.gap_covariance[0])[:, None])
+    assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # true gaps are none
+    assert (np.quantile(largest, 0.95, axis=0) > 0.3 * np.array(halves)).all()
     J, own = rigid.motion(at - parts[1].middle)[0], rigid.motion(at)[0]
     both = J @ stated.motion_with_pose[6:, 6:] @ own.T
     covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T

@@ -186,11 +186,11 @@ def test_what_no_cut_makes_hold_is_said():
 
 def test_a_joint_of_unsure_parts_gets_no_proposal_and_one_of_weak_parts_says_so():
     gaps = joint_measures.measure(along(-3.0), np.zeros((24, 24)), np.eye(4), POINTS)
-    unsure = propose("J1", gaps, GB, EXACT, unsure="rib1 may lie the other way round")
+    unsure = propose("J1", gaps, GB, EXACT, unsure="rib1 is ambiguous")
     assert unsure.action == "unknown"
     assert np.isnan(unsure.cut).all()
     assert np.isnan(unsure.probability_as_is)
-    assert unsure.sentence == "J1: nothing proposed until this is settled: rib1 may lie the other way round."
+    assert unsure.sentence == "J1: nothing proposed until this is settled: rib1 is ambiguous."
     weak = propose("J1", gaps, GB, EXACT, rests_on="rib1 (half of it was seen)")
     assert weak.action == "trim"
     assert weak.sentence.startswith("J1: rests on a weak part: rib1 (half of it was seen); cut the right part's end")
