@@ -1,4 +1,4 @@
-"""Scenes written as scan folders: project.toml, design.json with its meshes, scans, and truth.h5."""
+"""Scenes written as scan folders: project.toml, design.json with its meshes, scans, picks, and truth.h5."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from designgen import scan_files
 from designgen.scan_files import Written
 from processor import store
 from processor.model import KEY_POINTS, ArchDesign, FrameDesign, PointLabels, Scan, Scene, UsageError
+from processor.picks_file import PICKS, write_picks
 
 FEWEST_POINTS = 4  # that a reader takes for a scan
 
@@ -120,6 +121,9 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_me
             for name, position in zip(scene.stations.ids, scene.stations.positions, strict=True)
         }
         _write_json(folder / "stations.json", places)
+    if scene.picks is not None:
+        names = {scan.name: name for file in written for name, scan, _ in file.read_as}
+        write_picks(folder / PICKS, scene.picks, names, scale)
     (folder / "project.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return written
 

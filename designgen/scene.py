@@ -13,6 +13,7 @@ MAKERS = {
     "space-frame": ("frame", frame_scene.make),
     "structure": ("structure", structure_scene.make),
 }
+EXTRA = {"structure": {"picks"}}  # sections that one kind alone has
 
 
 def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple[Scene, Truth]:
@@ -24,7 +25,7 @@ def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple
     if kind not in MAKERS:
         raise UsageError(f"recipe {name}: kind: expected one of {', '.join(MAKERS)}, got {kind!r}")
     section, maker = MAKERS[kind]
-    known = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section}
+    known = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
     if unknown := sorted(set(recipe) - known):
         raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(known))}")
     used = recipe.get("seed", 0) if seed is None else seed

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from designgen import asbuilt, clutter, damage, sampler, scanner, sequences, survey
+from designgen import asbuilt, clutter, damage, picking, sampler, scanner, sequences, survey
 from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
 from designgen.reading import filled
@@ -18,9 +18,11 @@ from processor.model import (
     AsBuilt,
     DefectTruth,
     Floats,
+    Picks,
     PointLabels,
     Scan,
     Scene,
+    StationTruth,
     StructureDesign,
     StructureTruth,
     Truth,
@@ -53,7 +55,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     kind = recipe["structure"]["type"]
     patches, move, defects = BUILDERS[kind](components, recipe, seed)
     names = tuple(one.name for one in components)
-    stations, station_truth = None, None
+    stations, station_truth, picks = None, None, None
     origin = np.zeros(3)
     if isinstance(scanning, ByRays):
         params = scanning.params
@@ -65,10 +67,13 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         _add_poles(builder, poses, patches, params.clutter, seed)
         found = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
         scans, labels, stations, station_truth = survey.in_project(found, origin, params.merged)
+        picks = _picks(recipe, scans, station_truth, seed)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
             stations = None
     else:
+        if "picks" in recipe:
+            raise UsageError('picks: points are picked in scans by rays; set scan.mode = "rays"')
         # Where bodies meet, one hides the other: told by the design, as the movement is smooth. Plates only touch.
         hidden = None if kind == "plate-row" else _hidden(components)
         cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"), hidden)
@@ -83,6 +88,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         units="mm",
         units_reason="made in millimetres",
         structure=StructureDesign(kind, vertices + origin, faces),
+        picks=picks,
     )
     return scene, Truth(
         labels,
@@ -93,6 +99,16 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         spacing_mm=sampler.spacing_mm(scanning),
         sigma_mm=sampler.sigma_mm(scanning),
     )
+
+
+def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth, seed: int) -> Picks | None:
+    if "picks" not in recipe:
+        return None
+    T_project_scan = dict(zip(truth.ids, truth.T_project_station, strict=True))
+    if any(scan.name not in T_project_scan for scan in scans):
+        raise UsageError("picks: points are picked in scans of one station each; set scan.merged = false")
+    params = filled(picking.Params, recipe, "picks")
+    return picking.pick(scans, [T_project_scan[scan.name] for scan in scans], params, seed)[0]
 
 
 def _stadium(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:

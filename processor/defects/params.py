@@ -47,7 +47,7 @@ class Params:
     edge_mm: float = 8.0  # a border of every face where a beam sees more than the face
     align: bool = True  # fit stations and whole to the design before looking for defects
     registration_error_mm: float = math.nan  # one standard deviation; without it from the fit to the design
-    pictures: int = 12
+    pictures: int = 200
     paper: Paper = field(default_factory=Paper)
 
     def check(self) -> None:

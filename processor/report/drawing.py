@@ -1,4 +1,4 @@
-"""What all figures share: colours, dashes and marks, names as a figure can show them, PNG bytes.
+"""What all figures share: colours, dashes and marks, names as a figure can show them, PNG and PDF bytes.
 
 Lines and bars are told apart by dash, marker or hatch as well as by colour (Okabe and Ito's, safe without colour
 vision). The same run gives the same bytes: no dates, and none of the user's own settings.
@@ -7,10 +7,12 @@ vision). The same run gives the same bytes: no dates, and none of the user's own
 from __future__ import annotations
 
 import io
+from collections.abc import Iterable
 from functools import cache
 
 import numpy as np
 from matplotlib import font_manager
+from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
@@ -36,6 +38,15 @@ def png(figure: Figure) -> bytes:
     """Write a figure as PNG, without a date."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=110, metadata={"Software": None})
+    return out.getvalue()
+
+
+def pdf(pages: Iterable[Figure]) -> bytes:
+    """Write figures as a document of a page each, without a date."""
+    out = io.BytesIO()
+    with PdfPages(out, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as document:
+        for page in pages:
+            document.savefig(page, dpi=110)
     return out.getvalue()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import textwrap
+from collections.abc import Iterator
 from contextlib import nullcontext
 from pathlib import Path
 
@@ -14,14 +15,17 @@ from matplotlib.patches import Circle
 
 from processor.bolt_balls.scene_source import SceneSource, of_scene
 from processor.geometry import rigid
-from processor.model import Floats, Scene
-from processor.report.drawing import COLOURS, Drawn, png
+from processor.model import NORMAL_95, Floats, Scene
+from processor.report.drawing import COLOURS, Drawn, pdf, png
 from processor.report.dxf import nominal_places
 from processor.steps import spheres
 from processor.stored_points import StoredPoints, points_of
 
 PREFIX = "ball-to-see-"
-MOST_BALLS = 12
+MOST_BALLS = 12  # on the page
+MOST_PAGES = 500
+DOCUMENT = "balls-to-look-at.pdf"
+LINE = 0.052  # of the panel's height
 ORDER = ("wrong-size", "not-found", "low-confidence")  # of what is drawn first
 ROUND_MM = 60.0  # about the ball, that is shown
 SLICE_MM = 8.0  # on either side of the plane through the centre
@@ -36,26 +40,48 @@ def of_result(scene: Scene, result: spheres.Result, stored: Path | None = None) 
 
     ``stored`` is the scene's file, where its points were left there.
     """
-    nominal = designed_places(scene, result)
-    centres = np.where(np.isfinite(result.centres), result.centres, nominal)
-    there = np.flatnonzero(np.isfinite(centres).all(axis=1)).tolist()
-    doubtful = [i for flag in ORDER for i in there if result.flag[i] == flag]
-    shown = doubtful[:MOST_BALLS]
-    if not shown or (stored is None and not all(len(scan.points) for scan in scene.scans)):
-        return {}
-    reach = [_radius(result, i) + ROUND_MM for i in shown]
-    with points_of(stored) if stored is not None else nullcontext() as points:
-        crops = crops_about(scene, centres[shown], np.array(reach), points)
     as_is = ", each station where it was registered" if result.station_names else ""
-    more = f" (the first {len(shown)} of {len(doubtful)} to look at)" if len(shown) < len(doubtful) else ""
+    every = len(doubtful(scene, result))
+    more = f" (the first {MOST_BALLS} of {every} to look at, all in {DOCUMENT})" if every > MOST_BALLS else ""
     return {
         f"{PREFIX}{int(result.ids[i])}.png": (
             f"Ball {int(result.ids[i])}, {result.flag[i]}: the points about it{as_is}; dark are those within "
             f"{SLICE_MM:g} mm of the plane through its centre{more}",
-            _ball(result, i, centres[i], nominal[i] - centres[i], crops[k], reach[k]),
+            png(figure),
         )
-        for k, i in enumerate(shown)
+        for i, figure in _drawn(scene, result, stored, MOST_BALLS)
     }
+
+
+def document(scene: Scene, result: spheres.Result, stored: Path | None = None) -> bytes:
+    """Draw a page for each ball that is not ok, MOST_PAGES at most; empty where there is none, or no points."""
+    first = next(drawn := _drawn(scene, result, stored, MOST_PAGES), None)
+    return pdf(figure for _, figure in (first, *drawn)) if first is not None else b""
+
+
+def doubtful(scene: Scene, result: spheres.Result) -> list[int]:
+    """Rows of the balls that are not ok and of which it is known where to look, those to see first before others."""
+    there = np.isfinite(_places(result, designed_places(scene, result))).all(axis=1)
+    return [i for flag in ORDER for i in np.flatnonzero(there).tolist() if result.flag[i] == flag]
+
+
+def _places(result: spheres.Result, nominal: Floats) -> Floats:
+    """Return where each ball is (k, 3), or where the design has it."""
+    found: Floats = np.where(np.isfinite(result.centres), result.centres, nominal)
+    return found
+
+
+def _drawn(scene: Scene, result: spheres.Result, stored: Path | None, most: int) -> Iterator[tuple[int, Figure]]:
+    nominal = designed_places(scene, result)
+    centres = _places(result, nominal)
+    shown = doubtful(scene, result)[:most]
+    if not shown or (stored is None and not all(len(scan.points) for scan in scene.scans)):
+        return
+    reach = [_radius(result, i) + ROUND_MM for i in shown]
+    with points_of(stored) if stored is not None else nullcontext() as points:
+        crops = crops_about(scene, centres[shown], np.array(reach), points)
+    for k, i in enumerate(shown):
+        yield i, _ball(result, i, centres[i], nominal[i] - centres[i], crops[k], reach[k])
 
 
 def designed_places(scene: Scene, result: spheres.Result) -> Floats:
@@ -114,10 +140,11 @@ def _radius(result: spheres.Result, i: int) -> float:
     return max([LEAST_RADIUS_MM, *known])
 
 
-def _ball(result: spheres.Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float) -> bytes:
-    """Draw a ball about ``middle`` (3,); ``nominal`` (3,) is less it."""
-    figure = Figure(figsize=(9.4, 5.3), layout="constrained")
-    for axes, (name, across) in zip(figure.subplots(1, 2), VIEWS, strict=True):
+def _ball(result: spheres.Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float) -> Figure:
+    """Draw a ball about ``middle`` (3,), its numbers beside it; ``nominal`` (3,) is less it."""
+    figure = Figure(figsize=(12.4, 5.3), layout="constrained")
+    *views, beside = figure.subplots(1, 3, width_ratios=[4.6, 4.6, 3.0])
+    for axes, (name, across) in zip(views, VIEWS, strict=True):
         _points(axes, points, across)
         _members(axes, result, i, middle, across, reach)
         if np.isfinite(nominal).all() and np.isfinite(result.nominal_radii[i]):
@@ -131,7 +158,11 @@ def _ball(result: spheres.Result, i: int, middle: Floats, nominal: Floats, point
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
     heading = f"Ball {int(result.ids[i])}: {result.flag[i]}. {result.reason[i]}"
-    figure.suptitle("\n".join(textwrap.wrap(heading, 105)[:3]), fontsize=11)
+    figure.suptitle("\n".join(textwrap.wrap(heading, 130)[:3]), fontsize=11)
+    beside.axis("off")
+    for row, (what, value) in enumerate(_numbers(result, i, nominal)):
+        for x, text, side in ((0.0, what, "left"), (1.0, value, "right")):
+            beside.text(x, 1.0 - LINE * row, text, fontsize=8, ha=side, va="top", transform=beside.transAxes)
     handles = [
         Line2D([], [], marker=".", linestyle="", color="black", label=f"points within {SLICE_MM:g} mm of the plane"),
         Line2D([], [], marker=".", linestyle="", color="0.72", label="points before and behind it"),
@@ -140,7 +171,38 @@ def _ball(result: spheres.Result, i: int, middle: Floats, nominal: Floats, point
         Line2D([], [], color=COLOURS[2], linestyle="-.", label="axes of members"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=5, fontsize=8)
-    return png(figure)
+    return figure
+
+
+def _numbers(result: spheres.Result, i: int, nominal: Floats) -> list[tuple[str, str]]:
+    """Return what is known of a ball, in words and as text; ``nominal`` (3,) is the design's place less its own."""
+    sd = np.sqrt(np.where((variance := np.diag(result.covariance[i])) >= 0.0, variance, np.nan))
+    bound = result.bound_sd[i]
+    rows = [("mm", "± 95 %")]
+    for k, axis in enumerate("xyz"):
+        rows.append((f"centre {axis}", _with(result.centres[i, k], NORMAL_95 * sd[k], 1)))
+    rows += [
+        ("radius", _with(result.radii[i], NORMAL_95 * sd[3], 2)),
+        ("size in the catalogue", f"{result.sizes[i]:g}"),
+        ("radius designed", f"{result.nominal_radii[i]:g}"),
+        ("lowest point z", _with(result.lowest[i, 2], NORMAL_95 * result.lowest_sd[i], 2)),
+    ]
+    off = zip("xyz", (-nominal).tolist(), strict=True)
+    rows += [(f"off the design's place, {axis}", f"{value:.2f}") for axis, value in off]
+    rows += [(f"least possible ±, {what}", f"{NORMAL_95 * bound[k]:.2f}") for k, what in ((2, "z"), (3, "radius"))]
+    rows += [
+        ("residuals, rms", f"{result.rms[i]:.2f}"),
+        ("points", f"{int(result.points[i])}"),
+        ("visible, %", f"{100.0 * result.visible_fraction[i]:.0f}"),
+        ("stations", f"{int(result.stations[i])}"),
+        ("axes of members", f"{int(result.axes[i])}"),
+        ("evidence", result.evidence[i]),
+    ]
+    return [(what, "–" if "nan" in value else value) for what, value in rows]
+
+
+def _with(value: float, half: float, digits: int) -> str:
+    return f"{value:.{digits}f} ± {half:.2f}"
 
 
 def _points(axes: Axes, points: Floats, across: tuple[int, int]) -> None:
@@ -148,7 +210,7 @@ def _points(axes: Axes, points: Floats, across: tuple[int, int]) -> None:
     for chosen, colour, order in ((depth > SLICE_MM, "0.72", 1.0), (depth <= SLICE_MM, "black", 2.0)):
         few = np.compress(chosen, points, axis=0)
         few = few[:: max(1, -(-len(few) // MOST_POINTS))]
-        axes.plot(*few[:, across].T, ".", markersize=2.0, color=colour, zorder=order)
+        axes.plot(*few[:, across].T, ".", markersize=2.0, color=colour, zorder=order, rasterized=True)
 
 
 def _members(axes: Axes, result: spheres.Result, i: int, middle: Floats, across: tuple[int, int], reach: float) -> None:

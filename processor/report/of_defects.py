@@ -33,5 +33,6 @@ REPORT = StepReport(
     written=results_defects.written,
     tables=tables_defects.of_runs,
     figures=lambda execution, runs, report: figures_defects.of_runs(execution.scene, runs, report),
+    files=lambda _, run: figures_defects.files(run.result),
     live=view_defects.of_runs,
 )

@@ -92,7 +92,8 @@ def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
     }
 
 
-def _files(result: Result) -> dict[str, bytes]:
+def _files(_: Execution, run: StepRun) -> dict[str, bytes]:
+    result: Result = run.result
     text = core_points.csv_text(result.origin, result.core, result.distances, result.normals)
     return {"deviation.csv": text.encode("ascii")}
 

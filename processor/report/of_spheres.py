@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import collections
 
-from processor.report import dxf, figures_balls, results_balls, tables_balls, view_balls
+from processor.model import StepRun
+from processor.pipeline import Execution
+from processor.report import dxf, figures_ball, figures_balls, results_balls, tables_balls, view_balls
 from processor.report.step_report import StepReport
 from processor.steps import spheres
 
@@ -16,8 +18,12 @@ def _summary(result: spheres.Result) -> tuple[str, str]:
     return head, f"Flagged: {named}." if named else ""
 
 
-def _files(result: spheres.Result) -> dict[str, bytes]:
-    return {"nodes.dxf": dxf.drawing(result)} if len(result.tube_radii) else {}
+def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
+    found = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tube_radii) else {}
+    if tables_balls.has_bounds(run.result):
+        pages = figures_ball.document(execution.scene, run.result, execution.stored)
+        found |= {figures_ball.DOCUMENT: pages} if pages else {}
+    return found
 
 
 REPORT = StepReport(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import collections
 
+from processor.model import StepRun
+from processor.pipeline import Execution
 from processor.report import figures_stitch, results_stitch, tables_stitch, view_stitch
 from processor.report.step_report import StepReport
 from processor.stitching.result import Result
@@ -17,8 +19,8 @@ def _summary(result: Result) -> tuple[str, str]:
     return head, f"Flagged: {named}. {pairs}" if named else pairs
 
 
-def _files(result: Result) -> dict[str, bytes]:
-    return {results_stitch.POSES: results_stitch.poses(result)}
+def _files(_: Execution, run: StepRun) -> dict[str, bytes]:
+    return {results_stitch.POSES: results_stitch.poses(run.result)}
 
 
 REPORT = StepReport(

@@ -24,7 +24,7 @@ class StepReport:
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
     figures: Callable[[Execution, Sequence[StepRun], ErrorReport], Drawn]  # file names are the step's own
     further: Callable[[Any], list[tuple[str, str]]] = lambda _: []  # heads and texts beside the verdict
-    files: Callable[[Any], dict[str, bytes]] = lambda _: {}  # further files in OUT by name
+    files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     live: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None  # what the page's script draws
 
 

@@ -18,7 +18,7 @@ from processor.report import figures, page, printing, results_json, step_report,
 
 RESULTS, RUNS = "results.json", "results.h5"
 OWN_NAMES = (RESULTS, RUNS, "report.html", "figures", "job.json")  # the last is a batch's; gone, it does the job again
-OWN_ENDINGS = (".csv", ".dxf")
+OWN_ENDINGS = (".csv", ".dxf", ".pdf")
 
 
 def check_output(out: Path, source: Path, mark: str = RESULTS, own: Collection[str] = OWN_NAMES) -> None:
@@ -39,7 +39,7 @@ def check_output(out: Path, source: Path, mark: str = RESULTS, own: Collection[s
 
 
 def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
-    """Write results.h5, results.json, CSV tables, figures, drawing and report.html into ``out``, in place of others.
+    """Write results.h5, results.json, CSV tables, figures, drawings and report.html into ``out``, in place of others.
 
     The page alone is in the language ``lang``; tables and numbers for other programs are not. Raises InputError where
     they cannot be written; then ``out`` is as it was.
@@ -52,7 +52,7 @@ def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en"
             if table.file:
                 write_text(making / f"{table.file}.csv", printing.csv_text(table))
         for run, _ in tables.grouped(execution.runs):
-            for name, data in step_report.of(run.step).files(run.result).items():
+            for name, data in step_report.of(run.step).files(execution, run).items():
                 write_bytes(making / name, data)
         drawn = figures.of_run(execution, report)
         if any(drawn.values()):

@@ -1,8 +1,7 @@
 """Picked points with noise on the stations of a scene, and what its propagation through the network lets expect.
 
-Each scan is tied to the two after it by points of the structure that both stand before, and the last to the first: a
-chain with loops. The propagation is the linear least-squares one of all picks at once, written here anew: unknown are
-the poses, with seven parameters a scale a pair too.
+The propagation is the linear least-squares one of all picks at once, written here anew: unknown are the poses, with
+seven parameters a scale a pair too.
 """
 
 from __future__ import annotations
@@ -11,51 +10,21 @@ import dataclasses
 
 import numpy as np
 
-from processor.model import Picks
+from designgen import picking
 from processor.steps import stitch
 
 NOISE_MM = 5.0
 POINTS = 3  # as in the paper
-LEAST_APART_MM = 4000.0
-AWAY_FROM_A_LINE = 0.15  # of the longest side
-
-
-def pairs_of(count):
-    """Rows of the scans that are tied."""
-    return sorted({(min(p), max(p)) for i in range(count) for p in ((i, (i + 1) % count), (i, (i + 2) % count))})
-
-
-def spread_points(points, rng):
-    """Draw POINTS of points (n, 3) that are far from one another and from a line."""
-    while True:
-        p = points[rng.choice(len(points), POINTS, replace=False)]
-        sides = np.linalg.norm(p - np.roll(p, 1, axis=0), axis=1)
-        height = np.linalg.norm(np.cross(p[1] - p[0], p[2] - p[0])) / sides.max()
-        if sides.min() > LEAST_APART_MM and height > AWAY_FROM_A_LINE * sides.max():
-            return p
 
 
 def picked(scene, truth, draw):
     """Scene with noisy picks, true poses (k, 4, 4), and the places picked (p, POINTS, 3) with their pairs."""
-    rng = np.random.default_rng(draw)
     known = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
     T = np.stack([known[scan.name] for scan in scene.scans])
-    rows, places = [], []
-    pairs = pairs_of(len(scene.scans))
-    for a, b in pairs:
-        own = scene.scans[a]
-        x = spread_points(own.points + own.origin, rng) @ T[a][:3, :3].T + T[a][:3, 3]
-        places.append(x)
-        for k, p in enumerate(x):
-            at = [(np.linalg.inv(T[s]) @ [*p, 1.0])[:3] + rng.normal(0.0, NOISE_MM, 3) for s in (a, b)]
-            rows.append((own.name, scene.scans[b].name, f"P{k}", *at))
-    names_a, names_b, names, in_a, in_b = zip(*rows, strict=True)
-    return (
-        dataclasses.replace(scene, picks=Picks(names_a, names_b, names, np.array(in_a), np.array(in_b))),
-        T,
-        pairs,
-        places,
-    )
+    picks, places = picking.pick(scene.scans, T, picking.Params(POINTS, NOISE_MM), draw)
+    row = {scan.name: k for k, scan in enumerate(scene.scans)}
+    pairs = [(row[a], row[b]) for a, b in zip(picks.scan_a[::POINTS], picks.scan_b[::POINTS], strict=True)]
+    return dataclasses.replace(scene, picks=picks), T, pairs, places.reshape(-1, POINTS, 3)
 
 
 def expected(T, pairs, places, scale_free):

@@ -30,7 +30,7 @@ SOURCES = Path(language.__file__).parents[1]
 NAMES = {
     *(f"S{i}" for i in range(9)),
     *("site", "scan", "made", "component", "ply", "summary", "timings"),
-    *("automatic", "default", "paper", "three", "point", "stitch", "deviation", "spheres"),
+    *("automatic", "default", "paper", "three", "point", "stitch", "deviation", "spheres", "defects", "pdf"),
     *("PRCS", "SOCS", "GLCS", "T_PRCS_SOCS", "GLCS_PRCS", "LOD95", "lod95", "ppm", "rms"),
 }
 

@@ -7,6 +7,7 @@ import io
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 
@@ -349,7 +350,15 @@ def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
     execution, report = of_frame()
     writing.write(tmp_path / "out", execution, report)
     found = {path.name for path in (tmp_path / "out").iterdir()}
-    assert {"nodes.dxf", "balls.csv", "lowest.csv", "nodes.csv", "tubes.csv", "stations.csv"} <= found
+    assert {
+        "nodes.dxf",
+        "balls-to-look-at.pdf",
+        "balls.csv",
+        "lowest.csv",
+        "nodes.csv",
+        "tubes.csv",
+        "stations.csv",
+    } <= found
     writing.check_output(tmp_path / "out", tmp_path / "b.h5")
     writing.write(
         tmp_path / "out", Execution(execution.scene, (StepRun("spheres", "ransac", "{}", balls()),), PROVENANCE), report
@@ -395,6 +404,27 @@ def test_at_most_twelve_balls_have_a_picture_worst_first():
     assert len(drawn) == 12
     assert [caption.split(",")[1].split(":")[0].strip() for caption, _ in drawn.values()][:8] == ["wrong-size"] * 8
     assert "the first 12 of" in next(iter(drawn.values()))[0]
+    made = dataclasses.replace(made, **many, **texts)
+    every = figures_ball.doubtful(scene(made), made)
+    assert pages_of(figures_ball.document(scene(made), made)) == len(every) > 12
+
+
+def pages_of(pdf):
+    assert pdf.startswith(b"%PDF-")
+    return len(re.findall(rb"/Type /Page\b", pdf))
+
+
+def test_a_ball_to_look_at_has_a_page_with_its_numbers():
+    made = whole()
+    i = made.flag.index("wrong-size")
+    said = dict(figures_ball._numbers(made, i, np.array([1.0, -2.0, 0.5])))
+    half = 1.96 * np.sqrt(made.covariance[i, 3, 3])
+    assert said["radius"] == f"{made.radii[i]:.2f} ± {half:.2f}"
+    assert said["off the design's place, y"] == "2.00"  # found less designed
+    pdf = figures_ball.document(scene(made), made)
+    assert pages_of(pdf) == 3
+    assert pdf == figures_ball.document(scene(made), made)
+    assert figures_ball.document(scene(made), dataclasses.replace(made, flag=("ok",) * len(made.flag))) == b""
 
 
 def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():

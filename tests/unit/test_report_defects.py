@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import re
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from processor.defects import pictures, surface
 from processor.defects.fields import Field
 from processor.defects.result import Result
 from processor.evaluate import ErrorReport
-from processor.report import page, view_defects, view_points
+from processor.report import figures_defects, page, view_defects, view_points
 from tests import step_results
 from tests.unit.test_report_adjusted import Page
 
@@ -100,3 +101,12 @@ def test_small_defects_are_drawn_whole_and_lie_on_large_ones(plates):
     assert 300 < count[1] < 500
     unseen = dataclasses.replace(field, count=np.where(away < 60.0, 0, 1))
     assert (pictures.of_surface([small], unseen, found, 500)["surface_defect"] == -1).all()
+
+
+def test_every_defect_has_a_page():
+    result = step_results.defects()
+    (name, pdf), *none = figures_defects.files(result).items()
+    assert (name, none) == ("defects.pdf", [])
+    assert len(re.findall(rb"/Type /Page\b", pdf)) == len(result.picture_defect) > 0
+    assert pdf == figures_defects.files(result)[name]
+    assert figures_defects.files(Result("failed", "default", "no point")) == {}

@@ -1,0 +1,74 @@
+"""Common points as somebody would pick them in pairs of scans, with the noise of a hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from designgen.randomness import generator
+from processor.geometry import rigid
+from processor.model import Floats, Picks, Scan, UsageError
+
+AWAY_FROM_A_LINE = 0.15  # of the longest side of three points: least distance of the third from it
+MOST_DRAWS = 10_000
+
+
+@dataclass(frozen=True)
+class Params:
+    """How points are picked; ``apart_mm`` is the least distance of two of them in a pair of scans."""
+
+    points: int = 3
+    sigma_mm: float = 5.0  # of each coordinate in each scan
+    apart_mm: float = 4000.0
+
+
+def pick(scans: Sequence[Scan], T_project_scan: Sequence[Floats], params: Params, seed: int) -> tuple[Picks, Floats]:
+    """Pick points in scans in a ring, each tied to the two after it, and their true places (q, 3) in the project.
+
+    The points are of the first scan of a pair, in both with noise: that the other sees them too is taken for granted.
+    Raises UsageError for less than two scans or three points, and where a scan has none far enough apart.
+    """
+    if params.points < 3 or not params.sigma_mm >= 0.0 or not params.apart_mm >= 0.0:
+        raise UsageError(
+            "picks: expected points from 3, sigma_mm and apart_mm from 0, got "
+            f"{params.points}, {params.sigma_mm:g} and {params.apart_mm:g}"
+        )
+    if len(scans) < 2:
+        raise UsageError("picks: expected two scans or more; give the recipe more stations, and leave them unmerged")
+    rng = generator(seed, "picks")
+    scan_a, scan_b, names = [], [], []
+    in_a, in_b, places = [], [], []
+    for a, b in _pairs(len(scans)):
+        own = _apart(scans[a], params, rng) + scans[a].origin
+        there = rigid.apply(T_project_scan[a], own)
+        places.append(there)
+        in_a.append(own + rng.normal(0.0, params.sigma_mm, own.shape))
+        in_b.append(rigid.apply(rigid.invert(T_project_scan[b]), there) + rng.normal(0.0, params.sigma_mm, own.shape))
+        scan_a += [scans[a].name] * len(own)
+        scan_b += [scans[b].name] * len(own)
+        names += [f"P{k + 1}" for k in range(len(own))]
+    return Picks(tuple(scan_a), tuple(scan_b), tuple(names), np.vstack(in_a), np.vstack(in_b)), np.vstack(places)
+
+
+def _pairs(count: int) -> list[tuple[int, int]]:
+    ring = {tuple(sorted((i, (i + step) % count))) for i in range(count) for step in (1, 2) if step < count}
+    return sorted((a, b) for a, b in ring)
+
+
+def _apart(scan: Scan, params: Params, rng: np.random.Generator) -> Floats:
+    """Draw points (k, 3) of a scan that are far from one another, no three of them in a line."""
+    for _ in range(MOST_DRAWS):
+        if len(scan.points) < params.points:
+            break
+        chosen: Floats = scan.points[rng.choice(len(scan.points), params.points, replace=False)]
+        sides = np.linalg.norm(chosen[:, None] - chosen, axis=2)[np.triu_indices(params.points, 1)]
+        # The second largest extent of the points: across the line they are nearest to.
+        across = np.linalg.svd(chosen - chosen.mean(axis=0), compute_uv=False)[1]
+        if sides.min() >= params.apart_mm and across > AWAY_FROM_A_LINE * sides.max():
+            return chosen
+    raise UsageError(
+        f"picks: scan {scan.name} has no {params.points} points {params.apart_mm:g} mm from one another and away from "
+        "a line; ask for fewer points or a smaller picks.apart_mm"
+    )
