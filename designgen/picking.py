@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from designgen.randomness import generator
-from processor.geometry import rigid
 from processor.model import Floats, Picks, Scan, UsageError
 
 AWAY_FROM_A_LINE = 0.15  # of the longest side of three points: least distance of the third from it
@@ -42,10 +41,11 @@ def pick(scans: Sequence[Scan], T_project_scan: Sequence[Floats], params: Params
     in_a, in_b, places = [], [], []
     for a, b in _pairs(len(scans)):
         own = _apart(scans[a], params, rng) + scans[a].origin
-        there = rigid.apply(T_project_scan[a], own)
+        there = own @ T_project_scan[a][:3, :3].T + T_project_scan[a][:3, 3]
+        in_other = (there - T_project_scan[b][:3, 3]) @ T_project_scan[b][:3, :3]
         places.append(there)
         in_a.append(own + rng.normal(0.0, params.sigma_mm, own.shape))
-        in_b.append(rigid.apply(rigid.invert(T_project_scan[b]), there) + rng.normal(0.0, params.sigma_mm, own.shape))
+        in_b.append(in_other + rng.normal(0.0, params.sigma_mm, own.shape))
         scan_a += [scans[a].name] * len(own)
         scan_b += [scans[b].name] * len(own)
         names += [f"P{k + 1}" for k in range(len(own))]

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import csv
 import dataclasses
 import json
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,9 +18,9 @@ import numpy as np
 from designgen import scan_files
 from designgen.scan_files import Written
 from processor import store
-from processor.model import KEY_POINTS, ArchDesign, FrameDesign, PointLabels, Scan, Scene, UsageError
-from processor.picks_file import PICKS, write_picks
+from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Picks, PointLabels, Scan, Scene, UsageError
 
+PICKS, PICK_COLUMNS = "picks.csv", ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
 FEWEST_POINTS = 4  # that a reader takes for a scan
 
 
@@ -123,9 +124,19 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_me
         _write_json(folder / "stations.json", places)
     if scene.picks is not None:
         names = {scan.name: name for file in written for name, scan, _ in file.read_as}
-        write_picks(folder / PICKS, scene.picks, names, scale)
+        _write_picks(folder / PICKS, scene.picks, names, scale)
     (folder / "project.toml").write_text("\n".join(lines) + "\n", encoding="utf-8")
     return written
+
+
+def _write_picks(path: Path, picks: Picks, names: Mapping[str, str], scale: float) -> None:
+    """Write picked points between the scans that have ``names``, coordinates times ``scale``."""
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(PICK_COLUMNS)
+        for a, b, point, *at in zip(picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True):
+            if a in names and b in names:
+                rows.writerow([names[a], names[b], point, *(np.concatenate(at) * scale).tolist()])
 
 
 def _of_file(scans: Sequence[Scan]) -> list[str]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -58,13 +58,3 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
         raise InputError(f"{path}: holds no points; expected three or more a pair of scans")
     table = np.array(numbers) * MM_PER_UNIT[unit]
     return Picks(tuple(names_a), tuple(names_b), tuple(points), table[:, :3], table[:, 3:])
-
-
-def write_picks(path: Path, picks: Picks, names: Mapping[str, str], scale: float) -> None:
-    """Write picked points between the scans that have ``names``, coordinates times ``scale``."""
-    with path.open("w", encoding="utf-8", newline="") as file:
-        rows = csv.writer(file, lineterminator="\n")
-        rows.writerow(COLUMNS)
-        for a, b, point, *at in zip(picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True):
-            if a in names and b in names:
-                rows.writerow([names[a], names[b], point, *(np.concatenate(at) * scale).tolist()])
