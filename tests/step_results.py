@@ -89,7 +89,7 @@ def defects(count=ALL, message="1.2 m2 examined of 2.4 m2 of the design's surfac
         tuple(f"component-{i + 1}" for i in range(count)),
         np.column_stack([rng.uniform(100.0, 1000.0, count), np.zeros(count), rng.uniform(50.0, 500.0, count)]),
         np.tile(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), (count, 1, 1)), np.full((count, 2), 120.0),
-        9e3 * one, one, 0.2 * one, one, 1e4 * one, 1e3 * one, 50.0 * one, one, 0.2 * one, 9.0 * one,
+        9e3 * one, one, 0.2 * one, one, 1e4 * one, 1e3 * one, 50.0 * one, one, 0.2 * one, 9.0 * one, 1e-9 * one,
         tuple(remarks[i % 3] if i % 4 else "" for i in range(count)),
         np.zeros(4, np.int64), np.linspace(-200.0, 200.0, 4), one[:1].repeat(4), 0.1 * one[:1].repeat(4),
         np.arange(shown), np.full((shown, 2), side), np.full((shown, 2), -30.0), np.full(shown, 12.0),

@@ -22,6 +22,7 @@ from processor.defects.small import Near
 from processor.defects.surface import DesignSurface
 from processor.model import NORMAL_95, Floats, Ints
 
+CHANCE_MM2 = 1e8  # the surface that chance is counted on
 CURVE_STRIPS = 40
 SMALL_CELLS = 8.0  # of diameter, below which points are fitted and not cells
 SHALLOW_SHARE = 0.1  # of a component's shape that a model of it may be wrong by
@@ -150,7 +151,7 @@ def _shapes(found: Found) -> Iterator[Row]:
                 "depth_max": depth, "depth_ci95": judged.ci95, "depth_mean": volume / float(area[part].sum()),
                 "volume_mm3": volume, "volume_ci95": judged.ci95 * float(area.sum()) / NORMAL_95,
                 "edge_mm": float(frame.half[:2].min()), "curvature_per_m": _curvature(judged, frame.half),
-                "lod95": lod, "z": judged.z,
+                "lod95": lod, "z": judged.z, "chance": judged.chance * CHANCE_MM2,
             }  # fmt: skip
             yield Row(named, component, columns, rows[part], found.field, curve=curve)
 
@@ -196,7 +197,7 @@ def _places(found: Found) -> Iterator[Row]:
             "centres": got.centre, "axes": got.axes, "extent": got.extent, "area_mm2": got.area,
             "depth_max": depth, "depth_ci95": got.depth_ci95, "depth_mean": got.mean,
             "volume_mm3": got.volume, "volume_ci95": got.volume_ci95, "edge_mm": got.edge,
-            "curvature_per_m": got.curvature, "lod95": got.lod95, "z": main.z,
+            "curvature_per_m": got.curvature, "lod95": got.lod95, "z": main.z, "chance": main.chance * CHANCE_MM2,
         }  # fmt: skip
         yield Row(
             named, component, columns, np.unique(np.concatenate([one.cells for one in group])), found.left, remark

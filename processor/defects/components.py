@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from processor.defects import shapes
 from processor.defects.alignment import Alignment, chart_of_cells
@@ -143,6 +143,7 @@ class Judged:
     peak: float
     ci95: float
     z: float
+    chance: float  # how many as strong chance brings on one mm2
     margin: float  # how much more the best of other kinds leaves, in standard deviations squared
 
 
@@ -209,7 +210,8 @@ def significant(
             sd = float(np.sqrt(formal**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration[top] ** 2))
             z = abs(float(value[top])) / sd
             if z > threshold:
+                chance = 2.0 * float(ndtr(-z)) * len(shapes.BASES) / area
                 found.setdefault(one.component, []).append(
-                    Judged(shape, float(value[top]), NORMAL_95 * sd, z, one.fitted.margin / inflation**2)
+                    Judged(shape, float(value[top]), NORMAL_95 * sd, z, chance, one.fitted.margin / inflation**2)
                 )
     return found

@@ -217,7 +217,7 @@ def _result(
             "extent": [np.ptp(along) + size, np.ptp(across) + size], "area_mm2": area, "depth_max": -d[top],
             "depth_ci95": NORMAL_95 * cloud[1], "depth_mean": -d.mean(), "volume_mm3": -d.mean() * area,
             "volume_ci95": np.nan, "edge_mm": np.nan, "curvature_per_m": np.nan, "lod95": threshold,
-            "z": abs(d[top]) / max(cloud[1], 1e-12), "remarks": "",
+            "z": abs(d[top]) / max(cloud[1], 1e-12), "chance": np.nan, "remarks": "",
         })  # fmt: skip
         curves.append(deflection.by_slopes(along, d, min(params.paper.strips, max(2, len(at) // 4))))
     order = sorted(range(len(rows)), key=lambda k: -abs(rows[k]["volume_mm3"]))

@@ -23,12 +23,16 @@ DOUBT = 0.5  # of the points expected that are counted on: scanners thin out whe
 
 @dataclass(frozen=True)
 class Region:
-    """Cells of one face; ``sign`` -1 inward, 1 outward, 0 missing; ``z`` the largest deviation by its noise."""
+    """Cells of one face; ``sign`` -1 inward, 1 outward, 0 missing; ``z`` the largest deviation by its noise.
+
+    ``chance`` is how many as strong chance brings on one mm2.
+    """
 
     chart: int
     cells: Ints  # rows of all cells
     sign: int
     z: float
+    chance: float
 
 
 def of_finding(finding: Finding, surface: DesignSurface) -> list[Region]:
@@ -38,13 +42,12 @@ def of_finding(finding: Finding, surface: DesignSurface) -> list[Region]:
     for chart in range(len(charts.kind)):
         if not finding.sign[charts.cells(chart)].any():
             continue
-        sign, z = (charts.image(x, chart) for x in (finding.sign.astype(float), finding.z))
+        sign, z, chance = (charts.image(x, chart) for x in (finding.sign.astype(float), finding.z, finding.chance))
         for way in (-1, 1):
             whole = ndimage.binary_closing(np.pad(sign == way, 2), ROUND)[2:-2, 2:-2] & (sign != -way)
-            found += [
-                Region(chart, rows, way, float(np.abs(z.ravel()[rows - charts.first[chart]]).max()))
-                for rows in _connected(whole, charts, chart)
-            ]
+            for rows in _connected(whole, charts, chart):
+                own = rows - charts.first[chart]
+                found.append(Region(chart, rows, way, float(np.abs(z.flat[own]).max()), float(chance.flat[own].min())))
     return found
 
 
@@ -72,7 +75,8 @@ def missing(field: Field, hoped: Expected, surface: DesignSurface, alarms_per_mm
             # Chernoff's bound of a Poisson number far below what is expected.
             strength = lost - got + (got * np.log(got / lost) if got else 0.0) if lost > got else 0.0
             if strength > needed:
-                found.append(Region(chart, own, 0, float(np.sqrt(2.0 * strength))))
+                chance = float(np.exp(-strength)) / charts.cell_mm**2
+                found.append(Region(chart, own, 0, float(np.sqrt(2.0 * strength)), chance))
     return found
 
 
@@ -161,7 +165,8 @@ def _joined(group: list[Region]) -> list[Region]:
     if len(alike) == 1:
         return group
     cells = np.unique(np.concatenate([one.cells for one in alike]))
-    whole = Region(first.chart, cells, first.sign, max(one.z for one in alike))
+    strongest = max(one.z for one in alike), min(one.chance for one in alike)
+    whole = Region(first.chart, cells, first.sign, *strongest)
     return [whole, *(one for one in group if not any(one is other for other in alike))]
 
 

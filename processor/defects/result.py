@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from processor.model import Checked, Floats, Ints, Labels, Shorts, column, names, optional
 
+DOUBTFUL = 0.01  # places as strong that chance brings on 100 m2
 CLASSES = (
     "dent", "bulge", "bend", "twist", "waviness", "edge-loss", "missing-part", "pit", "crack", "step", "misalignment",
     "unknown",
@@ -57,6 +59,7 @@ class Result(Checked):
     curvature_per_m: Floats = column("k")  # largest principal curvature of the deviation at the deepest place
     lod95: Floats = column("k")  # at the defect's own size
     z: Floats = column("k")  # how many standard deviations it is beyond noise
+    chance: Floats = column("k")  # how many as strong chance brings on 100 m2
     remarks: tuple[str, ...] = names("k")
     curve_defect: Ints = column("c", dtype=np.int64)
     curve_at_mm: Floats = column("c")
@@ -72,3 +75,9 @@ class Result(Checked):
     surface_at: Floats = column("t", 3)
     surface_mm: Shorts = column("t", dtype=np.float32)  # deviations, outward positive
     surface_defect: Labels = column("t", dtype=np.int32)  # row of the defect, -1 = of none
+
+    @property
+    def doubtful(self) -> npt.NDArray[np.bool_]:
+        """Return which defects (k,) may be chance: one as strong comes on less than 10 000 m2."""
+        found: npt.NDArray[np.bool_] = self.chance > DOUBTFUL
+        return found

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 from scipy import ndimage
-from scipy.special import ndtri
+from scipy.special import ndtr, ndtri
 
 from processor.defects.fields import Field
 from processor.defects.surface import CYLINDER, Charts, DesignSurface
@@ -34,24 +34,31 @@ LINE_GROWTH = 0.7  # standard deviations of a cell on such a line
 class Levels:
     """Of each size of window (k,): its side in cells, by how much noise is larger than formal, and the threshold.
 
-    ``common_mm`` is the standard deviation that means of the largest windows keep, however many points they hold.
+    ``common_mm`` is the standard deviation that means of the largest windows keep, however many points they hold;
+    ``per_mm2`` how many windows of all sizes chance may draw from on one mm2, were all of them of this one.
     """
 
     sides: tuple[int, ...]
     inflation: Floats
     threshold: Floats
+    per_mm2: Floats
     common_mm: float
     line_threshold: float
+    line_per_mm2: float
     line_inflation: float
     systematic_mm: float
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Cells (cells,) that a significant window lies on, inward -1 and outward 1, and the largest |z| there."""
+    """Cells (cells,) that a significant window lies on, inward -1 and outward 1, and the largest |z| there.
+
+    ``chance`` is how many windows as strong as the strongest there chance brings on one mm2.
+    """
 
     sign: npt.NDArray[np.int8]
     z: Floats
+    chance: Floats
 
 
 def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, systematic_mm: float) -> Levels:
@@ -76,40 +83,46 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, syste
         common = float(np.sqrt(max(own**2 - 1.0, 0.0)) * np.median(sd))
     inflation = np.maximum.accumulate(spread)
     cell = charts.cell_mm
-    windows = np.array([1.0 / (max(1, side // 4) * cell) ** 2 for side in sides])  # of each size on one mm2
-    share = alarms_per_mm2 / (len(sides) + len(LINE_CELLS))
-    chance = np.minimum(share / windows, 0.5)
-    lines = min(share * cell**2 / LINE_TURNS, 0.5)
-    return Levels(sides, np.asarray(inflation, float), -ndtri(0.5 * chance), common,
-                  -float(ndtri(0.5 * lines)), _line_inflation(field, charts, used), systematic_mm)  # fmt: skip
+    kinds = len(sides) + len(LINE_CELLS)
+    windows = kinds / np.array([max(1, side // 4) * cell for side in sides]) ** 2
+    lines = kinds * LINE_TURNS / cell**2
+    threshold = -ndtri(0.5 * np.minimum(alarms_per_mm2 / windows, 0.5))
+    line_threshold = -float(ndtri(0.5 * min(alarms_per_mm2 / lines, 0.5)))
+    return Levels(sides, np.asarray(inflation, float), threshold, windows, common, line_threshold, lines,
+                  _line_inflation(field, charts, used), systematic_mm)  # fmt: skip
 
 
 def search(field: Field, surface: DesignSurface, levels: Levels) -> Finding:
     """Find the cells that deviate, from small windows to large; what is found does not count in larger ones."""
     charts = surface.charts
-    sign, score = np.zeros(len(surface.share), np.int8), np.zeros(len(surface.share))
+    count = len(surface.share)
+    finding = Finding(np.zeros(count, np.int8), np.zeros(count), np.full(count, np.inf))
     for chart in _used(field, charts):
         rows = charts.cells(chart)
-        found, z = _search_chart(field, charts, chart, levels)
-        sign[rows], score[rows] = found.ravel(), z.ravel()
-    return Finding(sign, score)
+        own = _search_chart(field, charts, chart, levels)
+        finding.sign[rows], finding.z[rows], finding.chance[rows] = own.sign.ravel(), own.z.ravel(), own.chance.ravel()
+    return finding
 
 
 def _used(field: Field, charts: Charts) -> list[int]:
     return [k for k in range(len(charts.kind)) if field.seen[charts.cells(k)].any()]
 
 
-def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> tuple[npt.NDArray[np.int8], Floats]:
+def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> Finding:
+    """Search a face; the arrays of what is found are of its shape."""
     shape = tuple(charts.shape[chart])
-    sign, score = np.zeros(shape, np.int8), np.zeros(shape)
-    for side, inflation, threshold in zip(levels.sides, levels.inflation, levels.threshold, strict=True):
+    found = Finding(np.zeros(shape, np.int8), np.zeros(shape), np.full(shape, np.inf))
+    sign = found.sign
+    for side, inflation, threshold, per_mm2 in zip(
+        levels.sides, levels.inflation, levels.threshold, levels.per_mm2, strict=True
+    ):
         if side > min(shape):
             break
         top, weight = _window_sums(field, charts, chart, side, sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
             z = np.where(weight > 0.0, top / weight / np.hypot(inflation / np.sqrt(weight), levels.systematic_mm), 0.0)
         if side == LINES_AFTER:
-            _search_lines(field, charts, chart, levels, sign, score)
+            _search_lines(field, charts, chart, levels, found)
         if not (np.abs(z) > threshold).any():
             continue
         small_top, small_weight = _smoothed(field, charts, chart, max(1, side // 2), sign != 0)
@@ -122,14 +135,14 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> t
             covered, best = _spread(np.where(hit, way * z, 0.0), side, shape)
             grown = _whole_pieces(covered & (way * near > GROWTH) & (sign == 0), covered)
             sign[grown] = way
-            score[grown] = best[grown]
-    return sign, score
+            found.z[grown] = best[grown]
+            found.chance[grown] = 2.0 * ndtr(-best[grown]) * per_mm2
+    return found
 
 
-def _search_lines(
-    field: Field, charts: Charts, chart: int, levels: Levels, sign: npt.NDArray[np.int8], score: Floats
-) -> None:
-    """Find what is narrower than a window and long, in lines of cells in eight directions; fills sign and score."""
+def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, found: Finding) -> None:
+    """Find what is narrower than a window and long, in lines of cells in eight directions; adds it to ``found``."""
+    sign, score = found.sign, found.z
     top, weight = _images(field, charts, chart, sign != 0)
     for length in LINE_CELLS:
         if length > max(top.shape):
@@ -148,6 +161,8 @@ def _search_lines(
                         if inside and way * top[a, b] > LINE_GROWTH * np.sqrt(weight[a, b]):
                             sign[a, b] = way
                             score[a, b] = max(score[a, b], way * z[i, j])
+                            chance = 2.0 * ndtr(-way * z[i, j]) * levels.line_per_mm2
+                            found.chance[a, b] = min(found.chance[a, b], chance)
 
 
 def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:

@@ -119,6 +119,7 @@ def _numbers(result: Result, row: int) -> list[tuple[str, str]]:
         ("volume", f"{result.volume_mm3[row]:.0f} ± {result.volume_ci95[row]:.0f} mm3"),
         ("from the face's border", f"{result.edge_mm[row]:.0f} mm"),
         ("curvature", f"{result.curvature_per_m[row]:.2f} 1/m"),
+        ("by chance on 100 m2", f"{result.chance[row]:.1g}" + (", doubtful" if result.doubtful[row] else "")),
         ("LOD95 of its depth", f"{result.lod95[row]:.2f} mm"),
         *((f"centre {axis}", f"{at:.1f} mm") for axis, at in zip("xyz", result.centres[row].tolist(), strict=True)),
     ]

@@ -15,7 +15,10 @@ def _summary(result: Result) -> tuple[str, str]:
         return result.status, result.message
     counts = collections.Counter(result.classes)
     named = ", ".join(f"{counts[kind]} {kind}" for kind in CLASSES if counts[kind])
-    head = f"{result.status}, {len(result.ids) or 'no'} defect{'' if len(result.ids) == 1 else 's'} found"
+    doubtful = int(result.doubtful.sum())
+    sure = len(result.ids) - doubtful
+    head = f"{result.status}, {sure or 'no'} defect{'' if sure == 1 else 's'} found"
+    head += f" and {doubtful} doubtful" if doubtful else ""
     said = f"{named.capitalize()}. " if named else ""
     said += f"{result.examined_mm2 / 1e6:.1f} m2 examined"
     if len(result.scale_mm):

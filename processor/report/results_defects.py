@@ -55,6 +55,8 @@ def _defect(result: Result, k: int) -> dict[str, Any]:
         "curvature_per_m": result.curvature_per_m[k],
         "lod95": result.lod95[k],
         "z": result.z[k],
+        "by_chance_on_100_m2": result.chance[k],
+        "doubtful": bool(result.doubtful[k]),
         "remark": result.remarks[k],
         "deflection": {
             "along": result.curve_at_mm[curve],

@@ -16,7 +16,8 @@ from processor.report.table import Table
 LIST_NOTE = (
     "Centres in the design's frame; a depth inward is positive. ci95 is the half-width of the 95 % interval. What is "
     "missing is as deep as the design is thick. Confidence 0.5 is a coin's; below 0.6 a class is unknown, and "
-    "otherwise says what it would be. lod95 is the level of detection of the means that a depth comes from."
+    "otherwise says what it would be. lod95 is the level of detection of the means that a depth comes from. "
+    "Doubtful is what chance brings as strong on less than 10 000 m2."
 )
 LEAST_NOTE = (
     "What a place of this size has to deviate by, on the median of the surface, to be found at the false alarms asked "
@@ -39,6 +40,7 @@ def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
 def _in_short(result: Result, method: str) -> Table:
     counts = collections.Counter(result.classes)
     rows: list[tuple[Any, ...]] = [("defects", len(result.ids), "")]
+    rows += [("doubtful", int(result.doubtful.sum()), "")]
     rows += [(kind, counts[kind], "") for kind in CLASSES if counts[kind]]
     rows += [
         ("surface examined for deviations", result.examined_mm2 / 1e6, "m2"),
@@ -73,6 +75,8 @@ def _list(run: StepRun, answer: bool) -> Table:
             float(result.edge_mm[k]),
             float(result.curvature_per_m[k]),
             float(result.lod95[k]),
+            float(result.chance[k]),
+            "yes" if result.doubtful[k] else "no",
             result.remarks[k],
         )
         for k, id_ in enumerate(result.ids.tolist())
@@ -80,7 +84,7 @@ def _list(run: StepRun, answer: bool) -> Table:
     columns = (
         "id", "class", "confidence", "otherwise", "component", "x_mm", "y_mm", "z_mm", "area_mm2", "length_mm",
         "width_mm", "depth_max_mm", "depth_ci95_mm", "depth_mean_mm", "volume_mm3", "volume_ci95_mm3", "edge_mm",
-        "curvature_per_m", "lod95_mm", "remark",
+        "curvature_per_m", "lod95_mm", "by_chance_on_100_m2", "doubtful", "remark",
     )  # fmt: skip
     file = "defects" if answer else f"defects-{run.method}"
     note = LIST_NOTE if answer else result.message

@@ -53,14 +53,16 @@ def run_one(scanner: str, size: float, seed: int) -> dict[str, Any]:
         "points": result.points, "noise": result.noise_mm,
     }  # fmt: skip
     if truth.defects is None or not len(truth.defects.ids):
-        return {**found, "false": len(result.ids), "rows": []}
+        return {**found, "false": len(result.ids), "sure": int((~result.doubtful).sum()), "rows": []}
     rows = against_truth.matched(result, truth.defects)
     error, allowed = against_truth.depth_errors(result, truth.defects, rows)
-    found["false"] = len(result.ids) - int((rows >= 0).sum())
+    other = ~np.isin(np.arange(len(result.ids)), rows)
+    found["false"], found["sure"] = int(other.sum()), int((other & ~result.doubtful).sum())
     found["rows"] = [
         {
             "class": kind,
             "found": bool(rows[k] >= 0),
+            "doubtful": bool(rows[k] >= 0 and result.doubtful[rows[k]]),
             "named": result.classes[rows[k]] if rows[k] >= 0 else "",
             "error": float(error[k]),
             "allowed": float(allowed[k]),
@@ -79,7 +81,8 @@ def table(runs: list[dict[str, Any]]) -> str:
         own = [run for run in runs if run["scanner"] == scanner]
         area, false = sum(run["area_m2"] for run in own), sum(run["false"] for run in own)
         lines.append(
-            f"{scanner}: {false} false alarms on {area:.0f} m2 examined = {100.0 * false / area:.2f} on 100 m2"
+            f"{scanner}: {false} false alarms on {area:.0f} m2 examined = {100.0 * false / area:.2f} on 100 m2, "
+            f"{sum(run['sure'] for run in own)} of them not called doubtful"
         )
         sizes = sorted({run["size"] for run in own if run["rows"]})
         heads = "".join(f"{f'size {size:g}':>28}" for size in sizes)
@@ -122,6 +125,10 @@ def main() -> None:
             if given.json:
                 given.json.write_text(json.dumps(runs), "utf-8")
     print(table(runs))
+    by_chance = [(run["size"], row["doubtful"]) for run in runs for row in run["rows"] if row["found"]]
+    for size in sorted({one for one, _ in by_chance}):
+        own = [doubtful for one, doubtful in by_chance if one == size]
+        print(f"size {size:g}: {sum(own)} of {len(own)} found called doubtful")
     unsure = [row for run in runs for row in run["rows"] if row["found"]]
     for low, high in ((0.0, 0.6), (0.6, 0.9), (0.9, 0.99), (0.99, 1.01)):
         own = [row["named"] == row["class"] for row in unsure if low <= row["confidence"] < high]

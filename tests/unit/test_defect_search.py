@@ -92,6 +92,18 @@ def test_an_undamaged_structure_has_no_defect(seed):
     assert result.noise_mm == pytest.approx(0.4, rel=0.05)
 
 
+def test_what_chance_brings_is_called_doubtful():
+    """Asked for 5000 false alarms on 100 m2 there are some on 1 m2, at most as many, and none passes for sure."""
+    result = defects.run(scene_of(3, flat), defects.Params(false_alarms=5000.0))
+    allowed = 5000.0 * result.examined_mm2 / 1e8
+    assert 0 < len(result.ids) < allowed
+    assert result.doubtful.all()
+    assert (result.chance <= 5000.0 * (1.0 + 1e-9)).all()
+    fewer = (result.chance < 500.0).sum()
+    assert fewer < 0.1 * allowed + 3.0 * np.sqrt(0.1 * allowed)  # a tenth as often ten times as strong
+    assert "no defects found and" in of_defects.REPORT.summary(result)[0]
+
+
 def test_a_dent_a_bulge_and_a_pit_are_measured():
     dent, bulge, pit = (
         bump(3.0, 90.0, (250.0, 300.0)),
@@ -101,6 +113,7 @@ def test_a_dent_a_bulge_and_a_pit_are_measured():
     scene = scene_of(3, lambda x, z: dent(x, z) + bulge(x, z) + pit(x, z), spacing=3.0)
     result = defects.run(scene, defects.Params())
     assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
+    assert not result.doubtful.any()
     for kind, depth, radius, at in (("dent", 3.0, 90.0, (250.0, 300.0)), ("bulge", -2.0, 80.0, (1250.0, 350.0)),
                                     ("pit", 4.0, 16.0, (2100.0, 200.0))):  # fmt: skip
         k = result.classes.index(kind)
@@ -369,7 +382,7 @@ def test_the_pieces_of_a_crack_are_one_and_what_lies_beside_it_is_not():
     def piece(low, high, x=305.0, sign=-1):
         at = whole.centres[rows]
         own = rows[(np.abs(at[:, 0] - x) < 5.0) & (at[:, 2] > low) & (at[:, 2] < high)]
-        return regions.Region(chart, own, sign, 9.0)
+        return regions.Region(chart, own, sign, 9.0, 1e-12)
 
     slim, inside, beyond, far = piece(300, 380), piece(410, 425), piece(100, 200), piece(520, 590)
     beside, raised = piece(410, 425, x=345.0), piece(440, 470, sign=1)
