@@ -7,11 +7,13 @@ vision). The same run gives the same bytes: no dates, and none of the user's own
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable
+import re
+from collections.abc import Iterable, Sequence
 from functools import cache
 
 import numpy as np
 from matplotlib import font_manager
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
@@ -53,6 +55,15 @@ def pdf(pages: Iterable[Figure]) -> bytes:
 @cache
 def _font() -> FT2Font:
     return font_manager.get_font(font_manager.findfont("DejaVu Sans"))
+
+
+def write_beside(axes: Axes, rows: Sequence[tuple[str, str]], line: float, size: float) -> None:
+    """Write what and value, a row each, a share ``line`` of the panel's height apart; "–" for a number not known."""
+    axes.axis("off")
+    for row, (what, value) in enumerate(rows):
+        known = value if not re.search(r"\bnan\b", value) else "–"
+        for x, text, side in ((0.0, what, "left"), (1.0, known, "right")):
+            axes.text(x, 1.0 - line * row, text, fontsize=size, ha=side, va="top", transform=axes.transAxes)
 
 
 def label(name: str, place: int) -> str:

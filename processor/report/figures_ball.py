@@ -16,7 +16,7 @@ from matplotlib.patches import Circle
 from processor.bolt_balls.scene_source import SceneSource, of_scene
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Scene
-from processor.report.drawing import COLOURS, Drawn, pdf, png
+from processor.report.drawing import COLOURS, Drawn, pdf, png, write_beside
 from processor.report.dxf import nominal_places
 from processor.steps import spheres
 from processor.stored_points import StoredPoints, points_of
@@ -159,10 +159,7 @@ def _ball(result: spheres.Result, i: int, middle: Floats, nominal: Floats, point
         axes.grid(alpha=0.3)
     heading = f"Ball {int(result.ids[i])}: {result.flag[i]}. {result.reason[i]}"
     figure.suptitle("\n".join(textwrap.wrap(heading, 130)[:3]), fontsize=11)
-    beside.axis("off")
-    for row, (what, value) in enumerate(_numbers(result, i, nominal)):
-        for x, text, side in ((0.0, what, "left"), (1.0, value, "right")):
-            beside.text(x, 1.0 - LINE * row, text, fontsize=8, ha=side, va="top", transform=beside.transAxes)
+    write_beside(beside, _numbers(result, i, nominal), LINE, 8.0)
     handles = [
         Line2D([], [], marker=".", linestyle="", color="black", label=f"points within {SLICE_MM:g} mm of the plane"),
         Line2D([], [], marker=".", linestyle="", color="0.72", label="points before and behind it"),
@@ -198,7 +195,7 @@ def _numbers(result: spheres.Result, i: int, nominal: Floats) -> list[tuple[str,
         ("axes of members", f"{int(result.axes[i])}"),
         ("evidence", result.evidence[i]),
     ]
-    return [(what, "–" if "nan" in value else value) for what, value in rows]
+    return rows
 
 
 def _with(value: float, half: float, digits: int) -> str:

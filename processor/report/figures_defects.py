@@ -13,13 +13,25 @@ from matplotlib.figure import Figure
 from processor.defects.result import Result
 from processor.evaluate import ErrorReport
 from processor.model import Scene, StepRun
-from processor.report.drawing import COLOURS, DASHES, DIVERGING, LEAST_SHOWN_MM, MARKERS, Drawn, label, pdf, png
+from processor.report.drawing import (
+    COLOURS,
+    DASHES,
+    DIVERGING,
+    LEAST_SHOWN_MM,
+    MARKERS,
+    Drawn,
+    label,
+    pdf,
+    png,
+    write_beside,
+)
 
 MAPS, CURVES = "defects-maps.png", "defects-curves.png"
 ACROSS = 3
 MOST_CURVES = 4
 MOST_MAPS = 12
 DOCUMENT = "defects.pdf"
+LINE = 0.07  # of a panel's height
 MISSING = ("edge-loss", "missing-part")
 
 
@@ -46,11 +58,7 @@ def _page(result: Result, k: int) -> Figure:
     figure = Figure(figsize=(10.5, 8.2 if curve else 5.0), layout="constrained")
     grid = figure.add_gridspec(2 if curve else 1, 2, width_ratios=[1.6, 1.0])
     _map(figure.add_subplot(grid[0, 0]), figure, result, k)
-    beside = figure.add_subplot(grid[0, 1])
-    beside.axis("off")
-    for line, (what, value) in enumerate(_numbers(result, row)):
-        for x, text, side in ((0.0, what, "left"), (1.0, value, "right")):
-            beside.text(x, 1.0 - 0.07 * line, text, fontsize=9, ha=side, va="top", transform=beside.transAxes)
+    write_beside(figure.add_subplot(grid[0, 1]), _numbers(result, row), LINE, 9.0)
     if curve:
         _curves_of(figure.add_subplot(grid[1, :]), result, [row])
     return figure
@@ -123,8 +131,7 @@ def _numbers(result: Result, row: int) -> list[tuple[str, str]]:
         ("LOD95 of its depth", f"{result.lod95[row]:.2f} mm"),
         *((f"centre {axis}", f"{at:.1f} mm") for axis, at in zip("xyz", result.centres[row].tolist(), strict=True)),
     ]
-    remark = textwrap.wrap(result.remarks[row], 52)[:4]
-    return [(what, "–" if "nan" in value else value) for what, value in rows] + [(line, "") for line in remark]
+    return rows + [(line, "") for line in textwrap.wrap(result.remarks[row], 52)[:4]]
 
 
 def _curves(result: Result) -> tuple[str, bytes]:
