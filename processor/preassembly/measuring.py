@@ -29,6 +29,10 @@ from processor.preassembly.systematic import SystematicParams
 
 CELL_MM = 40.0  # points of one are looked up one after the other
 SIZE_SHARE = 0.01  # of its length, within which a scan is as large as a part: noise, form and voxels move it by less
+SLICES, LEAST_OF_TYPICAL = 40, 0.1  # of a part's length; of the points on a side of one, that cover another
+ACROSS = 0.7  # cosine: what looks less along the part is of its sides
+LEAST_COVERED = 0.7
+WHICH = "is this the right part, and whole?"
 RESIDUALS = 4_000  # points of a part whose distances from the design are kept
 
 
@@ -62,11 +66,12 @@ class _Placed:
     fitted: registration.Registration
     trouble: str
     told: twins.Told = field(default_factory=twins.Told)
+    doubt: str = ""  # why it may be of another part
 
     @property
     def rank(self) -> tuple[bool, bool, int]:
         """How well it stands: told from its mirror poses, held in all directions, by many points."""
-        return self.found.status == "ok", not self.fitted.weak, len(self.scan.points)
+        return self.found.status == "ok", not self.fitted.weak and not self.doubt, len(self.scan.points)
 
 
 @dataclass(frozen=True)
@@ -112,7 +117,8 @@ def see(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, do
     said_of = [first.found.message] if first.found.message else []
     for one in every:
         if one not in used:
-            said_of.append(f"scan {one.scan.name} is not used: {one.trouble or one.found.message or _unheld(one)}")
+            why = one.trouble or one.found.message or one.doubt or _unheld(one)
+            said_of.append(f"scan {one.scan.name} is not used: {why}")
     moved = np.vstack([rigid.apply(one.fitted.T_bridge_scan, one.points) for one in used])
     station = _stations([one.station for one in used])
     apart = _between_stations(moved, station, shape)
@@ -133,11 +139,12 @@ def see(scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, do
     edges = systematic.of_edges(edges, doubts, apart * between.share(station))
     member = network.Member((None, None), edges, part.vertices.mean(axis=0), pose)
     said_of += [_unheld(first)] if first.fitted.weak else []
+    said_of += [first.doubt] if first.doubt else []
     cost = surrogate.cost(part)
     said_of += [cost] if cost else []
     # One scan of the part that shows its mark is enough.
     said_of += [] if any(not one.told.open for one in used) else first.told.open
-    weak = bool(first.fitted.weak) or any(end is not None and end.trouble for end in ends)
+    weak = bool(first.fitted.weak or first.doubt) or any(end is not None and end.trouble for end in ends)
     status = "ambiguous" if first.found.status == "ambiguous" else "weak" if weak else "ok"
     like = _looks_like(first.points, design, part) if status != "ok" else ""
     said_of += [like] if like else []
@@ -183,12 +190,45 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
         trouble = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface, "
         trouble += f"the others typically {fitted.sigma_mm / 1.4826:.0f} mm"
     if trouble:
-        like = _looks_like(points, design, part) or "is this the right part, and whole?"
+        like = _looks_like(points, design, part) or WHICH
         return _Placed(scan, points, station, found, fitted, f"{trouble}; {like}")
+    doubt = ""
+    if fitted.used_share < 1.0 - registration.CLUTTER_SHARE:
+        # A part of another size lies on the design as far as the two are alike, and the rest passes for clutter.
+        away = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface"
+        like = _looks_like(points, design, part)
+        if like:
+            return _Placed(scan, points, station, found, fitted, f"{away}; {like}")
+        covered = _covered(points, fitted.T_bridge_scan, shape)
+        doubt = f"{away} and the others cover {covered:.0%} of its sides; {WHICH}" if covered < LEAST_COVERED else ""
     told = twins.tell(points, fitted.T_bridge_scan, shape, part, design)
     # A part of another size may have its mark, by chance, where the twin has its own.
     wrong = told.wrong and (_looks_like(points, design, part) or told.wrong)
-    return _Placed(scan, points, station, found, fitted, wrong, told)
+    return _Placed(scan, points, station, found, fitted, wrong, told, doubt)
+
+
+def _covered(points: Floats, T: Floats, shape: attitude.Surface) -> float:
+    """Share of the design's outer faces, in slices of its length, that points (n, 3) taken by T (4, 4) lie on."""
+    along = shape.points @ shape.axes[:, 0]
+    bounds = np.linspace(along.min(), along.max(), SLICES + 1)[1:-1]
+    slices = np.digitize(along, bounds)
+    sums = np.stack([np.bincount(slices, x, SLICES) for x in shape.points.T], axis=1)
+    middle: Floats = sums / np.maximum(np.bincount(slices, minlength=SLICES), 1)[:, None]
+
+    def counted(at: Floats, normals: Floats) -> Floats:
+        own = np.digitize(at @ shape.axes[:, 0], bounds)
+        across = normals @ shape.axes
+        outer = (np.abs(across[:, 0]) < ACROSS) & (np.einsum("ni,ni->n", at - middle[own], normals) > 0.0)
+        level = np.abs(across[:, 1]) > np.abs(across[:, 2])
+        face = 2 * level + (np.where(level, across[:, 1], across[:, 2]) > 0.0)
+        found: Floats = np.bincount(4 * own[outer] + face[outer], minlength=4 * SLICES).astype(float)
+        return found
+
+    moved = rigid.apply(T, thinned(points, registration.POINTS))
+    face, distance, beyond = shape.mesh.distances(moved, registration.GATES_MM[0])
+    near = on_face(face, beyond) & (np.abs(distance) < attitude.TELLING_MM)
+    seen = counted(moved[near], shape.mesh.normals[face[near]])[counted(shape.points, shape.normals) > 0.0]
+    return float((seen > LEAST_OF_TYPICAL * np.median(seen[seen > 0.0])).mean()) if seen.any() else 0.0
 
 
 def _unheld(one: _Placed) -> str:

@@ -14,6 +14,7 @@ from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene
 from processor.preassembly import attitude, features, measuring, twins
 from processor.preassembly.systematic import SystematicParams
 from processor.steps import preassemble
+from tests import arch_clouds
 from tests.arch_clouds import random_pose
 
 SMALL = arch_bridge.Params(
@@ -193,6 +194,63 @@ def test_neighbours_swapped_are_named(asked, came, said):
     found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=20.0))[0])
     assert found.status != "ok"
     assert found.message.endswith(f"by its size it is rather {said}")
+
+
+def placed(design, index, points):
+    part = design.parts[index]
+    return measuring._place(scanned(points)[0], part, design, attitude.sample_surface(part), 1.0)
+
+
+@pytest.fixture(scope="module")
+def on_foot():
+    """The rib turned about the arch's middle until it ends where the foot does: half of it lies on the foot."""
+    scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=1)
+    points = rigid.apply(truth.arch.T_bridge_scan[2], scene.scans[2].points)
+    turn = (arch_clouds.CUTS[1] - arch_clouds.CUTS[3]) * arch_clouds.ARC / arch_clouds.RADIUS
+    middle = arch_clouds.RADIUS * np.array([np.sin(arch_clouds.HALF_ANGLE), 0.0, -np.cos(arch_clouds.HALF_ANGLE)])
+    R = rigid.rotation_from_vector(np.array([0.0, turn, 0.0]))
+    return scene.arch, Scan("scan", (points - middle) @ R.T + middle)
+
+
+@pytest.mark.parametrize("strays", [0, 3])
+def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot, strays, monkeypatch):
+    """The upper half of this foot has the rib's section: the rest passed for clutter. With clutter no size tells."""
+    design, scan = on_foot
+    clutter = np.random.default_rng(1).normal(0.0, 100.0, (40 * strays, 3)) + 9e3
+    scan = dataclasses.replace(scan, points=np.vstack([scan.points, clutter]))
+    shape = attitude.sample_surface(design.parts[0])
+    stated = attitude.Attitude(np.eye(4), np.eye(4), "ok", "")
+    monkeypatch.setattr(attitude, "find", lambda *_: stated)
+    found = measuring._place(scan, design.parts[0], design, shape, 1.0)
+    assert 0.5 < found.fitted.used_share < 0.7
+    if strays:
+        assert found.doubt.endswith("of its sides; is this the right part, and whole?")
+        assert not found.rank[1]
+    else:
+        assert found.trouble.endswith("of the points are away from the design's surface; by its size it is rather rib2")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("clutter", "index"), [(0.0, 0), (0.2, 0), (0.0, 4)])
+def test_another_part_is_not_taken_for_a_foot(clutter, index):
+    scene, _ = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=1)
+    points = scene.scans[2].points
+    floor = np.random.default_rng(1).uniform([-9e3, -9e3, -5e3], [9e3, 9e3, -4.9e3], (int(clutter * len(points)), 3))
+    every = np.vstack([points, floor + points.mean(axis=0)])
+    wrong, right = placed(scene.arch, index, every), placed(scene.arch, 2, every)
+    assert wrong.trouble or wrong.doubt or wrong.found.status != "ok"
+    assert (right.found.status, right.trouble, right.doubt) == ("ok", "", "")
+
+
+def test_how_much_of_a_part_its_points_lie_on():
+    parts, design = bridge()
+    shape = attitude.sample_surface(design.parts[RIB])
+    points = cloud(parts[RIB], spacing_mm=30.0)
+    along = points @ shape.axes[:, 0]
+    half = along < 0.5 * (along.min() + along.max())
+    left = points[:, 1] > 0.5 * SMALL.width_mm - 30.0
+    for own, share in ((points, 1.0), (points[half], 0.5), (points[~left], 0.75)):
+        assert measuring._covered(own, np.eye(4), shape) == pytest.approx(share, abs=0.03)
 
 
 def test_a_rival_farther_along_is_not_called_a_turn():
