@@ -108,16 +108,24 @@ def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth
     off = (result.gaps - gaps)[known]
     share = 100.0 * float((np.abs(off) <= result.gap_ci95[known]).mean())
     none = float("nan")
-    stated = np.array([result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max])
-    size = np.abs(gaps[known])
-    true_figures = np.array([size.mean(), size.max(), _over(np.mean, linear), _over(np.max, linear)])
-    held = 100.0 * float((np.abs(stated - true_figures) <= result.errors_ci95[:4]).mean())
     return [
         Metric("preassemble", "gaps against the truth's, rms", float(np.sqrt(np.mean(off**2))), none, "mm"),
         Metric("preassemble", "gaps within their 95 % intervals", share, none, "%"),
-        Metric("preassemble", "mean and largest errors within their intervals", held, none, "%"),
+        *_errors_held(result, gaps[known], linear),
         *signed("preassemble", "gaps", off),
     ]
+
+
+def _errors_held(result: Result, gaps: Floats, linear: Floats) -> list[Metric]:
+    """How many of the mean and largest errors lie within their intervals; the truth has gaps (g,), departures (s,)."""
+    if not len(result.errors_ci95):
+        return []
+    stated = np.array([result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max])
+    size = np.abs(gaps)
+    true = np.array([size.mean(), size.max(), _over(np.mean, linear), _over(np.max, linear)])
+    share = float((np.abs(stated - true) <= result.errors_ci95[:4]).mean())
+    name = "mean and largest errors within their intervals"
+    return [Metric("preassemble", name, 100.0 * share, float("nan"), "%")]
 
 
 def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: float) -> tuple[Floats, Floats]:
