@@ -6,12 +6,11 @@ from collections.abc import Sequence
 
 import numpy as np
 from scipy.linalg import block_diag
-from scipy.stats import chi2
 
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats
 from processor.preassembly import network
-from processor.preassembly.joint_measures import CLEAR_SD
+from processor.preassembly.chain_verdicts import greatest
 from processor.preassembly.measuring import Measured
 from processor.preassembly.network import Adjusted
 
@@ -105,11 +104,8 @@ def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
         return float("nan"), float("nan")
     variance = np.maximum(variance[known], 0.0)
     size, sd = np.linalg.norm(vectors[known], axis=1), np.sqrt(variance.max(axis=1))
-    top = int(np.argmax(size))
-    near = size >= size[top] - CLEAR_SD * (sd + sd[top])
-    reach = float(np.sqrt(chi2.ppf(0.95 ** (1.0 / near.sum()), vectors.shape[1]))) * sd[near]
-    largest = max(float((size[near] + reach).max()) - size[top], size[top] - float((size[near] - reach).max()))
-    return NORMAL_95 * float(np.sqrt(variance.sum(axis=1).mean())), float(largest)
+    largest, low, high = greatest(size, sd, vectors.shape[1])
+    return NORMAL_95 * float(np.sqrt(variance.sum(axis=1).mean())), max(high - largest, largest - low)
 
 
 def _missing(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> str:

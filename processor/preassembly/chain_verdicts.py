@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import chi2, norm
 
 from processor.model import NORMAL_95, Floats, Limit, Tolerance
 from processor.preassembly import tolerance as limits_of
@@ -86,7 +86,7 @@ def _held(found: tuple[Floats, Floats], limit: Limit, span_mm: float, unsure: bo
         return nan, nan, low, high, "indeterminate", nan
     sides = []
     for sign, bound in ((-1.0, -low), (1.0, high)):
-        value, bottom, top = _greatest(sign * values, sd)
+        value, bottom, top = greatest(sign * values, sd)
         sides.append((bound - value, sign * value, top - value, guarded((bottom, top), -math.inf, bound)))
     verdict = worst([side[3] for side in sides])
     _, value, half, _ = min(sides, key=lambda side: side[0])
@@ -97,10 +97,12 @@ def _held(found: tuple[Floats, Floats], limit: Limit, span_mm: float, unsure: bo
     return value, half, low, high, "indeterminate" if unsure else verdict, probability
 
 
-def _greatest(values: Floats, sd: Floats) -> tuple[float, float, float]:
-    """Greatest of values (n,), and its 95 % interval."""
+def greatest(values: Floats, sd: Floats, axes: int = 1) -> tuple[float, float, float]:
+    """Greatest of values (n,), and its 95 % interval.
+
+    ``sd`` (n,) is of the value itself, or of each of the ``axes`` of the vector whose size it is.
+    """
     top = int(np.argmax(values))
     near = values >= values[top] - CLEAR_SD * (sd + sd[top]) - EXACT_MM
-    factor = float(norm.ppf(0.5 + 0.5 * 0.95 ** (1.0 / near.sum())))
-    reach = factor * sd[near]
+    reach = float(np.sqrt(chi2.ppf(0.95 ** (1.0 / near.sum()), axes))) * sd[near]
     return float(values[top]), float((values[near] - reach).max()), float((values[near] + reach).max())

@@ -70,7 +70,7 @@ def test_edges_are_held_all_along_and_limits_hang_on_the_span():
     # Where many may be it, the band holds all of them.
     low, high = [], []
     for _ in range(400):
-        _, bottom, top = chain_verdicts._greatest(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
+        _, bottom, top = chain_verdicts.greatest(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
         low.append(bottom)
         high.append(top)
     assert np.mean((np.array(low) <= 0.0) & (np.array(high) >= 0.0)) >= 0.95
