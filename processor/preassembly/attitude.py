@@ -6,8 +6,8 @@ Principal axes leave four proper rotations, eight where the section is nearly sq
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
+from functools import cache, partial
 from itertools import product
 
 import numpy as np
@@ -60,8 +60,18 @@ class Surface:
     normals: Floats
     tree: cKDTree
     mesh: MeshSurface
+    centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
     size: float  # diagonal of the bounding box
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """A pose ``T``, T_bridge_scan (4, 4), where its hypothesis began (4, 4), and its misfit in mm."""
+
+    T: Floats
+    start: Floats
+    misfit: float = np.inf
 
 
 def samples_of(part: DesignPart) -> tuple[Floats, Floats]:
@@ -88,14 +98,9 @@ def sample_surface(part: DesignPart) -> Surface:
     """Prepare the part's surface: samples, their tree, and the mesh itself."""
     points, normals = samples_of(part)
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
-    return Surface(
-        points,
-        normals,
-        cKDTree(points, balanced_tree=False),
-        mesh_surface.of_mesh(part.vertices, part.faces),
-        principal.of_mesh(part.vertices, part.faces).axes,
-        size,
-    )
+    mesh = mesh_surface.of_mesh(part.vertices, part.faces)
+    own = principal.of_mesh(part.vertices, part.faces)
+    return Surface(points, normals, cKDTree(points, balanced_tree=False), mesh, own.centre, own.axes, size)
 
 
 def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
@@ -165,53 +170,95 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     if len(seeds) < 50:
         seeds = points
     few = thinned(seeds, COARSE_POINTS)
-    coarse = each(partial(_tried, few, surface, COARSE_GATES_MM), [(T, T) for T in principal_hypotheses(points, part)])
-    if min(c[0] for c in coarse) > PIECE_MM:
+    begun = [_Candidate(T, T) for T in principal_hypotheses(points, part)]
+    coarse = each(partial(_tried, few, surface, COARSE_GATES_MM), begun)
+    box = _corners(points)
+    if min(c.misfit for c in coarse) > PIECE_MM:
         coarse += _of_pieces(seeds, few, surface, part)
-    promising = [c for c in coarse if c[0] <= PROMISING * min(c[0] for c in coarse) + PROMISING_MM]
+    coarse = _promising(coarse, box)
     # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
     seeds = thinned(points, FINE_POINTS)
     tried = partial(_tried, seeds, surface, FINE_GATES_MM)
-    candidates = each(tried, [(fitted, T) for _, fitted, T in promising])
-    # Few points hold a part of even curvature along itself, and it may have come to rest metres off: every attitude is
-    # tried from where the best one lies, too, turned as their beginnings are.
-    _, best, start = min(candidates, key=lambda item: item[0])
-    candidates += each(tried, [(T @ rigid.invert(start) @ best, T) for _, _, T in promising if T is not start])
-    candidates.sort(key=lambda item: item[0])
-    misfit, best, start = candidates[0]
-    if misfit > NO_FIT_MM:
-        return Attitude(start, best, "failed", f"no attitude fits the design (typical distance {misfit:.0f} mm)")
-    message, other = "", np.full((4, 4), np.nan)
-    for rival_misfit, rival, rival_start in candidates[1:]:
-        if rival_misfit > RIVAL_RATIO * misfit + 0.5:
-            break
-        if _largest_move(best, rival, points) < SAME_POSE_MM:
-            continue
-        # Evidence counts tens of millimetres: neither pose may be off by such along the part.
-        best, rival = (registration.fine(seeds, surface.mesh, surface.axes, T).T_bridge_scan for T in (best, rival))
-        ours, theirs = _evidence(points, surface, best, rival)
-        more, fewer = max(ours, theirs), min(ours, theirs)
-        if more < LEAST_EVIDENCE or more < 2 * fewer:
-            message, other = _said_of(best, rival, surface), rival
-        elif theirs > ours:
-            best, start, message, other = rival, rival_start, "", np.full((4, 4), np.nan)
-    return Attitude(start, best, "ambiguous" if message else "ok", message, other)
+    candidates = _distinct(each(tried, coarse), box)
+    # Few points hold a part of even curvature along itself, and it may have come to rest metres off; and what lies
+    # beside the part turns its principal axes, from which the right attitude may not be reached. Every attitude is
+    # tried from where the best one lies, too: turned as their beginnings are, and as the part may lie on itself.
+    best = candidates[0]
+    turns = [c.start @ rigid.invert(best.start) for c in coarse]
+    turns += [_about(surface.centre, R) for R in _rotations(surface.axes, surface.axes)]
+    turned = [_Candidate(S @ best.T, S @ best.start) for S in turns]
+    screened = each(partial(_tried, few, surface, COARSE_GATES_MM[1:]), turned)
+    turned = _promising([replace(c, misfit=s.misfit) for c, s in zip(turned, screened, strict=True)], box)
+    candidates = _distinct(candidates + each(tried, turned), box)
+    best = candidates[0]
+    if best.misfit > NO_FIT_MM:
+        said = f"no attitude fits the design (typical distance {best.misfit:.0f} mm)"
+        return Attitude(best.start, best.T, "failed", said)
+    rivals = [c for c in candidates if c.misfit <= RIVAL_RATIO * best.misfit + 0.5]
+    return _settled(points, box, seeds, surface, rivals)
 
 
-def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -> list[tuple[float, Floats, Floats]]:
+def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -> list[_Candidate]:
     """Try the part's pieces: what stands best after a few quick steps goes through the coarse gates."""
     quick = thinned(few, PIECE_POINTS)
 
-    def stepped(T: Floats) -> tuple[float, Floats]:
+    def stepped(T: Floats) -> _Candidate:
         given = (quick, surface.points, surface.normals, T)
         gate = COARSE_GATES_MM[:1]
         fitted = icp.point_to_plane(
             *given, gates_mm=gate, tree=surface.tree, axes=surface.axes, max_iterations=PIECE_ITERATIONS
         ).T_target_source
-        return _misfit(quick, surface, fitted), fitted
+        return _Candidate(fitted, fitted, _misfit(quick, surface, fitted))
 
-    best = sorted(each(stepped, piece_hypotheses(seeds, part)), key=lambda item: item[0])[:PIECES_KEPT]
-    return each(partial(_tried, few, surface, COARSE_GATES_MM), [(T, T) for _, T in best])
+    best = sorted(each(stepped, piece_hypotheses(seeds, part)), key=lambda c: c.misfit)[:PIECES_KEPT]
+    return each(partial(_tried, few, surface, COARSE_GATES_MM), [_Candidate(c.T, c.T) for c in best])
+
+
+def _about(centre: Floats, R: Floats) -> Floats:
+    """Turn (4, 4) by R (3, 3) about a centre (3,)."""
+    return rigid.transform(R, centre - R @ centre)
+
+
+def _distinct(candidates: list[_Candidate], box: Floats) -> list[_Candidate]:
+    """Sort candidates by their misfit; of those that take the corners of the scan's box (8, 3) alike, keep one."""
+    kept: list[_Candidate] = []
+    for one in sorted(candidates, key=lambda c: c.misfit):
+        moved = rigid.apply(one.T, box)
+        if all(np.linalg.norm(moved - rigid.apply(c.T, box), axis=1).max() >= SAME_POSE_MM for c in kept):
+            kept.append(one)
+    return kept
+
+
+def _promising(candidates: list[_Candidate], box: Floats) -> list[_Candidate]:
+    """Drop candidates that come so much less near than the best that they cannot win, and twins."""
+    least = min(c.misfit for c in candidates)
+    return _distinct([c for c in candidates if c.misfit <= PROMISING * least + PROMISING_MM], box)
+
+
+def _settled(points: Floats, box: Floats, seeds: Floats, surface: Surface, candidates: list[_Candidate]) -> Attitude:
+    """Choose, of candidates that fit, the one that no other beats by what the scan shows."""
+    if len(candidates) > 1:
+        # Evidence counts tens of millimetres: no pose may be off by such along the part.
+        fine = [registration.fine(seeds, surface.mesh, surface.axes, c.T).T_bridge_scan for c in candidates]
+        candidates = _distinct([replace(c, T=T) for c, T in zip(candidates, fine, strict=True)], box)
+
+    @cache
+    def tells(i: int, j: int) -> int:
+        """Whether the scan speaks for the one (1), for the other (-1), or for neither (0)."""
+        ours, theirs = _evidence(points, surface, candidates[i].T, candidates[j].T)
+        more, fewer = max(ours, theirs), min(ours, theirs)
+        clear = more >= LEAST_EVIDENCE and more >= 2 * fewer
+        return int(np.sign(ours - theirs)) if clear else 0
+
+    best = 0
+    for other in range(1, len(candidates)):
+        best = other if tells(best, other) < 0 else best
+    rivals = [other for other in range(len(candidates)) if other != best and tells(best, other) <= 0]
+    T, start = candidates[best].T, candidates[best].start
+    if not rivals:
+        return Attitude(start, T, "ok", "")
+    T_rival = candidates[rivals[0]].T
+    return Attitude(start, T, "ambiguous", _said_of(T, T_rival, surface), T_rival)
 
 
 def _said_of(best: Floats, rival: Floats, surface: Surface) -> str:
@@ -225,13 +272,10 @@ def _said_of(best: Floats, rival: Floats, surface: Surface) -> str:
     return f"the part fits its design as well when shifted by {shift:.0f} mm along itself; an end seen would tell"
 
 
-def _tried(
-    points: Floats, surface: Surface, gates_mm: tuple[float, ...], start: tuple[Floats, Floats]
-) -> tuple[float, Floats, Floats]:
-    """Align from where a hypothesis has come to; returns misfit, pose, and where the hypothesis began."""
-    at, began = start
-    fitted = _aligned(points, surface, at, gates_mm)
-    return _misfit(points, surface, fitted), fitted, began
+def _tried(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:
+    """Align from where a candidate lies."""
+    T = _aligned(points, surface, candidate.T, gates_mm)
+    return _Candidate(T, candidate.start, _misfit(points, surface, T))
 
 
 def _aligned(points: Floats, surface: Surface, T: Floats, gates_mm: tuple[float, ...]) -> Floats:
@@ -251,10 +295,9 @@ def _misfit(points: Floats, surface: Surface, T: Floats) -> float:
     return float(np.median(np.where(distance > 100.0 + spacing, distance, normal_part)))
 
 
-def _largest_move(T: Floats, other: Floats, points: Floats) -> float:
-    low, high = points.min(axis=0), points.max(axis=0)
-    box = np.array([[x, y, z] for x in (low[0], high[0]) for y in (low[1], high[1]) for z in (low[2], high[2])])
-    return float(np.linalg.norm(rigid.apply(T, box) - rigid.apply(other, box), axis=1).max())
+def _corners(points: Floats) -> Floats:
+    """Return the corners (8, 3) of the points' bounding box."""
+    return np.array(list(product(*zip(points.min(axis=0), points.max(axis=0), strict=True))))
 
 
 def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> tuple[int, int]:

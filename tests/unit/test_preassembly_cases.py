@@ -1,6 +1,7 @@
 """Parts and scans as they come: square, half missing, steep, dirty, unmarked, cut, in two scans, of other plates."""
 
 import dataclasses
+from itertools import product
 
 import numpy as np
 import pytest
@@ -322,6 +323,34 @@ def test_unequal_plates_meet_at_their_outer_faces():
     twice = Scene("b", "arch-bridge", (*scans, dataclasses.replace(scans[1], name="again")), arch=design)
     with pytest.raises(InputError, match=r"takes one scan a part, rib1 has several"):
         preassemble.run(twice, preassemble.Params(method="line"))
+
+
+def with_a_floor(points, axes, share, rng):
+    """Points of a part and of a floor that makes up a share of all, somewhere beneath it and wider."""
+    local = points @ axes
+    low, high = local.min(axis=0) - 1_000.0, local.max(axis=0) + 1_000.0
+    floor = rng.uniform(low, high, (int(share / (1.0 - share) * len(points)), 3))
+    floor[:, 2] = low[2] + 700.0 + rng.normal(0.0, 1.0, len(floor))
+    return np.vstack([points, floor @ axes.T])
+
+
+# By day a rib that was laid half a turn round (the right way was not tried), and one that was its own rival.
+@pytest.mark.parametrize(
+    ("seed", "index", "share"),
+    [
+        pytest.param(*one, marks=() if one in ((3, 2, 0.1), (1, 3, 0.2)) else pytest.mark.slow)
+        for one in product(range(1, 7), range(5), (0.1, 0.2))
+    ],
+)
+def test_a_floor_beside_a_part_does_not_turn_it_round(seed, index, share):
+    scene, truth = arch_clouds.bridge(spacing_mm=10.0, sigma_mm=1.0, seed=seed)
+    T, rng = truth.arch.T_bridge_scan[index], np.random.default_rng(10 * seed + index)
+    shape = attitude.sample_surface(scene.arch.parts[index])
+    points = with_a_floor(rigid.apply(T, scene.scans[index].points), shape.axes, share, rng)
+    found = attitude.find(rigid.apply(rigid.invert(T), points), scene.arch.parts[index], shape)
+    assert (found.status, found.message) == ("ok", "")
+    turn = found.T_surface[:3, :3] @ T[:3, :3].T
+    assert np.degrees(rigid.rotation_angle(turn)) < 0.1
 
 
 @pytest.mark.slow
