@@ -25,11 +25,17 @@ class BottomEdges:
 
 @dataclass(frozen=True)
 class LinearError:
-    """Distance of the assembled edges from the design's, mm, at stations of the arc length along each edge."""
+    """How the assembled edges lie beside the design's, (n, 3) in mm, at stations of the arc length along each edge."""
 
     station: Floats
     edge: tuple[str, ...]
-    deviation: Floats
+    vector: Floats
+
+    @property
+    def deviation(self) -> Floats:
+        """Distances (n,); NaN without points."""
+        found: Floats = np.linalg.norm(self.vector, axis=1)
+        return found
 
     @property
     def mean(self) -> float:
@@ -53,7 +59,7 @@ def linear_error(parts: list[BottomEdges], poses: list[Floats]) -> LinearError:
     """
     stations: list[float] = []
     edges: list[str] = []
-    deviations: list[float] = []
+    every: list[Floats] = []
     for edge in ("left", "right"):
         before = 0.0
         for part, pose in zip(parts, poses, strict=True):
@@ -69,9 +75,9 @@ def linear_error(parts: list[BottomEdges], poses: list[Floats]) -> LinearError:
                     vectors[c] = np.median(offset[inner][cell == c], axis=0)
             stations += [before + (c + 0.5) * STATION_MM for c in range(count)]
             edges += [edge] * count
-            deviations += np.linalg.norm(vectors, axis=1).tolist()
+            every.append(vectors)
             before += design.length
-    return LinearError(np.array(stations), tuple(edges), np.array(deviations))
+    return LinearError(np.array(stations), tuple(edges), np.vstack(every))
 
 
 def gaps(left: Floats, right: Floats, T_left: Floats, T_right: Floats) -> Floats:

@@ -1,7 +1,8 @@
 """The source paper's three methods, as baselines: corner (W1), line (W2) and design-aided (W3).
 
 They chain the parts by the edges of their joints; ``design-aided`` also holds the bottom edges against the design's.
-They state no uncertainty, and their key points lie on the inner edges of the plates. Source: paper 000.
+They state no uncertainty (:mod:`processor.preassembly.own_error` gives them a band), and their key points lie on the
+inner edges of the plates. Source: paper 000.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from processor.preassembly import attitude, errors, features, matching
 from processor.preassembly.params import Params
 from processor.preassembly.result import Result
 
+NOT_STATED = "no uncertainty is stated by this method"
+MESSAGE = f"{NOT_STATED}; key points lie on the plates' inner edges"
 NOWHERE = np.full((4, 4), np.nan)
 GAUGES = {
     "corner": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
@@ -42,25 +45,40 @@ class Part:
     trouble: str
 
 
+@dataclass(frozen=True)
+class Assembly:
+    """The parts as placed: T_bridge_scan (4, 4), status and message of each, gaps (j, 8, 3), errors by both gauges."""
+
+    poses: list[Floats]
+    status: list[str]
+    messages: list[str]
+    gaps: Floats
+    linear: errors.LinearError
+    best_fit: errors.LinearError
+
+
 def extract(scans: Sequence[Scan], design: ArchDesign, params: Params) -> list[Part]:
     """Take from every scan, in the design's order, what any of the methods needs."""
-    return [_extract(scan, index, design, params) for index, scan in enumerate(scans)]
+    return [
+        features_of(scan, index, attitude.find(scan.points, design.parts[index]), design, params)
+        for index, scan in enumerate(scans)
+    ]
 
 
 def assemble(parts: list[Part], design: ArchDesign, params: Params) -> Result:
     """Assemble extracted parts by the method of the parameters."""
-    poses, messages = _assemble(parts, design, params)
-    return _result(parts, poses, messages, design, params)
+    return _result(parts, place(parts, design, params), design, params)
 
 
-def _generator(params: Params, purpose: str) -> np.random.Generator:
+def generator(params: Params, purpose: str) -> np.random.Generator:
+    """Return the random numbers of one purpose."""
     return np.random.default_rng([params.seed, zlib.crc32(purpose.encode())])
 
 
-def _extract(scan: Scan, index: int, design: ArchDesign, params: Params) -> Part:
+def features_of(scan: Scan, index: int, found: attitude.Attitude, design: ArchDesign, params: Params) -> Part:
+    """Take the features from the scan of the design's part ``index``, whose attitude is found."""
     part = design.parts[index]
     points = scan.points
-    found = attitude.find(points, part)
     spacing = surface_spacing(points)
     ends: list[features.JointEdges | None] = []
     trouble: list[str] = []
@@ -96,7 +114,7 @@ def _joint_end(
     corners = design_points[:4]
     size = np.array([np.linalg.norm(corners[0] - corners[1]), np.linalg.norm(corners[3] - corners[0])])
     cut = features.cut_joint_end(points, T_joint_scan, outward, size, params.boxes)
-    rng = _generator(params, f"{purpose} {outward}")
+    rng = generator(params, f"{purpose} {outward}")
     edges = features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
     if edges is None:
         return None, "no joint edges found"
@@ -109,7 +127,27 @@ def _joint_end(
     return edges, ""
 
 
-def _assemble(parts: list[Part], design: ArchDesign, params: Params) -> tuple[list[Floats], list[str]]:
+def place(parts: list[Part], design: ArchDesign, params: Params) -> Assembly:
+    """Chain extracted parts by the method of the parameters, and say how they fit."""
+    poses, messages = _chained(parts, design, params)
+    joint_gaps = np.full((len(parts) - 1, 8, 3), np.nan)
+    status = [_status(part, pose) for part, pose in zip(parts, poses, strict=True)]
+    for j, (left, right) in enumerate(pairwise(range(len(parts)))):
+        a, b = parts[left].ends[1], parts[right].ends[0]
+        if a is not None and b is not None and "failed" not in (status[left], status[right]):
+            joint_gaps[j] = errors.gaps(a.key_points, b.key_points, poses[left], poses[right])
+            widest = float(np.abs(joint_gaps[j]).max())
+            if widest > params.gap_limit_mm:
+                messages[right] += f"; {design.joint_names[j]} gapes by {widest:.0f} mm: the alignment may have failed"
+                status[right] = "weak" if status[right] == "ok" else status[right]
+    edges = [part.edges for part in parts]
+    to_design = parts[0].attitude.T_surface @ _inverse(poses[0])
+    at_rest = [to_design @ pose for pose in poses]
+    linear, best_fit = errors.linear_error(edges, poses), errors.linear_error(edges, at_rest)
+    return Assembly(poses, status, messages, joint_gaps, linear, best_fit)
+
+
+def _chained(parts: list[Part], design: ArchDesign, params: Params) -> tuple[list[Floats], list[str]]:
     """Chain the parts from the first: T_bridge_scan of each (NaN where the chain is broken) and a message each."""
     poses = [_place_first(parts[0], design, params)]
     messages = [""]
@@ -131,7 +169,7 @@ def _place_first(part: Part, design: ArchDesign, params: Params) -> Floats:
         return T
     source = np.vstack([end.points, part.lines])
     target = np.vstack([_outline(corners, 5.0), _design_lines(part, 5.0)])
-    return matching.by_lines(source, target, T, params.match, _generator(params, "match " + part.name)).T_bridge_scan
+    return matching.by_lines(source, target, T, params.match, generator(params, "match " + part.name)).T_bridge_scan
 
 
 def _place_next(before: Part, T_before: Floats, part: Part, params: Params) -> matching.Placement:
@@ -149,7 +187,7 @@ def _place_next(before: Part, T_before: Floats, part: Part, params: Params) -> m
     if params.method == "design-aided":
         source = np.vstack([source, part.lines])
         target = np.vstack([target, _design_lines(part, 5.0)])
-    return matching.by_lines(source, target, start, params.match, _generator(params, "match " + part.name))
+    return matching.by_lines(source, target, start, params.match, generator(params, "match " + part.name))
 
 
 def _shifted(T: Floats, by: Floats) -> Floats:
@@ -168,39 +206,23 @@ def _design_lines(part: Part, spacing_mm: float) -> Floats:
     return np.vstack([line.at(np.arange(0.0, line.length, spacing_mm)) for line in lines])
 
 
-def _result(parts: list[Part], poses: list[Floats], messages: list[str], design: ArchDesign, params: Params) -> Result:
-    pairs = list(pairwise(range(len(parts))))
-    joint_gaps = np.full((len(pairs), 8, 3), np.nan)
-    status = [_status(part, pose) for part, pose in zip(parts, poses, strict=True)]
-    messages = list(messages)
-    for j, (left, right) in enumerate(pairs):
-        a, b = parts[left].ends[1], parts[right].ends[0]
-        if a is not None and b is not None and "failed" not in (status[left], status[right]):
-            joint_gaps[j] = errors.gaps(a.key_points, b.key_points, poses[left], poses[right])
-            widest = float(np.abs(joint_gaps[j]).max())
-            if widest > params.gap_limit_mm:
-                messages[right] += f"; {design.joint_names[j]} gapes by {widest:.0f} mm: the alignment may have failed"
-                status[right] = "weak" if status[right] == "ok" else status[right]
-    splicing_mean, splicing_max = errors.splicing_error(joint_gaps)
-    edges = [part.edges for part in parts]
-    assembled = errors.linear_error(edges, poses)
-    to_design = parts[0].attitude.T_surface @ _inverse(poses[0])
-    best_fit = errors.linear_error(edges, [to_design @ pose for pose in poses])
+def _result(parts: list[Part], placed: Assembly, design: ArchDesign, params: Params) -> Result:
+    splicing_mean, splicing_max = errors.splicing_error(placed.gaps)
     said = [
         "; ".join(filter(None, (part.attitude.message, part.trouble, message.lstrip("; "))))
-        for part, message in zip(parts, messages, strict=True)
+        for part, message in zip(parts, placed.messages, strict=True)
     ]
-    placed = [one != "failed" for one in status]
+    some = any(one != "failed" for one in placed.status)
     return Result(
-        status="ok" if all(one == "ok" for one in status) else "partial" if any(placed) else "failed",
+        status="ok" if all(one == "ok" for one in placed.status) else "partial" if some else "failed",
         method=params.method,
-        message="no uncertainty is stated by this method; key points lie on the plates' inner edges",
+        message=MESSAGE,
         components=tuple(part.name for part in parts),
-        component_status=tuple(status),
+        component_status=tuple(placed.status),
         component_message=tuple(said),
         component_scans=tuple(part.scan.name for part in parts),
         T_bridge_scan=np.array(
-            [rigid.with_origin(pose, part.scan.origin) for pose, part in zip(poses, parts, strict=True)]
+            [rigid.with_origin(pose, part.scan.origin) for pose, part in zip(placed.poses, parts, strict=True)]
         ),
         covariance=np.full((len(parts), 6, 6), np.nan),
         key_points_scan=np.array([[_key_points(part, end) for end in part.ends] for part in parts]),
@@ -208,20 +230,20 @@ def _result(parts: list[Part], poses: list[Floats], messages: list[str], design:
         joints=design.joint_names,
         joint_left=design.joint_left,
         joint_right=design.joint_right,
-        gaps=joint_gaps,
-        gap_ci95=np.full_like(joint_gaps, np.nan),
-        verdict=("indeterminate",) * len(pairs),
+        gaps=placed.gaps,
+        gap_ci95=np.full_like(placed.gaps, np.nan),
+        verdict=("indeterminate",) * len(placed.gaps),
         splicing_mean=splicing_mean,
         splicing_max=splicing_max,
         gauge=GAUGES[params.method],
-        linear_mean=assembled.mean,
-        linear_max=assembled.max,
-        best_fit_linear_mean=best_fit.mean,
-        best_fit_linear_max=best_fit.max,
-        linear_station=assembled.station,
-        linear_edge=assembled.edge,
-        linear_deviation=assembled.deviation,
-        best_fit_linear_deviation=best_fit.deviation,
+        linear_mean=placed.linear.mean,
+        linear_max=placed.linear.max,
+        best_fit_linear_mean=placed.best_fit.mean,
+        best_fit_linear_max=placed.best_fit.max,
+        linear_station=placed.linear.station,
+        linear_edge=placed.linear.edge,
+        linear_deviation=placed.linear.deviation,
+        best_fit_linear_deviation=placed.best_fit.deviation,
     )
 
 

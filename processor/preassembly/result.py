@@ -48,7 +48,7 @@ class Result(Checked):
     linear_edge: tuple[str, ...] = names("s")  # left | right
     linear_deviation: Floats = column("s")  # as assembled
     best_fit_linear_deviation: Floats = column("s")
-    # of the adjustment alone, so empty or NaN for other methods
+    # of the adjustment alone, so empty or NaN for other methods, but for three bands: see ``bands_as_designed``
     measures: tuple[Measures, ...] = ()  # a record a joint
     judged: tuple[Verdict, ...] = ()
     proposals: tuple[Proposal, ...] = ()
@@ -75,3 +75,8 @@ class Result(Checked):
     # of the adjustment: over the weight lambda, splicing mean and max, linear mean and max
     trade_lambda: Floats = column("t")
     trade_figures: Floats = column("t", 4)
+
+    @property
+    def bands_as_designed(self) -> bool:
+        """Whether the bands say what the method makes of parts exactly as designed, not where the truth lies."""
+        return bool(np.isfinite(self.errors_ci95).any() and not np.isfinite(self.weight))

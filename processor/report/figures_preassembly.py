@@ -27,6 +27,7 @@ from processor.report.drawing import (
 from processor.report.figures_joints import by_axis, gap_vectors
 from processor.steps import preassemble
 
+OWN_ERROR_ALPHA = 0.4  # of the lines of how far a method errs by itself
 GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
 TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest |d|", 1, 3, "largest"))
 
@@ -194,7 +195,9 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
                     linewidth=width,
                     label=f"{run.method}, {edge} edge",
                 )
-                if len(band) and np.isfinite(band).any():
+                if run.result.bands_as_designed:
+                    axes.plot(station, band[on], color=COLOURS[k % 4], linewidth=width, alpha=OWN_ERROR_ALPHA)
+                elif len(band) and np.isfinite(band).any():
                     low, high = (np.maximum(deviation[on] + s * band[on], LEAST_SHOWN_MM) for s in (-1.0, 1.0))
                     axes.fill_between(station, low, high, color=COLOURS[k % 4], alpha=0.2, linewidth=0.0)
                     banded = True
@@ -215,6 +218,9 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
     caption = "Linear error: distance of the assembled bottom edges from the design's; dotted lines are joints"
     if banded:
         caption += "; the shaded band holds 95 % or more"
+    own = [run.method for _, run in styled if run.result.bands_as_designed]
+    own_said = "pale: below it lie 95 % or more of what these state of parts exactly as designed, scanned alike"
+    caption += f"; {own_said}: {', '.join(own)}" if own else ""
     bare = [run.method for _, run in styled if not np.isfinite(run.result.linear_ci95).any()]
     caption += f"; without a band, for they state no uncertainty: {', '.join(bare)}" if banded and bare else ""
     caption += f"; without an answer, so not drawn: {', '.join(silent)}" if silent else ""

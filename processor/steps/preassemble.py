@@ -2,8 +2,8 @@
 
 ``adjustment`` registers every part to its design and adjusts the whole chain at once, with an interval for every gap.
 ``corner`` (the paper's W1) chains the parts by the four corners of each joint, ``line`` (W2) by the points on the
-joint's edges, ``design-aided`` (W3) by these and the bottom edges held against the design's. They are baselines: they
-state no uncertainty, and their key points lie on the inner edges of the plates. Source: paper 000.
+joint's edges, ``design-aided`` (W3) by these and the bottom edges held against the design's. They are baselines: their
+band is what they make of parts as designed, and their key points lie on the plates' inner edges. Source: paper 000.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from processor.model import ArchDesign, InputError, Metric, Scan, Scene, Truth, UsageError
-from processor.preassembly import adjustment, against_truth, paper
+from processor.preassembly import adjustment, against_truth, own_error, paper
 from processor.preassembly.params import METHODS, Params
 from processor.preassembly.result import Result
 
@@ -39,7 +39,8 @@ def run(scene: Scene, params: Params) -> Result:
     several = [part.name for part, own in zip(design.parts, scans, strict=True) if len(own) > 1]
     if several:
         raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")
-    result = paper.assemble(paper.extract([own[0] for own in scans], design, params), design, params)
+    parts = paper.extract([own[0] for own in scans], design, params)
+    result = own_error.with_bands(paper.assemble(parts, design, params), parts, design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != adjustment.REFERENCE_C:
         said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
         result = replace(result, message=f"{result.message}; {said}")

@@ -182,7 +182,8 @@ def a_bridge():
     other = dataclasses.replace(
         others[0].result,
         gauge="Foot 1 at its principal-axes attitude, its joint corners on the design's",
-        message="no uncertainty is stated by this method; key points lie on the plates' inner edges",
+        message="bands are what this method makes of parts as designed; key points lie on the plates' inner edges",
+        errors_ci95=np.full(6, 9.0),
     )
     runs = (dataclasses.replace(first, result=result), dataclasses.replace(others[0], result=other))
     return dataclasses.replace(

@@ -316,7 +316,8 @@ def test_a_temperature_that_is_not_corrected_is_said(bridge, monkeypatch):
     scene, _ = bridge
     monkeypatch.setattr(paper, "extract", lambda *_: [])
     monkeypatch.setattr(paper, "assemble", lambda *_: preassemble.Result("ok", "corner", "assembled"))
-    result = preassemble.run(dataclasses.replace(scene, temperature_C=31.5), preassemble.Params(method="corner"))
+    params = preassemble.Params(method="corner", repetitions=0)
+    result = preassemble.run(dataclasses.replace(scene, temperature_C=31.5), params)
     assert result.message.startswith("assembled; the steel's temperature (31.5 C) is not corrected")
 
 

@@ -254,6 +254,15 @@ def test_why_a_method_failed_is_said_and_it_is_not_drawn():
     answered = figures.of_run(execution, ErrorReport())["preassemble"]["linear-error.png"]
     assert "without a band, for they state no uncertainty: line" in answered[0]
     line = execution.runs[1]
+    own = dataclasses.replace(
+        line.result, linear_ci95=np.full(120, 9.0), best_fit_linear_ci95=np.full(120, 9.0), errors_ci95=np.full(6, 9.0)
+    )
+    alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
+    caption, picture = figures.of_run(alone, ErrorReport())["preassemble"]["linear-error.png"]
+    assert "what these state of parts exactly as designed, scanned alike: line" in caption
+    assert picture != answered[1]
+    (summary,) = (table for table in tables.all_of(alone, ErrorReport()) if table.file == "summary")
+    assert "Of a bridge exactly as designed, scanned alike, line states up to 9.000" in summary.note
     nothing = np.full(120, NAN)
     result = dataclasses.replace(line.result, linear_deviation=nothing, best_fit_linear_deviation=nothing)
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))

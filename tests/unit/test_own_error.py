@@ -1,0 +1,125 @@
+"""Bands of the source paper's methods: what they make of parts as designed, against bridges whose errors are known."""
+
+import dataclasses
+
+import numpy as np
+import open3d
+import pytest
+
+from processor.geometry import rigid
+from processor.model import Scan
+from processor.preassembly import attitude, own_error, paper
+from processor.preassembly.params import PAPER_METHODS
+from processor.steps import preassemble
+from tests import arch_clouds
+
+
+def extracted(scene):
+    scans = [own[0] for own in preassemble.scans_in_order(scene, scene.arch)]
+    return paper.extract(scans, scene.arch, preassemble.Params())
+
+
+@pytest.fixture(scope="module")
+def bridge():
+    """A bridge and the features of its parts."""
+    scene, _ = arch_clouds.bridge(spacing_mm=25.0, sigma_mm=1.0, seed=3)
+    return scene.arch, extracted(scene)
+
+
+def banded(design, parts, method, **given):
+    params = preassemble.Params(method=method, **given)
+    return own_error.with_bands(paper.assemble(parts, design, params), parts, design, params)
+
+
+def test_a_bound_is_what_one_more_hardly_exceeds():
+    rng = np.random.default_rng(1)
+    every = np.array([5.0, 0.0, 0.0]) + rng.normal(0.0, 2.0, (6, 4_000, 3))
+    exceeded = np.linalg.norm(every[5], axis=1) > own_error.bound(every[:5])
+    assert exceeded.mean() < 0.05
+    assert own_error.bound(np.full((4, 1, 2), 3.0)) == pytest.approx(3.0 * np.sqrt(2.0))
+    # Of one number: its mean 2 and sd 1 by hand, Student's 97.5 % of 2 degrees of freedom.
+    assert own_error.bound(np.array([1.0, 2.0, 3.0])[:, None, None]) == pytest.approx(
+        2.0 + 4.30265 * np.sqrt(4.0 / 3.0)
+    )
+
+
+def test_too_few_answers_have_no_bound():
+    vectors = np.ones((5, 2, 3))
+    vectors[1:4, 1] = np.nan
+    assert np.isnan(own_error.bound(vectors)).tolist() == [False, True]
+
+
+def test_a_part_as_built_is_laid_on_its_design():
+    design, rng = arch_clouds.design().parts[2], np.random.default_rng(2)
+    points = arch_clouds.scan_points(2, 20.0, 0.5, rng)
+    middle = points.mean(axis=0)
+    built = points + 0.001 * (points - middle)  # 6 mm longer
+    built[:, 1] += 5.0 * np.cos(np.pi * (points[:, 0] - middle[0]) / np.ptp(points[:, 0]))
+    strays = middle + rng.uniform(1_500.0, 3_000.0, (50, 3))
+    T = arch_clouds.random_pose(rng)
+    scan = Scan("rib2", rigid.apply(T, np.vstack([built, strays])), component="rib2")
+    found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok", "")
+    part = paper.Part("rib2", scan, found, (None, None), np.empty((0, 3)), None, "")
+    laid = own_error._as_designed(part, design)
+    assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)
+    assert (~laid.near).sum() == 50
+    there = rigid.apply(laid.T_bridge_scan, laid.points)
+    # Open3D's distances are float32: hundredths of a millimetre, about the part's middle.
+    scene = open3d.t.geometry.RaycastingScene()
+    scene.add_triangles(np.float32(design.vertices - middle), np.uint32(design.faces))
+    assert scene.compute_distance(np.float32(there[laid.near] - middle)).numpy().max() < 0.01
+    assert np.abs(rigid.apply(laid.T_bridge_scan @ T, middle[None]) - middle).max() < 3.0
+
+
+@pytest.mark.parametrize(
+    "method", ["design-aided", *(pytest.param(one, marks=pytest.mark.slow) for one in ("corner", "line"))]
+)
+def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
+    """All that a method says of this bridge is wrong: its parts are exactly as designed."""
+    result = banded(*bridge, method)
+    assert result.bands_as_designed
+    for said, band in (
+        (result.linear_deviation, result.linear_ci95),
+        (result.best_fit_linear_deviation, result.best_fit_linear_ci95),
+    ):
+        known = np.isfinite(said)
+        assert (np.isfinite(band) == known).all()
+        assert (said <= band)[known].mean() > 0.9
+    figures = [result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max]
+    figures += [result.best_fit_linear_mean, result.best_fit_linear_max]
+    assert (figures <= result.errors_ci95).sum() >= 5
+
+
+@pytest.mark.slow
+def test_over_bridges_the_bands_hold_what_they_say():
+    held = {method: [] for method in PAPER_METHODS}
+    for seed in range(1, 9):
+        scene, _ = arch_clouds.bridge(spacing_mm=15.0, sigma_mm=1.0, seed=seed)
+        parts = extracted(scene)
+        for method, own in held.items():
+            result = banded(scene.arch, parts, method, seed=seed)
+            known = np.isfinite(result.linear_ci95) & np.isfinite(result.linear_deviation)
+            own.append((result.linear_deviation <= result.linear_ci95)[known].mean())
+    # Errors of one bridge's stations go together: with 8 bridges the mean share is known to some per cent.
+    for own in held.values():
+        assert np.mean(own) > 0.9
+
+
+def test_where_the_chain_is_broken_there_is_no_band(bridge):
+    design, parts = bridge
+    ball = np.random.default_rng(0).normal(size=(5_000, 3))
+    scan = dataclasses.replace(parts[2].scan, points=3_000.0 * ball / np.linalg.norm(ball, axis=1)[:, None])
+    found = attitude.Attitude(np.eye(4), np.eye(4), "failed", "no attitude fits the design")
+    broken = paper.features_of(scan, 2, found, design, preassemble.Params())
+    given = (design, [*parts[:2], broken, *parts[3:]], "corner")
+    result = banded(*given, repetitions=3)
+    assert result.component_status[2:] == ("failed",) * 3
+    assert np.isfinite(result.linear_ci95).any()
+    assert (np.isfinite(result.linear_ci95) <= np.isfinite(result.linear_deviation)).all()
+    assert banded(*given, repetitions=3).linear_ci95.tobytes() == result.linear_ci95.tobytes()
+
+
+def test_without_repetitions_nothing_is_said_of_uncertainty(bridge):
+    result = banded(*bridge, "corner", repetitions=0)
+    assert not result.bands_as_designed
+    assert result.message.startswith("no uncertainty is stated")
