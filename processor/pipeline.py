@@ -210,12 +210,15 @@ def execute(
         given = {} if points is None else {"points": points}
         runs: list[StepRun] = []
         answers: dict[str, Any] = {}
+        kept: dict[str, dict[str, Any]] = {}
         for job in jobs:
             needs: dict[str, Any] = {}
             if job.module.NEEDS:
                 needs["earlier"] = {name: answers[name] for name in job.module.NEEDS if name in answers}
             if job.step in answers and getattr(job.module, "COMPARES", False):
                 needs["answer_given"] = answers[job.step]
+            if getattr(job.module, "KEEPS", False):
+                needs["kept"] = kept.setdefault(job.step, {})
             runs.append(_run(path, scene, job, {**given, **needs}, log))
             answers.setdefault(job.step, runs[-1].result)
         digest = store.scene_hash(scene, None if points is None else points.pieces)

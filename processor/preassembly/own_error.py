@@ -43,30 +43,36 @@ class _AsDesigned:
     T_bridge_scan: Floats
 
 
-def with_bands(result: Result, parts: list[paper.Part], design: ArchDesign, params: Params) -> Result:
-    """Add to what a method says of ``parts`` how far it errs by itself, by ``params.repetitions`` of their scans.
+def scanned_again(parts: list[paper.Part], design: ArchDesign, params: Params) -> list[list[paper.Part]]:
+    """Scan parts as designed, ``params.repetitions`` times, as the given ones were scanned; their features each time.
 
-    NaN where too few of the repetitions have an answer.
+    They are the same for every method.
     """
     if params.repetitions < LEAST:
-        return result
+        return []
     exact = [_as_designed(part, own) for part, own in zip(parts, design.parts, strict=True)]
 
-    def repeated(turn: int) -> paper.Assembly:
-        again = [_repeated(one, i, turn, design, params) for i, one in enumerate(exact)]
-        return paper.place(again, design, params)
+    def again(turn: int) -> list[paper.Part]:
+        return [_repeated(one, i, turn, design, params) for i, one in enumerate(exact)]
 
-    found = each(repeated, range(params.repetitions))
+    return each(again, range(params.repetitions))
+
+
+def with_bands(result: Result, repeated: list[list[paper.Part]], design: ArchDesign, params: Params) -> Result:
+    """Add to what a method says how far it errs by itself: what it says of parts as designed, ``repeated``.
+
+    NaN where too few of the repetitions have an answer; unchanged without any.
+    """
+    if not repeated:
+        return result
+    found = [paper.place(parts, design, params) for parts in repeated]
     figures = [
         (*errors.splicing_error(one.gaps), one.linear.mean, one.linear.max, one.best_fit.mean, one.best_fit.max)
         for one in found
     ]
-    unknown = np.full((len(result.linear_station), 2), np.nan)
     return replace(
         result,
         message=paper.MESSAGE.replace(paper.NOT_STATED, "bands are what this method makes of parts as designed"),
-        linear_offset=unknown,
-        linear_offset_ci95=unknown,
         linear_ci95=bound(np.array([one.linear.vector for one in found])),
         best_fit_linear_ci95=bound(np.array([one.best_fit.vector for one in found])),
         errors_ci95=bound(np.array(figures)[:, :, None]),
@@ -143,4 +149,5 @@ def _repeated(one: _AsDesigned, index: int, turn: int, design: ArchDesign, param
         key=lambda T: float(np.linalg.norm(rigid.apply(T, points[::100]) - rigid.apply(T_before, points[::100]))),
     )
     found = replace(one.part.attitude, T_principal=T, T_surface=one.T_bridge_scan)
-    return paper.features_of(replace(one.part.scan, points=points), index, found, design, params)
+    features = paper.features_of(replace(one.part.scan, points=points), index, found, design, params)
+    return replace(features, scan=one.part.scan)  # the points are not needed any more

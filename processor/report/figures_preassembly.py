@@ -195,9 +195,11 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
                     linewidth=width,
                     label=f"{run.method}, {edge} edge",
                 )
+                if not np.isfinite(band).any():
+                    continue
                 if run.result.bands_as_designed:
                     axes.plot(station, band[on], color=COLOURS[k % 4], linewidth=width, alpha=OWN_ERROR_ALPHA)
-                elif len(band) and np.isfinite(band).any():
+                else:
                     low, high = (np.maximum(deviation[on] + s * band[on], LEAST_SHOWN_MM) for s in (-1.0, 1.0))
                     axes.fill_between(station, low, high, color=COLOURS[k % 4], alpha=0.2, linewidth=0.0)
                     banded = True

@@ -9,6 +9,7 @@ band is what they make of parts as designed, and their key points lie on the pla
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -20,12 +21,14 @@ from processor.preassembly.result import Result
 __all__ = ["KIND", "METHODS", "NEEDS", "Params", "Result", "check", "run"]
 
 NEEDS: tuple[str, ...] = ()
+KEEPS = True  # methods keep for each other what they have in common
 KIND = "arch-bridge"
 
 
-def run(scene: Scene, params: Params) -> Result:
+def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Result:
     """Assemble the bridge of a scene by one of METHODS.
 
+    What the paper's three have in common, the features of the parts, is ``kept`` for the next of them.
     Raises InputError without an arch design or with a part that has no scan, UsageError for an unknown method.
     """
     if params.method not in METHODS:
@@ -39,8 +42,12 @@ def run(scene: Scene, params: Params) -> Result:
     several = [part.name for part, own in zip(design.parts, scans, strict=True) if len(own) > 1]
     if several:
         raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")
-    parts = paper.extract([own[0] for own in scans], design, params)
-    result = own_error.with_bands(paper.assemble(parts, design, params), parts, design, params)
+    kept = {} if kept is None else kept
+    if "parts" not in kept:
+        kept["parts"] = paper.extract([own[0] for own in scans], design, params)
+        kept["scanned again"] = own_error.scanned_again(kept["parts"], design, params)
+    result = paper.assemble(kept["parts"], design, params)
+    result = own_error.with_bands(result, kept["scanned again"], design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != adjustment.REFERENCE_C:
         said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
         result = replace(result, message=f"{result.message}; {said}")

@@ -184,6 +184,7 @@ def a_bridge():
         gauge="Foot 1 at its principal-axes attitude, its joint corners on the design's",
         message="bands are what this method makes of parts as designed; key points lie on the plates' inner edges",
         errors_ci95=np.full(6, 9.0),
+        linear_ci95=np.full(len(others[0].result.linear_station), 9.0),
     )
     runs = (dataclasses.replace(first, result=result), dataclasses.replace(others[0], result=other))
     return dataclasses.replace(

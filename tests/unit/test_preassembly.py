@@ -314,10 +314,10 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
 
 def test_a_temperature_that_is_not_corrected_is_said(bridge, monkeypatch):
     scene, _ = bridge
-    monkeypatch.setattr(paper, "extract", lambda *_: [])
     monkeypatch.setattr(paper, "assemble", lambda *_: preassemble.Result("ok", "corner", "assembled"))
-    params = preassemble.Params(method="corner", repetitions=0)
-    result = preassemble.run(dataclasses.replace(scene, temperature_C=31.5), params)
+    params = preassemble.Params(method="corner")
+    kept = {"parts": [], "scanned again": []}
+    result = preassemble.run(dataclasses.replace(scene, temperature_C=31.5), params, kept)
     assert result.message.startswith("assembled; the steel's temperature (31.5 C) is not corrected")
 
 
