@@ -194,7 +194,7 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
         return _Placed(scan, points, station, found, fitted, f"{trouble}; {like}")
     doubt = ""
     # Of a part without a mesh much lies beside what stands for it, the right one's points as well.
-    if fitted.used_share < 1.0 - registration.CLUTTER_SHARE and not surrogate.cost(part):
+    if fitted.used_share < 1.0 - registration.CLUTTER_SHARE and part.source != surrogate.SOURCE:
         # A part of another size lies on the design as far as the two are alike, and the rest passes for clutter.
         away = f"{1.0 - fitted.used_share:.0%} of the points are away from the design's surface"
         like = _looks_like(points, design, part)
