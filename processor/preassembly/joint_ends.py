@@ -3,7 +3,8 @@
 In the joint's zone each outer face departs from the design by a plane in x (along the bridge from the joint) and w
 (across the face), a warp x w, and what bends it: x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
 and v and what bends it, see :mod:`processor.preassembly.end_ring`. A corner is where its two faces and the ring meet,
-as built; the covariance is that of these 40 numbers, so points of one corner are as dependent as they are.
+as built; the covariance is that of these 40 numbers, so points of one corner are as dependent as they are. What bends a
+face beyond them (x^3 and on) is not followed; how large it is at the joint is learned from all ends, and is added.
 
 Whether numbers are departures or noise is judged for all ends of a bridge together, see
 :mod:`processor.preassembly.evidence`: how far the others depart says what one's numbers mean.
@@ -36,6 +37,7 @@ TURNS = 4
 # rest is within 0.005 of the movement, anywhere within.
 SECOND_ORDER = 0.005 / np.sqrt(3.0)
 COUNT = len(FACES) * FACE + RING
+THERE = [FACE * face + number for face in range(len(FACES)) for number in (0, 2)]  # where a face is at the joint
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,7 @@ class Observed:
     half: Floats
     outward: float
     sigma_mm: float
+    third_order: Floats  # (8, 2): see form.third_order, of the four faces
     trouble: str
 
 
@@ -149,19 +152,26 @@ def observe(
     ]
     trouble = f"the {' and the '.join(doubtful)} face may be the plate's inner side" if doubtful else ""
     covariance = block_diag(*(block for _, block in fits))
-    return Observed(number, covariance, _moves(T_bridge_joint, half, outward), pose, half, outward, sigma, trouble)
+    third = np.vstack([form.third_order(face.basis, face.rest) for face in faces])
+    moves = _moves(T_bridge_joint, half, outward)
+    return Observed(number, covariance, moves, pose, half, outward, sigma, third, trouble)
 
 
 def judged(ends: Sequence[Observed]) -> list[JointEnd]:
     """Weigh the ends of one bridge against the design: by how far each departs, and by how far the others do."""
-    believed = _weighed(ends) if ends else []
-    return [_corners_of(end, own) for end, own in zip(ends, believed, strict=True)]
+    if not ends:
+        return []
+    bent = form.excess(np.vstack([end.third_order for end in ends]))
+    return [_corners_of(end, own, bent) for end, own in zip(ends, _weighed(ends), strict=True)]
 
 
-def _corners_of(end: Observed, believed: Believed) -> JointEnd:
+def _corners_of(end: Observed, believed: Believed, bent: float) -> JointEnd:
+    """Return the corners of an end; ``bent`` is the variance at the joint of what faces' numbers do not follow."""
     moved, derivative = _corners(end.half, end.outward, believed.mean)
     second_order = np.repeat(SECOND_ORDER * np.linalg.norm(moved.reshape(8, 3), axis=1), 3)
     covariance = derivative @ believed.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
+    there = derivative[:, THERE]
+    covariance += bent * there @ there.T
     by_pose = derivative @ believed.left_of(end.moves)
     return JointEnd(moved.reshape(8, 3), covariance, by_pose, end.sigma_mm, end.trouble)
 

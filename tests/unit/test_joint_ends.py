@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processor.geometry import mesh_surface, rigid
-from processor.preassembly import chain_figures, features, form, joint_ends, layers, network, outer_faces
+from processor.preassembly import chain_figures, end_faces, features, form, joint_ends, layers, network, outer_faces
 from processor.preassembly.bottom_edges import EdgeStations
 from processor.preassembly.evidence import Believed, by_the_others, either, no_surer, weigh
 
@@ -137,6 +137,32 @@ def test_variance_of_form():
         float(np.mean(steps**2)), abs=0.05
     )
     assert form.variance([(np.zeros(3), np.arange(3))], 0) == 0.0
+
+
+def faces_of(rng, bent, sigma, count=40, points=4_000):
+    """Rests of faces that depart at the joint by a cubic of so much, along the zone and from side to side."""
+    found = []
+    for _ in range(count):
+        x, w = rng.uniform(-end_faces.ZONE_MM, 0.0, points), rng.uniform(-1.0, 1.0, points)
+        amid, across = bent * rng.standard_normal(2)
+        # On 0..1 from the far side of the zone: 20 t^3 - 30 t^2 + 12 t - 1 is what quadratics leave of 20 t^3.
+        out = (amid + across * w) * 20.0 * (1.0 + x / end_faces.ZONE_MM) ** 3 + sigma * rng.standard_normal(points)
+        basis = end_faces.basis(x, w)
+        found.append((basis, out - basis @ np.linalg.lstsq(basis, out, rcond=None)[0]))
+    return found
+
+
+def test_what_bends_a_face_beyond_its_numbers_is_found_at_the_joint():
+    rng = np.random.default_rng(4)
+    third = np.vstack([form.third_order(*one) for one in faces_of(rng, 0.3, 1.0)])
+    # By hand: the mean square of the polynomial is 1/7, and 1/21 where it goes with w.
+    np.testing.assert_allclose(third[::2, 1], 7.0 / 4_000, rtol=0.1)
+    np.testing.assert_allclose(third[1::2, 1], 21.0 / 4_000, rtol=0.1)
+    # 80 squares of normal numbers: their mean is known to sqrt(2 / 80).
+    assert form.excess(third) == pytest.approx(0.09, rel=3.0 * np.sqrt(2.0 / 80.0))
+    nothing = np.vstack([form.third_order(*one) for one in faces_of(rng, 0.0, 1.0)])
+    assert form.excess(nothing) < 5.0 * np.sqrt(2.0 / 80.0) * nothing[:, 1].max()
+    assert form.excess(np.array([[0.1, 0.02], [0.1, 0.02]])) == 0.0
 
 
 def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
