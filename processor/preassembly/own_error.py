@@ -72,7 +72,7 @@ def with_bands(result: Result, repeated: list[list[paper.Part]], design: ArchDes
     ]
     return replace(
         result,
-        message=paper.MESSAGE.replace(paper.NOT_STATED, "bands are what this method makes of parts as designed"),
+        message=f"bands are what this method makes of parts as designed; {paper.INNER_EDGES}",
         linear_ci95=bound(np.array([one.linear.vector for one in found])),
         best_fit_linear_ci95=bound(np.array([one.best_fit.vector for one in found])),
         errors_ci95=bound(np.array(figures)[:, :, None]),

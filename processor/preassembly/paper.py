@@ -22,8 +22,7 @@ from processor.preassembly import attitude, errors, features, matching
 from processor.preassembly.params import Params
 from processor.preassembly.result import Result
 
-NOT_STATED = "no uncertainty is stated by this method"
-MESSAGE = f"{NOT_STATED}; key points lie on the plates' inner edges"
+INNER_EDGES = "key points lie on the plates' inner edges"
 NOWHERE = np.full((4, 4), np.nan)
 GAUGES = {
     "corner": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
@@ -216,7 +215,7 @@ def _result(parts: list[Part], placed: Assembly, design: ArchDesign, params: Par
     return Result(
         status="ok" if all(one == "ok" for one in placed.status) else "partial" if some else "failed",
         method=params.method,
-        message=MESSAGE,
+        message=f"no uncertainty is stated by this method; {INNER_EDGES}",
         components=tuple(part.name for part in parts),
         component_status=tuple(placed.status),
         component_message=tuple(said),

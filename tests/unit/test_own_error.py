@@ -8,7 +8,7 @@ import pytest
 
 from processor.geometry import rigid
 from processor.model import Scan
-from processor.preassembly import attitude, own_error, paper
+from processor.preassembly import attitude, errors, own_error, paper
 from processor.preassembly.params import PAPER_METHODS
 from processor.steps import preassemble
 from tests import arch_clouds
@@ -84,13 +84,16 @@ def test_a_part_as_built_is_laid_on_its_design():
 def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
     """All that a method says of this bridge is wrong: its parts are exactly as designed."""
     result = banded(*bridge, method)
+    joints = np.cumsum([part.edges.design_left.length for part in bridge[1]])[:-1]
     assert result.bands_as_designed
     for said, band in (
         (result.linear_deviation, result.linear_ci95),
         (result.best_fit_linear_deviation, result.best_fit_linear_ci95),
     ):
-        # A chain turned by PCA may reach a station at its end in some repetitions, and not in others.
-        assert (np.isfinite(band) == np.isfinite(said)).mean() > 0.97
+        # The last points of a part may fall beside its last station in some repetitions, and not in others.
+        apart = np.isfinite(band) != np.isfinite(said)
+        assert apart.sum() <= 1
+        assert (np.abs(joints[:, None] - result.linear_station[apart]) < errors.STATION_MM).any(axis=0).all()
         known = np.isfinite(said) & np.isfinite(band)
         assert (said <= band)[known].mean() > 0.9
     figures = [result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max]

@@ -406,7 +406,7 @@ def test_at_most_twelve_balls_have_a_picture_worst_first():
     assert "the first 12 of" in next(iter(drawn.values()))[0]
     made = dataclasses.replace(made, **many, **texts)
     every = figures_ball.doubtful(scene(made), made)
-    assert len(every) > 12
+    assert pages_of(figures_ball.document(scene(made), made)) == len(every) > 12
 
 
 def pages_of(pdf):
