@@ -43,12 +43,12 @@ def make_scene(path: Path, name: str, recipe: recipes.Recipe, seed: int | None) 
     """
     from threadpoolctl import threadpool_limits
 
-    from designgen import scene
-    from processor import store
+    from designgen.scenes import make
+    from processor.store import store
 
     # BLAS cuts its sums differently for other numbers of threads, and with them the last bits.
     with threadpool_limits(1, user_api="blas"):
-        made, truth = scene.make(name, recipe, seed)
+        made, truth = make.make(name, recipe, seed)
         used = recipe.get("seed", 0) if seed is None else seed
         store.write_scene(path, made, truth, _provenance(name, recipe, used, software()))
     return used, len(made.scans), sum(len(scan.points) for scan in made.scans)
@@ -222,7 +222,7 @@ def _done(job: Job) -> Outcome:
 
 def _kept(path: Path, job: Job) -> Content | str:
     """Return the content of a scene that is there already, or why it cannot be kept."""
-    from processor import store
+    from processor.store import store
 
     try:
         found = store.read_provenance(path)
@@ -240,7 +240,7 @@ def _kept(path: Path, job: Job) -> Content | str:
 
 
 def _content(path: Path, digest: str | None = None) -> Content:
-    from processor import store
+    from processor.store import store
 
     scene = store.read_scene(path)
     points = sum(len(scan.points) for scan in scene.scans)
@@ -375,7 +375,7 @@ def _read_index(path: Path) -> dict[str, Content]:
 
 
 def _write_index(path: Path, jobs: Sequence[Job], keys: Sequence[str], outcomes: dict[str, Outcome]) -> None:
-    from processor import store
+    from processor.store import store
 
     text = io.StringIO(newline="")
     table = csv.writer(text, lineterminator="\n")

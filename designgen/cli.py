@@ -105,12 +105,12 @@ def export(
     scene: Path, output: Path, format_: str, without_truth: bool, spherical: bool, step: bool, without_meshes: bool
 ) -> None:
     """Write SCENE as a scan folder: project.toml, design, scans, and the truth in truth.h5."""
-    from designgen import scan_folder
+    from designgen.export import folder
 
     if spherical and format_ != "e57":
         raise click.UsageError("--spherical is for --format e57")
     with stage(f"writing {output.name}"):
-        written = scan_folder.export(
+        written = folder.export(
             scene,
             output,
             format_,
@@ -135,13 +135,13 @@ def import_(context: click.Context, file: Path, output: Path, units: str, as_jso
 
     Exit codes: 0 done, 1 some bodies could not be taken (they are listed), 2 wrong usage, 3 bad input.
     """
-    from designgen import cad_files
+    from designgen.cad import files
 
-    said = cad_files.import_file(file, output, units)
+    said = files.import_file(file, output, units)
     if as_json:
         click.echo(json.dumps(said, ensure_ascii=False))
     else:
-        click.echo("\n".join(cad_files.summary(said)))
+        click.echo("\n".join(files.summary(said)))
     for problem in said["problems"]:
         click.echo(f"{file}: {problem}", err=True)
     context.exit(IN_PART if said["problems"] else DONE)

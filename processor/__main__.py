@@ -8,8 +8,8 @@ import traceback
 
 import click
 
-from processor.cli import commands
-from processor.cli_shared import say
+from processor.cli.common import say
+from processor.cli.run import commands
 from processor.model import InputError, UsageError
 
 WRONG_USAGE, BAD_INPUT = 2, 3

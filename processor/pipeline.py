@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
+import importlib.util
 import json
 import math
 import pkgutil
@@ -12,13 +13,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass
+from functools import cache
 from graphlib import TopologicalSorter
 from importlib.metadata import version
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from processor import __version__, steps
+import processor
+from processor import __version__
 from processor.model import InputError, Scene, StepRun, UsageError
 from processor.progress import stage
 
@@ -50,9 +53,21 @@ class Execution:
     stored: Path | None = None  # the scene's file, where its points are still in it
 
 
+@cache
 def step_modules() -> dict[str, ModuleType]:
-    """All steps by name; a step is a file in processor/steps."""
-    return {m.name: importlib.import_module(f"processor.steps.{m.name}") for m in pkgutil.iter_modules(steps.__path__)}
+    """All steps by name: the module ``step`` of each package of processor that has one, with the step's NAME."""
+    packages = [found.name for found in pkgutil.iter_modules(processor.__path__) if found.ispkg]
+    modules = [
+        importlib.import_module(f"processor.{package}.step")
+        for package in packages
+        if importlib.util.find_spec(f"processor.{package}.step")
+    ]
+    return {module.NAME: module for module in sorted(modules, key=lambda module: str(module.NAME))}
+
+
+def package_of(step: str) -> str:
+    """Return the name of a step's package; its report and its evaluation have the same."""
+    return step_modules()[step].__name__.split(".")[1]
 
 
 def result_classes() -> dict[str, type]:
@@ -65,7 +80,8 @@ def read(path: Path, units: str | None, piecewise: bool = False) -> Scene:
 
     ``piecewise`` leaves the points of a scene file where they are, for steps that take them piece by piece.
     """
-    from processor import folder, store
+    from processor.scan_folder import folder
+    from processor.store import store
 
     if path.is_file() and path.suffix.lower() == ".h5":
         if units is not None:
@@ -83,7 +99,7 @@ def read(path: Path, units: str | None, piecewise: bool = False) -> Scene:
 
 def is_large(path: Path) -> bool:
     """Whether a scene file holds more points than are read into memory at once where that is not needed."""
-    from processor.stored_points import points_of
+    from processor.store.streaming import points_of
 
     if not (path.is_file() and path.suffix.lower() == ".h5"):
         return False
@@ -203,8 +219,8 @@ def execute(
 
     Raises InputError and UsageError as the steps do, and InputError for whatever else goes wrong within one.
     """
-    from processor import store
-    from processor.stored_points import points_of
+    from processor.store import store
+    from processor.store.streaming import points_of
 
     with points_of(path) if piecewise else nullcontext() as points:
         given = {} if points is None else {"points": points}
@@ -254,8 +270,8 @@ def _parameters(runs: Sequence[StepRun]) -> list[dict[str, Any]]:
 
 def read_execution(results: Path, path: Path, units: str | None) -> Execution:
     """Read what was run on ``path`` earlier. Raises InputError where the results are those of another input."""
-    from processor import store
-    from processor.stored_points import points_of
+    from processor.store import store
+    from processor.store.streaming import points_of
 
     runs = store.read_results(results, result_classes())
     provenance = store.read_provenance(results)

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from processor.bolt_balls.nodes import Nodes, Tubes
-from processor.bolt_balls.source import InMemory
+from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.points.source import InMemory
 
 SLEEVE, TUBE, HOLE = 18.0, 30.0, 10.0
 MEMBERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0.55, 0.55, 0.63], [-0.55, -0.55, 0.63]], float)

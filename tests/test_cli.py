@@ -11,10 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processor import __main__, pipeline, store
-from processor.evaluate import evaluate
+from processor import __main__, pipeline
+from processor.evaluation.evaluate import evaluate
 from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError
-from processor.report import writing
+from processor.report import results_folder
+from processor.store import store
 from tests import arch_clouds
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -115,7 +116,7 @@ def test_a_step_named_twice_runs_once():
 def test_what_a_step_did_not_foresee_is_said_in_one_line(frame, tmp_path, monkeypatch, capsys):
     scene, _ = frame
     store.write_scene(tmp_path / "s.h5", scene, None, {})
-    monkeypatch.setattr("processor.steps.spheres.run", lambda *_: [][0])
+    monkeypatch.setattr("processor.space_frame.step.run", lambda *_: [][0])
     for debug in (False, True):
         monkeypatch.setattr(
             sys, "argv", ["processor", "run", str(tmp_path / "s.h5"), "-o", str(tmp_path / "out"), *["--debug"] * debug]
@@ -171,7 +172,7 @@ def run_in_process(path, out, methods=()):
     scene = pipeline.read(path, None)
     execution = pipeline.execute(path, scene, pipeline.plan(pipeline.steps_for(scene), methods, {}, 0))
     report = evaluate(path, execution)
-    writing.write(out, execution, report)
+    results_folder.write(out, execution, report)
     return json.loads((out / "results.json").read_text("utf-8")), report
 
 

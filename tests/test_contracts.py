@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from designgen import recipes
-from designgen.scene import make
-from processor import pipeline, readers, store
+from designgen.scenes.make import make
+from processor import pipeline, readers
 from processor.model import Metric, Scene, StepRun, UsageError
-from processor.report import step_report
+from processor.report import section
+from processor.store import store
 
 STEPS = pipeline.step_modules()
 
@@ -26,8 +27,8 @@ def test_a_step_has_its_names(name):
         assert dataclasses.is_dataclass(record)
         assert record.__dataclass_params__.frozen
     assert callable(module.run)
-    assert callable(module.check)
-    assert step_report.of(name).title
+    assert callable(importlib.import_module(f"processor.evaluation.{pipeline.package_of(name)}").check)
+    assert section.of(name).title
 
 
 @pytest.mark.parametrize("name", STEPS)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from processor.model import Scan, Scene
-from processor.steps import spheres
+from processor.space_frame import step as space_frame_step
 
 DATA = Path(__file__).resolve().parents[1] / "../shared/data/spheres"
 PUBLISHED = {
@@ -27,7 +27,7 @@ def scene(name, **known):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_free_radius(name):
-    result = spheres.run(scene(name), spheres.Params())
+    result = space_frame_step.run(scene(name), space_frame_step.Params())
     assert (result.status, result.flag) == ("ok", ("ok",))
     assert "orthogonal" in result.message
     assert np.linalg.norm(result.centres[0] - PUBLISHED[name]) < 0.25
@@ -36,7 +36,7 @@ def test_free_radius(name):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_held_radius(name):
-    result = spheres.run(scene(name), spheres.Params(radius_mm=50.0))
+    result = space_frame_step.run(scene(name), space_frame_step.Params(radius_mm=50.0))
     assert (result.status, result.flag, result.radii[0]) == ("ok", ("ok",), 50.0)
     assert np.linalg.norm(result.centres[0] - PUBLISHED[name]) < 0.1
     assert "held" in result.message
@@ -44,7 +44,7 @@ def test_held_radius(name):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_known_scanner(name):
-    result = spheres.run(scene(name, position=np.zeros(3)), spheres.Params(radius_mm=50.0))
+    result = space_frame_step.run(scene(name, position=np.zeros(3)), space_frame_step.Params(radius_mm=50.0))
     assert result.status == "ok"
     assert "range" in result.message
     assert np.linalg.norm(result.centres[0] - PUBLISHED[name]) < 0.1
@@ -52,14 +52,14 @@ def test_known_scanner(name):
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_seed_makes_no_difference(name):
-    results = [spheres.run(scene(name), spheres.Params(seed=seed)) for seed in (1, 2)]
+    results = [space_frame_step.run(scene(name), space_frame_step.Params(seed=seed)) for seed in (1, 2)]
     assert results[0].centres.tobytes() == results[1].centres.tobytes()
     assert results[0].covariance.tobytes() == results[1].covariance.tobytes()
 
 
 @pytest.mark.parametrize("name", PUBLISHED)
 def test_bounds_stand_beside_the_estimate(name):
-    result = spheres.run(scene(name, position=np.zeros(3)), spheres.Params())
+    result = space_frame_step.run(scene(name, position=np.zeros(3)), space_frame_step.Params())
     assert result.stations.tolist() == [1]
     assert np.isfinite(result.bound_sd).all()
     assert ((result.efficiency > 0.2) & (result.efficiency < 1.2)).all()
@@ -71,7 +71,7 @@ def test_mount_alone_holds_no_ball(name):
     scan = whole.scans[0]
     off = np.linalg.norm(scan.points + scan.origin - PUBLISHED[name], axis=1) - 50.0
     rest = Scene(name, "structure", (Scan(name, scan.points[np.abs(off) > 2.0], scan.origin),))
-    result = spheres.run(rest, spheres.Params())
+    result = space_frame_step.run(rest, space_frame_step.Params())
     assert (result.status, len(result.radii)) == ("failed", 0)
 
 
@@ -80,6 +80,6 @@ def test_a_large_offset_changes_nothing():
     scan = here.scans[0]
     utm = np.array([500_000_000.0, 4_300_000_000.0, 0.0])
     there = Scene("there", "structure", (Scan("there", scan.points, scan.origin + utm),))
-    a, b = (spheres.run(one, spheres.Params()) for one in (here, there))
+    a, b = (space_frame_step.run(one, space_frame_step.Params()) for one in (here, there))
     np.testing.assert_allclose(b.centres - utm, a.centres, atol=1e-6)
     np.testing.assert_allclose(b.radii, a.radii, atol=1e-6)

@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.bolt_balls.station_records import TubePoints
+from processor.space_frame.stations.records import TubePoints
 
 
 def turn(w):

@@ -82,8 +82,8 @@ def run(format_, count, keep=None, say=lambda _: None):
 
 
 def _attempt(path):
-    from processor import folder
     from processor.model import InputError
+    from processor.scan_folder import folder
 
     try:
         scene = folder.read_input(path)
@@ -106,10 +106,10 @@ def _mapped(key):
 def _serve():
     import numba  # noqa: F401  is there before the limit is set, as in a run
 
-    from processor import folder, store  # noqa: F401
-    from processor.readers import apart, decimal  # noqa: F401
+    from processor.readers import ascii_rows, sandbox  # noqa: F401
+    from processor.store import store  # noqa: F401
 
-    apart._running()  # starting is no part of reading
+    sandbox._running()  # starting is no part of reading
     before = _mapped("VmSize")
     resource.setrlimit(resource.RLIMIT_AS, (before + 4 * MEMORY_BYTES,) * 2)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from designgen.curves import Curve
-from designgen.surfaces import Patch
+from designgen.scanning.surfaces import Patch
 from processor.model import Floats
 
 if TYPE_CHECKING:

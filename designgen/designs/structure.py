@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.surfaces import Bools, Patch
+from designgen.scanning.surfaces import Bools, Patch
 from processor.model import Floats
 
 if TYPE_CHECKING:

@@ -21,10 +21,11 @@ from types import FrameType
 from typing import Any
 
 from processor.batch import job as jobs_
-from processor.batch import record, spreading, summary
+from processor.batch import record, summary
 from processor.batch.finding import STATE, Found, Input, find
 from processor.batch.job import Job
 from processor.batch.record import Record
+from processor.jobs import runner
 from processor.model import InputError, UsageError
 
 LOGS = "logs"
@@ -74,7 +75,7 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
         say(f"{name}: left out: {reason}")
     if not found.inputs:
         raise InputError(f"{settings.root}: expected scan folders, scenes or scans in it, found none")
-    client = spreading.connect(settings.cluster, say) if settings.cluster else None
+    client = runner.connect(settings.cluster, say) if settings.cluster else None
     try:
         with _stoppable() as stop_here, _alone_in(out) as state:
             return _run(settings, found, root, out, state, client, say, ended, stop_here)
@@ -106,9 +107,9 @@ def _run(
     except OSError as error:
         raise InputError(f"{out}: cannot be written ({error.strerror or error})") from error
     if client:
-        spread = spreading.over_cluster(jobs, client, settings.cluster or "", stop_here)
+        spread = runner.over_cluster(jobs, client, settings.cluster or "", stop_here)
     else:
-        spread = spreading.here(jobs, settings.jobs, stop_here)
+        spread = runner.here(jobs, settings.jobs, stop_here)
     records: dict[str, Record] = {}
     try:
         with closing(spread), tqdm(total=len(jobs), unit="input", disable=not sys.stderr.isatty()) as bar:

@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any
 
 import processor
-from processor import inputs
-from processor.batch import figures, process, record
+from processor.batch import figures, record
 from processor.batch.record import FAILED, Record
+from processor.jobs import process
 from processor.model import InputError
+from processor.scan_folder import fingerprint
 
 PACKAGES = ("ezdxf", "h5py", "laspy", "lazrs", "numba", "numpy", "plyfile", "pye57", "pypcd4", "scipy", "trimesh")
 PROGRAM = (sys.executable, "-m", "processor.batch.child")
@@ -89,7 +90,7 @@ def do(job: Job, stopped: Callable[[], bool] = lambda: False) -> Record:
     try:
         if software() != job.software:
             return _passing(job, _other_software(job))
-        before = inputs.content_hash(job.source, job.out)
+        before = fingerprint.content_hash(job.source, job.out)
         made_from = record.identity(before, job.parameters, job.software)
         earlier = _earlier(job, made_from)
         if earlier is not None:
@@ -156,7 +157,7 @@ def _done(job: Job, before: str, made_from: str, over: Callable[[], bool]) -> Re
         status, reason, limits, results = _judged(job, ended, made)
         if status == FAILED and any(sign in ended.last_line for sign in OUTPUT_GONE):
             raise OutputGoneError(reason)
-        after = inputs.content_hash(job.source, job.out)
+        after = fingerprint.content_hash(job.source, job.out)
         if after != before:
             text = "the input changed while it was processed, so nothing is kept; run again when it is complete"
             return _passing(job, text)

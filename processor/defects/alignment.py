@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.defects.observed import Pairs, Stations
-from processor.defects.surface import DesignSurface
+from processor.defects.observations import Pairs, Stations
+from processor.defects.surface_charts import DesignSurface
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 

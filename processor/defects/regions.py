@@ -8,11 +8,11 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from processor.defects.absence import Expected
 from processor.defects.classes import CRACK_RATIO
-from processor.defects.fields import Field
+from processor.defects.deviation_field import Field
+from processor.defects.missing_material import Expected
 from processor.defects.scan_statistic import Finding
-from processor.defects.surface import CYLINDER, Charts, DesignSurface
+from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Floats, Ints
 
 ROUND = np.ones((3, 3))

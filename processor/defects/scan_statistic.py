@@ -15,8 +15,8 @@ import numpy.typing as npt
 from scipy import ndimage
 from scipy.special import ndtr, ndtri
 
-from processor.defects.fields import Field
-from processor.defects.surface import CYLINDER, Charts, DesignSurface
+from processor.defects.deviation_field import Field
+from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Floats
 
 Bools = npt.NDArray[np.bool_]

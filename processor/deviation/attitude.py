@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.deviation.clouds import Samples
+from processor.deviation.cloud import Samples
 from processor.geometry import icp, principal, rigid
 from processor.geometry.neighbors import thinned
 from processor.model import Floats

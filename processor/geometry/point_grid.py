@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from processor.geometry.threads import over_ranges
+from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
 
 SIDE = 4  # cells along a block's edge

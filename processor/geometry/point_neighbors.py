@@ -8,8 +8,8 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.geometry import point_grid
+from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at
-from processor.geometry.threads import over_ranges
 from processor.model import Floats, Ints
 
 SPACING_NEIGHBOURS, SPACING_SAMPLE = 8, 20_000

@@ -11,14 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry.sphere import (
-    Sphere,
-    algebraic,
-    canonical_order,
-    sphere_cells,
-    through_four,
-    visible_fraction,
-)
+from processor.geometry.sphere import Sphere, algebraic, canonical_order, sphere_cells, through_four, visible_fraction
 from processor.geometry.sphere_robust import RobustFit, robust_fit
 from processor.model import Floats
 

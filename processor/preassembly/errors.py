@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.geometry.lines import Polyline
+from processor.geometry.polyline import Polyline
 from processor.model import Floats
 
 STATION_MM = 200.0

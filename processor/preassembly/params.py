@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from processor.model import UsageError
-from processor.preassembly.features import BoxParams, SliceParams
-from processor.preassembly.matching import MatchParams
-from processor.preassembly.proposals import TrimParams
-from processor.preassembly.systematic import SystematicParams
+from processor.preassembly.baselines.edge_features import BoxParams, SliceParams
+from processor.preassembly.baselines.joint_alignment import MatchParams
+from processor.preassembly.parts.systematic_errors import SystematicParams
+from processor.preassembly.verdicts.trim_and_shim import TrimParams
 
 PAPER_METHODS = ("design-aided", "line", "corner")
 METHODS = ("adjustment", *PAPER_METHODS)  # the first is the default

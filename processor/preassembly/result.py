@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.model import Checked, Floats, Labels, column, names
-from processor.preassembly.joint_measures import Measures
-from processor.preassembly.joint_verdicts import Verdict
-from processor.preassembly.proposals import Proposal
+from processor.preassembly.verdicts.joint_measures import Measures
+from processor.preassembly.verdicts.joints import Verdict
+from processor.preassembly.verdicts.trim_and_shim import Proposal
 
 
 @dataclass(frozen=True)

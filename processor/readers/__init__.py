@@ -7,15 +7,15 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError
-from processor.readers import apart, closed, e57, las, pcd, ply, ptx, text
-from processor.readers.raw import RawScan
+from processor.readers import e57, las, pcd, ply, proprietary, ptx, sandbox, text
+from processor.readers.common import RawScan
 
 __all__ = ["ARCHIVES", "SUFFIXES", "RawScan", "read"]
 
 _FORMATS = {suffix: module for module in (e57, las, pcd, ply, ptx, text) for suffix in module.SUFFIXES}
 
 SUFFIXES = tuple(sorted(_FORMATS))
-ARCHIVES = closed.ARCHIVES
+ARCHIVES = proprietary.ARCHIVES
 
 
 def read(path: Path) -> list[RawScan]:
@@ -25,7 +25,7 @@ def read(path: Path) -> list[RawScan]:
     """
     suffix = path.suffix.lower()
     if is_closed(path):
-        raise InputError(f"{path}: {closed.advice(suffix)}")
+        raise InputError(f"{path}: {proprietary.advice(suffix)}")
     if suffix not in _FORMATS:
         raise InputError(f"{path}: expected a scan file ({', '.join(SUFFIXES)}), found {suffix or 'no suffix'}")
     if not path.is_file():
@@ -35,7 +35,7 @@ def read(path: Path) -> list[RawScan]:
     module = _FORMATS[suffix]
     try:
         if getattr(module, "apart", lambda _: False)(path):
-            return apart.read(path, module.__name__.rpartition(".")[2])
+            return sandbox.read(path, module.__name__.rpartition(".")[2])
         # A damaged float32 may be a signalling NaN, of which numpy warns; what is not finite is refused later.
         with np.errstate(invalid="ignore", over="ignore"):
             scans: list[RawScan] = module.read(path)
@@ -48,4 +48,4 @@ def read(path: Path) -> list[RawScan]:
 
 def is_closed(path: Path) -> bool:
     """Whether a path has the suffix of a format that only its maker's software reads."""
-    return path.suffix.lower() in closed.FORMATS
+    return path.suffix.lower() in proprietary.FORMATS

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import Floats, InputError
-from processor.readers.raw import RawScan, make, parsing, room_for, stem
+from processor.readers.common import RawScan, make, parsing, room_for, stem
 
 SUFFIXES = (".e57",)
 UNIT = "m"

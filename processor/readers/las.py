@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.raw import RawScan, check_room, make, parsing, room_for, stem
+from processor.readers.common import RawScan, check_room, make, parsing, room_for, stem
 
 SUFFIXES = (".las", ".laz")
 UNIT = "m"

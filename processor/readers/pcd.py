@@ -15,19 +15,20 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from processor.model import Floats, InputError
-from processor.readers.raw import (
+from processor.readers.ascii_rows import Rows
+from processor.readers.common import (
     INTENSITY_NAMES,
     STATION_NAMES,
     RawScan,
     check_room,
+    fill,
     first_named,
     make,
+    of_records,
     parsing,
     room_for,
     stem,
 )
-from processor.readers.records import fill, of_records
-from processor.readers.rows import Rows
 
 SUFFIXES = (".pcd",)
 UNIT = ""

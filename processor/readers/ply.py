@@ -8,19 +8,20 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.raw import (
+from processor.readers.ascii_rows import Rows
+from processor.readers.common import (
     INTENSITY_NAMES,
     STATION_NAMES,
     RawScan,
     check_room,
+    fill,
     first_named,
     make,
+    of_records,
     parsing,
     room_for,
     stem,
 )
-from processor.readers.records import fill, of_records
-from processor.readers.rows import Rows
 
 SUFFIXES = (".ply",)
 UNIT = ""

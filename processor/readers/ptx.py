@@ -11,10 +11,11 @@ import dataclasses
 from pathlib import Path
 
 import numpy as np
+from numba import njit
 
-from processor.model import Floats, InputError
-from processor.readers.raw import RawScan, check_room, make, parsing, room_for, stem
-from processor.readers.rows import Rows
+from processor.model import Floats, InputError, Labels
+from processor.readers.ascii_rows import Rows
+from processor.readers.common import RawScan, check_room, make, parsing, room_for, stem
 
 SUFFIXES = (".ptx",)
 UNIT = "m"
@@ -62,7 +63,7 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     check_room(path, "PTX", cells, SHORTEST_ROW, size)
     T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
     with parsing(path, "PTX"):
-        from processor.readers.returns import keep
+        pass
 
         wide = rows.width() in (4, 7)
         points, intensity = room_for(cells, 3), room_for(cells if wide else 0)
@@ -103,3 +104,38 @@ def _rigid(path: Path, number: int, T: Floats) -> Floats:
     exact = np.eye(4)
     exact[:3, :3], exact[:3, 3] = u @ vt, T[:3, 3]
     return exact
+
+
+# --- Cells of a scanner's grid that had a return, sorted out of all: compiled.
+
+
+@njit(cache=True, nogil=True)
+def keep(
+    cells: Floats,
+    first: int,
+    lines: int,
+    found: int,
+    points: Floats,
+    intensity: Floats,
+    row: Labels,
+    column: Labels,
+) -> int:
+    """Copy those of cells (n, 3 or 4) that are not ``0 0 0`` behind the ``found`` returns that there are already.
+
+    Cells come column by column of ``lines`` cells each, the first of these being cell ``first``. ``points`` (m, 3),
+    ``intensity``, ``row`` and ``column`` (m,) are filled, but those that are empty. Returns the count of all returns.
+    """
+    c, r = divmod(first, lines)
+    for i in range(len(cells)):
+        x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
+        if x != 0.0 or y != 0.0 or z != 0.0:
+            points[found, 0], points[found, 1], points[found, 2] = x, y, z
+            if len(intensity):
+                intensity[found] = cells[i, 3]
+            if len(row):
+                row[found], column[found] = r, c
+            found += 1
+        r += 1
+        if r == lines:
+            r, c = 0, c + 1
+    return found

@@ -17,7 +17,8 @@ from typing import BinaryIO
 import numpy as np
 
 from processor.model import Floats, InputError
-from processor.readers.raw import (
+from processor.readers.ascii_rows import Rows
+from processor.readers.common import (
     INTENSITY_NAMES,
     STATION_NAMES,
     RawScan,
@@ -29,7 +30,6 @@ from processor.readers.raw import (
     room_for,
     stem,
 )
-from processor.readers.rows import Rows
 
 SUFFIXES = (".asc", ".csv", ".pts", ".txt", ".xyz")
 UNIT = ""

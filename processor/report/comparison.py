@@ -11,11 +11,13 @@ from typing import Any
 import matplotlib as mpl
 
 from processor import pipeline
-from processor.compare import Comparison, turned_note, unit_note
+from processor.compare.compare import Comparison, turned_note, unit_note
 from processor.geometry.m3c2 import FEWEST_FOR_LOD
-from processor.geometry.orientation import CONVENTION, Turned
+from processor.geometry.normal_orientation import CONVENTION, Turned
 from processor.language import language
-from processor.report import core_points, figures_deviation, writing
+from processor.report import results_folder
+from processor.report.deviation import csv
+from processor.report.deviation import figures as deviation_figures
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
 OWN_NAMES = (TABLE, *FIGURES, RECORD, PAGE)
@@ -30,7 +32,7 @@ def check_output(out: Path, found: tuple[Path | None, ...]) -> None:
     """Refuse a folder that holds anything but an earlier comparison, or one of the inputs: UsageError."""
     for path in found:
         if path is not None:
-            writing.check_output(out, path, RECORD, OWN_NAMES)
+            results_folder.check_output(out, path, RECORD, OWN_NAMES)
 
 
 def as_json(found: Comparison) -> dict[str, Any]:
@@ -104,17 +106,17 @@ def write(out: Path, found: Comparison, lang: str = "en") -> dict[str, Any]:
         mpl.rcdefaults()
         mpl.rcParams["text.parse_math"] = False
         drawn = [
-            figures_deviation.deviation_map(found.core + found.origin, found.normals, found.distances, found.unit),
-            figures_deviation.histogram(found.distances, found.unit),
+            deviation_figures.deviation_map(found.core + found.origin, found.normals, found.distances, found.unit),
+            deviation_figures.histogram(found.distances, found.unit),
         ]
-    with writing.whole(out) as making:
-        text = core_points.csv_text(found.origin, found.core, found.distances, found.normals)
-        writing.write_text(making / TABLE, text)
+    with results_folder.whole(out) as making:
+        text = csv.csv_text(found.origin, found.core, found.distances, found.normals)
+        results_folder.write_text(making / TABLE, text)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
-        writing.write_text(making / RECORD, record_text + "\n")
+        results_folder.write_text(making / RECORD, record_text + "\n")
         for name, (_, data) in zip(FIGURES, drawn, strict=True):
-            writing.write_bytes(making / name, data)
-        writing.write_text(making / PAGE, _page(record, drawn, lang))
+            results_folder.write_bytes(making / name, data)
+        results_folder.write_text(making / PAGE, _page(record, drawn, lang))
     return record
 
 

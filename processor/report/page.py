@@ -10,13 +10,13 @@ from typing import Any
 
 import jinja2
 
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.language import language
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report import step_report, tables, view
-from processor.report.drawing import Drawn
-from processor.report.printing import headings, numeric, shown
+from processor.report import all_tables, section, view
+from processor.report.style import Drawn
+from processor.report.table import headings, numeric, shown
 
 GOOD = "ok"
 LEAD = ("what-to-do", "limits", "limits-chain", "limits-not-held")  # tables above the figures
@@ -50,8 +50,8 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
     points = sum(len(scan.points) for scan in scene.scans)
     live = {
         run.step: data
-        for run, others in tables.grouped(execution.runs)
-        if (data := step_report.of(run.step).live(scene, [run, *others])) is not None
+        for run, others in all_tables.grouped(execution.runs)
+        if (data := section.of(run.step).live(scene, [run, *others])) is not None
     }
     script, digest = view.script()
     text: str = environment.get_template("page.html").render(
@@ -74,8 +74,8 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
 
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]:
     found = []
-    for run, _ in tables.grouped(execution.runs):
-        report_of = step_report.of(run.step)
+    for run, _ in all_tables.grouped(execution.runs):
+        report_of = section.of(run.step)
         head, said = report_of.summary(run.result)
         title = f"{report_of.title}: {head}"
         found.append({"tone": _tone(run), "head": title, "text": f"Method {run.method}. {said}".strip()})
@@ -106,11 +106,11 @@ def _sections(
     execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str]
 ) -> list[dict[str, Any]]:
     sections = []
-    for run, others in tables.grouped(execution.runs):
-        shown_tables = [one for one in tables.of_step(run, others, report) if one.on_page]
+    for run, others in all_tables.grouped(execution.runs):
+        shown_tables = [one for one in all_tables.of_step(run, others, report) if one.on_page]
         sections.append(
             {
-                "title": step_report.of(run.step).title,
+                "title": section.of(run.step).title,
                 "message": run.result.message,
                 "lead": [_table(one) for one in shown_tables if one.file in LEAD],
                 "tables": [_table(one) for one in shown_tables if one.file not in LEAD],
@@ -123,14 +123,14 @@ def _sections(
             }
         )
     if report.metrics:
-        checks = _table(tables.of_checks(report))
+        checks = _table(all_tables.of_checks(report))
         sections.append(
             {"title": "Truth", "message": "", "lead": [], "tables": [checks], "figures": [], "live": False, "step": ""}
         )
     return sections
 
 
-def _table(table: tables.Table) -> dict[str, Any]:
+def _table(table: all_tables.Table) -> dict[str, Any]:
     note = table.note
     if len(table.rows) > MOST_ROWS:
         note = f"{note} The first {MOST_ROWS} of {len(table.rows)} rows; all are in {table.file}.csv.".strip()

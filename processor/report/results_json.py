@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report import step_report
+from processor.report import section
 
 FORMAT, FORMAT_VERSION = "processor-results", "1.0"
 
@@ -54,7 +54,7 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
 
 def step_json(run: StepRun) -> dict[str, Any]:
     """Write one step's result."""
-    return step_report.of(run.step).written(run.result)
+    return section.of(run.step).written(run.result)
 
 
 def plain(value: Any) -> Any:

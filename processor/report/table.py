@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import io
+import itertools
+import math
+import unicodedata
 from dataclasses import dataclass
 from typing import Any
+
+import numpy as np
 
 NAN = float("nan")
 
@@ -23,3 +30,84 @@ class Table:
     groups: tuple[str, ...] = ()
     on_page: bool = True
     on_terminal: bool = True
+
+
+FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # how a cell begins that a spreadsheet would execute
+
+
+def csv_text(table: Table) -> str:
+    """Write a table as CSV; text that a spreadsheet would take for a formula gets a leading apostrophe."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(table.columns)
+    writer.writerows([_csv_cell(cell) for cell in row] for row in table.rows)
+    return out.getvalue()
+
+
+def _csv_cell(cell: Any) -> Any:
+    if isinstance(cell, float | np.floating):
+        return "" if not math.isfinite(cell) else repr(round(float(cell), 6))
+    if isinstance(cell, str):
+        text = shown(cell)
+        return "'" + text if text.startswith(FORMULA) else text
+    return cell
+
+
+def shown(cell: Any) -> str:
+    """Write a cell for people: three decimals, a dash where there is no number, no control characters."""
+    if isinstance(cell, float | np.floating):
+        return "–" if not math.isfinite(cell) else f"{cell:.3f}"
+    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in str(cell))
+
+
+def plain_text(table: Table, most: int = 40) -> str:
+    """Write a table for the terminal, columns aligned, at most so many rows."""
+    cells = [list(headings(table)), *([shown(cell) for cell in row] for row in table.rows[:most])]
+    widths = [max(_width(row[i]) for row in cells) for i in range(len(table.columns))]
+    lines = [shown(table.title)]
+    if table.groups:
+        lines.append(_group_line(table, widths))
+    right = numeric(table)
+    lines += ["  " + "  ".join(map(_aligned, row, widths, right)) for row in cells]
+    if len(table.rows) > most:
+        where = f" in {table.file}.csv" if table.file else ""
+        lines.append(f"  ... and {len(table.rows) - most} more{where}")
+    return "\n".join(line.rstrip() for line in lines)
+
+
+def headings(table: Table) -> tuple[str, ...]:
+    """Return the columns' names as people read them: the title tells the unit, groups what a column belongs to."""
+    names = [column.removesuffix("_mm").removesuffix("_mrad").replace("_", " ") for column in table.columns]
+    if table.groups:
+        names = [name.split(" ")[-1] if group else name for name, group in zip(names, table.groups, strict=True)]
+    return tuple(names)
+
+
+def _group_line(table: Table, widths: list[int]) -> str:
+    """Put each group's heading above its columns; those widen where it is longer than they are."""
+    line = "  "
+    start = 0
+    for group, members in itertools.groupby(table.groups):
+        columns = range(start, start + len(list(members)))
+        start = columns.stop
+        width = sum(widths[i] for i in columns) + 2 * (len(columns) - 1)
+        widths[columns[-1]] += max(0, _width(group) - width)
+        line += shown(group) + " " * (max(width, _width(group)) - _width(group) + 2)
+    return line
+
+
+def numeric(table: Table) -> tuple[bool, ...]:
+    """Tell which columns hold numbers; these are aligned to the right."""
+    return tuple(
+        any(isinstance(row[i], int | float | np.number) for row in table.rows) for i in range(len(table.columns))
+    )
+
+
+def _aligned(cell: str, width: int, right: bool) -> str:
+    space = " " * (width - _width(cell))
+    return space + cell if right else cell + space
+
+
+def _width(text: str) -> int:
+    """Columns that a text takes on a terminal: Chinese characters take two."""
+    return sum(2 if unicodedata.east_asian_width(one) in "WF" else 1 for one in text)

@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from processor.model import KEY_POINTS, Floats, Scene, StepRun
-from processor.report.drawing import DIVERGING_STOPS, colour_limit
-from processor.report.printing import shown
+from processor.preassembly import step as preassembly_step
+from processor.report.preassembly.results import TRADE_OFF
 from processor.report.results_json import plain
-from processor.report.results_preassembly import TRADE_OFF
-from processor.steps import preassemble
+from processor.report.style import DIVERGING_STOPS, colour_limit
+from processor.report.table import shown
 
 MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page
 MOST_ON_AN_EDGE = 80
@@ -28,7 +28,7 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return what the page draws of an assembled bridge, mm; None where there is no design to draw."""
     if scene.arch is None or not scene.arch.parts:
         return None
-    result: preassemble.Result = runs[0].result
+    result: preassembly_step.Result = runs[0].result
     found = {
         "title": "Gaps and residuals in space" if len(result.residual) else "Gaps in space",
         "arrows": "gaps as arrows",
@@ -75,7 +75,7 @@ def script() -> tuple[str, str]:
     return text, f"'sha256-{digest}'"
 
 
-def _part(scene: Scene, result: preassemble.Result, i: int) -> dict[str, Any]:
+def _part(scene: Scene, result: preassembly_step.Result, i: int) -> dict[str, Any]:
     assert scene.arch is not None
     part = scene.arch.parts[i]
     own = np.flatnonzero(_component(result, part.name))
@@ -89,7 +89,7 @@ def _part(scene: Scene, result: preassemble.Result, i: int) -> dict[str, Any]:
     }
 
 
-def _component(result: preassemble.Result, name: str) -> Any:
+def _component(result: preassembly_step.Result, name: str) -> Any:
     """Mark (p,) the residuals of a part."""
     if not len(result.residual) or name not in result.components:
         return np.zeros(len(result.residual), bool)
@@ -105,7 +105,7 @@ def _thinned(edge: Floats) -> Floats:
 
 
 def _linear(run: StepRun) -> dict[str, Any]:
-    result: preassemble.Result = run.result
+    result: preassembly_step.Result = run.result
     step = max(1, -(-len(result.linear_station) // MOST_STATIONS))
     return {
         "method": run.method,

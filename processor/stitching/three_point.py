@@ -6,6 +6,7 @@ without a trace, so six are the default, and scale is a diagnostic.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,9 +14,9 @@ from scipy.stats import f
 from scipy.stats import t as student
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats
+from processor.model import NORMAL_95, Floats, Picks, Scan
 from processor.stitching import frames
-from processor.stitching.pairs import Pair
+from processor.stitching.fine.pair_checks import Pair
 
 LEAST_POINTS = 3
 LEAST_SD_MM = 1e-6  # of picks without any error, as tests make them
@@ -221,3 +222,26 @@ def _equation(one: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
     A[3:, :3] = R.T @ frames.cross_matrix(arm)
     weight: Floats = np.asarray(np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True), np.float64)
     return A, r, weight
+
+
+# --- Picked common points of a scene, by pair of scans.
+
+
+Picked = dict[tuple[int, int], tuple[Floats, Floats, tuple[str, ...]]]
+
+
+def by_pair(picks: Picks | None, scans: Sequence[Scan]) -> Picked:
+    """Gather picks by rows of two scans, the lesser first: points (n, 3) in each scan's file frame, and their names."""
+    if picks is None:
+        return {}
+    row = {scan.name: i for i, scan in enumerate(scans)}
+    found: dict[tuple[int, int], list[tuple[Floats, Floats, str]]] = {}
+    for name_a, name_b, point, xa, xb in zip(
+        picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True
+    ):
+        a, b = row[name_a], row[name_b]
+        found.setdefault((min(a, b), max(a, b)), []).append((xa, xb, point) if a < b else (xb, xa, point))
+    return {
+        key: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), tuple(r[2] for r in rows))
+        for key, rows in sorted(found.items())
+    }

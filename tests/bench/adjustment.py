@@ -20,10 +20,11 @@ from pathlib import Path
 import numpy as np
 
 from designgen import recipes
-from designgen.scene import make
+from designgen.scenes.make import make
+from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import rigid
-from processor.preassembly import features
-from processor.steps import preassemble
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.baselines import edge_features
 
 CHECKED = {
     "splicing mean": "splicing error of the true key points, mean",
@@ -40,9 +41,9 @@ def figures(recipe, settings, seed):
     """All figures of one bridge."""
     scene, truth = make("bench", recipes.overridden(recipes.load(recipe)[1], settings), seed)
     started = time.monotonic()
-    result = preassemble.run(scene, preassemble.Params(seed=seed))
+    result = preassembly_step.run(scene, preassembly_step.Params(seed=seed))
     found = {"seconds": time.monotonic() - started, "points": sum(len(scan.points) for scan in scene.scans)}
-    checks = {metric.name: metric for metric in preassemble.check(scene, result, truth)}
+    checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
     found |= {name: checks[said].value if said in checks else float("nan") for name, said in CHECKED.items()}
     found["measured splicing mean"], found["measured linear mean"] = result.splicing_mean, result.linear_mean
     found["not ok"] = sum(status != "ok" for status in result.component_status)
@@ -56,7 +57,7 @@ def figures(recipe, settings, seed):
 def key_point_errors(design, result, truth):
     """Errors (n, 3) of all key points along the axes of their joints."""
     found = []
-    frames = [features.joint_frame(points)[:3, :3] for points in design.joint_points]
+    frames = [edge_features.joint_frame(points)[:3, :3] for points in design.joint_points]
     for i in range(len(result.components)):
         turn = truth.T_bridge_scan[i][:3, :3]
         for end, joint in enumerate((i - 1, i)):

@@ -17,10 +17,11 @@ import argparse
 import numpy as np
 from scipy.optimize import least_squares
 
-from processor.bolt_balls import balls, catalogue
-from processor.bolt_balls.crops import Crops
-from processor.bolt_balls.nodes import Nodes, Tubes
 from processor.geometry.sphere import algebraic
+from processor.space_frame import catalogue
+from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.points.sphere_crops import Crops
+from processor.space_frame.spheres import fit_all
 
 DOWN = np.array([0.0, 0.0, 1.0, -1.0])
 STATIONS = {
@@ -64,8 +65,8 @@ def trial(rng, draws, radius, count, visible, sigma, several, prior=None, likeli
     covariance = np.full((draws, 3, 3), np.nan) if prior is None else np.tile(prior**2 * np.eye(3), (draws, 1, 1))
     moved = Crops(crops.start, points - np.repeat(start, count, axis=0), station)
     nodes = Nodes(start, covariance, np.zeros(draws, np.int64), np.full(draws, np.nan))
-    params = balls.Params(sigma_mm=2.0, process_hole_mm=0.0)
-    got = balls.fit_crops(
+    params = fit_all.Params(sigma_mm=2.0, process_hole_mm=0.0)
+    got = fit_all.fit_crops(
         moved, stations, nodes, Tubes(), catalogue.of_radii([]), None, np.zeros((len(stations), 3, 3)), params
     )
     errors = np.column_stack([got.centres, got.radii - radius])

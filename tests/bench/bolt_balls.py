@@ -19,8 +19,8 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from designgen import recipes
-from designgen.scene import make
-from processor.steps import spheres
+from designgen.scenes.make import make
+from processor.space_frame import step as space_frame_step
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=6", "scan.stations=[2,3]", "scan.clutter=8"]
 CASES = {
@@ -100,12 +100,12 @@ def figures(every):
 def measured(case, seeds, with_design, settings=()):
     """Figures of one case, blind or with its design."""
     every = []
-    params = dataclasses.replace(spheres.Params(), **PARAMS.get(case, {}))
+    params = dataclasses.replace(space_frame_step.Params(), **PARAMS.get(case, {}))
     for seed in seeds:
         scene, truth = scene_of(case, seed, settings)
         scene = scene if with_design else dataclasses.replace(scene, frame=None)
         started = time.monotonic()
-        result = spheres.run(scene, params)
+        result = space_frame_step.run(scene, params)
         every.append({**errors(scene, result, truth.frame), "seconds": np.array([time.monotonic() - started])})
     return figures(every)
 

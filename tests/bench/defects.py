@@ -20,10 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from designgen import damage, recipes
-from designgen.scene import make
-from processor.defects import against_truth
-from processor.steps import defects
+from designgen import recipes
+from designgen.asbuilt import defects as asbuilt_defects
+from designgen.scenes.make import make
+from processor.defects import step as defects_step
+from processor.evaluation import defects as evaluation_defects
 
 FOUND = 0.9
 CRACK_MM = 8.0  # width of a crack of size 1
@@ -46,7 +47,7 @@ def run_one(scanner: str, size: float, seed: int) -> dict[str, Any]:
     """Run one scene and hold it against its truth."""
     scene, truth = scene_of(scanner, size, seed)
     started = time.monotonic()
-    result = defects.run(scene, defects.Params())
+    result = defects_step.run(scene, defects_step.Params())
     took = time.monotonic() - started
     found: dict[str, Any] = {
         "scanner": scanner, "size": size, "seed": seed, "seconds": took, "area_m2": result.examined_mm2 / 1e6,
@@ -54,8 +55,8 @@ def run_one(scanner: str, size: float, seed: int) -> dict[str, Any]:
     }  # fmt: skip
     if truth.defects is None or not len(truth.defects.ids):
         return {**found, "false": len(result.ids), "sure": int((~result.doubtful).sum()), "rows": []}
-    rows = against_truth.matched(result, truth.defects)
-    error, allowed = against_truth.depth_errors(result, truth.defects, rows)
+    rows = evaluation_defects.matched(result, truth.defects)
+    error, allowed = evaluation_defects.depth_errors(result, truth.defects, rows)
     other = ~np.isin(np.arange(len(result.ids)), rows)
     found["false"], found["sure"] = int(other.sum()), int((other & ~result.doubtful).sum())
     found["rows"] = [
@@ -87,7 +88,7 @@ def table(runs: list[dict[str, Any]]) -> str:
         sizes = sorted({run["size"] for run in own if run["rows"]})
         heads = "".join(f"{f'size {size:g}':>28}" for size in sizes)
         lines.append(f"  {'class':14}{heads}   (found, class right, depth within 10 % or 2 LOD95)   smallest")
-        for kind in damage.CLASSES:
+        for kind in asbuilt_defects.CLASSES:
             cells, smallest = [], ""
             for size in sizes:
                 rows = [row for run in own if run["size"] == size for row in run["rows"] if row["class"] == kind]

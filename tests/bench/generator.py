@@ -21,9 +21,9 @@ from pathlib import Path
 import numpy as np
 import open3d
 
-from designgen import echoes, frame_surfaces, raycast, scanner, survey
 from designgen.designs import arch_bridge, arch_part, space_frame, truss_bridge
-from designgen.surfaces import Builder
+from designgen.scanning import frame_surfaces, raycast, returns, scanner, survey
+from designgen.scanning.surfaces import Builder
 
 ROUNDS = 3
 
@@ -60,7 +60,7 @@ def ours(surfaces, T, params):
     took = []
     for round_ in range(ROUNDS + 1):
         started = time.perf_counter(), time.process_time()
-        found = echoes.scan(surfaces, T, scanner.Scanner(), params, round_, "S1")
+        found = returns.scan(surfaces, T, scanner.Scanner(), params, round_, "S1")
         took.append((time.perf_counter() - started[0], time.process_time() - started[1]))
     return *np.median(took[1:], axis=0).tolist(), len(found.returns.points)  # the first compiles
 
@@ -107,8 +107,8 @@ def main():
             print(f"{recipe}: {said}")
     params = scanner.Params(step_mrad=1.0)
     step = 1e-3 * params.step_mrad
-    rows = int(np.radians(echoes.HIGHEST_DEG - echoes.LOWEST_DEG) / step)
-    grid = raycast.Grid(step, float(np.radians(echoes.LOWEST_DEG)), rows, round(2.0 * np.pi / step))
+    rows = int(np.radians(returns.HIGHEST_DEG - returns.LOWEST_DEG) / step)
+    grid = raycast.Grid(step, float(np.radians(returns.LOWEST_DEG)), rows, round(2.0 * np.pi / step))
     rays = grid.rows * grid.columns
     print("scene   rays        points      M rays/s  a core  M points/s  Open3D alone, M rays/s  ratio")
     for name, (surfaces, T) in {"rib": rib(), "roof": roof(), "truss": truss()}.items():

@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.geometry import m3c2, orientation, point_neighbors
+from processor.geometry import m3c2, normal_orientation, point_neighbors
 from tests.unit.test_m3c2 import brute
 
 NORMAL_MM, PROJECTION_MM, DEPTH_MM = 110.0, 55.0, 100.0
@@ -36,7 +36,7 @@ def ours(first, second, core, threads):
     marks = [time.perf_counter()]
     grids = m3c2.grid(first, PROJECTION_MM), m3c2.grid(second, PROJECTION_MM)
     marks.append(time.perf_counter())
-    normals = orientation.turned(m3c2.normals(grids[0], core, NORMAL_MM, threads), core, NORMAL_MM).normals
+    normals = normal_orientation.turned(m3c2.normals(grids[0], core, NORMAL_MM, threads), core, NORMAL_MM).normals
     marks.append(time.perf_counter())
     found = m3c2.distances(
         *grids, core, normals, projection_diameter_mm=PROJECTION_MM, max_depth_mm=DEPTH_MM, threads=threads

@@ -16,10 +16,12 @@ from pathlib import Path
 import numpy as np
 
 from designgen import recipes
-from designgen.scene import make
-from processor.preassembly import paper
+from designgen.scenes.make import make
+from processor.evaluation import preassembly as preassembly_evaluation
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.baselines import methods as baselines_methods
 from processor.preassembly.params import PAPER_METHODS
-from processor.steps import preassemble, spheres
+from processor.space_frame import step as space_frame_step
 
 FIGURES = ("splicing mean", "splicing max", "linear mean", "linear max", "best-fit linear mean", "true linear mean")
 
@@ -35,15 +37,15 @@ def bridges(sets, seeds, sigmas, spacing, methods):
                 scene, truth = make(name, recipes.overridden(recipes.load(f"arch-{name.lower()}")[1], settings), seed)
                 started = time.monotonic()
                 if set(methods) & set(PAPER_METHODS):
-                    scans = [own[0] for own in preassemble.scans_in_order(scene, scene.arch)]
-                    parts = paper.extract(scans, scene.arch, preassemble.Params(seed=seed))
+                    scans = [own[0] for own in preassembly_step.scans_in_order(scene, scene.arch)]
+                    parts = baselines_methods.extract(scans, scene.arch, preassembly_step.Params(seed=seed))
                 for method in methods:
-                    params = preassemble.Params(method=method, seed=seed)
+                    params = preassembly_step.Params(method=method, seed=seed)
                     if method in PAPER_METHODS:
-                        result = paper.assemble(parts, scene.arch, params)
+                        result = baselines_methods.assemble(parts, scene.arch, params)
                     else:
-                        result = preassemble.run(scene, params)
-                    checks = {metric.name: metric for metric in preassemble.check(scene, result, truth)}
+                        result = preassembly_step.run(scene, params)
+                    checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
                     found[method].append(
                         [
                             result.splicing_mean,
@@ -83,11 +85,13 @@ def _print_row(row):
 def balls(seeds):
     """Radius errors of both estimators on 100 balls."""
     rows = []
-    for method in spheres.METHODS:
+    for method in space_frame_step.METHODS:
         errors = []
         for seed in seeds:
             scene, truth = make("balls-100", recipes.load("balls-100")[1], seed)
-            result = spheres.run(scene, dataclasses.replace(spheres.Params(), method=method, seed=seed))
+            result = space_frame_step.run(
+                scene, dataclasses.replace(space_frame_step.Params(), method=method, seed=seed)
+            )
             errors.append(np.abs(result.radii - truth.frame.radii))
         quantiles = np.nanquantile(np.array(errors), [0.5, 0.95, 1.0], axis=1)
         rows.append(
@@ -111,7 +115,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--sigmas", default="0,1", help="mm, comma-separated")
     parser.add_argument("--spacing", type=float, default=5.0, help="mm")
-    parser.add_argument("--methods", default=",".join(preassemble.METHODS), help="of preassembly, comma-separated")
+    parser.add_argument("--methods", default=",".join(preassembly_step.METHODS), help="of preassembly, comma-separated")
     parser.add_argument("--output", type=Path, required=True)
     arguments = parser.parse_args()
     seeds = range(arguments.seeds)

@@ -22,8 +22,8 @@ import numpy as np
 from plyfile import PlyData, PlyElement
 from scipy.spatial import cKDTree
 
-from processor.bolt_balls.scene_source import of_scene
-from processor.steps import spheres
+from processor.space_frame import step as space_frame_step
+from processor.space_frame.points.scene_source import of_scene
 from tests.bench.bolt_balls import scene_of
 
 NEAR_MM = 10.0
@@ -54,7 +54,7 @@ def ours(scene, truth):
     blind = dataclasses.replace(scene, frame=None)
     for _ in range(2):
         started = time.monotonic()
-        result = spheres.run(blind, spheres.Params())
+        result = space_frame_step.run(blind, space_frame_step.Params())
         seconds = time.monotonic() - started
     known = np.isfinite(result.centres).all(axis=1)
     return scored("ray, whole cloud", seconds, result.centres[known], result.radii[known], truth)

@@ -45,10 +45,10 @@ def cloud(count):
 
 
 def write_e57(path, points, intensity):
-    from designgen import e57_file
+    from designgen.export import e57
     from processor.model import Scan
 
-    e57_file.write(path, [Scan("S1", points * 1_000.0, intensity=intensity.astype(float))], spherical=False)
+    e57.write(path, [Scan("S1", points * 1_000.0, intensity=intensity.astype(float))], spherical=False)
 
 
 def write_las(path, points, intensity):

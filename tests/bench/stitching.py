@@ -30,9 +30,10 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from designgen import recipes
-from designgen.scene import make
-from processor.steps import stitch
-from processor.stitching import against_truth
+from designgen.scenes.make import make
+from processor.evaluation import stitching
+from processor.evaluation import stitching as stitching_evaluation
+from processor.stitching import step as stitching_step
 from tests.bench import stitching_picks
 
 PARTS = ("seeds", "starts", "picks")
@@ -51,12 +52,12 @@ def made(recipe, settings, seed):
 def measured(scene, truth, params):
     """Figures of one run of ``automatic``."""
     wall, cpu = time.monotonic(), time.process_time()
-    result = stitch.run(scene, params)
+    result = stitching_step.run(scene, params)
     wall, cpu = time.monotonic() - wall, time.process_time() - cpu
-    found = {metric.name: metric.value for metric in stitch.check(scene, result, truth)}
+    found = {metric.name: metric.value for metric in stitching_evaluation.check(scene, result, truth)}
     true = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
     rows = [i for i, name in enumerate(result.scans) if np.isfinite(result.T_project_scan[i]).all()]
-    pulls = against_truth.pulls_of(result, rows, np.stack([true[result.scans[i]] for i in rows]))
+    pulls = stitching.pulls_of(result, rows, np.stack([true[result.scans[i]] for i in rows]))
     return {
         "points": int(sum(len(scan.points) for scan in scene.scans)),
         "position_mm": found.get("station positions after datum fit, max", float("inf")),
@@ -64,7 +65,7 @@ def measured(scene, truth, params):
         "stated_position_mm": float(np.nanmax(result.position_sd)),
         "stated_rotation_mrad": float(1e3 * np.nanmax(result.rotation_sd)),
         "components": len(pulls),
-        "within_95": float((np.abs(pulls) < against_truth.NORMAL_95).mean()) if len(pulls) else float("nan"),
+        "within_95": float((np.abs(pulls) < stitching.NORMAL_95).mean()) if len(pulls) else float("nan"),
         "pull_rms": float(np.sqrt(np.mean(pulls**2))) if len(pulls) else float("nan"),
         "flags": [s for s in result.scan_status if s != "ok"],
         "pairs_used": f"{int(result.used.sum())}/{len(result.used)}",
@@ -93,9 +94,9 @@ def row(task):
     part, recipe, settings, seed, number = task
     scene, truth = made(recipe, settings, seed)
     if part == "seeds":
-        return {"part": part, "seed": seed, **measured(scene, truth, stitch.Params())}
+        return {"part": part, "seed": seed, **measured(scene, truth, stitching_step.Params())}
     if part == "starts":
-        found = measured(*turned(scene, truth, number), stitch.Params())
+        found = measured(*turned(scene, truth, number), stitching_step.Params())
         right = found["position_mm"] < RIGHT_MM and not found["flags"]
         wrong = found["position_mm"] >= RIGHT_MM and not found["flags"]
         return {"part": part, "start": number, "right": right, "wrong_without_flag": wrong, **found}

@@ -10,8 +10,8 @@ import dataclasses
 
 import numpy as np
 
-from designgen import picking
-from processor.steps import stitch
+from designgen.scanning import picking
+from processor.stitching import step as stitching_step
 
 NOISE_MM = 5.0
 POINTS = 3  # as in the paper
@@ -57,7 +57,9 @@ def figures(scene, truth, draw):
     scene, T, pairs, places = picked(scene, truth, draw)
     found = {"draw": draw}
     for name, scale in (("six", "fixed"), ("seven", "free")):
-        result = stitch.run(scene, stitch.Params(method="three-point", scale=scale, weak_mm=1e3, weak_mrad=1e2))
+        result = stitching_step.run(
+            scene, stitching_step.Params(method="three-point", scale=scale, weak_mm=1e3, weak_mrad=1e2)
+        )
         base = result.T_project_scan[0] @ np.linalg.inv(T[0])
         C = expected(base @ T, pairs, places, scale == "free")
         shift, ratio, pull = [], [], []

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import importlib
 import json
 import math
 from concurrent.futures import ProcessPoolExecutor
@@ -14,7 +15,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 from designgen import recipes
-from designgen.scene import make
+from designgen.scenes.make import make
 from processor import pipeline
 
 FRAME = ("frame.nodes_x=4", "frame.nodes_y=4", "scan.spacing_mm=8")
@@ -32,10 +33,11 @@ def figures(task):
     (recipe, settings, step, methods), seed = task
     scene, truth = make(recipe, recipes.overridden(recipes.load(recipe)[1], settings), seed)
     module = pipeline.step_modules()[step]
+    check = importlib.import_module(f"processor.evaluation.{pipeline.package_of(step)}").check
     rows = []
     for method in methods:
         result = module.run(scene, dataclasses.replace(module.Params(), method=method))
-        rows += [[method, m.name, m.value, m.unit] for m in module.check(scene, result, truth)]
+        rows += [[method, m.name, m.value, m.unit] for m in check(scene, result, truth)]
     return rows
 
 

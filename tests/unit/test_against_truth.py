@@ -5,15 +5,18 @@ import dataclasses
 import numpy as np
 import pytest
 
+from processor.evaluation import preassembly
 from processor.geometry import rigid
-from processor.geometry.lines import Polyline
+from processor.geometry.polyline import Polyline
 from processor.model import ArchTruth, Scene, Truth
-from processor.preassembly import against_truth, bottom_edges, features, joint_ends, network
+from processor.preassembly.baselines import edge_features
+from processor.preassembly.chain import adjustment
+from processor.preassembly.ends import bottom_edges, joint_end
 from processor.preassembly.result import Result
 from tests import arch_clouds
 
 DESIGN = arch_clouds.design()
-FRAMES = np.array([features.joint_frame(points) for points in DESIGN.joint_points])
+FRAMES = np.array([edge_features.joint_frame(points) for points in DESIGN.joint_points])
 WEIGHT = 0.1
 
 
@@ -47,15 +50,15 @@ def member(i, ends, edges, unseen, without):
         if not 0 <= joint < 4:
             own.append(None)
         elif (i, e) in unseen or i in without:
-            own.append(joint_ends.nothing("too few points on the end face"))
+            own.append(joint_end.nothing("too few points on the end face"))
         else:
             moved = (ends[i, e] - DESIGN.joint_points[joint]) @ FRAMES[joint][:3, :3]
-            own.append(joint_ends.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), 0.01, ""))
+            own.append(joint_end.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), 0.01, ""))
     middle = part.vertices.mean(axis=0)
     if i in without:
-        return network.Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))
+        return adjustment.Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))
     count = len(stations.arc) // 2
-    at = np.vstack([against_truth._at_stations(edges[i, k], lines[k]) for k in range(2)])
+    at = np.vstack([preassembly._at_stations(edges[i, k], lines[k]) for k in range(2)])
     departure = np.einsum("kai,ki->ka", stations.axes, at - stations.points)
     measured = dataclasses.replace(
         stations,
@@ -63,14 +66,14 @@ def member(i, ends, edges, unseen, without):
         covariance=np.stack([1e-4 * np.eye(2 * count)] * 2),
         by_pose=np.zeros((2 * count, 2, 6)),
     )
-    return network.Member((own[0], own[1]), measured, middle, np.zeros((6, 6)))
+    return adjustment.Member((own[0], own[1]), measured, middle, np.zeros((6, 6)))
 
 
 def checked(unseen, without):
     """Checks of the answer from exact members; ``without`` are parts that were not placed."""
     ends, edges = as_built()
     members = [member(i, ends, edges, unseen, without) for i in range(5)]
-    adjusted = network.adjust(members, DESIGN.joint_points, FRAMES, WEIGHT)
+    adjusted = adjustment.adjust(members, DESIGN.joint_points, FRAMES, WEIGHT)
     pose = np.tile(np.eye(4), (5, 1, 1))
     pose[list(without)] = np.nan
     result = Result(
@@ -83,7 +86,7 @@ def checked(unseen, without):
     )  # fmt: skip
     truth = ArchTruth(arch_clouds.NAMES, np.tile(np.eye(4), (5, 1, 1)), ends, ends, edges)
     scene = Scene("b", "arch-bridge", arch=DESIGN)
-    return {one.name: one.value for one in against_truth.check(scene, result, Truth(arch=truth, spacing_mm=10.0))}
+    return {one.name: one.value for one in preassembly.check(scene, result, Truth(arch=truth, spacing_mm=10.0))}
 
 
 @pytest.mark.parametrize(("unseen", "without", "joints"), [((), (), 4), (((4, 0),), (), 3), ((), (2,), 2)])

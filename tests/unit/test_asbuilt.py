@@ -6,19 +6,21 @@ import numpy as np
 import pytest
 import trimesh
 
-from designgen import asbuilt, damage, recipes, sampler
+from designgen import recipes
+from designgen.asbuilt import defects, imperfections
 from designgen.designs import arch_bridge, arch_part, plate_row, stadium_roof, structure, truss_bridge
 from designgen.randomness import generator
-from designgen.scene import make
+from designgen.scanning import sampler
+from designgen.scenes.make import make
 from processor.model import UsageError
 
-NONE = {wall: asbuilt._Wave(0.0, 0.0, 1000.0) for wall in ("bottom", "top", "left", "right")}
+NONE = {wall: imperfections._Wave(0.0, 0.0, 1000.0) for wall in ("bottom", "top", "left", "right")}
 RIB = arch_bridge.build(arch_bridge.Params())[2]
 
 
 def built(**errors):
     still = {"ends": np.zeros((2, 3)), "twist": 0.0, "bow": (0.0, 0.0), "section": (0.0, 0.0), "waves": NONE}
-    return asbuilt.fabricate(RIB, asbuilt.ArchErrors(**{**still, **errors}), RIB.plates)
+    return imperfections.fabricate(RIB, imperfections.ArchErrors(**{**still, **errors}), RIB.plates)
 
 
 def frames(s):
@@ -88,8 +90,8 @@ def test_corners_of_an_end_move_each_on_its_own():
     np.testing.assert_allclose(moved @ tangent, [5, 0, 0, 0, 2.5, 0, 0, 2.5], atol=0.15)  # longer above the soffit
     np.testing.assert_allclose(moved[:, 1], [0, 0, 7, 0, 0, 3.5, 3.5, 0], atol=1e-9)
     np.testing.assert_allclose(moved @ normal, [0, 0, -3, 0, 0, -1.5, -1.5, 0], atol=2e-2)
-    far = off.key_points(RIB.s1 - asbuilt.CORNER_REACH_MM)
-    np.testing.assert_allclose(far, RIB.key_points(RIB.s1 - asbuilt.CORNER_REACH_MM), atol=1e-9)
+    far = off.key_points(RIB.s1 - imperfections.CORNER_REACH_MM)
+    np.testing.assert_allclose(far, RIB.key_points(RIB.s1 - imperfections.CORNER_REACH_MM), atol=1e-9)
 
 
 @pytest.mark.parametrize("name", ["arch-east", "arch-west"])
@@ -103,10 +105,10 @@ def test_real_bridges_gape_as_in_the_source_paper(name):
 
 
 def test_dents_waves_and_missing_pieces_are_where_the_truth_says():
-    params = asbuilt.ArchParams(dents=2, missing_pieces=1, waviness_mm=0.0)
-    ledger = asbuilt.Ledger()
+    params = imperfections.ArchParams(dents=2, missing_pieces=1, waviness_mm=0.0)
+    ledger = imperfections.Ledger()
     parts = arch_bridge.build(arch_bridge.Params())
-    made = asbuilt.arch(parts, params, [generator(0, part.name) for part in parts], ledger)
+    made = imperfections.arch(parts, params, [generator(0, part.name) for part in parts], ledger)
     truth = ledger.record()
     rows = {(what, where): value for what, where, value in zip(truth.what, truth.where, truth.value, strict=True)}
     dents = [where for what, where in rows if what == "dent, depth"]
@@ -132,10 +134,10 @@ def test_dents_waves_and_missing_pieces_are_where_the_truth_says():
     )
     away = np.linalg.norm(cloud.points - middle, axis=1)
     assert 100.0 < away.min() < 130.0  # 125 to the edge; the plate's cut faces reach a little inward
-    waves = asbuilt.fabricate(
+    waves = imperfections.fabricate(
         RIB,
-        asbuilt.ArchErrors(
-            np.zeros((2, 3)), 0.0, (0.0, 0.0), (0.0, 0.0), {w: asbuilt._Wave(1.5, 0.0, 1500.0) for w in NONE}
+        imperfections.ArchErrors(
+            np.zeros((2, 3)), 0.0, (0.0, 0.0), (0.0, 0.0), {w: imperfections._Wave(1.5, 0.0, 1500.0) for w in NONE}
         ),
         RIB.plates,
     )
@@ -173,9 +175,9 @@ def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
 def test_dents_and_missing_pieces_keep_apart():
     """Many on each part: no dent reaches into a hole, whose edge would then not be where the truth says."""
     parts = arch_bridge.build(arch_bridge.Params())
-    params = asbuilt.ArchParams(dents=30, missing_pieces=30, dent_radius_mm=120.0)
-    ledger = asbuilt.Ledger()
-    made = asbuilt.arch(parts, params, [generator(3, part.name) for part in parts], ledger)
+    params = imperfections.ArchParams(dents=30, missing_pieces=30, dent_radius_mm=120.0)
+    ledger = imperfections.Ledger()
+    made = imperfections.arch(parts, params, [generator(3, part.name) for part in parts], ledger)
     assert sum(len(part.holes) for part in made) == 30
     x = np.linspace(0.0, 1.0, 60)
     for part, design in zip(made, parts, strict=True):
@@ -187,9 +189,9 @@ def test_dents_and_missing_pieces_keep_apart():
         for one in part.holes:
             others = [o for o in part.holes if o is not one and o.wall == one.wall]
             assert all(abs(one.s0 - o.s0) >= 250.0 or abs(one.c0 - o.c0) >= 250.0 for o in others)
-    crowd = asbuilt.ArchParams(dents=500)
+    crowd = imperfections.ArchParams(dents=500)
     with pytest.raises(UsageError, match="do not fit on the webs of rib2 apart from each other"):
-        asbuilt.arch(parts[2:3], crowd, [generator(3, "x")], ledger)
+        imperfections.arch(parts[2:3], crowd, [generator(3, "x")], ledger)
 
 
 @pytest.mark.parametrize(
@@ -217,13 +219,15 @@ def test_parts_that_cannot_be_built_are_refused(errors, bridge, said):
     parts = arch_bridge.build(arch_bridge.Params(**bridge))
     rngs = [generator(1, f"built {part.name}") for part in parts]
     with pytest.raises(UsageError, match=rf"^asbuilt\.{said}"):
-        asbuilt.arch(parts, asbuilt.ArchParams(**errors), rngs, asbuilt.Ledger())
+        imperfections.arch(parts, imperfections.ArchParams(**errors), rngs, imperfections.Ledger())
 
 
 def test_plates_that_vary_a_little_are_built():
     parts = arch_bridge.build(arch_bridge.Params())
     rngs = [generator(1, f"built {part.name}") for part in parts]
-    made = asbuilt.arch(parts, asbuilt.ArchParams(plate_mm=1.0, section_mm=3.0), rngs, asbuilt.Ledger())
+    made = imperfections.arch(
+        parts, imperfections.ArchParams(plate_mm=1.0, section_mm=3.0), rngs, imperfections.Ledger()
+    )
     thick = np.array([dataclasses.astuple(part.plates) for part in made])
     assert 0.3 < np.std(thick - [24.0, 24.0, 20.0]) < 2.0
 
@@ -253,7 +257,7 @@ def test_a_structure_moves_by_its_field():
     assert 20.0 < np.linalg.norm(field.displacement, axis=1).max() < 60.0
     np.testing.assert_allclose(np.linalg.norm(field.normals, axis=1), 1.0, atol=1e-9)
     components = stadium_roof.build(stadium_roof.Params(trusses=4))
-    move = damage.movement(damage.MovementParams(), components)
+    move = defects.movement(defects.MovementParams(), components)
     # Points of the scan, moved back, lie on the design's tubes.
     points = scene.scans[0].points[::200]
     design = points - move(points)

@@ -3,18 +3,20 @@
 import numpy as np
 import pytest
 
-from designgen import asbuilt, recipes, sampler
+from designgen import recipes
+from designgen.asbuilt import imperfections
 from designgen.designs import space_frame
 from designgen.randomness import generator
-from designgen.scene import make
+from designgen.scanning import sampler
+from designgen.scenes.make import make
 from processor.model import UsageError
 
 FRAME = space_frame.build(space_frame.Params(nodes_x=3, nodes_y=3, layers=2, radii_mm=(45.0, 60.0)))
 
 
 def frame_with(**params):
-    ledger = asbuilt.Ledger()
-    return asbuilt.frame(FRAME, asbuilt.FrameParams(**params), generator(1, "x"), ledger), ledger.record()
+    ledger = imperfections.Ledger()
+    return imperfections.frame(FRAME, imperfections.FrameParams(**params), generator(1, "x"), ledger), ledger.record()
 
 
 def test_frames_are_built_otherwise_by_what_the_truth_says():
@@ -61,8 +63,8 @@ def test_tubes_bow_by_a_share_of_their_own_length():
     short = space_frame.build(
         space_frame.Params(nodes_x=9, nodes_y=9, spacing_mm=800.0, depth_mm=700.0, radii_mm=(60.0,))
     )
-    params = asbuilt.FrameParams(bow_share=0.001, eccentricity_mm=3.0, node_movement_mm=5.0, temperature_C=60.0)
-    bowed = asbuilt.frame(short, params, generator(1, "x"), asbuilt.Ledger())
+    params = imperfections.FrameParams(bow_share=0.001, eccentricity_mm=3.0, node_movement_mm=5.0, temperature_C=60.0)
+    bowed = imperfections.frame(short, params, generator(1, "x"), imperfections.Ledger())
     lengths = np.array([tube_length(bowed, m) for m in range(len(bowed.members))])
     np.testing.assert_allclose(bowed.tube_lengths(), lengths, atol=1e-6)
     shares = np.linalg.norm(bowed.bows, axis=1) / lengths

@@ -11,8 +11,9 @@ import h5py
 import numpy as np
 import pytest
 
-from processor import readers, store
+from processor import readers
 from processor.model import InputError, PointLabels, Scan, Scene, Truth
+from processor.store import store
 from tests.unit.test_readers import TURNED, las_bytes, pcd_header, ply_header
 from tests.unit.test_store import a_scene
 

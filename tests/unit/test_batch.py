@@ -28,10 +28,13 @@ from unittest import mock
 import numpy as np
 import pytest
 
-from processor import __main__, cli, inputs
-from processor.batch import batch, finding, job, spreading, summary
+from processor import __main__
+from processor.batch import batch, finding, job, summary
 from processor.batch.figures import of_results
+from processor.cli import run as cli_run
+from processor.jobs import runner
 from processor.model import InputError, UsageError
+from processor.scan_folder import fingerprint
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
@@ -187,22 +190,22 @@ def test_what_is_left_out_is_said(tmp_path):
 def test_every_byte_and_name_counts_and_nothing_else(tmp_path):
     one = folder(tmp_path / "one")
     (one / "empty").mkdir()
-    first = inputs.content_hash(one)
+    first = fingerprint.content_hash(one)
     shutil.copytree(one, tmp_path / "two")
     os.utime(tmp_path / "two/scan.xyz", (1, 1))
-    assert inputs.content_hash(tmp_path / "two") == first
+    assert fingerprint.content_hash(tmp_path / "two") == first
     (one / "scan.xyz").rename(one / "scan.pts")
-    assert inputs.content_hash(one) != first
+    assert fingerprint.content_hash(one) != first
     (one / "scan.pts").rename(one / "scan.xyz")
     (one / "scan.xyz").write_text("1 2 4\n")
-    assert inputs.content_hash(one) != first
+    assert fingerprint.content_hash(one) != first
     (one / "scan.xyz").write_text("1 2 3\n")
     (one / "more").touch()
-    assert inputs.content_hash(one) != first
+    assert fingerprint.content_hash(one) != first
     (one / "more").unlink()
     folder(one / "out")
-    assert inputs.content_hash(one) != first
-    assert inputs.content_hash(one, one / "out") == first
+    assert fingerprint.content_hash(one) != first
+    assert fingerprint.content_hash(one, one / "out") == first
 
 
 def test_links_out_and_pipes_are_not_read(tmp_path):
@@ -210,9 +213,9 @@ def test_links_out_and_pipes_are_not_read(tmp_path):
     os.mkfifo(one / "pipe")
     (one / "link").symlink_to("/dev/zero")
     (one / "loop").symlink_to(one)
-    assert inputs.content_hash(one) == inputs.content_hash(one)
+    assert fingerprint.content_hash(one) == fingerprint.content_hash(one)
     with pytest.raises(InputError, match="vanished"):
-        inputs.content_hash(tmp_path / "none")
+        fingerprint.content_hash(tmp_path / "none")
 
 
 # --- one bad input stops nothing ------------------------------------------------------------------------------------
@@ -561,7 +564,8 @@ def test_output_that_cannot_be_written_to(tmp_path, site, small_disk):
 def test_a_run_whose_input_changes_writes_nothing(site, tmp_path, monkeypatch):
     from click.testing import CliRunner
 
-    from processor import cli, evaluate
+    from processor.cli import run as cli_run
+    from processor.evaluation import evaluate
 
     root, _ = copied(site, tmp_path)
     real = evaluate.evaluate
@@ -572,7 +576,7 @@ def test_a_run_whose_input_changes_writes_nothing(site, tmp_path, monkeypatch):
         return real(path, execution)
 
     monkeypatch.setattr(evaluate, "evaluate", late)
-    done = CliRunner().invoke(cli.commands, ["run", str(root / "c/d"), "-o", str(tmp_path / "out"), *SPHERES])
+    done = CliRunner().invoke(cli_run.commands, ["run", str(root / "c/d"), "-o", str(tmp_path / "out"), *SPHERES])
     assert isinstance(done.exception, InputError)
     assert "target.xyz: changed while it was processed" in str(done.exception)
     assert not (tmp_path / "out").exists()
@@ -733,7 +737,7 @@ def test_a_cluster_that_is_lost_is_said_and_the_next_run_goes_on(tmp_path, clust
 
 def test_a_cluster_that_does_not_answer_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(spreading, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(runner, "CONNECT_SECONDS", 1)
     folder(tmp_path / "root/a")
     address = f"tcp://127.0.0.1:{free_port()}"
     done = run(tmp_path / "root", "-o", tmp_path / "out", "--cluster", address, code=2)
@@ -755,7 +759,7 @@ def test_the_command_of_the_snakefile_is_one_that_processor_takes():
     text = text.replace("{{", "{").replace("}}", "}")
     assert subprocess.run(["bash", "-n", "-c", text], check=False).returncode == 0
     words = shlex.split(text.split(">")[0])
-    context = cli.commands.commands["run"].make_context("run", words[2:])
+    context = cli_run.commands.commands["run"].make_context("run", words[2:])
     assert [str(context.params[name]) for name in ("input_", "output")] == list(names.values())
     for code, taken in ((0, 0), (1, 0), (3, 1), (4, 0)):
         stub = f"processor() {{ return {code}; }}; set -e; {text}"

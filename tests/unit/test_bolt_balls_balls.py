@@ -5,12 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from processor.bolt_balls import catalogue, crops
-from processor.bolt_balls.ball_baselines import paper_estimates
-from processor.bolt_balls.balls import Params, find_balls
-from processor.bolt_balls.nodes import Nodes, Tubes
-from processor.bolt_balls.source import InMemory
 from processor.model import UsageError
+from processor.space_frame import catalogue
+from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.points import sphere_crops
+from processor.space_frame.points.source import InMemory
+from processor.space_frame.spheres.baselines import paper_estimates
+from processor.space_frame.spheres.fit_all import Params, find_balls
 from tests.ball_clouds import frame, grid_of_balls
 
 STATIONS = np.array([[1000.0, 500.0, 0.0], [9000.0, 1000.0, 0.0], [5000.0, 7000.0, 0.0]])
@@ -153,7 +154,7 @@ def test_stations_that_moved_are_noticed_and_enter_the_covariance():
 def test_crops_hold_what_is_near_and_nothing_else(roof):
     _, _, _, source, nodes, _ = roof
     positions = np.vstack([nodes.positions, nodes.positions[:1] + np.array([100.0, 0.0, 0.0])])  # two that share points
-    got = crops.gather(source, positions, 150.0)
+    got = sphere_crops.gather(source, positions, 150.0)
     for i, node in enumerate(positions):
         near = np.linalg.norm(source.points - node, axis=1) <= 150.0
         mine = slice(got.start[i], got.start[i + 1])
@@ -162,8 +163,8 @@ def test_crops_hold_what_is_near_and_nothing_else(roof):
         expected = expected[np.lexsort(expected.T[[3, 2, 1, 0]])]
         assert np.column_stack([got.station[mine], got.points[mine] * 1000.0]).round(3).tolist() == expected.tolist()
     with pytest.raises(UsageError, match="reach"):
-        crops.gather(source, positions, 0.0)
-    assert crops.gather(source, np.empty((0, 3)), 100.0).start.tolist() == [0]
+        sphere_crops.gather(source, positions, 0.0)
+    assert sphere_crops.gather(source, np.empty((0, 3)), 100.0).start.tolist() == [0]
 
 
 def test_crops_of_many_points_keep_an_even_share_whatever_the_order():
@@ -177,7 +178,7 @@ def test_crops_of_many_points_keep_an_even_share_whatever_the_order():
     for seed, chunk_size, threads in ((0, 1 << 20, 1), (1, 1000, 2), (2, 7777, 3)):
         order = np.random.default_rng(seed).permutation(len(cloud))
         source = InMemory(cloud[order], station[order], np.zeros((3, 3)), chunk_size=chunk_size)
-        answers.append(crops.gather(source, nodes, 100.0, threads, most))
+        answers.append(sphere_crops.gather(source, nodes, 100.0, threads, most))
     for other in answers[1:]:
         for field in ("start", "points", "station"):
             assert getattr(answers[0], field).tobytes() == getattr(other, field).tobytes()
@@ -194,7 +195,7 @@ def test_crops_of_many_points_keep_an_even_share_whatever_the_order():
 
 def test_the_papers_estimators_run_on_the_same_points(roof, found):
     _, radii, _, source, nodes, tubes = roof
-    near = crops.gather(source, nodes.positions, 190.0)
+    near = sphere_crops.gather(source, nodes.positions, 190.0)
     plain = paper_estimates(near, nodes, tubes, found)
     drawn = paper_estimates(near, nodes, tubes, found, "ransac", seed=1)
     assert (plain.points == drawn.points).all()

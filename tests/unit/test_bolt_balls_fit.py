@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
-from processor.bolt_balls import balls, catalogue
-from processor.bolt_balls.ball_noise import limb_cosine, noise_model, radius_offset, radius_scatter
-from processor.bolt_balls.ball_residuals import residual, select, weight
-from processor.bolt_balls.ball_solve import inverse_of, solve
-from processor.bolt_balls.crops import Crops
-from processor.bolt_balls.nodes import Nodes, Tubes
+from processor.space_frame import catalogue
+from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.points.sphere_crops import Crops
+from processor.space_frame.spheres import fit_all
+from processor.space_frame.spheres.gauss_newton import inverse_of, residual, select, solve, weight
+from processor.space_frame.spheres.noise_model import limb_cosine, noise_model, radius_offset, radius_scatter
 from tests.bench import ball_fit
 
 
@@ -158,8 +158,8 @@ def test_without_rays_half_of_what_noise_may_bring_is_taken_off_and_the_rest_is_
         crops = Crops(np.arange(draws + 1) * count, points, np.full(len(points), -1, np.int32))
         unfixed = np.full((draws, 3, 3), np.nan)
         nodes = Nodes(np.zeros((draws, 3)), unfixed, np.zeros(draws, np.int64), np.full(draws, np.nan))
-        params = balls.Params(sigma_mm=2.0, process_hole_mm=0.0)
-        found = balls.fit_crops(crops, np.empty((0, 3)), nodes, Tubes(), catalogue.of_radii([]), params=params)
+        params = fit_all.Params(sigma_mm=2.0, process_hole_mm=0.0)
+        found = fit_all.fit_crops(crops, np.empty((0, 3)), nodes, Tubes(), catalogue.of_radii([]), params=params)
         return found.radii - radius, found.covariance[:, 3, 3]
 
     chance = 4.0 * sigma / np.sqrt(draws * count)

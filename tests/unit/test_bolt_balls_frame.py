@@ -6,13 +6,16 @@ import numpy as np
 import pytest
 
 from designgen import recipes
-from designgen.scene import make
+from designgen.scenes.make import make
 from processor import pipeline
-from processor.bolt_balls import answer, ball_baselines, threads, verdicts
-from processor.bolt_balls.scene_source import of_scene
-from processor.geometry import rigid
+from processor.evaluation import space_frame
+from processor.geometry import parallel, rigid
 from processor.model import Scan
-from processor.steps import spheres
+from processor.space_frame import result as space_frame_result
+from processor.space_frame import step as space_frame_step
+from processor.space_frame import to_result
+from processor.space_frame.points.scene_source import of_scene
+from processor.space_frame.spheres import baselines
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutter=6", "scan.step_mrad=2.2"]
 
@@ -29,10 +32,12 @@ def errors(result, truth, rows=slice(None)):
 
 def test_every_ball_is_found_blind(roof):
     scene, truth = roof
-    result = spheres.run(dataclasses.replace(scene, frame=None), spheres.Params())
+    result = space_frame_step.run(dataclasses.replace(scene, frame=None), space_frame_step.Params())
     assert result.status == "ok"
     assert len(result.ids) == len(truth.frame.ids)
-    checks = {metric.name: metric for metric in spheres.check(dataclasses.replace(scene, frame=None), result, truth)}
+    checks = {
+        metric.name: metric for metric in space_frame.check(dataclasses.replace(scene, frame=None), result, truth)
+    }
     assert all(metric.passed for metric in checks.values())
     assert checks["nodes found within 3 mm"].value == 100.0
     assert checks["nodes that are none"].value == 0.0
@@ -42,7 +47,7 @@ def test_every_ball_is_found_blind(roof):
 
 def test_rows_are_the_designs_nodes_in_its_order(roof):
     scene, truth = roof
-    result = spheres.run(scene, spheres.Params())
+    result = space_frame_step.run(scene, space_frame_step.Params())
     assert result.ids.tolist() == scene.frame.ids.tolist()
     assert result.gauge == "design frame"
     assert errors(result, truth).max() < 1.5
@@ -55,7 +60,7 @@ def test_a_design_of_another_frame_is_found(roof):
     scene, truth = roof
     R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 0.7])), np.array([5.0e8, 4.3e9, 1e3])
     moved = dataclasses.replace(scene.frame, centres=scene.frame.centres @ R.T + t)
-    result = spheres.run(dataclasses.replace(scene, frame=moved), spheres.Params())
+    result = space_frame_step.run(dataclasses.replace(scene, frame=moved), space_frame_step.Params())
     assert result.matching == "ok"
     assert result.gauge == "best fit"
     assert errors(result, truth).max() < 1.5
@@ -79,7 +84,7 @@ def test_a_node_that_was_not_built_is_not_found_and_one_that_was_not_designed_is
         member_b=frame.member_b[own],
         tube_diameters=frame.tube_diameters[own],
     )
-    result = spheres.run(dataclasses.replace(scene, frame=other), spheres.Params())
+    result = space_frame_step.run(dataclasses.replace(scene, frame=other), space_frame_step.Params())
     assert result.flag[7] == "not-found"
     assert np.isnan(result.centres[7]).all()
     rest = np.arange(len(ids)) != 7
@@ -91,8 +96,8 @@ def test_a_ball_of_another_size_is_named(roof):
     scene, _ = roof
     radii = scene.frame.radii.copy()
     radii[3] += 10.0
-    result = spheres.run(
-        dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, radii=radii)), spheres.Params()
+    result = space_frame_step.run(
+        dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, radii=radii)), space_frame_step.Params()
     )
     assert [i for i, flag in enumerate(result.flag) if flag == "wrong-size"] == [3]
 
@@ -100,16 +105,16 @@ def test_a_ball_of_another_size_is_named(roof):
 @pytest.mark.parametrize(("chunk", "threads_used"), [(1 << 20, 2), (70_001, 1), (12_345, 3)])
 def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used, monkeypatch):
     scene, _ = roof
-    first = spheres.run(scene, spheres.Params())
-    monkeypatch.setattr(threads, "usable", lambda: threads_used)
-    monkeypatch.setattr(answer, "of_scene", lambda *given: dataclasses.replace(of_scene(*given), chunk_size=chunk))
+    first = space_frame_step.run(scene, space_frame_step.Params())
+    monkeypatch.setattr(parallel, "usable", lambda: threads_used)
+    monkeypatch.setattr(to_result, "of_scene", lambda *given: dataclasses.replace(of_scene(*given), chunk_size=chunk))
     rng = np.random.default_rng(1)
     scans = []
     for scan in scene.scans:
         order = rng.permutation(len(scan.points))
         columns = {name: getattr(scan, name) for name in ("points", "intensity", "grid_row", "grid_column")}
         scans.append(dataclasses.replace(scan, **{k: v[order] if len(v) else v for k, v in columns.items()}))
-    again = spheres.run(dataclasses.replace(scene, scans=tuple(scans)), spheres.Params())
+    again = space_frame_step.run(dataclasses.replace(scene, scans=tuple(scans)), space_frame_step.Params())
     for field in dataclasses.fields(first):
         one, other = getattr(first, field.name), getattr(again, field.name)
         same = one.tobytes() == other.tobytes() if isinstance(one, np.ndarray) else repr(one) == repr(other)
@@ -160,7 +165,7 @@ def test_the_balls_sizes_tell_how_a_square_roof_is_turned(square):
     assert len(truly_wrong(scene, truth)) == 3
     for without, extra in (((), ()), (scene.frame.ids[[7, 20]], beyond)):
         design, R = elsewhere(scene.frame, without, extra)
-        result = spheres.run(dataclasses.replace(scene, frame=design), spheres.Params())
+        result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
         assert result.matching == "ok"
         assert np.degrees(rigid.rotation_angle(result.T_design_scan[:3, :3] @ R.T)) < 0.2
         assert wrong_sizes(result) == truly_wrong(scene, truth) - set(without)
@@ -175,7 +180,7 @@ def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(s
     # of one size but for a corner: which of four that is, one ball does not decide
     radii = np.where(corner, 60.0, 50.0)
     design, _ = elsewhere(dataclasses.replace(scene.frame, radii=radii))
-    result = spheres.run(dataclasses.replace(scene, frame=design), spheres.Params())
+    result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
     assert result.matching == "ambiguous"
     disputed = np.isnan(result.nominal_radii)
     assert disputed.sum() == len(result.T_rivals) + 1 >= 2
@@ -205,11 +210,11 @@ def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_
     row = int(np.argmin(np.linalg.norm(truth.frame.centres - truth.frame.centres.mean(axis=0), axis=1)))
     for onward, flag, said in ((900.0, "not-found", "rays went through"), (None, "low-confidence", "hardly a ray"),
                                (-900.0, "low-confidence", "hides it")):  # fmt: skip
-        result = spheres.run(emptied(scene, truth, row, onward), spheres.Params())
+        result = space_frame_step.run(emptied(scene, truth, row, onward), space_frame_step.Params())
         assert result.flag[row] == flag, onward
         assert said in result.reason[row]
         assert "8 axes" in result.reason[row]
-        held = verdicts.of_result(dataclasses.replace(result, movement_limit=1.0))
+        held = space_frame_result.of_result(dataclasses.replace(result, movement_limit=1.0))
         assert held.verdict[row] == ("" if flag == "not-found" else "indeterminate")
         assert "fail" in held.verdict
         assert np.isnan(result.centres[row]).all() == (flag == "not-found")
@@ -222,22 +227,22 @@ def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
     runs = pipeline.execute(tmp_path / "s.h5", scene, jobs).runs
     ray = runs[0].result
     error = {run.method: np.abs(run.result.radii - truth.frame.radii)[ray.points > 30] for run in runs}
-    alone = spheres.run(scene, spheres.Params(method="least-squares"))
+    alone = space_frame_step.run(scene, space_frame_step.Params(method="least-squares"))
     for run in runs[1:]:
         np.testing.assert_array_equal(run.result.ids, ray.ids)
-        assert ball_baselines.SAME in run.result.message
+        assert baselines.SAME in run.result.message
         # tens of points of a ball and sleeves beside: hundreds are in the crop
         assert (run.result.points <= 1.3 * ray.points + 10).all()
         assert run.result.points.sum() < 0.8 * alone.points.sum()
     assert np.median(error["least-squares"]) < 0.7 * np.median(np.abs(alone.radii - truth.frame.radii)[ray.points > 30])
     assert np.median(error["ray"]) < np.median(error["least-squares"])
     again = pipeline.execute(tmp_path / "s.h5", scene, jobs[1:]).runs[0].result
-    assert ball_baselines.SAME not in again.message
+    assert baselines.SAME not in again.message
 
 
 def test_a_wrong_size_is_told_without_a_catalogue(square):
     scene, truth = square
-    result = spheres.run(scene, spheres.Params(catalogue="none"))
+    result = space_frame_step.run(scene, space_frame_step.Params(catalogue="none"))
     said = [result.reason[i] for i, flag in enumerate(result.flag) if flag == "wrong-size"]
     assert all("beyond the blank's" in one for one in said)
     assert wrong_sizes(result) >= truly_wrong(scene, truth)
@@ -248,7 +253,7 @@ def test_a_wrong_size_is_told_without_a_catalogue(square):
 
 def test_a_wrong_size_that_the_catalogue_lacks_is_told_where_the_interval_excludes_the_designed_one(square):
     scene, truth = square
-    result = spheres.run(scene, spheres.Params(radii_mm=(45.0, 50.0)))
+    result = space_frame_step.run(scene, space_frame_step.Params(radii_mm=(45.0, 50.0)))
     largest = scene.frame.ids[np.argmax(truth.frame.radii)]
     assert wrong_sizes(result) == {largest}
     assert "beyond the blank's" in result.reason[list(result.ids).index(largest)]

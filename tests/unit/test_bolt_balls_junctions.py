@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from processor.bolt_balls.junctions import Lines, graph
+from processor.space_frame.members.junctions import Lines, graph
 
 
 def lines_of(*ends):

@@ -5,11 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from designgen.designs import space_frame
-from processor.bolt_balls import matching
-from processor.bolt_balls.match_odds import Found, match_members
-from processor.bolt_balls.matching import match
-from processor.bolt_balls.movement import movement
 from processor.model import FrameDesign
+from processor.space_frame.design import matching
+from processor.space_frame.design.matching import Found, match, match_members
+from processor.space_frame.design.movement import movement
 
 SIZES = (45.0, 50.0, 60.0, 70.0, 80.0)
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from processor.bolt_balls import members
-from processor.bolt_balls.nodes import Nodes, Tubes
-from processor.bolt_balls.source import InMemory
+from processor.space_frame.members import members
+from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.points.source import InMemory
 from tests import frame_clouds
 from tests.frame_clouds import STATIONS
 

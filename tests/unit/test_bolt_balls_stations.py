@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from processor.bolt_balls import station_adjustment, station_kernels, station_normals, threads
-from processor.bolt_balls.corrected import Corrected, corrected_gathered
-from processor.bolt_balls.source import InMemory
-from processor.bolt_balls.station_control import ControlPoints
-from processor.bolt_balls.station_records import TubePoints
-from processor.bolt_balls.stations import register
+from processor.geometry import parallel
+from processor.space_frame.points.corrected_source import Corrected, corrected_gathered
+from processor.space_frame.points.source import InMemory
+from processor.space_frame.stations import normal_equations, residual_kernels
+from processor.space_frame.stations import posterior as stations_posterior
+from processor.space_frame.stations.control_points import ControlPoints
+from processor.space_frame.stations.records import TubePoints
+from processor.space_frame.stations.registration import register
 from tests import tube_clouds
 
 
@@ -388,7 +390,7 @@ def test_same_bytes_on_any_number_of_threads(monkeypatch):
     _, seen, _ = frame(2, per_pair=30)
     answers = []
     for count in (1, 2, 3):
-        monkeypatch.setattr(threads, "usable", lambda count=count: count)
+        monkeypatch.setattr(parallel, "usable", lambda count=count: count)
         answers.append(registered(seen, np.random.default_rng(0)))
     for other in answers[1:]:
         for field in ("T_project_station", "covariance", "range_offset", "axis_points"):
@@ -407,7 +409,7 @@ def test_residuals_are_those_of_rays_met_with_a_cylinder():
     e1 /= np.linalg.norm(e1)
     scanner = np.array([[3000.0, -8000.0, -4000.0]])
     points = a + rng.uniform(-800.0, 800.0, (50, 1)) * d + rng.normal(0.0, 18.0, (50, 3))
-    seen = station_kernels.residuals(
+    seen = residual_kernels.residuals(
         points, np.array([0, 50]), np.array([0]), np.array([0]), np.eye(4)[None], np.array([0.25]), scanner,
         np.concatenate([a, d])[None], e1[None], np.cross(d, e1)[None], np.array([800.0]), np.array([30.0]), 0.3,
     )  # fmt: skip
@@ -460,7 +462,7 @@ def test_eliminating_the_tubes_is_solving_for_all_at_once():
     arguments = (
         N, b, weight, 0.0, np.arange(0, q + 1, per), station, axis, e1, e2, half, places, prior
     )  # fmt: skip
-    H, g = station_normals.reduced(*arguments)
+    H, g = normal_equations.reduced(*arguments)
     # One row a point: tube's seven unknowns less the station's motion of the axis at the middle and at its end.
     A, right = [], []
     for i in range(q):
@@ -483,7 +485,7 @@ def test_eliminating_the_tubes_is_solving_for_all_at_once():
     x = np.linalg.solve(full, A.T @ right)
     mine = np.linalg.solve(H + 1e-2 * np.eye(len(H)), g)
     np.testing.assert_allclose(mine, x[7 * tubes :], rtol=1e-6, atol=1e-9)
-    found, _ = station_normals.tubes(*arguments, mine, 0.09)
+    found, _ = normal_equations.tubes(*arguments, mine, 0.09)
     np.testing.assert_allclose(found[:, :7].ravel(), x[: 7 * tubes], rtol=1e-6, atol=1e-9)
 
 
@@ -494,7 +496,7 @@ def test_a_floor_is_an_unknown_of_its_own():
     more = np.zeros((10, 10))
     more[:8, :8], more[8:, :8], more[:8, 8:], more[8:, 8:] = N, N[:2], N[:, :2], N[:2, :2] + np.eye(2) / 0.3
     right = np.concatenate([b, b[:2]])
-    M, y = station_normals.with_floor(N, b, 0.3)
+    M, y = normal_equations.with_floor(N, b, 0.3)
     np.testing.assert_allclose(np.linalg.solve(M, y), np.linalg.solve(more, right)[:8], rtol=1e-9)
     np.testing.assert_allclose(np.linalg.inv(M), np.linalg.inv(more)[:8, :8], rtol=1e-8, atol=1e-12)
 
@@ -504,11 +506,11 @@ def test_small_algebra_is_numpys():
     A = rng.normal(size=(9, 9))
     A = A @ A.T + np.eye(9)
     B = rng.normal(size=(9, 4))
-    L = station_normals.cholesky(A)
+    L = normal_equations.cholesky(A)
     np.testing.assert_allclose(L, np.linalg.cholesky(A), rtol=1e-12)
-    np.testing.assert_allclose(station_normals.solve(L, B), np.linalg.solve(A, B), rtol=1e-10)
-    np.testing.assert_allclose(station_normals.product(A, B), A @ B, rtol=1e-12)
-    assert np.isnan(station_normals.cholesky(-A)).all()
+    np.testing.assert_allclose(normal_equations.solve(L, B), np.linalg.solve(A, B), rtol=1e-10)
+    np.testing.assert_allclose(normal_equations.product(A, B), A @ B, rtol=1e-12)
+    assert np.isnan(normal_equations.cholesky(-A)).all()
 
 
 def test_the_effect_is_every_stations_motion_at_the_place():
@@ -523,7 +525,7 @@ def test_the_effect_is_every_stations_motion_at_the_place():
     moved = draws[:, :, 3:6] + np.cross(draws[:, :, :3], arm)
     moved += draws[:, :, 6:] * (arm / np.linalg.norm(arm, axis=1)[:, None])
     sampled = np.cov(np.einsum("sdi,nsi->nd", influence[k], moved).T)
-    found = station_kernels.effect(points, influence, places, C)[k]
+    found = residual_kernels.effect(points, influence, places, C)[k]
     np.testing.assert_allclose(found, sampled, atol=0.02 * np.abs(found).max())
 
 
@@ -532,9 +534,9 @@ def test_the_prior_of_a_free_common_motion_leaves_it_free():
     places = rng.normal(0.0, 1e4, (4, 3))
     target = rng.normal(0.0, 1e4, (3, 3))
     control = ControlPoints(("A", "B", "C"), target, target, np.ones((3, 3)), np.full((3, 4), 0.25))
-    posterior = station_adjustment.Posterior(places, control)
+    posterior = stations_posterior.Posterior(places, control)
     P = posterior._prior(posterior.variance)
-    common = station_adjustment.common_motion(places - places.mean(axis=0))
+    common = stations_posterior.common_motion(places - places.mean(axis=0))
     assert np.abs(P @ common).max() < 1e-6 * np.abs(np.diag(P)[:, None] * common).max()
     assert np.linalg.eigvalsh(P / np.sqrt(np.outer(np.diag(P), np.diag(P)))).min() > -1e-9
 
@@ -543,8 +545,8 @@ def test_the_prior_of_a_free_common_motion_leaves_it_free():
 
 
 def test_a_source_and_gathered_points_are_corrected_alike():
-    from processor.bolt_balls.corridors import corridors, gather
-    from processor.bolt_balls.thinning import STEPS_PER_MM
+    from processor.space_frame.points.hash_sampling import STEPS_PER_MM
+    from processor.space_frame.points.line_crops import corridors, gather
 
     _, seen, rng = frame(2, per_pair=30)
     found = registered(seen, rng)

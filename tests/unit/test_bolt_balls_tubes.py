@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from processor.bolt_balls import corridors, tubes
-from processor.bolt_balls.cylinder import NP, residual
+from processor.space_frame.members import tubes
+from processor.space_frame.members.cylinder import NP, residual
+from processor.space_frame.points import line_crops
 from tests import frame_clouds
 
 LENGTH = 2700.0
@@ -18,8 +19,8 @@ def fitted(cloud, station, scanners=STATIONS, bow_share=BOW_SHARE, off_mm=0.0, v
     """Rough and final fit of the tube from A along U, started ``off_mm`` off its axis."""
     middle, direction = (A + 0.5 * LENGTH * U + off_mm * frame_clouds.across(U)[0])[None], U[None]
     half = np.array([0.5 * LENGTH + 250.0])
-    near = corridors.corridors(middle, direction, -half, half, 120.0)
-    gathered = corridors.gather([(cloud, station)], 100.0, near, 8192)
+    near = line_crops.corridors(middle, direction, -half, half, 120.0)
+    gathered = line_crops.gather([(cloud, station)], 100.0, near, 8192)
     rough = tubes.rough(gathered, scanners, middle, direction, half - 450.0, half, (15.0, 110.0), 256, 1)
     cos = tubes.least_cosine(rough, 0.2) if least_cos is None else least_cos
     return rough, tubes.refined(gathered, scanners, rough, half, (15.0, 110.0), 256, bow_share, cos, variance, 1)

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from processor.bolt_balls import corridors, linearity, segments, thinning, voxels
-from processor.bolt_balls.source import InMemory
-from processor.bolt_balls.threads import over_ranges
+from processor.geometry.parallel import over_ranges
+from processor.space_frame.members import linearity, segments
+from processor.space_frame.points import hash_sampling, line_crops, voxels
+from processor.space_frame.points.source import InMemory
 
 
 @pytest.fixture(scope="module")
@@ -77,16 +78,16 @@ def test_a_line_is_one_segment(cloud):
 
 def test_a_share_of_the_points_is_kept_by_their_coordinates_alone(cloud):
     whole = {tuple(p) for p in np.rint(cloud * 100.0).astype(int).tolist()}
-    kept = thinning.thinned(InMemory(cloud), 10_000)
+    kept = hash_sampling.thinned(InMemory(cloud), 10_000)
     assert len(kept) == pytest.approx(10_000, abs=4.0 * np.sqrt(7_500))
     assert {tuple(p) for p in kept.tolist()} <= whole
-    again = thinning.thinned(InMemory(cloud[::-1], chunk_size=999), 10_000, threads=2)
+    again = hash_sampling.thinned(InMemory(cloud[::-1], chunk_size=999), 10_000, threads=2)
     assert sorted(map(tuple, again.tolist())) == sorted(map(tuple, kept.tolist()))
     # Evenly over space: neither of the halves across any axis gets more.
     for i in range(3):
         upper = kept[:, i] > np.median(cloud[:, i]) * 100.0
         assert upper.mean() == pytest.approx(0.5, abs=0.02)
-    assert len(thinning.thinned(InMemory(cloud), 10**9)) == len(cloud)
+    assert len(hash_sampling.thinned(InMemory(cloud), 10**9)) == len(cloud)
 
 
 def lines(rng, count):
@@ -112,8 +113,8 @@ def test_points_near_lines_are_those_near_by_hand(cloud):
     points, directions, low, high = lines(rng, 25)
     station = rng.integers(-1, 5, len(cloud)).astype(np.int32)
     expected = near_by_hand(cloud, points, directions, low, high, 120.0)
-    found = corridors.gather(
-        [(cloud, station)], 100.0, corridors.corridors(points, directions, low, high, 120.0), len(cloud)
+    found = line_crops.gather(
+        [(cloud, station)], 100.0, line_crops.corridors(points, directions, low, high, 120.0), len(cloud)
     )
     assert (found.shares == 1.0).all()
     for m in range(25):
@@ -121,9 +122,9 @@ def test_points_near_lines_are_those_near_by_hand(cloud):
         assert found.counts[m] == expected[:, m].sum()
         places, at = found.places[rows], found.stations[rows]
         assert (np.lexsort((places, at)) == np.arange(len(at))).all()
-        mask = (1 << corridors.FIELD) - 1
-        fields = np.stack([places >> 2 * corridors.FIELD, places >> corridors.FIELD & mask, places & mask], axis=1)
-        got = np.column_stack([fields - corridors.HALF + found.middles[m], at])
+        mask = (1 << line_crops.FIELD) - 1
+        fields = np.stack([places >> 2 * line_crops.FIELD, places >> line_crops.FIELD & mask, places & mask], axis=1)
+        got = np.column_stack([fields - line_crops.HALF + found.middles[m], at])
         want = np.column_stack([np.rint(cloud * 100.0).astype(int), station])[expected[:, m]]
         assert sorted(map(tuple, got.tolist())) == sorted(map(tuple, want.tolist()))
 
@@ -131,9 +132,9 @@ def test_points_near_lines_are_those_near_by_hand(cloud):
 def test_a_line_with_little_room_keeps_the_largest_share_that_fits(cloud):
     rng = np.random.default_rng(5)
     points, directions, low, high = lines(rng, 25)
-    near = corridors.corridors(points, directions, low, high, 120.0)
+    near = line_crops.corridors(points, directions, low, high, 120.0)
     whole = near_by_hand(cloud, points, directions, low, high, 120.0).sum(axis=0)
-    one = corridors.gather([(cloud, np.empty(0, np.int32))], 100.0, near, 64)
+    one = line_crops.gather([(cloud, np.empty(0, np.int32))], 100.0, near, 64)
     assert (one.counts <= 64).all()
     assert (one.shares[whole > 64] < 1.0).all()
     assert (one.shares[whole <= 64] == 1.0).all()
@@ -141,7 +142,7 @@ def test_a_line_with_little_room_keeps_the_largest_share_that_fits(cloud):
     assert one.counts[whole > 64].min() > 15
     order = rng.permutation(len(cloud))
     pieces = [(cloud[order[i : i + 1234]], np.empty(0, np.int32)) for i in range(0, len(cloud), 1234)]
-    two = corridors.gather(pieces, 100.0, near, 64, threads=1)
+    two = line_crops.gather(pieces, 100.0, near, 64, threads=1)
     assert (one.counts == two.counts).all()
     for m in range(25):
         rows = slice(m * 64, m * 64 + one.counts[m])

@@ -5,7 +5,7 @@ import json
 import pytest
 
 from processor.batch import figures as batch_figures
-from processor.report import figures, page
+from processor.report import all_figures, page
 from tests.browser import opened, picture, read_over
 from tests.unit import test_language_pages as pages
 from tests.unit.test_batch import folder, run
@@ -64,7 +64,7 @@ def test_the_pages_of_nights(tmp_path, lang):
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory):
     execution, report = pages.searched()
-    drawn = figures.of_run(execution, report)
+    drawn = all_figures.of_run(execution, report)
     folder_of = tmp_path_factory.mktemp("pages")
     for lang in ("en", "zh"):
         (folder_of / f"{lang}.html").write_text(page.html(execution, report, drawn, lang), "utf-8")

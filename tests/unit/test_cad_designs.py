@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processor import cad, folder
 from processor.model import InputError
+from processor.scan_folder import cad, folder
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/design/base_interface_AP203.STEP"
 PLY = (

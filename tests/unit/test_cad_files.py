@@ -22,7 +22,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from designgen import cad_files, recipes
+from designgen import recipes
+from designgen.cad import files as cad_files
 from designgen.designs import arch_bridge, arch_part
 from processor.model import InputError, UsageError
 

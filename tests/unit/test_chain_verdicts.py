@@ -5,16 +5,20 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from processor.limits import standards
 from processor.model import ArchDesign, DesignPart, Tolerance
-from processor.preassembly import adjustment, chain_figures, chain_verdicts, joint_verdicts, network, tolerance
-from processor.preassembly.bottom_edges import EdgeStations
+from processor.preassembly import assemble
+from processor.preassembly.chain import adjustment as chain_adjustment
+from processor.preassembly.chain import span_and_closure
+from processor.preassembly.ends.bottom_edges import EdgeStations
+from processor.preassembly.verdicts import chain, joints
 
-GB, JTG = tolerance.load("GB 50205-2020"), tolerance.load("JTG arch rib")
+GB, JTG = standards.load("GB 50205-2020"), standards.load("JTG arch rib")
 NAN = float("nan")
 
 
 def own(**limits):
-    return tolerance.with_own(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
+    return standards.with_own(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
 
 
 def chord(value, sd):
@@ -32,7 +36,7 @@ def chord(value, sd):
     ],
 )
 def test_a_span_is_held_against_the_projects_limit(value, sd, verdict):
-    found = chain_verdicts.judge(chord(value, sd), own(span_mm=[-1.0, 1.0]), 24_000.0)
+    found = chain.judge(chord(value, sd), own(span_mm=[-1.0, 1.0]), 24_000.0)
     assert (found.verdict, found.each) == (verdict, (verdict,))
     assert (found.key, found.clause, found.source, found.edition) == (
         ("span_mm",), ("project.toml",), ("project.toml",), ("",),
@@ -44,7 +48,7 @@ def test_a_span_is_held_against_the_projects_limit(value, sd, verdict):
 
 
 def test_a_standard_is_cited():
-    found = chain_verdicts.judge(chord(-30.0, 0.5), GB, 24_000.0)
+    found = chain.judge(chord(-30.0, 0.5), GB, 24_000.0)
     assert found.key == ("unit_length_mm", "span_mm")
     assert found.each == ("fail", "fail")
     assert set(found.clause) == {"GB 50205-2020 table 9.2.3"}
@@ -57,20 +61,20 @@ def test_edges_are_held_all_along_and_limits_hang_on_the_span():
     values, sd = rng.uniform(-2.0, 2.0, 300), np.full(300, 0.1)
     values[17] = 4.5  # 30 m / 6000 = 5 mm
     quantities = dict.fromkeys(("inner_arc", "lateral_axis", "elevation"), (values, sd))
-    found = chain_verdicts.judge(quantities, JTG, 30_000.0)
+    found = chain.judge(quantities, JTG, 30_000.0)
     by_key = dict(zip(found.key, found.each, strict=True))
     assert by_key == {"inner_arc_mm": "pass", "lateral_axis_mm": "pass", "elevation_mm": "pass"}
     np.testing.assert_allclose(found.high, [8.0, 5.0, 10.0])
     np.testing.assert_allclose(found.value, 4.5)
     np.testing.assert_allclose(found.ci95, 1.96 * 0.1, rtol=1e-3)  # no other station may be the extreme
     values[17] = 4.9
-    assert chain_verdicts.judge(quantities, JTG, 30_000.0).each[1] == "indeterminate"
+    assert chain.judge(quantities, JTG, 30_000.0).each[1] == "indeterminate"
     values[17] = -5.4
-    assert chain_verdicts.judge(quantities, JTG, 30_000.0).each[1] == "fail"
+    assert chain.judge(quantities, JTG, 30_000.0).each[1] == "fail"
     # Where many may be it, the band holds all of them.
     low, high = [], []
     for _ in range(400):
-        _, bottom, top = chain_verdicts.greatest(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
+        _, bottom, top = chain.greatest(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
         low.append(bottom)
         high.append(top)
     assert np.mean((np.array(low) <= 0.0) & (np.array(high) >= 0.0)) >= 0.95
@@ -83,11 +87,11 @@ def test_what_the_stations_say():
         ("left", "left", "right", "right"), np.zeros(4), np.zeros((4, 3)), axes, np.zeros((4, 2)),
         np.zeros((2, 4, 4)), np.zeros((4, 2, 6)),
     )  # fmt: skip
-    member = network.Member((None, None), edges, np.zeros(3), np.zeros((6, 6)))
+    member = chain_adjustment.Member((None, None), edges, np.zeros(3), np.zeros((6, 6)))
     adjusted = SimpleNamespace(
         departures=(np.tile([3.0, 2.0], (4, 1)),), departure_variance=(np.tile([0.04, 0.01], (4, 1)),)
     )
-    found = chain_verdicts.quantities([member], adjusted, -1.0, 0.196)
+    found = chain.quantities([member], adjusted, -1.0, 0.196)
     expected = {"span": (-1.0, 0.1), "unit_length": (-1.0, 0.1), "inner_arc": (2.0, 0.1), "lateral_axis": (3.0, 0.2),
                 "elevation": (2.5, 0.125)}  # fmt: skip
     for name, (value, sd) in expected.items():
@@ -97,19 +101,19 @@ def test_what_the_stations_say():
 
 
 def test_a_limit_that_nothing_is_held_against_is_said():
-    assert chain_verdicts.not_held(GB) == []
-    mixed = tolerance.with_own(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
-    assert [limit.key for limit in chain_verdicts.not_held(mixed)] == ["bow_mm"]
+    assert chain.not_held(GB) == []
+    mixed = standards.with_own(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
+    assert [limit.key for limit in chain.not_held(mixed)] == ["bow_mm"]
     params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
-    assert "limits that nothing is held against: bow_mm" in adjustment._message(params, mixed, 0.0, [])
+    assert "limits that nothing is held against: bow_mm" in assemble._message(params, mixed, 0.0, [])
 
 
 def test_an_unsure_chain_is_left_open():
-    found = chain_verdicts.judge(chord(-30.0, 0.5), GB, 24_000.0, "J4 has no answer")
+    found = chain.judge(chord(-30.0, 0.5), GB, 24_000.0, "J4 has no answer")
     assert (found.verdict, found.each) == ("indeterminate", ("indeterminate", "indeterminate"))
     assert np.isnan(found.each_probability).all()
     assert found.said.startswith("J4 has no answer")
-    none = chain_verdicts.judge(chord(0.0, 0.1), own(misalignment_mm=[2.0]), 24_000.0)
+    none = chain.judge(chord(0.0, 0.1), own(misalignment_mm=[2.0]), 24_000.0)
     assert (none.verdict, none.key) == ("indeterminate", ())
     assert "no limit for the whole chain" in none.said
 
@@ -120,23 +124,23 @@ def test_the_span_is_not_known_where_a_joint_is_not():
     parts = tuple(DesignPart(str(i), bottom_edge_left=line, bottom_edge_right=line) for i in range(2))
     design = ArchDesign(parts, ("J1",), ("0",), ("1",), np.zeros((1, 8, 3)))
     adjusted = SimpleNamespace(gaps=np.full((1, 8, 3), NAN))
-    assert np.isnan(chain_figures.span([], adjusted, design)).all()
+    assert np.isnan(span_and_closure.span([], adjusted, design)).all()
 
 
 def test_a_joint_left_open_has_no_limit_that_is_sure():
-    verdict = joint_verdicts.Verdict(
+    verdict = joints.Verdict(
         "fail", 0.0, ("a",), ("b",), np.ones(1), np.ones(1), np.zeros(1), np.zeros(1), ("fail",), np.zeros(1),
         ("c",), ("",), ("s",), np.zeros(1, np.uint8), "x",
     )  # fmt: skip
-    told = adjustment._if_told(verdict, "rib1 is ambiguous")
+    told = assemble._if_told(verdict, "rib1 is ambiguous")
     assert (told.verdict, told.each) == ("indeterminate", ("indeterminate",))
     assert np.isnan([told.probability, told.each_probability[0]]).all()
-    assert adjustment._if_told(verdict, "") is verdict
+    assert assemble._if_told(verdict, "") is verdict
 
 
 def test_mean_and_largest_of_many_alike_are_as_unsure_as_one():
     """Of one number 1.96 sd; of a hundred that may err alike the mean still: 95 % or more holds."""
-    of = chain_figures.mean_max_ci95
+    of = span_and_closure.mean_max_ci95
     np.testing.assert_allclose(of(np.array([[3.0]]), np.array([[0.04]])), 0.392, rtol=1e-3)
     assert of(np.zeros((100, 1)), np.full((100, 1), 0.04))[0] == pytest.approx(0.392, rel=1e-3)
     half = of(np.array([[3.0, 4.0], [1.0, 0.0], [np.nan, 0.0]]), np.full((3, 2), 0.04))

@@ -10,13 +10,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processor import compare, store
 from processor.__main__ import main
-from processor.compare import Request
+from processor.compare import compare
+from processor.compare.compare import Request
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError, Scan, Scene, UsageError
-from processor.report import comparison, core_points
-from processor.report.core_points import COLUMNS
+from processor.report import comparison
+from processor.report.deviation import csv as deviation_csv
+from processor.report.deviation.csv import COLUMNS
+from processor.store import store
 from tests.unit.test_m3c2 import brute, wavy
 
 UTM = np.array([512_345.25, 5_412_678.5, 231.0])  # metres
@@ -261,7 +263,7 @@ def test_what_has_no_answer_is_nan(tmp_path):
     origin = np.zeros(3)
     nan = np.array([np.nan])
     found = Distances(nan, nan, np.array([0]), np.array([2]), nan, np.array([0.5]))
-    text = core_points.csv_text(origin, np.zeros((1, 3)), found, np.full((1, 3), np.nan))
+    text = deviation_csv.csv_text(origin, np.zeros((1, 3)), found, np.full((1, 3), np.nan))
     assert text.splitlines()[1] == "0.0,0.0,0.0,nan,nan,0,0,2,nan,0.5,nan,nan,nan"
 
 

@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from designgen import recipes
-from designgen.scene import make
-from processor import folder, store
+from designgen.scenes.make import make
 from processor.geometry import rigid
 from processor.model import Control, InputError
-from processor.steps import spheres
+from processor.scan_folder import folder
+from processor.space_frame import step as space_frame_step
+from processor.store import store
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutter=0", "scan.step_mrad=2.4"]
 COMMON_MM = np.array([1.2, -0.9, 1.3])  # 2 mm in all
@@ -68,8 +69,8 @@ def offsets(result, truth):
 def test_the_shift_all_stations_share_is_found_by_control_points_and_covered_without(roof):
     scene, truth = roof
     wrong = shifted(scene, 1)
-    held = spheres.run(dataclasses.replace(wrong, control=control(scene, 2)), spheres.Params())
-    free = spheres.run(wrong, spheres.Params(datum_mm=1.5))
+    held = space_frame_step.run(dataclasses.replace(wrong, control=control(scene, 2)), space_frame_step.Params())
+    free = space_frame_step.run(wrong, space_frame_step.Params(datum_mm=1.5))
     off, sd = offsets(held, truth)
     # six targets of 0.3 mm, each seen twice to 0.4: 0.17 mm an axis, and their turn's share at the roof
     assert np.abs(np.mean(off, axis=0)).max() < 0.6
@@ -231,7 +232,7 @@ def test_coordinates_of_another_frame_are_told(tmp_path):
     far = CSV.replace("T1,,1000.0", "T1,,500000000.0")
     scene = folder.read_input(place(tmp_path, TOML, far))
     with pytest.raises(InputError, match="control points lie 5e\\+05 m from where"):
-        spheres.run(scene, spheres.Params())
+        space_frame_step.run(scene, space_frame_step.Params())
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1000.0, "1000"), (1.0 / 25.4, "1/25.4"), (1.3, "")])
@@ -243,4 +244,4 @@ def test_control_points_in_another_unit_are_told_with_the_factor(tmp_path, facto
         rows += [f"T{i},,{known[0]},{known[1]},{known[2]},1.0", f"T{i},S1,{y},{5.0 - x},{z},"]
     scene = folder.read_input(place(tmp_path, TOML, "\n".join(rows) + "\n"))
     with pytest.raises(InputError, match=f"lie {said} times as far apart" if said else "from where the scans"):
-        spheres.run(scene, spheres.Params())
+        space_frame_step.run(scene, space_frame_step.Params())

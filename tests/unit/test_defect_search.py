@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.defects import deflection, facets, fields, paper, regions, scan_statistic, shapes, surface
+from processor.defects import baseline, deviation_field, pictures, regions, scan_statistic, shape_models, surface_charts
+from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
+from processor.geometry import visible_facets
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.pipeline import as_json
-from processor.report import of_defects
+from processor.report.defects import section
 from processor.report.results_json import plain
-from processor.steps import defects
 
 SIDE, THICK, GAP = 600.0, 12.0, 300.0
 BOX_FACES = np.array(
@@ -84,7 +85,7 @@ def found(result):
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_an_undamaged_structure_has_no_defect(seed):
-    result = defects.run(scene_of(3, flat, seed=seed), defects.Params())
+    result = defects_step.run(scene_of(3, flat, seed=seed), defects_step.Params())
     assert result.status == "ok"
     assert found(result) == []
     inner = SIDE - 16.0  # less a border of 8 mm, and what a row of cells may take
@@ -94,14 +95,14 @@ def test_an_undamaged_structure_has_no_defect(seed):
 
 def test_what_chance_brings_is_called_doubtful():
     """Asked for 5000 false alarms on 100 m2 there are some on 1 m2, at most as many, and none passes for sure."""
-    result = defects.run(scene_of(3, flat), defects.Params(false_alarms=5000.0))
+    result = defects_step.run(scene_of(3, flat), defects_step.Params(false_alarms=5000.0))
     allowed = 5000.0 * result.examined_mm2 / 1e8
     assert 0 < len(result.ids) < allowed
     assert result.doubtful.all()
     assert (result.chance <= 5000.0 * (1.0 + 1e-9)).all()
     fewer = (result.chance < 500.0).sum()
     assert fewer < 0.1 * allowed + 3.0 * np.sqrt(0.1 * allowed)  # a tenth as often ten times as strong
-    assert "no defects found and" in of_defects.REPORT.summary(result)[0]
+    assert "no defects found and" in section.REPORT.summary(result)[0]
 
 
 def test_a_dent_a_bulge_and_a_pit_are_measured():
@@ -111,7 +112,7 @@ def test_a_dent_a_bulge_and_a_pit_are_measured():
         bump(4.0, 16.0, (2100.0, 200.0)),
     )
     scene = scene_of(3, lambda x, z: dent(x, z) + bulge(x, z) + pit(x, z), spacing=3.0)
-    result = defects.run(scene, defects.Params())
+    result = defects_step.run(scene, defects_step.Params())
     assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
     assert not result.doubtful.any()
     for kind, depth, radius, at in (("dent", 3.0, 90.0, (250.0, 300.0)), ("bulge", -2.0, 80.0, (1250.0, 350.0)),
@@ -139,7 +140,7 @@ def test_missing_corners_edges_and_holes_are_named():
         hole = np.hypot(x - 2100.0, z - 300.0) < 50.0
         return corner | edge | hole
 
-    result = defects.run(scene_of(3, flat, missing), defects.Params())
+    result = defects_step.run(scene_of(3, flat, missing), defects_step.Params())
     assert sorted(found(result)) == [
         ("edge-loss", "component-2"), ("missing-part", "component-1"), ("missing-part", "component-3"),
     ]  # fmt: skip
@@ -154,12 +155,12 @@ def test_what_something_hides_is_not_missing():
     """A ball in the way of both stations: no point of the surface in its shadow."""
     clutter = (1200.0, -250.0, 300.0, 90.0)
     scene = scene_of(3, flat, clutter=clutter)
-    result = defects.run(scene, defects.Params())
+    result = defects_step.run(scene, defects_step.Params())
     assert found(result) == []
     assert result.expected_mm2 < 3 * SIDE**2 - 8_000.0
     # The same points gone without anything in the way are.
     kept = [dataclasses.replace(s, points=s.points[s.points[:, 1] > -100.0]) for s in scene.scans]
-    gone = defects.run(dataclasses.replace(scene, scans=tuple(kept)), defects.Params())
+    gone = defects_step.run(dataclasses.replace(scene, scans=tuple(kept)), defects_step.Params())
     assert set(found(gone)) == {("missing-part", "component-2")}
 
 
@@ -175,8 +176,8 @@ def test_what_something_hides_is_not_missing():
 )
 def test_shapes_of_whole_components(kind, inward, depth):
     """On the second of five plates; the others tell where the whole is."""
-    result = defects.run(
-        scene_of(5, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)), defects.Params()
+    result = defects_step.run(
+        scene_of(5, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)), defects_step.Params()
     )
     assert found(result) == [(kind, "component-2")]
     assert abs(result.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
@@ -194,16 +195,16 @@ def test_stations_that_are_off_are_no_defect():
     for scan, off in zip(scene.scans, (0.5, -0.5), strict=True):
         ray = scan.points - scan.position
         scans.append(dataclasses.replace(scan, points=scan.points + off * ray / np.linalg.norm(ray, axis=1)[:, None]))
-    result = defects.run(dataclasses.replace(scene, scans=tuple(scans)), defects.Params())
+    result = defects_step.run(dataclasses.replace(scene, scans=tuple(scans)), defects_step.Params())
     assert found(result) == []
 
 
 def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
     dent = bump(3.0, 90.0, (250.0, 300.0))
     scene = scene_of(3, dent)
-    first = defects.run(scene, defects.Params())
+    first = defects_step.run(scene, defects_step.Params())
     mixed = [dataclasses.replace(s, points=np.random.default_rng(5).permutation(s.points)) for s in scene.scans]
-    again = defects.run(dataclasses.replace(scene, scans=tuple(mixed)), defects.Params())
+    again = defects_step.run(dataclasses.replace(scene, scans=tuple(mixed)), defects_step.Params())
     assert found(again) == found(first)
     np.testing.assert_allclose(again.depth_max, first.depth_max, atol=1e-6)
     np.testing.assert_allclose(again.centres, first.centres, atol=1e-6)
@@ -214,7 +215,7 @@ def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
         "far", "structure", tuple(dataclasses.replace(s, T_project_scan=T) for s in scene.scans),
         structure=StructureDesign("far", scene.structure.vertices + far, scene.structure.faces),
     )  # fmt: skip
-    there = defects.run(moved, defects.Params())
+    there = defects_step.run(moved, defects_step.Params())
     assert found(there) == found(first)
     np.testing.assert_allclose(there.depth_max, first.depth_max, atol=1e-3)
     np.testing.assert_allclose(there.centres - far, first.centres, atol=1e-2)
@@ -222,19 +223,19 @@ def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
 
 def test_the_papers_chain_finds_a_dent_and_is_seeded():
     scene = scene_of(2, bump(5.0, 120.0, (250.0, 300.0)), spacing=8.0)
-    params = defects.Params(method="paper", paper=paper.Paper(trials=60, feature_points=80))
-    result = defects.run(scene, params)
+    params = defects_step.Params(method="paper", paper=baseline.Paper(trials=60, feature_points=80))
+    result = defects_step.run(scene, params)
     assert set(result.classes) == {"unknown"}
     np.testing.assert_allclose(result.centres[0], [250.0, 2.0, 300.0], atol=12.0)
     assert result.depth_max[0] == pytest.approx(5.0, abs=1.2)
     assert (result.curve_defect == 0).sum() > 5
-    again = defects.run(scene, params)
+    again = defects_step.run(scene, params)
     np.testing.assert_array_equal(again.depth_max, result.depth_max)
 
 
 def test_what_is_written():
-    result = defects.run(scene_of(3, bump(3.0, 90.0, (250.0, 300.0))), defects.Params())
-    written = json.loads(as_json(plain(of_defects.REPORT.written(result))))
+    result = defects_step.run(scene_of(3, bump(3.0, 90.0, (250.0, 300.0))), defects_step.Params())
+    written = json.loads(as_json(plain(section.REPORT.written(result))))
     (one,) = written["defects"]
     keys = {"id", "class", "confidence", "component", "centre", "area_mm2", "depth_max", "depth_ci95", "volume_mm3"}
     assert keys <= set(one)
@@ -244,13 +245,13 @@ def test_what_is_written():
 def test_what_cannot_be_used_is_said():
     scene = scene_of(2, flat, spacing=20.0)
     with pytest.raises(InputError, match="design"):
-        defects.run(dataclasses.replace(scene, structure=None), defects.Params())
+        defects_step.run(dataclasses.replace(scene, structure=None), defects_step.Params())
     with pytest.raises(InputError, match="points"):
-        defects.run(dataclasses.replace(scene, scans=()), defects.Params())
+        defects_step.run(dataclasses.replace(scene, scans=()), defects_step.Params())
     with pytest.raises(UsageError, match="reach_mm"):
-        defects.run(scene, defects.Params(reach_mm=0.0))
+        defects_step.run(scene, defects_step.Params(reach_mm=0.0))
     with pytest.raises(UsageError, match="method"):
-        defects.run(scene, defects.Params(method="magic"))
+        defects_step.run(scene, defects_step.Params(method="magic"))
 
 
 # --- parts of it ---------------------------------------------------------------------------------------------------
@@ -258,7 +259,7 @@ def test_what_cannot_be_used_is_said():
 
 def test_false_alarms_are_no_more_than_asked_for():
     """A hundred square metres of independent noise, over and over: one alarm each is allowed, and chance on top."""
-    plate = surface.of_mesh(*box((0.0, 0.0, 0.0), (10_000.0, 12.0, 10_000.0)), 50.0)
+    plate = surface_charts.of_mesh(*box((0.0, 0.0, 0.0), (10_000.0, 12.0, 10_000.0)), 50.0)
     chart = int(np.argmin(plate.charts.axes[:, 2, 1]))
     rows = plate.charts.cells(chart)
     seen = np.zeros(len(plate.share))
@@ -267,7 +268,7 @@ def test_false_alarms_are_no_more_than_asked_for():
     for seed in range(10):
         noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
         ones = np.ones(len(seen), np.int64)
-        field = fields.Field(noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen)
+        field = deviation_field.Field(noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen)
         levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
         sign = scan_statistic.search(field, plate, levels).sign
         alarms += int((np.abs(plate.charts.image(sign.astype(float), chart)) > 0).any())
@@ -280,8 +281,8 @@ def test_facets_are_the_nearest_that_a_scanner_can_see():
     normals = trimesh.Trimesh(vertices, faces, process=False).face_normals
     rng = np.random.default_rng(3)
     points = rng.uniform([-30.0, -30.0, -30.0], [330.0, 42.0, 230.0], (2000, 3))
-    grid = facets.grid_of(vertices, faces, normals, 60.0)
-    facet, distance = facets.nearest(grid, points, np.zeros((1, 3)), np.full(2000, -1))
+    grid = visible_facets.grid_of(vertices, faces, normals, 60.0)
+    facet, distance = visible_facets.nearest(grid, points, np.zeros((1, 3)), np.full(2000, -1))
     _, true, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(vertices, faces, process=False), points)
     corner = vertices[faces[facet, 0]]
     np.testing.assert_allclose(distance, np.einsum("ni,ni->n", points - corner, normals[facet]), atol=1e-9)
@@ -290,20 +291,20 @@ def test_facets_are_the_nearest_that_a_scanner_can_see():
     np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), true, atol=1e-9)
     # Deep in the plate, nearer to its back, but seen from the front.
     deep = np.array([[150.0, 9.0, 100.0]])
-    facet, distance = facets.nearest(grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64))
+    facet, distance = visible_facets.nearest(grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64))
     assert distance[0] == pytest.approx(-9.0)
     np.testing.assert_allclose(normals[facet[0]], [0.0, -1.0, 0.0])
 
 
 def test_cells_cover_what_a_design_has():
-    plate = surface.of_mesh(*box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0)), 5.0)
+    plate = surface_charts.of_mesh(*box((0.0, 0.0, 0.0), (300.0, 12.0, 200.0)), 5.0)
     area = 2.0 * (300.0 * 200.0 + 300.0 * 12.0 + 200.0 * 12.0)
     assert plate.area_mm2 == pytest.approx(area, rel=0.02)
     assert plate.components == 1
     assert thickness_at(plate, np.array([100.0, 0.0, 90.0]), np.array([0.0, -1.0, 0.0]), 0) == pytest.approx(12.0)
     tube = trimesh.creation.cylinder(100.0, 1000.0, sections=96)
-    round_ = surface.of_mesh(np.asarray(tube.vertices), np.asarray(tube.faces, np.int64), 10.0)
-    cylinder = np.flatnonzero(round_.charts.kind == surface.CYLINDER)
+    round_ = surface_charts.of_mesh(np.asarray(tube.vertices), np.asarray(tube.faces, np.int64), 10.0)
+    cylinder = np.flatnonzero(round_.charts.kind == surface_charts.CYLINDER)
     assert len(cylinder) == 1
     mantle = round_.share[round_.charts.cells(int(cylinder[0]))].sum() * 100.0
     assert mantle == pytest.approx(2.0 * np.pi * 100.0 * 1000.0, rel=0.02)
@@ -317,7 +318,7 @@ def test_bodies_that_touch_are_one_component():
     alone = box((900.0, 0.0, 0.0), (1100.0, 10.0, 300.0))
     vertices = np.vstack([web[0], flange[0], alone[0]])
     faces = np.vstack([BOX_FACES, BOX_FACES + 8, BOX_FACES + 16])
-    whole = surface.of_mesh(vertices, faces, 20.0)
+    whole = surface_charts.of_mesh(vertices, faces, 20.0)
     assert whole.components == 2
     assert len(set(whole.component_of[:24].tolist())) == 1
 
@@ -325,7 +326,7 @@ def test_bodies_that_touch_are_one_component():
 def test_density_clusters_are_those_of_the_definition():
     rng = np.random.default_rng(4)
     points = np.vstack([rng.normal(0, 3, (60, 3)), rng.normal(40, 3, (50, 3)), rng.uniform(-80, 120, (40, 3))])
-    label = paper.density_clusters(points, 4.0, 4)
+    label = baseline.density_clusters(points, 4.0, 4)
     near = np.linalg.norm(points[:, None] - points[None], axis=2) <= 4.0
     core = near.sum(axis=1) >= 4
     reach = np.where(core[:, None] & core[None], near, False)
@@ -338,10 +339,10 @@ def test_density_clusters_are_those_of_the_definition():
 
 def test_numbers_by_hand():
     # Huber, limit 2: 1 -> 0.5; 3 -> 0.5 * 2 * (6 - 2) = 4.
-    assert paper.huber(np.array([1.0, 3.0]), 2.0) == pytest.approx(4.5)
+    assert baseline.huber(np.array([1.0, 3.0]), 2.0) == pytest.approx(4.5)
     # A parabola of 1 mm at 100 mm: slopes of its chords add up to what it is at the end.
     x = np.linspace(0.0, 100.0, 2001)
-    at, mu = deflection.by_slopes(x, (x / 100.0) ** 2, 10)
+    at, mu = pictures.by_slopes(x, (x / 100.0) ** 2, 10)
     np.testing.assert_allclose(mu, (at / 100.0) ** 2, atol=5e-4)
 
 
@@ -360,10 +361,10 @@ def test_numbers_by_hand():
 def test_one_shape_is_chosen(kind, height):
     a, b = (x.ravel() for x in np.meshgrid(np.linspace(-485.0, 485.0, 34), np.linspace(-285.0, 285.0, 20)))
     points = np.stack([a, b, np.zeros(len(a))], axis=1)
-    frame = shapes.Frame(np.zeros(3), np.eye(3), np.array([500.0, 300.0, 6.0]), 300.0)
+    frame = shape_models.Frame(np.zeros(3), np.eye(3), np.array([500.0, 300.0, 6.0]), 300.0)
     mean = height(points) + np.random.default_rng(2).normal(0.0, 0.03, len(a))
     outward = np.broadcast_to([0.0, 0.0, 1.0], points.shape)
-    fitted = shapes.fit(shapes.Blocks(points, outward, mean, np.full(len(a), 0.03**-2), 30.0), frame)
+    fitted = shape_models.fit(shape_models.Blocks(points, outward, mean, np.full(len(a), 0.03**-2), 30.0), frame)
     assert [one.kind for one in fitted.shapes] == ([kind] if kind else [])
     if kind:
         value = fitted.shapes[0].values(frame, points, outward)
@@ -373,7 +374,7 @@ def test_one_shape_is_chosen(kind, height):
 def test_the_pieces_of_a_crack_are_one_and_what_lies_beside_it_is_not():
     """Cells by their places on the front of a plate: a slim piece, others in its line, one that lies 4 cells off."""
     design = design_of(1)
-    whole = surface.gridded(surface.of_mesh(design.vertices, design.faces, 60.0), 10.0)
+    whole = surface_charts.gridded(surface_charts.of_mesh(design.vertices, design.faces, 60.0), 10.0)
     (chart,) = {
         int(k) for k in range(len(whole.charts.kind)) if whole.outward[whole.charts.first[k]] @ [0.0, -1.0, 0.0] > 0.9
     }

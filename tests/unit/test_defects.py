@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from designgen import damage, recipes, structure_scene
+from designgen import recipes
+from designgen.asbuilt import defects
 from designgen.designs import plate_row
+from designgen.scenes import structure as scenes_structure
 from processor.model import UsageError
 
 ROWS = {
@@ -21,8 +23,8 @@ def row_of(row, kinds, sizes, seed=1):
     """Components as designed, faces as built with the component of each, and the truth."""
     structure = {"type": "plate-row", "components": list(kinds), **row}
     recipe = {"kind": "structure", "structure": structure, "asbuilt": sizes}
-    components = structure_scene.design(recipe)
-    return components, *structure_scene.BUILDERS["plate-row"](components, recipe, seed)[::2]
+    components = scenes_structure.design(recipe)
+    return components, *scenes_structure.BUILDERS["plate-row"](components, recipe, seed)[::2]
 
 
 def volume(patches):
@@ -79,10 +81,10 @@ def missing(component, built):
 @pytest.mark.parametrize("size", [0.4, 1.0, 1.5])
 @pytest.mark.parametrize("row", ROWS)
 def test_the_truth_of_every_defect_is_that_of_the_faces(row, size, seed):
-    components, patches, truth = row_of(ROWS[row], damage.CLASSES, {"size": size}, seed)
-    assert truth.classes == damage.CLASSES
+    components, patches, truth = row_of(ROWS[row], defects.CLASSES, {"size": size}, seed)
+    assert truth.classes == defects.CLASSES
     assert truth.components == tuple(one.name for one in components)
-    for part, kind in enumerate(damage.CLASSES):
+    for part, kind in enumerate(defects.CLASSES):
         built = [patch for number, patch in patches if number == part]
         component = components[part]
         area, depth, lost = truth.area_mm2[part], truth.depth_max_mm[part], truth.volume_mm3[part]
@@ -204,12 +206,12 @@ def test_a_pit_leaves_steel_behind_it():
 
 def test_an_unknown_defect_is_refused():
     with pytest.raises(UsageError, match="expected classes of dent, bulge"):
-        damage.draw("rust", damage.Params(), plate_row.Params(), np.random.default_rng(0))
+        defects.draw("rust", defects.Params(), plate_row.Params(), np.random.default_rng(0))
 
 
 def test_named_recipes_fit():
     for name in ("plates-defects", "girders-defects"):
         recipe = recipes.load(name)[1]
         row = {key: value for key, value in recipe["structure"].items() if key not in ("type", "components")}
-        _, _, truth = row_of(row, damage.CLASSES, {})
-        assert truth.classes == damage.CLASSES
+        _, _, truth = row_of(row, defects.CLASSES, {})
+        assert truth.classes == defects.CLASSES

@@ -7,8 +7,8 @@ import json
 import numpy as np
 import pytest
 
-from processor import folder
 from processor.model import InputError
+from processor.scan_folder import folder
 from tests.unit.test_folder import BOX, TRIANGLES, arch_design, bridge, part, surface, write_ply, write_xyz
 
 __all__ = ["bridge"]  # a fixture

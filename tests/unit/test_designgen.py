@@ -11,12 +11,15 @@ import pytest
 import trimesh
 from scipy.integrate import quad
 
-from designgen import curves, recipes, sampler, scan_folder
+from designgen import curves, recipes
 from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, space_frame
+from designgen.export import folder as export_folder
 from designgen.randomness import generator
-from designgen.scene import make
-from processor import folder, store
+from designgen.scanning import sampler
+from designgen.scenes.make import make
 from processor.model import UsageError
+from processor.scan_folder import folder
+from processor.store import store
 
 ROOT = Path(__file__).resolve().parents[2]
 HEIGHTS = {  # z(x) with x from the start, written down apart from the code under test
@@ -229,7 +232,7 @@ def test_an_exported_folder_holds_design_and_truth(tmp_path):
     recipe = recipes.overridden(recipes.load("frame-small")[1], ["scan.spacing_mm=40"])
     scene, truth = make("roof", recipe)
     store.write_scene(tmp_path / "s.h5", scene, truth, {"parameters": recipe})
-    scan_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True, step=True)
+    export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True, step=True)
     back = folder.read_input(tmp_path / "out")
     assert (back.kind, back.name) == ("space-frame", "roof")
     np.testing.assert_array_equal(back.frame.centres, scene.frame.centres)
@@ -237,7 +240,7 @@ def test_an_exported_folder_holds_design_and_truth(tmp_path):
     assert folder.truth_file(tmp_path / "out") is not None
     assert (tmp_path / "out/design/frame.step").stat().st_size > 10_000
     with pytest.raises(UsageError, match="not empty"):
-        scan_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True)
+        export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True)
 
 
 def test_the_command_line(tmp_path):

@@ -23,8 +23,8 @@ import numpy as np
 import pytest
 
 from designgen import batch, recipes, spread
-from processor import store
 from processor.model import UsageError
+from processor.store import store
 
 MAKE = (sys.executable, "-m", "designgen", "make", "frame-small", "--set", "scan.spacing_mm=60")
 COLUMNS = ["file", "recipe", "seed", "points", "scans", "scene_hash", "sha256", "status", "reason"]

@@ -5,9 +5,10 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from processor.deviation import attitude, clouds, scales, summary
-from processor.geometry import curved_facets, m3c2, mesh_surface, neighbors, point_neighbors, principal, rigid
-from processor.geometry import surface_movement as moving
+from processor.deviation import attitude, scales, statistics
+from processor.deviation import cloud as deviation_cloud
+from processor.geometry import local_translation as moving
+from processor.geometry import m3c2, mesh_distance, neighbors, point_neighbors, principal, rigid
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError
 from tests.unit.test_m3c2 import wavy
@@ -58,7 +59,7 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
     covered = 0
     for _ in range(200):
         marks = rng.random(400) < 0.05
-        found = summary.share(marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0)
+        found = statistics.share(marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0)
         assert found.low <= found.share <= found.high
         covered += found.low <= 0.05 <= found.high
     assert 0.9 <= covered / 200 <= 1.0
@@ -67,13 +68,13 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
 def test_a_share_of_places_that_agree_counts_them_once():
     marks = np.repeat(np.random.default_rng(8).random(100) < 0.3, 50)
     places = np.repeat(np.arange(100.0), 50)[:, None] * [100.0, 0.0, 0.0]
-    found = summary.share(marks, places, 60.0)
-    alone = summary.share(marks[::50], places[::50], 60.0)
+    found = statistics.share(marks, places, 60.0)
+    alone = statistics.share(marks[::50], places[::50], 60.0)
     assert found.high - found.low == pytest.approx(alone.high - alone.low, rel=0.05)
-    none = summary.share(np.zeros(5000, bool), places, 60.0)
+    none = statistics.share(np.zeros(5000, bool), places, 60.0)
     assert none.low == 0.0
     assert 0.02 < none.high < 0.05  # rule of three for 100 cells
-    assert np.isnan(summary.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
+    assert np.isnan(statistics.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
 
 
 def planes_compared(seed, off=0.0, error=0.0):
@@ -110,7 +111,7 @@ def test_the_summary_counts_what_has_no_level():
         np.array([30, 10, 30, 3]), np.ones(4), np.ones(4),
     )  # fmt: skip
     normals = np.array([UP, UP, [nan] * 3, UP])
-    total = summary.of_distances(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
+    total = statistics.of_distances(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
     assert (total.core_points, total.without_lod, total.without_normal) == (4, 2, 1)
     assert (total.few_points, total.significant) == (1, 1)
     assert (total.mean, total.min, total.max, total.rms) == (-1.0, -3.0, 1.0, pytest.approx(np.sqrt(5.0)))
@@ -131,7 +132,7 @@ def coarse(mesh, T, seed):
     points = np.asarray(trimesh.sample.sample_surface(mesh, 20_000, seed=seed)[0])
     moved = rigid.apply(rigid.invert(T), points) + np.random.default_rng(seed).normal(0.0, 2.0, points.shape)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    samples = clouds.sampled(vertices, faces, 30.0)
+    samples = deviation_cloud.sampled(vertices, faces, 30.0)
     return attitude.coarse(moved, samples, principal.of_mesh(vertices, faces))
 
 
@@ -167,19 +168,19 @@ def test_adaptive_voxels_hold_their_points():
     rng = np.random.default_rng(10)
     dense, sparse = rng.uniform(0.0, 10.0, (5000, 3)), rng.uniform(0.0, 1000.0, (300, 3))
     points = np.vstack([dense, sparse])
-    group = clouds.adaptive_voxels(points, 2.0, 5)
+    group = deviation_cloud.adaptive_voxels(points, 2.0, 5)
     count = np.bincount(group)
     assert (count[:-1] >= 5).all()
     assert count.sum() == len(points)
     widths = [np.ptp(points[group == g], axis=0).max() for g in range(len(count) - 1)]
     assert max(widths[:50]) <= 2.0 < np.max(widths)
-    means = clouds.group_means(points, group)
+    means = deviation_cloud.group_means(points, group)
     np.testing.assert_allclose(means[3], points[group == 3].mean(axis=0))
 
 
 def test_samples_of_a_mesh_are_even():
     mesh = trimesh.creation.box((2000.0, 1000.0, 500.0))
-    found = clouds.sampled(np.asarray(mesh.vertices), np.asarray(mesh.faces), 20.0)
+    found = deviation_cloud.sampled(np.asarray(mesh.vertices), np.asarray(mesh.faces), 20.0)
     assert len(found.points) == pytest.approx(mesh.area / 400.0, rel=0.01)
     on_top = found.normals[:, 2] > 0.5
     assert on_top.mean() == pytest.approx(2e6 / mesh.area, rel=0.02)
@@ -195,8 +196,8 @@ def tube(radius, length, sections):
 
 def test_facets_of_a_tube_are_as_round_as_the_tube():
     vertices, faces = tube(100.0, 1000.0, 48)
-    surface = mesh_surface.of_mesh(vertices, faces)
-    curved = curved_facets.of_surface(surface)
+    surface = mesh_distance.of_mesh(vertices, faces)
+    curved = mesh_distance.of_surface(surface)
     angle = np.random.default_rng(11).uniform(0.0, 2.0 * np.pi, 3000)
     height = np.random.default_rng(12).uniform(-450.0, 450.0, 3000)
     points = np.column_stack([100.0 * np.cos(angle), 100.0 * np.sin(angle), height])
@@ -206,9 +207,9 @@ def test_facets_of_a_tube_are_as_round_as_the_tube():
     left = distance - curved.heights(feet, facet)
     assert np.abs(left).max() < 0.01 * distance.max()
     box = trimesh.creation.box((1000.0, 500.0, 20.0))
-    flat = curved_facets.of_surface(mesh_surface.of_mesh(np.asarray(box.vertices), np.asarray(box.faces)))
+    flat = mesh_distance.of_surface(mesh_distance.of_mesh(np.asarray(box.vertices), np.asarray(box.faces)))
     assert np.abs(flat.slopes).max() < 1e-12
-    coarse_tube = curved_facets.of_surface(mesh_surface.of_mesh(*tube(2000.0, 5000.0, 24)))
+    coarse_tube = mesh_distance.of_surface(mesh_distance.of_mesh(*tube(2000.0, 5000.0, 24)))
     assert not coarse_tube.slopes.any()  # would bulge by 17 mm: no tube
 
 

@@ -10,10 +10,12 @@ import pytest
 import trimesh
 
 from designgen import recipes
-from designgen.scene import make
+from designgen.scenes.make import make
 from processor import pipeline
-from processor.deviation import paper
-from processor.evaluate import ErrorReport
+from processor.deviation import baseline
+from processor.deviation import step as deviation_step
+from processor.evaluation import deviation as deviation_evaluation
+from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
 from processor.language import language
 from processor.model import (
@@ -28,8 +30,8 @@ from processor.model import (
     UsageError,
 )
 from processor.pipeline import Execution
-from processor.report import figures_deviation, of_deviation, results_deviation, results_json, writing
-from processor.steps import deviation
+from processor.report import results_folder, results_json
+from processor.report.deviation import figures, results, section
 from tests.unit.test_deviation_parts import bracket
 
 FAR = np.array([5.0e8, 3.2e9, 1.0e5])  # mm
@@ -57,12 +59,12 @@ def scene_of(seed, move=field, T_design_scan=None, origin=0.0, count=60_000):
 
 
 def metrics(scene, result, truth):
-    return {one.name: one for one in deviation.check(scene, result, truth)}
+    return {one.name: one for one in deviation_evaluation.check(scene, result, truth)}
 
 
 def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_bad_frame():
     scene, truth = scene_of(1, origin=FAR)
-    result = deviation.run(scene, deviation.Params())
+    result = deviation_step.run(scene, deviation_step.Params())
     assert (result.status, result.registration) == ("ok", "as given")
     np.testing.assert_array_equal(result.T_design_scan, np.eye(4))
     found = metrics(scene, result, truth)["core points farther from the truth than their LOD95"]
@@ -75,7 +77,7 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
     assert result.significant_low < result.significant_share < result.significant_high
     assert "A best fit would move" in result.message
     assert 3.0 < result.best_fit_shift @ [0.0, -1.0, 0.0] < 5.0  # as the scan lies 4 mm to +y
-    fitted = deviation.run(scene, deviation.Params(register="fine"))
+    fitted = deviation_step.run(scene, deviation_step.Params(register="fine"))
     assert fitted.registration == "fine"
     assert abs(np.nanmean(fitted.distance[result.normals[:, 1] > 0.9])) < 0.7  # the best fit has it
     assert "taken up" in fitted.message
@@ -85,7 +87,7 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
 def test_a_scan_in_another_frame_is_registered_whatever_its_order():
     T = rigid.transform(rigid.rotation_from_vector(np.array([0.4, -1.1, 2.0])), np.array([9e3, -4e3, 700.0]))
     scene, _ = scene_of(2, lambda p: 0.0 * p, T)
-    result = deviation.run(scene, deviation.Params())
+    result = deviation_step.run(scene, deviation_step.Params())
     assert (result.status, result.registration) == ("ok", "coarse")
     off = result.T_design_scan @ rigid.invert(T)
     sd = np.sqrt(np.diag(result.covariance))
@@ -95,7 +97,7 @@ def test_a_scan_in_another_frame_is_registered_whatever_its_order():
     assert result.significant_share < 0.06
     points = np.random.default_rng(3).permutation(scene.scans[0].points)
     mixed = Scene("bracket", "structure", (Scan("scan", points),), structure=scene.structure, units="mm")
-    again = deviation.run(mixed, deviation.Params())
+    again = deviation_step.run(mixed, deviation_step.Params())
     np.testing.assert_allclose(again.distance, result.distance, atol=1e-9)
     np.testing.assert_array_equal(again.n2, result.n2)
 
@@ -103,9 +105,9 @@ def test_a_scan_in_another_frame_is_registered_whatever_its_order():
 @pytest.mark.parametrize("seed", [4, 5])
 def test_an_undamaged_structure_is_a_twentieth_beyond_where_the_frame_is_sure(seed):
     scene, _ = scene_of(seed, lambda p: 0.0 * p)
-    result = deviation.run(scene, deviation.Params(registration_error_mm=0.0))
+    result = deviation_step.run(scene, deviation_step.Params(registration_error_mm=0.0))
     assert 0.035 < result.significant_share < 0.065
-    cautious = deviation.run(scene, deviation.Params())
+    cautious = deviation_step.run(scene, deviation_step.Params())
     assert cautious.registration_error > 0.0
     assert cautious.significant_share < result.significant_share
 
@@ -121,7 +123,7 @@ def test_a_scanner_tells_the_sides_of_a_plate_apart():
     design = StructureDesign("plate", np.asarray(mesh.vertices), np.asarray(mesh.faces))
     station = Stations(("S1",), np.array([[0.0, 5000.0, 0.0]]))
     scene = Scene("plate", "structure", (scan,), stations=station, structure=design, units="mm")
-    result = deviation.run(scene, deviation.Params())
+    result = deviation_step.run(scene, deviation_step.Params())
     front = np.isfinite(result.lod95) & (result.normals[:, 1] > 0.9)
     assert front.sum() > 100
     assert np.nanmedian(result.distance[front]) == pytest.approx(-7.0, abs=0.1)
@@ -137,33 +139,33 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
     )  # fmt: skip
     several = Scene("bracket", "structure", scans, structure=scene.structure, units="mm")
     stitched = SimpleNamespace(scans=("a", "b", "c"), T_project_scan=np.array([np.eye(4), T, np.full((4, 4), np.nan)]))
-    result = deviation.run(several, deviation.Params(), earlier={"stitch": stitched})
+    result = deviation_step.run(several, deviation_step.Params(), earlier={"stitch": stitched})
     assert result.points_read == len(points)
     assert result.status == "ok"
     assert abs(np.nanmean(result.distance)) < 0.05
-    assert "no pose" in deviation.run(several, deviation.Params(register="none")).message
+    assert "no pose" in deviation_step.run(several, deviation_step.Params(register="none")).message
 
 
 def test_what_is_no_structure_and_what_has_no_design():
     scene, _ = scene_of(7, count=5000)
     without = Scene("bracket", "structure", scene.scans, units="mm")
-    assert deviation.applies(scene)
-    assert not deviation.applies(without)
+    assert deviation_step.applies(scene)
+    assert not deviation_step.applies(without)
     with pytest.raises(InputError, match="needs a design"):
-        deviation.run(without, deviation.Params())
+        deviation_step.run(without, deviation_step.Params())
     few = Scene("bracket", "structure", (Scan("scan", np.eye(3)),), structure=scene.structure, units="mm")
     with pytest.raises(InputError, match="100 points"):
-        deviation.run(few, deviation.Params())
+        deviation_step.run(few, deviation_step.Params())
     flat = StructureDesign("line", np.eye(3), np.array([[0, 0, 1]]))
     with pytest.raises(InputError, match="surface"):
-        deviation.run(Scene("b", "structure", scene.scans, structure=flat, units="mm"), deviation.Params())
+        deviation_step.run(Scene("b", "structure", scene.scans, structure=flat, units="mm"), deviation_step.Params())
     for bad in ({"register": "sideways"}, {"method": "magic"}, {"max_depth_mm": -1.0}, {"neighbours": 0}):
         with pytest.raises(UsageError):
-            deviation.run(scene, deviation.Params(**bad))
+            deviation_step.run(scene, deviation_step.Params(**bad))
     elsewhere = Scene(
         "b", "structure", (Scan("scan", scene.scans[0].points, FAR),), structure=scene.structure, units="mm"
     )
-    lost = deviation.run(elsewhere, deviation.Params(register="none"))
+    lost = deviation_step.run(elsewhere, deviation_step.Params(register="none"))
     assert lost.status == "failed"
     assert "0 % of the scan" in lost.message
     assert np.isnan(lost.significant_share)
@@ -171,7 +173,7 @@ def test_what_is_no_structure_and_what_has_no_design():
 
 def test_the_papers_chain_says_what_its_scales_leave(tmp_path):
     scene, truth = scene_of(8, count=20_000)
-    result = deviation.run(scene, deviation.Params(method="paper", register="fine"))
+    result = deviation_step.run(scene, deviation_step.Params(method="paper", register="fine"))
     assert (result.normal_diameter, result.projection_diameter) == (110.541, 55.270)
     assert result.registration_error < 0.01  # of a clone: repeatability alone
     assert np.isnan(result.lod95[np.minimum(result.n1, result.n2) < 4]).all()
@@ -201,12 +203,12 @@ def arch(seed=11, count=20_000):
 
 def test_the_papers_attitude_is_called_ambiguous_where_another_fits_as_well():
     scene, _ = arch()
-    result = deviation.run(scene, deviation.Params(method="paper", register="coarse"))
+    result = deviation_step.run(scene, deviation_step.Params(method="paper", register="coarse"))
     assert result.status == "ambiguous"
     assert 1.0 <= result.ambiguity < 1.3
     assert "Another attitude" in result.message
     bracket_scene, _ = scene_of(12, lambda p: 0.0 * p, count=20_000)
-    sure = deviation.run(bracket_scene, deviation.Params(method="paper", register="coarse"))
+    sure = deviation_step.run(bracket_scene, deviation_step.Params(method="paper", register="coarse"))
     assert sure.status == "ok"
     assert sure.ambiguity > 2.0
     assert rigid.rotation_angle(sure.T_design_scan[:3, :3]) < 0.01
@@ -223,7 +225,7 @@ def test_cases_are_compared_after_they_were_refined_and_alike_axes_are_swapped(w
     target, seen = (np.asarray(trimesh.sample.sample_surface(mesh, 15_000, seed=seed)[0]) for seed in (1, 2))
     T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, -0.2, 1.5])), np.array([500.0, -80.0, 7.0]))
     kept = np.random.default_rng(1).random(len(seen)) < np.where(seen[:, 0] * seen[:, 1] > 0.0, 1.0, 0.8)
-    found, ambiguity = paper.coarse(rigid.apply(rigid.invert(T), seen[kept]), target)
+    found, ambiguity = baseline.coarse(rigid.apply(rigid.invert(T), seen[kept]), target)
     assert rigid.rotation_angle(found[:3, :3] @ T[:3, :3].T) < 0.15
     assert ambiguity > 1.3
 
@@ -236,10 +238,10 @@ def _at(x, y, z):
 
 def test_a_pose_that_is_another_of_those_that_fit_is_not_held_against_the_truth():
     scene, truth = arch()
-    result = deviation.run(scene, deviation.Params(register="none"))
+    result = deviation_step.run(scene, deviation_step.Params(register="none"))
     half = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, np.pi])), np.zeros(3))
     turned = dataclasses.replace(result, T_design_scan=half, status="ambiguous")
-    (said,) = deviation.check(scene, turned, truth)
+    (said,) = deviation_evaluation.check(scene, turned, truth)
     assert said.name.startswith("not compared")
     assert said.value == pytest.approx(180.0)
     assert said.passed
@@ -249,25 +251,25 @@ def test_a_pose_that_is_another_of_those_that_fit_is_not_held_against_the_truth(
 
 def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
     scene, _ = scene_of(14, count=20_000)
-    result = deviation.run(scene, deviation.Params())
-    written = results_deviation.written(result)
+    result = deviation_step.run(scene, deviation_step.Params())
+    written = results.written(result)
     known = np.isfinite(result.lod95)
     for end, row in (("min", np.argmin(result.distance[known])), ("max", np.argmax(result.distance[known]))):
         value, lod95 = result.distance[known][row], result.lod95[known][row]
         assert written[end] == value
         np.testing.assert_allclose(written[f"{end}_ci95"], [value - lod95, value + lod95])
-        said = of_deviation.REPORT.summary(result)[1]
+        said = section.REPORT.summary(result)[1]
         assert f"{value:.3f} ± {lod95:.3f}" in said
         assert "±" not in language("zh").say(said) or "至" in language("zh").say(said)
     run = StepRun("deviation", "default", "{}", result)
-    (table,) = of_deviation.REPORT.tables([run], ErrorReport())
+    (table,) = section.REPORT.tables([run], ErrorReport())
     rows = {row[0]: row[1] for row in table.rows}
     assert rows["least"] + rows["least, its LOD95"] == pytest.approx(written["min_ci95"][1])
     assert rows["greatest"] + rows["greatest, its LOD95"] == pytest.approx(written["max_ci95"][1])
 
 
 def test_marks_of_the_legend_can_be_seen():
-    legend = figures_deviation._legend(3, 5, 7)
+    legend = figures._legend(3, 5, 7)
     assert [one.get_label().rsplit("(", 1)[1] for one in legend] == ["3)", "5)", "7)"]
     for one in legend:
         assert max(mpl.colors.to_rgb(one.get_color())) < 0.5  # white is 1
@@ -280,9 +282,9 @@ def test_it_is_written_as_the_interface_says(tmp_path):
     scene, truth = scene_of(9, count=20_000)
     jobs = pipeline.plan(("deviation",), (), {}, 0)
     found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
-    report = ErrorReport(tuple(deviation.check(scene, found.runs[0].result, truth)))
+    report = ErrorReport(tuple(deviation_evaluation.check(scene, found.runs[0].result, truth)))
     assert isinstance(found, Execution)
-    writing.write(tmp_path / "out", found, report)
+    results_folder.write(tmp_path / "out", found, report)
     written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["deviation"]
     for key in ("T_design_scan", "registration_error", "core_points", "significant_share", "min", "max"):
         assert written[key] is not None
@@ -304,7 +306,7 @@ def test_it_is_written_as_the_interface_says(tmp_path):
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
     scene, truth = make("roof", recipes.overridden(recipes.load("stadium-roof")[1], [f"seed={seed}"]))
-    result = deviation.run(scene, deviation.Params())
-    assert all(one.passed for one in deviation.check(scene, result, truth))
+    result = deviation_step.run(scene, deviation_step.Params())
+    assert all(one.passed for one in deviation_evaluation.check(scene, result, truth))
     assert np.isfinite(result.lod95).mean() > 0.95
     assert np.nanmedian(result.lod95) < 2.0

@@ -5,10 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
-from processor import pipeline, store
-from processor.evaluate import ErrorReport, evaluate, true_rows
+from processor import pipeline
+from processor.evaluation.evaluate import ErrorReport, evaluate
+from processor.evaluation.space_frame import true_rows
 from processor.model import ArchTruth, FrameDesign, FrameTruth, InputError, Metric, Scan, Scene, StepRun, Truth
-from processor.steps import preassemble, spheres
+from processor.preassembly import step as preassembly_step
+from processor.space_frame import step as space_frame_step
+from processor.store import store
 
 NAN = float("nan")
 TRUE = FrameTruth(np.array([3, 5, 8]), np.array([[0.0, 0, 0], [1000, 0, 0], [2000, 0, 0]]), np.array([45.0, 50, 60]))
@@ -16,7 +19,7 @@ TRUE = FrameTruth(np.array([3, 5, 8]), np.array([[0.0, 0, 0], [1000, 0, 0], [200
 
 def result(ids, centres, radii, method="ransac"):
     k = len(ids)
-    return spheres.Result(
+    return space_frame_step.Result(
         "ok",
         method,
         ids=np.array(ids),
@@ -111,6 +114,6 @@ def test_a_report_passes_when_every_limit_is_kept():
 
 def test_every_step_can_be_checked():
     assert {name for name, module in pipeline.step_modules().items() if callable(module.check)} >= {
-        preassemble.__name__.rsplit(".", 1)[1],
-        spheres.__name__.rsplit(".", 1)[1],
+        preassembly_step.__name__.rsplit(".", 1)[1],
+        space_frame_step.__name__.rsplit(".", 1)[1],
     }

@@ -7,8 +7,9 @@ import json
 import numpy as np
 import pytest
 
-from processor import folder, store
 from processor.model import InputError, Scan, Scene, Truth, UsageError
+from processor.scan_folder import folder
+from processor.store import store
 
 BOX = np.array([[x, y, z] for x in (0.0, 4.0) for y in (-0.4, 0.4) for z in (0.0, 0.9)])  # a part in metres
 TRIANGLES = [[0, 1, 3], [0, 3, 2], [4, 5, 7], [4, 7, 6], [0, 1, 5], [2, 3, 7]]

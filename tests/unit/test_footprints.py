@@ -5,9 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen import echoes, footprints, scanner
 from designgen.designs import structure
-from designgen.surfaces import Builder
+from designgen.scanning import footprints, scanner
+from designgen.scanning import returns as scanning_returns
+from designgen.scanning.surfaces import Builder
 
 QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
 
@@ -35,10 +36,10 @@ def test_nothing_thin_between_the_rays_is_overlooked(monkeypatch):
     surfaces = builder.done()
     device = dataclasses.replace(QUIET, divergence_mrad=0.8, beam_exit_mm=3.0)
     params = scanner.Params(step_mrad=4.0, specular=0.0)
-    found = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    found = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
     mark_every_ray(monkeypatch)
-    every = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
-    assert (every.source == echoes.MIXED).sum() > 300
+    every = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    assert (every.source == scanning_returns.MIXED).sum() > 300
     np.testing.assert_array_equal(found.points, every.points)
     np.testing.assert_array_equal(found.source, every.source)
 
@@ -61,7 +62,7 @@ OUTERMOST = 0.7 * np.cos(np.radians(30.0))  # of the middle to an edge upright: 
 def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     surfaces, device = before_a_wall()
     params = scanner.Params(step_mrad=step_mrad, specular=0.0)
-    returns = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    returns = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
     columns = round(2.0 * np.pi / (1e-3 * step_mrad))
     lowest, step = np.radians(-60.0), 1e-3 * step_mrad
     turn = 2.0 * np.pi * returns.column / columns - 0.5 * np.pi  # of the edge at x = 0, to the left
@@ -73,7 +74,7 @@ def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     reach = np.arctan(OUTERMOST * angle / level)
     off = np.abs(turn) - reach
     sure = low & (np.abs(off) > 0.02 * reach) & (np.abs(turn) < 0.02)  # the range is a neighbour's
-    mixed = returns.source == echoes.MIXED
+    mixed = returns.source == scanning_returns.MIXED
     np.testing.assert_array_equal(mixed[sure], off[sure] < 0.0)
     rows = len(np.unique(returns.row[low]))
     width = 2.0 * OUTERMOST * 0.5 * (4e-3 + 8.0 / 4000.0)
@@ -88,7 +89,7 @@ def test_a_ray_within_an_edge_is_as_far_as_the_mean_of_its_sub_rays():
     surfaces, device = before_a_wall()
     device = dataclasses.replace(device, divergence_mrad=6.0, beam_exit_mm=20.0)  # 22 mm at the half plane
     params = scanner.Params(step_mrad=0.25, specular=0.0)
-    returns = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    returns = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
     columns, step = round(2.0 * np.pi / 2.5e-4), 2.5e-4
     azimuth, elevation = 2.0 * np.pi * returns.column / columns, np.radians(-60.0) + step * returns.row
     x = 4000.0 / np.tan(azimuth)
@@ -111,7 +112,7 @@ def test_a_ray_within_an_edge_is_as_far_as_the_mean_of_its_sub_rays():
         assert max(ranges) > 6900.0
         expected = np.dot(energy, ranges) / np.sum(energy)
         assert np.linalg.norm(returns.points[k]) == pytest.approx(expected, abs=0.05)
-        assert returns.source[k] == echoes.MIXED
+        assert returns.source[k] == scanning_returns.MIXED
 
 
 def large_faces():
@@ -136,11 +137,11 @@ WIDE = dataclasses.replace(QUIET, divergence_mrad=18.0, beam_exit_mm=5.0, thresh
 
 def test_no_mixed_pixel_of_a_beam_three_times_the_step_is_overlooked(monkeypatch):
     surfaces, params = large_faces(), scanner.Params(step_mrad=6.0, specular=0.0, sub_rays=19)
-    found = echoes.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
+    found = scanning_returns.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
     mark_every_ray(monkeypatch)
-    every = echoes.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
-    assert (every.source == echoes.MIXED).sum() > 10_000
-    assert (every.source == echoes.SURFACE).sum() > 10_000
+    every = scanning_returns.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
+    assert (every.source == scanning_returns.MIXED).sum() > 10_000
+    assert (every.source == scanning_returns.SURFACE).sum() > 10_000
     np.testing.assert_array_equal(found.row, every.row)
     np.testing.assert_array_equal(found.source, every.source)
     np.testing.assert_array_equal(found.points, every.points)
@@ -150,9 +151,9 @@ def test_a_scan_does_not_depend_on_its_strips(monkeypatch):
     surfaces, params = large_faces(), scanner.Params(step_mrad=6.0, specular=0.0)
     found = []
     for strip in (64, 16, 7):
-        monkeypatch.setattr(echoes, "STRIP", strip)
-        found.append(echoes.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns)
-    assert (found[0].source == echoes.MIXED).sum() > 10_000
+        monkeypatch.setattr(scanning_returns, "STRIP", strip)
+        found.append(scanning_returns.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns)
+    assert (found[0].source == scanning_returns.MIXED).sum() > 10_000
     for other in found[1:]:
         for column in ("row", "column", "points", "source", "part", "range_error_mm"):
             np.testing.assert_array_equal(getattr(other, column), getattr(found[0], column))
@@ -170,14 +171,14 @@ def test_a_beam_on_two_plates_gives_a_mixed_pixel_by_the_device():
     for behaviour in ("phase", "pulse"):
         device = dataclasses.replace(QUIET, behaviour=behaviour, divergence_mrad=0.8, encoder_urad=100.0)
         device = dataclasses.replace(device, separation_mm=500.0)
-        returns = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+        returns = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
         edge = (
-            (returns.source == echoes.MIXED)
+            (returns.source == scanning_returns.MIXED)
             & (np.abs(returns.points[:, 0]) < 10.0)
             & (np.abs(returns.points[:, 2]) < 2000.0)
         )
         depth[behaviour] = returns.points[edge, 1]
-        assert np.abs(returns.range_error_mm[returns.source == echoes.SURFACE]).max() == 0.0
+        assert np.abs(returns.range_error_mm[returns.source == scanning_returns.SURFACE]).max() == 0.0
     assert len(depth["phase"]) > 1_000
     assert ((depth["phase"] > 5000.0) & (depth["phase"] < 7000.0)).all()
     assert np.ptp(depth["phase"]) > 800.0
@@ -252,8 +253,8 @@ def test_a_beam_many_times_the_step_is_cut_in_every_row(monkeypatch):
     surfaces = large_faces()
     device = dataclasses.replace(WIDE, divergence_mrad=600.0)
     params = scanner.Params(step_mrad=10.0, specular=0.0, sub_rays=19)
-    found = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    found = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
     mark_every_ray(monkeypatch)
-    every = echoes.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    every = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
     np.testing.assert_array_equal(found.points, every.points)
-    assert (every.source == echoes.MIXED).mean() > 0.5
+    assert (every.source == scanning_returns.MIXED).mean() > 0.5

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processor.geometry import icp, neighbors, principal, rigid
-from processor.geometry.lines import Line, Polyline, crossing, fit_line, ransac_line
+from processor.geometry.polyline import Line, Polyline, crossing, fit_line, ransac_line
 
 
 def test_fit_recovers_a_quarter_turn_worked_by_hand():

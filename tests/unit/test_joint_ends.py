@@ -5,10 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from processor.geometry import mesh_surface, rigid
-from processor.preassembly import chain_figures, end_faces, features, form, joint_ends, layers, network, outer_faces
-from processor.preassembly.bottom_edges import EdgeStations
-from processor.preassembly.evidence import Believed, by_the_others, either, no_surer, weigh
+from processor.adjustment import variance_components
+from processor.adjustment.model_averaging import Believed, by_the_others, either, no_surer, weigh
+from processor.geometry import mesh_distance, rigid
+from processor.preassembly.baselines import edge_features
+from processor.preassembly.chain import adjustment, span_and_closure
+from processor.preassembly.ends import faces as ends_faces
+from processor.preassembly.ends import joint_end, plate_sides
+from processor.preassembly.ends.bottom_edges import EdgeStations
 
 LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
 
@@ -29,7 +33,7 @@ def design():
     corners = np.array([[0.0, y, z] for y, z in ((B, 0.0), (-B, 0.0), (-B, H), (B, H))])
     middles = [0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0))]
     joint = np.vstack([corners, middles])
-    return mesh_surface.of_mesh(np.vstack([outer, inner]), np.vstack([faces, same + 8, np.array(ends)])), joint
+    return mesh_distance.of_mesh(np.vstack([outer, inner]), np.vstack([faces, same + 8, np.array(ends)])), joint
 
 
 def cloud(rng, spacing, shares=(1.0, 1.0, 1.0, 1.0), inner=1.0):
@@ -63,18 +67,18 @@ def built(points, corners):
 
 def fitted(points, rng, sigma=1.0):
     surface, joint = design()
-    outer = outer_faces.of_part(surface, [joint])
+    outer = ends_faces.of_part(surface, [joint])
     noisy = points + sigma * rng.standard_normal(points.shape)
     station = np.zeros(len(points), np.int64)
-    frame = features.joint_frame(joint)
+    frame = edge_features.joint_frame(joint)
     assert np.allclose(frame[:3, :3], np.eye(3))
-    seen = joint_ends.observe(noisy, surface, outer, frame, joint[:4], 1.0, 1e-12 * np.eye(6), station, 0.0)
-    return seen if isinstance(seen, joint_ends.JointEnd) else joint_ends.judged([seen])[0]
+    seen = joint_end.observe(noisy, surface, outer, frame, joint[:4], 1.0, 1e-12 * np.eye(6), station, 0.0)
+    return seen if isinstance(seen, joint_end.JointEnd) else joint_end.judged([seen])[0]
 
 
 def test_the_outer_faces_are_those_that_the_corners_lie_on():
     surface, joint = design()
-    outer = outer_faces.of_part(surface, [joint])
+    outer = ends_faces.of_part(surface, [joint])
     assert len(outer.faces) == 8
     assert np.isin(np.abs(outer.vertices[outer.faces][:, :, 1]), [B]).all()
 
@@ -121,7 +125,7 @@ def test_the_outermost_layer_of_a_tilted_plate():
     inner = np.arange(4000) % 3 > 0
     out = level - 24.0 * inner + rng.standard_normal(4000)
     cell = (np.floor(5 * x) * 6 + np.floor(3.0 * (w + 1.0))).astype(np.int64)
-    kept = layers.outer_surface(out, basis, cell)
+    kept = plate_sides.outer_surface(out, basis, cell)
     assert kept[~inner].mean() > 0.99
     assert not kept[inner].any()
 
@@ -129,40 +133,40 @@ def test_the_outermost_layer_of_a_tilted_plate():
 def test_variance_of_form():
     rng = np.random.default_rng(2)
     cell = np.repeat(np.arange(40), 100)
-    found = [form.variance([(rng.standard_normal(4000), cell)], 0) for _ in range(40)]
+    found = [variance_components.lack_of_fit_variance([(rng.standard_normal(4000), cell)], 0) for _ in range(40)]
     # By noise alone the sum of squares between 40 cells is chi-squared: its mean is 40, its sd sqrt(80).
     assert max(found) < 5.0 * np.sqrt(80.0) / 4000.0
     steps = 0.5 * rng.standard_normal(40)
-    assert form.variance([(rng.standard_normal(4000) + steps[cell], cell)], 0) == pytest.approx(
-        float(np.mean(steps**2)), abs=0.05
-    )
-    assert form.variance([(np.zeros(3), np.arange(3))], 0) == 0.0
+    assert variance_components.lack_of_fit_variance(
+        [(rng.standard_normal(4000) + steps[cell], cell)], 0
+    ) == pytest.approx(float(np.mean(steps**2)), abs=0.05)
+    assert variance_components.lack_of_fit_variance([(np.zeros(3), np.arange(3))], 0) == 0.0
 
 
 def faces_of(rng, bent, sigma, count=40, points=4_000):
     """Rests of faces that depart at the joint by a cubic of so much, along the zone and from side to side."""
     found = []
     for _ in range(count):
-        x, w = rng.uniform(-end_faces.ZONE_MM, 0.0, points), rng.uniform(-1.0, 1.0, points)
+        x, w = rng.uniform(-ends_faces.ZONE_MM, 0.0, points), rng.uniform(-1.0, 1.0, points)
         amid, across = bent * rng.standard_normal(2)
         # On 0..1 from the far side of the zone: 20 t^3 - 30 t^2 + 12 t - 1 is what quadratics leave of 20 t^3.
-        out = (amid + across * w) * 20.0 * (1.0 + x / end_faces.ZONE_MM) ** 3 + sigma * rng.standard_normal(points)
-        basis = end_faces.basis(x, w)
+        out = (amid + across * w) * 20.0 * (1.0 + x / ends_faces.ZONE_MM) ** 3 + sigma * rng.standard_normal(points)
+        basis = ends_faces.basis(x, w)
         found.append((basis, out - basis @ np.linalg.lstsq(basis, out, rcond=None)[0]))
     return found
 
 
 def test_what_bends_a_face_beyond_its_numbers_is_found_at_the_joint():
     rng = np.random.default_rng(4)
-    third = np.vstack([form.third_order(*one) for one in faces_of(rng, 0.3, 1.0)])
+    third = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.3, 1.0)])
     # By hand: the mean square of the polynomial is 1/7, and 1/21 where it goes with w.
     np.testing.assert_allclose(third[::2, 1], 7.0 / 4_000, rtol=0.1)
     np.testing.assert_allclose(third[1::2, 1], 21.0 / 4_000, rtol=0.1)
     # 80 squares of normal numbers: their mean is known to sqrt(2 / 80).
-    assert form.excess(third) == pytest.approx(0.09, rel=3.0 * np.sqrt(2.0 / 80.0))
-    nothing = np.vstack([form.third_order(*one) for one in faces_of(rng, 0.0, 1.0)])
-    assert form.excess(nothing) < 5.0 * np.sqrt(2.0 / 80.0) * nothing[:, 1].max()
-    assert form.excess(np.array([[0.1, 0.02], [0.1, 0.02]])) == 0.0
+    assert variance_components.excess(third) == pytest.approx(0.09, rel=3.0 * np.sqrt(2.0 / 80.0))
+    nothing = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.0, 1.0)])
+    assert variance_components.excess(nothing) < 5.0 * np.sqrt(2.0 / 80.0) * nothing[:, 1].max()
+    assert variance_components.excess(np.array([[0.1, 0.02], [0.1, 0.02]])) == 0.0
 
 
 def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
@@ -180,8 +184,8 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
         ("left",) * 60 + ("right",) * 60, np.tile(arc, 2), np.vstack(points), np.vstack(axes), noise,
         np.stack([0.02**2 * np.eye(120)] * 2), np.zeros((120, 2, 6)),
     )  # fmt: skip
-    member = network.Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]), np.zeros((6, 6)))
-    adjusted = network.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
+    member = adjustment.Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]), np.zeros((6, 6)))
+    adjusted = adjustment.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
     assert np.abs(adjusted.motions[0][:3, 3]).max() < 1.0 + 60_000.0 * 2e-5  # its turn is about the middle
     moved = adjusted.motions[0] @ np.array([0.0, 0.0, 60_000.0, 1.0])
     assert abs(moved[0]) < 1.0
@@ -221,7 +225,7 @@ def test_what_two_sets_of_hypotheses_say_is_what_all_of_them_say():
 
 
 def test_a_bridge_without_an_end_that_was_seen_has_none_to_judge():
-    assert joint_ends.judged([]) == []
+    assert joint_end.judged([]) == []
 
 
 def test_others_say_how_large_departures_are():
@@ -271,12 +275,12 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
         )  # fmt: skip
         at_joint = rigid.motion(joints[0]).reshape(24, 6)
         covariance = at_joint @ pose @ at_joint.T + noise**2 * np.eye(24)
-        end = joint_ends.JointEnd(np.zeros((8, 3)), covariance, at_joint, 0.0, "")
+        end = joint_end.JointEnd(np.zeros((8, 3)), covariance, at_joint, 0.0, "")
         middle = np.array([3000.0 * sense, 0.0, 0.0])
-        parts.append(network.Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
-    stated = network.adjust(parts, joints, np.eye(4)[None], 0.1)
+        parts.append(adjustment.Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
+    stated = adjustment.adjust(parts, joints, np.eye(4)[None], 0.1)
     for end in (parts[0].ends[1], parts[1].ends[0]):
-        left = np.sqrt(np.diag(network.of_itself(end, pose)))
+        left = np.sqrt(np.diag(adjustment.of_itself(end, pose)))
         np.testing.assert_allclose(left, noise, rtol=1e-3)  # what limits the gap: the rest cancels in it
     gaps, moved, at_rest, largest = [], [], [], []
     for _ in range(400):
@@ -289,7 +293,7 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
                 for one in part.ends
             )
             drawn.append(replace(part, ends=ends, edges=replace(part.edges, departure=departure)))
-        found = network.adjust(drawn, joints, np.eye(4)[None], 0.1)
+        found = adjustment.adjust(drawn, joints, np.eye(4)[None], 0.1)
         gaps.append(found.gaps.ravel())
         # With the first part back on its design, edges lie off by what it was registered wrong by.
         back = rigid.invert(found.motions[0])
@@ -305,7 +309,7 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
     np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)
     drawn_sd = np.std(np.array(at_rest).reshape(400, 48, 2), axis=0)
     np.testing.assert_allclose(drawn_sd, np.sqrt(np.vstack(stated.at_rest_variance)), rtol=0.2)
-    halves = chain_figures.mean_max_ci95(stated.gaps.reshape(-1, 1), np.diag(stated.gap_covariance[0])[:, None])
+    halves = span_and_closure.mean_max_ci95(stated.gaps.reshape(-1, 1), np.diag(stated.gap_covariance[0])[:, None])
     assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # true gaps are none
     assert (np.quantile(largest, 0.95, axis=0) > 0.3 * np.array(halves)).all()
     J, own = rigid.motion(at - parts[1].middle)[0], rigid.motion(at)[0]

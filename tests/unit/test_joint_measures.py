@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from processor.limits import standards
 from processor.model import Limit, Tolerance
-from processor.preassembly import features, joint_measures, joint_verdicts, tolerance
-from processor.preassembly.joint_measures import measure
-from processor.preassembly.joint_verdicts import judge
+from processor.preassembly.baselines import edge_features
+from processor.preassembly.verdicts import joint_measures, joints
+from processor.preassembly.verdicts.joint_measures import measure
+from processor.preassembly.verdicts.joints import judge
 
 B, H = 700.0, 900.0  # half the width and the height of a section of 1400 x 1800
 # P1..P8: corners bottom-left, bottom-right, top-right, top-left; middles of bottom, right, top, left. y left, z up.
@@ -19,7 +21,7 @@ POINTS = np.array(
     [[0, B, -H], [0, -B, -H], [0, -B, H], [0, B, H], [0, 0, -H], [0, -B, 0], [0, 0, H], [0, B, 0]], np.float64
 )
 NONE = np.zeros((24, 24))
-GB = tolerance.load("GB 50205-2020")
+GB = standards.load("GB 50205-2020")
 
 
 def at_rest(gaps, covariance=NONE):
@@ -41,13 +43,13 @@ def some_covariance(seed, scale=0.3):
 
 def only(**limits):
     base = Tolerance("by hand")
-    return tolerance.with_own(base, {key: np.atleast_1d(np.float64(value)) for key, value in limits.items()}, "test")
+    return standards.with_own(base, {key: np.atleast_1d(np.float64(value)) for key, value in limits.items()}, "test")
 
 
 def test_the_joints_axes_are_those_of_its_frame():
     T = tilted()
     there = POINTS @ T[:3, :3].T + T[:3, 3]
-    np.testing.assert_allclose(features.joint_frame(there), T, atol=1e-9)
+    np.testing.assert_allclose(edge_features.joint_frame(there), T, atol=1e-9)
     gaps = np.random.default_rng(1).normal(size=(8, 3))
     covariance = some_covariance(2)
     local, spread = joint_measures.in_joint_axes(gaps, covariance, T)
@@ -184,7 +186,7 @@ def test_a_lone_extreme_has_the_interval_of_a_single_value():
     ],
 )
 def test_guard_band(interval, verdict):
-    assert joint_verdicts.guarded(interval, -1.0, 2.0) == verdict
+    assert joints.guarded(interval, -1.0, 2.0) == verdict
 
 
 def lone(value, sd, point=5, axis=1):
@@ -254,12 +256,12 @@ def test_unknown_gaps_and_unknown_sizes_are_indeterminate():
     assert found.verdict == "indeterminate"
     assert found.each == ("indeterminate",) * 2
     assert np.isnan(found.probability)
-    jtg = tolerance.load("JTG arch rib")
+    jtg = standards.load("JTG arch rib")
     assert judge(lone(0.5, 0.1), jtg).verdict == "indeterminate"
     assert "thickness, which is not known" in judge(lone(0.5, 0.1), jtg).said
     assert judge(lone(0.5, 0.1), jtg, {"thickness": 24.0}).verdict == "pass"
     assert judge(lone(1.7, 0.01), jtg, {"thickness": 8.0}).verdict == "fail"  # 0.2 x 8 = 1.6
-    nothing = judge(lone(0.5, 0.1), tolerance.load("JGJ 7-2010"))
+    nothing = judge(lone(0.5, 0.1), standards.load("JGJ 7-2010"))
     assert (nothing.verdict, nothing.key) == ("indeterminate", ())
     assert nothing.said == "JGJ 7-2010 has no limit for joints"
 
@@ -278,10 +280,10 @@ def test_gaps_without_a_covariance_are_measured_and_not_judged():
 
 def test_eccentricity():
     gaps = np.tile([0.0, 3.0, 4.0], (8, 1))  # 5 mm off
-    en = tolerance.load("EN 1090-2")
+    en = standards.load("EN 1090-2")
     assert judge(at_rest(gaps), en).verdict == "pass"
     assert judge(at_rest(gaps * 1.01), en).verdict == "fail"
-    assert judge(at_rest(gaps), tolerance.load("EN 1090-2 class 2")).verdict == "fail"
+    assert judge(at_rest(gaps), standards.load("EN 1090-2 class 2")).verdict == "fail"
     assert judge(at_rest(gaps, np.eye(24)), en).probability == pytest.approx(0.45, abs=0.06)
 
 

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from processor import language
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.model import Metric
-from processor.preassembly import joint_measures, proposals
-from processor.report import figures, page, view
+from processor.preassembly.verdicts import joint_measures, trim_and_shim
+from processor.report import all_figures, page, view
 from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
 from tests.unit.test_report_balls import of_frame, whole, with_truth
 
@@ -157,7 +157,7 @@ def latin(texts, stays=STAYS):
 
 
 def chinese_page(execution, report):
-    return page.html(execution, report, figures.of_run(execution, report), "zh")
+    return page.html(execution, report, all_figures.of_run(execution, report), "zh")
 
 
 def a_bridge():
@@ -232,7 +232,7 @@ def test_no_proposal_keeps_a_word_of_english(size_mm):
         tilt = np.outer(SECTION[:, 1] / 450.0, rng.normal(0.0, [size_mm, 0.0, 0.0]))
         gaps = rng.normal(0.0, size_mm, 3) + tilt + rng.normal(0.0, 0.3, (8, 3))
         found = joint_measures.measure(gaps, sd**2 * np.eye(24), np.eye(4), SECTION)
-        said.add(say(proposals.propose("J1", found, LIMITS).sentence))
+        said.add(say(trim_and_shim.propose("J1", found, LIMITS).sentence))
     assert len(said) > 1
     assert latin(said) == []
 

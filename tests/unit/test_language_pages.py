@@ -9,17 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processor import compare, language
+from processor import language
 from processor.batch import figures as batch_figures
 from processor.batch import summary
 from processor.batch.job import Job
 from processor.batch.record import Record
+from processor.compare import compare
 from processor.defects.result import CLASSES
 from processor.defects.result import Result as Defects
-from processor.evaluate import ErrorReport
-from processor.geometry.orientation import Turned
+from processor.evaluation.evaluate import ErrorReport
+from processor.geometry.normal_orientation import Turned
 from processor.model import Metric
-from processor.report import comparison, figures, page
+from processor.report import all_figures, comparison, page
 from processor.stitching.result import Held
 from processor.validation import changes, night
 from processor.validation import summary as nights_summary
@@ -194,7 +195,7 @@ def searched():
 @pytest.mark.parametrize("made", [stitched, controlled, given, searched])
 def test_nothing_but_names_and_units_is_left_in_english(made):
     execution, report = made()
-    text = page.html(execution, report, figures.of_run(execution, report), "zh")
+    text = page.html(execution, report, all_figures.of_run(execution, report), "zh")
     assert left_in_english(text) == []
 
 

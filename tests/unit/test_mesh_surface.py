@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.geometry import mesh_surface
+from processor.geometry import mesh_distance
 
 
 def test_a_cylinder_of_fine_facets_is_a_cylinder():
     mesh = trimesh.creation.cylinder(1000.0, 4000.0, sections=3000)
-    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    surface = mesh_distance.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
     rng = np.random.default_rng(0)
     angle, height = rng.uniform(0.0, 2.0 * np.pi, 5000), rng.uniform(-1900.0, 1900.0, 5000)
     off = rng.normal(0.0, 5.0, 5000)
@@ -23,7 +23,7 @@ def test_a_cylinder_of_fine_facets_is_a_cylinder():
 
 def test_a_plate_has_two_sides_and_edges():
     mesh = trimesh.creation.box((2000.0, 1000.0, 20.0))
-    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    surface = mesh_distance.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
     points = np.array([[300.0, 100.0, 12.0], [-700.0, -200.0, -13.0], [300.0, 495.0, 8.0], [300.0, 100.0, 400.0]])
     face, distance, beyond = surface.distances(points, 60.0)
     np.testing.assert_allclose(distance[:3], [2.0, 3.0, -2.0], atol=1e-9)
@@ -38,7 +38,7 @@ def test_a_plate_has_two_sides_and_edges():
 
 def test_facets_are_neighbours_over_smooth_sides_only():
     mesh = trimesh.creation.box((100.0, 100.0, 100.0))
-    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    surface = mesh_distance.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
     # Of each facet's three sides the diagonal alone is smooth.
     assert ((surface.neighbours >= 0).sum(axis=1) == 1).all()
     for face, row in enumerate(surface.neighbours):
@@ -55,7 +55,7 @@ def _walked(surface, point, at):
         second, third = np.linalg.lstsq(edges.T, point - corners[0], rcond=None)[0]
         return np.array([1.0 - second - third, second, third]), corners
 
-    for _ in range(mesh_surface.WALK_STEPS):
+    for _ in range(mesh_distance.WALK_STEPS):
         share, corners = shares(at)
         over = surface.neighbours[at, share.argmin()]
         if share.min() > -1e-9 or over < 0:
@@ -71,7 +71,7 @@ def _walked(surface, point, at):
 
 def test_walks_end_where_they_do_step_by_step():
     mesh = trimesh.creation.cylinder(500.0, 2000.0, sections=48)
-    surface = mesh_surface.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    surface = mesh_distance.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
     rng = np.random.default_rng(3)
     points = rng.uniform(-1.0, 1.0, (300, 3)) * (600.0, 600.0, 1100.0)
     start = rng.integers(-1, len(mesh.faces), len(points))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from processor.geometry import m3c2, orientation, point_neighbors
+from processor.geometry import m3c2, normal_orientation, point_neighbors
 from processor.geometry.m3c2 import oriented
-from processor.geometry.orientation import UP
+from processor.geometry.normal_orientation import UP
 from tests.unit.test_m3c2 import wavy
 
 ACROSS = 120.0  # normal diameter, mm
@@ -30,7 +30,7 @@ def tube(seed, count=12_000, radius=150.0):
 def turned(cloud, core=None, scanner=None, across=ACROSS):
     core = cloud if core is None else core
     found = m3c2.normals(point_neighbors.of_spacing(cloud), core, across)
-    return found, orientation.turned(found, core, across, scanner)
+    return found, normal_orientation.turned(found, core, across, scanner)
 
 
 def test_what_up_decides_is_as_before_to_the_bit():

@@ -8,9 +8,11 @@ import pytest
 
 from processor.geometry import rigid
 from processor.model import Scan
-from processor.preassembly import attitude, errors, own_error, paper
+from processor.preassembly import errors
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.baselines import bootstrap_bands, methods
 from processor.preassembly.params import PAPER_METHODS
-from processor.steps import preassemble
+from processor.preassembly.parts import attitude
 from tests import arch_clouds
 
 
@@ -21,7 +23,7 @@ def extracted(scene, truth):
         hypotheses = attitude.principal_hypotheses(scan.points, part)
         turns = [rigid.rotation_angle(one[:3, :3] @ T[:3, :3].T) for one in hypotheses]
         found = attitude.Attitude(hypotheses[int(np.argmin(turns))], T, "ok", "")
-        parts.append(paper.features_of(scan, i, found, scene.arch, preassemble.Params()))
+        parts.append(methods.features_of(scan, i, found, scene.arch, preassembly_step.Params()))
     return parts
 
 
@@ -33,19 +35,19 @@ def bridge():
 
 
 def banded(design, parts, method, **given):
-    params = preassemble.Params(method=method, **given)
-    repeated = own_error.scanned_again(parts, design, params)
-    return own_error.with_bands(paper.assemble(parts, design, params), repeated, design, params)
+    params = preassembly_step.Params(method=method, **given)
+    repeated = bootstrap_bands.scanned_again(parts, design, params)
+    return bootstrap_bands.with_bands(methods.assemble(parts, design, params), repeated, design, params)
 
 
 def test_a_bound_is_what_one_more_hardly_exceeds():
     rng = np.random.default_rng(1)
     every = np.array([5.0, 0.0, 0.0]) + rng.normal(0.0, 2.0, (6, 4_000, 3))
-    exceeded = np.linalg.norm(every[5], axis=1) > own_error.bound(every[:5])
+    exceeded = np.linalg.norm(every[5], axis=1) > bootstrap_bands.bound(every[:5])
     assert exceeded.mean() < 0.05
-    assert own_error.bound(np.full((4, 1, 2), 3.0)) == pytest.approx(3.0 * np.sqrt(2.0))
+    assert bootstrap_bands.bound(np.full((4, 1, 2), 3.0)) == pytest.approx(3.0 * np.sqrt(2.0))
     # Of one number: its mean 2 and sd 1 by hand, Student's 97.5 % of 2 degrees of freedom.
-    assert own_error.bound(np.array([1.0, 2.0, 3.0])[:, None, None]) == pytest.approx(
+    assert bootstrap_bands.bound(np.array([1.0, 2.0, 3.0])[:, None, None]) == pytest.approx(
         2.0 + 4.30265 * np.sqrt(4.0 / 3.0)
     )
 
@@ -53,7 +55,7 @@ def test_a_bound_is_what_one_more_hardly_exceeds():
 def test_too_few_answers_have_no_bound():
     vectors = np.ones((5, 2, 3))
     vectors[1:4, 1] = np.nan
-    assert np.isnan(own_error.bound(vectors)).tolist() == [False, True]
+    assert np.isnan(bootstrap_bands.bound(vectors)).tolist() == [False, True]
 
 
 def test_a_part_as_built_is_laid_on_its_design():
@@ -66,8 +68,8 @@ def test_a_part_as_built_is_laid_on_its_design():
     T = arch_clouds.random_pose(rng)
     scan = Scan("rib2", rigid.apply(T, np.vstack([built, strays])), component="rib2")
     found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok", "")
-    part = paper.Part("rib2", scan, found, (None, None), np.empty((0, 3)), None, "")
-    laid = own_error._as_designed(part, design)
+    part = methods.Part("rib2", scan, found, (None, None), np.empty((0, 3)), None, "")
+    laid = bootstrap_bands._as_designed(part, design)
     assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)
     assert (~laid.near).sum() == 50
     there = rigid.apply(laid.T_bridge_scan, laid.points)
@@ -121,7 +123,7 @@ def test_where_the_chain_is_broken_there_is_no_band(bridge):
     ball = np.random.default_rng(0).normal(size=(5_000, 3))
     scan = dataclasses.replace(parts[2].scan, points=3_000.0 * ball / np.linalg.norm(ball, axis=1)[:, None])
     found = attitude.Attitude(np.eye(4), np.eye(4), "failed", "no attitude fits the design")
-    broken = paper.features_of(scan, 2, found, design, preassemble.Params())
+    broken = methods.features_of(scan, 2, found, design, preassembly_step.Params())
     given = (design, [*parts[:2], broken, *parts[3:]], "corner")
     result = banded(*given, repetitions=3)
     assert result.component_status[2:] == ("failed",) * 3

@@ -3,12 +3,16 @@
 import numpy as np
 import pytest
 
-from designgen import picking, recipes, scan_folder
-from designgen.scene import make
-from processor import folder, store
+from designgen import recipes
+from designgen.export import folder as export_folder
+from designgen.scanning import picking
+from designgen.scenes.make import make
+from processor.evaluation import stitching as stitching_evaluation
 from processor.geometry import rigid
 from processor.model import Scan, UsageError
-from processor.steps import stitch
+from processor.scan_folder import folder
+from processor.stitching import step as stitching_step
+from processor.store import store
 from tests.stitch_clouds import pose
 
 COARSE = ["scan.step_mrad=20.0", "scan.stations=3", "scan.repeated=0"]
@@ -78,16 +82,16 @@ def test_only_scans_of_one_station_each_have_picks(scan):
 def test_picks_go_through_the_folder_and_tie_the_scans(tmp_path):
     scene, truth = make("t", recipes.overridden(recipes.load("truss-bridge-picks")[1], [*COARSE, "picks.points=6"]), 1)
     store.write_scene(tmp_path / "t.h5", scene, truth, {})
-    scan_folder.export(tmp_path / "t.h5", tmp_path / "out", "ply", with_truth=False)
+    export_folder.export(tmp_path / "t.h5", tmp_path / "out", "ply", with_truth=False)
     read = folder.read_input(tmp_path / "out")
     for name in ("scan_a", "scan_b", "points"):
         assert getattr(read.picks, name) == getattr(scene.picks, name)
     np.testing.assert_allclose(read.picks.in_a, scene.picks.in_a, atol=1e-9)
     np.testing.assert_allclose(read.picks.in_b, scene.picks.in_b, atol=1e-9)
-    found = stitch.run(scene, stitch.Params(method="three-point", weak_mm=100.0, weak_mrad=10.0))
+    found = stitching_step.run(scene, stitching_step.Params(method="three-point", weak_mm=100.0, weak_mrad=10.0))
     T = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
     base = found.T_project_scan[0] @ rigid.invert(T[scene.scans[0].name])
     for scan, posed in zip(scene.scans, found.T_project_scan, strict=True):
         off = posed[:3, 3] - (base @ T[scan.name])[:3, 3]
         assert np.linalg.norm(off) < 60.0  # six points of 5 mm, some metres from the station
-    assert all(metric.passed for metric in stitch.check(scene, found, truth))  # no limit for a hand
+    assert all(metric.passed for metric in stitching_evaluation.check(scene, found, truth))  # no limit for a hand

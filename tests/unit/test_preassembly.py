@@ -5,12 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import pfh, rigid
-from processor.geometry.lines import Polyline
+from processor.geometry.polyline import Polyline
 from processor.model import InputError, Scene, UsageError
-from processor.preassembly import attitude, errors, features, matching, paper
+from processor.preassembly import errors
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.baselines import edge_features, joint_alignment, methods
 from processor.preassembly.params import PAPER_METHODS
-from processor.steps import preassemble
+from processor.preassembly.parts import attitude
 from tests import arch_clouds
 
 
@@ -23,10 +26,10 @@ def bridge():
 def runs(bridge):
     """Answers by all methods; what the paper's three have in common, the features of the parts, is extracted once."""
     scene, _ = bridge
-    scans = [own[0] for own in preassemble.scans_in_order(scene, scene.arch)]
-    parts = paper.extract(scans, scene.arch, preassemble.Params())
-    found = {one: paper.assemble(parts, scene.arch, preassemble.Params(method=one)) for one in PAPER_METHODS}
-    return found | {"adjustment": preassemble.run(scene, preassemble.Params())}
+    scans = [own[0] for own in preassembly_step.scans_in_order(scene, scene.arch)]
+    parts = methods.extract(scans, scene.arch, preassembly_step.Params())
+    found = {one: methods.assemble(parts, scene.arch, preassembly_step.Params(method=one)) for one in PAPER_METHODS}
+    return found | {"adjustment": preassembly_step.run(scene, preassembly_step.Params())}
 
 
 @pytest.mark.slow  # by day those of the bridge that every method assembles
@@ -91,7 +94,9 @@ def box_end(spacing=4.0, sigma=0.0, width=900.0, height=1100.0, plate=24.0):
 
 def test_reduced_boxes_find_the_inner_edges_of_the_plates():
     # As published: the point nearest to P lies on the end's inner edge, a plate's thickness inside of the outer one.
-    edges = features.reduced_boxes(box_end(), 1.0, 4.0, features.BoxParams(edge_box_mm=36.0), np.random.default_rng(0))
+    edges = edge_features.reduced_boxes(
+        box_end(), 1.0, 4.0, edge_features.BoxParams(edge_box_mm=36.0), np.random.default_rng(0)
+    )
     inner_b, inner_h = 450.0 - 24.0, 550.0 - 24.0
     expected = np.array(
         [[0, inner_b, -inner_h], [0, -inner_b, -inner_h], [0, -inner_b, inner_h], [0, inner_b, inner_h]]
@@ -104,13 +109,13 @@ def test_reduced_boxes_find_the_inner_edges_of_the_plates():
 def test_reduced_boxes_without_points_say_so():
     cut = box_end()
     rng = np.random.default_rng(0)
-    assert features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, features.BoxParams(), rng) is None
-    assert features.reduced_boxes(cut[:20], 1.0, 4.0, features.BoxParams(), rng) is None
+    assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, edge_features.BoxParams(), rng) is None
+    assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, edge_features.BoxParams(), rng) is None
 
 
 def test_the_joint_frame_looks_along_the_bridge():
     points = arch_clouds.key_points(0.4 * arch_clouds.ARC)
-    T = features.joint_frame(points)
+    T = edge_features.joint_frame(points)
     ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))
     here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))
     np.testing.assert_allclose(T[:3, 0], (ahead - here)[0], atol=1e-4)
@@ -122,7 +127,7 @@ def test_slices_follow_the_bottom_edges():
     rng = np.random.default_rng(3)
     points = arch_clouds.scan_points(2, 8.0, 0.5, rng)
     part = arch_clouds.design().parts[2]
-    left, right = features.slice_edges(points, np.eye(4), 8.0, 0.5, features.SliceParams())
+    left, right = edge_features.slice_edges(points, np.eye(4), 8.0, 0.5, edge_features.SliceParams())
     for found, design in ((left, part.bottom_edge_left), (right, part.bottom_edge_right)):
         offset = np.linalg.norm(Polyline.through(design).nearest(found)[1], axis=1)
         assert len(found) > 500
@@ -153,14 +158,14 @@ def test_splicing_error_by_hand():
     assert largest == 3.0
 
 
-@pytest.mark.parametrize("method", preassemble.METHODS)
+@pytest.mark.parametrize("method", preassembly_step.METHODS)
 def test_every_method_assembles_the_bridge(bridge, runs, method):
     scene, truth = bridge
     result = runs[method]
     assert result.status == "ok"
     assert result.components == arch_clouds.NAMES
     assert result.splicing_mean < 10.0  # one spacing
-    checks = {metric.name: metric for metric in preassemble.check(scene, result, truth)}
+    checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
     assert checks["wrong poses called ok"].passed
     if method in PAPER_METHODS:
         # The key points lie on the inner edges: off by the root of two plates squared, as the authors did not say.
@@ -212,7 +217,7 @@ def test_the_adjustment_measures_what_was_built_otherwise(bridge):
     points[near] += 3.0 * np.clip(1.0 - depth[near, None] / 100.0, 0.0, 1.0) * (ahead - here)
     cut = dataclasses.replace(rib, points=rigid.apply(rigid.invert(T), points))
     scans = (*scene.scans[:2], cut, *scene.scans[3:])
-    result = preassemble.run(dataclasses.replace(scene, scans=scans), preassemble.Params())
+    result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params())
     moved = rigid.apply(T, result.key_points_scan[2, 0]) - truth.arch.key_points_bridge[2, 0]
     np.testing.assert_allclose(moved @ (ahead - here), 3.0, atol=0.35)
     # Edges may slide along themselves: the bridge closes the gap and is shorter between its feet by as much.
@@ -230,7 +235,7 @@ def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
     scene, truth = bridge
     grown = 1.0 + 12e-6 * 30.0
     warm = tuple(dataclasses.replace(s, points=s.points * grown) for s in scene.scans)
-    result = preassemble.run(dataclasses.replace(scene, scans=warm, temperature_C=50.0), preassemble.Params())
+    result = preassembly_step.run(dataclasses.replace(scene, scans=warm, temperature_C=50.0), preassembly_step.Params())
     off = result.key_points_scan / grown - truth.arch.key_points_scan
     assert np.sqrt(np.nanmean(off**2)) < 0.12
     assert np.abs(result.gaps).max() < 1.0
@@ -246,7 +251,7 @@ def test_a_part_of_another_place_is_not_assembled(bridge):
         dataclasses.replace(rib, name="foot1", component="foot1"),
         dataclasses.replace(foot, name="rib2", component="rib2"),
     )
-    result = preassemble.run(dataclasses.replace(scene, scans=tuple(swapped)), preassemble.Params())
+    result = preassembly_step.run(dataclasses.replace(scene, scans=tuple(swapped)), preassembly_step.Params())
     assert result.status == "partial"
     assert "ok" not in (result.component_status[0], result.component_status[2])
     assert np.isnan(result.gaps[[0, 1, 2]]).all()
@@ -267,7 +272,9 @@ def test_a_coarse_pose_slid_along_the_bridge_is_not_believed(slide, believed, mo
     monkeypatch.setattr(pfh, "coarse_alignment", slid)
     x = np.linspace(0.0, 5000.0, 400)
     lines = np.vstack([np.column_stack([x, np.full_like(x, y), np.zeros_like(x)]) for y in (-450.0, 450.0)])
-    T, message = matching._coarse(lines, lines, np.eye(4), matching.MatchParams(), np.random.default_rng(0))
+    T, message = joint_alignment._coarse(
+        lines, lines, np.eye(4), joint_alignment.MatchParams(), np.random.default_rng(0)
+    )
     assert (T[0, 3], message == "") == ((slide, True) if believed else (0.0, False))
     assert believed or "1500 mm from where the joint puts the part" in message
 
@@ -277,7 +284,7 @@ def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
     scene, _ = bridge
     widest = np.abs(runs["corner"].gaps).max(axis=(1, 2))
     limit = float(np.sort(widest)[1:3].mean())  # two of the four joints gape wider
-    found = preassemble.run(scene, preassemble.Params(method="corner", gap_limit_mm=limit))
+    found = preassembly_step.run(scene, preassembly_step.Params(method="corner", gap_limit_mm=limit))
     assert [one == "weak" for one in found.component_status] == [False, *(widest > limit)]
     assert found.status == "partial"
     assert sum("gapes by" in one for one in found.component_message) == 2
@@ -288,7 +295,7 @@ def test_an_origin_taken_off_changes_nothing(bridge, runs):
     scene, _ = bridge
     far = np.array([5.0e8, 4.3e9, 1.0e5])
     moved = dataclasses.replace(scene, scans=tuple(dataclasses.replace(s, origin=far) for s in scene.scans))
-    found = preassemble.run(moved, preassemble.Params(method="corner"))
+    found = preassembly_step.run(moved, preassembly_step.Params(method="corner"))
     np.testing.assert_array_equal(found.gaps, runs["corner"].gaps)
     np.testing.assert_allclose(found.key_points_scan - far, runs["corner"].key_points_scan, atol=1e-5)
     again = rigid.apply(found.T_bridge_scan[1], found.key_points_scan[1, 0])
@@ -306,7 +313,7 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
     near = np.linalg.norm(rigid.apply(T, rib.points) - middle, axis=1) < 1300.0  # its mark stays
     cut = dataclasses.replace(rib, points=rib.points[~near])
     scans = (*scene.scans[:2], cut, *scene.scans[3:])
-    result = preassemble.run(dataclasses.replace(scene, scans=scans), preassemble.Params(method="line"))
+    result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params(method="line"))
     assert result.status == "partial"
     assert result.component_status == ("ok", "ok", "failed", "failed", "failed")
     assert "from where the design has it" in result.component_message[2]
@@ -315,18 +322,18 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
 
 def test_a_temperature_that_is_not_corrected_is_said(bridge, monkeypatch):
     scene, _ = bridge
-    monkeypatch.setattr(paper, "assemble", lambda *_: preassemble.Result("ok", "corner", "assembled"))
-    params = preassemble.Params(method="corner")
+    monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner", "assembled"))
+    params = preassembly_step.Params(method="corner")
     kept = {"parts": [], "scanned again": []}
-    result = preassemble.run(dataclasses.replace(scene, temperature_C=31.5), params, kept)
+    result = preassembly_step.run(dataclasses.replace(scene, temperature_C=31.5), params, kept)
     assert result.message.startswith("assembled; the steel's temperature (31.5 C) is not corrected")
 
 
 def test_what_cannot_be_assembled_is_refused(bridge):
     scene, _ = bridge
     with pytest.raises(InputError, match="arch-bridge design"):
-        preassemble.run(Scene("x", "arch-bridge", scene.scans), preassemble.Params())
+        preassembly_step.run(Scene("x", "arch-bridge", scene.scans), preassembly_step.Params())
     with pytest.raises(InputError, match="expected a scan of component 'rib3', found none"):
-        preassemble.run(dataclasses.replace(scene, scans=scene.scans[:3]), preassemble.Params())
+        preassembly_step.run(dataclasses.replace(scene, scans=scene.scans[:3]), preassembly_step.Params())
     with pytest.raises(UsageError, match="unknown method 'magic'"):
-        preassemble.run(scene, preassemble.Params(method="magic"))
+        preassembly_step.run(scene, preassembly_step.Params(method="magic"))

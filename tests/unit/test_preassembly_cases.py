@@ -6,15 +6,17 @@ from itertools import product
 import numpy as np
 import pytest
 
-from designgen import recipes, sampler
+from designgen import recipes
 from designgen.designs import arch_bridge, arch_mesh
-from designgen.scene import make
+from designgen.scanning import sampler
+from designgen.scenes.make import make
 from processor.geometry import principal, rigid
 from processor.geometry.neighbors import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene
-from processor.preassembly import attitude, features, measuring, twins
-from processor.preassembly.systematic import SystematicParams
-from processor.steps import preassemble
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.baselines import edge_features
+from processor.preassembly.parts import attitude, identity, measure
+from processor.preassembly.parts.systematic_errors import SystematicParams
 from tests import arch_clouds
 from tests.arch_clouds import random_pose
 
@@ -54,7 +56,7 @@ def scanned(points, seed=1, name="scan", component=""):
 
 
 def measured(design, index, *scans):
-    return measuring.measure(scans, index, design, 1.0, SystematicParams())
+    return measure.measure(scans, index, design, 1.0, SystematicParams())
 
 
 def pulls(design, index, part, found, T):
@@ -64,7 +66,7 @@ def pulls(design, index, part, found, T):
         own = found.member.ends[("start", "end").index(end)]
         if own is None or not np.isfinite(own.moved).all():
             continue
-        R = features.joint_frame(design.joint_points[joint])[:3, :3]
+        R = edge_features.joint_frame(design.joint_points[joint])[:3, :3]
         there = design.joint_points[joint] + own.moved @ R.T
         off = (rigid.apply(T @ rigid.invert(found.T_bridge_scan), there) - part.key_points(s)) @ R
         result[end] = off.ravel() / np.sqrt(np.diag(own.covariance))
@@ -178,7 +180,7 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
         far = np.linalg.norm(points - place, axis=1)
         up = part.point(np.array([s]), np.array([u]), np.array([1.0])) - part.point(np.array([s]), np.array([u]), [0.0])
         points = points + np.where(far < 700.0, 14.0, 0.0)[:, None] * up
-    assert twins.tell(points, np.eye(4), shape, design.parts[1], design) == twins.Told()
+    assert identity.tell(points, np.eye(4), shape, design.parts[1], design) == identity.Told()
 
 
 @pytest.mark.parametrize(
@@ -199,7 +201,7 @@ def test_neighbours_swapped_are_named(asked, came, said):
 
 def placed(design, index, points):
     part = design.parts[index]
-    return measuring._place(scanned(points)[0], part, design, attitude.sample_surface(part), 1.0)
+    return measure._place(scanned(points)[0], part, design, attitude.sample_surface(part), 1.0)
 
 
 @pytest.fixture(scope="module")
@@ -222,7 +224,7 @@ def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot
     shape = attitude.sample_surface(design.parts[0])
     stated = attitude.Attitude(np.eye(4), np.eye(4), "ok", "")
     monkeypatch.setattr(attitude, "find", lambda *_: stated)
-    found = measuring._place(scan, design.parts[0], design, shape, 1.0)
+    found = measure._place(scan, design.parts[0], design, shape, 1.0)
     assert 0.5 < found.fitted.used_share < 0.7
     if strays:
         assert found.doubt.endswith("of its sides; is this the right part, and whole?")
@@ -251,7 +253,7 @@ def test_how_much_of_a_part_its_points_lie_on():
     half = along < 0.5 * (along.min() + along.max())
     left = points[:, 1] > 0.5 * SMALL.width_mm - 30.0
     for own, share in ((points, 1.0), (points[half], 0.5), (points[~left], 0.75)):
-        assert measuring._covered(own, np.eye(4), shape) == pytest.approx(share, abs=0.03)
+        assert measure._covered(own, np.eye(4), shape) == pytest.approx(share, abs=0.03)
 
 
 def test_a_rival_farther_along_is_not_called_a_turn():
@@ -316,13 +318,13 @@ def test_unequal_plates_meet_at_their_outer_faces():
     parts = (parts[0], dataclasses.replace(parts[1], plates=thin), *parts[2:])
     design = design_of(parts)
     scans = tuple(scanned(cloud(part, 7, spacing_mm=16.0), i, part.name, part.name)[0] for i, part in enumerate(parts))
-    result = preassemble.run(Scene("b", "arch-bridge", scans, arch=design), preassemble.Params())
+    result = preassembly_step.run(Scene("b", "arch-bridge", scans, arch=design), preassembly_step.Params())
     assert result.component_status == ("ok",) * 5
     assert np.abs(result.gaps).max() < 0.5
     assert (np.abs(result.gaps) < 1.5 * result.gap_ci95 + 0.02).all()
     twice = Scene("b", "arch-bridge", (*scans, dataclasses.replace(scans[1], name="again")), arch=design)
     with pytest.raises(InputError, match=r"takes one scan a part, rib1 has several"):
-        preassemble.run(twice, preassemble.Params(method="line"))
+        preassembly_step.run(twice, preassembly_step.Params(method="line"))
 
 
 def with_a_floor(points, axes, share, rng):
@@ -381,7 +383,7 @@ def test_a_rib_of_even_curvature_is_not_laid_half_a_turn_round():
     scene, truth = make("d3", recipe, 1)
     part = scene.arch.parts[2]
     scan = next(scan for scan in scene.scans if scan.component == part.name)
-    found = attitude.find(scan.points[by_cell(scan.points, measuring.CELL_MM)], part)
+    found = attitude.find(scan.points[by_cell(scan.points, measure.CELL_MM)], part)
     turn = found.T_surface[:3, :3] @ truth.arch.T_bridge_scan[2][:3, :3].T
     assert found.status == "ok"
     assert np.degrees(rigid.rotation_angle(turn)) < 0.1

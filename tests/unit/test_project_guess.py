@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from processor import cli, component_names, folder, project_guess, project_text
+from processor.cli import run
 from processor.model import InputError, UsageError
+from processor.scan_folder import component_names, folder, guess
 
 ROOT = Path(__file__).resolve().parents[2]
 ORDER = ("foot1", "rib1", "rib2", "foot2")
@@ -102,7 +103,7 @@ def bridge(tmp_path):
 
 
 def init(place, *options):
-    return CliRunner().invoke(cli.commands, ["init", str(place), *options])
+    return CliRunner().invoke(run.commands, ["init", str(place), *options])
 
 
 def test_a_bridge_with_names_and_without(bridge):
@@ -134,7 +135,7 @@ def test_a_bridge_with_names_and_without(bridge):
 def test_a_name_that_its_shape_contradicts_is_said(bridge):
     write_scan(bridge / "rib1.xyz", box_points(SIZES["rib2"], 1) * 1000.0)
     write_scan(bridge / "odd.xyz", box_points((6.0, 3.0, 3.0), 2) * 1000.0)
-    found = project_guess.guess(bridge)
+    found = guess.guess(bridge)
     assert found.units == "mm"
     one = next(one for one in found.scans if one.file == "rib1.xyz")
     assert (one.component, one.sure) == ("rib1", False)
@@ -147,7 +148,7 @@ def test_a_name_that_its_shape_contradicts_is_said(bridge):
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("mm", 1000.0), ("cm", 100.0), ("inch", 1 / 0.0254)])
 def test_units_come_from_the_design(bridge, unit, factor):
     write_scan(bridge / "scans/rib2.xyz", box_points(SIZES["rib2"], 1) * factor)
-    assert project_guess.guess(bridge).units == unit
+    assert guess.guess(bridge).units == unit
 
 
 def test_no_design_and_a_scan_that_cannot_be_read(tmp_path):
@@ -168,9 +169,9 @@ def test_no_design_and_a_scan_that_cannot_be_read(tmp_path):
 def test_one_mesh_is_a_structure(tmp_path):
     write_mesh(tmp_path / "design/hall.obj", np.array([30_000.0, 20_000.0, 5_000.0]), 0.0)
     write_scan(tmp_path / "hall.xyz", box_points((30.0, 20.0, 5.0), 1, turn=False))
-    found = project_guess.guess(tmp_path)
+    found = guess.guess(tmp_path)
     assert (found.kind, found.design, found.design_units, found.units) == ("structure", "design/hall.obj", "mm", "m")
-    (tmp_path / "project.toml").write_text(project_text.written(found), "utf-8")
+    (tmp_path / "project.toml").write_text(guess.written(found), "utf-8")
     scene = folder.read_input(tmp_path)
     assert np.ptp(scene.structure.vertices, axis=0) == pytest.approx([30_000.0, 20_000.0, 5_000.0])
     (tmp_path / "project.toml").write_text('design = "design/hall.obj"\n', "utf-8")  # then the mesh is in m as well
@@ -190,9 +191,9 @@ def test_nothing_is_overwritten_and_names_are_quoted(tmp_path):
     assert (place / "project.toml").read_text() == "mine"
     assert init(place, "--force").exit_code == 0
     with pytest.raises(InputError, match="expected scans"):
-        project_guess.guess(tmp_path)
+        guess.guess(tmp_path)
     with pytest.raises(InputError, match="found nothing"):
-        project_guess.guess(tmp_path / "none")
+        guess.guess(tmp_path / "none")
 
 
 def test_project_files_in_gb18030_are_read(tmp_path):

@@ -9,16 +9,17 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
 
-from processor import store
+from processor.limits import standards
 from processor.model import Checked, StepRun, Tolerance, UsageError
-from processor.preassembly import joint_measures, joint_verdicts, proposals, tolerance
-from processor.preassembly.proposals import TrimParams, propose
+from processor.preassembly.verdicts import joint_measures, joints, trim_and_shim
+from processor.preassembly.verdicts.trim_and_shim import TrimParams, propose
+from processor.store import store
 
 B, H = 700.0, 900.0  # half the width and the height of the section; y left, z up
 POINTS = np.array(
     [[0, B, -H], [0, -B, -H], [0, -B, H], [0, B, H], [0, 0, -H], [0, -B, 0], [0, 0, H], [0, B, 0]], np.float64
 )
-GB = tolerance.load("GB 50205-2020")  # groove gap -1 to +2, misalignment 2
+GB = standards.load("GB 50205-2020")  # groove gap -1 to +2, misalignment 2
 EXACT = TrimParams(cut_sd_mm=0.0)
 
 
@@ -91,7 +92,7 @@ def test_cuts_are_planes_that_take_nothing_on(seed):
     rng = np.random.default_rng(seed)
     A = np.column_stack([np.ones(8), POINTS[:, 1:] / 1000.0])
     lacking = rng.normal(1.0, 2.0, 8) + A[:, 1:] @ rng.normal(0.0, 3.0, 2)
-    nearest = A @ proposals._nearest(A, lacking)
+    nearest = A @ trim_and_shim._nearest(A, lacking)
     assert nearest.min() > -1e-8
     solved = minimize(
         lambda p: ((A @ p - lacking) ** 2).sum(),
@@ -101,11 +102,11 @@ def test_cuts_are_planes_that_take_nothing_on(seed):
         options={"ftol": 1e-12},
     )
     np.testing.assert_allclose(nearest, A @ solved.x, atol=1e-4)
-    even = A @ proposals._even(A, lacking)
+    even = A @ trim_and_shim._even(A, lacking)
     assert even.min() > -1e-9
     rest = even - lacking
     np.testing.assert_allclose(A[:, 1:].T @ rest, 0.0, atol=1e-9)  # nothing is left to tilt
-    covering = A @ proposals._covering(A, lacking)
+    covering = A @ trim_and_shim._covering(A, lacking)
     assert (covering - np.maximum(lacking, 0.0)).min() > -1e-9
     assert covering.sum() <= 8.0 * max(lacking.max(), 0.0) + 1e-9  # no more than a straight cut of that depth
     found = proposed(along(-lacking), 0.01 * np.eye(24), params=TrimParams())
@@ -230,10 +231,10 @@ def test_what_is_not_known_is_said():
     assert unknown.action == "unknown"
     assert np.isnan(unknown.cut).all()
     assert unknown.sentence.startswith("J1: the gaps are not known")
-    no_groove = proposed(along(-3.0), limits=tolerance.with_own(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x"))
+    no_groove = proposed(along(-3.0), limits=standards.with_own(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x"))
     assert (no_groove.action, no_groove.probability) == ("nothing", 1.0)
     assert "groove_gap_mm" in no_groove.sentence
-    by_thickness = proposed(along(-3.0), limits=tolerance.load("JTG arch rib"))
+    by_thickness = proposed(along(-3.0), limits=standards.load("JTG arch rib"))
     assert np.isnan(by_thickness.probability)
     assert np.isnan(by_thickness.misaligned_by).all()
     bare = proposed(along(-3.0), limits=Tolerance())
@@ -256,14 +257,14 @@ def test_the_same_proposal_every_time():
 @dataclasses.dataclass(frozen=True)
 class Judged(Checked):
     measures: tuple[joint_measures.Measures, ...]
-    verdicts: tuple[joint_verdicts.Verdict, ...]
-    proposals: tuple[proposals.Proposal, ...]
+    verdicts: tuple[joints.Verdict, ...]
+    trim_and_shim: tuple[trim_and_shim.Proposal, ...]
 
 
 def test_the_records_go_through_the_store(tmp_path):
     gaps = (along(-3.0), np.full((8, 3), np.nan))
     measured = tuple(joint_measures.measure(one, one[:1, 0] * np.eye(24) * 0.0, np.eye(4), POINTS) for one in gaps)
-    verdicts = tuple(joint_verdicts.judge(one, GB) for one in measured)
+    verdicts = tuple(joints.judge(one, GB) for one in measured)
     result = Judged(measured, verdicts, tuple(propose("J", one, GB) for one in measured))
     store.write_results(tmp_path / "r.h5", [StepRun("x", "m", "{}", result)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {"x": Judged})

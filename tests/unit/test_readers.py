@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from designgen import e57_file
+from designgen.export import e57
 from processor import readers
 from processor.model import InputError, Scan
 from processor.readers.e57 import cartesian_from_spherical
@@ -218,7 +218,7 @@ def test_las_by_the_specification(tmp_path):
 )
 def test_e57_scans_keep_their_names_where_these_are_plain(own, expected, tmp_path):
     scans = [Scan(name, POINTS + i) for i, name in enumerate(own)]
-    e57_file.write(tmp_path / "a.e57", scans, spherical=False)
+    e57.write(tmp_path / "a.e57", scans, spherical=False)
     assert [scan.name for scan in readers.read(tmp_path / "a.e57")] == expected
 
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from designgen import e57_file
+from designgen.export import e57
 from processor import readers
 from processor.model import InputError, Scan
-from processor.readers import apart
+from processor.readers import sandbox
 from tests import watched
 from tests.damage import damaged, good_files, with_check_sums
 
@@ -63,7 +63,7 @@ def test_reading_has_a_time_limit(tmp_path, monkeypatch):
     path = tmp_path / name
     path.write_bytes(content)
     assert len(readers.read(path)) == 2
-    monkeypatch.setattr(apart, "limit_s", lambda _: 1e-6)
+    monkeypatch.setattr(sandbox, "limit_s", lambda _: 1e-6)
     with pytest.raises(InputError, match=r"a\.e57: reading took more than .* export it again"):
         readers.read(path)
     monkeypatch.undo()
@@ -98,5 +98,5 @@ def test_xml_of_e57_has_no_entities(tmp_path, new, why):
 
 def test_a_name_in_xml_is_text(tmp_path):
     name = "<script>&\"'</script>"
-    e57_file.write(tmp_path / "a.e57", [Scan(name, np.eye(3)), Scan("S 2", np.eye(3))], spherical=False)
+    e57.write(tmp_path / "a.e57", [Scan(name, np.eye(3)), Scan("S 2", np.eye(3))], spherical=False)
     assert [scan.name for scan in readers.read(tmp_path / "a.e57")] == ["a-1", "S 2"]  # no slash in a name

@@ -10,10 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from designgen import e57_file
-from processor import folder, readers
+from designgen.export import e57
+from processor import readers
 from processor.model import InputError, Scan
-from processor.readers import rows
+from processor.readers import ascii_rows
+from processor.scan_folder import folder
 from tests.unit.test_folder import BOX, arch_design, surface, write_ply, write_xyz
 from tests.unit.test_readers import las_bytes, ply_header, put
 
@@ -71,12 +72,12 @@ def ptx_on_the_map(path):
 def posed_e57(path):
     pose = np.eye(4)
     pose[:3, 3] = BASE * 1_000.0
-    e57_file.write(path, [Scan("S1", NEAR * 1_000.0, T_project_scan=pose)], spherical=True)
+    e57.write(path, [Scan("S1", NEAR * 1_000.0, T_project_scan=pose)], spherical=True)
 
 
 DOUBLES = UTM.astype("<f8").tobytes()
 FAR = {
-    "e57": ("a.e57", lambda p: e57_file.write(p, [Scan("S1", NEAR * 1e3, origin=BASE * 1e3)], spherical=False)),
+    "e57": ("a.e57", lambda p: e57.write(p, [Scan("S1", NEAR * 1e3, origin=BASE * 1e3)], spherical=False)),
     "e57 with a pose": ("b.e57", posed_e57),
     "las": ("a.las", las),
     "laz": ("a.laz", laz),
@@ -164,8 +165,8 @@ def test_las_that_declares_fewer_points_than_it_holds(tmp_path):
 def test_reading_takes_little_more_than_the_points(tmp_path, monkeypatch, suffix):
     from tests.bench import readers as bench
 
-    monkeypatch.setattr(rows, "PIECE_BYTES", 1 << 18)
-    monkeypatch.setattr(rows, "PIECE_ROWS", 1 << 13)
+    monkeypatch.setattr(ascii_rows, "PIECE_BYTES", 1 << 18)
+    monkeypatch.setattr(ascii_rows, "PIECE_ROWS", 1 << 13)
     points, intensity = bench.cloud(100_000)
     path = tmp_path / f"a.{suffix}"
     {"pcd": bench.write_packed_pcd}.get(suffix, getattr(bench, f"write_{suffix}"))(path, points, intensity)

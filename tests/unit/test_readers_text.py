@@ -11,8 +11,8 @@ import pytest
 
 from processor import readers
 from processor.model import InputError
-from processor.readers import rows as rows_module
-from processor.readers.rows import Rows
+from processor.readers import ascii_rows as rows_module
+from processor.readers.ascii_rows import Rows
 
 
 def numbers(text, columns=(0, 1, 2), most=2**62, **how):

@@ -12,12 +12,14 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-from processor import store
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.model import ArchDesign, DesignPart, FrameDesign, InputError, Metric, Scan, Scene, StepRun, UsageError
 from processor.pipeline import Execution
-from processor.report import figures, page, printing, results_json, tables, writing
-from processor.steps import preassemble, spheres
+from processor.preassembly import step as preassembly_step
+from processor.report import all_figures, all_tables, page, results_folder, results_json
+from processor.report import table as report_table
+from processor.space_frame import step as space_frame_step
+from processor.store import store
 
 NAN = float("nan")
 KEYS = [f"P{i}" for i in range(1, 9)]
@@ -42,7 +44,7 @@ def assembled(method="design-aided", names=("foot1", "rib1", "foot2"), joints=("
     key_points = np.full((3, 2, 8, 3), NAN)
     key_points[0, 1] = np.arange(24.0).reshape(8, 3)
     station = np.tile(np.arange(0.0, 12000.0, 200.0), 2)
-    return preassemble.Result(
+    return preassembly_step.Result(
         status="partial",
         method=method,
         components=names,
@@ -76,7 +78,7 @@ def balls(method="ransac", radii=(45.5, 60.0, NAN), flag=("ok", "wrong-size", "n
     radii = np.array(radii)
     k = len(radii)
     centres = np.where(np.isfinite(radii)[:, None], np.arange(3.0 * k).reshape(k, 3) * 1000.0, NAN)
-    return spheres.Result(
+    return space_frame_step.Result(
         status="partial",
         method=method,
         ids=np.arange(k) + 7,
@@ -118,7 +120,7 @@ def of_frame():
 
 
 def render(execution, report):
-    return page.html(execution, report, figures.of_run(execution, report))
+    return page.html(execution, report, all_figures.of_run(execution, report))
 
 
 class Page(HTMLParser):
@@ -204,8 +206,8 @@ def test_results_json_of_balls():
 
 
 def by_file(execution, report, file):
-    (table,) = [one for one in tables.all_of(execution, report) if one.file == file]
-    return list(csv.DictReader(io.StringIO(printing.csv_text(table))))
+    (table,) = [one for one in all_tables.all_of(execution, report) if one.file == file]
+    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
 
 
 def test_csv_of_gaps_and_stations():
@@ -239,8 +241,8 @@ def test_csv_of_balls_holds_the_error_against_the_true_radius():
 
 @pytest.mark.parametrize("name", ["=1+1", "+1", "-1", "@a", "\t=x", "\r=x", "\n=x", "＝1", '"', 'a",=1'])
 def test_no_name_becomes_a_formula_in_a_spreadsheet(name):
-    table = tables.Table("t", ("a", "b"), ((name, -1.5),))
-    _, row = csv.reader(io.StringIO(printing.csv_text(table), newline=""))
+    table = all_tables.Table("t", ("a", "b"), ((name, -1.5),))
+    _, row = csv.reader(io.StringIO(report_table.csv_text(table), newline=""))
     assert row[1] == "-1.5"
     assert not row[0].startswith(("=", "+", "-", "@", "\t", "\r", "\n", "＝"))
     if name.isprintable():
@@ -248,13 +250,13 @@ def test_no_name_becomes_a_formula_in_a_spreadsheet(name):
 
 
 def test_terminal_text_is_aligned_and_without_control_characters():
-    table = tables.Table(
+    table = all_tables.Table(
         "t\x1b[31m",
         ("name", "mean_mm", "max_mm"),
         (("钢 1", 1.0, NAN), ("a\x1b]0;b\n", -22.5, 3.0)),
         groups=("", "a long heading here", "a long heading here"),
     )
-    assert printing.plain_text(table).splitlines() == [
+    assert report_table.plain_text(table).splitlines() == [
         "t�[31m",
         "           a long heading here",
         "  name        mean         max",
@@ -264,8 +266,8 @@ def test_terminal_text_is_aligned_and_without_control_characters():
 
 
 def test_long_tables_are_cut_on_the_terminal_and_say_so():
-    table = tables.Table("t", ("a",), tuple((i,) for i in range(50)), "long")
-    lines = printing.plain_text(table, most=10).splitlines()
+    table = all_tables.Table("t", ("a",), tuple((i,) for i in range(50)), "long")
+    lines = report_table.plain_text(table, most=10).splitlines()
     assert len(lines) == 13
     assert lines[-1] == "  ... and 40 more in long.csv"
 
@@ -288,7 +290,7 @@ def test_a_joint_without_an_answer_is_not_a_perfect_one():
 
 
 def figures_of_both():
-    drawn = figures.of_run(of_bridge(), ErrorReport()) | figures.of_run(*of_frame())
+    drawn = all_figures.of_run(of_bridge(), ErrorReport()) | all_figures.of_run(*of_frame())
     return drawn["preassemble"] | drawn["spheres"]
 
 
@@ -308,7 +310,7 @@ def test_figures_are_the_same_bytes_whatever_the_users_settings():
 def test_any_name_can_be_drawn_and_shown(name):
     execution = of_bridge(names=(name, "rib1", "foot2"), joints=(name, "J2"))
     found = Page(render(execution, ErrorReport()))
-    assert found.tables["Components"][1][0] == printing.shown(name)
+    assert found.tables["Components"][1][0] == report_table.shown(name)
 
 
 def test_a_run_without_any_answer_is_drawn_too():
@@ -325,7 +327,7 @@ def test_a_run_without_any_answer_is_drawn_too():
     assert "0 of 2 balls" in render(
         Execution(frame_scene(2), (StepRun("spheres", "ransac", "{}", none),), PROVENANCE), report
     )
-    empty = spheres.Result("failed", "ransac", "no ball stands out")
+    empty = space_frame_step.Result("failed", "ransac", "no ball stands out")
     assert "no ball stands out" in render(
         Execution(frame_scene(2), (StepRun("spheres", "ransac", "{}", empty),), PROVENANCE), ErrorReport()
     )
@@ -377,9 +379,9 @@ def contents(folder):
 
 def test_earlier_results_are_replaced_as_a_whole(tmp_path):
     out = tmp_path / "deep" / "out"
-    writing.write(out, *of_frame())
+    results_folder.write(out, *of_frame())
     assert "balls.csv" in contents(out)
-    writing.write(out, of_bridge(), ErrorReport())
+    results_folder.write(out, of_bridge(), ErrorReport())
     found = contents(out)
     assert "balls.csv" not in found
     assert {"results.h5", "results.json", "report.html", "gaps.csv", "figures/bridge.png"} <= set(found)
@@ -389,7 +391,7 @@ def test_earlier_results_are_replaced_as_a_whole(tmp_path):
 @pytest.mark.parametrize("where", ["page", "move"])
 def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
     out = tmp_path / "out"
-    writing.write(out, *of_frame())
+    results_folder.write(out, *of_frame())
     before = contents(tmp_path)
     if where == "page":
         monkeypatch.setattr(page, "html", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
@@ -403,7 +405,7 @@ def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
 
         monkeypatch.setattr(os, "replace", failing)
     with pytest.raises(InputError, match=r"cannot be written \(No space left"):
-        writing.write(out, of_bridge(), ErrorReport())
+        results_folder.write(out, of_bridge(), ErrorReport())
     monkeypatch.undo()
     assert contents(tmp_path) == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
@@ -412,27 +414,27 @@ def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
 def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
     source, out = tmp_path / "b.h5", tmp_path / "out"
     source.touch()
-    writing.check_output(out, source)
+    results_folder.check_output(out, source)
     out.mkdir()
-    writing.check_output(out, source)
-    writing.write(out, *of_frame())
-    writing.check_output(out, source)
+    results_folder.check_output(out, source)
+    results_folder.write(out, *of_frame())
+    results_folder.check_output(out, source)
     (out / "my-notes.txt").touch()
     with pytest.raises(UsageError, match=r"my-notes\.txt"):
-        writing.check_output(out, source)
+        results_folder.check_output(out, source)
     (out / "my-notes.txt").unlink()
     with pytest.raises(UsageError, match="holds the input"):
-        writing.check_output(out, out / "results.h5")
+        results_folder.check_output(out, out / "results.h5")
     with pytest.raises(UsageError, match="is a file"):
-        writing.check_output(source, source)
+        results_folder.check_output(source, source)
     (out / "results.json").unlink()
     with pytest.raises(UsageError, match="no earlier results"):
-        writing.check_output(out, source)
+        results_folder.check_output(out, source)
 
 
 @pytest.mark.parametrize("made", [assembled(), balls()], ids=["preassemble", "spheres"])
 def test_results_go_through_the_store_unchanged(made, tmp_path):
-    step = "preassemble" if isinstance(made, preassemble.Result) else "spheres"
+    step = "preassemble" if isinstance(made, preassembly_step.Result) else "spheres"
     store.write_results(tmp_path / "r.h5", [StepRun(step, made.method, "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {step: type(made)})
     for field in dataclasses.fields(made):

@@ -11,13 +11,17 @@ import numpy as np
 import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
 from processor.model import Limit, StepRun, Tolerance
 from processor.pipeline import Execution
-from processor.preassembly import chain_verdicts, joint_measures, joint_verdicts, proposals
-from processor.report import figures, figures_joints, figures_residuals, page, printing, results_json, tables
-from processor.report.drawing import rounded
+from processor.preassembly.verdicts import chain as verdicts_chain
+from processor.preassembly.verdicts import joint_measures, trim_and_shim
+from processor.preassembly.verdicts import joints as verdicts_joints
+from processor.report import all_figures, all_tables, page, results_json
+from processor.report import table as report_table
+from processor.report.preassembly import joint_figures, residual_map
+from processor.report.style import rounded
 from tests.unit.test_report import PROVENANCE, arch_scene, assembled
 
 NAN = float("nan")
@@ -42,7 +46,7 @@ def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600
     base = assembled("adjustment", names, joints)
     gaps = np.stack([np.outer(np.arange(8.0), [0.5, 0.2, -0.3]), np.outer(np.arange(8.0), [-0.25, 0.1, 0.2])])
     records = [joint_measures.measure(gap, 0.01 * np.eye(24), np.eye(4), SECTION) for gap in gaps]
-    judged = [joint_verdicts.judge(one, LIMITS) for one in records]
+    judged = [verdicts_joints.judge(one, LIMITS) for one in records]
     rng = np.random.default_rng(3)
     points, residual, component = [], [], []
     for i in range(len(names)):
@@ -60,8 +64,8 @@ def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600
         verdict=tuple(one.verdict for one in judged),
         measures=tuple(records),
         judged=tuple(judged),
-        proposals=tuple(proposals.propose(j, one, LIMITS) for j, one in zip(joints, records, strict=True)),
-        chain_judged=(chain_verdicts.judge({"span": (np.array([-1.25]), np.array([0.25]))}, SPAN, 12_000.0),),
+        proposals=tuple(trim_and_shim.propose(j, one, LIMITS) for j, one in zip(joints, records, strict=True)),
+        chain_judged=(verdicts_chain.judge({"span": (np.array([-1.25]), np.array([0.25]))}, SPAN, 12_000.0),),
         not_held=("bow_mm",),
         not_held_what=("bow of a unit preassembled",),
         T_rival_scan=np.stack([rigid.transform(np.diag([-1.0, -1.0, 1.0]), [5.0, 0, 0]), *np.full((2, 4, 4), NAN)]),
@@ -101,7 +105,7 @@ def of_bridge(**kwargs):
 
 
 def rendered(execution):
-    return page.html(execution, ErrorReport(), figures.of_run(execution, ErrorReport()))
+    return page.html(execution, ErrorReport(), all_figures.of_run(execution, ErrorReport()))
 
 
 class Page(HTMLParser):
@@ -138,8 +142,8 @@ class Page(HTMLParser):
 
 
 def of_file(execution, file):
-    (table,) = [one for one in tables.all_of(execution, ErrorReport()) if one.file == file]
-    return list(csv.DictReader(io.StringIO(printing.csv_text(table))))
+    (table,) = [one for one in all_tables.all_of(execution, ErrorReport()) if one.file == file]
+    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
 
 
 def number(text):
@@ -209,7 +213,7 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
     # What was stated and is held against nothing is said.
     assert step["limits_not_held"] == ["bow_mm"]
     assert of_file(execution, "limits-not-held") == [{"key": "bow_mm", "limit": "bow of a unit preassembled"}]
-    on_terminal = [table.title for table in tables.all_of(execution, ErrorReport()) if table.on_terminal]
+    on_terminal = [table.title for table in all_tables.all_of(execution, ErrorReport()) if table.on_terminal]
     assert {"Limits of the whole chain, method adjustment (mm)", "Limits that nothing is held against"} <= set(
         on_terminal
     )
@@ -244,29 +248,31 @@ def test_both_poses_of_an_ambiguous_part_and_what_would_tell():
 def test_what_limits_the_accuracy_has_a_file_and_stands_on_the_terminal():
     rows = of_file(of_bridge(), "accuracy")
     assert [row["answer"] for row in rows] == ["J1 P1: the end face", "a scan of rib1"]
-    assert any(table.file == "accuracy" and table.on_terminal for table in tables.all_of(of_bridge(), ErrorReport()))
+    assert any(
+        table.file == "accuracy" and table.on_terminal for table in all_tables.all_of(of_bridge(), ErrorReport())
+    )
 
 
 def test_why_a_method_failed_is_said_and_it_is_not_drawn():
     execution = of_bridge()
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
-    answered = figures.of_run(execution, ErrorReport())["preassemble"]["linear-error.png"]
+    answered = all_figures.of_run(execution, ErrorReport())["preassemble"]["linear-error.png"]
     assert "without a band, for they state no uncertainty: line" in answered[0]
     line = execution.runs[1]
     own = dataclasses.replace(
         line.result, linear_ci95=np.full(120, 9.0), best_fit_linear_ci95=np.full(120, 9.0), errors_ci95=np.full(6, 9.0)
     )
     alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
-    caption, picture = figures.of_run(alone, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = all_figures.of_run(alone, ErrorReport())["preassemble"]["linear-error.png"]
     assert "what these state of parts exactly as designed, scanned alike: line" in caption
     assert picture != answered[1]
-    (summary,) = (table for table in tables.all_of(alone, ErrorReport()) if table.file == "summary")
+    (summary,) = (table for table in all_tables.all_of(alone, ErrorReport()) if table.file == "summary")
     assert "Of a bridge exactly as designed, scanned alike, line states up to 9.000" in summary.note
     nothing = np.full(120, NAN)
     result = dataclasses.replace(line.result, linear_deviation=nothing, best_fit_linear_deviation=nothing)
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
-    caption, picture = figures.of_run(silent, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = all_figures.of_run(silent, ErrorReport())["preassemble"]["linear-error.png"]
     assert "without an answer, so not drawn: line" in caption
     assert picture != answered[1]
     data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
@@ -291,9 +297,9 @@ def test_span_closure_budget_and_trade_off_as_tables():
 def test_methods_without_intervals_have_none_of_these():
     runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
     execution = Execution(arch_scene(), runs, PROVENANCE)
-    files = {table.file for table in tables.all_of(execution, ErrorReport())}
+    files = {table.file for table in all_tables.all_of(execution, ErrorReport())}
     assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
-    assert not set(figures.of_run(execution, ErrorReport())["preassemble"]) & OWN
+    assert not set(all_figures.of_run(execution, ErrorReport())["preassemble"]) & OWN
     assert "What limits the accuracy" not in rendered(execution)
 
 
@@ -315,7 +321,7 @@ def unknown(result, joints, parts):
     records = list(result.measures)
     for j in joints:
         records[j] = joint_measures.measure(np.full((8, 3), NAN), np.full((24, 24), NAN), np.eye(4), SECTION)
-    judged = [joint_verdicts.judge(one, LIMITS) for one in records]
+    judged = [verdicts_joints.judge(one, LIMITS) for one in records]
     return dataclasses.replace(
         result,
         gaps=gaps,
@@ -323,7 +329,7 @@ def unknown(result, joints, parts):
         measures=tuple(records),
         judged=tuple(judged),
         verdict=tuple(one.verdict for one in judged),
-        proposals=tuple(proposals.propose(j, one, LIMITS) for j, one in zip(result.joints, records, strict=True)),
+        proposals=tuple(trim_and_shim.propose(j, one, LIMITS) for j, one in zip(result.joints, records, strict=True)),
         span_departure=NAN,
         span_ci95=NAN,
         closure=np.full(6, NAN),
@@ -337,7 +343,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
     execution = of_bridge()
     result = unknown(execution.runs[0].result, list(joints), parts)
     execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
-    found = figures.of_run(execution, ErrorReport())["preassemble"]
+    found = all_figures.of_run(execution, ErrorReport())["preassemble"]
     assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == drawn
     parsed = Page(rendered(execution))
     last = parsed.tables["Joints: what to do, method adjustment"][-1]
@@ -353,7 +359,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
 
 
 def test_every_picture_shows_something():
-    found = figures.of_run(of_bridge(), ErrorReport())["preassemble"]
+    found = all_figures.of_run(of_bridge(), ErrorReport())["preassemble"]
     assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
     for name, (caption, png) in found.items():
         pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
@@ -365,11 +371,11 @@ def test_every_picture_shows_something():
 
 def test_pictures_follow_what_they_show():
     """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
-    before = figures.of_run(of_bridge(), ErrorReport())["preassemble"]
+    before = all_figures.of_run(of_bridge(), ErrorReport())["preassemble"]
     execution = of_bridge()
     run = execution.runs[0]
     other = dataclasses.replace(run.result, residual=-3.0 * np.abs(run.result.residual), weight=1.0)
-    after = figures.of_run(
+    after = all_figures.of_run(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
     )["preassemble"]
     assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
@@ -387,7 +393,7 @@ def test_parts_unroll_face_by_face():
     part = arch_scene().arch.parts[0]
     corners = [[x, y, z] for x in np.linspace(50.0, 3950.0, 40) for y in (0.0, 450.0) for z in (0.0, 1100.0)]
     middles = [[1000.0, 225, 0], [1000, 0, 550], [1000, 225, 1100], [1000, 450, 550], [3000, 450, 100]]
-    flat = figures_residuals.unroll(part, np.array(corners + middles))
+    flat = residual_map.unroll(part, np.array(corners + middles))
     np.testing.assert_allclose(flat.edges, [0.0, 0.45, 1.55, 2.0, 3.1], atol=0.01)
     np.testing.assert_allclose(flat.around[-5:], [0.225, 1.0, 1.775, 2.55, 3.0], atol=0.01)
     np.testing.assert_allclose(flat.along[-5:], [1.0, 1.0, 1.0, 1.0, 3.0], atol=0.01)
@@ -401,10 +407,10 @@ def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps
         drawn.append(figure)
         return b""
 
-    monkeypatch.setattr(figures_joints, "png", kept)
+    monkeypatch.setattr(joint_figures, "png", kept)
     result = unknown(adjusted(), [1], ())
     wide = joint_measures.measure(np.outer(np.arange(8.0), [-6.6, 3.0, 3.0]), 0.2 * np.eye(24), np.eye(4), SECTION)
-    figures_joints.gap_vectors(dataclasses.replace(result, measures=(wide, result.measures[1])))
+    joint_figures.gap_vectors(dataclasses.replace(result, measures=(wide, result.measures[1])))
     shown, silent = drawn[0].axes
     numbers = [one for one in shown.texts if one.get_text().startswith("P")]
     assert len(numbers) == 8

@@ -16,25 +16,17 @@ import matplotlib as mpl
 import numpy as np
 import pytest
 
-from processor import store
-from processor.bolt_balls import verdicts
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.model import FrameDesign, Scan, Scene, Stations, StepRun
 from processor.pipeline import Execution
-from processor.report import (
-    dxf,
-    figures,
-    figures_ball,
-    figures_balls,
-    page,
-    printing,
-    results_balls,
-    results_json,
-    tables,
-    tables_balls,
-    writing,
-)
-from processor.steps import spheres
+from processor.report import all_figures, all_tables, page, results_folder, results_json
+from processor.report import table as report_table
+from processor.report.space_frame import close_ups, dxf, results
+from processor.report.space_frame import figures as space_frame_figures
+from processor.report.space_frame import tables as space_frame_tables
+from processor.space_frame import result as space_frame_result
+from processor.space_frame import step as space_frame_step
+from processor.store import store
 from tests.unit.test_report import PROVENANCE, Page, balls
 
 NAN = float("nan")
@@ -62,7 +54,7 @@ def whole(limit=10.0, T=None, **changes):
     covariance[2] = NAN
     moved_covariance = np.tile(np.diag([0.25, 1.0, 4.0]), (5, 1, 1))
     moved_covariance[[2, 4]] = NAN
-    made = spheres.Result(
+    made = space_frame_step.Result(
         status="partial",
         method="ray",
         message="one missing",
@@ -136,41 +128,45 @@ def with_truth():
 
 
 def by_file(file, *args):
-    (table,) = [one for one in tables.all_of(*of_frame(*args)) if one.file == file]
-    return list(csv.DictReader(io.StringIO(printing.csv_text(table))))
+    (table,) = [one for one in all_tables.all_of(*of_frame(*args)) if one.file == file]
+    return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
 
 
 # --- verdicts ------------------------------------------------------------------------------------------------------
 
 
 def test_verdicts_by_hand():
-    judged = verdicts.of_result(whole())
+    judged = space_frame_result.of_result(whole())
     # 3-4-0: along (0.6, 0.8, 0) the variance is 0.36 * 0.25 + 0.64 * 1 = 0.73; 12 down: 4; 0.3-0-0.4: 0.36/4 + 0.64 * 4
     np.testing.assert_allclose(judged.size[[0, 1, 3]], [5.0, 12.0, 0.5])
     np.testing.assert_allclose(judged.ci95[[0, 1, 3]], 1.96 * np.sqrt([0.73, 4.0, 2.65]), rtol=1e-4)
     assert np.isnan(judged.size[[2, 4]]).all()
     assert judged.verdict == ("pass", "indeterminate", "", "pass", "")
-    assert verdicts.of_result(whole(limit=8.0)).verdict[1] == "fail"
-    assert verdicts.of_result(whole(limit=5.5)).verdict[0] == "indeterminate"
-    assert verdicts.of_result(whole(limit=2.0)).verdict == ("fail", "fail", "", "indeterminate", "")
-    assert verdicts.of_result(whole(limit=NAN)).verdict == ("no limit", "no limit", "", "no limit", "")
+    assert space_frame_result.of_result(whole(limit=8.0)).verdict[1] == "fail"
+    assert space_frame_result.of_result(whole(limit=5.5)).verdict[0] == "indeterminate"
+    assert space_frame_result.of_result(whole(limit=2.0)).verdict == ("fail", "fail", "", "indeterminate", "")
+    assert space_frame_result.of_result(whole(limit=NAN)).verdict == ("no limit", "no limit", "", "no limit", "")
 
 
 @pytest.mark.parametrize("matching", ["ambiguous", "failed"])
 def test_nothing_passes_where_it_is_not_known_which_node_is_which(matching):
-    assert set(verdicts.of_result(whole(matching=matching)).verdict) == {"indeterminate", ""}
+    assert set(space_frame_result.of_result(whole(matching=matching)).verdict) == {"indeterminate", ""}
 
 
 def test_a_ball_that_was_not_seen_neither_passes_nor_fails():
     for limit in (100.0, 0.001):
         unseen = whole(limit=limit, evidence=("axes", "ball", "axes", "axes", "fused"))
-        assert verdicts.of_result(unseen).verdict[0] == verdicts.of_result(unseen).verdict[3] == "indeterminate"
-    assert verdicts.of_result(whole(limit=NAN, evidence=("axes",) * 5)).verdict[0] == "no limit"
+        assert (
+            space_frame_result.of_result(unseen).verdict[0]
+            == space_frame_result.of_result(unseen).verdict[3]
+            == "indeterminate"
+        )
+    assert space_frame_result.of_result(whole(limit=NAN, evidence=("axes",) * 5)).verdict[0] == "no limit"
 
 
 def test_a_node_that_did_not_move_has_no_direction_but_a_verdict():
     still = whole(movement=np.zeros((5, 3)))
-    judged = verdicts.of_result(still)
+    judged = space_frame_result.of_result(still)
     assert judged.verdict[0] == "pass"
     assert judged.size[0] == 0.0
 
@@ -222,7 +218,7 @@ def test_results_json_holds_only_what_there_is():
 def test_the_result_goes_through_the_store_unchanged(tmp_path):
     made = whole()
     store.write_results(tmp_path / "r.h5", [StepRun("spheres", "ray", "{}", made)], {})
-    (back,) = store.read_results(tmp_path / "r.h5", {"spheres": spheres.Result})
+    (back,) = store.read_results(tmp_path / "r.h5", {"spheres": space_frame_step.Result})
     for field in dataclasses.fields(made):
         np.testing.assert_array_equal(getattr(back.result, field.name), getattr(made, field.name))
 
@@ -273,15 +269,15 @@ def test_a_stations_shift_is_that_at_the_balls():
 
 
 def test_without_a_limit_the_table_says_so():
-    (table,) = [one for one in tables.all_of(*of_frame(whole(limit=NAN))) if one.file == "nodes"]
+    (table,) = [one for one in all_tables.all_of(*of_frame(whole(limit=NAN))) if one.file == "nodes"]
     assert "node_place_mm" in table.note
-    (table,) = [one for one in tables.all_of(*of_frame(whole(matching="ambiguous"))) if one.file == "nodes"]
+    (table,) = [one for one in all_tables.all_of(*of_frame(whole(matching="ambiguous"))) if one.file == "nodes"]
     assert "10 mm by project.toml" in table.note
     assert "not certain" in table.note
 
 
 def test_the_terminal_has_a_summary_what_to_look_at_and_the_stations():
-    shown = [one for one in tables.all_of(*of_frame()) if one.on_terminal]
+    shown = [one for one in all_tables.all_of(*of_frame()) if one.on_terminal]
     assert [one.title.split(",")[0] for one in shown] == [
         "Balls in short", "Balls to look at", "Stations against each other (mm"
     ]  # fmt: skip
@@ -323,7 +319,7 @@ def test_a_drawing_read_back(T):
 
 def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
     code = (
-        "import hashlib; from tests.unit.test_report_balls import whole; from processor.report import dxf;"
+        "import hashlib; from tests.unit.test_report_balls import whole; from processor.report.space_frame import dxf;"
         "print(hashlib.sha256(dxf.drawing(whole())).hexdigest())"
     )
     data = dxf.drawing(whole())
@@ -342,13 +338,13 @@ def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
 
 
 def test_starting_the_program_loads_no_drawing_library():
-    code = "import sys, processor.cli, processor.report.writing; assert 'ezdxf' not in sys.modules"
+    code = "import sys, processor.cli.run, processor.report.results_folder; assert 'ezdxf' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
     execution, report = of_frame()
-    writing.write(tmp_path / "out", execution, report)
+    results_folder.write(tmp_path / "out", execution, report)
     found = {path.name for path in (tmp_path / "out").iterdir()}
     assert {
         "nodes.dxf",
@@ -359,8 +355,8 @@ def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
         "tubes.csv",
         "stations.csv",
     } <= found
-    writing.check_output(tmp_path / "out", tmp_path / "b.h5")
-    writing.write(
+    results_folder.check_output(tmp_path / "out", tmp_path / "b.h5")
+    results_folder.write(
         tmp_path / "out", Execution(execution.scene, (StepRun("spheres", "ransac", "{}", balls()),), PROVENANCE), report
     )
     assert not {"nodes.dxf", "lowest.csv", "nodes.csv"} & {path.name for path in (tmp_path / "out").iterdir()}
@@ -371,7 +367,7 @@ def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
 
 def test_figures_of_a_frame_and_those_of_balls_to_look_at():
     report, result = with_truth()
-    found = figures.of_run(*of_frame(result, report))["spheres"]
+    found = all_figures.of_run(*of_frame(result, report))["spheres"]
     assert set(found) == {
         "plan.png", "radius-errors.png", "ball-errors.png", "ball-to-see-11.png", "ball-to-see-12.png",
         "ball-to-see-13.png",
@@ -381,13 +377,13 @@ def test_figures_of_a_frame_and_those_of_balls_to_look_at():
     assert "sd" not in found["ball-errors.png"][0]
     assert found["ball-to-see-11.png"][0].startswith("Ball 11, wrong-size")
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
-        assert figures.of_run(*of_frame(result, report))["spheres"] == found
-    untold = figures.of_run(*of_frame())["spheres"]
+        assert all_figures.of_run(*of_frame(result, report))["spheres"] == found
+    untold = all_figures.of_run(*of_frame())["spheres"]
     assert "Standard deviations" in untold["ball-errors.png"][0]
 
 
 def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
-    found = figures.of_run(*of_frame(points=np.empty((0, 3))))["spheres"]
+    found = all_figures.of_run(*of_frame(points=np.empty((0, 3))))["spheres"]
     assert set(found) == {"plan.png", "ball-errors.png"}
 
 
@@ -400,13 +396,13 @@ def test_at_most_twelve_balls_have_a_picture_worst_first():
     }
     many["ids"] = np.arange(40)
     texts = {name: getattr(made, name) * 8 for name in ("evidence", "flag", "reason")}
-    drawn = figures_ball.of_result(scene(made), dataclasses.replace(made, **many, **texts))
+    drawn = close_ups.of_result(scene(made), dataclasses.replace(made, **many, **texts))
     assert len(drawn) == 12
     assert [caption.split(",")[1].split(":")[0].strip() for caption, _ in drawn.values()][:8] == ["wrong-size"] * 8
     assert "the first 12 of" in next(iter(drawn.values()))[0]
     made = dataclasses.replace(made, **many, **texts)
-    every = figures_ball.doubtful(scene(made), made)
-    assert pages_of(figures_ball.document(scene(made), made)) == len(every) > 12
+    every = close_ups.doubtful(scene(made), made)
+    assert pages_of(close_ups.document(scene(made), made)) == len(every) > 12
 
 
 def pages_of(pdf):
@@ -417,14 +413,14 @@ def pages_of(pdf):
 def test_a_ball_to_look_at_has_a_page_with_its_numbers():
     made = whole()
     i = made.flag.index("wrong-size")
-    said = dict(figures_ball._numbers(made, i, np.array([1.0, -2.0, 0.5])))
+    said = dict(close_ups._numbers(made, i, np.array([1.0, -2.0, 0.5])))
     half = 1.96 * np.sqrt(made.covariance[i, 3, 3])
     assert said["radius"] == f"{made.radii[i]:.2f} ± {half:.2f}"
     assert said["off the design's place, y"] == "2.00"  # found less designed
-    pdf = figures_ball.document(scene(made), made)
+    pdf = close_ups.document(scene(made), made)
     assert pages_of(pdf) == 3
-    assert pdf == figures_ball.document(scene(made), made)
-    assert figures_ball.document(scene(made), dataclasses.replace(made, flag=("ok",) * len(made.flag))) == b""
+    assert pdf == close_ups.document(scene(made), made)
+    assert close_ups.document(scene(made), dataclasses.replace(made, flag=("ok",) * len(made.flag))) == b""
 
 
 def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
@@ -439,7 +435,7 @@ def test_crops_hold_the_points_about_each_place_of_every_scan_and_pose():
     made = Scene("s", "space-frame", scans, stations=Stations())
     centres = origin + np.array([[0.0, 0.0, 0.0], [200.0, -100.0, 300.0]])
     for crop, centre, far in zip(
-        figures_ball.crops_about(made, centres, np.array([90.0, 150.0])), centres, (90.0, 150.0), strict=True
+        close_ups.crops_about(made, centres, np.array([90.0, 150.0])), centres, (90.0, 150.0), strict=True
     ):
         away = np.linalg.norm(points + origin - centre, axis=1)
         assert len(crop) == (away <= far).sum() > 0
@@ -461,11 +457,11 @@ def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
     )
     one = dataclasses.replace(scene(made), scans=scans, stations=Stations(("S1",), np.zeros((1, 3))))
     store.write_scene(tmp_path / "s.h5", one, None, {})
-    in_memory = figures_ball.of_result(store.read_scene(tmp_path / "s.h5"), made)
+    in_memory = close_ups.of_result(store.read_scene(tmp_path / "s.h5"), made)
     alone = store.read_scene(tmp_path / "s.h5", points=False)
     assert len(in_memory) > 1
-    assert figures_ball.of_result(alone, made) == {}
-    assert figures_ball.of_result(alone, made, tmp_path / "s.h5") == in_memory
+    assert close_ups.of_result(alone, made) == {}
+    assert close_ups.of_result(alone, made, tmp_path / "s.h5") == in_memory
 
 
 def test_control_points_have_a_table_and_their_place_in_results_json():
@@ -474,28 +470,30 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
         control_used=[1, 0],
         control_scan=("S1", "S2"),
     )  # fmt: skip
-    (table,) = (one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+    (table,) = (one for one in space_frame_tables.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
                 if one.file == "control")  # fmt: skip
     assert table.columns[0] == "control_point"
     assert table.rows[0] == ("T1", 0.3, 0.0, -0.4, pytest.approx(0.5), "yes", "S1")
     assert table.columns[-1] == "scan"
     assert table.rows[1][-2].startswith("no, ")
-    written = results_balls.written(made)
+    written = results.written(made)
     assert written["datum"] == "2 control points"
     assert [(one["name"], one["scan"], one["used"]) for one in written["control"]] == [
         ("T1", "S1", True),
         ("T2", "S2", False),
     ]
-    assert not {"datum", "control"} & set(results_balls.written(whole()))
+    assert not {"datum", "control"} & set(results.written(whole()))
 
 
 def test_targets_without_members_have_lowest_points_and_bounds():
-    nothing = {name: getattr(spheres.Result("ok", "ray"), name) for name in (
+    nothing = {name: getattr(space_frame_step.Result("ok", "ray"), name) for name in (
         "movement", "movement_ci95", "movement_covariance", "gauge", "matching", "tube_start", "tube_end", "tube_radii",
         "tube_bow", "tube_a", "tube_b", "station_names", "T_station", "station_said",
     )}  # fmt: skip
     made = whole(sizes=np.full(5, NAN), axes=np.zeros(5, int), nominal_radii=np.full(5, NAN), **nothing)
-    found = {one.file: one for one in tables_balls.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())}
+    found = {
+        one.file: one for one in space_frame_tables.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+    }
     assert {"balls", "lowest"} <= set(found)
     assert {"bound_sd_lowest_z_mm", "efficiency_radius"} <= set(found["balls"].columns)
     assert any(one.on_terminal and "radius_mm" in one.columns for one in found.values())
@@ -503,24 +501,24 @@ def test_targets_without_members_have_lowest_points_and_bounds():
 
 def test_the_expected_distribution_holds_as_many_errors_as_there_are():
     x = np.linspace(-5.0, 5.0, 1001)
-    y = figures_balls._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
+    y = space_frame_figures._mixture(x, np.array([0.2, 0.5, NAN, 0.0]), 0.1)
     assert y.sum() * (x[1] - x[0]) / 0.1 == pytest.approx(2.0, abs=1e-6)
     assert y[500] == pytest.approx(0.1 * (1 / 0.2 + 1 / 0.5) / math.sqrt(2.0 * math.pi))
-    assert figures_balls._mixture(x, np.array([NAN]), 0.1) is None
+    assert space_frame_figures._mixture(x, np.array([NAN]), 0.1) is None
 
 
 def test_where_the_design_has_a_ball():
     T = pose(TURN, (7e5, -2e5, 100.0))
     made = whole(T=T)
     np.testing.assert_allclose(
-        figures_ball.designed_places(scene(made), made)[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6
+        close_ups.designed_places(scene(made), made)[:4] @ T[:3, :3].T + T[:3, 3], NOMINAL[:4], atol=1e-6
     )
-    assert np.isnan(figures_ball.designed_places(scene(made), made)[4]).all()
+    assert np.isnan(close_ups.designed_places(scene(made), made)[4]).all()
 
 
 def test_the_page_of_a_frame():
     execution, report = of_frame()
-    drawn = figures.of_run(execution, report)
+    drawn = all_figures.of_run(execution, report)
     text = page.html(execution, report, drawn)
     found = Page(text)
     assert {"Nodes against the design (mm)", "Balls to look at, method ray (mm)", "Balls, method ray (mm)"} <= set(

@@ -7,17 +7,18 @@ import re
 import numpy as np
 import pytest
 
-from processor.defects import pictures, surface
-from processor.defects.fields import Field
+from processor.defects import pictures, surface_charts
+from processor.defects.deviation_field import Field
 from processor.defects.result import Result
-from processor.evaluate import ErrorReport
-from processor.report import figures_defects, page, view_defects, view_points
+from processor.evaluation.evaluate import ErrorReport
+from processor.report import page, surface_view
+from processor.report.defects import figures, view
 from tests import step_results
 from tests.unit.test_report_adjusted import Page
 
 
 def drawn(result):
-    return view_defects.of_runs(None, step_results.execution(("defects", "default", "{}", result)).runs)
+    return view.of_runs(None, step_results.execution(("defects", "default", "{}", result)).runs)
 
 
 def test_the_view_holds_the_surface_and_an_outline_a_defect():
@@ -44,16 +45,16 @@ def test_nothing_is_drawn_of_what_failed():
 
 
 def test_many_defects_and_places_keep_the_page_small():
-    result = step_results.defects(3000, places=2 * view_points.MOST_POINTS)
+    result = step_results.defects(3000, places=2 * surface_view.MOST_POINTS)
     execution = step_results.execution(("defects", "default", "{}", result))
     text = page.html(execution, ErrorReport(), {})
     assert len(text.encode()) < 6_000_000
     found = json.loads(Page(text).scripts[0][1])["steps"]["defects"]
-    assert len(found["parts"][0]["residual"]) <= view_points.MOST_POINTS
-    assert len(found["marks"]) == view_points.MOST_REGIONS
-    assert len(found["parts"]) == 2 + view_points.MOST_TICKS
+    assert len(found["parts"][0]["residual"]) <= surface_view.MOST_POINTS
+    assert len(found["marks"]) == surface_view.MOST_REGIONS
+    assert len(found["parts"]) == 2 + surface_view.MOST_TICKS
     assert found["parts"][-1]["text"] == "further ones"
-    assert len(found["parts"][-1]["edges"]) == view_points.MOST_REGIONS - view_points.MOST_TICKS
+    assert len(found["parts"][-1]["edges"]) == surface_view.MOST_REGIONS - surface_view.MOST_TICKS
 
 
 # --- places that are drawn ------------------------------------------------------------------------------------------
@@ -65,7 +66,7 @@ def plates():
     corners = np.array([[0.0, 0, 0], [2000, 0, 0], [2000, 0, 1000], [0, 0, 1000]])
     strip = np.array([[0.0, 500, 0], [2000, 500, 0], [2000, 500, 20], [0, 500, 20]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    found = surface.of_mesh(np.vstack([corners, strip]), np.vstack([faces, faces + 4]), 10.0)
+    found = surface_charts.of_mesh(np.vstack([corners, strip]), np.vstack([faces, faces + 4]), 10.0)
     ones = np.ones(len(found.share))
     value = 1e-3 * found.centres[:, 0]
     return found, Field(value, ones, ones.astype(np.int64), 0 * ones.astype(np.int64), ones, ones, ones)
@@ -105,8 +106,8 @@ def test_small_defects_are_drawn_whole_and_lie_on_large_ones(plates):
 
 def test_every_defect_has_a_page():
     result = step_results.defects()
-    (name, pdf), *none = figures_defects.files(result).items()
+    (name, pdf), *none = figures.files(result).items()
     assert (name, none) == ("defects.pdf", [])
     assert len(re.findall(rb"/Type /Page\b", pdf)) == len(result.picture_defect) > 0
-    assert pdf == figures_defects.files(result)[name]
-    assert figures_defects.files(Result("failed", "default", "no point")) == {}
+    assert pdf == figures.files(result)[name]
+    assert figures.files(Result("failed", "default", "no point")) == {}

@@ -8,7 +8,7 @@ import subprocess
 
 import pytest
 
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.report import results_json, view
 from tests.unit.test_report_adjusted import BAD, Page, of_bridge, rendered
 

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from processor.evaluate import ErrorReport
+from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
 from processor.model import Scan
-from processor.report import figures, page, view_stitch
+from processor.report import all_figures, page
+from processor.report.stitching import view
 from tests import step_results
 from tests.browser import opened, picture, read_over
 
@@ -39,7 +40,7 @@ def made():
 
 
 def test_each_point_says_how_far_the_other_scan_lies(made):
-    data = view_stitch.of_runs(made.scene, made.runs)
+    data = view.of_runs(made.scene, made.runs)
     assert [part["name"] for part in data["parts"]] == list(NAMES[:3])
     off = [np.array(part["residual"], float) for part in data["parts"]]
     # What lies behind as its scanner sees it is negative, what lies before it positive; both to the rounding.
@@ -54,14 +55,14 @@ def test_each_point_says_how_far_the_other_scan_lies(made):
 
 def test_one_scan_alone_has_no_view(made):
     alone = dataclasses.replace(made.scene, scans=made.scene.scans[:1])
-    assert view_stitch.of_runs(alone, made.runs) is None
+    assert view.of_runs(alone, made.runs) is None
 
 
 def test_many_scans_keep_the_page_small(made):
     rng = np.random.default_rng(1)
     scans = [dataclasses.replace(scan, points=rng.normal(0.0, 1e4, (100_000, 3))) for scan in made.scene.scans]
-    data = view_stitch.of_runs(dataclasses.replace(made.scene, scans=tuple(scans)), made.runs)
-    assert sum(len(part["residual"]) for part in data["parts"]) <= view_stitch.MOST_POINTS
+    data = view.of_runs(dataclasses.replace(made.scene, scans=tuple(scans)), made.runs)
+    assert sum(len(part["residual"]) for part in data["parts"]) <= view.MOST_POINTS
 
 
 @pytest.mark.parametrize(
@@ -70,7 +71,7 @@ def test_many_scans_keep_the_page_small(made):
 )
 def test_scans_in_space_react(made, tmp_path, lang, unit):
     report = ErrorReport()
-    (tmp_path / "page.html").write_text(page.html(made, report, figures.of_run(made, report), lang), "utf-8")
+    (tmp_path / "page.html").write_text(page.html(made, report, all_figures.of_run(made, report), lang), "utf-8")
     with opened(tmp_path / "page.html") as shown:
         shown.locator("canvas.space").scroll_into_view_if_needed()
         first = picture(shown)

@@ -12,9 +12,10 @@ import pytest
 from click.testing import CliRunner
 
 from designgen import cli as designgen_cli
-from designgen import e57_file, recipes, scan_files, scan_folder
-from designgen.scene import make as make_scene
-from processor import folder, store
+from designgen import recipes
+from designgen.export import e57, formats
+from designgen.export import folder as export_folder
+from designgen.scenes.make import make as make_scene
 from processor.model import (
     FrameDesign,
     InputError,
@@ -26,6 +27,8 @@ from processor.model import (
     Truth,
     UsageError,
 )
+from processor.scan_folder import folder
+from processor.store import store
 
 RNG = np.random.default_rng(3)
 LIMITS_MM = {"las": 0.0501, "laz": 0.0501, "ptx": 1.1e-4, "xyz": 1.1e-4}  # the rest are doubles
@@ -99,7 +102,7 @@ ORIGINS = {"local": np.zeros(3), "georeferenced": np.array([5.0e8, 4.3e9, 1.0e5]
 
 def exported(scene, tmp_path, format_, **options):
     store.write_scene(tmp_path / "s.h5", scene, None, {})
-    scan_folder.export(tmp_path / "s.h5", tmp_path / "out", format_, with_truth=True, **options)
+    export_folder.export(tmp_path / "s.h5", tmp_path / "out", format_, with_truth=True, **options)
     return store.read_scene(tmp_path / "s.h5"), tmp_path / "out"
 
 
@@ -108,7 +111,7 @@ def sorted_rows(points):
 
 
 @pytest.mark.parametrize("where", ORIGINS)
-@pytest.mark.parametrize("format_", [*scan_files.FORMATS, "e57-spherical"])
+@pytest.mark.parametrize("format_", [*formats.FORMATS, "e57-spherical"])
 def test_scans_of_stations_come_back(format_, where, tmp_path):
     name, _, spherical = format_.partition("-")
     options = {"spherical": True} if spherical else {}
@@ -200,20 +203,20 @@ def test_other_programs_read_the_files(tmp_path):
     cloud = open3d.t.io.read_point_cloud(str(tmp_path / "m/out/scans/scan.ply"))
     np.testing.assert_array_equal(cloud.point.positions.numpy(), scan.points)
     np.testing.assert_array_equal(cloud.point.station.numpy().ravel(), scan.point_station + 1)
-    scan_files.write_pcd(tmp_path / "a.pcd", scan)
+    formats.write_pcd(tmp_path / "a.pcd", scan)
     cloud = open3d.t.io.read_point_cloud(str(tmp_path / "a.pcd"))
     np.testing.assert_allclose(cloud.point.positions.numpy(), scan.points / 1000.0, atol=1e-15)
-    scan_files.write_las(tmp_path / "a.laz", scan)
+    formats.write_las(tmp_path / "a.laz", scan)
     las = laspy.read(tmp_path / "a.laz")
     np.testing.assert_allclose(las.xyz, scan.points / 1000.0, atol=0.501e-4)
     np.testing.assert_array_equal(las.point_source_id, scan.point_station + 1)
     assert (las.header.version.minor, las.header.point_format.id) == (4, 6)
-    scan_files.write_xyz(tmp_path / "a.xyz", scan)
+    formats.write_xyz(tmp_path / "a.xyz", scan)
     table = np.loadtxt(tmp_path / "a.xyz", skiprows=1)
     np.testing.assert_allclose(table[:, :3], scan.points / 1000.0, atol=0.51e-7)
 
 
-@pytest.mark.parametrize("format_", scan_files.FORMATS)
+@pytest.mark.parametrize("format_", formats.FORMATS)
 def test_the_same_scene_makes_the_same_files(format_, tmp_path):
     scene = stations_apart(np.zeros(3))
     digests = []
@@ -235,7 +238,7 @@ def test_quaternions_of_all_kinds_of_rotations():
         n = np.array(axis) / np.linalg.norm(axis)
         K = np.array([[0, -n[2], n[1]], [n[2], 0, -n[0]], [-n[1], n[0], 0]])
         R = np.eye(3) + np.sin(angle) * K + (1 - np.cos(angle)) * K @ K
-        q = np.array(e57_file.quaternion(R))
+        q = np.array(e57.quaternion(R))
         expected = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * n)])
         assert min(np.abs(q - expected).max(), np.abs(q + expected).max()) < 1e-12
 
@@ -274,11 +277,11 @@ def labelled(scene):
 
 
 @pytest.mark.parametrize("make", [stations_apart, merged])
-@pytest.mark.parametrize("format_", scan_files.FORMATS)
+@pytest.mark.parametrize("format_", formats.FORMATS)
 def test_the_truth_is_found_by_the_names_that_scans_are_read_by(make, format_, tmp_path):
     scene = make(np.zeros(3))
     store.write_scene(tmp_path / "s.h5", scene, labelled(scene), {})
-    scan_folder.export(tmp_path / "s.h5", tmp_path / "out", format_, with_truth=True)
+    export_folder.export(tmp_path / "s.h5", tmp_path / "out", format_, with_truth=True)
     back = folder.read_input(tmp_path / "out")
     truth = store.read_truth(tmp_path / "out/truth.h5")
     labels = {label.scan: label for label in truth.labels}
@@ -301,18 +304,18 @@ def test_odd_names_in_e57_are_numbers_in_the_truth_too(tmp_path):
     """The generator's notion of an odd name is the reader's."""
     points = on_grid(50)[0]
     taken = [Scan(name, points) for name in ("t-2", "a/b", "ok")]
-    e57_file.write(tmp_path / "t.e57", taken, spherical=False)
+    e57.write(tmp_path / "t.e57", taken, spherical=False)
     back = folder.read_input(tmp_path / "t.e57")
-    assert [scan.name for scan in back.scans] == e57_file.names_read("t", taken) == ["t-1", "t-2", "t-3"]
+    assert [scan.name for scan in back.scans] == e57.names_read("t", taken) == ["t-1", "t-2", "t-3"]
     odd = ["ok", "a/b", " a", ".a", "x" * 101, "a\\b", "a\tb", "S 1"]
     scans = [Scan(name, points + i) for i, name in enumerate(odd)]
-    e57_file.write(tmp_path / "f.e57", scans, spherical=False)
+    e57.write(tmp_path / "f.e57", scans, spherical=False)
     back = folder.read_input(tmp_path / "f.e57")
-    assert [scan.name for scan in back.scans] == e57_file.names_read("f", scans)
+    assert [scan.name for scan in back.scans] == e57.names_read("f", scans)
     assert [scan.name for scan in back.scans] == ["ok", *(f"f-{i}" for i in range(2, 8)), "S 1"]
 
 
-@pytest.mark.parametrize("format_", scan_files.FORMATS)
+@pytest.mark.parametrize("format_", formats.FORMATS)
 def test_a_station_that_saw_nothing_is_left_out_and_said(format_, tmp_path):
     scene = stations_apart(np.zeros(3))
     blind = Scan("S2", np.empty((0, 3)), station="S2", position=np.zeros(3), T_project_scan=np.eye(4))
@@ -329,7 +332,7 @@ def test_a_station_that_saw_nothing_is_left_out_and_said(format_, tmp_path):
     assert len(store.read_truth(tmp_path / "out/truth.h5").labels) == 2
     store.write_scene(tmp_path / "none.h5", dataclasses.replace(scene, scans=(blind,)), None, {})
     with pytest.raises(UsageError, match="no scan has 4 points or more, so there is nothing to export"):
-        scan_folder.export(tmp_path / "none.h5", tmp_path / "none", format_, with_truth=True)
+        export_folder.export(tmp_path / "none.h5", tmp_path / "none", format_, with_truth=True)
     assert not (tmp_path / "none").exists()
 
 
@@ -340,7 +343,7 @@ def test_an_arch_bridge_comes_back_from_e57_with_its_components(spherical, tmp_p
     scans = [dataclasses.replace(scan, sigma_mm=1.0 + i) for i, scan in enumerate(scene.scans)]
     scans[0] = dataclasses.replace(scans[0], station="foot1/S1")
     store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, scans=tuple(scans)), truth, {})
-    scan_folder.export(tmp_path / "s.h5", tmp_path / "out", "e57", with_truth=True, spherical=spherical)
+    export_folder.export(tmp_path / "s.h5", tmp_path / "out", "e57", with_truth=True, spherical=spherical)
     files = sorted(path.name for path in (tmp_path / "out/scans").iterdir())
     assert files == ["foot1.e57", "foot2.e57", "rib1.e57", "rib2.e57", "rib3.e57"]
     back, kept = folder.read_input(tmp_path / "out"), store.read_scene(tmp_path / "s.h5")
@@ -357,7 +360,7 @@ def test_an_arch_bridge_comes_back_from_e57_with_its_components(spherical, tmp_p
 def test_two_e57_files_may_hold_scans_of_one_name(tmp_path):
     scans = stations_apart(np.zeros(3)).scans
     for stem in ("day1", "day2"):
-        e57_file.write(tmp_path / f"{stem}.e57", scans[:2], spherical=False)
+        e57.write(tmp_path / f"{stem}.e57", scans[:2], spherical=False)
     back = folder.read_input(tmp_path)
     assert [scan.name for scan in back.scans] == ["S1", "二号站", "day2-1", "day2-2"]
 

@@ -7,11 +7,16 @@ import pye57
 import pytest
 from pye57 import libe57
 
-from designgen import e57_file, recipes, scan_files, scan_folder
-from designgen.scene import make
-from processor import folder, readers, scan_grids, store
-from processor.steps import stitch
-from processor.stitching import clouds
+from designgen import recipes
+from designgen.export import e57, formats
+from designgen.export import folder as export_folder
+from designgen.scenes.make import make
+from processor import readers
+from processor.evaluation import stitching as stitching_evaluation
+from processor.scan_folder import folder, scanner_grid
+from processor.stitching import step as stitching_step
+from processor.stitching.planes import scan_planes
+from processor.store import store
 from tests import stitch_clouds
 from tests.unit.test_readers import DATA, needs_data
 from tests.unit.test_scan_folder import exported, merged
@@ -151,10 +156,10 @@ def test_a_sweep_is_a_scanners_grid_wherever_the_scanner_is():
     at = np.array([5.0, -3.0, 1.0])
     turn = np.linalg.qr(np.random.default_rng(2).normal(size=(3, 3)))[0]
     for moved, scanner in ((points, np.zeros(3)), (points @ turn.T + at, at)):
-        kept = scan_grids.of_scanner(moved, row, column, scanner)
+        kept = scanner_grid.of_scanner(moved, row, column, scanner)
         assert np.array_equal(kept[0], row)
         assert np.array_equal(kept[1], column)
-    assert not len(scan_grids.of_scanner(points + at, row, column, np.zeros(3))[0])
+    assert not len(scanner_grid.of_scanner(points + at, row, column, np.zeros(3))[0])
 
 
 def made_up(case):
@@ -183,13 +188,13 @@ def made_up(case):
      "cells of gigabytes", "too few to tell"],
 )  # fmt: skip
 def test_other_rows_are_no_scanners_grid(case):
-    row, column = scan_grids.of_scanner(*made_up(case), np.zeros(3))
+    row, column = scanner_grid.of_scanner(*made_up(case), np.zeros(3))
     assert len(row) == len(column) == 0
 
 
 def test_a_piece_cut_out_of_a_large_grid_counts_from_nought():
     points, row, column = swept()
-    kept = scan_grids.of_scanner(points, row + 70_000, column + 90_000, np.zeros(3))
+    kept = scanner_grid.of_scanner(points, row + 70_000, column + 90_000, np.zeros(3))
     assert np.array_equal(kept[0], row)
     assert np.array_equal(kept[1], column)
 
@@ -197,8 +202,8 @@ def test_a_piece_cut_out_of_a_large_grid_counts_from_nought():
 def test_a_large_scan_is_judged_by_a_part_of_it():
     """Also where every k-th point of it is of one row."""
     points, row, column = swept(rows=20, columns=12_000)
-    assert len(points) > 3 * scan_grids.SAMPLE
-    assert len(scan_grids.of_scanner(points, row, column, np.zeros(3))[0]) == len(points)
+    assert len(points) > 3 * scanner_grid.SAMPLE
+    assert len(scanner_grid.of_scanner(points, row, column, np.zeros(3))[0]) == len(points)
 
 
 def test_a_position_in_the_project_file_counts(tmp_path):
@@ -229,7 +234,7 @@ def room():
 
 def test_e57_brings_the_grid_back(room, tmp_path):
     for spherical in (False, True):
-        e57_file.write(tmp_path / "a.e57", room, spherical=spherical)
+        e57.write(tmp_path / "a.e57", room, spherical=spherical)
         for ours, theirs in zip(room, folder.read_input(tmp_path / "a.e57").scans, strict=True):
             np.testing.assert_array_equal(theirs.grid_row, ours.grid_row)
             np.testing.assert_array_equal(theirs.grid_column, ours.grid_column)
@@ -237,7 +242,7 @@ def test_e57_brings_the_grid_back(room, tmp_path):
 
 def test_ptx_brings_the_grid_back(room, tmp_path):
     for ours in room:
-        scan_files.write_ptx(tmp_path / "a.ptx", ours, None)
+        formats.write_ptx(tmp_path / "a.ptx", ours, None)
         (theirs,) = folder.read_input(tmp_path / "a.ptx").scans
         order = np.lexsort((ours.grid_row, ours.grid_column))
         np.testing.assert_allclose(theirs.points, ours.points[order], atol=1.1e-4)
@@ -254,13 +259,13 @@ def test_a_merged_cloud_has_no_grid_in_e57(tmp_path):
 
 def test_stitching_finds_the_same_ends_in_files_as_in_the_scene(room, tmp_path):
     ours = room[0]
-    scan_files.write_ptx(tmp_path / "a.ptx", ours, None)
-    e57_file.write(tmp_path / "b.e57", [ours], spherical=False)
-    expected = clouds.prepared(ours, 200.0)
+    formats.write_ptx(tmp_path / "a.ptx", ours, None)
+    e57.write(tmp_path / "b.e57", [ours], spherical=False)
+    expected = scan_planes.prepared(ours, 200.0)
     assert len(expected.ends.points) > 100
     for path in (tmp_path / "a.ptx", tmp_path / "b.e57"):
         (theirs,) = folder.read_input(path).scans
-        found = clouds.prepared(dataclasses.replace(theirs, sigma_mm=2.0), 200.0)
+        found = scan_planes.prepared(dataclasses.replace(theirs, sigma_mm=2.0), 200.0)
         want, got = expected.ends.points, found.ends.points
         assert abs(len(want) - len(got)) <= 3  # PTX rounds, and some points lie at a limit
         np.testing.assert_allclose(got.mean(axis=0), want.mean(axis=0), atol=1.0)
@@ -275,11 +280,14 @@ def test_stitching_is_as_good_from_files_as_from_the_scene(tmp_path):
 
     def worst_mm(path):
         read = folder.read_input(path)
-        figures = {one.name: one.value for one in stitch.check(read, stitch.run(read, stitch.Params()), truth)}
+        figures = {
+            one.name: one.value
+            for one in stitching_evaluation.check(read, stitching_step.run(read, stitching_step.Params()), truth)
+        }
         return figures["station positions after datum fit, max"]
 
     expected = worst_mm(tmp_path / "s.h5")
     assert expected < 2.0
     for format_ in ("ptx", "e57"):
-        scan_folder.export(tmp_path / "s.h5", tmp_path / format_, format_, with_truth=False)
+        export_folder.export(tmp_path / "s.h5", tmp_path / format_, format_, with_truth=False)
         assert abs(worst_mm(tmp_path / format_) - expected) < 0.05

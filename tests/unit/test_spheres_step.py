@@ -4,9 +4,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from processor.evaluation import space_frame
 from processor.model import FrameDesign, FrameTruth, Scan, Scene, Stations, Truth, UsageError
-from processor.steps import spheres
-from processor.steps.spheres import Params
+from processor.space_frame import step as space_frame_step
+from processor.space_frame.step import Params
 
 PITCH = 1500.0
 PAPERS = ("ransac", "least-squares")
@@ -49,7 +50,7 @@ def paper(**given):
 
 
 def metrics(scene, result, truth):
-    return {metric.name: metric for metric in spheres.check(scene, result, truth)}
+    return {metric.name: metric for metric in space_frame.check(scene, result, truth)}
 
 
 def only_ball(scene):
@@ -62,7 +63,7 @@ def only_ball(scene):
 
 def test_in_kind_ransac_beats_least_squares():
     scene, truth = frame()
-    by_method = {method: metrics(scene, spheres.run(scene, Params(method=method)), truth) for method in PAPERS}
+    by_method = {method: metrics(scene, space_frame_step.run(scene, Params(method=method)), truth) for method in PAPERS}
     median = {method: by_name["radius error, median"].value for method, by_name in by_method.items()}
     assert median["ransac"] < 0.7
     assert 3.0 < median["least-squares"] < 8.0
@@ -74,7 +75,7 @@ def test_in_kind_ransac_beats_least_squares():
 
 def test_rows_are_the_designs_nodes_in_its_order():
     scene, _ = frame(k=5)
-    result = spheres.run(scene, paper())
+    result = space_frame_step.run(scene, paper())
     assert (result.status, result.method) == ("ok", "ransac")
     np.testing.assert_array_equal(result.ids, scene.frame.ids)
     np.testing.assert_allclose(result.lowest, result.centres - result.radii[:, None] * [0.0, 0.0, 1.0])
@@ -91,7 +92,7 @@ def test_a_ball_without_points_is_data_and_no_exception():
         keep = ~gone
         keep[np.flatnonzero(gone)[:left]] = True
         fewer = replace(scene, scans=(Scan("all", scene.scans[0].points[keep]),))
-        result = spheres.run(fewer, paper())
+        result = space_frame_step.run(fewer, paper())
         assert result.status == "partial"
         assert result.flag[2] == "not-found"
         assert f"{left} points" in result.reason[2]
@@ -99,28 +100,28 @@ def test_a_ball_without_points_is_data_and_no_exception():
         assert np.isnan(result.radii[2])
         assert metrics(fewer, result, truth)["balls not found"].value == 1.0
     nothing = replace(scene, scans=())
-    assert spheres.run(nothing, Params(method="least-squares")).status == "failed"
+    assert space_frame_step.run(nothing, Params(method="least-squares")).status == "failed"
 
 
 def test_a_cloud_without_members_is_still_held_against_its_design():
     scene, truth = frame(k=4)
     gone = np.linalg.norm(scene.scans[0].points - scene.frame.centres[2], axis=1) < 200.0
     fewer = replace(scene, scans=(Scan("all", scene.scans[0].points[~gone]),))
-    result = spheres.run(fewer, Params())
+    result = space_frame_step.run(fewer, Params())
     assert (result.status, result.method) == ("partial", "ray")
     assert "no members that meet" in result.message
     np.testing.assert_array_equal(result.ids, scene.frame.ids)
     assert result.flag[2] == "not-found"
     assert metrics(fewer, result, truth)["balls not found"].value == 1.0
     small = replace(scene, frame=replace(scene.frame, radii=np.full(4, 60.0)))
-    assert set(spheres.run(small, Params()).flag) == {"wrong-size"}
+    assert set(space_frame_step.run(small, Params()).flag) == {"wrong-size"}
 
 
 def test_four_points_give_a_sphere_of_low_confidence():
     scene, _ = frame(k=1)
     quad = scene.frame.centres[0] + 45.0 * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])
     for method in PAPERS:
-        result = spheres.run(replace(scene, scans=(Scan("s", quad),)), Params(method=method))
+        result = space_frame_step.run(replace(scene, scans=(Scan("s", quad),)), Params(method=method))
         assert result.radii[0] == pytest.approx(45.0)
         assert result.flag == ("low-confidence",)
         assert "4 points" in result.reason[0]
@@ -130,7 +131,7 @@ def test_a_fit_that_leaves_its_crop_is_not_found():
     scene, _ = frame(k=1)
     rng = np.random.default_rng(0)
     wall = scene.frame.centres[0] + np.column_stack([rng.uniform(-40, 40, (300, 2)), 30.0 + rng.normal(0, 0.2, 300)])
-    result = spheres.run(replace(scene, scans=(Scan("s", wall),)), Params(method="least-squares"))
+    result = space_frame_step.run(replace(scene, scans=(Scan("s", wall),)), Params(method="least-squares"))
     assert result.status == "failed"
     assert result.flag == ("not-found",)
     assert "left the crop" in result.reason[0]
@@ -143,7 +144,7 @@ def test_wrong_size_and_right_size():
     d /= np.linalg.norm(d, axis=2)[:, :, None]
     points = np.vstack([50.0 * d[0], 45.4 * d[1] + nodes[1]]) + rng.normal(0.0, 0.5, (800, 3))
     design = FrameDesign(ids=[1, 2], centres=nodes, radii=[45.0, 45.0])
-    result = spheres.run(Scene("s", "space-frame", (Scan("s", points),), frame=design), paper())
+    result = space_frame_step.run(Scene("s", "space-frame", (Scan("s", points),), frame=design), paper())
     assert result.flag == ("wrong-size", "ok")
     assert "+5.0 mm" in result.reason[0]
     np.testing.assert_allclose(result.radii, [50.0, 45.4], atol=0.2)
@@ -153,9 +154,9 @@ def test_offsets_and_poses_change_nothing():
     scene, _ = frame(k=3)
     utm = np.array([500_000_000.0, 4_300_000_000.0, 0.0])
     points = scene.scans[0].points
-    here = spheres.run(scene, paper())
+    here = space_frame_step.run(scene, paper())
     far = replace(scene, scans=(Scan("s", points, utm),), frame=replace(scene.frame, centres=scene.frame.centres + utm))
-    there = spheres.run(far, paper())
+    there = space_frame_step.run(far, paper())
     np.testing.assert_allclose(there.centres - utm, here.centres, atol=1e-6)
     np.testing.assert_allclose(there.radii, here.radii, atol=1e-6)
 
@@ -164,7 +165,7 @@ def test_offsets_and_poses_change_nothing():
     half = len(points) // 2
     in_scan = (points[:half] - turn[:3, 3]) @ turn[:3, :3]
     posed = (Scan("a", in_scan, T_project_scan=turn), Scan("b", points[half:], T_project_scan=np.eye(4)))
-    merged = spheres.run(replace(scene, scans=posed), paper())
+    merged = space_frame_step.run(replace(scene, scans=posed), paper())
     np.testing.assert_allclose(merged.centres, here.centres, atol=1e-6)
     np.testing.assert_allclose(merged.radii, here.radii, atol=1e-6)
 
@@ -173,7 +174,7 @@ def test_same_seed_same_answer_whatever_the_order_of_points():
     scene, _ = frame(k=5)
     points = scene.scans[0].points
     shuffled = replace(scene, scans=(Scan("s", points[np.random.default_rng(1).permutation(len(points))]),))
-    first, again, other = (spheres.run(s, paper(seed=3)) for s in (scene, scene, shuffled))
+    first, again, other = (space_frame_step.run(s, paper(seed=3)) for s in (scene, scene, shuffled))
     assert first.centres.tobytes() == again.centres.tobytes()
     np.testing.assert_allclose(other.centres, first.centres, atol=1e-8)
 
@@ -197,15 +198,15 @@ def test_search_without_a_design_uses_known_scanners():
     stations = Stations(ids=("S1", "S2"), positions=np.array([[9e3, 0.0, 0.0], position]))
     listed = Scan("s", points, point_station=np.ones(len(points), int))
     results = [
-        spheres.run(Scene("t", "structure", (posed,)), Params()),
-        spheres.run(Scene("t", "structure", (listed,), stations=stations), Params()),
+        space_frame_step.run(Scene("t", "structure", (posed,)), Params()),
+        space_frame_step.run(Scene("t", "structure", (listed,), stations=stations), Params()),
     ]
     for result in results:
         assert "known scanner positions" in result.message
         assert np.linalg.norm(result.centres[0]) < 0.3
         assert result.radii[0] == pytest.approx(70.0, abs=0.2)
     np.testing.assert_allclose(results[0].centres, results[1].centres, atol=1e-6)
-    unknown = spheres.run(Scene("t", "structure", (Scan("s", points),)), Params())
+    unknown = space_frame_step.run(Scene("t", "structure", (Scan("s", points),)), Params())
     assert "orthogonal" in unknown.message
 
 
@@ -218,7 +219,7 @@ def test_the_bound_of_a_target_is_what_its_points_allow():
         points = target(rng, 800, view)
         ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
         scan = Scan("s", points + ray * rng.normal(0.0, 0.5, (len(points), 1)), position=position)
-        result = spheres.run(Scene("t", "structure", (scan,)), Params())
+        result = space_frame_step.run(Scene("t", "structure", (scan,)), Params())
         off.append(np.append(result.centres[0], [result.radii[0] - 70.0, result.lowest[0, 2] + 70.0]))
         bounds.append(result.bound_sd[0])
         sd.append(np.append(np.sqrt(np.diag(result.covariance[0])), result.lowest_sd[0]))
@@ -232,7 +233,7 @@ def test_the_bound_of_a_target_is_what_its_points_allow():
 def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, said):
     rng = np.random.default_rng(5)
     points = scale * (target(rng) + rng.normal(0.0, 0.3, (800, 3)))
-    result = spheres.run(Scene("t", "structure", (Scan("s", points),)), Params())
+    result = space_frame_step.run(Scene("t", "structure", (Scan("s", points),)), Params())
     assert result.flag == ("low-confidence",)
     assert "no ball or target has a radius" in result.reason[0]
     assert said in result.reason[0]
@@ -245,16 +246,16 @@ def test_search_says_when_it_stopped_early_and_when_there_is_nothing():
         0.0, 0.3, (2400, 3)
     )
     scene = Scene("targets", "structure", (Scan("s", points),))
-    all_three = spheres.run(scene, Params())
+    all_three = space_frame_step.run(scene, Params())
     assert (all_three.status, sorted(np.round(all_three.centres[:, 0] / 500.0))) == ("ok", [0.0, 1.0, 2.0])
-    two = spheres.run(scene, Params(max_balls=2))
+    two = space_frame_step.run(scene, Params(max_balls=2))
     assert (two.status, len(two.radii)) == ("partial", 2)
     assert "design" in two.message
     flat = np.column_stack([rng.uniform(-500.0, 500.0, (3000, 2)), rng.normal(0.0, 0.5, 3000)])
-    none = spheres.run(Scene("flat", "structure", (Scan("s", flat),)), Params())
+    none = space_frame_step.run(Scene("flat", "structure", (Scan("s", flat),)), Params())
     assert (none.status, len(none.ids)) == ("failed", 0)
     assert "design" in none.message
-    assert spheres.run(Scene("empty", "structure"), Params()).status == "failed"
+    assert space_frame_step.run(Scene("empty", "structure"), Params()).status == "failed"
 
 
 def test_check_by_numbers_worked_by_hand():
@@ -262,7 +263,7 @@ def test_check_by_numbers_worked_by_hand():
     truth = FrameTruth(ids=[7, 8, 9], centres=centres, radii=[45.0, 45.0, 45.0], lowest=centres - [0.0, 0.0, 45.0])
     got = centres[[2, 0, 1]] + np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 30.0]])
     radii = np.array([46.0, 43.0, 45.0])
-    result = spheres.Result(
+    result = space_frame_step.Result(
         "ok",
         "ransac",
         ids=[9, 7, 8],
@@ -291,11 +292,11 @@ def test_check_by_numbers_worked_by_hand():
         assert value["balls not found"] == 0.0
         assert value["balls called ok, centre over 10 mm off"] == 1.0
         assert value["radii within their 95 % intervals"] == pytest.approx(200.0 / 3.0)
-    nothing = spheres.Result("failed", "ransac")
+    nothing = space_frame_step.Result("failed", "ransac")
     none = metrics(Scene("s", "space-frame", frame=design), nothing, Truth(frame=truth))
     assert none["balls not found"].value == 3.0
     assert not none["radius error, median"].passed
-    assert spheres.check(Scene("s", "space-frame"), nothing, Truth()) == []
+    assert space_frame.check(Scene("s", "space-frame"), nothing, Truth()) == []
 
 
 @pytest.mark.parametrize(
@@ -316,4 +317,4 @@ def test_check_by_numbers_worked_by_hand():
 def test_parameters_that_make_no_sense(wrong):
     scene, _ = frame(k=1)
     with pytest.raises(UsageError, match="spheres"):
-        spheres.run(scene, Params(**wrong))
+        space_frame_step.run(scene, Params(**wrong))

@@ -8,12 +8,15 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from processor import folder, pipeline, store
-from processor.evaluate import ErrorReport
+from processor import pipeline
+from processor.evaluation import stitching as stitching_evaluation
+from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, Scan, Scene, StationTruth, Truth, UsageError
-from processor.report import writing
-from processor.steps import stitch
+from processor.report import results_folder
+from processor.scan_folder import folder
+from processor.stitching import step as stitching_step
 from processor.stitching.result import Held
+from processor.store import store
 from tests import stitch_clouds
 from tests.stitch_clouds import four
 
@@ -32,7 +35,7 @@ def errors(result, T):
 @pytest.fixture(scope="module")
 def room():
     T, scans = four()
-    return T, scans, stitch.run(Scene("room", "structure", scans), stitch.Params())
+    return T, scans, stitching_step.run(Scene("room", "structure", scans), stitching_step.Params())
 
 
 def test_four_scans_of_a_room_come_together(room):
@@ -76,7 +79,7 @@ def test_the_result_does_not_depend_on_how_a_scan_lies_in_its_frame(room):
         )
         D[:3, 3] += 7.0
         back.append(D)
-    result = stitch.run(Scene("room", "structure", tuple(turned)), stitch.Params())
+    result = stitching_step.run(Scene("room", "structure", tuple(turned)), stitching_step.Params())
     assert result.status == "ok"
     found = [np.linalg.inv(back[0]) @ one @ D for one, D in zip(result.T_project_scan, back, strict=True)]
     shift, turn = errors(dataclasses.replace(first, T_project_scan=np.array(found)), T)
@@ -98,7 +101,7 @@ def test_order_of_points_and_threads_do_not_show(room):
                 grid_column=scan.grid_column[order],
             )
         )
-    again = stitch.run(Scene("room", "structure", tuple(mixed)), stitch.Params())
+    again = stitching_step.run(Scene("room", "structure", tuple(mixed)), stitching_step.Params())
     np.testing.assert_allclose(again.T_project_scan, first.T_project_scan, rtol=0.0, atol=1e-4)
 
 
@@ -108,7 +111,7 @@ def test_a_room_that_looks_the_same_turned_round_is_ambiguous():
     T = [stitch_clouds.pose([-1500.0, 300.0, 1500.0], 10.0), stitch_clouds.pose([1200.0, -400.0, 1500.0], 70.0)]
     scans = tuple(stitch_clouds.scan(f"S{i}", one, i, room=room, things=(), step_mrad=20.0) for i, one in enumerate(T))
     # Levelled: upside down the room would fit as well.
-    result = stitch.run(Scene("empty", "structure", scans), stitch.Params(levelled_mrad=20.0))
+    result = stitching_step.run(Scene("empty", "structure", scans), stitching_step.Params(levelled_mrad=20.0))
     assert result.status == "partial"
     assert result.scan_status[1] == "ambiguous"
     # The rival is the other answer: one of the two is right.
@@ -126,14 +129,14 @@ def test_scans_of_different_places_are_never_called_ok():
         room=(np.array([-2000.0, -9000.0, 0.0]), np.array([2500.0, 8000.0, 5200.0])),
         things=((np.array([-2000.0, 3000.0, 0.0]), np.array([-500.0, 4000.0, 2600.0])),),
     )
-    result = stitch.run(Scene("two", "structure", (scans[0], other)), stitch.Params())
+    result = stitching_step.run(Scene("two", "structure", (scans[0], other)), stitching_step.Params())
     assert result.scan_status[1] != "ok"
     assert result.status != "ok"
 
 
 def test_scans_without_a_grid_or_a_scanner_that_is_known():
     T, scans = four(grid=False)
-    result = stitch.run(Scene("room", "structure", scans), stitch.Params(reference="S2"))
+    result = stitching_step.run(Scene("room", "structure", scans), stitching_step.Params(reference="S2"))
     assert result.reference == "S2"
     base = np.linalg.inv(T[1])
     for found, true in zip(result.T_project_scan, T, strict=True):
@@ -145,8 +148,8 @@ def test_a_given_pose_of_the_reference_leads_to_the_project():
     given = stitch_clouds.pose([5e5, 4e6, 300.0], 33.0)
     scans = (dataclasses.replace(scans[0], T_project_scan=given), *scans[1:])
     scene = Scene("room", "structure", scans)
-    assert stitch.applies(scene)
-    result = stitch.run(scene, stitch.Params())
+    assert stitching_step.applies(scene)
+    result = stitching_step.run(scene, stitching_step.Params())
     want = given @ np.linalg.inv(T[0]) @ T[2]
     np.testing.assert_allclose(result.T_project_scan[0], given)
     assert result.frame == "GLCS"
@@ -157,17 +160,20 @@ def test_bad_input_is_said_plainly():
     few = Scan("few", np.zeros((20, 3)))
     many = Scan("many", np.random.default_rng(0).normal(size=(500, 3)))
     with pytest.raises(InputError, match="two scans or more, found 1"):
-        stitch.run(Scene("s", "structure", (many,)), stitch.Params())
+        stitching_step.run(Scene("s", "structure", (many,)), stitching_step.Params())
     with pytest.raises(InputError, match="'few' has 20 points"):
-        stitch.run(Scene("s", "structure", (many, few)), stitch.Params())
+        stitching_step.run(Scene("s", "structure", (many, few)), stitching_step.Params())
     with pytest.raises(UsageError, match="no scan 'S9'"):
-        stitch.run(Scene("s", "structure", (many, dataclasses.replace(many, name="b"))), stitch.Params(reference="S9"))
+        stitching_step.run(
+            Scene("s", "structure", (many, dataclasses.replace(many, name="b"))), stitching_step.Params(reference="S9")
+        )
     with pytest.raises(InputError, match=r"picks\.csv"):
-        stitch.run(
-            Scene("s", "structure", (many, dataclasses.replace(many, name="b"))), stitch.Params(method="three-point")
+        stitching_step.run(
+            Scene("s", "structure", (many, dataclasses.replace(many, name="b"))),
+            stitching_step.Params(method="three-point"),
         )
     with pytest.raises(UsageError, match=r"stitch\.scale"):
-        stitch.Params(scale="loose")
+        stitching_step.Params(scale="loose")
 
 
 @pytest.mark.parametrize("kind", ["ball of noise", "one plane", "one place"])
@@ -179,7 +185,7 @@ def test_scans_that_hold_nothing_to_go_by_fail_without_a_crash(kind):
         "one place": lambda: np.tile([1000.0, 0.0, 0.0], (3000, 1)),
     }[kind]
     scans = tuple(Scan(name, made()) for name in ("a", "b"))
-    result = stitch.run(Scene("s", "structure", scans), stitch.Params())
+    result = stitching_step.run(Scene("s", "structure", scans), stitching_step.Params())
     assert result.scan_status[1] != "ok"
     assert result.status in ("partial", "failed")
 
@@ -190,7 +196,7 @@ def test_intervals_cover_over_seeds():
     pulls = []
     for seed in range(1, 5):
         T, scans = four(seed, step_mrad=20.0)
-        result = stitch.run(Scene("room", "structure", scans), stitch.Params())
+        result = stitching_step.run(Scene("room", "structure", scans), stitching_step.Params())
         shift, _ = errors(result, T)
         pulls.append(shift[1:] / result.position_sd[1:])
     assert (np.abs(pulls) < 1.96).mean() > 0.8
@@ -204,7 +210,7 @@ def test_a_run_is_reported_whole(room, tmp_path):
     store.write_scene(path, Scene("room", "structure", scans, units="mm", units_reason="made so"), None, {})
     scene = pipeline.read(path, None)
     execution = pipeline.execute(path, scene, pipeline.plan(("stitch",), (), {}, None))
-    writing.write(tmp_path / "out", execution, ErrorReport())
+    results_folder.write(tmp_path / "out", execution, ErrorReport())
     found = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
     assert found["reference"] == "S1"
     assert [one["status"] for one in found["scans"]] == ["ok"] * 4
@@ -232,13 +238,13 @@ def held_against(T, true, status, **more):
     """Checks of made-up poses (k, 4, 4) against true ones."""
     k = len(T)
     names = tuple(f"S{i + 1}" for i in range(k))
-    made = stitch.Result(
+    made = stitching_step.Result(
         "ok", "automatic", reference="S1", scans=names, scan_status=status, scan_message=("",) * k, T_project_scan=T,
         position=T[:, :3, 3], position_sd=np.full((k, 3), 1.0), rotation_sd=np.full((k, 3), 1e-4),
         covariance=np.zeros((k, 6, 6)), rivalry=np.zeros(k), T_rival_scan=np.full((k, 4, 4), np.nan), **more,
     )  # fmt: skip
     truth = Truth(stations=StationTruth(names, true))
-    return {one.name: one.value for one in stitch.check(Scene("s", "structure"), made, truth)}
+    return {one.name: one.value for one in stitching_evaluation.check(Scene("s", "structure"), made, truth)}
 
 
 def test_a_scan_rightly_called_weak_does_not_make_the_good_ones_wrong():
@@ -271,7 +277,7 @@ ROOMS = Path(__file__).resolve().parents[2] / "../shared/data/pcd"
 def test_two_real_scans_of_a_room_come_together():
     """By another library: point-to-plane ICP of Open3D, started at the answer, stays there."""
     scans = tuple(folder.read_input(ROOMS / f"room_scan{i}.pcd").scans[0] for i in (1, 2))
-    result = stitch.run(Scene("rooms", "structure", scans), stitch.Params())
+    result = stitching_step.run(Scene("rooms", "structure", scans), stitching_step.Params())
     # A sensor's errors, alike over whole walls, and rough normals: an adjustment that takes them as independent would
     # say 0.6 mm. Plain ICP on halves of the room scatters by 5 to 15 mm and several mrad.
     assert result.scan_status[1] == "weak"

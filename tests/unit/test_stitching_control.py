@@ -11,11 +11,11 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from processor import cli
+from processor.cli import run
 from processor.geometry import rigid
 from processor.model import Control, InputError
-from processor.steps import stitch
-from processor.stitching import control
+from processor.stitching import step as stitching_step
+from processor.stitching.fine import control_points
 from tests.stitch_clouds import four, pose
 from tests.unit.test_stitching_picks import network
 
@@ -59,7 +59,7 @@ def toy(seed, count=6, wrong=None, known_sd=0.5, seen_sd=0.8, each=2):
 
 
 def held(T, C, points, point_mm=1.0):
-    return control.hold(points, NAMES[: len(T)], T, C, np.zeros((len(T), 3)), point_mm)
+    return control_points.hold(points, NAMES[: len(T)], T, C, np.zeros((len(T), 3)), point_mm)
 
 
 def in_site(found):
@@ -284,9 +284,9 @@ def targets(T, known_sd=0.3, seen_sd=0.5, seed=0, count=6):
 
 def test_picked_scans_are_laid_to_control_points():
     T, scene = network(1, 2.0)
-    free = stitch.run(scene, stitch.Params(method="three-point"))
+    free = stitching_step.run(scene, stitching_step.Params(method="three-point"))
     points = targets(T)
-    result = stitch.run(dataclasses.replace(scene, control=points), stitch.Params(method="three-point"))
+    result = stitching_step.run(dataclasses.replace(scene, control=points), stitching_step.Params(method="three-point"))
     want = SITE @ T
     assert (free.frame, result.frame) == ("PRCS", "GLCS")
     off = result.T_project_scan[:, :3, 3] - want[:, :3, 3]
@@ -306,7 +306,8 @@ def test_without_control_points_nothing_changes():
     _, scene = network(1, 2.0)
     few = targets(np.array([np.eye(4)] * 5), count=2)
     results = [
-        stitch.run(dataclasses.replace(scene, control=one), stitch.Params(method="three-point")) for one in (None, few)
+        stitching_step.run(dataclasses.replace(scene, control=one), stitching_step.Params(method="three-point"))
+        for one in (None, few)
     ]
     for field in dataclasses.fields(results[0]):
         if field.name not in ("control", "message"):
@@ -335,7 +336,7 @@ def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
     with (folder / "control.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     (folder / "project.toml").write_text('kind = "structure"\n')
-    ran = CliRunner().invoke(cli.commands, ["run", str(folder), "-o", str(tmp_path / "out"), "--steps", "stitch"])
+    ran = CliRunner().invoke(run.commands, ["run", str(folder), "-o", str(tmp_path / "out"), "--steps", "stitch"])
     assert ran.exit_code in (0, 1), ran.output
     said = ran.output.replace("\n", " ")
     assert "held by 5 control points seen 20 times" in said

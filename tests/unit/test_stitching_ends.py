@@ -2,8 +2,10 @@
 
 import numpy as np
 
-from processor.stitching import bounding, ends, rays
-from processor.stitching.octree import Planes
+from processor.geometry import scanner_rays
+from processor.stitching.fine import edge_constraints
+from processor.stitching.planes import edges
+from processor.stitching.planes.extraction import Planes
 from tests.stitch_clouds import pose, scan
 
 
@@ -11,10 +13,10 @@ def test_rays_of_a_grid_are_those_that_made_it():
     made = scan("S", pose([0.0, 0.0, 1500.0], 0.0), 1, step_mrad=20.0, sigma_mm=0.0)
     keep = np.arange(len(made.points)) % 3 > 0
     row, column = made.grid_row.astype(np.int64), made.grid_column.astype(np.int64)
-    found = rays.fitted(made.points[keep], row[keep], column[keep])
+    found = scanner_rays.fitted(made.points[keep], row[keep], column[keep])
     true = made.points / np.linalg.norm(made.points, axis=1)[:, None]
     np.testing.assert_allclose(found.of(row, column), true, atol=1e-9)
-    lost = rays.unanswered(found, row[keep], column[keep])
+    lost = scanner_rays.unanswered(found, row[keep], column[keep])
     assert len(lost) == (~keep).sum()
     np.testing.assert_allclose(np.sort(lost, axis=0), np.sort(true[~keep], axis=0), atol=1e-9)
 
@@ -36,8 +38,8 @@ def post(width_mm, phase, step=5e-3, range_mm=20_000.0):
     r, c = row.ravel()[hit], column.ravel()[hit]
     piece = np.where(low[hit], -1, 0)
     piece[~low[hit] & (r % 7 > 0)] = -1  # found as flat in few rows only
-    own = rays.fitted(p[hit], r, c)
-    return ends.ends_of(p[hit], r, c, piece, plane, 2.0, own)
+    own = scanner_rays.fitted(p[hit], r, c)
+    return edges.ends_of(p[hit], r, c, piece, plane, 2.0, own)
 
 
 def test_ends_of_a_post_are_without_bias_whatever_the_rays_met_of_it():
@@ -57,7 +59,7 @@ def matches(share, gap, scan_row=None):
     n = len(share)
     zeros = np.zeros(n, np.int64)
     width = np.full(n, 60.0)
-    return bounding.Matches(
+    return edge_constraints.Matches(
         zeros, zeros if scan_row is None else scan_row, np.zeros((n, 3)), share * width, width,
         np.tile([0.0, 1.0, 0.0], (n, 1)), gap, zeros,
     )  # fmt: skip
@@ -66,12 +68,12 @@ def matches(share, gap, scan_row=None):
 def test_ends_in_one_gap_tell_no_more_than_one_others_as_many_as_they_are():
     """200 ends of a post share one place in one gap: the variance of their mean is that of one end, w^2 / 12."""
     rng = np.random.default_rng(0)
-    post_ends = bounding.variance(matches(0.3 + rng.normal(0.0, 0.005, 200), np.zeros(200, np.int64)))
+    post_ends = edge_constraints.variance(matches(0.3 + rng.normal(0.0, 0.005, 200), np.zeros(200, np.int64)))
     assert 1.0 / (1.0 / post_ends).sum() > 0.98 * 60.0**2 / 12.0
     anywhere = (0.618034 * np.arange(200)) % 1.0 - 0.5
-    slanting = bounding.variance(matches(anywhere, np.arange(200)))
+    slanting = edge_constraints.variance(matches(anywhere, np.arange(200)))
     np.testing.assert_allclose(slanting, 60.0**2 / 12.0)
-    steep = bounding.variance(matches(np.linspace(-0.5, 0.5, 200), np.zeros(200, np.int64)))
+    steep = edge_constraints.variance(matches(np.linspace(-0.5, 0.5, 200), np.zeros(200, np.int64)))
     np.testing.assert_allclose(1.0 / (1.0 / steep).sum(), 60.0**2 / 12.0 / 200, rtol=0.3)
 
 
@@ -82,7 +84,7 @@ def test_ends_of_an_edge_in_step_with_the_grid_by_moving_the_edge():
     for share in (np.full(40, 0.2), np.tile([-0.4, 0.1], 20), 0.1 * rng.standard_normal(40) - 0.2, np.array([0.37])):
         moved = (share[None] - moves[:, None] + 0.5) % 1.0 - 0.5
         want = np.mean(moved.mean(axis=1) ** 2) * len(share)
-        found = bounding.in_step(share, np.zeros(len(share), np.int64))
+        found = edge_constraints.in_step(share, np.zeros(len(share), np.int64))
         np.testing.assert_allclose(found, max(want, 1.0 / 12.0), rtol=0.08)  # 16 harmonics, of which two in step have 8
 
 
@@ -103,7 +105,7 @@ def test_far_edges_of_a_face_seen_at_a_slant_are_without_bias():
             np.ones(1), np.array([[0.0, 0.0, -height]]), np.array([[0.0, 0.0, 1.0]]), np.ones((1, 3)), np.eye(3)[None]
         )
         r, c = row.ravel()[keep], column.ravel()[keep]
-        found = ends.ends_of(p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, rays.fitted(p[keep], r, c))
+        found = edges.ends_of(p[keep], r, c, np.where(hit[keep], 0, -1), plane, 2.0, scanner_rays.fitted(p[keep], r, c))
         far = (found.across[:, 0] > 0.0) & (np.abs(found.across[:, 1]) < 0.5 * found.across[:, 0])
         assert far.sum() >= 40
         off += (found.points[far, 0] - edge).tolist()
@@ -114,7 +116,7 @@ def test_far_edges_of_a_face_seen_at_a_slant_are_without_bias():
 
 def test_points_beside_the_next_face_are_left_out():
     """A box corner: the front 5 m ahead ends at y = 0, and its side runs away from there."""
-    from processor.stitching import borders
+    from processor.stitching.planes import borders
 
     y = np.linspace(-500.0, 200.0, 15) + 3.0
     front = np.stack([np.full(15, 5000.0), y, np.zeros(15)], axis=1)

@@ -3,8 +3,9 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from processor.stitching import grouping, near
-from processor.stitching.elements import Elements
+from processor.stitching.coarse import face_index
+from processor.stitching.planes import hashing
+from processor.stitching.planes.samples import Elements
 
 
 def test_keys_are_numbered_as_numpy_does():
@@ -16,22 +17,22 @@ def test_keys_are_numbered_as_numpy_does():
         np.empty(0, np.int64),
     ):
         want, first, number = np.unique(keys, return_index=True, return_inverse=True)
-        got_first, got = grouping.numbered(keys)
+        got_first, got = hashing.numbered(keys)
         np.testing.assert_array_equal(got_first, first)
         np.testing.assert_array_equal(got, number.ravel())
-        assert grouping.distinct_count(keys) == len(want)
+        assert hashing.distinct_count(keys) == len(want)
 
 
 def test_sums_by_group_are_those_of_a_matrix():
     rng = np.random.default_rng(2)
     points, group = rng.normal(size=(300, 3)), rng.integers(0, 9, 300)
     member = (group == np.arange(9)[:, None]).astype(float)
-    np.testing.assert_allclose(grouping.summed(points, group, 9), member @ points)
+    np.testing.assert_allclose(hashing.summed(points, group, 9), member @ points)
     x = np.hstack([points, np.ones((300, 1))])
     want = [[(x[group == g, i] * x[group == g, j]).sum() for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2),
                                                                      (0, 3), (1, 3), (2, 3), (3, 3))]
             for g in range(9)]  # fmt: skip
-    np.testing.assert_allclose(grouping.sums_of_points(points, group, 9), want)
+    np.testing.assert_allclose(hashing.sums_of_points(points, group, 9), want)
 
 
 def faces(rng, n, spread):
@@ -48,17 +49,19 @@ def test_near_faces_are_those_of_all_distances():
     d = np.linalg.norm(x[:, None] - there.points, axis=2)
     off = np.abs(np.einsum("kni,ni->kn", x[:, None] - there.points, there.normals))
     like = n @ there.normals.T
-    nearest = np.argsort(d, axis=1)[:, : near.KEPT]
+    nearest = np.argsort(d, axis=1)[:, : face_index.KEPT]
     fits = (d < 1.4) & (off < 0.6) & (like > 0.2)
     want = np.take_along_axis(fits, nearest, axis=1).any(axis=1)
     got = np.empty(600, np.bool_)
-    near.agreeing(near.of_faces(there, 1.5), T, asked.points, asked.normals, 1.4, 0.6, 0.2, got)
+    face_index.agreeing(face_index.of_faces(there, 1.5), T, asked.points, asked.normals, 1.4, 0.6, 0.2, got)
     np.testing.assert_array_equal(got, want)
     assert 20 < want.sum() < 580
 
     weight = rng.uniform(0.5, 2.0, 600)
-    small, large = near.of_faces(there, 0.5), near.of_faces(there, 1.5)
-    H, g, centre, reach, count = near.equations(small, large, T, asked.points, asked.normals, weight, 1.2, 0.5, 0.1)
+    small, large = face_index.of_faces(there, 0.5), face_index.of_faces(there, 1.5)
+    H, g, centre, reach, count = face_index.equations(
+        small, large, T, asked.points, asked.normals, weight, 1.2, 0.5, 0.1
+    )
     one = nearest[:, 0]
     rows = np.arange(600)
     kept = (d[rows, one] < 1.2) & (off[rows, one] < 0.5) & (like[rows, one] > 0.1)

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from processor import folder
 from processor.model import InputError, Picks, Scan, Scene
-from processor.steps import stitch
+from processor.scan_folder import folder
+from processor.stitching import step as stitching_step
 from processor.stitching import three_point
 from tests.stitch_clouds import pose
 
@@ -88,7 +88,7 @@ def test_a_chain_of_all_scans_with_picks_of_5_mm():
     errors, pulls = [], []
     for seed in range(20):
         T, scene = network(seed, 5.0)
-        result = stitch.run(scene, stitch.Params(method="three-point"))
+        result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
         assert result.status in ("ok", "partial")  # partial where luck leaves a scan weak
         assert "failed" not in result.scan_status
         want = np.linalg.inv(T[0]) @ T
@@ -108,7 +108,7 @@ def _places(scene):
 
 def test_exact_picks_give_exact_poses_and_close_the_loop():
     T, scene = network(1, 0.0)
-    result = stitch.run(scene, stitch.Params(method="three-point"))
+    result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
     np.testing.assert_allclose(result.T_project_scan, np.linalg.inv(T[0]) @ T, atol=1e-6)
     assert result.closure_mm[0] < 1e-6
     assert sorted(result.loops[0].split(" > ")[1:]) == ["S1", "S2", "S3", "S4", "S5"]
@@ -116,7 +116,7 @@ def test_exact_picks_give_exact_poses_and_close_the_loop():
 
 def test_a_scan_in_other_units_is_told():
     _, scene = network(2, 1.0, scale=0.001)
-    result = stitch.run(scene, stitch.Params(method="three-point"))
+    result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
     assert "units mixed up (m and mm)" in result.message
 
 
@@ -164,7 +164,7 @@ def test_picks_start_a_pair_that_nothing_else_brings_together():
     in_a = in_b @ want[:3, :3].T + want[:3, 3] + 4.0
     picks = Picks(("S1",) * 3, ("S2",) * 3, ("P", "Q", "R"), in_a, in_b)
     scene = dataclasses.replace(Scene("room", "structure", scans[:2]), picks=picks)
-    result = stitch.run(scene, stitch.Params())
+    result = stitching_step.run(scene, stitching_step.Params())
     assert np.linalg.norm(result.T_project_scan[1][:3, 3] - want[:3, 3]) < 0.5
 
 
@@ -174,7 +174,7 @@ def test_three_points_a_pair_state_what_they_scatter_by(scale):
     inside = []
     for seed in range(40):
         T, scene = network(seed, 5.0, points=3)
-        result = stitch.run(scene, stitch.Params(method="three-point", scale=scale))
+        result = stitching_step.run(scene, stitching_step.Params(method="three-point", scale=scale))
         want = np.linalg.inv(T[0]) @ T
         for s in range(1, len(T)):
             place = [*_places(scene)[s], 1.0]
@@ -187,9 +187,9 @@ def test_a_pair_with_a_blunder_does_not_make_the_others_unsure():
     T, scene = network(3, 2.0)
     in_a = scene.picks.in_a.copy()
     in_a[0] += 4000.0
-    result = stitch.run(dataclasses.replace(scene, picks=dataclasses.replace(scene.picks, in_a=in_a)),
-                        stitch.Params(method="three-point"))  # fmt: skip
-    clean = stitch.run(scene, stitch.Params(method="three-point"))
+    result = stitching_step.run(dataclasses.replace(scene, picks=dataclasses.replace(scene.picks, in_a=in_a)),
+                        stitching_step.Params(method="three-point"))  # fmt: skip
+    clean = stitching_step.run(scene, stitching_step.Params(method="three-point"))
     assert "blunder" in result.message
     assert np.nanmax(result.position_sd) < 3.0 * np.nanmax(clean.position_sd)
     want = np.linalg.inv(T[0]) @ T
@@ -202,8 +202,8 @@ def test_a_scale_of_one_is_not_called_another(points):
     said = [
         message
         for seed in range(40)
-        for message in stitch.run(
-            network(seed, 5.0, points=points)[1], stitch.Params(method="three-point")
+        for message in stitching_step.run(
+            network(seed, 5.0, points=points)[1], stitching_step.Params(method="three-point")
         ).pair_message
     ]
     assert sum("scale" in one for one in said) <= 0.02 * len(said)
@@ -219,7 +219,9 @@ def test_one_pair_alone_needs_more_to_doubt_its_scale():
 def test_a_scale_that_is_one_is_found_and_its_interval_holds():
     inside, named = [], []
     for seed in range(30):
-        result = stitch.run(network(seed, 2.0, scale=1.0 / 1.004)[1], stitch.Params(method="three-point"))
+        result = stitching_step.run(
+            network(seed, 2.0, scale=1.0 / 1.004)[1], stitching_step.Params(method="three-point")
+        )
         inside += (np.abs(result.scale - 1.004) < 1.96 * result.scale_sd).tolist()
         named += ["scale 1.004" in one or "scale 1.003" in one for one in result.pair_message]
     assert 0.88 < np.mean(inside) < 0.99
@@ -235,7 +237,7 @@ def test_a_scan_that_cannot_be_placed_says_what_it_lacks():
     few = Picks(*([getattr(picks, name)[i] for i in rows] for name in ("scan_a", "scan_b", "points", "in_a", "in_b")))
     lone = Scan("S6", scene.scans[0].points)
     scene = dataclasses.replace(scene, scans=(*scene.scans, lone), picks=few)
-    result = stitch.run(scene, stitch.Params(method="three-point"))
+    result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
     assert result.scan_status[4:] == ("failed", "failed")
     assert result.scan_message[4] == (
         "1 common points with S1, 2 common points with S4, three that span a plane are needed"

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from processor.geometry import rigid
-from processor.stitching import coarse, placing
+from processor.stitching.coarse import network, pairwise
 
 
 def test_a_pose_is_worth_what_the_best_of_its_versions_is(monkeypatch):
@@ -18,17 +18,17 @@ def test_a_pose_is_worth_what_the_best_of_its_versions_is(monkeypatch):
 
     def held(views, T, i, j, pose, asked):
         against = 10.0 if apart(pose, turned) < 1.0 else 0.05 * apart(pose, right)
-        return coarse.Placing(pose, 600.0, against, 0.4)
+        return pairwise.Placing(pose, 600.0, against, 0.4)
 
-    monkeypatch.setattr(placing, "held", held)
-    monkeypatch.setattr(coarse, "same", lambda T, S, side, b: apart(T, S) < 500.0)
+    monkeypatch.setattr(network, "held", held)
+    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: apart(T, S) < 500.0)
     candidates = {
-        (0, 2): [coarse.Placing(near, 1.0, 0.0, 0.4), coarse.Placing(turned, 0.9, 0.0, 0.4)],
-        (1, 2): [coarse.Placing(right, 1.0, 0.0, 0.4), coarse.Placing(turned, 0.9, 0.0, 0.4)],
+        (0, 2): [pairwise.Placing(near, 1.0, 0.0, 0.4), pairwise.Placing(turned, 0.9, 0.0, 0.4)],
+        (1, 2): [pairwise.Placing(right, 1.0, 0.0, 0.4), pairwise.Placing(turned, 0.9, 0.0, 0.4)],
     }
-    assert placing.together([], np.zeros(0), [0], 2, near, {}) < placing.together([], np.zeros(0), [0], 2, turned, {})
+    assert network.together([], np.zeros(0), [0], 2, near, {}) < network.together([], np.zeros(0), [0], 2, turned, {})
     views = [SimpleNamespace(side_mm=700.0)] * 3
-    ranked = placing.ranking(views, candidates, np.tile(np.eye(4), (3, 1, 1)), [0, 1], 2, {})
+    ranked = network.ranking(views, candidates, np.tile(np.eye(4), (3, 1, 1)), [0, 1], 2, {})
     np.testing.assert_array_equal(ranked[0][1], right)
     np.testing.assert_array_equal(ranked[1][1], turned)
     assert ranked[0][0] > 0.9 > 0.1 > ranked[1][0]
@@ -37,11 +37,11 @@ def test_a_pose_is_worth_what_the_best_of_its_versions_is(monkeypatch):
 def test_a_pose_that_rests_on_one_scan_is_refuted_by_what_was_looked_through():
     """A bridge turned end for end: much agrees, and a few faces stand where the other scanner saw through."""
     T = np.eye(4)
-    right, turned, apart = (coarse.Placing(T, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
-    np.testing.assert_array_equal(placing.refuted({(0, 1): right}, 2, 0), [0.0, 0.0])
-    np.testing.assert_allclose(placing.refuted({(0, 1): turned}, 2, 0), [0.0, 1.1 / 50.0])
+    right, turned, apart = (pairwise.Placing(T, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
+    np.testing.assert_array_equal(network.refuted({(0, 1): right}, 2, 0), [0.0, 0.0])
+    np.testing.assert_allclose(network.refuted({(0, 1): turned}, 2, 0), [0.0, 1.1 / 50.0])
     # Two scans that tell the same would have to be wrong together; one that shares next to nothing tells nothing.
     both = {(0, 1): right, (0, 2): turned, (1, 2): turned}
-    np.testing.assert_array_equal(placing.refuted(both, 3, 0), [0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(network.refuted(both, 3, 0), [0.0, 0.0, 0.0])
     alone = {(0, 1): right, (0, 2): turned, (1, 2): apart}
-    np.testing.assert_allclose(placing.refuted(alone, 3, 0), [0.0, 2.02 / 50.0, 3.1 / 50.0])
+    np.testing.assert_allclose(network.refuted(alone, 3, 0), [0.0, 2.02 / 50.0, 3.1 / 50.0])

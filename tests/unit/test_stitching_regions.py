@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 
 from processor.model import Scene
-from processor.steps import stitch
+from processor.stitching import step as stitching_step
 from tests.stitch_clouds import four
 
 
@@ -20,7 +20,9 @@ def test_scans_that_are_bent_are_not_called_sure():
     T, scans = four(3, step_mrad=20.0)
     want = np.linalg.inv(T[0]) @ T
     crooked = (scans[0], *(bent(scan, 8.0) for scan in scans[1:]))
-    good, bad = (stitch.run(Scene("room", "structure", one), stitch.Params()) for one in (scans, crooked))
+    good, bad = (
+        stitching_step.run(Scene("room", "structure", one), stitching_step.Params()) for one in (scans, crooked)
+    )
     off = np.linalg.norm(bad.T_project_scan[1:, :3, 3] - want[1:, :3, 3], axis=1)
     assert off.max() > 0.5  # far more than the noise makes
     assert (bad.position_sd[1:].max(axis=1) > 2.0 * good.position_sd[1:].max(axis=1)).all()
@@ -35,7 +37,7 @@ def test_a_board_that_stood_elsewhere_during_one_scan_does_not_pull_it():
     assert board.sum() > 400
     points = (inside + np.where(board, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0] - T[2][:3, 3]) @ T[2][:3, :3]
     moved = (*scans[:2], dataclasses.replace(scans[2], points=points), scans[3])
-    result = stitch.run(Scene("room", "structure", moved), stitch.Params())
+    result = stitching_step.run(Scene("room", "structure", moved), stitching_step.Params())
     want = np.linalg.inv(T[0]) @ T
     off = np.abs(result.T_project_scan[1:, :3, 3] - want[1:, :3, 3])
     assert (off < 4.0 * result.position_sd[1:]).all()
@@ -48,7 +50,7 @@ def test_a_near_wall_that_moved_during_one_scan_is_told_by_the_faces_that_it_ove
     inside = scans[2].points @ T[2][:3, :3].T + T[2][:3, 3]
     moved = inside + np.where(inside[:, 0] > 6900.0, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
     wrong = dataclasses.replace(scans[2], points=(moved - T[2][:3, 3]) @ T[2][:3, :3])
-    result = stitch.run(Scene("room", "structure", (*scans[:2], wrong, scans[3])), stitch.Params())
+    result = stitching_step.run(Scene("room", "structure", (*scans[:2], wrong, scans[3])), stitching_step.Params())
     off = np.linalg.inv(T[0]) @ T - result.T_project_scan
     assert np.abs(off[2, :3, 3]).max() > 1.0  # or there would be nothing to say
     assert result.scan_status == ("ok", "ok", "weak", "ok")

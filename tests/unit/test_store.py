@@ -10,7 +10,6 @@ import h5py
 import numpy as np
 import pytest
 
-from processor import store
 from processor.model import (
     ArchDesign,
     ArchTruth,
@@ -28,7 +27,8 @@ from processor.model import (
     column,
     names,
 )
-from processor.steps import spheres
+from processor.space_frame import step as space_frame_step
+from processor.store import store
 
 HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm
 
@@ -290,15 +290,24 @@ def test_results_come_back(tmp_path):
     path = tmp_path / "results.h5"
     inner = Inner(("a", "", "长"), [[1, 2], [3, np.nan], [5, 6]])
     outer = Outer("ok", False, -(2**40), inner, None, (inner, Inner()), float("-inf"))
-    balls = spheres.Result("partial", "ransac", "two lines\nof text", [1], np.ones((1, 3)), [75.0], evidence=["ball"],
-                           flag=["ok"], reason=[""])  # fmt: skip
+    balls = space_frame_step.Result(
+        "partial",
+        "ransac",
+        "two lines\nof text",
+        [1],
+        np.ones((1, 3)),
+        [75.0],
+        evidence=["ball"],
+        flag=["ok"],
+        reason=[""],
+    )
     runs = (StepRun("outer", "m", json.dumps({"seed": 1}), outer), StepRun("spheres", "ransac", "{}", balls))
-    classes = {"spheres": spheres.Result, "outer": Outer}
+    classes = {"spheres": space_frame_step.Result, "outer": Outer}
     store.write_results(path, runs, {})
     assert same(store.read_results(path, classes), runs)
     assert store.problems(path) == []
     with pytest.raises(InputError, match="unknown step 'outer'"):
-        store.read_results(path, {"spheres": spheres.Result})
+        store.read_results(path, {"spheres": space_frame_step.Result})
     with pytest.raises(InputError, match=r"0001/result.*(missing|unknown)"):
         store.read_results(path, {"spheres": Outer, "outer": Outer})
 
@@ -308,7 +317,9 @@ def test_results_come_back(tmp_path):
 
 def test_an_error_while_writing_leaves_the_old_file(written, monkeypatch):
     before = written.read_bytes()
-    monkeypatch.setattr("processor.codec.write_array", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left")))
+    monkeypatch.setattr(
+        "processor.store.codec.write_array", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left"))
+    )
     with pytest.raises(InputError, match=r"cannot be written .*No space left"):
         store.write_scene(written, *a_scene(100), {})
     assert written.read_bytes() == before

@@ -3,9 +3,10 @@
 import numpy as np
 import pytest
 
-from designgen import damage, recipes
+from designgen import recipes
+from designgen.asbuilt import defects
 from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
-from designgen.scene import make
+from designgen.scenes.make import make
 
 
 def corners_of(patches):
@@ -50,8 +51,8 @@ def test_a_hole_takes_its_volume_from_the_plate():
     row = plate_row.Params(components=("crack",))
     (place,) = plate_row.places(row)
     for kind in ("crack", "edge-loss", "missing-part"):
-        defect = damage.draw(kind, damage.Params(), row, np.random.default_rng(2))
-        patches = damage.damaged(place, plate_row.bodies(row, place), defect)
+        defect = defects.draw(kind, defects.Params(), row, np.random.default_rng(2))
+        patches = defects.damaged(place, plate_row.bodies(row, place), defect)
         assert signed_volume(patches, place.origin) == pytest.approx(1000.0 * 1000.0 * 12.0 - defect.volume_mm3)
 
 
@@ -90,7 +91,7 @@ def test_no_point_of_the_truth_lies_inside_a_tube():
     tubes = [body for one in components for body in one.bodies]
     deepest = np.max([inside_by(tube, points) for tube in tubes], axis=0)
     np.testing.assert_allclose(deepest, 0.0, atol=1e-6)
-    np.testing.assert_allclose(moved, damage.movement(damage.MovementParams(), components)(points), atol=1e-9)
+    np.testing.assert_allclose(moved, defects.movement(defects.MovementParams(), components)(points), atol=1e-9)
     asked = sum(8 * max(2, int(np.linalg.norm(tube.end - tube.start) / 250.0)) for tube in tubes)
     assert 0.9 * asked < len(points) < asked
     chord = tubes[0]

@@ -13,13 +13,16 @@ from click.testing import CliRunner
 from designgen import cli as designgen_cli
 from designgen import recipes
 from designgen.designs import arch_bridge
-from designgen.scene import make as make_scene
-from processor import folder, store
-from processor.geometry import rigid
+from designgen.scenes.make import make as make_scene
+from processor.evaluation import preassembly as preassembly_evaluation
+from processor.geometry import box_girder, rigid
 from processor.model import InputError, UsageError
-from processor.preassembly import layers, measuring, surrogate
-from processor.preassembly.systematic import SystematicParams
-from processor.steps import preassemble
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.ends import plate_sides
+from processor.preassembly.parts import measure
+from processor.preassembly.parts.systematic_errors import SystematicParams
+from processor.scan_folder import folder
+from processor.store import store
 
 SKEWED = ["bridge.joints=[0.19, 0.38, 0.62, 0.81]"]
 
@@ -32,7 +35,7 @@ def surrogate_of(parts_, i, **options):
     part = parts_[i]
     start = part.key_points(part.s0) if i > 0 else None
     end = part.key_points(part.s1) if i < 4 else None
-    return surrogate.mesh(*part.bottom_edges(), start, end, **options)
+    return box_girder.mesh(*part.bottom_edges(), start, end, **options)
 
 
 def sections(part, count=400):
@@ -104,7 +107,7 @@ def test_a_height_between_two_joints_is_linear():
     for x, h in ((0.0, 800.0), (4000.0, 1200.0)):
         corners = np.array([[x, 400.0, 0], [x, -400.0, 0], [x, -400.0, h], [x, 400.0, h]])
         ends.append(np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))]))
-    vertices, faces = surrogate.mesh(edge, edge * [1, -1, 1], *ends)
+    vertices, faces = box_girder.mesh(edge, edge * [1, -1, 1], *ends)
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert off(mesh, np.array([[1000.0, 0.0, 900.0], [3000.0, 100.0, 1100.0], [2000.0, 400.0, 990.0]])).max() < 1e-6
 
@@ -113,11 +116,11 @@ def test_edges_and_joints_that_do_not_belong_together():
     rib = parts()[1]
     edges, start, end = rib.bottom_edges(), rib.key_points(rib.s0), rib.key_points(rib.s1)
     with pytest.raises(InputError, match=r"end at P1 and P2 of the joint there, found them \d+ mm away"):
-        surrogate.mesh(*edges, start, start)
+        box_girder.mesh(*edges, start, start)
     with pytest.raises(InputError, match="above P2 and P1"):
-        surrogate.mesh(*edges[::-1], start[[1, 0, 3, 2, 4, 7, 6, 5]], end[[1, 0, 3, 2, 4, 7, 6, 5]])
+        box_girder.mesh(*edges[::-1], start[[1, 0, 3, 2, 4, 7, 6, 5]], end[[1, 0, 3, 2, 4, 7, 6, 5]])
     with pytest.raises(InputError, match="a joint at one end"):
-        surrogate.mesh(*edges, None, None)
+        box_girder.mesh(*edges, None, None)
 
 
 # --- through a folder ------------------------------------------------------------------------------------------------
@@ -151,8 +154,8 @@ def test_a_folder_without_meshes_comes_back(tmp_path):
         low, high = ours.vertices.min(axis=0), ours.vertices.max(axis=0)
         assert (theirs.vertices > low - 50.0).all()
         assert (theirs.vertices < high + 50.0).all()
-        assert surrogate.cost(theirs)
-        assert not surrogate.cost(ours)
+        assert box_girder.cost(theirs)
+        assert not box_girder.cost(ours)
     store.write_scene(tmp_path / "again.h5", back, None, {})
     assert [part.source for part in store.read_scene(tmp_path / "again.h5").arch.parts] == ["curves"] * 5
 
@@ -175,12 +178,12 @@ def test_a_thickness_in_the_design_is_used(tmp_path):
 
 
 def test_only_an_arch_bridge_goes_without_meshes(tmp_path):
-    from designgen import scan_folder
+    from designgen.export import folder as export_folder
 
     scene, truth = make_scene("f", recipes.load("frame-small")[1], 1)
     store.write_scene(tmp_path / "f.h5", scene, truth, {})
     with pytest.raises(UsageError, match="only an arch bridge"):
-        scan_folder.export(tmp_path / "f.h5", tmp_path / "out", "ply", with_truth=True, with_meshes=False)
+        export_folder.export(tmp_path / "f.h5", tmp_path / "out", "ply", with_truth=True, with_meshes=False)
 
 
 # --- what comes of it ------------------------------------------------------------------------------------------------
@@ -198,8 +201,8 @@ def without_meshes(tmp_path_factory):
 @pytest.mark.slow
 def test_ends_are_measured_as_with_meshes(without_meshes):
     scene, truth = without_meshes
-    result = preassemble.run(scene, preassemble.Params(seed=1))
-    checks = {metric.name: metric.value for metric in preassemble.check(scene, result, truth)}
+    result = preassembly_step.run(scene, preassembly_step.Params(seed=1))
+    checks = {metric.name: metric.value for metric in preassembly_evaluation.check(scene, result, truth)}
     assert checks["wrong poses called ok"] == 0.0
     status = dict(zip(result.components, result.component_status, strict=True))
     assert all(status[name] == "ok" for name in ("foot1", "rib1", "rib3", "foot2")), result.component_message
@@ -214,11 +217,11 @@ def test_ends_are_measured_as_with_meshes(without_meshes):
 
 def test_parts_of_one_shape_are_named():
     scene, _ = made(["scan.spacing_mm=200"])
-    assert [surrogate.alike(part, scene.arch) for part in scene.arch.parts] == [
+    assert [box_girder.alike(part, scene.arch) for part in scene.arch.parts] == [
         ("foot2",), ("rib3",), (), ("rib1",), ("foot1",)
     ]  # fmt: skip
     scene, _ = made(["scan.spacing_mm=200", "bridge.joints=[0.18, 0.38, 0.63, 0.81]"])
-    assert [surrogate.alike(part, scene.arch) for part in scene.arch.parts] == [()] * 5
+    assert [box_girder.alike(part, scene.arch) for part in scene.arch.parts] == [()] * 5
 
 
 @pytest.mark.slow
@@ -226,7 +229,7 @@ def test_a_wrong_part_is_not_called_ok(without_meshes):
     scene, _ = without_meshes
     scans = {scan.component: scan for scan in scene.scans}
     for asked, came in ((1, "rib2"), (2, "rib1"), (0, "rib3")):
-        found = measuring.measure([scans[came]], asked, scene.arch, 1.0, SystematicParams())
+        found = measure.measure([scans[came]], asked, scene.arch, 1.0, SystematicParams())
         assert found.status != "ok", (asked, came, found.message)
 
 
@@ -238,7 +241,7 @@ def test_poses_of_any_kind_are_right_or_not_called_ok(without_meshes):
         R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         turn = rigid.transform(R * np.linalg.det(R), rng.uniform(-1e4, 1e4, 3))
         scan = dataclasses.replace(scene.scans[i], points=rigid.apply(turn, scene.scans[i].points))
-        found = measuring.measure([scan], i, scene.arch, 1.0, SystematicParams())
+        found = measure.measure([scan], i, scene.arch, 1.0, SystematicParams())
         back = found.T_bridge_scan @ turn @ rigid.invert(truth.arch.T_bridge_scan[i])
         assert found.status == "ambiguous" or rigid.rotation_angle(back[:3, :3]) < 0.002
 
@@ -250,12 +253,14 @@ def test_the_outer_layer():
     rng = np.random.default_rng(2)
     outside, inside = rng.normal(1.5, 1.0, 3000), rng.normal(-22.0, 1.0, 2800)
     out = np.concatenate([outside, inside, rng.uniform(-50.0, 50.0, 60)])
-    kept = layers.outer(out)
+    kept = plate_sides.outer(out)
     assert kept[:3000].all()
     assert not kept[3000:5800].any()
-    assert layers.outer(outside).all()
-    assert layers.outer(np.concatenate([outside, rng.uniform(-50.0, 50.0, 60)])).all()  # strays are left to the fit
-    assert layers.outer(np.empty(0)).shape == (0,)
+    assert plate_sides.outer(outside).all()
+    assert plate_sides.outer(
+        np.concatenate([outside, rng.uniform(-50.0, 50.0, 60)])
+    ).all()  # strays are left to the fit
+    assert plate_sides.outer(np.empty(0)).shape == (0,)
 
 
 @pytest.mark.parametrize("walls", [True, False])
@@ -265,5 +270,5 @@ def test_a_plates_thickness(true_mm, walls):
     ring = np.stack([np.zeros(2000), rng.uniform(0.0, true_mm, 2000)], axis=1)
     deep = np.stack([rng.uniform(-80.0, 0.0, 4000), np.repeat([0.0, true_mm], 2000)], axis=1)[: 4000 if walls else 2000]
     x, e = (np.vstack([ring, deep]) + rng.normal(0.0, 0.8, (2000 + len(deep), 2))).T
-    assert abs(layers.plate_mm(x, e, 0.8, 20.0) - true_mm) < (0.2 if walls else 1.0)
-    assert layers.plate_mm(x[:5], e[:5], 0.8, 20.0) == 20.0  # too few to say
+    assert abs(plate_sides.plate_mm(x, e, 0.8, 20.0) - true_mm) < (0.2 if walls else 1.0)
+    assert plate_sides.plate_mm(x[:5], e[:5], 0.8, 20.0) == 20.0  # too few to say

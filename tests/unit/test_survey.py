@@ -5,8 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen import recipes, scanner, scene, sequences, structure_scene, survey
-from designgen.surfaces import Builder
+from designgen import recipes, sequences
+from designgen.scanning import scanner, survey
+from designgen.scanning.surfaces import Builder
+from designgen.scenes import make, structure
 from processor.model import UsageError
 
 AXES = np.eye(3)
@@ -29,9 +31,9 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
         found = [survey.below(low, high, params, 3), survey.around(AXES, low, HALF, params, 3, "p/")]
         for name in ("stadium-roof", "truss-bridge", "plates-defects"):
             recipe = recipes.load(name)[1]
-            components = structure_scene.design(recipe)
-            patches, _, _ = structure_scene.BUILDERS[recipe["structure"]["type"]](components, recipe, 1)
-            found.append(structure_scene._places(recipe["structure"]["type"], patches, params, 3))
+            components = structure.design(recipe)
+            patches, _, _ = structure.BUILDERS[recipe["structure"]["type"]](components, recipe, 1)
+            found.append(structure._places(recipe["structure"]["type"], patches, params, 3))
         return found
 
     for few, more in zip(places(count), places(count + 1), strict=True):
@@ -88,7 +90,7 @@ def test_a_station_more_leaves_the_scans_of_the_others():
     table["asbuilt"] = {"node_movement_mm": 3.0}
 
     def made(count):
-        return scene.make("x", recipes.overridden(table, [*settings, f"scan.stations={count}"]))
+        return make.make("x", recipes.overridden(table, [*settings, f"scan.stations={count}"]))
 
     (few, few_truth), (more, more_truth) = made(3), made(4)
     assert [scan.name for scan in more.scans] == ["S1", "S2", "S3", "S4"]
@@ -115,7 +117,7 @@ def test_a_station_more_leaves_the_scans_of_the_others():
 def test_keys_that_a_kind_does_not_use_are_refused(name, setting, said):
     key = setting.partition("=")[0]
     with pytest.raises(UsageError) as refused:
-        scene.make("x", recipes.overridden(recipes.load(name)[1], [setting]))
+        make.make("x", recipes.overridden(recipes.load(name)[1], [setting]))
     assert str(refused.value).startswith(f"{key}: ")
     assert said in str(refused.value)
     assert f" {key.removeprefix('scan.')}," not in str(refused.value).partition("there are")[2] + ","
@@ -124,7 +126,7 @@ def test_keys_that_a_kind_does_not_use_are_refused(name, setting, said):
 def test_a_stadium_is_scanned_from_within():
     table = {key: value for key, value in recipes.load("stadium-roof")[1].items() if key != "scan"}
     with pytest.raises(UsageError, match=r"scan\.distance_mm: not used for kind stadium-roof"):
-        scene.make("x", recipes.overridden(table, ["scan.mode=rays", "scan.distance_mm=4000.0"]))
+        make.make("x", recipes.overridden(table, ["scan.mode=rays", "scan.distance_mm=4000.0"]))
 
 
 def poles_of(monkeypatch, name, settings):
@@ -139,7 +141,7 @@ def poles_of(monkeypatch, name, settings):
         cone(builder, part, surface, start, axis, radii, length, *rest)
 
     monkeypatch.setattr(Builder, "cone", noting)
-    made, truth = scene.make("x", recipes.overridden(recipes.load(name)[1], settings))
+    made, truth = make.make("x", recipes.overridden(recipes.load(name)[1], settings))
     return made, truth, poles
 
 

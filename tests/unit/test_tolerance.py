@@ -8,16 +8,18 @@ import math
 import numpy as np
 import pytest
 
-from processor import folder, store
-from processor.bolt_balls import blanks
+from processor.limits import standards
 from processor.model import InputError, Limit, Scan, Scene, Tolerance
-from processor.preassembly import chain_verdicts, joint_verdicts, tolerance
+from processor.preassembly.verdicts import chain, joints
+from processor.scan_folder import folder
+from processor.space_frame.spheres import quality
+from processor.store import store
 
-MEASURES = ("", *joint_verdicts.MEASURES, *chain_verdicts.MEASURES)
+MEASURES = ("", *joints.MEASURES, *chain.MEASURES)
 
 
 def limit(standard, key):
-    return tolerance.find(tolerance.load(standard), key)
+    return standards.find(standards.load(standard), key)
 
 
 def write_project(place, text):
@@ -27,8 +29,8 @@ def write_project(place, text):
 
 
 def test_every_row_says_what_it_is():
-    assert len(tolerance.standards()) >= 6
-    for name, standard in tolerance.standards().items():
+    assert len(standards.standards()) >= 6
+    for name, standard in standards.standards().items():
         keys = [row.key for row in standard.limits]
         assert len(set(keys)) == len(keys), name
         for row in standard.limits:
@@ -40,37 +42,37 @@ def test_every_row_says_what_it_is():
                 row.key
             )
             assert bool(row.of) == (not all(map(math.isnan, (row.high_ratio, row.above_mm, row.up_to_mm))))
-            low, high = tolerance.bounds(row, dict.fromkeys(("length", "thickness", "diameter", "spacing"), 1000.0))
+            low, high = standards.bounds(row, dict.fromkeys(("length", "thickness", "diameter", "spacing"), 1000.0))
             assert low < high < math.inf
             assert not (row.verified and not row.clause), "a verified row has its clause"
 
 
 def test_only_what_was_seen_in_print_is_verified():
-    seen = {(name, row.clause) for name, one in tolerance.standards().items() for row in one.limits if row.verified}
+    seen = {(name, row.clause) for name, one in standards.standards().items() for row in one.limits if row.verified}
     assert seen == {("GB 50205-2020", "11.3.6"), ("JGJ 7-2010", "6.11"), ("AWS D1.1", "7.22.9")}
 
 
 def test_numbers_by_hand():
-    assert tolerance.bounds(limit("GB 50205-2020", "misalignment_mm"), {}) == (-math.inf, 2.0)
-    assert tolerance.bounds(limit("GB 50205-2020", "groove_gap_mm"), {}) == (-1.0, 2.0)
+    assert standards.bounds(limit("GB 50205-2020", "misalignment_mm"), {}) == (-math.inf, 2.0)
+    assert standards.bounds(limit("GB 50205-2020", "groove_gap_mm"), {}) == (-1.0, 2.0)
     bow = limit("GB 50205-2020", "bow_mm")  # l/1500 and 10
-    assert tolerance.bounds(bow, {"length": 12_000.0})[1] == pytest.approx(8.0)
-    assert tolerance.bounds(bow, {"length": 30_000.0})[1] == 10.0
-    assert math.isnan(tolerance.bounds(bow, {})[1])
+    assert standards.bounds(bow, {"length": 12_000.0})[1] == pytest.approx(8.0)
+    assert standards.bounds(bow, {"length": 30_000.0})[1] == 10.0
+    assert math.isnan(standards.bounds(bow, {})[1])
     for name, expected in (("EN 1090-2", 4.0), ("EN 1090-2 class 1", 4.0), ("EN 1090-2 class 2", 3.0)):
         # At 10 m: 10000/5000 + 2 = 4 and 10000/10000 + 2 = 3.
-        bounds = tolerance.bounds(limit(name, "length_mm"), {"length": 10_000.0})
+        bounds = standards.bounds(limit(name, "length_mm"), {"length": 10_000.0})
         assert bounds == pytest.approx((-expected, expected))
     edge = limit("JTG arch rib", "misalignment_mm")  # 0.2 t and 2
-    assert tolerance.bounds(edge, {"thickness": 8.0})[1] == pytest.approx(1.6)
-    assert tolerance.bounds(edge, {"thickness": 24.0})[1] == 2.0
+    assert standards.bounds(edge, {"thickness": 8.0})[1] == pytest.approx(1.6)
+    assert standards.bounds(edge, {"thickness": 24.0})[1] == 2.0
     camber = limit("GB 50205-2020", "camber_not_specified_mm")  # +l/2000, -0
-    assert tolerance.bounds(camber, {"length": 40_000.0}) == pytest.approx((0.0, 20.0))
+    assert standards.bounds(camber, {"length": 40_000.0}) == pytest.approx((0.0, 20.0))
 
 
 def test_unknown_standard_names_those_there_are():
     with pytest.raises(InputError, match=r"'GB 50205'.*GB 50205-2020, JGJ 7-2010"):
-        tolerance.load("GB 50205")
+        standards.load("GB 50205")
 
 
 @pytest.mark.parametrize(
@@ -99,11 +101,11 @@ def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
     text = '[tolerance]\nstandard = "GB 50205-2020"\nmisalignment_mm = 1.5\ngroove_gap_mm = [-2, 3]\nroot_gap_mm = 6\n'
     scene = folder.read_input(write_project(tmp_path, text))
     found = scene.tolerance
-    own = tolerance.find(found, "misalignment_mm")
+    own = standards.find(found, "misalignment_mm")
     assert (own.high, own.verified, own.clause, own.source) == (1.5, True, "", "project.toml")
-    assert tolerance.bounds(tolerance.find(found, "groove_gap_mm"), {}) == (-2.0, 3.0)
-    assert tolerance.find(found, "span_mm").high == 5.0
-    assert len(found.limits) == len(tolerance.load("GB 50205-2020").limits)
+    assert standards.bounds(standards.find(found, "groove_gap_mm"), {}) == (-2.0, 3.0)
+    assert standards.find(found, "span_mm").high == 5.0
+    assert len(found.limits) == len(standards.load("GB 50205-2020").limits)
     assert found.root_gap_mm == 6.0
     store.write_scene(tmp_path / "s.h5", scene, None, {})
     assert store.problems(tmp_path / "s.h5") == []
@@ -115,21 +117,21 @@ def test_a_projects_own_limits_win_and_go_through_the_store(tmp_path):
 def test_limits_without_a_standard_are_all_there_is(tmp_path):
     scene = folder.read_input(write_project(tmp_path, "[tolerance]\nsplice_eccentricity_mm = 4.0\n"))
     assert [row.key for row in scene.tolerance.limits] == ["splice_eccentricity_mm"]
-    assert tolerance.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
+    assert standards.bounds(scene.tolerance.limits[0], {}) == (-math.inf, 4.0)
 
 
 def test_a_project_may_limit_what_no_standard_does(tmp_path):
-    for name in tolerance.standards():
-        assert tolerance.find(tolerance.load(name), tolerance.NODE_PLACE) is None
+    for name in standards.standards():
+        assert standards.find(standards.load(name), standards.NODE_PLACE) is None
     for text in ("", 'standard = "JGJ 7-2010"\n'):
         scene = folder.read_input(write_project(tmp_path, f"[tolerance]\n{text}node_place_mm = 15\n"))
-        own = tolerance.find(scene.tolerance, tolerance.NODE_PLACE)
+        own = standards.find(scene.tolerance, standards.NODE_PLACE)
         assert (own.high, own.verified, own.source) == (15.0, True, "project.toml")
 
 
 def test_nothing_said_is_nothing_held(tmp_path):
     assert folder.read_input(write_project(tmp_path, "[tolerance]\n")).tolerance is None
-    assert tolerance.default_for(None).standard == "GB 50205-2020"
+    assert standards.default_for(None).standard == "GB 50205-2020"
     empty = Scene("e", "structure", (Scan("s", np.eye(3)),), tolerance=Tolerance())
     store.write_scene(tmp_path / "e.h5", empty, None, {})
     assert store.read_scene(tmp_path / "e.h5").tolerance == Tolerance()
@@ -137,10 +139,10 @@ def test_nothing_said_is_nothing_held(tmp_path):
 
 def test_blanks_of_balls():
     # Half of +2/-1 up to a diameter of 120 and of +3/-1.5 above.
-    gb = tolerance.load("GB 50205-2020")
-    for limits in (gb, Tolerance(), tolerance.load("JGJ 7-2010")):
-        assert blanks.blank_tolerance(60.0, limits) == (0.5, 1.0)
-        assert blanks.blank_tolerance(60.001, limits) == (0.75, 1.5)
+    gb = standards.load("GB 50205-2020")
+    for limits in (gb, Tolerance(), standards.load("JGJ 7-2010")):
+        assert quality.blank_tolerance(60.0, limits) == (0.5, 1.0)
+        assert quality.blank_tolerance(60.001, limits) == (0.75, 1.5)
     own = Tolerance(limits=(Limit("ball_blank_diameter_small_mm", "x", low=-4.0, high=6.0, up_to_mm=120.0),))
-    assert blanks.blank_tolerance(50.0, own) == (2.0, 3.0)
-    assert blanks.blank_tolerance(75.0, own) == (0.75, 1.5)
+    assert quality.blank_tolerance(50.0, own) == (2.0, 3.0)
+    assert quality.blank_tolerance(75.0, own) == (0.75, 1.5)

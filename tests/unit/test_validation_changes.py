@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from processor.bolt_balls import single
+from processor.evaluation import space_frame
 from processor.geometry.sphere import algebraic
 from processor.model import FrameDesign, FrameTruth, Scan, Scene, Truth
-from processor.steps import spheres
+from processor.space_frame import step as space_frame_step
+from processor.space_frame.spheres import isolated
 from processor.validation import changes
 from processor.validation.aims import badness
 from processor.validation.history import Row
@@ -177,7 +178,7 @@ def balls(seed, sigma):
 
 def checks(seed, sigma):
     scene, truth = balls(seed, sigma)
-    return spheres.check(scene, spheres.run(scene, spheres.Params(method="least-squares")), truth)
+    return space_frame.check(scene, space_frame_step.run(scene, space_frame_step.Params(method="least-squares")), truth)
 
 
 def figures(night, seed, sigma, fixed, found):
@@ -203,7 +204,7 @@ def test_an_estimator_20_percent_worse_is_reported_the_first_night(earlier, monk
     undisturbed = changes.find(given, night_name(earlier - 1), {})
     assert undisturbed.changes == ()
     # An estimator that uses 1 / 1.2^2 of the points has 1.2 times the standard deviation.
-    monkeypatch.setattr(single, "algebraic", lambda points: algebraic(points[: int(len(points) / 1.44)]))
+    monkeypatch.setattr(isolated, "algebraic", lambda points: algebraic(points[: int(len(points) / 1.44)]))
     found = changes.find(given + one_night(earlier), night_name(earlier), {})
     worse = {one.name[2]: one for one in found.of("regression")}
     assert {"radii, standard deviation", "centres, standard deviation"} <= set(worse)

@@ -1,0 +1,215 @@
+"""Scans written in the formats of scanners and programs: points in the scan's own frame, its origin put back.
+
+PLY in mm, all others in metres. Intensity goes along where there is one; ``station`` numbers (from 1, 0 = unknown)
+where a merged cloud says from which scanner a point was seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processor.model import Floats, Ints, Scan, Stations, UsageError
+
+METRES = 0.001  # of a millimetre
+LAS_STEP_M = 0.0001
+FORMATS = ("ply", "las", "laz", "e57", "ptx", "pcd", "xyz")
+
+
+def station_numbers(scan: Scan) -> Ints:
+    """Return the stations' numbers (n,) of a merged cloud, (0,) of another."""
+    return scan.point_station.astype(np.int64) + 1
+
+
+def write_mesh(path: Path, vertices: Floats, faces: Ints) -> None:
+    """Write a mesh as binary PLY with coordinates as doubles, mm."""
+    _write_ply(path, {axis: vertices[:, i] for i, axis in enumerate("xyz")}, faces)
+
+
+def write_ply(path: Path, scan: Scan) -> None:
+    """Write binary PLY with coordinates as doubles, mm."""
+    columns: dict[str, Any] = {axis: scan.points[:, i] + scan.origin[i] for i, axis in enumerate("xyz")}
+    if len(scan.intensity):
+        columns["intensity"] = scan.intensity.astype(np.float32)
+    if len(scan.point_station):
+        columns["station"] = station_numbers(scan).astype(np.int32)
+    _write_ply(path, columns)
+
+
+def _write_ply(path: Path, columns: dict[str, Any], faces: Ints | None = None) -> None:
+    from plyfile import PlyData, PlyElement
+
+    count = len(columns["x"])
+    vertex = np.empty(count, dtype=[(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    for name, column in columns.items():
+        vertex[name] = column
+    elements = [PlyElement.describe(vertex, "vertex")]
+    if faces is not None:
+        face = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
+        face["vertex_indices"] = faces
+        elements.append(PlyElement.describe(face, "face"))
+    PlyData(elements, byte_order="<").write(str(path))
+
+
+def write_las(path: Path, scan: Scan) -> None:
+    """Write LAS or LAZ 1.4 in metres, to 0.0001 m; the intensity scaled to 16 bits, the station as point source."""
+    import laspy
+
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    header.scales = np.full(3, LAS_STEP_M)
+    low = scan.points.min(axis=0) if len(scan.points) else np.zeros(3)
+    header.offsets = np.floor((scan.origin + low) * METRES)
+    # The file's date would make every day's file another one.
+    header.creation_date = None
+    las = laspy.LasData(header)
+    # Steps from the offset, without a detour over large coordinates.
+    shift = scan.origin - header.offsets / METRES
+    steps = np.rint((scan.points + shift) * (METRES / LAS_STEP_M)).astype(np.int32)
+    record = laspy.ScaleAwarePointRecord.zeros(len(scan.points), header=header)
+    record.X, record.Y, record.Z = steps.T
+    if len(scan.intensity):
+        brightest = max(float(scan.intensity.max(initial=0.0)), 1e-12)
+        record.intensity = np.rint(np.clip(scan.intensity / brightest, 0.0, 1.0) * 65535.0).astype(np.uint16)
+    if len(scan.point_station):
+        record.point_source_id = station_numbers(scan).astype(np.uint16)
+    las.points = record
+    las.write(str(path))
+
+
+def write_pcd(path: Path, scan: Scan) -> None:
+    """Write binary PCD in metres, coordinates as doubles."""
+    from pypcd4.pypcd4 import Encoding, PointCloud
+
+    columns: list[Any] = [(scan.points[:, i] + scan.origin[i]) * METRES for i in range(3)]
+    names: list[str] = ["x", "y", "z"]
+    types: list[Any] = [np.float64] * 3
+    if len(scan.intensity):
+        columns.append(scan.intensity.astype(np.float32))
+        names.append("intensity")
+        types.append(np.float32)
+    if len(scan.point_station):
+        columns.append(station_numbers(scan).astype(np.int32))
+        names.append("station")
+        types.append(np.int32)
+    PointCloud.from_points(columns, names, types).save(path, Encoding.BINARY)
+
+
+def write_xyz(path: Path, scan: Scan) -> None:
+    """Write text in metres to 0.1 micrometre; with a header where there is more than coordinates."""
+    columns, names, forms = [(scan.points + scan.origin) * METRES], ["x", "y", "z"], ["%.7f"] * 3
+    if len(scan.intensity):
+        columns.append(scan.intensity[:, None])
+        names.append("intensity")
+        forms.append("%.5g")
+    if len(scan.point_station):
+        columns.append(station_numbers(scan)[:, None].astype(np.float64))
+        names.append("station")
+        forms.append("%d")
+    header = " ".join(names) if len(names) > 3 else ""
+    np.savetxt(path, np.hstack(columns), fmt=forms, header=header, comments="")
+
+
+def write_ptx(path: Path, scan: Scan, stations: Stations | None) -> None:
+    """Write PTX: a grid a station, cut to the rows and columns that have returns.
+
+    Points are in the scanner's frame, and the matrix is the scanner's pose: of a merged cloud that of each station.
+    Raises UsageError for a scan without grid numbers or poses.
+    """
+    with path.open("w", encoding="ascii", newline="\n") as file:
+        for rows, T in ptx_grids(scan, stations):
+            points = scan.points[rows] + (scan.origin - T[:3, 3])
+            _write_grid(file, scan, rows, points @ T[:3, :3], T)
+
+
+def ptx_grids(scan: Scan, stations: Stations | None) -> list[tuple[Ints, Floats]]:
+    """Return the grids as PTX has them: rows of points in the file's order, pose of the scanner in the points' frame.
+
+    Raises UsageError for a scan without grid numbers or poses.
+    """
+    if len(scan.grid_row) != len(scan.points) or (len(scan.grid_row) and scan.grid_row.min() < 0):
+        raise UsageError(f"scan {scan.name!r} was not made on a scanner's grid: it cannot be written as PTX")
+    order = np.lexsort((scan.grid_row, scan.grid_column))
+    if not len(scan.point_station):
+        return [(order, np.eye(4))]
+    if stations is None or not len(stations.T_project_station):
+        raise UsageError(f"scan {scan.name!r} has no poses of its stations: it cannot be written as PTX")
+    seen = np.unique(scan.point_station)
+    return [(order[scan.point_station[order] == k], stations.T_project_station[k]) for k in seen]
+
+
+def _write_grid(file: Any, scan: Scan, rows: Ints, points: Floats, T_frame_scanner: Floats) -> None:
+    row, column = scan.grid_row[rows], scan.grid_column[rows]
+    row, column = row - row.min(), column - column.min()
+    lines = int(row.max()) + 1
+    T = scan.T_project_scan @ T_frame_scanner if scan.T_project_scan.size else T_frame_scanner.copy()
+    T[:3, 3] *= METRES
+    number = "%.9f %.9f %.9f"
+    file.write(f"{int(column.max()) + 1}\n{lines}\n{number % tuple(T[:3, 3])}\n")
+    file.writelines(f"{number % tuple(T[:3, i])}\n" for i in range(3))
+    file.writelines(f"{number % tuple(T[:3, i])} {float(i == 3):.0f}\n" for i in range(4))  # for row vectors
+    points = points * METRES
+    bright = scan.intensity[rows] if len(scan.intensity) else np.full(len(rows), 0.5)
+    bright = bright / max(float(bright.max(initial=0.0)), 1e-12)
+    start = np.searchsorted(column, np.arange(int(column.max()) + 2))
+    empty = "0 0 0 0.500000\n"
+    for c in range(int(column.max()) + 1):
+        cells = [empty] * lines
+        for k in range(start[c], start[c + 1]):
+            x, y, z = points[k]
+            cells[row[k]] = f"{x:.7f} {y:.7f} {z:.7f} {bright[k]:.6f}\n"
+        file.writelines(cells)
+
+
+@dataclass(frozen=True)
+class Written:
+    """A file of scans, by its name; of each scan that a reader finds in it the name, and its points by their rows."""
+
+    name: str
+    scans: tuple[Scan, ...]
+    read_as: tuple[tuple[str, Scan, Ints], ...]
+
+
+def write_all(
+    folder: Path, format_: str, scans: Sequence[tuple[str, Scan]], stations: Stations | None, *, spherical: bool
+) -> list[Written]:
+    """Write scans under ``folder`` by their file stems: a file each, but E57 holds the stations of one place together.
+
+    In E57 a lone scan and scans of components have a file each as well, so that what is said of files fits them.
+    """
+    if format_ == "e57":
+        apart = len(scans) == 1 or any(scan.component for _, scan in scans)
+        groups = [(stem, [scan]) for stem, scan in scans] if apart else [("scans", [scan for _, scan in scans])]
+        return [_write_e57(folder, stem, group, spherical=spherical) for stem, group in groups]
+    if format_ == "ptx":
+        return [_write_ptx(folder, stem, scan, stations) for stem, scan in scans]
+    writers = {"ply": write_ply, "las": write_las, "laz": write_las, "pcd": write_pcd, "xyz": write_xyz}
+    written = []
+    for stem, scan in scans:
+        name = f"{stem}.{format_}"
+        writers[format_](folder / name, scan)
+        written.append(Written(name, (scan,), ((stem, scan, _all_rows(scan)),)))
+    return written
+
+
+def _all_rows(scan: Scan) -> Ints:
+    return np.arange(len(scan.points))
+
+
+def _write_e57(folder: Path, stem: str, scans: Sequence[Scan], *, spherical: bool) -> Written:
+    from designgen.export import e57
+
+    e57.write(folder / f"{stem}.e57", scans, spherical=spherical)
+    names = [stem] if len(scans) == 1 else e57.names_read(stem, scans)
+    read_as = tuple((name, scan, _all_rows(scan)) for name, scan in zip(names, scans, strict=True))
+    return Written(f"{stem}.e57", tuple(scans), read_as)
+
+
+def _write_ptx(folder: Path, stem: str, scan: Scan, stations: Stations | None) -> Written:
+    write_ptx(folder / f"{stem}.ptx", scan, stations)
+    grids = [rows for rows, _ in ptx_grids(scan, stations)]
+    names = [stem] if len(grids) == 1 else [f"{stem}-{i + 1}" for i in range(len(grids))]
+    return Written(f"{stem}.ptx", (scan,), tuple((n, scan, rows) for n, rows in zip(names, grids, strict=True)))

@@ -1,0 +1,71 @@
+"""How a recipe's scene is scanned: by rays of a device from stations, or sampled from its surfaces."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from designgen.reading import filled
+from designgen.scanning import sampler, scanner
+from processor.model import UsageError
+
+
+@dataclass(frozen=True)
+class ByRays:
+    """Scans by rays of a device."""
+
+    params: scanner.Params
+    device: scanner.Scanner
+
+
+Scanning = sampler.Params | ByRays
+
+# Keys of [scan] that not every kind of scene uses, and the kinds that do.
+OF_SOME_KINDS = {
+    "inner_depth_mm": ("arch-bridge",),
+    "member_reach_mm": ("space-frame",),
+    "distance_mm": ("arch-bridge", "structure"),
+    "height_mm": ("space-frame", "structure"),
+    "registered": ("structure",),
+    "repeated": ("structure",),
+    "scans_at_first": ("structure",),
+    "merged": ("space-frame", "structure"),
+    "origin_mm": ("space-frame", "structure"),
+}
+# And those that a type of structure does not use: a stadium is scanned from within.
+NOT_OF_TYPES = {"stadium-roof": ("distance_mm",)}
+
+
+def read(recipe: Mapping[str, Any]) -> Scanning:
+    """Read the sections ``scan`` and ``scanner``. Raises UsageError that names the key for what cannot be."""
+    table = recipe.get("scan", {})
+    mode = table.get("mode", sampler.MODE) if isinstance(table, Mapping) else sampler.MODE
+    if mode not in (sampler.MODE, scanner.MODE):
+        raise UsageError(f"scan.mode: expected {sampler.MODE} or {scanner.MODE}, got {mode!r}")
+    if mode == sampler.MODE:
+        if "scanner" in recipe:
+            raise UsageError(f"scanner: there is a scanner only with scan.mode = {scanner.MODE!r}")
+        sampled = filled(sampler.Params, recipe, "scan")
+        _check_used(recipe, sampler.Params)
+        return sampled
+    params = filled(scanner.Params, recipe, "scan")
+    _check_used(recipe, scanner.Params)
+    own = recipe.get("scanner", {})
+    if not isinstance(own, Mapping):
+        raise UsageError(f"scanner: expected a section, got {own!r}")
+    return ByRays(params, filled(scanner.Scanner, {"scanner": {**scanner.preset(params.scanner), **own}}, "scanner"))
+
+
+def _check_used(recipe: Mapping[str, Any], params: type) -> None:
+    """Raise UsageError for a key of ``scan`` that scenes of the recipe's kind do not use."""
+    kind, section = recipe.get("kind"), recipe.get("structure")
+    unused = {key for key, kinds in OF_SOME_KINDS.items() if kind not in kinds}
+    if kind == "structure" and isinstance(section, Mapping) and section.get("type") in NOT_OF_TYPES:
+        kind = section["type"]
+        unused.update(NOT_OF_TYPES[kind])
+    for key in recipe.get("scan", {}):
+        if key in unused:
+            there = ", ".join(f.name for f in dataclasses.fields(params) if f.name not in unused)
+            raise UsageError(f"scan.{key}: not used for kind {kind}; there are {there}")

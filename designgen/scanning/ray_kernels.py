@@ -1,0 +1,396 @@
+"""Compiled kernels of the ray caster: shapes against rays, all in float64.
+
+Every kernel works on one strip of columns, alone, so that results do not depend on the threads. The shapes' numbers are
+those of :class:`designgen.scanning.surfaces.Builder`; a ray starts at the origin of the scanner's frame.
+"""
+# Numba infers the types of the arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+MISS = -1
+SLACK = 1e-9  # relative: two triangles that share an edge leave no gap
+FEW_ROWS = 12  # testing so many rays costs no more than finding those that may meet a triangle
+
+
+@njit(cache=True, nogil=True)
+def hit(kind, n, cuts, c0, c1, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Nearest range at which the ray d from the origin meets a shape from either side; infinite where it does not."""
+    if kind == 0:
+        d2 = dx * dx + dy * dy + dz * dz
+        b = (n[0] * dx + n[1] * dy + n[2] * dz) / d2
+        # From the foot of the perpendicular: no difference of large squares.
+        fx, fy, fz = n[0] - b * dx, n[1] - b * dy, n[2] - b * dz
+        inside = n[3] * n[3] - (fx * fx + fy * fy + fz * fz)
+        if inside < 0.0:
+            return np.inf
+        root = np.sqrt(inside / d2)
+        for sign in range(2):
+            t = b - root if sign == 0 else b + root
+            if t <= 0.0:
+                continue
+            ux, uy, uz = t * dx - n[0], t * dy - n[1], t * dz - n[2]
+            left = True
+            for c in range(c0, c1):
+                if cuts[c, 0] * ux + cuts[c, 1] * uy + cuts[c, 2] * uz > cuts[c, 3]:
+                    left = False
+                    break
+            if left:
+                return t
+        return np.inf
+    if kind == 1:
+        return hit_cone(n, dx, dy, dz)
+    if kind == 2:
+        slope = n[3] * dx + n[4] * dy + n[5] * dz
+        if slope == 0.0:
+            return np.inf
+        t = (n[3] * n[0] + n[4] * n[1] + n[5] * n[2]) / slope
+        ux, uy, uz = t * dx - n[0], t * dy - n[1], t * dz - n[2]
+        r2 = ux * ux + uy * uy + uz * uz
+        return t if t > 0.0 and n[7] * n[7] <= r2 <= n[6] * n[6] else np.inf
+    e1x, e1y, e1z = n[3] - n[0], n[4] - n[1], n[5] - n[2]
+    e2x, e2y, e2z = n[6] - n[0], n[7] - n[1], n[8] - n[2]
+    px, py, pz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
+    det = e1x * px + e1y * py + e1z * pz
+    if det == 0.0:
+        return np.inf
+    u = -(n[0] * px + n[1] * py + n[2] * pz) / det
+    if u < -SLACK or u > 1.0 + SLACK:
+        return np.inf
+    qx, qy, qz = -(n[1] * e1z - n[2] * e1y), -(n[2] * e1x - n[0] * e1z), -(n[0] * e1y - n[1] * e1x)
+    v = (dx * qx + dy * qy + dz * qz) / det
+    if v < -SLACK or u + v > 1.0 + SLACK:
+        return np.inf
+    t = (e2x * qx + e2y * qy + e2z * qz) / det
+    return t if t > 0.0 else np.inf
+
+
+@njit(cache=True, nogil=True)
+def cone_at(n, t, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Height z along a cone's axis at range t, distance squared from it less the radius squared, and d/dt of this."""
+    ux, uy, uz = t * dx - n[0], t * dy - n[1], t * dz - n[2]
+    z = ux * n[3] + uy * n[4] + uz * n[5]
+    rate = dx * n[3] + dy * n[4] + dz * n[5]
+    q = (n[12] + z) / n[13]
+    move, change = 4.0 * q * (1.0 - q), 4.0 * (1.0 - 2.0 * q) * rate / n[13]
+    ux, uy, uz = ux - z * n[3] - move * n[9], uy - z * n[4] - move * n[10], uz - z * n[5] - move * n[11]
+    vx = dx - rate * n[3] - change * n[9]
+    vy = dy - rate * n[4] - change * n[10]
+    vz = dz - rate * n[5] - change * n[11]
+    taper = (n[7] - n[6]) / n[8]
+    r = n[6] + taper * z
+    value = ux * ux + uy * uy + uz * uz - r * r
+    return z, value, 2.0 * (ux * vx + uy * vy + uz * vz - r * taper * rate)
+
+
+@njit(cache=True, nogil=True)
+def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Solve the straight cone moved by the bow near the hit, then Newton on the bowed one."""
+    rate = dx * n[3] + dy * n[4] + dz * n[5]
+    taper = (n[7] - n[6]) / n[8]
+    bowed = n[9] != 0.0 or n[10] != 0.0 or n[11] != 0.0
+    ox, oy, oz = -n[0], -n[1], -n[2]
+    z0 = ox * n[3] + oy * n[4] + oz * n[5]
+    # The range nearest to the axis is the start: the quadratic about it has no large terms.
+    wx, wy, wz = dx - rate * n[3], dy - rate * n[4], dz - rate * n[5]
+    px, py, pz = ox - z0 * n[3], oy - z0 * n[4], oz - z0 * n[5]
+    w2 = wx * wx + wy * wy + wz * wz
+    near = -(px * wx + py * wy + pz * wz) / w2 if w2 > 1e-18 else 0.0
+    if rate != 0.0:  # a ray along the axis comes nearest to it far away
+        enter, leave = -z0 / rate, (n[8] - z0) / rate
+        near = min(max(near, min(enter, leave)), max(enter, leave))
+    if bowed:
+        q = (n[12] + min(max(z0 + near * rate, 0.0), n[8])) / n[13]
+        move = 4.0 * q * (1.0 - q)
+        px, py, pz = px - move * n[9], py - move * n[10], pz - move * n[11]
+    fx, fy, fz = px + near * wx, py + near * wy, pz + near * wz
+    r = n[6] + taper * (z0 + near * rate)
+    a = w2 - taper * taper * rate * rate
+    b = fx * wx + fy * wy + fz * wz - r * taper * rate
+    c = fx * fx + fy * fy + fz * fz - r * r
+    inside = b * b - a * c
+    if inside < 0.0:
+        return np.inf
+    # Both roots without a difference of like numbers; a is negative for a ray steeper than the cone, 0 along its side.
+    large = -b - np.sqrt(inside) if b > 0.0 else -b + np.sqrt(inside)
+    one = c / large if large != 0.0 else (0.0 if a != 0.0 else np.inf)
+    two = large / a if a != 0.0 else np.inf
+    for sign in range(2):
+        t = near + (min(one, two) if sign == 0 else max(one, two))
+        if not np.isfinite(t):
+            continue
+        z = z0 + t * rate
+        if bowed:
+            for _ in range(8):
+                z, value, slope = cone_at(n, t, dx, dy, dz)
+                if slope == 0.0:
+                    break
+                step = value / slope
+                t -= step
+                if abs(step) < 1e-9 * abs(t):
+                    break
+            z, value, slope = cone_at(n, t, dx, dy, dz)
+            if abs(value) > 1e-5 * n[6]:  # a grazing ray that Newton could not follow
+                continue
+        if t > 0.0 and 0.0 <= z <= n[8] and n[6] + taper * z > 0.0:
+            return t
+    return np.inf
+
+
+@njit(cache=True, nogil=True)
+def cast(  # type: ignore[no-untyped-def]
+    kind,
+    numbers,
+    cuts,
+    cut_start,
+    owner,
+    centres,
+    radii,
+    boxes,
+    first,
+    width,
+    side,
+    columns,
+    lowest,
+    step,
+    jitter,
+    turned,
+    least,
+    most,
+    beam,
+    beside,
+):
+    """Nearest shape and range of each ray of a strip and beside it: (width + 2 side, rows) each.
+
+    Columns ``first - side`` to ``first + width - 1 + side`` are cast; beside the strip only ``beside`` (rows,) of them.
+
+    A third answer is the range at which a beam, of radius ``beam[0] + beam[1] range``, may touch a thing too thin for
+    the grid's rays; infinite where there is none.
+    """
+    rows = jitter.shape[1]
+    best = np.full((width + 2 * side, rows), np.inf)
+    thin = np.full((width + 2 * side, rows), np.inf)
+    shape = np.full((width + 2 * side, rows), MISS, np.int32)
+    used = min(width, columns - first)
+    level, rise = np.empty(rows), np.empty(rows)
+    for i in range(rows):
+        level[i], rise[i] = np.cos(lowest + step * i), np.sin(lowest + step * i)
+    for b in range(len(boxes)):
+        k = boxes[b, 0]
+        i = owner[k]
+        cx, cy, cz, r2 = centres[k, 0], centres[k, 1], centres[k, 2], 1.000001 * radii[k] * radii[k]
+        c2 = cx * cx + cy * cy + cz * cz
+        # A bit more than what the angle between rays of the grid spans there, across.
+        slim = thickness(kind[i], numbers[i]) < 1.5 * step * (np.sqrt(c2) + radii[k])
+        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        if wide:
+            planes = edge_planes(numbers[i])
+        for column in range(max(boxes[b, 1], first - side), min(boxes[b, 2], first + used - 1 + side) + 1):
+            j = column - first + side
+            away = max(first - column, column - first - used + 1)
+            azimuth = 2.0 * np.pi * column / columns
+            ca, sa = np.cos(azimuth), np.sin(azimuth)
+            low, high = boxes[b, 3], boxes[b, 4]
+            if wide:
+                low, high = rows_within(planes, ca, sa, turned, lowest, step, low, high)
+            for row in range(low, high + 1):
+                if away > beside[row]:
+                    continue
+                da, de = jitter[j, row, 0], jitter[j, row, 1]
+                # First order in the encoders' noise: the direction stays a unit vector to 1e-10.
+                flat = level[row] - de * rise[row]
+                dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
+                along = dx * cx + dy * cy + dz * cz
+                if along + radii[k] < 0.0 or along - radii[k] > best[j, row]:
+                    continue
+                if slim:
+                    near = radii[k] + beam[0] + beam[1] * along
+                    if c2 - along * along <= near * near and along < thin[j, row]:
+                        thin[j, row] = along
+                if c2 - along * along > r2 + 1e-9 * c2:
+                    continue
+                t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
+                if t <= most and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
+                    best[j, row], shape[j, row] = t, i
+    hide(shape, best, least)
+    return shape, best, thin
+
+
+@njit(cache=True, nogil=True)
+def edge_planes(n):  # type: ignore[no-untyped-def]
+    """Return inward unit normals (3, 3) of planes through the origin and a triangle's edges, 0 of one seen end on."""
+    planes = np.zeros((3, 3))
+    for k in range(3):
+        a, b, c = 3 * k, 3 * ((k + 1) % 3), 3 * ((k + 2) % 3)
+        x = n[a + 1] * n[b + 2] - n[a + 2] * n[b + 1]
+        y = n[a + 2] * n[b] - n[a] * n[b + 2]
+        z = n[a] * n[b + 1] - n[a + 1] * n[b]
+        size = np.sqrt(x * x + y * y + z * z)
+        if size > 0.0:
+            if x * n[c] + y * n[c + 1] + z * n[c + 2] < 0.0:
+                size = -size
+            planes[k, 0], planes[k, 1], planes[k, 2] = x / size, y / size, z / size
+    return planes
+
+
+@njit(cache=True, nogil=True)
+def rows_within(planes, ca, sa, slack, lowest, step, low, high):  # type: ignore[no-untyped-def]
+    """First and last of the rows ``low`` to ``high`` of a column that are no further than ``slack`` beyond a plane.
+
+    ``ca`` and ``sa`` are the cosine and sine of the column's azimuth. Where none is, the first is above the last.
+    """
+    bottom, top = lowest + step * low, lowest + step * high
+    for k in range(3):
+        across, up = planes[k, 0] * ca + planes[k, 1] * sa, planes[k, 2]
+        size = np.sqrt(across * across + up * up)
+        if size <= slack:
+            continue
+        # across cos e + up sin e >= -slack holds about one elevation.
+        middle, half = np.arctan2(up, across), np.arccos(-slack / size)
+        a, z = np.inf, -np.inf
+        for turn in range(-1, 2):
+            first = max(bottom, middle - half + 2.0 * np.pi * turn)
+            last = min(top, middle + half + 2.0 * np.pi * turn)
+            if first <= last:
+                a, z = min(a, first), max(z, last)
+        if a > z:
+            return 1, 0
+        bottom, top = a, z
+    return max(low, int(np.floor((bottom - lowest) / step))), min(high, int(np.ceil((top - lowest) / step)))
+
+
+@njit(cache=True, nogil=True)
+def hide(shape, best, least):  # type: ignore[no-untyped-def]
+    """Leave nothing of rays that end nearer than the scanner sees: what is there hides what is behind it."""
+    for j in range(best.shape[0]):
+        for k in range(best.shape[1]):
+            if best[j, k] < least:
+                best[j, k], shape[j, k] = np.inf, MISS
+
+
+@njit(cache=True, nogil=True)
+def thickness(kind, n):  # type: ignore[no-untyped-def]
+    """Return the width of a ball or bar, of which nothing may be seen but from its side; infinite of faces."""
+    if kind == 0:
+        return 2.0 * n[3]
+    return 2.0 * max(n[6], n[7]) if kind == 1 else np.inf
+
+
+@njit(cache=True, nogil=True)
+def cast_around(  # type: ignore[no-untyped-def]
+    kind,
+    numbers,
+    cuts,
+    cut_start,
+    owner,
+    centres,
+    radii,
+    boxes,
+    first,
+    width,
+    side,
+    columns,
+    lowest,
+    step,
+    jitter,
+    turned,
+    least,
+    most,
+    number,
+    angle,
+    offsets,
+    count,
+):
+    """Cast sub-rays about the rays numbered in ``number`` (width + 2 side, rows; -1 = none): (count, offsets) each."""
+    m = len(offsets)
+    best = np.full((count, m), np.inf)
+    shape = np.full((count, m), MISS, np.int32)
+    farthest = np.full(count, np.inf)  # of a ray's sub-rays
+    broadest = angle.max() if count else 0.0
+    rows = number.shape[1]
+    level, rise = np.empty(rows), np.empty(rows)
+    for i in range(rows):
+        level[i], rise[i] = np.cos(lowest + step * i), np.sin(lowest + step * i)
+    for b in range(len(boxes)):
+        k = boxes[b, 0]
+        i = owner[k]
+        cx, cy, cz, r = centres[k, 0], centres[k, 1], centres[k, 2], radii[k]
+        c2 = cx * cx + cy * cy + cz * cz
+        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        if wide:
+            planes = edge_planes(numbers[i])
+        for column in range(max(boxes[b, 1], first), min(boxes[b, 2], first + width - 1) + 1):
+            j = column - first + side
+            azimuth = 2.0 * np.pi * column / columns
+            ca, sa = np.cos(azimuth), np.sin(azimuth)
+            low, high = boxes[b, 3], boxes[b, 4]
+            if wide:
+                low, high = rows_within(planes, ca, sa, turned + broadest, lowest, step, low, high)
+            for row in range(low, high + 1):
+                ray = number[j, row]
+                if ray < 0:
+                    continue
+                da, de = jitter[j, row, 0], jitter[j, row, 1]
+                flat = level[row] - de * rise[row]
+                dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
+                along = dx * cx + dy * cy + dz * cz
+                near = r + angle[ray] * abs(along) + 1e-6 * r  # the beam's edge may touch what its middle passes by
+                if along + r < 0.0 or along - r > farthest[ray] or c2 - along * along > near * near + 1e-9 * c2:
+                    continue
+                changed = False
+                for o in range(m):
+                    da = jitter[j, row, 0] + angle[ray] * offsets[o, 0]
+                    de = jitter[j, row, 1] + angle[ray] * offsets[o, 1]
+                    flat = level[row] - de * rise[row]
+                    dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
+                    t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
+                    if t <= most and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
+                        best[ray, o], shape[ray, o] = t, i
+                        changed = True
+                if changed:
+                    farthest[ray] = best[ray].max()
+    hide(shape, best, least)
+    return shape, best
+
+
+@njit(cache=True, nogil=True)
+def normals(kind, numbers, shape, points):  # type: ignore[no-untyped-def]
+    """Return unit normals (n, 3), of either sense, at points (n, 3) on shapes (n,)."""
+    result = np.empty((len(shape), 3))
+    for k in range(len(shape)):
+        n = numbers[shape[k]]
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        what = kind[shape[k]]
+        if what == 0:
+            nx, ny, nz = x - n[0], y - n[1], z - n[2]
+        elif what == 1:
+            # The gradient of the bowed cone's equation, by its derivative along each axis.
+            length = np.sqrt(x * x + y * y + z * z)
+            nx = cone_slope(n, x, y, z, 1.0, 0.0, 0.0, length)
+            ny = cone_slope(n, x, y, z, 0.0, 1.0, 0.0, length)
+            nz = cone_slope(n, x, y, z, 0.0, 0.0, 1.0, length)
+        elif what == 2:
+            nx, ny, nz = n[3], n[4], n[5]
+        else:
+            ax, ay, az = n[3] - n[0], n[4] - n[1], n[5] - n[2]
+            bx, by, bz = n[6] - n[0], n[7] - n[1], n[8] - n[2]
+            nx, ny, nz = ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx
+        size = np.sqrt(nx * nx + ny * ny + nz * nz)
+        result[k, 0], result[k, 1], result[k, 2] = nx / size, ny / size, nz / size
+    return result
+
+
+@njit(cache=True, nogil=True)
+def cone_slope(n, x, y, z, ex, ey, ez, length):  # type: ignore[no-untyped-def]
+    """Return the derivative of the bowed cone's equation at (x, y, z) along the unit vector e."""
+    ux, uy, uz = x - n[0], y - n[1], z - n[2]
+    h = ux * n[3] + uy * n[4] + uz * n[5]
+    rate = ex * n[3] + ey * n[4] + ez * n[5]
+    q = (n[12] + h) / n[13]
+    move, change = 4.0 * q * (1.0 - q), 4.0 * (1.0 - 2.0 * q) * rate / n[13]
+    ux, uy, uz = ux - h * n[3] - move * n[9], uy - h * n[4] - move * n[10], uz - h * n[5] - move * n[11]
+    vx, vy, vz = ex - rate * n[3] - change * n[9], ey - rate * n[4] - change * n[10], ez - rate * n[5] - change * n[11]
+    taper = (n[7] - n[6]) / n[8]
+    return ux * vx + uy * vy + uz * vz - (n[6] + taper * h) * taper * rate

@@ -1,0 +1,35 @@
+"""From a recipe to a scene and its truth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from designgen.scanning import modes
+from designgen.scenes import arch_bridge, space_frame, structure
+from processor.model import Scene, Truth, UsageError
+
+MAKERS = {
+    "arch-bridge": ("bridge", arch_bridge.make),
+    "space-frame": ("frame", space_frame.make),
+    "structure": ("structure", structure.make),
+}
+EXTRA = {"structure": {"picks"}}  # sections that one kind alone has
+
+
+def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple[Scene, Truth]:
+    """Make the scene of a recipe and its truth; ``seed`` replaces the recipe's own.
+
+    Raises UsageError that names the key for an unknown kind or key, a wrong type or an impossible size.
+    """
+    kind = recipe.get("kind")
+    if kind not in MAKERS:
+        raise UsageError(f"recipe {name}: kind: expected one of {', '.join(MAKERS)}, got {kind!r}")
+    section, maker = MAKERS[kind]
+    known = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
+    if unknown := sorted(set(recipe) - known):
+        raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(known))}")
+    used = recipe.get("seed", 0) if seed is None else seed
+    if not isinstance(used, int) or isinstance(used, bool) or used < 0:
+        raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")
+    return maker(name, recipe, modes.read(recipe), used)

@@ -1,0 +1,77 @@
+"""Command ``processor compare``: two clouds without a design."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from processor.cli.common import LANGUAGES, say
+
+LENGTH = click.FloatRange(min=0.0, min_open=True)
+FILE = click.Path(path_type=Path)
+RADIUS = ("rad", "scale")  # in the names of options that other software has in place of diameters
+
+
+class _Diameters(click.Command):
+    """A command whose lengths across are diameters: who gives a radius is told, and is not led to give it as one."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        try:
+            return super().parse_args(ctx, args)
+        except click.NoSuchOption as error:
+            if any(part in error.option_name.lower() for part in RADIUS):
+                raise click.UsageError(
+                    f"No such option: {error.option_name}. What is measured across is given as a diameter, twice the "
+                    "radius: --projection-diameter of the cylinder, --normal-diameter of the sphere for normals.",
+                    ctx,
+                ) from error
+            raise
+
+
+@click.command(cls=_Diameters)
+@click.argument("reference", type=FILE)
+@click.argument("compared", type=FILE)
+@click.option("-o", "--output", required=True, type=FILE, help="folder of the results")
+@click.option("--core", type=FILE, help="cloud of core points  [default: every point of REFERENCE]")
+@click.option("--normal-diameter", type=LENGTH, help="of the sphere that a normal is fitted in")
+@click.option("--projection-diameter", type=LENGTH, help="of the cylinder along the normal")
+@click.option("--max-depth", type=LENGTH, help="of the cylinder, to either side of the core point")
+@click.option("--registration-error", type=click.FloatRange(min=0.0), default=0.0, help="a length, part of the LOD95")
+@click.option("--normals", type=FILE, help="nx, ny, nz of every core point, PLY or text, instead of fitted ones")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option("--json", "as_json", is_flag=True, help="print compare.json")
+@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+def compare(
+    reference: Path,
+    compared: Path,
+    output: Path,
+    core: Path | None,
+    normal_diameter: float | None,
+    projection_diameter: float | None,
+    max_depth: float | None,
+    registration_error: float,
+    normals: Path | None,
+    lang: str,
+    as_json: bool,
+) -> None:
+    """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
+
+    All lengths are in the clouds' own unit; what is not given is made from their density.
+    """
+    from processor.compare import compare as comparing
+    from processor.report import comparison
+
+    comparison.check_output(output, (reference, compared, core, normals))
+    request = comparing.Request(
+        reference, compared, core, normals, normal_diameter or 0.0, projection_diameter or 0.0, max_depth or 0.0,
+        registration_error,
+    )  # fmt: skip
+    record = comparison.write(output, comparing.compare(request, say), lang)
+    if as_json:
+        click.echo(json.dumps(record, ensure_ascii=False))
+        return
+    for line in comparison.lines(record):
+        click.echo(line)
+    click.echo(f"report: {output / comparison.PAGE}")

@@ -1,0 +1,44 @@
+"""Defects of a structure against its design: found, measured, named.
+
+``default`` puts the points on cells of the design's surface, fits the stations to each other and the whole to the
+design, and then looks for shapes of whole components, for places that deviate at every size and for places that are
+missing, with a bound on false alarms. ``paper`` follows paper 004 as far as its one page tells.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from processor.defects import baseline, detect
+from processor.defects.params import METHODS, Params
+from processor.defects.result import Result
+from processor.model import InputError, Scene, UsageError
+
+__all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
+
+NAME = "defects"
+NEEDS = ("stitch", "deviation")
+KIND = "structure"
+
+
+def applies(scene: Scene) -> bool:
+    """Whether the step runs by itself: a structure with a design, its scans in one frame."""
+    one_frame = len(scene.scans) == 1 or all(scan.T_project_scan.size for scan in scene.scans)
+    return scene.kind == KIND and scene.structure is not None and bool(scene.scans) and one_frame
+
+
+def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) -> Result:
+    """Find the defects of a scene's structure; ``earlier`` are results of steps in NEEDS that ran before.
+
+    Raises UsageError for parameters that make no sense, InputError without a design or points.
+    """
+    if params.method not in METHODS:
+        raise UsageError(f"defects: unknown method {params.method!r}; it has {', '.join(METHODS)}")
+    params.check()
+    if scene.structure is None or not len(scene.structure.faces):
+        raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP, see project.toml)")
+    if not any(len(scan.points) for scan in scene.scans):
+        raise InputError(f"{scene.name}: expected scans of the structure, found no points")
+    method = baseline.defects if params.method == "paper" else detect.defects
+    return method(scene, params, dict(earlier or {}))

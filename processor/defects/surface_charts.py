@@ -1,0 +1,304 @@
+"""The design's surface on grids: components, their faces, and cells on the faces.
+
+A face that is flat or a cylinder is laid out in a plane by its own chart; any other is cut into pieces that are nearly
+flat. A component is what hangs together: bodies that touch, or each body by itself where very many touch.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from processor.geometry import mesh_distance, visible_facets
+from processor.model import Floats, Ints
+
+FLAT_COS = np.cos(np.radians(1.0))
+PIECE_COS = np.cos(np.radians(15.0))
+ROUND_SHARE = 0.02  # of its radius that a vertex of a cylinder may lie off it
+WELD_MM = 0.01
+TOUCH_MM = 0.5
+MOST_BODIES = 12  # of a component
+MOST_SIDES = 60  # tried for the direction of a face
+PLANE, CYLINDER = 0, 1
+
+
+@dataclass(frozen=True)
+class Charts:
+    """Faces laid out in planes: u, v of a point are along ``axes`` rows 0 and 1 from ``origin``.
+
+    On a cylinder u runs along its axis, v around it, and ``origin`` lies on the axis. The cells of a chart, ``shape``
+    of them, are rows ``first`` onward of all cells, u slowest.
+    """
+
+    kind: Ints  # (c,)
+    component: Ints
+    origin: Floats  # (c, 3)
+    axes: Floats  # (c, 3, 3) rows u, v, outward normal (of a cylinder: where v = 0)
+    radius: Floats
+    low: Floats  # (c, 2) of u, v at the corner of the first cell
+    shape: Ints  # (c, 2)
+    first: Ints
+    cell_mm: float
+
+    def cells(self, chart: int) -> slice:
+        """Return the rows of a chart's cells."""
+        start = int(self.first[chart])
+        return slice(start, start + int(self.shape[chart].prod()))
+
+    def image(self, values: Floats, chart: int) -> Floats:
+        """Return values (cells,) of all cells as the image (nu, nv) of one chart."""
+        found: Floats = values[self.cells(chart)].reshape(tuple(self.shape[chart]))
+        return found
+
+
+@dataclass(frozen=True)
+class DesignSurface:
+    """A design's facets with their charts, and the cells on these.
+
+    ``share`` (cells,) is how much of a cell the face covers.
+    """
+
+    vertices: Floats
+    faces: Ints
+    normals: Floats
+    chart_of: Ints  # (f,)
+    component_of: Ints  # (f,)
+    charts: Charts
+    share: Floats
+    centres: Floats  # (cells, 3)
+    outward: Floats  # (cells, 3)
+    components: int
+
+    @property
+    def area_mm2(self) -> float:
+        """Area of all cells, mm2."""
+        return float(self.share.sum()) * self.charts.cell_mm**2
+
+
+def of_mesh(vertices: Floats, faces: Ints, cell_mm: float) -> DesignSurface:
+    """Lay out a mesh in charts with cells of ``cell_mm``."""
+    mesh = mesh_distance.of_mesh(*_welded(vertices, faces), spacing_mm=1e9)
+    vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
+    component = _components(vertices, faces)
+    chart_of = _pieces(vertices, faces, normals, mesh.part_of)
+    blank = _charts(vertices, faces, normals, chart_of, component)
+    whole = DesignSurface(vertices, faces, normals, chart_of, component, blank, np.empty(0), np.empty((0, 3)),
+                          np.empty((0, 3)), int(component.max(initial=-1)) + 1)  # fmt: skip
+    return gridded(whole, cell_mm)
+
+
+def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
+    """Return the surface with cells of another size."""
+    vertices, faces, chart_of = surface.vertices, surface.faces, surface.chart_of
+    charts = _with_cells(surface, cell_mm)
+    share = np.zeros(int(charts.shape.prod(axis=1).sum()))
+    a, b, c = (layout(charts, chart_of, vertices[faces[:, k]]) for k in range(3))
+    turn = np.where(charts.kind == CYLINDER, 2.0 * np.pi * charts.radius, np.inf)[chart_of]
+    for other in (b, c):  # a facet that lies across the seam
+        other[:, 1] += np.where(np.isfinite(turn), np.round((a[:, 1] - other[:, 1]) / turn), 0.0) * np.where(
+            np.isfinite(turn), turn, 0.0
+        )
+    rasterise(a, b, c, chart_of, charts.low, charts.shape, charts.first, cell_mm, share)
+    centres, outward = _cell_places(charts)
+    return dataclasses.replace(surface, charts=charts, share=np.minimum(share, 1.0), centres=centres, outward=outward)
+
+
+def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
+    """Return u, v (n, 2) of points (n, 3) on their charts (n,), mm."""
+    arm = points - charts.origin[chart]
+    local = np.einsum("nij,nj->ni", charts.axes[chart], arm)
+    around = charts.radius[chart] * np.arctan2(local[:, 1], local[:, 2])
+    return np.stack([local[:, 0], np.where(charts.kind[chart] == CYLINDER, around, local[:, 1])], axis=1)
+
+
+def _welded(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
+    """Make one of vertices at one place."""
+    key = np.round(vertices / WELD_MM).astype(np.int64)
+    _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    return vertices[first], inverse.reshape(-1)[faces]
+
+
+def _components(vertices: Floats, faces: Ints) -> Ints:
+    """Return the component (f,) of each facet, numbered in the order of the mesh."""
+    links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())),
+                      (len(vertices),) * 2)  # fmt: skip
+    body = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
+    one, two = visible_facets.touching(vertices, faces, TOUCH_MM)
+    own = np.full(len(vertices), -1, np.int64)
+    own[faces.ravel()] = np.repeat(body, 3)
+    count = int(body.max(initial=-1)) + 1
+    pairs = coo_array((np.ones(len(one), np.int8), (own[one], body[two])), (count, count))
+    whole = connected_components(pairs, directed=False)[1].astype(np.int64)
+    many = np.bincount(whole) > MOST_BODIES
+    group = np.where(many[whole[body]], count + body, whole[body])
+    _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), np.int64)
+    rank[np.argsort(first)] = np.arange(len(first))
+    return rank[inverse.reshape(-1)]
+
+
+def _pieces(vertices: Floats, faces: Ints, normals: Floats, part: Ints) -> Ints:
+    """Return the chart (f,) of each facet: a smooth face, or where that is neither flat nor round pieces of it."""
+    found = np.full(len(faces), -1, np.int64)
+    count = 0
+    order = np.argsort(part, kind="stable")
+    for rows in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
+        n = normals[rows]
+        flat = n @ n[0] > FLAT_COS
+        if flat.all() or _cylinder(vertices[faces[rows]], n) is not None:
+            found[rows] = count
+            count += 1
+            continue
+        left = rows
+        while len(left):
+            near = normals[left] @ normals[left[0]] > PIECE_COS
+            found[left[near]] = count
+            count += 1
+            left = left[~near]
+    return found
+
+
+def _cylinder(corners: Floats, normals: Floats) -> tuple[Floats, Floats, float] | None:
+    """Return a point of the axis (3,), its direction (3,) and the radius of facets (f, 3, 3); None where not round."""
+    if len(corners) < 6:
+        return None
+    variances, axes = np.linalg.eigh(normals.T @ normals / len(normals))
+    if variances[0] > 1e-4 or variances[1] < 1e-2:
+        return None
+    axis = axes[:, 0] * np.sign(axes[np.argmax(np.abs(axes[:, 0])), 0])
+    points = corners.reshape(-1, 3)
+    middle = points.mean(axis=0)
+    flat = (points - middle) @ axes[:, 1:]
+    solved = np.linalg.lstsq(np.column_stack([2.0 * flat, np.ones(len(flat))]), (flat**2).sum(axis=1), rcond=None)[0]
+    radius = float(np.sqrt(max(solved[2] + solved[:2] @ solved[:2], 0.0)))
+    off = np.abs(np.linalg.norm(flat - solved[:2], axis=1) - radius).max()
+    return (middle + axes[:, 1:] @ solved[:2], axis, radius) if off < ROUND_SHARE * radius else None
+
+
+def _charts(vertices: Floats, faces: Ints, normals: Floats, chart_of: Ints, component: Ints) -> Charts:
+    count = int(chart_of.max(initial=-1)) + 1
+    kind, own = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    origin, axes, radius = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.full(count, np.inf)
+    order = np.argsort(chart_of, kind="stable")
+    for chart, rows in enumerate(np.split(order, np.flatnonzero(np.diff(chart_of[order])) + 1)):
+        corners = vertices[faces[rows]]
+        own[chart] = component[rows[0]]
+        size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+        normal = size @ normals[rows]
+        flat = (normals[rows] @ normals[rows[0]] > FLAT_COS).all()
+        found = None if flat else _cylinder(corners, normals[rows])
+        if found is not None:
+            kind[chart] = CYLINDER
+            origin[chart], along, radius[chart] = found
+            side = normals[rows[0]] - (normals[rows[0]] @ along) * along
+            out = side / np.linalg.norm(side)
+        else:
+            origin[chart] = corners.reshape(-1, 3).mean(axis=0)
+            out = normal / np.linalg.norm(normal)
+            along = _longest(corners, out)
+        axes[chart] = [along, np.cross(out, along), out]
+    return Charts(kind, own, origin, axes, np.where(kind == PLANE, 1.0, radius), np.zeros((count, 2)),
+                  np.ones((count, 2), np.int64), np.zeros(count, np.int64), 1.0)  # fmt: skip
+
+
+def _with_cells(surface: DesignSurface, cell_mm: float) -> Charts:
+    blank, chart_of = surface.charts, surface.chart_of
+    count = len(blank.kind)
+    low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
+    for k in range(3):
+        uv = layout(blank, chart_of, surface.vertices[surface.faces[:, k]])
+        np.minimum.at(low, chart_of, uv)
+        np.maximum.at(high, chart_of, uv)
+    closed = blank.kind == CYLINDER
+    turn = np.pi * blank.radius
+    low[closed, 1], high[closed, 1] = -turn[closed], turn[closed]
+    shape = np.maximum(np.ceil((high - low) / cell_mm - 1e-6), 1).astype(np.int64)
+    low = 0.5 * (low + high) - 0.5 * shape * cell_mm  # the cells about the middle of the face
+    low[closed, 1] = -turn[closed]
+    first = np.concatenate([[0], np.cumsum(shape.prod(axis=1))[:-1]]).astype(np.int64)
+    return dataclasses.replace(blank, low=low, shape=shape, first=first, cell_mm=cell_mm)
+
+
+def _longest(corners: Floats, out: Floats) -> Floats:
+    """Return the direction (3,) along the smallest rectangle about facets, across their normal."""
+    sides = (corners - np.roll(corners, 1, axis=1)).reshape(-1, 3)
+    sides = sides - np.outer(sides @ out, out)
+    lengths = np.linalg.norm(sides, axis=1)
+    order = np.argsort(-lengths, kind="stable")[:MOST_SIDES]
+    points = corners.reshape(-1, 3)
+    best, found = np.inf, sides[order[0]] / lengths[order[0]]
+    for row in order:
+        along = sides[row] / max(lengths[row], 1e-12)
+        wide, high = np.ptp(points @ np.stack([along, np.cross(out, along)], axis=1), axis=0)
+        if wide * high < best * (1.0 - 1e-6):
+            best = wide * high
+            found = along if wide >= high * (1.0 - 1e-6) else np.cross(out, along)
+    main = int(np.argmax(np.abs(found) > 0.7)) if (np.abs(found) > 0.7).any() else int(np.argmax(np.abs(found)))
+    result: Floats = found * np.sign(found[main])
+    return result
+
+
+def _cell_places(charts: Charts) -> tuple[Floats, Floats]:
+    """Return the middles (cells, 3) of all cells and their outward normals."""
+    centres, outward = [np.empty((0, 3))], [np.empty((0, 3))]
+    for chart in range(len(charts.kind)):
+        grid = np.indices(tuple(charts.shape[chart])).reshape(2, -1).T + 0.5
+        u, v = (charts.low[chart] + grid * charts.cell_mm).T
+        axes = charts.axes[chart]
+        if charts.kind[chart] == CYLINDER:
+            turn = v / charts.radius[chart]
+            out = np.outer(np.sin(turn), axes[1]) + np.outer(np.cos(turn), axes[2])
+            centres.append(charts.origin[chart] + np.outer(u, axes[0]) + charts.radius[chart] * out)
+        else:
+            out = np.broadcast_to(axes[2], (len(u), 3))
+            centres.append(charts.origin[chart] + np.outer(u, axes[0]) + np.outer(v, axes[1]))
+        outward.append(out)
+    return np.concatenate(centres), np.concatenate(outward)
+
+
+# --- Compiled: how much of each cell of a chart its facets cover.
+
+
+PER_SIDE = 4  # samples of a cell along each axis
+
+
+@njit(cache=True, nogil=True)
+def rasterise(
+    a: Floats,
+    b: Floats,
+    c: Floats,
+    chart_of: Ints,
+    low: Floats,
+    shape: Ints,
+    first: Ints,
+    cell_mm: float,
+    share: Floats,
+) -> None:
+    """Add to ``share`` (cells,) what triangles with corners a, b, c (f, 2) cover of the cells of their charts."""
+    step = cell_mm / PER_SIDE
+    for f in range(len(a)):
+        k = chart_of[f]
+        nu, nv = shape[k, 0] * PER_SIDE, shape[k, 1] * PER_SIDE
+        au, av = (a[f, 0] - low[k, 0]) / step, (a[f, 1] - low[k, 1]) / step
+        bu, bv = (b[f, 0] - low[k, 0]) / step, (b[f, 1] - low[k, 1]) / step
+        cu, cv = (c[f, 0] - low[k, 0]) / step, (c[f, 1] - low[k, 1]) / step
+        turn = (bu - au) * (cv - av) - (bv - av) * (cu - au)
+        if turn == 0.0:
+            continue
+        i0, i1 = max(0, int(min(au, bu, cu))), min(nu - 1, int(max(au, bu, cu)))
+        j0, j1 = int(min(av, bv, cv)) - 1, int(max(av, bv, cv))
+        for i in range(i0, i1 + 1):
+            u = i + 0.5
+            for j in range(j0, j1 + 1):
+                v = j + 0.5
+                # Samples on a common side count for one triangle alone: half-open by a shift that no side has.
+                p = ((bu - u) * (cv - v) - (bv - v) * (cu - u)) / turn
+                q = ((cu - u) * (av - v) - (cv - v) * (au - u)) / turn
+                if p >= -1e-9 and q >= -1e-9 and p + q <= 1.0 + 1e-9:
+                    row, column = i // PER_SIDE, (j % nv) // PER_SIDE
+                    share[first[k] + row * shape[k, 1] + column] += 1.0 / (PER_SIDE * PER_SIDE)

@@ -1,0 +1,266 @@
+"""Method ``default``: how the scanned surface has moved from the design's, at points of the design's surface.
+
+M3C2 with the design's own surface in place of a cloud of it: each scanned point is held against the facet below it, so
+that a tube's curve is no roughness, and the two sides of a plate are told apart.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from processor.deviation import cloud, design_pose, scales, statistics
+from processor.deviation.attitude import AMBIGUOUS
+from processor.deviation.cloud import Samples, ScanCloud
+from processor.deviation.design_pose import Placed
+from processor.deviation.params import Params
+from processor.deviation.result import Result
+from processor.geometry import local_translation, m3c2, mesh_distance, rigid
+from processor.geometry.local_translation import Movement
+from processor.geometry.m3c2 import Distances
+from processor.geometry.mesh_distance import CurvedFacets, MeshSurface
+from processor.geometry.surface_registration import about_origin
+from processor.model import Floats, Ints, Scene
+
+SURFACE_SAMPLES = 1_000_000
+SAMPLE_MM = (8.0, 40.0)  # least and greatest spacing of samples on the design
+MOST_CORE = 150_000
+POINTS_A_CORE = 40.0  # scanned points about a core point; fewer where a surface is narrow
+CORE_SHARE = 0.5  # of the projection diameter: the spacing of core points
+REACH_MM = 200.0  # farther from the design's surface nothing is of it
+DEPTH_SHARE, DEPTH_TIMES, LEAST_DEPTH_MM = 0.98, 2.5, 20.0
+LEAST_COS = 0.5  # between a core point's normal and the surface's under a scanned point
+NEAR_CORE = 4  # core points among which a scanned point's movement is looked for
+BACK_COS = -0.2  # a facet that looks away from the scanner by more was not seen
+BACK_TRIES = 8  # nearest samples among which a facet that was seen is looked for
+
+
+@dataclass(frozen=True)
+class OnSurface:
+    """Points of a scan as the design sees them: foot (n, 3), signed distance (n,) and facet (n,); mm, outward > 0."""
+
+    feet: Floats
+    distance: Floats
+    facet: Ints
+
+
+def surface_of(vertices: Floats, faces: Ints) -> MeshSurface:
+    """Prepare a design's mesh, with samples as dense as its area allows."""
+    spacing = np.sqrt(cloud.area(vertices, faces) / SURFACE_SAMPLES)
+    return mesh_distance.of_mesh(vertices, faces, float(np.clip(spacing, *SAMPLE_MM)))
+
+
+def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, params: Params) -> Result:
+    """Deviations of a scan from a design with vertices (v, 3) less ``origin`` (3,)."""
+    assert scene.structure is not None
+    surface = surface_of(vertices, scene.structure.faces)
+    curved = mesh_distance.of_surface(surface)
+    given = rigid.transform(np.eye(3), scan.origin - origin)
+    placed = design_pose.place(scan, surface, given, params.register)
+    diameter = params.projection_diameter_mm or scales.rounded(scales.diameter_for(POINTS_A_CORE, scan.spacing_mm))
+    area = cloud.area(vertices, surface.faces)
+    core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
+    core = cloud.sampled(vertices, surface.faces, core_spacing)
+    seen = on_surface(scan, curved, placed.T)
+    depth = params.max_depth_mm or _depth(seen.distance)
+    near = np.abs(seen.distance) <= depth
+    moved = movement(core, curved, seen, near, diameter)
+    found, error, source = distances(core, moved, placed, params.registration_error_mm)
+    return _result(scan, placed, core, found, origin, params, (diameter, depth, error, source, float(near.mean())))
+
+
+def on_surface(scan: ScanCloud, curved: CurvedFacets, T: Floats, reach_mm: float = REACH_MM) -> OnSurface:
+    """Hold a scan's points, placed by T (4, 4), against a design; those off its faces have distance NaN, facet -1.
+
+    Where it is known from where a point was seen, it is held against a facet that could be seen from there.
+    """
+    surface = curved.surface
+    points = rigid.apply(T, scan.points)
+    face, distance, beyond = surface.distances(points, reach_mm)
+    if scan.scanner is not None:
+        sight = rigid.apply(T, scan.scanner) - points
+        sight /= np.maximum(np.linalg.norm(sight, axis=1), 1e-9)[:, None]
+        away = np.flatnonzero((face >= 0) & (np.einsum("ni,ni->n", surface.normals[face], sight) < BACK_COS))
+        if len(away):
+            other = _facing(points[away], sight[away], surface, reach_mm)
+            face[away], distance[away], beyond[away] = surface.distances(points[away], reach_mm, other)
+    used = mesh_distance.on_face(face, beyond)
+    face, distance = np.where(used, face, -1), np.where(used, distance, np.nan)
+    feet = points - distance[:, None] * surface.normals[face]
+    return OnSurface(feet, distance - curved.heights(feet, face), face)
+
+
+def _facing(points: Floats, sight: Floats, surface: MeshSurface, reach: float) -> Ints:
+    """Return the facet (n,) of the nearest sample that looks along ``sight`` (n, 3), -1 where none of the nearest."""
+    k = min(BACK_TRIES, len(surface.sample_face))
+    near, index = surface.tree.query(points, k=np.arange(1, k + 1), distance_upper_bound=reach, workers=-1)
+    facet = surface.sample_face[np.minimum(index, len(surface.sample_face) - 1)]
+    looks = np.einsum("nki,ni->nk", surface.normals[facet], sight) >= BACK_COS
+    good = np.isfinite(near) & looks
+    first = np.argmax(good, axis=1)
+    rows = np.arange(len(points))
+    found: Ints = np.where(good[rows, first], facet[rows, first], -1)
+    return found
+
+
+def movement(
+    core: Samples, curved: CurvedFacets, seen: OnSurface, used: npt.NDArray[np.bool_], diameter_mm: float
+) -> Movement:
+    """Fit movements at core points to the scan's points in use (n,).
+
+    Twice: a point is held against the facet below where it was before it moved, so that a tube that moved sideways is
+    no smaller one.
+    """
+    surface = curved.surface
+    rows = np.flatnonzero(used)
+    feet, distance, facet = seen.feet[rows], seen.distance[rows], seen.facet[rows]
+    first = _fitted(core, surface, feet, distance, facet, diameter_mm)
+    known = np.flatnonzero(np.isfinite(first.along))
+    if not len(known):
+        return first
+    near, index = cKDTree(core.points[known]).query(feet, k=np.arange(1, NEAR_CORE + 1), workers=-1)
+    at = known[np.minimum(index, len(known) - 1)]
+    alike = np.einsum("nki,ni->nk", core.normals[at], surface.normals[facet]) >= LEAST_COS
+    alike &= near <= 0.5 * diameter_mm
+    nearest = at[np.arange(len(at)), np.argmax(alike, axis=1)]
+    vector = np.where(alike.any(axis=1)[:, None], first.vector[nearest], 0.0)
+    height = distance + curved.heights(feet, facet)
+    before = feet + height[:, None] * surface.normals[facet] - vector
+    facet, left, beyond = surface.distances(before, REACH_MM, facet)
+    on = mesh_distance.on_face(facet, beyond)
+    before, facet, left, vector = before[on], facet[on], left[on], vector[on]
+    normals = surface.normals[facet]
+    # What is left after the first movement, and the first movement itself along the facet's normal.
+    feet = before - left[:, None] * normals
+    distance = left - curved.heights(feet, facet) + np.einsum("ni,ni->n", normals, vector)
+    return _fitted(core, surface, feet, distance, facet, diameter_mm)
+
+
+def _fitted(
+    core: Samples, surface: MeshSurface, feet: Floats, distance: Floats, facet: Ints, diameter_mm: float
+) -> Movement:
+    grid = m3c2.grid(feet, diameter_mm)
+    return local_translation.movement(
+        grid, distance[grid.order], surface.normals[facet[grid.order]], core.points, core.normals,
+        diameter_mm=diameter_mm, least_cos=LEAST_COS,
+    )  # fmt: skip
+
+
+def distances(core: Samples, moved: Movement, placed: Placed, stated_error_mm: float) -> tuple[Distances, float, str]:
+    """Distances at core points with LOD95, the registration error in it (one sd, mm), and where that is from."""
+    known = np.isfinite(moved.along)
+    if np.isfinite(stated_error_mm):
+        error, source = stated_error_mm, "given"
+    elif np.isfinite(placed.covariance).all() and known.any():
+        error = design_pose.error_along(placed.covariance, core.points[known], core.normals[known])
+        source = "covariance of the best fit, rms over the core points"
+    else:
+        error, source = 0.0, "not known: the best fit is not held by what was seen"
+    lod95 = m3c2.Z95 * (moved.sd / np.sqrt(np.maximum(moved.count, 1)) + error)
+    return Distances(moved.along, lod95, moved.count, moved.count, np.zeros(len(lod95)), moved.sd), error, source
+
+
+def _depth(distance: Floats) -> float:
+    known = np.abs(distance[np.isfinite(distance)])
+    if not len(known):
+        return LEAST_DEPTH_MM
+    return float(
+        np.clip(scales.rounded(DEPTH_TIMES * float(np.quantile(known, DEPTH_SHARE))), LEAST_DEPTH_MM, REACH_MM)
+    )
+
+
+def _result(
+    scan: ScanCloud,
+    placed: Placed,
+    core: Samples,
+    found: Distances,
+    origin: Floats,
+    params: Params,
+    used: tuple[float, float, float, str, float],
+) -> Result:
+    diameter, depth, error, source, share = used
+    total = statistics.of_distances(found, core.points, core.normals, diameter, scales.PAPER_POINTS_A_CYLINDER)
+    status, said = _status(placed, total, params)
+    if scan.unposed > 1:
+        said += f" {scan.unposed} scans have no pose: they were taken to be in one frame already."
+    known = found.std2[np.isfinite(found.lod95)]
+    return Result(
+        status=status,
+        method=params.method,
+        message=said,
+        T_design_scan=global_pose(placed.T, scan.origin, origin),
+        registration=placed.registration,
+        registration_error=error,
+        registration_error_from=source,
+        T_best_fit=global_pose(placed.T_best_fit, scan.origin, origin),
+        covariance=about_origin(placed.covariance, origin),
+        best_fit_shift=placed.shift,
+        best_fit_turn=placed.turn,
+        ambiguity=placed.ambiguity,
+        spacing=scan.spacing_mm,
+        sigma=float(np.median(known)) if len(known) else float("nan"),
+        points_read=scan.read,
+        points_kept=scan.kept,
+        on_surface_share=share,
+        projection_diameter=diameter,
+        max_depth=depth,
+        significant_share=total.significant_share.share,
+        significant_low=total.significant_share.low,
+        significant_high=total.significant_share.high,
+        origin=origin,
+        core=core.points,
+        normals=core.normals,
+        distance=found.distance,
+        lod95=found.lod95,
+        n1=found.n1,
+        n2=found.n2,
+        std1=found.std1,
+        std2=found.std2,
+    )
+
+
+def _status(placed: Placed, total: statistics.Summary, params: Params) -> tuple[str, str]:
+    """Return the status and what to say of the registration."""
+    if total.core_points == total.without_lod:
+        return "failed", (
+            f"no core point has enough scanned points: {100.0 * placed.near_share:.0f} % of the scan lie within "
+            f"{design_pose.NEAR_MM:g} mm of the design as given; is the design of this structure, and in its unit?"
+        )
+    said = []
+    status = "ok"
+    if placed.registration == "as given":
+        why = "asked for" if params.register == "none" else f"{100.0 * placed.near_share:.0f} % of it lie there"
+        said.append(f"The scan is taken to be in the design's frame ({why}): deviations hold what moved as a whole.")
+        if np.isfinite(placed.turn):
+            shift = " / ".join(f"{one:.2f}" for one in placed.shift.tolist())
+            said.append(
+                f"A best fit would move its middle by {shift} mm and turn it by {1000.0 * placed.turn:.3f} mrad; "
+                'deviation.register = "fine" applies it.'
+            )
+    else:
+        said.append(
+            "The scan was registered to the design by a best fit: what the structure moved as a whole is taken up by "
+            "it and not among the deviations."
+        )
+        if not np.isfinite(placed.T_best_fit).all():
+            status = "weak"
+            said.append("What was seen does not hold the best fit: the attitude is the coarse one.")
+    if placed.ambiguity < AMBIGUOUS:
+        status = "ambiguous"
+        said.append(
+            f"Another attitude fits about as well (its error is {placed.ambiguity:.2f} times the best one's): the "
+            "structure looks the same from there; give the scan in about the design's frame to tell them apart."
+        )
+    if placed.weak and placed.registration != "as given" and status == "ok":
+        status = "weak"
+        said.append(f"Not held well by what was seen: {', '.join(placed.weak)}.")
+    return status, " ".join(said)
+
+
+def global_pose(T: Floats, scan_origin: Floats, design_origin: Floats) -> Floats:
+    """Pose of local frames as one of frames whose origins are put back."""
+    shift: Floats = T[:3, 3] + design_origin - T[:3, :3] @ scan_origin
+    return rigid.transform(T[:3, :3], shift)

@@ -1,0 +1,46 @@
+"""Deviation of a scanned structure from its design, with a level of detection at every core point.
+
+Method ``default`` holds each scanned point against the design's surface; ``paper`` is the source paper's chain (paper
+002): sampled design, principal axes, iterative closest point, M3C2 between two clouds with the paper's scales.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from processor.deviation import baseline, cloud, measure
+from processor.deviation.params import METHODS, Params
+from processor.deviation.result import Result
+from processor.model import InputError, Scene, UsageError
+
+__all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
+
+NAME = "deviation"
+NEEDS = ("stitch",)
+KIND = "structure"
+
+
+def applies(scene: Scene) -> bool:
+    """Whether there is a design to hold the scan against."""
+    return scene.kind == KIND and scene.structure is not None and len(scene.structure.faces) > 0
+
+
+def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) -> Result:
+    """Hold the scan of a scene against its design; scans that were stitched ``earlier`` are placed as found there.
+
+    Raises InputError without a design or points, UsageError for parameters that make no sense.
+    """
+    if params.method not in METHODS:
+        raise UsageError(f"deviation: unknown method {params.method!r}; it has {', '.join(METHODS)}")
+    params.check()
+    if scene.structure is None:
+        raise InputError(
+            f"{scene.name}: deviation needs a design, a mesh named by 'design' in project.toml; without one, "
+            "processor compare holds one scan against another"
+        )
+    vertices, origin = cloud.local_design(scene.structure)
+    scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, (earlier or {}).get("stitch"))
+    if params.method == "paper":
+        return baseline.measure(scene, scan, vertices, origin, params)
+    return measure.measure(scene, scan, vertices, origin, params)

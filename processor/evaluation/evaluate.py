@@ -1,0 +1,83 @@
+"""Results held against the truth. The only reader of truth."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processor import pipeline
+from processor.evaluation.space_frame import true_rows
+from processor.model import Floats, InputError, Metric, Scene, Truth
+from processor.pipeline import Execution
+from processor.scan_folder import folder
+from processor.space_frame import step as space_frame_step
+from processor.store import store
+
+
+@dataclass(frozen=True)
+class ErrorReport:
+    """The checks of a run; by method of spheres the true radius (k,) and centre (k, 3) of each ball found, mm.
+
+    NaN where it is none.
+    """
+
+    metrics: tuple[Metric, ...] = ()
+    true_radii: Mapping[str, Floats] = field(default_factory=dict)
+    true_centres: Mapping[str, Floats] = field(default_factory=dict)
+
+    @property
+    def passed(self) -> bool:
+        """Whether no limit was missed."""
+        return all(metric.passed for metric in self.metrics)
+
+
+def _check_of(step: str) -> Callable[[Scene, Any, Truth], list[Metric]]:
+    """Return ``check`` of the step's module in this folder, which has the name of the step's package."""
+    found: Callable[[Scene, Any, Truth], list[Metric]]
+    found = importlib.import_module(f"processor.evaluation.{pipeline.package_of(step)}").check
+    return found
+
+
+def evaluate(path: Path, execution: Execution) -> ErrorReport:
+    """Check every run against the truth of the input at ``path``; empty where it holds none.
+
+    The name of a check begins with the method's where the run was made for comparison. Raises InputError for a truth
+    that cannot be read, or is that of another scene.
+    """
+    source = folder.truth_file(path)
+    truth = None if source is None else store.read_truth(source, labels=execution.stored is None)
+    if source is None or truth is None:
+        return ErrorReport()
+    metrics: list[Metric] = []
+    answered: set[str] = set()
+    for run in execution.runs:
+        try:
+            found = _check_of(run.step)(execution.scene, run.result, truth)
+        except (LookupError, ValueError) as error:
+            raise InputError(
+                f"{source}: the truth does not fit what step {run.step} found ({error!r}); is it of another scene?"
+            ) from error
+        if run.step in answered:
+            found = [dataclasses.replace(metric, name=f"{run.method}: {metric.name}") for metric in found]
+        answered.add(run.step)
+        metrics += found
+    true = truth.frame
+    if true is None:
+        return ErrorReport(tuple(metrics))
+    rows = {
+        run.method: true_rows(execution.scene, run.result, true)
+        for run in execution.runs
+        if isinstance(run.result, space_frame_step.Result)
+    }
+    radii, centres = np.append(true.radii, np.nan), np.vstack([true.centres, np.full(3, np.nan)])
+    return ErrorReport(
+        tuple(metrics),
+        {method: radii[row] for method, row in rows.items()},
+        {method: centres[row] for method, row in rows.items()},
+    )

@@ -1,0 +1,69 @@
+"""Virtual preassembly of an arch bridge from scans of its parts: ``adjustment``, or the source paper's three methods.
+
+``adjustment`` registers every part to its design and adjusts the whole chain at once, with an interval for every gap.
+``corner`` (the paper's W1) chains the parts by the four corners of each joint, ``line`` (W2) by the points on the
+joint's edges, ``design-aided`` (W3) by these and the bottom edges held against the design's. They are baselines: their
+band is what they make of parts as designed, and their key points lie on the plates' inner edges. Source: paper 000.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from processor.model import ArchDesign, InputError, Scan, Scene, UsageError
+from processor.preassembly import assemble
+from processor.preassembly.baselines import bootstrap_bands, methods
+from processor.preassembly.params import METHODS, Params
+from processor.preassembly.result import Result
+
+__all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "run"]
+
+NAME = "preassemble"
+NEEDS: tuple[str, ...] = ()
+KEEPS = True  # methods keep for each other what they have in common
+KIND = "arch-bridge"
+
+
+def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Result:
+    """Assemble the bridge of a scene by one of METHODS.
+
+    What the paper's three have in common, the features of the parts, is ``kept`` for the next of them.
+    Raises InputError without an arch design or with a part that has no scan, UsageError for an unknown method.
+    """
+    if params.method not in METHODS:
+        raise UsageError(f"preassemble: unknown method {params.method!r}; it has {', '.join(METHODS)}")
+    design = scene.arch
+    if design is None or len(design.parts) < 2:
+        raise InputError(f"{scene.name}: preassembly needs an arch-bridge design of at least two parts (design.json)")
+    scans = scans_in_order(scene, design)
+    if params.method == "adjustment":
+        return assemble.assemble(scans, scene, design, params)
+    several = [part.name for part, own in zip(design.parts, scans, strict=True) if len(own) > 1]
+    if several:
+        raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")
+    kept = {} if kept is None else kept
+    if "parts" not in kept:
+        kept["parts"] = methods.extract([own[0] for own in scans], design, params)
+        kept["scanned again"] = bootstrap_bands.scanned_again(kept["parts"], design, params)
+    result = methods.assemble(kept["parts"], design, params)
+    result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
+    if np.isfinite(scene.temperature_C) and scene.temperature_C != assemble.REFERENCE_C:
+        said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
+        result = replace(result, message=f"{result.message}; {said}")
+    return result
+
+
+def scans_in_order(scene: Scene, design: ArchDesign) -> list[list[Scan]]:
+    """Return the scans of each part in the design's order. Raises InputError for a part without any."""
+    scans = [[scan for scan in scene.scans if scan.component == part.name] for part in design.parts]
+    for part, own in zip(design.parts, scans, strict=True):
+        if not own:
+            named = ", ".join(sorted(scan.component or scan.name for scan in scene.scans))
+            raise InputError(
+                f"{scene.name}: expected a scan of component {part.name!r}, found none "
+                f"(scans are of: {named}); name them by 'component' in project.toml"
+            )
+    return scans

@@ -1,0 +1,319 @@
+"""Reading in a process of its own, for formats whose libraries may crash, hang or ask for any memory on damaged files.
+
+One such process serves all files of a run; what it dies of is said, and the next file gets a new one. Points come back
+in shared memory, so nothing is copied. It may take ``SLACK_BYTES`` beyond the points themselves, and ``limit_s``.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import importlib
+import json
+import math
+import mmap
+import os
+import resource
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from processor.model import InputError
+from processor.readers import common
+from processor.readers.common import RawScan
+
+SLACK_BYTES = 1 << 30
+LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # no library for a format is nearly as slow
+PATIENCE = 4.0  # times as long by the clock: the machine may be busy with other work
+START_S = 120.0
+ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column")
+SMALL = 1 << 16
+START = (
+    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from processor.readers import sandbox; sandbox.serve()"
+)
+
+
+@dataclass
+class _Helper:
+    process: subprocess.Popen[bytes]
+    channel: socket.socket
+
+    def end(self) -> int:
+        """End the process and return its exit code, negative for a signal."""
+        self.channel.close()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            return self.process.wait(0.5)
+        self.process.kill()
+        return self.process.wait()
+
+
+_helper: _Helper | None = None
+_lock = threading.Lock()
+
+
+def limit_s(path: Path) -> float:
+    """Processor seconds that reading a file may take."""
+    return LEAST_S + path.stat().st_size / BYTES_PER_S
+
+
+def read(path: Path, module: str) -> list[RawScan]:
+    """Read a file by a module of this package in another process.
+
+    Raises InputError as the module does, and where the process crashes or takes more than its time.
+    """
+    with _lock:
+        helper = _running()
+        try:
+            _send(
+                helper.channel, {"module": module, "path": os.fsencode(path.absolute()).hex(), "limit_s": limit_s(path)}
+            )
+            # The process ends itself in time; this is for one that is stopped or cannot be ended.
+            helper.channel.settimeout(PATIENCE * limit_s(path) + 30.0)
+            said, descriptor = _receive(helper.channel)
+        except (OSError, EOFError) as error:
+            raise _death(path, helper, error) from None
+        except BaseException:
+            _forget(helper)
+            raise
+    if "error" in said:
+        raise InputError(f"{path}{said['error']}" if said["about_file"] else said["error"])
+    return _scans(said, descriptor)
+
+
+def _running() -> _Helper:
+    global _helper
+    if _helper is not None and _helper.process.poll() is None:
+        return _helper
+    if _helper is not None:
+        _helper.end()
+    ours, theirs = socket.socketpair()
+    with theirs:
+        process = subprocess.Popen(
+            [sys.executable, "-I", "-c", START, json.dumps(sys.path), str(theirs.fileno())],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            pass_fds=[theirs.fileno()],
+            env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"},
+        )
+    ours.settimeout(START_S)
+    try:
+        _receive(ours)
+    except (OSError, EOFError):
+        process.kill()
+        said = (process.communicate()[1].decode("utf-8", "replace").strip().splitlines() or ["no word from it"])[-1]
+        ours.close()
+        raise InputError(f"a process for reading scans cannot be started: {said}") from None
+    assert process.stderr is not None
+    process.stderr.close()
+    _helper = _Helper(process, ours)
+    return _helper
+
+
+def _forget(helper: _Helper) -> None:
+    global _helper
+    _helper = None
+    helper.process.kill()
+    helper.end()
+
+
+def _death(path: Path, helper: _Helper, error: BaseException) -> InputError:
+    global _helper
+    _helper = None
+    code = helper.end()
+    if code in (-signal.SIGPROF, -signal.SIGALRM) or isinstance(error, TimeoutError):
+        why = f"reading took more than {limit_s(path):.0f} s, far more than a file of its size needs"
+    elif code == -signal.SIGKILL:
+        why = "reading was killed, most likely for want of memory"
+    else:
+        why = f"the library that reads it crashed ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
+    return InputError(f"{path}: {why}; the file is damaged: copy or export it again")
+
+
+@atexit.register
+def close() -> None:
+    """End the reading process, if there is one."""
+    global _helper
+    helper, _helper = _helper, None
+    if helper is not None:
+        helper.end()
+
+
+def _scans(said: dict[str, Any], descriptor: int) -> list[RawScan]:
+    try:
+        length = os.fstat(descriptor).st_size
+        shared = mmap.mmap(descriptor, length) if length else b""
+    finally:
+        os.close(descriptor)
+    scans = []
+    for one in said["scans"]:
+        arrays: dict[str, Any] = {
+            key: np.frombuffer(shared, dtype, math.prod(shape), offset).reshape(shape) if 0 not in shape else ()
+            for key, (offset, shape, dtype) in one["arrays"].items()
+        }
+        scans.append(RawScan(one["name"], unit=one["unit"], step=one["step"], **arrays))
+    return scans
+
+
+# --- messages: a length, JSON, and with those that have arrays a descriptor ----------------------------------------
+
+
+def _send(channel: socket.socket, message: dict[str, Any], descriptor: int | None = None) -> None:
+    text = json.dumps(message).encode()
+    head = struct.pack("<Q", len(text))
+    if descriptor is None:
+        channel.sendall(head)
+    else:
+        socket.send_fds(channel, [head], [descriptor])
+    channel.sendall(text)
+
+
+def _receive(channel: socket.socket) -> tuple[dict[str, Any], int]:
+    head, descriptors, _, _ = socket.recv_fds(channel, 8, 1)
+    while len(head) < 8:
+        head += _some(channel, 8 - len(head))
+    text = bytearray()
+    while len(text) < struct.unpack("<Q", head)[0]:
+        text += _some(channel, struct.unpack("<Q", head)[0] - len(text))
+    message: dict[str, Any] = json.loads(text)
+    return message, descriptors[0] if descriptors else -1
+
+
+def _some(channel: socket.socket, most: int) -> bytes:
+    found = channel.recv(min(most, 1 << 20))
+    if not found:
+        raise EOFError
+    return found
+
+
+# --- the other process ---------------------------------------------------------------------------------------------
+
+
+class _Shared:
+    """Memory of which arrays are cut, and which the other process sees through one descriptor."""
+
+    def __init__(self) -> None:
+        self.end = 0
+        self.blocks: list[tuple[int, int, int]] = []  # address, bytes, offset
+        if hasattr(os, "memfd_create"):
+            self.descriptor = os.memfd_create("scan")
+        else:
+            with tempfile.TemporaryFile() as file:
+                self.descriptor = os.dup(file.fileno())
+
+    def new(self, shape: tuple[int, ...], dtype: type) -> npt.NDArray[Any]:
+        """Return an array in the shared memory, and allow the process as much more."""
+        size = np.dtype(dtype).itemsize * math.prod(shape)
+        if size < SMALL:
+            return np.empty(shape, dtype)
+        _allow(size)
+        offset = self.end
+        self.end += -(-size // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+        os.ftruncate(self.descriptor, self.end)
+        array: npt.NDArray[Any] = np.frombuffer(mmap.mmap(self.descriptor, size, offset=offset), dtype).reshape(shape)
+        self.blocks.append((_address(array), size, offset))
+        return array
+
+    def place(self, array: Any) -> int:
+        """Offset of an array's content in the shared memory, where it is put if it is not there yet."""
+        address = _address(array)
+        for start, size, offset in self.blocks:
+            if start <= address and address + array.nbytes <= start + size:
+                return offset + address - start
+        offset = self.end
+        self.end += -(-array.nbytes // 16) * 16
+        os.ftruncate(self.descriptor, self.end)
+        view = memoryview(array).cast("B") if array.size else b""
+        done = 0
+        while done < array.nbytes:
+            done += os.pwrite(self.descriptor, view[done : done + (1 << 26)], offset + done)
+        return offset
+
+
+def _address(array: Any) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
+def _allow(more: int) -> None:
+    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
+    if soft != resource.RLIM_INFINITY:
+        wanted = soft + more if hard == resource.RLIM_INFINITY else min(soft + more, hard)
+        resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))
+
+
+def _limit_memory(slack: int) -> None:
+    """Limit the address space to what is in use now and ``slack``; never above a limit that is there already."""
+    pages = Path("/proc/self/statm")
+    if not pages.exists():
+        return
+    wanted = int(pages.read_text().split()[0]) * mmap.PAGESIZE + slack
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    resource.setrlimit(resource.RLIMIT_AS, (wanted if hard == resource.RLIM_INFINITY else min(wanted, hard), hard))
+
+
+def serve() -> None:
+    """Answer requests until the other side closes."""
+    channel = socket.socket(fileno=int(sys.argv[2]))
+    for name in ("laspy", "pye57"):
+        importlib.import_module(name)
+    for number in (signal.SIGPROF, signal.SIGALRM):
+        signal.signal(number, signal.SIG_DFL)  # ends the process even within a library
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    _send(channel, {})
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what libraries complain of comes as errors too
+    while True:
+        try:
+            asked, _ = _receive(channel)
+        except (EOFError, OSError):
+            return
+        shared = _Shared()
+        common.give_room_by(shared.new)
+        _limit_memory(SLACK_BYTES)
+        signal.setitimer(signal.ITIMER_PROF, asked["limit_s"])
+        signal.setitimer(signal.ITIMER_REAL, PATIENCE * asked["limit_s"])
+        said = _answer(Path(os.fsdecode(bytes.fromhex(asked["path"]))), asked["module"], shared)
+        for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
+            signal.setitimer(timer, 0.0)
+        _send(channel, said, shared.descriptor)
+        os.close(shared.descriptor)
+        del shared
+        common.give_room_by(np.empty)
+
+
+def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:
+    try:
+        with np.errstate(invalid="ignore"):
+            scans = importlib.import_module(f"processor.readers.{module}").read(path)
+    except InputError as error:
+        said = str(error)
+        about = said.startswith(str(path))
+        return {"error": said.removeprefix(str(path)), "about_file": about}
+    except OSError as error:
+        return {"error": f": cannot be read ({error.strerror or error})", "about_file": True}
+    except MemoryError:
+        return {
+            "error": ": takes more memory than a file of its size should; is it damaged?",
+            "about_file": True,
+        }
+    found = []
+    for scan in scans:
+        arrays = {}
+        for key in ARRAYS:
+            array = getattr(scan, key)
+            arrays[key] = (shared.place(array), array.shape, array.dtype.str)
+        found.append({"name": scan.name, "unit": scan.unit, "step": scan.step, "arrays": arrays})
+    return {"scans": found}

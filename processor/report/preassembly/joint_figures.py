@@ -1,0 +1,152 @@
+"""Figures of the gaps at every joint: the section with arrows across it, and all methods beside each other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Ellipse, Polygon
+
+from processor.model import KEY_POINTS, NORMAL_95, Floats, StepRun
+from processor.preassembly import step as preassembly_step
+from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
+from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, label, png, rounded
+
+MOST_JOINTS = 24
+ARROW_SHARE = 0.3  # of the section: how long the longest arrow is drawn
+# Where the numbers of P1..P8 stand: outward of the section, left of the bridge is left on the page.
+OUTWARD = ((-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0))
+ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
+
+
+def gap_vectors(result: preassembly_step.Result) -> tuple[str, bytes]:
+    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without an answer says so."""
+    shown = range(len(result.measures))[:MOST_JOINTS]
+    known = [j for j in shown if np.isfinite(result.measures[j].gaps).all()]
+    across = min(2, len(shown))
+    down = math.ceil(len(shown) / across)
+    figure = Figure(figsize=(4.6 * across, 4.3 * down + 0.5), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(down, across, squeeze=False).ravel())
+    times = _times([result.measures[j] for j in known])
+    for axes, j in zip(panels, shown, strict=False):
+        if j in known:
+            _section(axes, result.measures[j], times)
+        else:
+            axes.set(xticks=[], yticks=[])
+            axes.text(0.5, 0.5, "no answer: the gaps are not known", ha="center", transform=axes.transAxes, fontsize=9)
+        axes.set_title(f"{label(result.joints[j], j)}: {result.verdict[j]}", fontsize=11)
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    handles = [
+        Line2D([], [], color=COLOURS[0], marker=">", label=f"gap across, drawn {times:,.0f} times its size"),
+        Line2D([], [], color=COLOURS[1], label="95 % region of the gap across"),
+        Line2D([], [], color="black", marker="o", fillstyle="none", linestyle="", label="dx +: open along the bridge"),
+        Line2D([], [], color="black", marker="s", linestyle="", label="dx −: overlap"),
+    ]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
+    count = len(result.measures)
+    more = f"; the first {len(shown)} of {count} joints" if len(shown) < count else ""
+    return (
+        "Gaps at the joints, right part minus left, in the joint's axes, seen along the bridge; numbers are dx with "
+        f"its 95 % interval, mm{more}",
+        png(figure),
+    )
+
+
+def by_axis(runs: Sequence[StepRun]) -> tuple[str, bytes]:
+    """Draw the gaps of all methods along each axis, point pair by point pair (paper 000, figures 19 to 21)."""
+    joints = runs[0].result.joints[:MOST_JOINTS]
+    figure = Figure(figsize=(max(8.0, 1.8 * len(joints)), 8.2), layout="constrained")
+    panels = figure.subplots(3, 1, sharex=True)
+    place = np.arange(len(joints))[:, None] + np.linspace(-0.38, 0.38, 8)
+    for axis, (axes, name) in enumerate(zip(panels, ("dx, along the span", "dy, across", "dz, up"), strict=True)):
+        for k, run in enumerate(runs):
+            width = run.result.gap_ci95[: len(joints), :, axis]
+            axes.errorbar(
+                (place + 0.022 * (k - 0.5 * (len(runs) - 1))).ravel(),
+                run.result.gaps[: len(joints), :, axis].ravel(),
+                yerr=width.ravel() if np.isfinite(width).any() else None,
+                fmt=MARKERS[k % len(MARKERS)],
+                color=COLOURS[k % len(COLOURS)],
+                markersize=4,
+                markerfacecolor="none",
+                label=run.method,
+            )
+        axes.axhline(0.0, color="0.3", linewidth=0.8)
+        for line in range(1, len(joints)):
+            axes.axvline(line - 0.5, color="0.8", linewidth=0.8)
+        axes.set(ylabel=f"{name}, mm")
+    panels[2].set_xticks(np.arange(len(joints)), [label(joint, j) for j, joint in enumerate(joints)])
+    panels[2].set(xlabel="joint, P1 to P8 from left to right")
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
+    return "Gaps by every method along each axis, right part minus left", png(figure)
+
+
+def _times(measures: Sequence[Measures]) -> float:
+    """By how much arrows are enlarged; intervals count, lest noise look like a gap."""
+    longest, size = LEAST_SHOWN_MM, 0.0
+    for one in measures:
+        reach = RAYLEIGH_95 * np.sqrt(np.maximum(np.diag(one.covariance), 0.0)).reshape(8, 3)[:, 1:].max()
+        longest = max(longest, float(np.linalg.norm(one.gaps[:, 1:], axis=1).max()), float(reach))
+        size = max(size, float(np.ptp(one.points[:, 1:], axis=0).min()))
+    return rounded(ARROW_SHARE * size / longest)
+
+
+def _section(axes: Axes, measures: Measures, times: float) -> None:
+    at, gaps = measures.points[:, 1:], measures.gaps
+    axes.add_patch(Polygon(at[:4], closed=True, facecolor="0.96", edgecolor="0.45", linewidth=1.2))
+    half = NORMAL_95 * np.sqrt(np.maximum(np.diag(measures.covariance)[::3], 0.0))
+    for k in range(8):
+        tip = at[k] + times * gaps[k, 1:]
+        block = measures.covariance[3 * k + 1 : 3 * k + 3, 3 * k + 1 : 3 * k + 3]
+        axes.add_patch(_ellipse(tip, block * times**2))
+        axes.annotate(
+            "",
+            tip,
+            at[k],
+            arrowprops={
+                "arrowstyle": "-|>",
+                "color": COLOURS[0],
+                "lw": 1.4,
+                "mutation_scale": 7,
+                "shrinkA": 0,
+                "shrinkB": 0,
+            },
+        )
+        is_open = gaps[k, 0] >= 0.0
+        axes.plot(*at[k], "o" if is_open else "s", color="black", markersize=5, fillstyle="none" if is_open else "full")
+        side, up = OUTWARD[k]
+        # Left of the bridge is +y and stands on the left: the axis is turned round below.
+        axes.annotate(
+            f"{KEY_POINTS[k]}\n{round(gaps[k, 0], 2) + 0.0:+.2f}\n± {half[k]:.2f}",
+            (at[k, 0], at[k, 1]),
+            xytext=(30 * side, 26 * up),
+            textcoords="offset points",
+            ha=ALIGNED[side][0],
+            va=ALIGNED[up][1],
+            fontsize=8,
+            bbox=BEHIND_TEXT,
+            zorder=1.5,
+        )
+    size = np.ptp(at, axis=0)
+    low, high = at.min(axis=0) - 0.72 * size.max(), at.max(axis=0) + 0.72 * size.max()
+    axes.set(xlim=(high[0], low[0]), ylim=(at[:, 1].min() - 0.47 * size.max(), at[:, 1].max() + 0.47 * size.max()))
+    axes.set_aspect("equal")
+    axes.set(xlabel="to the left, mm", ylabel="up, mm")
+    axes.tick_params(labelsize=8)
+    axes.grid(alpha=0.25)
+
+
+def _ellipse(at: Floats, covariance: Floats) -> Ellipse:
+    """Return the region that holds 95 % of a normal distribution in the plane."""
+    scale, axes = np.linalg.eigh(covariance)
+    length = 2.0 * RAYLEIGH_95 * np.sqrt(np.maximum(scale, 0.0))
+    turn = math.degrees(math.atan2(axes[1, 1], axes[0, 1]))
+    return Ellipse(
+        (float(at[0]), float(at[1])), float(length[1]), float(length[0]), angle=turn,
+        facecolor="none", edgecolor=COLOURS[1], linewidth=1.1, zorder=4,
+    )  # fmt: skip

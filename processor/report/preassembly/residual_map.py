@@ -1,0 +1,142 @@
+"""Figure of every part's distances from its design, unrolled: along the part against around its four faces."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from processor.model import DesignPart, Floats, Scene
+from processor.preassembly import step as preassembly_step
+from processor.report.style import DIVERGING, LEAST_SHOWN_MM, label, png
+
+FACES = ("bottom", "right", "top", "left")
+MOST_PARTS = 24
+ACROSS = 2
+POINTS_A_CELL = 6.0
+SECTIONS = 30  # pieces of a part's length that the height of its section is read from
+
+
+@dataclass(frozen=True)
+class Unrolled:
+    """Points of a part laid out flat, m: along the part, and around it from the bottom's left edge over the right."""
+
+    along: Floats
+    around: Floats
+    edges: Floats  # (5,) where the four faces begin and the last ends
+
+
+def unroll(part: DesignPart, points: Floats) -> Unrolled:
+    """Lay out points (n, 3) on a part's surface; a face's width is the median one, as sections may grow."""
+    middle = 0.5 * (_evenly(part.bottom_edge_left) + _evenly(part.bottom_edge_right))
+    half_width = 0.5 * np.linalg.norm(_evenly(part.bottom_edge_left) - _evenly(part.bottom_edge_right), axis=1)
+    step = np.linalg.norm(np.diff(middle, axis=0), axis=1)
+    arc = np.concatenate([[0.0], np.cumsum(step)])
+    flat = np.linalg.norm(points[:, None, [0, 2]] - middle[None, :, [0, 2]], axis=2)
+    at = np.argmin(flat, axis=1)
+    tangent = np.gradient(middle, axis=0)
+    tangent /= np.linalg.norm(tangent, axis=1)[:, None]
+    off = points - middle[at]
+    along = arc[at] + np.einsum("ni,ni->n", off, tangent[at])
+    left = off[:, 1]
+    up = off[:, 2] * tangent[at, 0] - off[:, 0] * tangent[at, 2]
+    height = _heights(along, up, float(arc[-1]))
+    share_y = np.clip(0.5 - 0.5 * left / half_width[at], 0.0, 1.0)  # 0 at the left, 1 at the right
+    share_z = np.clip(up / height, 0.0, 1.0)
+    width, tall = 2.0 * half_width[at], height
+    off_face = np.stack([share_z * tall, (1.0 - share_y) * width, (1.0 - share_z) * tall, share_y * width])
+    face = np.argmin(off_face, axis=0)
+    share = np.choose(face, [share_y, share_z, 1.0 - share_y, 1.0 - share_z])
+    sizes = np.array([np.median(width), np.median(tall)] * 2) / 1e3
+    edges = np.concatenate([[0.0], np.cumsum(sizes)])
+    return Unrolled(along / 1e3, edges[face] + share * sizes[face], edges)
+
+
+def _evenly(edge: Floats, count: int = 200) -> Floats:
+    """Return points (count, 3) evenly along a polyline."""
+    arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(edge, axis=0), axis=1))])
+    at = np.linspace(0.0, arc[-1], count)
+    return np.stack([np.interp(at, arc, edge[:, i]) for i in range(3)], axis=1)
+
+
+def _heights(along: Floats, up: Floats, length: float) -> Floats:
+    """Height of the section (n,) at each point, from the highest points about it."""
+    piece = np.clip((along / max(length, 1e-9) * SECTIONS).astype(int), 0, SECTIONS - 1)
+    top = np.array([np.quantile(up[piece == i], 0.98) if (piece == i).any() else np.nan for i in range(SECTIONS)])
+    known = np.isfinite(top)
+    centres = (np.arange(SECTIONS) + 0.5) * length / SECTIONS
+    found: Floats = np.maximum(np.interp(along, centres[known], top[known]), 1e-6)
+    return found
+
+
+def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
+    """Medians (across, along) of the values in cells, NaN where there is none, and the cells' limits."""
+    length, girth = max(float(np.ptp(flat.along)), 1e-6), float(flat.edges[-1])
+    total = max(len(values) / POINTS_A_CELL, 16.0)
+    columns = int(np.clip(math.sqrt(total * length / girth), 4, 120))
+    rows = int(np.clip(total / columns, 4, 40))
+    x = np.linspace(flat.along.min(), flat.along.min() + length, columns + 1)
+    y = np.unique(
+        np.concatenate(
+            [np.linspace(a, b, max(rows // 4, 1) + 1) for a, b in zip(flat.edges, flat.edges[1:], strict=False)]
+        )
+    )
+    i = np.clip(np.searchsorted(x, flat.along, side="right") - 1, 0, columns - 1)
+    k = np.clip(np.searchsorted(y, flat.around, side="right") - 1, 0, len(y) - 2)
+    found = np.full((len(y) - 1, columns), np.nan)
+    place = k * columns + i
+    order = np.argsort(place, kind="stable")
+    starts = np.flatnonzero(np.diff(place[order], prepend=-1))
+    for group in np.split(order, starts[1:]):
+        found.flat[place[group[0]]] = np.median(values[group])
+    return found, x, y
+
+
+def _can_show(part: DesignPart, result: preassembly_step.Result, i: int) -> bool:
+    known = (result.residual_component == i) & np.isfinite(result.residual)
+    return bool(known.any()) and min(len(part.bottom_edge_left), len(part.bottom_edge_right)) > 1
+
+
+def residuals(scene: Scene, result: preassembly_step.Result) -> tuple[str, bytes] | None:
+    """Draw the distances from the design's surface, a panel a part, up to MOST_PARTS of them; None without any."""
+    assert scene.arch is not None
+    parts = {part.name: part for part in scene.arch.parts}
+    with_points = [i for i, name in enumerate(result.components) if name in parts and _can_show(parts[name], result, i)]
+    shown = with_points[:MOST_PARTS]
+    if not shown:
+        return None
+    down = math.ceil(len(shown) / ACROSS)
+    figure = Figure(figsize=(9.0, 2.9 * down + 0.6), layout="constrained")
+    panels = figure.subplots(down, ACROSS, squeeze=False).ravel()
+    drawn = []
+    for i in shown:
+        own = (result.residual_component == i) & np.isfinite(result.residual)
+        flat = unroll(parts[result.components[i]], result.residual_points[own])
+        drawn.append((i, flat, *cells(flat, result.residual[own])))
+    everything = np.concatenate([np.abs(values[np.isfinite(values)]) for _, _, values, _, _ in drawn])
+    limit = max(float(np.quantile(everything, 0.99)), LEAST_SHOWN_MM)
+    for axes, (i, flat, values, x, y) in zip(panels, drawn, strict=False):
+        _panel(axes, flat)
+        mesh = axes.pcolormesh(x, y, np.ma.masked_invalid(values), cmap=DIVERGING, vmin=-limit, vmax=limit)
+        axes.set_title(label(result.components[i], i), fontsize=11)
+    for axes in panels[len(shown) :]:
+        axes.set_visible(False)
+    bar = figure.colorbar(mesh, ax=panels.tolist(), location="bottom", shrink=0.6, aspect=40, extend="both", pad=0.02)
+    bar.set_label("distance from the design's surface, outward positive, median of a cell, mm")
+    more = f"; the first {len(shown)} of {len(with_points)} parts" if len(shown) < len(with_points) else ""
+    return f"Residuals of each part, its four faces unrolled; hatched: no points{more}", png(figure)
+
+
+def _panel(axes: Axes, flat: Unrolled) -> None:
+    axes.patch.set(facecolor="white", hatch="////", edgecolor="0.8")
+    for edge in flat.edges[1:-1]:
+        axes.axhline(edge, color="0.2", linewidth=0.8, zorder=3)
+    axes.set(xlabel="along the part, m", ylabel="around, m", xlim=(flat.along.min(), flat.along.max()))
+    axes.set_ylim(0.0, flat.edges[-1])
+    axes.tick_params(labelsize=8)
+    names = axes.secondary_yaxis("right")
+    names.set_yticks(0.5 * (flat.edges[1:] + flat.edges[:-1]), FACES, fontsize=8)
+    names.tick_params(length=0)

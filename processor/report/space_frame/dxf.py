@@ -1,0 +1,81 @@
+"""Nodes, axes and movements of a frame as a drawing (DXF, release 2010) in millimetres, in the input's own frame.
+
+Layers: NODES has a circle of each ball's radius and a point at its centre, AXES a line a tube, MOVEMENTS a line from
+each node's nominal place to where it was found (true to scale), IDS the ids. No text from outside is in it.
+"""
+
+from __future__ import annotations
+
+import importlib
+import io
+from typing import Any
+
+import numpy as np
+
+from processor.model import Floats
+from processor.space_frame.result import Result
+
+MILLIMETRES = 4  # of $INSUNITS
+METRIC = 1  # of $MEASUREMENT
+LAYERS = {"NODES": 5, "AXES": 8, "MOVEMENTS": 30, "IDS": 7}  # with the colours of AutoCAD's index
+TEXT_HEIGHT_MM = 50.0
+
+
+def nominal_places(result: Result) -> Floats:
+    """Return where the design has each node (k, 3), in the input's own frame; NaN where no movement is known."""
+    if not result.gauge:
+        return np.full_like(result.centres, np.nan)
+    found: Floats = result.centres - result.movement @ result.T_design_scan[:3, :3]
+    return found
+
+
+def drawing(result: Result) -> bytes:
+    """Draw a frame; the same bytes for the same result."""
+    ezdxf: Any = importlib.import_module("ezdxf")  # takes a while: not where nothing is drawn
+
+    fixed = ezdxf.options.write_fixed_meta_data_for_testing
+    ezdxf.options.write_fixed_meta_data_for_testing = True  # no dates, no random ids
+    try:
+        document: Any = ezdxf.new("R2010", units=MILLIMETRES)
+        document.header["$MEASUREMENT"] = METRIC
+        for name, colour in LAYERS.items():
+            document.layers.add(name, color=colour)
+        _draw(document.modelspace(), result)
+        low, high = _extent(result)
+        document.header["$EXTMIN"], document.header["$EXTMAX"] = tuple(low), tuple(high)
+        # The library takes them from a set, whose order differs from run to run.
+        document.classes.add_required_classes(document.dxfversion)
+        document.classes.classes = dict(sorted(document.classes.classes.items()))
+        out = io.StringIO(newline="\n")
+        document.write(out)
+    finally:
+        ezdxf.options.write_fixed_meta_data_for_testing = fixed
+    return out.getvalue().encode("utf-8")
+
+
+def _draw(space: Any, result: Result) -> None:
+    nominal = nominal_places(result)
+    for i, centre in enumerate(result.centres.tolist()):
+        if not np.isfinite(centre).all():
+            continue
+        on_nodes, on_ids = {"layer": "NODES"}, {"layer": "IDS"}
+        space.add_point(centre, dxfattribs=on_nodes)
+        aside = 0.0
+        if np.isfinite(result.radii[i]):
+            aside = float(result.radii[i])
+            space.add_circle(centre, aside, dxfattribs=on_nodes)
+        text = space.add_text(str(int(result.ids[i])), height=TEXT_HEIGHT_MM, dxfattribs=on_ids)
+        text.set_placement((centre[0] + aside, centre[1] + aside, centre[2]))
+        if np.isfinite(nominal[i]).all():
+            space.add_line(nominal[i].tolist(), centre, dxfattribs={"layer": "MOVEMENTS"})
+    for start, end in zip(result.tube_start.tolist(), result.tube_end.tolist(), strict=True):
+        space.add_line(start, end, dxfattribs={"layer": "AXES"})
+
+
+def _extent(result: Result) -> tuple[list[float], list[float]]:
+    """Corners of all places, so that a viewer opens on the frame and not on the origin."""
+    places = np.vstack([result.centres, result.tube_start, result.tube_end])
+    places = places[np.isfinite(places).all(axis=1)]
+    if not len(places):
+        return [0.0] * 3, [0.0] * 3
+    return places.min(axis=0).tolist(), places.max(axis=0).tolist()

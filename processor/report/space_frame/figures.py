@@ -1,0 +1,224 @@
+"""Figures of balls: where they are and how they moved, their errors against the bound, and each one to look at."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import matplotlib as mpl
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+from matplotlib.colors import TwoSlopeNorm
+from matplotlib.figure import Figure
+from matplotlib.ticker import NullFormatter
+from scipy.spatial import cKDTree
+
+from processor.evaluation.evaluate import ErrorReport
+from processor.model import Floats, Scene, StepRun
+from processor.report.space_frame import close_ups
+from processor.report.space_frame.dxf import nominal_places
+from processor.report.space_frame.tables import has_bounds
+from processor.report.style import COLOURS, DASHES, DIVERGING, HATCHES, LEAST_SHOWN_MM, MARKERS, Drawn, png, rounded
+from processor.space_frame import step as space_frame_step
+
+FLAGS = ("ok", "low-confidence", "wrong-size")
+MOST_LABELS = 30
+ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest arrows are drawn
+PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
+
+
+def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> Drawn:
+    """Draw balls; ``runs`` are the answer and those compared with it, ``stored`` the file that still has the points."""
+    first: space_frame_step.Result = runs[0].result
+    found: Drawn = {}
+    if len(first.ids) > 1:
+        found[PLAN] = _plan(scene, runs[0])
+        if report.true_radii:
+            found[RADIUS_ERRORS] = _radius_errors(runs, report)
+        if has_bounds(first):
+            found[BALL_ERRORS] = _ball_errors(runs[0], report)
+    if has_bounds(first):
+        found |= close_ups.of_result(scene, first, stored)
+    return found
+
+
+# --- plan ----------------------------------------------------------------------------------------------------------
+
+
+def _plan(scene: Scene, run: StepRun) -> tuple[str, bytes]:
+    """Plan of the balls; one that was not found stands where the design has it."""
+    figure = Figure(figsize=(7.5, 6.5), layout="constrained")
+    axes = figure.subplots()
+    result: space_frame_step.Result = run.result
+    flags = np.array(result.flag, dtype=object)
+    said = _movements(figure, axes, result) if result.gauge else ""
+    for k, flag in enumerate(FLAGS):
+        on = (flags == flag) & np.isfinite(result.centres).all(axis=1)
+        if on.any():
+            axes.scatter(
+                result.centres[on, 0] / 1000.0,
+                result.centres[on, 1] / 1000.0,
+                s=36.0,
+                marker=MARKERS[k],
+                facecolors="none",
+                edgecolors=COLOURS[k],
+                label=f"{flag} ({on.sum()})",
+            )
+    where = result.centres.copy()
+    missing = ~np.isfinite(where).all(axis=1) | (flags == "not-found")
+    where[missing] = close_ups.designed_places(scene, result)[missing]
+    drawn = missing & np.isfinite(where).all(axis=1)
+    if drawn.any():
+        label = f"not found, place of the design ({drawn.sum()})"
+        x, y = (where[drawn, :2] / 1000.0).T
+        axes.scatter(x, y, s=36.0, marker="x", color="black", label=label)
+    to_see = np.flatnonzero((flags != "ok") & np.isfinite(where).all(axis=1))[:MOST_LABELS]
+    for i in to_see.tolist():
+        axes.annotate(str(result.ids[i]), where[i, :2] / 1000.0, xytext=(5, 4), textcoords="offset points", fontsize=8)
+    axes.set(xlabel="x, m", ylabel="y, m")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    if axes.get_legend_handles_labels()[0]:
+        axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3)
+    return f"Plan of the balls, method {run.method}; those to look at bear their ids{said}", png(figure)
+
+
+def _movements(figure: Figure, axes: Axes, result: space_frame_step.Result) -> str:
+    """Draw how nodes moved in plan as arrows and in height as colours; returns what to say of it."""
+    vector = result.centres - nominal_places(result)
+    known = np.isfinite(vector).all(axis=1)
+    if not known.any():
+        return ""
+    vector, places = vector[known], result.centres[known, :2] / 1000.0
+    apart = cKDTree(result.centres[known]).query(result.centres[known], k=2)[0][:, 1] if known.sum() > 1 else np.ones(1)
+    long = max(float(np.quantile(np.hypot(vector[:, 0], vector[:, 1]), 0.95)), LEAST_SHOWN_MM)
+    times = rounded(ARROW_SHARE * float(np.median(apart)) / long)
+    limit = max(float(np.quantile(np.abs(vector[:, 2]), 0.98)), LEAST_SHOWN_MM)
+    up = axes.scatter(
+        places[:, 0], places[:, 1], c=np.clip(vector[:, 2], -limit, limit), s=30.0, cmap=DIVERGING,
+        norm=TwoSlopeNorm(0.0, -limit, limit),
+    )  # fmt: skip
+    figure.colorbar(up, ax=axes, label="movement up, mm", shrink=0.7)
+    axes.quiver(
+        *places.T, *(vector[:, :2].T * times / 1000.0), angles="xy", scale_units="xy", scale=1.0, width=0.0025,
+        color="black", zorder=3,
+    )  # fmt: skip
+    axes.plot([], [], color="black", marker=">", markersize=4.0, label=f"movement in plan, drawn {times:,.0f} times")
+    return f"; arrows are movements in plan, found minus nominal ({result.gauge}), drawn {times:,.0f} times their size"
+
+
+# --- errors --------------------------------------------------------------------------------------------------------
+
+
+def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[str, bytes]:
+    """Histogram of the radius errors and cumulative share of their sizes."""
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    histogram, cumulative = figure.subplots(1, 2)
+    errors = [run.result.radii - report.true_radii[run.method] for run in runs]
+    errors = [error[np.isfinite(error)] for error in errors]
+    everything = np.concatenate(errors)
+    low, high = np.quantile(everything, (0.01, 0.99)) if len(everything) else (-1.0, 1.0)
+    low, high = min(float(low), -LEAST_SHOWN_MM), max(float(high), LEAST_SHOWN_MM)
+    for k, (run, error) in enumerate(zip(runs, errors, strict=True)):
+        histogram.hist(
+            np.clip(error, low, high),
+            bins=np.linspace(low, high, 31).tolist(),
+            histtype="stepfilled",
+            facecolor=(*mpl.colors.to_rgb(COLOURS[k % 4]), 0.35),
+            edgecolor=COLOURS[k % 4],
+            hatch=HATCHES[k % 4],
+            label=run.method,
+        )
+        size = np.sort(np.maximum(np.abs(error), LEAST_SHOWN_MM))
+        share = np.arange(1, len(size) + 1) / len(run.result.ids)
+        cumulative.step(
+            size, share, DASHES[k % 4], color=COLOURS[k % 4], where="post", label=f"{run.method} (n = {len(size)})"
+        )
+    histogram.axvline(0.0, color="0.3", linewidth=0.8)
+    histogram.set(xlabel="radius error, mm", ylabel="balls")
+    cumulative.set(xlabel="|radius error|, mm", ylabel="share of all balls", ylim=(0.0, 1.02))
+    if len(everything):
+        cumulative.set_xscale("log")
+        cumulative.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        cumulative.xaxis.set_minor_formatter(NullFormatter())
+    for axes in (histogram, cumulative):
+        axes.grid(alpha=0.3)
+        axes.legend(fontsize=8)
+    return "Radius errors by method, estimate minus truth; the outermost bars hold all beyond", png(figure)
+
+
+def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[str, bytes]:
+    """Histograms of radius and centre: errors where the truth is known, else standard deviations; and the bound's."""
+    result: space_frame_step.Result = run.result
+    figure = Figure(figsize=(9.0, 3.9), layout="constrained")
+    found = np.array([flag != "not-found" for flag in result.flag], bool)
+    sd = np.sqrt(np.maximum(np.einsum("kii->ki", result.covariance), 0.0))[found]
+    bound = result.bound_sd[found]
+    radii, centres = report.true_radii.get(run.method), report.true_centres.get(run.method)
+    panels = figure.subplots(1, 2)
+    if radii is None or centres is None:
+        _deviations(panels[0], sd[:, 3], bound[:, 3], "sd of the radius, mm", "balls")
+        _deviations(panels[1], sd[:, :3], bound[:, :3], "sd of the centre along x, y and z, mm", "coordinates")
+        said = "Standard deviations as stated, and the least that any estimate could have (Cramér-Rao bound)"
+    else:
+        off = (result.radii - radii)[found], (result.centres - centres)[found]
+        _errors(panels[0], off[0], sd[:, 3], bound[:, 3], "radius error, mm", "balls")
+        _errors(panels[1], off[1], sd[:, :3], bound[:, :3], "centre error along x, y and z, mm", "coordinates")
+        said = "Errors of radius and centre, estimate minus truth, and how they would spread as stated and at best"
+    for axes in panels:
+        axes.grid(alpha=0.3)
+        axes.set_ylim(0.0, 1.3 * max(axes.get_ylim()[1], 1.0))  # room for the legend
+        axes.legend(fontsize=8, loc="upper left")
+    return f"{said}; the outermost bars hold all beyond", png(figure)
+
+
+def _errors(axes: Axes, off: Floats, sd: Floats, bound: Floats, what: str, of: str) -> None:
+    """Draw errors, and the distribution that they would have: a normal one a ball, all added up."""
+    known = np.isfinite(off)
+    errors = off[known]
+    reach = float(np.quantile(np.abs(errors), 0.99)) if len(errors) else 1.0
+    reach = 1.15 * max(reach, 2.5 * _middle(bound[known]), LEAST_SHOWN_MM)
+    bins = np.linspace(-reach, reach, 31)
+    _bars(axes, np.clip(errors, -reach, reach), bins, f"errors (n = {len(errors)})")
+    x = np.linspace(-reach, reach, 301)
+    for k, (name, one) in enumerate((("Cramér-Rao bound, stations held", bound), ("as stated", sd)), start=1):
+        y = _mixture(x, one[known], bins[1] - bins[0])
+        if y is not None:
+            axes.plot(x, y, DASHES[k], color=COLOURS[k], label=f"expected, {name}")
+    axes.axvline(0.0, color="0.3", linewidth=0.8)
+    axes.set(xlabel=what, ylabel=of)
+
+
+def _mixture(x: Floats, sd: Floats, width: float) -> Floats | None:
+    """Return how many of the errors with these sd a bar of that width about each x would hold; None without any."""
+    sd = sd[np.isfinite(sd) & (sd > 0.0)]
+    if not len(sd):
+        return None
+    found = np.zeros_like(x)
+    for part in np.array_split(sd, -(-len(sd) // 1000)):  # a roof's balls at once would be too large a table
+        found += (np.exp(-0.5 * (x[:, None] / part) ** 2) / part).sum(axis=1)
+    density: Floats = found * width / np.sqrt(2.0 * np.pi)
+    return density
+
+
+def _deviations(axes: Axes, sd: Floats, bound: Floats, what: str, of: str) -> None:
+    """Draw standard deviations as stated over those of the bound."""
+    ends = [one[np.isfinite(one)] for one in (sd, bound)]
+    high = max([LEAST_SHOWN_MM, *(float(np.quantile(one, 0.98)) for one in ends if len(one))])
+    bins = np.linspace(0.0, 1.1 * high, 31)
+    for k, (name, one) in enumerate(zip(("as stated", "Cramér-Rao bound, stations held"), ends, strict=True)):
+        _bars(axes, np.minimum(one, 1.1 * high), bins, f"{name} (n = {len(one)})", k)
+    axes.set(xlabel=what, ylabel=of)
+
+
+def _bars(axes: Axes, values: npt.NDArray[np.float64], bins: Floats, label: str, k: int = 0) -> None:
+    axes.hist(
+        values, bins=bins.tolist(), histtype="stepfilled", facecolor=(*mpl.colors.to_rgb(COLOURS[k]), 0.35),
+        edgecolor=COLOURS[k], hatch=HATCHES[k], label=label,
+    )  # fmt: skip
+
+
+def _middle(values: Floats) -> float:
+    known = values[np.isfinite(values)]
+    return float(np.median(known)) if len(known) else 0.0

@@ -1,0 +1,124 @@
+"""Values out of project.toml and design.json, each checked, with its place in the file in every message."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processor.model import Floats, InputError, UsageError
+from processor.scan_folder.units import known_unit
+
+
+def inside(folder: Path, text: str, where: str) -> Path:
+    """Path of a file that a text within ``folder`` names. Raises InputError for one that leads out of the folder."""
+    path = folder / text
+    parts = text.replace("\\", "/").split("/")
+    if "\0" in text or (path.is_absolute() and text.startswith(("/", "\\"))) or ".." in parts or ":" in parts[0]:
+        raise InputError(f"{where}: {text!r} leads out of the folder; give a path below it")
+    try:
+        stays = path.resolve().is_relative_to(folder.resolve())
+    except (OSError, RuntimeError, ValueError):
+        stays = False
+    if not stays:
+        raise InputError(f"{where}: {text!r} is a link that leads out of the folder; put the file itself there")
+    if not path.exists():
+        raise InputError(f"{where}: there is no file {text!r} in {folder}")
+    return path
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a file, and where it stands there."""
+
+    where: str
+    values: Mapping[str, Any]
+
+    @classmethod
+    def of(cls, where: str, value: Any) -> Table:
+        """Take a value as a table. Raises InputError where it is none."""
+        if not isinstance(value, dict):
+            raise InputError(f"{where}: expected a table of names and values, found {_kind(value)}")
+        return cls(where, value)
+
+    def only(self, known: Collection[str]) -> None:
+        """Raise InputError for a key that is not known."""
+        unknown = [key for key in self.values if key not in known]
+        if unknown:
+            raise InputError(f"{self.where}: unknown key {unknown[0]!r}; known are {', '.join(known)}")
+
+    def _error(self, key: str, expected: str) -> InputError:
+        found = _kind(self.values[key]) if key in self.values else "nothing"
+        return InputError(f"{self.where}: expected {expected} as {key!r}, found {found}")
+
+    def text(self, key: str, default: str | None = None) -> str:
+        """Text that is not empty."""
+        value = self.values.get(key, default)
+        if not isinstance(value, str) or (key in self.values and not value):
+            raise self._error(key, "a text")
+        return value
+
+    def unit(self, key: str, default: str | None = None) -> str:
+        """Return the name of a known unit of length."""
+        text = self.text(key, default)
+        try:
+            return known_unit(text) if text else text
+        except UsageError as error:
+            raise InputError(f"{self.where}: {error}") from None
+
+    def number(self, key: str, default: float | None = None, positive: bool = False) -> float:
+        """Return a finite number."""
+        if key not in self.values and default is not None:
+            return default
+        value = self.values.get(key)
+        try:
+            if isinstance(value, bool) or not isinstance(value, (int, float)):
+                raise ValueError
+            number = float(value)
+        except (ValueError, OverflowError):
+            raise self._error(key, "a number") from None
+        if not math.isfinite(number) or (positive and number <= 0):
+            raise self._error(key, "a number above 0" if positive else "a finite number")
+        return number
+
+    def integer(self, key: str) -> int:
+        """Return a whole number of at most 53 bits."""
+        value = self.values.get(key)
+        if isinstance(value, bool) or not isinstance(value, int) or abs(value) >= 2**53:
+            raise self._error(key, "a whole number")
+        return value
+
+    def array(self, key: str, *shape: int) -> Floats:
+        """Return an array of finite numbers; -1 in ``shape`` leaves an axis free."""
+        expected = "numbers of shape " + " x ".join("n" if n < 0 else str(n) for n in shape)
+        try:
+            array = np.array(self.values.get(key), np.float64)
+        except (ValueError, TypeError, OverflowError):
+            raise self._error(key, expected) from None
+        fits = array.ndim == len(shape) and all(n in (-1, m) for n, m in zip(shape, array.shape, strict=True))
+        if not fits or not np.isfinite(array).all():
+            raise self._error(key, expected)
+        return array
+
+    def tables(self, key: str) -> list[Table]:
+        """List of tables; none where the key is absent."""
+        value = self.values.get(key, [])
+        if not isinstance(value, list):
+            raise self._error(key, "a list")
+        return [Table.of(f"{self.where}: {key} {i}", item) for i, item in enumerate(value, 1)]
+
+    def table(self, key: str) -> Table:
+        """Return a table within this one."""
+        if key not in self.values:
+            raise self._error(key, "a table")
+        return Table.of(f"{self.where}: {key}", self.values[key])
+
+
+def _kind(value: Any) -> str:
+    if isinstance(value, (str, int, float)):
+        return repr(value)[:60]
+    return {list: "a list", dict: "a table", type(None): "null"}.get(type(value), type(value).__name__)

@@ -1,0 +1,207 @@
+"""Designs from files: design.json of an arch bridge or a space frame, or a table of balls; meshes of components."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+from collections.abc import Sequence
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from processor.geometry import box_girder
+from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints
+from processor.readers.common import decoded, parsing
+from processor.scan_folder import cad
+from processor.scan_folder.checked_toml import Table, inside
+from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
+from processor.scan_folder.units import MM_PER_UNIT, SYNONYMS
+
+TEXT_LIMIT = 256 * 2**20
+
+
+def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | FrameDesign:
+    """Read a design in mm. ``table_unit`` is that of a CSV whose header names none.
+
+    Raises InputError for anything missing, unknown or inconsistent.
+    """
+    suffix = path.suffix.lower()
+    if suffix == ".csv":
+        return _read_balls(path, table_unit)
+    if suffix in (*cad.SUFFIXES, *MESH_SUFFIXES):
+        raise InputError(
+            f"{path}: a {suffix[1:].upper()} file alone is a design of kind structure; an arch bridge or a space frame "
+            "needs a design.json (its components may name such files as 'mesh')"
+        )
+    if suffix != ".json":
+        raise InputError(f"{path}: expected a design as .json or .csv, found {suffix or 'no suffix'}")
+    design = read_json(path)
+    kind = design.text("kind")
+    if kind == "arch-bridge":
+        return _arch(folder, design)
+    if kind == "space-frame":
+        return _frame(design)
+    raise InputError(f"{path}: expected kind arch-bridge or space-frame, found {kind!r}")
+
+
+def read_json(path: Path) -> Table:
+    """Read a JSON file whose content is an object. Raises InputError for any other."""
+    try:
+        data = json.loads(_text(path))
+    except (ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not readable JSON: {error}") from None
+    return Table.of(str(path), data)
+
+
+def _text(path: Path) -> str:
+    if path.stat().st_size > TEXT_LIMIT:
+        raise InputError(f"{path}: {path.stat().st_size} bytes are more than a design needs; is it the right file?")
+    try:
+        return decoded(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+
+
+def _arch(folder: Path, design: Table) -> ArchDesign:
+    design.only(("units", "kind", "name", "order", "components", "joints"))
+    scale = MM_PER_UNIT[design.unit("units")]
+    order = design.values.get("order")
+    components = design.table("components")
+    if not isinstance(order, list) or not order or not all(isinstance(name, str) for name in order):
+        raise InputError(f"{design.where}: expected 'order', the names of the components from one end to the other")
+    if len(set(order)) != len(order) or set(order) != set(components.values):
+        raise InputError(
+            f"{design.where}: 'order' ({', '.join(order)}) does not name each of the components "
+            f"({', '.join(components.values)}) once"
+        )
+    joints: dict[tuple[str, str], tuple[str, Floats]] = {}
+    for joint in design.tables("joints"):
+        joint.only(("name", "left", "right", "points"))
+        points = joint.table("points")
+        points.only(KEY_POINTS)
+        corners = np.stack([points.array(key, 3) for key in KEY_POINTS]) * scale
+        sides = (joint.text("left"), joint.text("right"))
+        if sides in joints:
+            raise InputError(f"{joint.where}: a second joint of {sides[0]} and {sides[1]}")
+        joints[sides] = (joint.text("name"), corners)
+    expected = list(pairwise(order))
+    if set(expected) != set(joints):
+        wrong = sorted(set(expected) ^ set(joints))[0]
+        raise InputError(
+            f"{design.where}: expected one joint for each two neighbours in 'order' (left, right); see {wrong}"
+        )
+    at = [None, *(joints[sides][1] for sides in expected), None]
+    parts = tuple(
+        _part(folder, name, components.table(name), design.unit("units"), at[i : i + 2]) for i, name in enumerate(order)
+    )
+    return ArchDesign(
+        parts,
+        tuple(joints[sides][0] for sides in expected),
+        tuple(left for left, _ in expected),
+        tuple(right for _, right in expected),
+        np.array([joints[sides][1] for sides in expected]),
+    )
+
+
+def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floats | None]) -> DesignPart:
+    """Read a component between its joints' key points (8, 3, mm); without a mesh it gets one from what is known."""
+    scale = MM_PER_UNIT[unit]
+    part.only(("mesh", "bottom_edge_left", "bottom_edge_right", "plate_mm"))
+    edges = [part.array(f"bottom_edge_{side}", -1, 3) * scale for side in ("left", "right")]
+    for side, edge in zip(("left", "right"), edges, strict=True):
+        if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():
+            raise InputError(f"{part.where}: bottom_edge_{side} needs two points or more, none of them twice in a row")
+    plate_mm = part.number("plate_mm", box_girder.PLATE_MM, positive=True)
+    if "mesh" in part.values:
+        vertices, faces = read_surface(inside(folder, part.text("mesh"), part.where), unit)
+        return DesignPart(name, vertices, faces, edges[0], edges[1])
+    try:
+        vertices, faces = box_girder.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
+    except InputError as error:
+        raise InputError(f"{part.where}: without a mesh: {error}") from None
+    return DesignPart(name, vertices, faces, edges[0], edges[1], box_girder.SOURCE)
+
+
+def _frame(design: Table) -> FrameDesign:
+    design.only(("units", "kind", "name", "nodes", "members"))
+    scale = MM_PER_UNIT[design.unit("units")]
+    ids, centres, radii = [], [], []
+    for node in design.tables("nodes"):
+        node.only(("id", "centre", "radius"))
+        ids.append(node.integer("id"))
+        centres.append(node.array("centre", 3) * scale)
+        radii.append(node.number("radius", positive=True) * scale)
+    _check_balls(design.where, ids)
+    known = set(ids)
+    a, b, diameters = [], [], []
+    for member in design.tables("members"):
+        member.only(("a", "b", "tube_diameter"))
+        ends = (member.integer("a"), member.integer("b"))
+        if not known.issuperset(ends) or ends[0] == ends[1]:
+            raise InputError(f"{member.where}: a member from {ends[0]} to {ends[1]} needs two of the nodes' ids")
+        a.append(ends[0])
+        b.append(ends[1])
+        diameters.append(member.number("tube_diameter", positive=True) * scale)
+    return FrameDesign(
+        np.array(ids, np.int64),
+        np.array(centres),
+        np.array(radii),
+        np.array(a, np.int64),
+        np.array(b, np.int64),
+        np.array(diameters),
+    )
+
+
+def _check_balls(where: str, ids: list[int]) -> None:
+    if not ids:
+        raise InputError(f"{where}: holds no nodes")
+    twice = sorted({one for one in ids if ids.count(one) > 1}) if len(set(ids)) != len(ids) else []
+    if twice:
+        raise InputError(f"{where}: id {twice[0]} is given more than once")
+
+
+def _read_balls(path: Path, table_unit: str) -> FrameDesign:
+    """Read a table of balls: id, x, y, z, radius in any order of columns, named by a header (``x_mm`` names a unit)."""
+    text = _text(path)
+    first = text.split("\n", 1)[0]
+    separator = next((one for one in (";", "\t", ",") if one in first), ",")
+    with parsing(path, "CSV"):
+        rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(map(str.strip, row))]
+    header = [name.strip().lower() for name in rows[0]] if rows else []
+    columns, units = {}, set()
+    for i, name in enumerate(header):
+        match = re.fullmatch(r"(x|y|z|radius)[\s_\[(]*([a-z-]*)[\])]?|id", name)
+        if match:
+            columns[match.group(1) or "id"] = i
+            if match.group(1):
+                units.add(match.group(2))
+    if set(columns) != {"id", "x", "y", "z", "radius"} or len(units) != 1:
+        raise InputError(f"{path}: expected columns id,x,y,z,radius of one unit, found {first.strip()[:80]!r}")
+    said = units.pop() or table_unit
+    unit = SYNONYMS.get(said, said)
+    if unit not in MM_PER_UNIT:
+        raise InputError(f"{path}: unknown unit {said!r}; expected one of {', '.join(MM_PER_UNIT)}")
+    ids, numbers = [], []
+    for line, row in enumerate(rows[1:], 2):
+        try:
+            cells = [row[columns[key]].strip() for key in ("x", "y", "z", "radius")]
+            values = [float(cell.replace(",", ".") if separator != "," else cell) for cell in cells]
+            ids.append(int(row[columns["id"]]))
+        except (ValueError, IndexError):
+            raise InputError(f"{path}: line {line}: expected id,x,y,z,radius, found {row}") from None
+        if not np.isfinite(values).all() or values[3] <= 0 or abs(ids[-1]) >= 2**53:
+            raise InputError(f"{path}: line {line}: expected finite numbers and a radius above 0, found {row}")
+        numbers.append(values)
+    _check_balls(str(path), ids)
+    table = np.array(numbers) * MM_PER_UNIT[unit]
+    return FrameDesign(np.array(ids, np.int64), table[:, :3], table[:, 3])
+
+
+def read_surface(path: Path, unit: str) -> tuple[Floats, Ints]:
+    """Vertices (v, 3) in mm and triangles (f, 3) of a mesh in ``unit``, or of a CAD file with a unit of its own."""
+    if path.suffix.lower() in cad.SUFFIXES:
+        return cad.read(path, unit)
+    vertices, faces = read_mesh(path)
+    return vertices * MM_PER_UNIT[unit], faces

@@ -1,0 +1,60 @@
+"""picks.csv of a scan folder: common points that were picked in two scans each."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from processor.model import InputError, Picks, Scan
+from processor.readers.common import decoded, parsing
+from processor.scan_folder.units import MM_PER_UNIT
+
+PICKS = "picks.csv"
+COLUMNS = ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
+
+
+def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
+    """Read picked points; coordinates are in the scans' own ``unit``.
+
+    Raises InputError that names the line for whatever does not fit, and the scans there are for an unknown one.
+    """
+    try:
+        text = decoded(path.read_bytes())
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    with parsing(path, "CSV"):
+        rows = list(csv.reader(text.splitlines()))
+    header = tuple(cell.strip().lower() for cell in rows[0]) if rows else ()
+    if header != COLUMNS:
+        raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}")
+    known = {scan.name for scan in scans}
+    names_a, names_b, points, numbers = [], [], [], []
+    for line, row in enumerate(rows[1:], 2):
+        if not any(map(str.strip, row)):
+            continue
+        where = f"{path}: line {line}"
+        if len(row) != len(COLUMNS):
+            raise InputError(f"{where}: expected {len(COLUMNS)} cells, found {len(row)}")
+        a, b = row[0].strip(), row[1].strip()
+        for name in (a, b):
+            if name not in known:
+                raise InputError(f"{where}: there is no scan {name!r}; there are {', '.join(sorted(known))}")
+        if a == b:
+            raise InputError(f"{where}: a common point of scan {a!r} with itself; name two scans")
+        try:
+            values = [float(cell) for cell in row[3:]]
+        except ValueError:
+            raise InputError(f"{where}: expected six numbers, found {row[3:]}") from None
+        if not np.isfinite(values).all():
+            raise InputError(f"{where}: expected finite numbers, found {row[3:]}")
+        names_a.append(a)
+        names_b.append(b)
+        points.append(row[2].strip())
+        numbers.append(values)
+    if not numbers:
+        raise InputError(f"{path}: holds no points; expected three or more a pair of scans")
+    table = np.array(numbers) * MM_PER_UNIT[unit]
+    return Picks(tuple(names_a), tuple(names_b), tuple(points), table[:, :3], table[:, 3:])

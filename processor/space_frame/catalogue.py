@@ -1,0 +1,53 @@
+"""The radii that balls are made in: data, the user's own list, or nothing."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from importlib import resources
+
+import numpy as np
+
+from processor.model import Checked, Floats, UsageError, column
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+DEFAULT = "plausible"
+
+
+@dataclass(frozen=True)
+class Catalogue(Checked):
+    """Radii (m,) of balls in mm, ascending, and the standard deviation of a made ball's radius about its size.
+
+    Without radii the catalogue says nothing, and a ball's radius is free.
+    """
+
+    radii: Floats = column("m")
+    sd_mm: float = 0.4
+    name: str = ""
+    verified: bool = False  # the sizes were held against a published catalogue
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not self.sd_mm > 0.0 or not (self.radii > 0.0).all() or not np.isfinite(self.radii).all():
+            raise UsageError("catalogue of balls: expected radii and a standard deviation above 0 mm")
+        if (np.diff(self.radii) <= 0.0).any():
+            raise UsageError("catalogue of balls: expected each radius once, in ascending order")
+
+
+def load(name: str = DEFAULT) -> Catalogue:
+    """Load a catalogue of the package by name. UsageError names those there are."""
+    known = tomllib.loads((resources.files("processor.space_frame") / "catalogues.toml").read_text("utf-8"))
+    if name not in known:
+        raise UsageError(f"catalogue of balls: expected one of {', '.join(known)}, got {name!r}")
+    entry = known[name]
+    return Catalogue(np.array(entry["radii_mm"], np.float64), entry["sd_mm"], name, entry["verified"])
+
+
+def of_radii(radii_mm: Sequence[float], sd_mm: float = 0.4, name: str = "given") -> Catalogue:
+    """Make a catalogue of the user's own list, in any order; an empty list leaves the radius free."""
+    return Catalogue(np.unique(np.array(radii_mm, np.float64)), sd_mm, name, False)

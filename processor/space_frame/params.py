@@ -1,0 +1,56 @@
+"""Parameters of step ``spheres``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from processor.model import UsageError
+from processor.space_frame.members import members
+
+METHODS = ("ray", "ransac", "least-squares")  # the first is the default
+NAN = float("nan")
+
+
+@dataclass(frozen=True)
+class Params:
+    """Parameters (lengths in mm)."""
+
+    method: str = METHODS[0]
+    seed: int = 0
+    catalogue: str = "plausible"  # ray: of ball radii, by name; "none" leaves radii free
+    radii_mm: tuple[float, ...] = ()  # ray: a catalogue of one's own, instead
+    register_stations: bool = True  # ray: against each other, on the tubes, where they are off
+    datum_mm: float = 0.0  # ray: sd an axis of a shift that all stations share, where no control points hold them
+    members: members.Params = field(default_factory=members.Params)  # ray
+    crop_margin_mm: float = 20.0  # the paper's: beyond the nominal radius, about the nominal centre
+    tau_mm: float = 4.0  # ransac: distance from the surface within which a point consents; two sd of a 2 mm scanner
+    probability: float = 0.99  # ransac: that one minimal set was free of outliers
+    max_iterations: int = 10_000  # ransac: minimal sets at most
+    min_points: int = 20  # the paper's: fewer: low confidence; of a ball without members: no ball, and 40 is the least
+    radius_mm: float = NAN  # of balls without members: the known radius, held; NaN = estimated
+    max_balls: int = 10  # without members: to search for, one after another
+
+    def check(self, has_design: bool) -> None:
+        """Raise UsageError for parameters that make no sense."""
+        if self.method not in METHODS:
+            raise UsageError(f"spheres: unknown method {self.method!r}; it has {', '.join(METHODS)}")
+        for name, sound in (
+            ("crop_margin_mm", self.crop_margin_mm > 0.0),
+            ("tau_mm", self.tau_mm > 0.0),
+            ("probability", 0.0 < self.probability < 1.0),
+            ("max_iterations", self.max_iterations >= 1),
+            ("min_points", self.min_points >= 1),
+            ("max_balls", self.max_balls >= 1),
+            ("seed", self.seed >= 0),
+            ("datum_mm", 0.0 <= self.datum_mm < np.inf),
+            ("radius_mm", np.isnan(self.radius_mm) or 0.0 < self.radius_mm < np.inf),
+        ):
+            if not sound:
+                raise UsageError(f"spheres: {name} = {getattr(self, name)} makes no sense")
+        if not np.isnan(self.radius_mm) and (has_design or self.method == "least-squares"):
+            raise UsageError(
+                "spheres: radius_mm holds the radius of a ball searched for without a design; "
+                "with a design, and by least-squares, the radius is free: take radius_mm out"
+            )

@@ -1,0 +1,69 @@
+"""Points as whole steps of 0.01 mm, and a share of them chosen by a hash of these steps.
+
+Whether a point is kept depends on nothing but its own coordinates: not on its place in the file, nor on chunks.
+"""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from processor.geometry.parallel import over_ranges
+from processor.space_frame.points.source import Source
+
+STEPS_PER_MM = 100.0
+REACH = 2**30  # steps: 10.7 km from the origin; what is farther off, or not a number, is no point of a frame
+WHOLE = 2**32  # the hash's range: a threshold of so much keeps every point
+
+Steps = npt.NDArray[np.int32]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def hashed(x, y, z):  # type: ignore[no-untyped-def]
+    """Mix three integers to 32 even bits (the finaliser of MurmurHash3)."""
+    h = np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)
+    h = (h ^ np.uint64(y)) * np.uint64(0xC2B2AE3D27D4EB4F)
+    h = (h ^ (h >> np.uint64(29)) ^ np.uint64(z)) * np.uint64(0xFF51AFD7ED558CCD)
+    h = (h ^ (h >> np.uint64(33))) * np.uint64(0xC4CEB9FE1A85EC53)
+    return h >> np.uint64(32)
+
+
+@njit(cache=True, nogil=True)
+def keep(points, threshold, kept, counts, piece, first, last):  # type: ignore[no-untyped-def]
+    """Write the steps of the points first..last whose hash is below a threshold to ``kept`` from row ``first``."""
+    n = first
+    for i in range(first, last):
+        fx, fy, fz = points[i, 0] * 100.0, points[i, 1] * 100.0, points[i, 2] * 100.0
+        if not (abs(fx) < REACH and abs(fy) < REACH and abs(fz) < REACH):
+            continue
+        x, y, z = np.int32(np.rint(fx)), np.int32(np.rint(fy)), np.int32(np.rint(fz))
+        if hashed(x, y, z) < threshold:
+            kept[n, 0], kept[n, 1], kept[n, 2] = x, y, z
+            n += 1
+    counts[piece] = n - first
+
+
+def threshold_of(share: float) -> np.uint64:
+    """Threshold below which the hashes of a share of all points lie."""
+    found: np.uint64 = np.uint64(min(max(round(share * WHOLE), 0), WHOLE))
+    return found
+
+
+def thinned(source: Source, most: int, threads: int = 0) -> Steps:
+    """Return steps (n, 3) of about ``most`` points of a source, or of all if they are fewer; in no certain order."""
+    threshold = threshold_of(most / max(source.count, 1))
+    pieces: list[Steps] = []
+    for chunk in source.chunks():
+        found = np.empty((len(chunk.points), 3), np.int32)
+        ranges: list[tuple[int, Steps]] = []
+
+        def run(first: int, last: int, points=chunk.points, found=found, ranges=ranges) -> None:  # type: ignore[no-untyped-def]
+            count = np.zeros(1, np.int64)
+            keep(points, threshold, found, count, 0, first, last)
+            ranges.append((first, found[first : first + count[0]]))
+
+        over_ranges(run, len(chunk.points), threads, least=100_000)
+        pieces.extend(one.copy() for _, one in ranges)
+    return np.concatenate([np.empty((0, 3), np.int32), *pieces])

@@ -1,0 +1,281 @@
+"""Points near lines: of each line as many as its room holds, chosen by their hash, in one pass over the cloud.
+
+A line keeps the points whose hash lies below a threshold of its own. When its room overflows the threshold is halved,
+so at the end it is the largest power of two for which they fit: which points are kept depends on no order.
+"""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+
+from processor.geometry.parallel import over_ranges, usable
+from processor.model import Floats, Ints, Labels
+from processor.space_frame.points.hash_sampling import REACH, STEPS_PER_MM, WHOLE, hashed
+from processor.space_frame.points.voxels import EMPTY, slot_of
+
+CELL_MM = 200.0
+FIELD = 21  # bits for each coordinate of a point less its line's middle
+HALF = 1 << (FIELD - 1)  # 10.5 m in steps of 0.01 mm
+CELL_FIELD = 20
+LEAST_RANGE = 50_000  # points a thread takes at once
+
+
+@dataclass(frozen=True)
+class Gathered:
+    """Points near lines: of line i those in rows ``i * room`` to ``i * room + counts[i]``.
+
+    ``places`` are points in whole steps less ``middles`` (m, 3), 21 bits a coordinate, ``stations`` where each was
+    seen from; both are sorted, by station first. ``shares`` (m,) of all points of the line are kept.
+    """
+
+    room: int
+    counts: Ints
+    places: Ints
+    stations: npt.NDArray[np.int16]
+    middles: Ints
+    shares: Floats
+
+
+@dataclass(frozen=True)
+class Corridors:
+    """Lines (m,) and their cells: what is near is within ``reach_mm``, from ``low`` to ``high`` along the line."""
+
+    points: Floats
+    directions: Floats
+    low: Floats
+    high: Floats
+    reach_mm: float
+    keys: Ints  # open table of cells
+    spans: Ints  # (slots, 2): first and last entry of a cell
+    lines: Labels  # of all cells, one after another
+
+
+@njit(cache=True, nogil=True)
+def cells_near(points, directions, low, high, reach, cell, keys, lines, start, first, last):  # type: ignore[no-untyped-def]
+    """Write cells that the corridors of lines first..last touch, from entry ``start`` on; with no room only count."""
+    n = start
+    count_only = len(keys) == 0
+    slack = reach + 0.5 * np.sqrt(3.0) * cell
+    half = 1 << (CELL_FIELD - 1)
+    for m in range(first, last):
+        x0 = y0 = z0 = 0
+        box_lo, box_hi = np.empty(3), np.empty(3)
+        for i in range(3):
+            a, b = points[m, i] + low[m] * directions[m, i], points[m, i] + high[m] * directions[m, i]
+            box_lo[i], box_hi[i] = min(a, b) - reach, max(a, b) + reach
+        # Along the axis that the line follows most, slabs of cells; in each slab only those near the line.
+        k = 0
+        for i in range(1, 3):
+            if abs(directions[m, i]) > abs(directions[m, k]):
+                k = i
+        i1, i2 = (k + 1) % 3, (k + 2) % 3
+        dk = directions[m, k]
+        for ck in range(int(np.floor(box_lo[k] / cell)), int(np.floor(box_hi[k] / cell)) + 1):
+            t = ((ck + 0.5) * cell - points[m, k]) / dk
+            c1, c2 = points[m, i1] + t * directions[m, i1], points[m, i2] + t * directions[m, i2]
+            wide = slack / abs(dk)
+            for a in range(int(np.floor((c1 - wide) / cell)), int(np.floor((c1 + wide) / cell)) + 1):
+                if (a + 1) * cell < box_lo[i1] or a * cell > box_hi[i1]:
+                    continue
+                for b in range(int(np.floor((c2 - wide) / cell)), int(np.floor((c2 + wide) / cell)) + 1):
+                    if (b + 1) * cell < box_lo[i2] or b * cell > box_hi[i2]:
+                        continue
+                    vk = (ck + 0.5) * cell - points[m, k]
+                    v1, v2 = (a + 0.5) * cell - points[m, i1], (b + 0.5) * cell - points[m, i2]
+                    along = vk * dk + v1 * directions[m, i1] + v2 * directions[m, i2]
+                    if vk * vk + v1 * v1 + v2 * v2 - along * along > slack * slack:
+                        continue
+                    if not count_only:
+                        if k == 0:
+                            x0, y0, z0 = ck, a, b
+                        elif k == 1:
+                            x0, y0, z0 = b, ck, a
+                        else:
+                            x0, y0, z0 = a, b, ck
+                        keys[n] = ((x0 + half) << (2 * CELL_FIELD)) | ((y0 + half) << CELL_FIELD) | (z0 + half)
+                        lines[n] = m
+                    n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def tabulate(sorted_keys, starts, table, spans):  # type: ignore[no-untyped-def]
+    """Enter cells with their spans of entries in an open table."""
+    for i in range(len(sorted_keys)):
+        at = slot_of(table, sorted_keys[i])
+        table[at] = sorted_keys[i]
+        spans[at, 0], spans[at, 1] = starts[i], starts[i + 1]
+
+
+def corridors(points: Floats, directions: Floats, low: Floats, high: Floats, reach_mm: float) -> Corridors:
+    """Prepare lines through points (m, 3) along unit directions (m, 3), from ``low`` to ``high`` (m,) along each."""
+    arguments = (points, directions, low, high, reach_mm, CELL_MM)
+    none, nothing = np.empty(0, np.int64), np.empty(0, np.int32)
+    count = cells_near(*arguments, none, nothing, 0, 0, len(points))
+    keys, lines = np.empty(count, np.int64), np.empty(count, np.int32)
+    cells_near(*arguments, keys, lines, 0, 0, len(points))
+    order = np.argsort(keys, kind="stable")
+    keys = keys[order]
+    first = np.flatnonzero(np.diff(keys, prepend=EMPTY))
+    unique = keys[first]
+    slots = 1 << max(4, int(2 * len(unique)).bit_length())
+    table, spans = np.full(slots, EMPTY, np.int64), np.zeros((slots, 2), np.int64)
+    tabulate(unique, np.append(first, count), table, spans)
+    return Corridors(points, directions, low, high, reach_mm, table, spans, lines[order])
+
+
+@njit(cache=True, nogil=True)
+def near(  # type: ignore[no-untyped-def]
+    coordinates, scale, station, points, directions, low, high, reach, cell, table, spans, lines, thresholds, middles,
+    found, places, stations,
+):  # fmt: skip
+    """Write line, place and station of every point near a line; one entry for each line. Returns their number."""
+    n = 0
+    half = 1 << (CELL_FIELD - 1)
+    held, at = np.int64(-2), np.uint64(0)
+    mm, per_cell = 1.0 / STEPS_PER_MM, 1.0 / cell
+    for i in range(len(coordinates)):
+        fx, fy, fz = coordinates[i, 0] * scale, coordinates[i, 1] * scale, coordinates[i, 2] * scale
+        if not (abs(fx) < REACH and abs(fy) < REACH and abs(fz) < REACH):
+            continue
+        x, y, z = np.int64(np.rint(fx)), np.int64(np.rint(fy)), np.int64(np.rint(fz))
+        px, py, pz = x * mm, y * mm, z * mm
+        key = (
+            ((np.int64(np.floor(px * per_cell)) + half) << (2 * CELL_FIELD))
+            | ((np.int64(np.floor(py * per_cell)) + half) << CELL_FIELD)
+            | (np.int64(np.floor(pz * per_cell)) + half)
+        )
+        if key != held:
+            at, held = slot_of(table, key), key
+        if table[at] == EMPTY:
+            continue
+        h = hashed(x, y, z)
+        for e in range(spans[at, 0], spans[at, 1]):
+            m = lines[e]
+            if h >= thresholds[m]:
+                continue
+            dx, dy, dz = px - points[m, 0], py - points[m, 1], pz - points[m, 2]
+            t = dx * directions[m, 0] + dy * directions[m, 1] + dz * directions[m, 2]
+            if t < low[m] or t > high[m] or dx * dx + dy * dy + dz * dz - t * t > reach * reach:
+                continue
+            qx, qy, qz = x - middles[m, 0] + HALF, y - middles[m, 1] + HALF, z - middles[m, 2] + HALF
+            if min(qx, qy, qz) < 0 or max(qx, qy, qz) >= 2 * HALF or n >= len(found):
+                continue
+            found[n] = m
+            places[n] = (qx << (2 * FIELD)) | (qy << FIELD) | qz
+            stations[n] = station[i] if len(station) else -1
+            n += 1
+    return n
+
+
+@njit(cache=True, nogil=True)
+def insert(  # type: ignore[no-untyped-def]
+    found, new_places, new_stations, middles, room, counts, thresholds, places, stations, first, last
+):
+    """Put entries of lines first..last into their room; where it overflows a line halves its threshold and drops."""
+    for i in range(len(found)):
+        m = found[i]
+        if m < first or m >= last:
+            continue
+        base = m * room
+        if hash_of(new_places[i], middles[m]) >= thresholds[m]:
+            continue
+        while counts[m] == room:
+            thresholds[m] = thresholds[m] >> np.uint64(1)
+            n = 0
+            for k in range(base, base + room):
+                if hash_of(places[k], middles[m]) < thresholds[m]:
+                    places[base + n], stations[base + n] = places[k], stations[k]
+                    n += 1
+            counts[m] = n
+            if thresholds[m] == 0:
+                break
+        if counts[m] < room and hash_of(new_places[i], middles[m]) < thresholds[m]:
+            places[base + counts[m]], stations[base + counts[m]] = new_places[i], new_stations[i]
+            counts[m] += 1
+
+
+@njit(cache=True, nogil=True, inline="always")
+def hash_of(place, middle):  # type: ignore[no-untyped-def]
+    """Hash of the point that a place stands for."""
+    mask = (1 << FIELD) - 1
+    x = (place >> (2 * FIELD)) - HALF + middle[0]
+    y = ((place >> FIELD) & mask) - HALF + middle[1]
+    z = (place & mask) - HALF + middle[2]
+    return hashed(np.int32(x), np.int32(y), np.int32(z))
+
+
+@njit(cache=True, nogil=True)
+def arrange(counts, room, places, stations, most_station, first, last):  # type: ignore[no-untyped-def]
+    """Sort the entries of lines first..last by station, then by place: sums over them never vary."""
+    heads = np.zeros(most_station + 3, np.int64)
+    for m in range(first, last):
+        base, n = m * room, counts[m]
+        heads[:] = 0
+        for i in range(base, base + n):
+            heads[stations[i] + 2] += 1
+        for s in range(1, len(heads)):
+            heads[s] += heads[s - 1]
+        starts = heads.copy()
+        own, at = places[base : base + n].copy(), stations[base : base + n].copy()
+        for i in range(n):
+            k = base + heads[at[i] + 1]
+            places[k], stations[k] = own[i], at[i]
+            heads[at[i] + 1] += 1
+        for s in range(len(starts) - 1):
+            if starts[s + 1] - starts[s] > 1:
+                places[base + starts[s] : base + starts[s + 1]].sort()
+
+
+def gather(
+    stretches: Iterable[tuple[npt.NDArray[np.generic], Labels]],
+    scale: float,
+    lines: Corridors,
+    room: int,
+    threads: int = 0,
+) -> Gathered:
+    """Gather up to ``room`` points a line from stretches of (coordinates (n, 3), stations (n,) or empty).
+
+    ``scale`` turns coordinates into steps of 0.01 mm: 100 for mm.
+    """
+    count = len(lines.points)
+    middles = np.rint(lines.points * STEPS_PER_MM).astype(np.int64)
+    thresholds = np.full(count, WHOLE, np.uint64)
+    counts = np.zeros(count, np.int64)
+    places, stations = np.empty(count * room, np.int64), np.full(count * room, -1, np.int16)
+    fixed = (
+        lines.points, lines.directions, lines.low, lines.high, lines.reach_mm, CELL_MM, lines.keys, lines.spans,
+        lines.lines,
+    )  # fmt: skip
+    for coordinates, station in stretches:
+        pieces: list[tuple[Labels, Ints, npt.NDArray[np.int16]]] = []
+
+        def run(first: int, last: int, coordinates=coordinates, station=station, pieces=pieces) -> None:  # type: ignore[no-untyped-def]
+            n = 3 * (last - first) + 64  # entries: a point belongs to few lines
+            own = station[first:last] if len(station) else station
+            while True:
+                room_for = (np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n, np.int16))
+                found = near(coordinates[first:last], scale, own, *fixed, thresholds, middles, *room_for)
+                if found < n:
+                    break
+                n *= 2
+            pieces.append((room_for[0][:found], room_for[1][:found], room_for[2][:found]))
+
+        over_ranges(run, len(coordinates), threads, least=LEAST_RANGE)
+        into = (middles, room, counts, thresholds, places, stations)
+
+        def keep(first: int, last: int, pieces=pieces, into=into) -> None:  # type: ignore[no-untyped-def]
+            for entries in pieces:
+                insert(*entries, *into, first, last)  # type: ignore[call-arg]
+
+        over_ranges(keep, count, threads, least=max(count // (threads or usable()), 1))
+    most_station = int(stations.max(initial=-1)) if count else -1
+    over_ranges(partial(arrange, counts, room, places, stations, most_station), count, threads)
+    return Gathered(room, counts, places, stations, middles, thresholds / WHOLE)

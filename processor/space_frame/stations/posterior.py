@@ -1,0 +1,219 @@
+"""The motions of all stations a posteriori, the variances of their prior being estimated along the way."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats
+from processor.space_frame.stations.control_points import ControlPoints, Doubt, doubted, motions
+from processor.space_frame.stations.normal_equations import cholesky, product, solve
+from processor.space_frame.stations.residual_kernels import STATION
+
+# of turn (rad), translation and offset of the ranges (mm)
+START = (5e-5, 2.0, 0.5)  # sd: where the iteration starts, nothing more
+SMALLEST = (1e-8, 1e-3, 1e-3)
+LOOSE = (1e-2, 1e3, 1e2)
+LEAST_TOLD = 0.5  # motions the data must tell of before they say anything of a variance
+ALLOWED = 6.0  # in log density below the likeliest variance
+
+
+def corrections(x: Floats, places: Floats) -> Floats:
+    """Return T (s, 4, 4) of the stations' unknowns x (7 s,): turns about places (s, 3), then translations."""
+    R, t = motions(x, places)
+    shift = places - np.einsum("sij,sj->si", R, places) + t
+    return np.array([rigid.transform(turn, move) for turn, move in zip(R, shift, strict=True)])
+
+
+def common_motion(places: Floats) -> Floats:
+    """How the stations' unknowns (7 s,) follow a turn about the frame's origin and a translation (6,) of them all."""
+    found = np.zeros((len(places), STATION, 6))
+    found[:, :3, :3] = np.eye(3)
+    found[:, 3:6] = rigid.motion(places)
+    return found.reshape(-1, 6)
+
+
+def mean_gain(M: Floats, precision: Floats) -> Floats:
+    """How the common motion (6,) that fits the stations' unknowns best follows each of them (6, 7 s)."""
+    weighted = np.ascontiguousarray(M.T) * precision
+    found: Floats = solve(cholesky(product(weighted, M)), weighted)
+    return found
+
+
+class Posterior:
+    """The unknowns of stations at ``places`` (s, 3), x = (turn, translation, offset of the ranges) of each.
+
+    A priori they are normal about zero, about a shift that all share of sd ``datum_mm`` an axis, or about any common
+    motion where control points hold the whole cloud. The three
+    variances are those under which the unknowns' sum of squares is what the data make one expect (MacKay 1992).
+    """
+
+    def __init__(self, places: Floats, control: ControlPoints | None, datum_mm: float = 0.0) -> None:
+        self.places, self.datum_mm = places, datum_mm
+        self.variance = np.array(START) ** 2
+        self.M = common_motion(places - places.mean(axis=0))
+        self.kind = np.tile(np.array([0, 0, 0, 1, 1, 1, 2]), len(places))
+        self.control: ControlPoints | None = None
+        self.hold(control)
+
+    def hold(self, control: ControlPoints | None) -> None:
+        """Take control points into the equations, or none."""
+        if self.control is None:
+            self.untouched = self.variance.copy()
+        self.control = control
+        self.free = control is not None and control.hold_all
+        # of each kind, how many are not common to all stations where a common motion is free
+        self.number = np.array([3.0, 3.0, 1.0]) * len(self.places) - np.array([3.0, 3.0, 0.0]) * self.free
+
+    def doubted(self, H: Floats, g: Floats, x: Floats) -> Doubt:
+        """Hold the control points against each other; H and g are the tubes' equations at x."""
+        # Where they do not hold all, what they say has gone into the variances: that would excuse them.
+        P = self._prior(self.variance if self.free else self.untouched)
+        if self.free:  # what is left without one of them may not hold all
+            gain = mean_gain(self.M, self.precision(self.variance))
+            loose = np.repeat(np.array(LOOSE[:2]) ** -2.0, 3)
+            P = P + product(np.ascontiguousarray(gain.T) * loose, gain)
+
+        def solved(some: ControlPoints) -> tuple[Floats, Floats]:
+            Hs, gs = some.added(H, g, x, self.places)
+            right = np.column_stack([gs - product(P, x[:, None])[:, 0], np.eye(len(x))])
+            both = solve(cholesky(Hs + P), right)
+            return both[:, 0], np.ascontiguousarray(both[:, 1:])
+
+        return doubted(self.control or ControlPoints(), x, self.places, solved)
+
+    def step(self, H: Floats, g: Floats, x: Floats, rounds: int) -> tuple[Floats, Floats]:
+        """Return the change of x (7 s,) and the covariance a posteriori; H and g are the tubes' equations at x.
+
+        ``rounds`` is how often the variances are estimated anew.
+        """
+        H, g = self._with_control(H, g, x)
+        change, C = np.zeros(len(x)), np.zeros_like(H)
+        for turn in range(rounds + 1):
+            _, solved = self._solved(H, g, x, self.variance)
+            change, C = solved[:, 0], solved[:, 1:]
+            if turn < rounds:
+                self._estimate(x + change, C)
+        return change, C
+
+    def integrated(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
+        """Return change and covariance as :meth:`step` does, averaged over all variances that the data allow.
+
+        With few stations, or weak ties, the variances are known poorly: one guess of them would make the covariance
+        too small. Their prior is uniform in log sd above what the data can resolve and in the sd itself below
+        (Gelman 2006 on why not in the log there). The kinds are averaged over one by one, about the likeliest.
+        """
+        H, g = self._with_control(H, g, x)
+        resolved = self._resolution(H)
+        sd, nodes = np.sqrt(self.variance), [np.empty(0)] * len(START)
+        for kind in (1, 0, 2, 1, 0):
+            sd, nodes[kind] = self._allowed(H, g, x, sd, kind, resolved)
+        _, best = self._solved(H, g, x, sd**2)
+        change, C, variance = best[:, 0].copy(), best[:, 1:].copy(), np.zeros(len(START))
+        for kind, values in enumerate(nodes):
+            tried = np.tile(sd, (len(values), 1))
+            tried[:, kind] = values
+            found = [self._solved(H, g, x, one**2) for one in tried]
+            log = np.array([
+                self._evidence(L, g, solved[:, 0], x, one**2, resolved)
+                for (L, solved), one in zip(found, tried, strict=True)
+            ])  # fmt: skip
+            weight = np.exp(log - log.max())
+            weight /= weight.sum()
+            mean = np.sum(weight[:, None] * np.array([solved[:, 0] for _, solved in found]), axis=0)
+            change += mean - best[:, 0]
+            for w, (_, solved) in zip(weight, found, strict=True):
+                off = solved[:, 0] - mean
+                C += w * (solved[:, 1:] - best[:, 1:] + off[:, None] * off)
+            variance[kind] = float(np.sum(weight * values**2))
+        self.variance = variance
+        return change, 0.5 * (C + C.T)
+
+    def precision(self, variance: Floats) -> Floats:
+        """Information (7 s,) of the prior on each unknown."""
+        found: Floats = 1.0 / variance[self.kind]
+        return found
+
+    def _solved(self, H: Floats, g: Floats, x: Floats, variance: Floats) -> tuple[Floats, Floats]:
+        """Factor L of the matrix a posteriori, and the change (7 s,) beside the covariance, (7 s, 1 + 7 s)."""
+        P = self._prior(variance)
+        L = cholesky(H + P)
+        return L, solve(L, np.column_stack([g - product(P, x[:, None])[:, 0], np.eye(len(x))]))
+
+    def _prior(self, variance: Floats) -> Floats:
+        precision = self.precision(variance)
+        P = np.diag(precision)
+        if self.free:
+            P -= product(precision[:, None] * self.M, mean_gain(self.M, precision))
+        elif self.datum_mm > 0.0:  # D and a common shift of its own variance, by Woodbury's identity
+            weighted = precision[:, None] * self.M[:, 3:]
+            inner = product(np.ascontiguousarray(self.M[:, 3:].T), weighted) + np.eye(3) / self.datum_mm**2
+            P -= product(weighted, solve(cholesky(inner), np.ascontiguousarray(weighted.T)))
+        found: Floats = 0.5 * (P + P.T)
+        return found
+
+    def _with_control(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
+        return (H, g) if self.control is None else self.control.added(H, g, x, self.places)
+
+    def _estimate(self, x: Floats, C: Floats) -> None:
+        own, spread = x, np.diag(C)
+        if self.free:
+            gain = np.eye(len(x)) - product(self.M, mean_gain(self.M, self.precision(self.variance)))
+            own, spread = product(gain, x[:, None])[:, 0], np.einsum("pq,pq->p", product(gain, C), gain)
+        for kind, least in enumerate(SMALLEST):
+            of_kind = self.kind == kind
+            told = self.number[kind] - float(spread[of_kind].sum()) / self.variance[kind]
+            if told > LEAST_TOLD:
+                self.variance[kind] = max(float(np.sum(own[of_kind] ** 2)) / told, least**2)
+
+    def _resolution(self, H: Floats) -> Floats:
+        """Sd (3,) with which the data tell a station's unknowns from the others', whatever they are."""
+        loose = np.array(LOOSE) ** 2
+        C = solve(cholesky(H + self._prior(loose)), np.eye(len(H)))
+        gain = np.eye(len(H)) - product(self.M, mean_gain(self.M, self.precision(loose)))
+        spread = np.einsum("pq,pq->p", product(gain, C), gain)
+        return np.array([float(np.sqrt(np.median(spread[self.kind == kind]))) for kind in range(len(START))])
+
+    def _allowed(
+        self, H: Floats, g: Floats, x: Floats, sd: Floats, kind: int, resolved: Floats
+    ) -> tuple[Floats, Floats]:
+        """Return the likeliest sd (3,) along one ``kind``, and those (n,) that the data allow, even in the log."""
+        if self.number[kind] < 1.0:  # one station, held by control points: nothing to compare it with
+            return sd, sd[kind : kind + 1]
+
+        def density(value: float) -> float:
+            tried = sd.copy()
+            tried[kind] = value
+            P = self._prior(tried**2)
+            L = cholesky(H + P)
+            right = g - product(P, x[:, None])[:, 0]
+            return self._evidence(L, g, solve(L, right[:, None])[:, 0], x, tried**2, resolved)
+
+        coarse = resolved[kind] * 2.0 ** np.arange(-5, 14)
+        value = np.array([density(one) for one in coarse])
+        best = sd.copy()
+        top = int(np.argmax(value))
+        best[kind] = coarse[top]
+        near = np.flatnonzero(value > value[top] - ALLOWED)
+        if len(near) > 4 or top in (0, len(coarse) - 1):
+            return best, coarse[near]
+        step = 0.25 * np.log(2.0)
+        peak, width = float(np.log(coarse[top])), step
+        for _ in range(2):  # the density is next to normal: two parabolas find its top and width
+            low, middle, high = (density(float(np.exp(peak + shift))) for shift in (-step, 0.0, step))
+            bend = low - 2.0 * middle + high
+            if not bend < 0.0:
+                return best, coarse[near]
+            width = step / np.sqrt(-bend)
+            peak += float(np.clip(0.5 * step * (low - high) / bend, -2.0 * step, 2.0 * step))
+        best[kind] = np.exp(peak)
+        return best, np.exp(peak + width * np.arange(-2.0, 2.5))
+
+    def _evidence(self, L: Floats, g: Floats, change: Floats, x: Floats, variance: Floats, resolved: Floats) -> float:
+        """Log density of log variances given the data, up to a constant."""
+        P = self._prior(variance)
+        Px = product(P, x[:, None])[:, 0]
+        fit = float(np.sum((g - Px) * change)) - float(np.sum(x * Px))
+        sd = np.sqrt(variance)
+        log_prior = -float(np.sum(self.number * np.log(sd))) + float(np.sum(np.log(sd / (sd + resolved))))
+        return log_prior - float(np.sum(np.log(np.diag(L)))) + 0.5 * fit

@@ -1,0 +1,121 @@
+"""What the stations' registration takes and gives: points on tubes, and corrections with what remains uncertain."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Checked, Floats, Ints, Labels, column, names
+from processor.space_frame.stations import normal_equations as normals
+from processor.space_frame.stations import residual_kernels as kernels
+from processor.space_frame.stations.posterior import common_motion, mean_gain
+
+
+@dataclass(frozen=True)
+class TubePoints:
+    """Points on tubes, sorted by tube: those of tube j are rows start[j]:start[j + 1], mm, in a canonical order.
+
+    ``station`` (n,) is the row of the scanners; -1 = unknown, such points are left out.
+    """
+
+    points: Floats
+    station: Labels
+    start: Ints
+
+
+@dataclass(frozen=True)
+class Stations(Checked):
+    """Corrections of all stations, and what remains uncertain after they are applied.
+
+    Off the ranges of a station goes its ``range_offset``; then ``T_project_station`` (s, 4, 4) maps its points, in the
+    project's frame as registered less the origin, to where they belong: see :meth:`corrected`.
+
+    ``covariance`` (7 s, 7 s) is of each station's (turn about x, y, z through ``places`` (s, 3), translation, range
+    offset) in turn; rad and mm, T = exp(xi) T. It holds both what is left between the stations and the motion that all
+    have in common; NaN where nothing tells of it.
+    """
+
+    status: str  # ok | weak | single | unknown | doubtful: what stations seem off may be the beam's width
+    message: str
+    T_project_station: Floats = column("s", 4, 4)
+    places: Floats = column("s", 3)
+    covariance: Floats = column("p", "p")
+    before_mm: float = float("nan")  # sd of a station's translation along an axis, as registered
+    before_rad: float = float("nan")  # and of its turn
+    range_offset: Floats = column("s")  # of a station's ranges less the mean of all, mm
+    range_offset_sd: float = float("nan")  # of all stations, as scanned
+    shared_offset_sd: float = 0.0  # of what all ranges may be off alike, for an offset or a wide beam; in no covariance
+    observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
+    weak: tuple[str, ...] = names("s")  # which motions of a station the tubes do not tell; empty = all told
+    range_sd: Floats = column("s")  # scale of the residuals along the ray, mm
+    floor_mm: float = 0.0  # sd of what an observation of a tube lies off beyond the points' noise
+    axis_points: Floats = column("m", 3)  # of the tubes after the corrections, and their directions and radii
+    axis_directions: Floats = column("m", 3)
+    axis_radii: Floats = column("m")
+    datum: str = ""  # what says where all stations together lie, and how well
+    control: tuple[str, ...] = names("c")  # targets as they were seen, a row a sighting
+    control_scan: tuple[str, ...] = names("c")  # the stations that saw them
+    control_off: Floats = column("c", 3)  # target minus sighting after the corrections
+    control_used: Ints = column("c", dtype=np.int64)  # 1 = yes
+
+    def corrected(self, points: Floats, station: Labels) -> Floats:
+        """Return points (n, 3) of stations (n,), less the origin, where they belong; those of station -1 unmoved."""
+        return kernels.corrected(
+            np.ascontiguousarray(points), station, self.places, self.range_offset, self.T_project_station
+        )
+
+    def effect(self, points: Floats, influence: Floats, relative: bool = False) -> Floats:
+        """Covariance (k, d, d) that the stations add to estimates near points (k, 3).
+
+        ``influence`` is how an estimate follows the stations' points: (k, s) weights adding up to 1 for centres that
+        move as the weighted mean of the stations does, or (k, s, d, 3) derivatives by a shift of a station's points at
+        the place, for d parameters each. ``relative`` leaves out what all stations have in common (:meth:`common`).
+        """
+        if influence.ndim == 2:
+            influence = influence[:, :, None, None] * np.eye(3)
+        covariance = self.covariance
+        if relative and np.isfinite(self.before_mm):
+            own = np.eye(len(covariance)) - normals.product(
+                common_motion(self.places), mean_gain(common_motion(self.places), self._precision())
+            )
+            covariance = normals.product(normals.product(own, covariance), np.ascontiguousarray(own.T))
+        return kernels.effect(np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance)
+
+    def common(self, place: Floats) -> Floats:
+        """Covariance (6, 6) of the motion all stations have in common: turn about ``place`` (3,), translation.
+
+        It is that of the rigid motion which fits the stations' own motions best, weighted as they scatter.
+        """
+        if not np.isfinite(self.before_mm):
+            known: Floats = self.covariance[:6, :6].copy()
+            return known
+        gain = mean_gain(common_motion(self.places - place), self._precision())
+        found: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
+        return found
+
+    def shared_offset_at(self, points: Floats) -> Floats:
+        """Covariance (k, 3, 3) that an offset all ranges share adds at points (k, 3): along the mean of their rays."""
+        ray = points[:, None] - self.places
+        squared = np.maximum(np.sum(ray**2, axis=2, keepdims=True), 1e-300)
+        near = np.sum(ray / squared**1.5, axis=1) / np.sum(1.0 / squared, axis=1)  # points a station as it is near
+        found: Floats = self.shared_offset_sd**2 * near[:, :, None] * near[:, None]
+        return found
+
+    def datum_at(self, points: Floats) -> Floats:
+        """Covariance (k, 3, 3) that the motion of all stations adds to anything at points (k, 3), the same for all."""
+        middle = points.mean(axis=0) if len(points) else np.zeros(3)
+        J = rigid.motion(points - middle)
+        found: Floats = np.einsum("kip,pq,kjq->kij", J, self.common(middle), J)
+        return found
+
+    @property
+    def between(self) -> Floats:
+        """Covariance (s, 3, 3) of each station's place against all the others': without what they have in common."""
+        alone = np.eye(len(self.places))
+        return self.effect(self.places, alone, relative=True)
+
+    def _precision(self) -> Floats:
+        one = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
+        return np.tile(one, len(self.places))

@@ -1,0 +1,135 @@
+"""A scan in an HDF5 group: its points in tiles, and every other column of it in the same order."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any
+
+import h5py
+import numpy as np
+
+from processor.model import Floats, Ints, Scan
+from processor.store import codec, tiles
+from processor.store.codec import DecodeError
+
+AXES = ("x", "y", "z")
+NO_STATIONS = np.empty(0, np.int32)
+
+
+def write_scan(group: Any, scan: Scan) -> Ints:
+    """Write a scan into a group; returns the row (n,) of ``scan.points`` that lies in each place of the file."""
+    tiled = tiles.arrange(scan.points)
+    sorted_columns = {
+        field.name: getattr(scan, field.name)[tiled.order]
+        for field in dataclasses.fields(scan)
+        if field.metadata.get("shape") == ("n",) and getattr(scan, field.name).size
+    }
+    codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points"})
+    points = group.create_group("points")
+    for axis, column in zip(AXES, tiled.columns, strict=True):
+        codec.write_array(points, axis, column)
+    grid = tiled.grid
+    numbers = {"steps_per_mm": grid.steps_per_mm, "offset": grid.offset, "lower": grid.lower, "edge": grid.edge}
+    for name, value in numbers.items():
+        codec.write_array(points, name, np.asarray(value, np.float64))
+    for name, index in (("cell", tiled.cell), ("start", tiled.start), ("count", tiled.count)):
+        codec.write_array(points, name, index)
+    return tiled.order
+
+
+def read_scan(group: Any) -> Scan:
+    """Read a scan. Raises DecodeError also for points that are not finite or lie outside of their tile."""
+    grid, cell, _, count, columns = _read_tiles(group)
+    data = tuple(column[()] for column in columns)
+    if not all(np.isfinite(column).all() for column in data):
+        raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
+    wrong = tiles.misplaced(grid, cell, count, (data[0], data[1], data[2]))
+    if wrong:
+        raise DecodeError([f"{group.name}/points: {wrong} points lie outside of the tile that the index gives them"])
+    scan = codec.read_record(group, Scan, given={"points": grid.millimetres((data[0], data[1], data[2]))})
+    if not np.isfinite(scan.origin).all():
+        raise DecodeError([f"{group.name}/origin: is not finite"])
+    return scan
+
+
+PER_POINT = tuple(f.name for f in dataclasses.fields(Scan) if f.metadata.get("shape", ("",))[0] == "n")
+
+
+def read_scan_alone(group: Any) -> Scan:
+    """Read a scan without its points and what stands beside them."""
+    _read_tiles(group)
+    none = {f.name: np.empty(0, f.metadata["dtype"]) for f in dataclasses.fields(Scan) if f.name in PER_POINT}
+    return codec.read_record(group, Scan, given=none)
+
+
+def count(group: Any) -> int:
+    """Points of a scan's group."""
+    return int(sum(_read_tiles(group)[3].tolist()))
+
+
+def shape(group: Any, name: str) -> tuple[int, ...]:
+    """Shape of a per-point column of a scan's group."""
+    if name == "points":
+        return (count(group), 3)
+    return (len(_column(group, name)),)
+
+
+def _column(group: Any, name: str) -> Any:
+    return codec.column(group, name, next(f.metadata["dtype"] for f in dataclasses.fields(Scan) if f.name == name))
+
+
+def pieces(group: Any, name: str, size: int) -> Iterator[Any]:
+    """Yield a per-point column of a scan's group, ``size`` points at a time. DecodeError for what is not finite."""
+    if name == "points":
+        grid, _, _, _, columns = _read_tiles(group)
+        for start in range(0, len(columns[0]), size):
+            x, y, z = (column[start : start + size] for column in columns)
+            points = grid.millimetres((x, y, z))
+            if not np.isfinite(points).all():
+                raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
+            yield points
+        return
+    column = _column(group, name)
+    for start in range(0, len(column), size):
+        yield column[start : start + size]
+
+
+def _read_tiles(group: Any) -> tuple[tiles.Grid, Ints, Ints, Ints, list[Any]]:
+    points = group.get("points")
+    where = f"{group.name}/points"
+    if not isinstance(points, h5py.Group):
+        raise DecodeError([f"{where}: missing"])
+    names = (*AXES, "steps_per_mm", "offset", "lower", "edge", "cell", "start", "count")
+    if sorted(points) != sorted(names):
+        raise DecodeError([f"{where}: expected {', '.join(sorted(names))}, found {', '.join(sorted(points))}"])
+    steps, edge = (float(codec.read_array(points, name, np.float64, 0)) for name in ("steps_per_mm", "edge"))
+    offset, lower = (codec.read_array(points, name, np.float64, 1) for name in ("offset", "lower"))
+    cell = codec.read_array(points, "cell", np.int64, 2)
+    start, count = (codec.read_array(points, name, np.int64, 1) for name in ("start", "count"))
+    columns = [points[axis] for axis in AXES]
+    types = {column.dtype.str for column in columns if isinstance(column, h5py.Dataset) and column.ndim == 1}
+    if len(types) != 1 or not types <= {"<i4", "<f8"} or not all(isinstance(one, h5py.Dataset) for one in columns):
+        raise DecodeError([f"{where}: expected x, y, z as columns of int32 or of float64"])
+    lengths = {len(column) for column in columns}
+    if len(lengths) != 1 or offset.shape != (3,) or lower.shape != (3,) or cell.shape[1:] != (3,):
+        raise DecodeError([f"{where}: its columns do not fit each other"])
+    grid = tiles.Grid(steps, offset, lower, edge)
+    found = tiles.problems(grid, cell, start, count, lengths.pop())
+    if found:
+        raise DecodeError([f"{where}: {what}" for what in found])
+    return grid, cell, start, count, columns
+
+
+def read_box(group: Any, lower: Floats, upper: Floats) -> Floats:
+    """Points (m, 3) of a scan's group within ``lower <= p <= upper`` (mm), from the tiles that the box touches."""
+    grid, cell, start, count, columns = _read_tiles(group)
+    low, high = grid.cell_range(lower, upper)
+    rows = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))
+    pieces = [np.empty((0, 3))]
+    for run in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1):
+        if len(run):
+            part = slice(int(start[run[0]]), int(start[run[-1]] + count[run[-1]]))
+            points = grid.millimetres((columns[0][part], columns[1][part], columns[2][part]))
+            pieces.append(points[((points >= lower) & (points <= upper)).all(axis=1)])
+    return np.concatenate(pieces)

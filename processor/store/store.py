@@ -1,0 +1,389 @@
+"""Scenes, truths and results in HDF5.
+
+A file has the root attributes ``format``, ``format_version``, ``units`` and ``history`` (JSON list), the text
+``provenance`` (JSON) and the groups ``/scene``, ``/truth`` or ``/results``. The points of a scan lie in spatial tiles
+(:mod:`processor.store.tiles`), each coordinate a column of its own, with every other column of the scan and its truth
+labels in the same order. The same content makes the same bytes.
+
+Files from outside are not trusted: :mod:`processor.store.safety` looks at the structure before any data is read.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import re
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, TypeVar
+
+import h5py
+import numpy as np
+
+from processor.model import Floats, InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
+from processor.store import codec, safety, scan_tiles
+from processor.store.codec import DecodeError
+
+FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
+FORMAT_VERSION = "1.3"
+READABLE = ("1.2", FORMAT_VERSION)  # of scenes and truths: what is newer in a record may be absent there
+HISTORY = [
+    "1.0: first",
+    "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
+    "1.2: bottom edges as built, in the truth of arch bridges; limits that the project names; "
+    "what a part's mesh is made from",
+    "1.3: control points",
+]
+
+# All that HDF5 and h5py raise for a damaged file; none of it names the file or helps its user.
+DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
+
+T = TypeVar("T")
+Pieces = Callable[[int, str], tuple[tuple[int, ...], Iterator[Any]]]
+
+
+# --- writing ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a temporary path beside ``path``; what was written there takes its place once it is safe on the disk.
+
+    Raises InputError where the file cannot be written. On any error the temporary file is removed and ``path`` is left
+    as it was.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, path)
+        sync(path.parent)
+    except (OSError, RuntimeError) as error:
+        # Of a full disk HDF5 says so within a text of its own, and not always as an OSError.
+        said = re.search(r"error message = '([^']*)'", str(error))
+        if isinstance(error, RuntimeError) and not said:
+            raise
+        why = said[1] if said else getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be written ({why})") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file or folder is on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+@contextmanager
+def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterator[Any]:
+    # HDF5 can end the process at once when the disk is full. What is small is made in memory and written as bytes.
+    small = kind != "scene"
+    driver: dict[str, Any] = {"driver": "core", "backing_store": False} if small else {}
+    with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest", **driver) as file:
+        header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "units": "mm"}
+        header["history"] = json.dumps(HISTORY)
+        for name, text in header.items():
+            file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
+        codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
+        yield file
+        if small:
+            file.flush()
+            temporary.write_bytes(file.id.get_file_image())
+
+
+def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mapping[str, object]) -> None:
+    """Write a scene, with its truth beside it where there is one.
+
+    ``provenance`` is anything that JSON can hold. Points are kept to 0.0001 mm (0.001 mm beyond an extent of 400 m).
+    Raises InputError for points that are not finite, scans of one name, and labels that do not fit their scan.
+    """
+    _check(path, scene)
+    orders: dict[str, Ints] = {}
+
+    def write_scan(group: Any, scan: Scan) -> None:
+        orders[scan.name] = scan_tiles.write_scan(group, scan)
+
+    with _new_file(path, "scene", provenance) as file:
+        codec.write_record(file.create_group("scene"), scene, hooks={Scan: write_scan})
+        if truth is not None:
+            labels = tuple(_in_order(label, orders, path) for label in truth.labels)
+            codec.write_record(file.create_group("truth"), dataclasses.replace(truth, labels=labels))
+
+
+def _check(path: Path, scene: Scene) -> None:
+    names = [scan.name for scan in scene.scans]
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: the scene has more than one scan of one name ({', '.join(sorted(names))})")
+    for scan in scene.scans:
+        bad = int(np.count_nonzero(~np.isfinite(scan.points).all(axis=1)))
+        if bad or not np.isfinite(scan.origin).all():
+            raise InputError(f"{path}: scan {scan.name!r} has {bad or 'an origin of'} points that are not finite")
+
+
+def _in_order(labels: PointLabels, orders: Mapping[str, Ints], path: Path) -> PointLabels:
+    order = orders.get(labels.scan)
+    if order is None:
+        raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r} that the scene has not")
+    per_point = (field.name for field in dataclasses.fields(labels) if field.metadata.get("shape") == ("n",))
+    columns = {name: getattr(labels, name) for name in per_point}
+    for name, column in columns.items():
+        if len(column) not in (0, len(order)):
+            raise InputError(f"{path}: {len(column)} labels ({name}) for the {len(order)} points of {labels.scan!r}")
+    return dataclasses.replace(labels, **{name: column[order] for name, column in columns.items() if len(column)})
+
+
+def write_truth(path: Path, truth: Truth, provenance: Mapping[str, object] | None = None) -> None:
+    """Write a truth on its own; its labels stay in the order given."""
+    with _new_file(path, "truth", provenance or {}) as file:
+        codec.write_record(file.create_group("truth"), truth)
+
+
+def copy_truth(
+    src: Path, dst: Path, labels: Callable[[tuple[PointLabels, ...]], tuple[PointLabels, ...]] | None = None
+) -> bool:
+    """Write the truth of ``src`` to a file ``dst`` of its own. Without one nothing is written: False.
+
+    ``labels`` makes the copy's labels of the points of those there are.
+    """
+    truth = read_truth(src)
+    if truth is None:
+        return False
+    if labels is not None:
+        truth = dataclasses.replace(truth, labels=labels(truth.labels))
+    write_truth(dst, truth, read_provenance(src))
+    return True
+
+
+def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, object]) -> None:
+    """Write the results of steps in the order they ran."""
+    with _new_file(path, "results", provenance) as file:
+        results = file.create_group("results")
+        for i, run in enumerate(runs):
+            codec.write_record(results.create_group(f"{i:04d}"), run)
+
+
+# --- reading ---------------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
+    """Open a file of one of ``kinds`` that passes vetting. Raises InputError for any other and for damage."""
+    try:
+        with safety.limited_memory():
+            file = h5py.File(path, "r", locking=False)
+        with file:
+            with safety.limited_memory():
+                found = safety.problems(file, path)
+            found = found or _header_problems(file, kinds)
+            if found:
+                raise DecodeError(found)
+            yield file
+    except DecodeError as error:
+        raise InputError(f"{path}: {_listed(error.problems)}") from error
+    except FileNotFoundError:
+        raise InputError(f"{path}: there is no such file") from None
+    except DAMAGE as error:
+        wanted = " or ".join(FORMATS[kind] for kind in kinds)
+        raise InputError(
+            f"{path}: expected a {wanted} file (HDF5), found one that is damaged, cut off or of another kind "
+            f"({_first_line(error)}); make or copy it again"
+        ) from error
+
+
+def _listed(problems: Sequence[str], most: int = 20) -> str:
+    more = [f"and {len(problems) - most} more"] if len(problems) > most else []
+    return "; ".join([*problems[:most], *more])
+
+
+def _first_line(error: BaseException) -> str:
+    return (str(error).splitlines() or [type(error).__name__])[0]
+
+
+def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
+    header = {name: _attribute(file, name) for name in ("format", "format_version", "units")}
+    wanted = [FORMATS[kind] for kind in kinds]
+    if header["format"] not in wanted:
+        return [f"expected format {' or '.join(wanted)}, found {header['format'] or 'none'}"]
+    found = []
+    readable = (FORMAT_VERSION,) if header["format"] == FORMATS["results"] else READABLE
+    if header["format_version"] not in readable:
+        found.append(f"expected format_version {' or '.join(readable)}, found {header['format_version'] or 'none'}")
+    if header["units"] != "mm":
+        found.append(f"expected units mm, found {header['units'] or 'none'}")
+    return found
+
+
+def _attribute(file: Any, name: str) -> str:
+    value = file.attrs.get(name, b"")
+    return bytes(value).decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
+
+
+def _group(file: Any, name: str) -> Any:
+    if not isinstance(file.get(name), h5py.Group):
+        raise DecodeError([f"/{name}: missing"])
+    return file[name]
+
+
+def read_scene(path: Path, points: bool = True) -> Scene:
+    """Read a scene; its points come in the order of their tiles. Raises InputError with all that is wrong.
+
+    Without ``points`` the scans have none, nor anything else that stands beside them; see
+    :mod:`processor.store.streaming`.
+    """
+    with opened(path, ["scene"]) as file:
+        return _decode_scene(file, scan_tiles.read_scan if points else scan_tiles.read_scan_alone)
+
+
+def _decode_scene(file: Any, read_scan: Callable[[Any], Scan]) -> Scene:
+    scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
+    names = [scan.name for scan in scene.scans]
+    if len(set(names)) != len(names):
+        raise DecodeError(["/scene/scans: two scans have one name"])
+    return scene
+
+
+def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats) -> Floats:
+    """Points (m, 3) of a scan within ``lower <= p <= upper`` (mm, relative to the scan's origin).
+
+    Reads the tiles that the box touches and no others. Raises InputError where the file has no such scan.
+    """
+    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+    with opened(path, ["scene"]) as file:
+        scans = _group(file, "scene").get("scans")
+        members = list(scans.values()) if isinstance(scans, h5py.Group) else []
+        names = [codec.read_text(group, "name") for group in members]
+        if scan_name not in names:
+            raise DecodeError([f"expected a scan {scan_name!r}, found {', '.join(names) or 'none'}"])
+        return scan_tiles.read_box(members[names.index(scan_name)], lower, upper)
+
+
+def read_truth(path: Path, labels: bool = True) -> Truth | None:
+    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone.
+
+    Without ``labels`` what each point really is stays in the file.
+    """
+    with opened(path, ["scene", "truth"]) as file:
+        if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
+            return None
+        return codec.read_record(_group(file, "truth"), Truth, given={} if labels else {"labels": ()})
+
+
+def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:
+    """Read results in the order they ran; ``result_classes`` gives each step's Result record by the step's name.
+
+    Raises InputError for a step that is not among them, and for a damaged file.
+    """
+
+    def read_run(group: Any) -> StepRun:
+        step = codec.read_text(group, "step")
+        if step not in result_classes:
+            raise DecodeError([f"{group.name}: results of an unknown step {step!r}"])
+        if not isinstance(group.get("result"), h5py.Group):
+            raise DecodeError([f"{group.name}/result: missing"])
+        result: object = codec.read_record(group["result"], result_classes[step])
+        return codec.read_record(group, StepRun, given={"result": result})
+
+    with opened(path, ["results"]) as file:
+        runs = _group(file, "results")
+        expected = [f"{i:04d}" for i in range(len(runs))]
+        if list(runs) != expected or not all(isinstance(runs[name], h5py.Group) for name in expected):
+            raise DecodeError(["/results: expected groups 0000, 0001, ..."])
+        return tuple(read_run(runs[name]) for name in expected)
+
+
+def read_provenance(path: Path) -> dict[str, Any]:
+    """Read what a file says of how it was made."""
+    with opened(path, list(FORMATS)) as file:
+        try:
+            found = json.loads(codec.read_text(file, "provenance"))
+        except json.JSONDecodeError:
+            found = None
+        if not isinstance(found, dict):
+            raise DecodeError(["/provenance: expected a JSON object"])
+        return found
+
+
+def problems(path: Path) -> list[str]:
+    """List all that is wrong with a scene, truth or results file; an empty list means that it can be read."""
+
+    def attempt(read: Callable[[Path], object]) -> list[str]:
+        try:
+            read(path)
+        except InputError as error:
+            cause = error.__cause__
+            return cause.problems if isinstance(cause, DecodeError) else [str(error).removeprefix(f"{path}: ")]
+        return []
+
+    def read_kind(path: Path) -> str:
+        with opened(path, list(FORMATS)) as file:
+            return _attribute(file, "format")
+
+    found = attempt(read_kind)
+    if found:
+        return found
+    kind = read_kind(path)
+    found = attempt(read_provenance)
+    if kind == FORMATS["scene"]:
+        found += attempt(read_scene)
+    if kind != FORMATS["results"]:
+        return found + attempt(read_truth)
+    return found + attempt(_read_runs_plainly)
+
+
+def _read_runs_plainly(path: Path) -> None:
+    """Read the parts of each run that are the same for all steps."""
+    with opened(path, ["results"]) as file:
+        for group in _group(file, "results").values():
+            codec.read_record(group, StepRun, given={"result": None}) if isinstance(group, h5py.Group) else None
+
+
+# --- identity --------------------------------------------------------------------------------------------------------
+
+
+def scene_hash(scene: Scene, pieces: Pieces | None = None) -> str:
+    """SHA-256 (hex) of all that a scene holds: names, types, shapes and bytes of its fields, in their order.
+
+    It depends on nothing else: not on the truth, the file's name, or the versions of the software. ``pieces`` gives
+    the columns of points that a scene was read without, piece by piece: by the scan's number and the column's name its
+    shape, and its parts in turn.
+    """
+    digest = hashlib.sha256()
+    _feed(digest, "scene", scene, pieces)
+    return digest.hexdigest()
+
+
+def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int = 0) -> None:
+    if isinstance(value, np.ndarray):
+        little = np.ascontiguousarray(value, value.dtype.newbyteorder("<"))
+        digest.update(f"{name}:{little.dtype.str}{value.shape};".encode())
+        digest.update(little.data if little.size else b"")
+    elif dataclasses.is_dataclass(value):
+        digest.update(f"{name}:{type(value).__name__}(".encode())
+        for field in dataclasses.fields(value):
+            if pieces is not None and isinstance(value, Scan) and field.metadata.get("shape", ("",))[0] == "n":
+                shape, parts = pieces(scan, field.name)
+                kind = np.dtype(field.metadata["dtype"]).newbyteorder("<")
+                digest.update(f"{field.name}:{kind.str}{shape};".encode())
+                for part in parts:
+                    digest.update(np.ascontiguousarray(part, kind).data)
+                continue
+            item = getattr(value, field.name)
+            if item is not None or not field.metadata.get("newer"):
+                _feed(digest, field.name, item, pieces)
+        digest.update(b")")
+    elif isinstance(value, tuple):
+        digest.update(f"{name}:tuple{len(value)}(".encode())
+        for i, item in enumerate(value):
+            _feed(digest, "", item, pieces, i)
+        digest.update(b")")
+    else:
+        text = value.hex() if isinstance(value, float) else str(value)
+        digest.update(f"{name}:{type(value).__name__}{len(text)}:{text};".encode())
