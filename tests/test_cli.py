@@ -16,7 +16,7 @@ from processor.evaluation.evaluate import evaluate
 from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError
 from processor.report import results_folder
 from processor.store import store
-from tests import arch_clouds
+from tests.support import arch_clouds
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -24,8 +24,8 @@ from pathlib import Path
 
 import numpy as np
 
-from tests import watched
-from tests.damage import good_files
+from tests.support import watched_reading
+from tests.support.damaged_files import good_files
 
 ROUNDS, MOST_ROUNDS, ENOUGH_S = 3, 9, 20.0
 LEAST_RATIO, MOST_MEMORY = 1.3, 2.5
@@ -278,7 +278,7 @@ def mutations(count, formats, keep):
     found = {}
     for name in formats:
         began = time.monotonic()
-        counts, faults, slowest = watched.run(name, count, keep, print)
+        counts, faults, slowest = watched_reading.run(name, count, keep, print)
         found[name] = {"counts": dict(counts), "faults": faults, "slowest_s": slowest}
         said = ", ".join(f"{what} {n}" for what, n in sorted(counts.items()))
         print(f"{name:<6} {said}; slowest {slowest:.1f} s; {time.monotonic() - began:.0f} s in all", flush=True)

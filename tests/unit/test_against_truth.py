@@ -13,7 +13,7 @@ from processor.preassembly.baselines import edge_features
 from processor.preassembly.chain import adjustment
 from processor.preassembly.ends import bottom_edges, joint_end
 from processor.preassembly.result import Result
-from tests import arch_clouds
+from tests.support import arch_clouds
 
 DESIGN = arch_clouds.design()
 FRAMES = np.array([edge_features.joint_frame(points) for points in DESIGN.joint_points])

@@ -38,12 +38,12 @@ from processor.scan_folder import fingerprint
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
-REAL, PLANTED = job.PROGRAM, (sys.executable, str(ROOT / "tests/planted_job.py"))
+REAL, FAILING = job.PROGRAM, (sys.executable, str(ROOT / "tests/support/failing_job.py"))
 SPHERES = ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
 SUMMARY = ("index.html", "summary.csv", "summary.json")
 
 
-def run(*arguments, code=0, program=PLANTED):
+def run(*arguments, code=0, program=FAILING):
     """Run the command line in this process, the jobs by ``program``."""
     out, err = io.StringIO(), io.StringIO()
     with (
@@ -60,7 +60,7 @@ def run(*arguments, code=0, program=PLANTED):
 
 
 def command(*arguments):
-    return [*PLANTED, "batch", *map(str, arguments)]
+    return [*FAILING, "batch", *map(str, arguments)]
 
 
 def started(*arguments):

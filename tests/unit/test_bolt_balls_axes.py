@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from processor.space_frame.members import axis_intersection
-from tests.frame_clouds import across
+from tests.support.frame_clouds import across
 
 
 def ends_at(rng, nodes, per_node, sd=0.1, eccentricity=0.0, starts=None, response=None):

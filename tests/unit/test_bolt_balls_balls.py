@@ -12,7 +12,7 @@ from processor.space_frame.points import sphere_crops
 from processor.space_frame.points.source import InMemory
 from processor.space_frame.spheres.baselines import paper_estimates
 from processor.space_frame.spheres.fit_all import Params, find_balls
-from tests.ball_clouds import frame, grid_of_balls
+from tests.support.ball_clouds import frame, grid_of_balls
 
 STATIONS = np.array([[1000.0, 500.0, 0.0], [9000.0, 1000.0, 0.0], [5000.0, 7000.0, 0.0]])
 SIZES = (45.0, 50.0, 60.0, 80.0)

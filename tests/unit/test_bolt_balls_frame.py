@@ -106,7 +106,9 @@ def test_a_ball_of_another_size_is_named(roof):
 def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used, monkeypatch):
     scene, _ = roof
     first = space_frame_step.run(scene, space_frame_step.Params())
+    pools, pool = set(), parallel._pool
     monkeypatch.setattr(parallel, "usable", lambda: threads_used)
+    monkeypatch.setattr(parallel, "_pool", lambda count: (pools.add(count), pool(count))[1])
     monkeypatch.setattr(to_result, "of_scene", lambda *given: dataclasses.replace(of_scene(*given), chunk_size=chunk))
     rng = np.random.default_rng(1)
     scans = []
@@ -115,6 +117,7 @@ def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used,
         columns = {name: getattr(scan, name) for name in ("points", "intensity", "grid_row", "grid_column")}
         scans.append(dataclasses.replace(scan, **{k: v[order] if len(v) else v for k, v in columns.items()}))
     again = space_frame_step.run(dataclasses.replace(scene, scans=tuple(scans)), space_frame_step.Params())
+    assert pools == {threads_used} - {1}  # one thread needs no pool
     for field in dataclasses.fields(first):
         one, other = getattr(first, field.name), getattr(again, field.name)
         same = one.tobytes() == other.tobytes() if isinstance(one, np.ndarray) else repr(one) == repr(other)

@@ -6,8 +6,8 @@ import pytest
 from processor.space_frame.members import members
 from processor.space_frame.members.records import Nodes, Tubes
 from processor.space_frame.points.source import InMemory
-from tests import frame_clouds
-from tests.frame_clouds import STATIONS
+from tests.support import frame_clouds
+from tests.support.frame_clouds import STATIONS
 
 PARAMS = members.Params()
 

@@ -14,7 +14,7 @@ from processor.space_frame.stations import posterior as stations_posterior
 from processor.space_frame.stations.control_points import ControlPoints
 from processor.space_frame.stations.records import TubePoints
 from processor.space_frame.stations.registration import register
-from tests import tube_clouds
+from tests.support import tube_clouds
 
 
 def frame(seed, nx=4, ny=4, grid=(2, 2), **how):
@@ -388,10 +388,12 @@ def test_points_of_unknown_stations_and_tubes_without_points_do_no_harm():
 
 def test_same_bytes_on_any_number_of_threads(monkeypatch):
     _, seen, _ = frame(2, per_pair=30)
-    answers = []
+    answers, pools, pool = [], set(), parallel._pool
+    monkeypatch.setattr(parallel, "_pool", lambda count: (pools.add(count), pool(count))[1])
     for count in (1, 2, 3):
         monkeypatch.setattr(parallel, "usable", lambda count=count: count)
         answers.append(registered(seen, np.random.default_rng(0)))
+    assert pools == {2, 3}  # one thread needs no pool
     for other in answers[1:]:
         for field in ("T_project_station", "covariance", "range_offset", "axis_points"):
             assert getattr(answers[0], field).tobytes() == getattr(other, field).tobytes()

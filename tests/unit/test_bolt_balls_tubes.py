@@ -6,7 +6,7 @@ import pytest
 from processor.space_frame.members import tubes
 from processor.space_frame.members.cylinder import NP, residual
 from processor.space_frame.points import line_crops
-from tests import frame_clouds
+from tests.support import frame_clouds
 
 LENGTH = 2700.0
 A = np.array([1000.0, 2000.0, 6000.0])

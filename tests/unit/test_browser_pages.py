@@ -6,7 +6,7 @@ import pytest
 
 from processor.batch import figures as batch_figures
 from processor.report import all_figures, page
-from tests.browser import opened, picture, read_over
+from tests.support.browser import opened, picture, read_over
 from tests.unit import test_language_pages as pages
 from tests.unit.test_batch import folder, run
 

@@ -24,7 +24,7 @@ from processor.report import all_figures, comparison, page
 from processor.stitching.result import Held
 from processor.validation import changes, night
 from processor.validation import summary as nights_summary
-from tests import nights, step_results
+from tests.support import step_results, validation_nights
 from tests.unit.test_language import CODES, STAYS, Visible, latin
 
 SOURCES = Path(language.__file__).parents[1]
@@ -375,7 +375,9 @@ def a_night(failed=1, missed=2, found=CHANGES, **more):
     cells = tuple({"failed": "x" if i < failed else ""} for i in range(3))
     figure = nights_summary.Figure("spheres", "ray", "radii, bias", 1.0, 0.5, "mm")
     of = changes.Found(found, 12, 3, 4, **more)
-    return nights_summary.Summary("2026-11-21", nights.SOFTWARE, cells, {"a": [figure] * missed} if missed else {}, of)
+    return nights_summary.Summary(
+        "2026-11-21", validation_nights.SOFTWARE, cells, {"a": [figure] * missed} if missed else {}, of
+    )
 
 
 @pytest.mark.parametrize(
@@ -394,15 +396,19 @@ def test_the_line_of_a_night_in_chinese(told):
 
 
 def two_nights(out, lang):
-    stored = {figure["name"] for case in nights.Simulated(1).cases for figure in case["figures"]}
+    stored = {figure["name"] for case in validation_nights.Simulated(1).cases for figure in case["figures"]}
     figures_of = {name: (0.5, 0.2 if "bias" in name else None, "mm") for name in stored}
     figures_of |= dict.fromkeys((*STITCH_CHECKS[:-1], *DEFECT_CHECKS), (1.0, None, "mm"))
     rays = '[scan]\nmode = "rays"\nscanner = "phase"\nstep_mrad = 1.5\n'
-    cases = (nights.case(), nights.case("scan", text=rays), nights.case(steps=("defects",), methods=("default",)))
-    asked = nights.matrix(*cases)
+    cases = (
+        validation_nights.case(),
+        validation_nights.case("scan", text=rays),
+        validation_nights.case(steps=("defects",), methods=("default",)),
+    )
+    asked = validation_nights.matrix(*cases)
     for day in ("2026-11-20", "2026-11-21"):
-        runner = nights.runner(lambda cell: dict(figures_of))
-        night.run(asked, out, day, runner, made_by=nights.SOFTWARE, lang=lang)
+        runner = validation_nights.runner(lambda cell: dict(figures_of))
+        night.run(asked, out, day, runner, made_by=validation_nights.SOFTWARE, lang=lang)
 
 
 def test_pages_of_nights_in_chinese(tmp_path):

@@ -13,7 +13,7 @@ from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import bootstrap_bands, methods
 from processor.preassembly.params import PAPER_METHODS
 from processor.preassembly.parts import attitude
-from tests import arch_clouds
+from tests.support import arch_clouds
 
 
 def extracted(scene, truth):

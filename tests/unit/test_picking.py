@@ -13,7 +13,7 @@ from processor.model import Scan, UsageError
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
 from processor.store import store
-from tests.stitch_clouds import pose
+from tests.support.stitch_clouds import pose
 
 COARSE = ["scan.step_mrad=20.0", "scan.stations=3", "scan.repeated=0"]
 

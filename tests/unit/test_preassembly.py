@@ -14,7 +14,7 @@ from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features, joint_alignment, methods
 from processor.preassembly.params import PAPER_METHODS
 from processor.preassembly.parts import attitude
-from tests import arch_clouds
+from tests.support import arch_clouds
 
 
 @pytest.fixture(scope="module")

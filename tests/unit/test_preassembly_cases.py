@@ -17,8 +17,8 @@ from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features
 from processor.preassembly.parts import attitude, identity, measure
 from processor.preassembly.parts.systematic_errors import SystematicParams
-from tests import arch_clouds
-from tests.arch_clouds import random_pose
+from tests.support import arch_clouds
+from tests.support.arch_clouds import random_pose
 
 SMALL = arch_bridge.Params(
     span_mm=24_000.0, rise_mm=6_000.0, width_mm=900.0, height_mm=1_100.0, plate_bottom_mm=24.0, plate_top_mm=24.0,

@@ -9,15 +9,15 @@ from designgen.export import e57
 from processor import readers
 from processor.model import InputError, Scan
 from processor.readers import sandbox
-from tests import watched
-from tests.damage import damaged, good_files, with_check_sums
+from tests.support import watched_reading
+from tests.support.damaged_files import damaged, good_files, with_check_sums
 
 SAMPLE = 25
 
 
 @pytest.fixture(scope="module")
 def process():
-    started = watched.Watched()
+    started = watched_reading.Watched()
     yield started
     started.close()
 

@@ -7,7 +7,7 @@ import pytest
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.report import all_figures, page, results_json
-from tests.browser import opened, picture, read_over
+from tests.support.browser import opened, picture, read_over
 from tests.unit.test_report_adjusted import BAD, of_bridge, rendered
 from tests.unit.test_report_balls import of_frame
 

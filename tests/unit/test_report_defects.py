@@ -13,7 +13,7 @@ from processor.defects.result import Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.report import page, surface_view
 from processor.report.defects import figures, view
-from tests import step_results
+from tests.support import step_results
 from tests.unit.test_report_adjusted import Page
 
 

@@ -10,8 +10,8 @@ from processor.geometry import rigid
 from processor.model import Scan
 from processor.report import all_figures, page
 from processor.report.stitching import view
-from tests import step_results
-from tests.browser import opened, picture, read_over
+from tests.support import step_results
+from tests.support.browser import opened, picture, read_over
 
 NAMES = ("S1", "S2", "S3", "<b>S4</b>")
 APART = 4.0  # mm of S2's wall behind that of S1

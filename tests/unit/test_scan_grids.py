@@ -17,7 +17,7 @@ from processor.scan_folder import folder, scanner_grid
 from processor.stitching import step as stitching_step
 from processor.stitching.planes import scan_planes
 from processor.store import store
-from tests import stitch_clouds
+from tests.support import stitch_clouds
 from tests.unit.test_readers import DATA, needs_data
 from tests.unit.test_scan_folder import exported, merged
 

@@ -17,8 +17,8 @@ from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
 from processor.stitching.result import Held
 from processor.store import store
-from tests import stitch_clouds
-from tests.stitch_clouds import four
+from tests.support import stitch_clouds
+from tests.support.stitch_clouds import four
 
 
 def errors(result, T):

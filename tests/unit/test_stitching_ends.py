@@ -6,7 +6,7 @@ from processor.geometry import scanner_rays
 from processor.stitching.fine import edge_constraints
 from processor.stitching.planes import edges
 from processor.stitching.planes.extraction import Planes
-from tests.stitch_clouds import pose, scan
+from tests.support.stitch_clouds import pose, scan
 
 
 def test_rays_of_a_grid_are_those_that_made_it():

@@ -10,7 +10,7 @@ from processor.model import InputError, Picks, Scan, Scene
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
 from processor.stitching import three_point
-from tests.stitch_clouds import pose
+from tests.support.stitch_clouds import pose
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [9000.0, 0.0, 500.0], [2000.0, 7000.0, 4000.0], [8000.0, 6000.0, 100.0]])
 
@@ -156,7 +156,7 @@ def test_bad_picks_are_named(tmp_path, text, said):
 
 def test_picks_start_a_pair_that_nothing_else_brings_together():
     """Automatic on scans whose picks name the pose: it is among those tried, and held against the scans."""
-    from tests.stitch_clouds import four
+    from tests.support.stitch_clouds import four
 
     T, scans = four(step_mrad=20.0)
     want = np.linalg.inv(T[0]) @ T[1]

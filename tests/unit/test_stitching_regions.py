@@ -6,7 +6,7 @@ import numpy as np
 
 from processor.model import Scene
 from processor.stitching import step as stitching_step
-from tests.stitch_clouds import four
+from tests.support.stitch_clouds import four
 
 
 def bent(scan, mm):

@@ -17,7 +17,7 @@ from processor.model import InputError, UsageError
 from processor.validation import cells, certificate, matrix, night, software
 from processor.validation.cells import Outcome
 from processor.validation.history import History
-from tests import nights
+from tests.support import validation_nights
 
 ROOT = Path(__file__).resolve().parents[2]
 NIGHT = "2026-11-21"
@@ -64,9 +64,9 @@ def test_a_cell_is_known_by_all_that_is_asked_for(tmp_path):
     for old, new in (("2.0]", "3.0]"), ("[1, 2]", "[1, 3]"), ('"none"', '"common"'), ('["ransac", "ray"]', '["ray"]')):
         others = {cell.key for cell in read(tmp_path, TWO_CELLS.replace(old, new)).cells(1)}
         assert others - keys
-    one, other = nights.case(), nights.case(text="[scan]\n")
+    one, other = validation_nights.case(), validation_nights.case(text="[scan]\n")
     assert one.key != other.key
-    assert nights.case(methods=("ray", "ransac")).key == one.key  # its figures stay comparable
+    assert validation_nights.case(methods=("ray", "ransac")).key == one.key  # its figures stay comparable
 
 
 @pytest.mark.parametrize(
@@ -105,7 +105,7 @@ def test_the_default_matrix_covers_every_step_that_is_there():
 
 
 def test_figures_are_told_apart_by_method():
-    found = nights.results({"radii, bias": 0.5, "ransac: radii, bias": None, "other: x": (2.0, 1.0, "%")})
+    found = validation_nights.results({"radii, bias": 0.5, "ransac: radii, bias": None, "other: x": (2.0, 1.0, "%")})
     found["comparison"] = {"spheres": [{"method": "ransac"}]}
     figures = cells.figures_of(found)
     assert [(f.method, f.name) for f in figures] == [
@@ -125,9 +125,9 @@ def of_cell(cell):
 
 
 def run(out, asked, figures_of=of_cell, day=NIGHT, done=None, **more):
-    more.setdefault("made_by", nights.SOFTWARE)
+    more.setdefault("made_by", validation_nights.SOFTWARE)
     with night.opened(out):
-        return night.run(asked, out, day, nights.runner(figures_of, done), **more)
+        return night.run(asked, out, day, validation_nights.runner(figures_of, done), **more)
 
 
 def stored(out, query):
@@ -136,19 +136,21 @@ def stored(out, query):
 
 
 def test_one_row_a_figure_with_all_that_made_it(tmp_path):
-    asked = nights.matrix(nights.case(settings=("a=1",)), nights.case(settings=("a=2",)))
+    asked = validation_nights.matrix(
+        validation_nights.case(settings=("a=1",)), validation_nights.case(settings=("a=2",))
+    )
     told = run(tmp_path / "out", asked)
     assert (told.passed, len(told.cells), told.failed) == (True, 8, [])
     rows = stored(tmp_path / "out", "SELECT night, name, software, commit_, recipe_sha256, seed, fixed FROM rows")
     assert len(rows) == 16
     assert {json.loads(row[2])["numpy"] for row in rows} == {"2"}
-    assert {row[3] for row in rows} == {nights.SOFTWARE.commit}
+    assert {row[3] for row in rows} == {validation_nights.SOFTWARE.commit}
     assert {row[4] for row in rows} == {asked.entries[0].case.recipe_sha256}
     assert sorted({row[5] for row in rows if row[6]}) == [1, 2, 3]
 
 
 def test_done_cells_are_not_done_again_and_failed_ones_are(tmp_path):
-    asked, done = nights.matrix(nights.case()), []
+    asked, done = validation_nights.matrix(validation_nights.case()), []
 
     def once(cell):
         return Outcome(failed="no memory") if cell.seed == 2 and len(done) <= 4 else of_cell(cell)
@@ -168,7 +170,7 @@ def test_done_cells_are_not_done_again_and_failed_ones_are(tmp_path):
 
 
 def test_other_software_does_a_night_again_only_where_that_is_asked_for(tmp_path):
-    asked, done = nights.matrix(nights.case()), []
+    asked, done = validation_nights.matrix(validation_nights.case()), []
     run(tmp_path / "out", asked, done=done)
     other = software.Software("code-2", "", {})
     with pytest.raises(UsageError, match="--again does all of it again"):
@@ -181,7 +183,7 @@ def test_other_software_does_a_night_again_only_where_that_is_asked_for(tmp_path
 def test_a_regression_stays_until_it_is_accepted(tmp_path):
     from processor.validation import command
 
-    asked, out = nights.matrix(nights.case(), seeds=range(6)), tmp_path / "out"
+    asked, out = validation_nights.matrix(validation_nights.case(), seeds=range(6)), tmp_path / "out"
 
     def worse(cell):
         return {"sd": 1.2 + 0.001 * cell.seed % 0.01}
@@ -211,7 +213,7 @@ def test_limits_missed_reach_the_ci_server(tmp_path):
             return Outcome(failed="designgen make: exit code 2: \x07 <b>")
         return {"lowest <1>": (2.0, 1.0, "mm")} if cell.seed == 2 else of_cell(cell)
 
-    told = run(tmp_path / "out", nights.matrix(nights.case()), over)
+    told = run(tmp_path / "out", validation_nights.matrix(validation_nights.case()), over)
     assert not told.passed
     assert "1 limit missed" in told.line
     suite = ET.parse(tmp_path / "out" / "junit.xml").getroot()[0]
@@ -249,7 +251,7 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from processor.validation import night
-from tests import nights
+from tests.support import validation_nights
 from tests.unit import test_validation as t
 
 def slow(cell):
@@ -259,13 +261,13 @@ def slow(cell):
 out = Path(sys.argv[1])
 with night.opened(out):
     print("begun", flush=True)
-    night.run(t.killed_matrix(), out, t.NIGHT, nights.runner(slow), made_by=nights.SOFTWARE)
+    night.run(t.killed_matrix(), out, t.NIGHT, validation_nights.runner(slow), made_by=validation_nights.SOFTWARE)
 print("ended", flush=True)
 """
 
 
 def killed_matrix():
-    return nights.matrix(*(nights.case(settings=(f"a={i}",)) for i in range(15)))
+    return validation_nights.matrix(*(validation_nights.case(settings=(f"a={i}",)) for i in range(15)))
 
 
 def test_a_night_killed_at_any_moment_loses_and_doubles_nothing(tmp_path):
@@ -316,7 +318,7 @@ def test_the_certificate_pools_errors_as_if_they_were_one_list(tmp_path):
         }
 
     text = '[scan]\nmode = "rays"\nscanner = "phase"\nstep_mrad = 2.0\n'
-    asked = nights.matrix(nights.case(settings=("scan.step_mrad=1.5",), text=text))
+    asked = validation_nights.matrix(validation_nights.case(settings=("scan.step_mrad=1.5",), text=text))
     run(tmp_path / "out", asked, of, "2026-11-01")
     run(tmp_path / "out", asked, of)  # the fixed seeds again: the same three scenes
     found = json.loads((tmp_path / "out" / "certificate.json").read_text("utf-8"))
@@ -340,7 +342,7 @@ def test_the_bias_of_equal_scenes_has_the_standard_error_of_their_mean(tmp_path)
         bias = {1: 0.1, 2: 0.3, 3: 0.5}.get(cell.seed, 0.3)
         return {"gaps, bias": bias, "gaps, standard deviation": 0.2, "gaps, number": (8.0, None, "")}
 
-    run(tmp_path / "out", nights.matrix(nights.case(), fresh=0), of)
+    run(tmp_path / "out", validation_nights.matrix(validation_nights.case(), fresh=0), of)
     (line,) = json.loads((tmp_path / "out" / "certificate.json").read_text("utf-8"))["lines"]
     assert line["bias"] == pytest.approx(0.3)
     assert line["u_b"] == pytest.approx(0.2 / math.sqrt(3.0))
@@ -348,7 +350,7 @@ def test_the_bias_of_equal_scenes_has_the_standard_error_of_their_mean(tmp_path)
 
 
 def test_conditions_of_scans_without_rays():
-    assert certificate.conditions(nights.case())[1:] == ("1.0 mm", "? mm")
+    assert certificate.conditions(validation_nights.case())[1:] == ("1.0 mm", "? mm")
 
 
 # --- what is true of a real cell ------------------------------------------------------------------------------------

@@ -17,8 +17,8 @@ from processor.space_frame.spheres import isolated
 from processor.validation import changes
 from processor.validation.aims import badness
 from processor.validation.history import Row
-from tests import nights
-from tests.nights import night_name
+from tests.support import validation_nights
+from tests.support.validation_nights import night_name
 
 NAME = ("spheres", "ray", "radii, standard deviation")
 
@@ -217,7 +217,7 @@ def test_an_estimator_20_percent_worse_is_reported_the_first_night(earlier, monk
 
 @pytest.mark.parametrize("seed", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)])
 def test_sixty_undisturbed_nights_raise_at_most_one_alarm(seed):
-    simulated = nights.Simulated(seed)
+    simulated = validation_nights.Simulated(seed)
     for number in range(60):
         simulated.night(number)
     assert len({night for night, _ in simulated.alarms}) <= 1
@@ -225,7 +225,7 @@ def test_sixty_undisturbed_nights_raise_at_most_one_alarm(seed):
 
 @pytest.mark.parametrize("method", ["ray", "ransac"])
 def test_a_worse_figure_of_stored_cells_is_reported_the_first_night(method):
-    simulated = nights.Simulated(3)
+    simulated = validation_nights.Simulated(3)
     for number in range(10):
         simulated.night(number)
 

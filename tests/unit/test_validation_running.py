@@ -11,7 +11,7 @@ import pytest
 from processor.model import UsageError
 from processor.validation import child, running
 from processor.validation.cells import Cell, Outcome
-from tests import nights
+from tests.support import validation_nights
 
 
 def spec(**more):
@@ -65,7 +65,7 @@ def test_parameters_are_written_as_toml():
 
 
 def test_stopping_ends_what_is_under_way(tmp_path):
-    cell = Cell(nights.case(), 1, True)
+    cell = Cell(validation_nights.case(), 1, True)
     started = time.monotonic()
     with running.over_processes(1, tmp_path) as run:
         coming = run([cell, cell])
@@ -85,7 +85,7 @@ def test_cells_on_a_cluster(monkeypatch):
         return Outcome("", {"seed": given["seed"], "pid": os.getpid()}, 1.0, 1.0)
 
     monkeypatch.setattr(running, "do", do)
-    cells = [Cell(nights.case(), seed, True) for seed in (1, 2, 3)]
+    cells = [Cell(validation_nights.case(), seed, True) for seed in (1, 2, 3)]
     with (
         distributed.LocalCluster(1, processes=False, threads_per_worker=2, dashboard_address=None) as cluster,
         running.over_cluster(cluster.scheduler_address) as run,

@@ -14,7 +14,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from tests.damage import damaged
+from tests.support.damaged_files import damaged
 
 MEMORY_BYTES = 2 << 30
 HANG_S = 10.0
@@ -28,7 +28,7 @@ class Watched:
         self._start()
 
     def _start(self):
-        command = [sys.executable, "-m", "tests.watched"]
+        command = [sys.executable, "-m", "tests.support.watched_reading"]
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
         )

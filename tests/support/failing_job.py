@@ -1,6 +1,6 @@
 """A job's process that fails as the file ``plant`` in its input says, and is done in no time where it says nothing.
 
-As ``planted_job.py batch ...`` it is the command line of processor, whose jobs are done so.
+As ``failing_job.py batch ...`` it is the command line of processor, whose jobs are done so.
 """
 
 import json
@@ -12,7 +12,7 @@ import time
 from functools import partial
 from pathlib import Path
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from processor.batch import child
 

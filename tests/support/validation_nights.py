@@ -11,7 +11,7 @@ from processor.validation.history import Row
 from processor.validation.matrix import Entry, Matrix
 from processor.validation.software import Software
 
-STORED = Path(__file__).resolve().parents[1] / "fixtures" / "validation" / "stored-cells.json"
+STORED = Path(__file__).resolve().parents[2] / "fixtures" / "validation" / "stored-cells.json"
 SOFTWARE = Software("code-1", "c0ffee" * 6, {"steel-scan-check": "0.1.0", "numpy": "2"})
 
 
