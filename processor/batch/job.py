@@ -27,7 +27,19 @@ from processor.jobs import process
 from processor.model import InputError
 from processor.scan_folder import fingerprint
 
-PACKAGES = ("ezdxf", "h5py", "laspy", "lazrs", "numba", "numpy", "plyfile", "pye57", "pypcd4", "scipy", "trimesh")
+PACKAGES = (
+    "ezdxf",
+    "h5py",
+    "laspy",
+    "lazrs",
+    "numba",
+    "numpy",
+    "plyfile",
+    "pye57",
+    "python-neo-lzf",
+    "scipy",
+    "trimesh",
+)
 PROGRAM = (sys.executable, "-m", "processor.batch.child")
 STATUS = {0: "done", 1: "in-part", 4: "limit-missed"}  # by the exit code of `processor run`
 THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")

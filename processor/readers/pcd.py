@@ -1,6 +1,8 @@
 """PCD: ASCII, binary or binary_compressed. Points of an organised cloud without a return are NaN and are left out.
 
-VIEWPOINT is not used: programs differ on whether the points are to be moved by it.
+VIEWPOINT is not used: programs differ on whether the points are to be transformed by it. Parsed here and not by
+pypcd4, which for 5 million points takes 1.2 (binary), 2 (compressed) and 3.5 times (ASCII) as long, needs more memory,
+and refuses files of version 0.6, without COUNT, or with tabs or repeated blanks.
 """
 
 from __future__ import annotations

@@ -1,4 +1,8 @@
-"""PLY: ASCII or binary, of either byte order, float or double. The vertices are the points; the rest is passed over."""
+"""PLY: ASCII or binary, of either byte order, float or double. The vertices are the points; the rest is ignored.
+
+Points are parsed here and not by plyfile, which for 5 million points takes 1.0 (binary) and 50 times (ASCII) as long,
+1.8 times the memory, and refuses comments that are not ASCII; meshes and normals are read with plyfile.
+"""
 
 from __future__ import annotations
 

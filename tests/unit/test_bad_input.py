@@ -258,17 +258,17 @@ TAMPERED = {
     "number for a record": (set_to("scene/arch", 7), "expected a group"),
     "not UTF-8": (set_to("scene/name", np.bytes_(b"\xff\xfe")), "not UTF-8"),
     "columns of points": (set_to(POINTS + "/x", np.zeros(50_000, "i8")), "columns of int32 or of float64"),
-    "length of a column": (set_to(POINTS + "/x", np.zeros(7, "i4")), "do not fit each other"),
+    "length of a column": (set_to(POINTS + "/x", np.zeros(7, "i4")), "differ in length"),
     "NaN points": (lambda f: [set_to(f"{POINTS}/{axis}", np.full(50_000, np.nan))(f) for axis in "xyz"], "not finite"),
     "NaN origin": (poke(SCAN + "/origin", 0, np.nan), "origin: is not finite"),
     "tile counts": (poke(POINTS + "/count", 0, 3), "does not cover the 50000 points"),
     "tile starts": (poke(POINTS + "/start", 1, 3), "does not cover the 50000 points"),
     "negative counts": (poke(POINTS + "/count", 0, -(2**62)), "does not cover the 50000 points"),
-    "tile cells": (poke(POINTS + "/cell", 0, [9, 9, 9]), "lie outside of the tile"),
+    "tile cells": (poke(POINTS + "/cell", 0, [9, 9, 9]), "lie outside their tile"),
     "tile edge": (set_to(POINTS + "/edge", 0.0), "grid of the tiles"),
     "tile lower": (poke(POINTS + "/lower", 0, np.inf), "grid of the tiles"),
     "members": (lambda f: f.move(SCAN, "scene/scans/7"), "expected groups 0000"),
-    "two of one name": (set_to("scene/scans/0001/name", np.bytes_("s1")), "two scans have one name"),
+    "two of one name": (set_to("scene/scans/0001/name", np.bytes_("s1")), "two scans have the same name"),
 }  # fmt: skip
 
 
