@@ -67,7 +67,7 @@ def literals():
             elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:
                 found.append(node.value)
     others = [path for pattern in ("*.html", "*.js") for path in SOURCES.rglob(pattern)]
-    others += (SOURCES / "tolerances").glob("*.toml")
+    others += (SOURCES / "limits").glob("*.toml")
     return found, [path.read_text("utf-8") for path in sorted(others)]
 
 
