@@ -18,7 +18,7 @@ NAN = float("nan")
 
 
 def own(**limits):
-    return standards.with_own(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
+    return standards.override(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
 
 
 def chord(value, sd):
@@ -102,7 +102,7 @@ def test_what_the_stations_say():
 
 def test_a_limit_that_nothing_is_held_against_is_said():
     assert chain.not_held(GB) == []
-    mixed = standards.with_own(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
+    mixed = standards.override(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
     assert [limit.key for limit in chain.not_held(mixed)] == ["bow_mm"]
     params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
     assert "limits that nothing is held against: bow_mm" in assemble._message(params, mixed, 0.0, [])
