@@ -120,32 +120,22 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     :mod:`processor.geometry.normal_orientation`. ``log`` receives one line a message. Raises InputError for a file that
     cannot be used, and where no core point has a distance.
     """
-    reference, compared = _read(request.reference), _read(request.compared)
-    core_cloud = reference if request.core is None else _read(request.core)
-    clouds = [reference, compared] if request.core is None else [reference, compared, core_cloud]
-    for cloud in (reference, compared):
-        if cloud.count < m3c2.FEWEST_FOR_LOD:
-            raise InputError(
-                f"{cloud.path}: holds {cloud.count} point{'s' * (cloud.count > 1)}; expected "
-                f"{m3c2.FEWEST_FOR_LOD} or more, which a level of detection needs"
-            )
-    unit = _unit(clouds)
+    clouds = _read_clouds(request)
+    reference, compared = clouds["reference"], clouds["compared"]
+    unit = _unit(list(clouds.values()))
     origin = _origin(reference)
-    core = np.ascontiguousarray(core_cloud.relative_to(origin))
+    core = np.ascontiguousarray(clouds.get("core", reference).relative_to(origin))
     first, second = (point_neighbors.of_spacing(cloud.relative_to(origin)) for cloud in (reference, compared))
     used = scales.derived(first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth)
     if reason := diagnosis.other_unit(first.cells.points, second.cells.points, used):
         raise InputError(f"{request.reference} and {request.compared}: {reason}")
-    units = {name: cloud.unit for name, cloud in zip(CLOUDS, clouds, strict=False)}
+    units = {name: cloud.unit for name, cloud in clouds.items()}
     _log_scales(request, used, unit, units, log)
-    turned = None
     if request.normals is not None:
+        turned, source = None, f"file {request.normals.name}"
         normals = scan_folder_normals.read(request.normals, core, origin, used.projection_diameter_mm)
-        source = f"file {request.normals.name}"
     else:
-        fitted = m3c2.normals(_sorted(first, used.normal_diameter_mm), core, used.normal_diameter_mm)
-        scanner = _seen_from(reference, core, fitted, used.normal_diameter_mm, origin)
-        turned = normal_orientation.turned(fitted, core, used.normal_diameter_mm, scanner)
+        turned = _fitted_normals(reference, first, core, origin, used.normal_diameter_mm)
         normals = turned.normals
         source = "planes of the reference, turned towards +z" + (", upright ones otherwise" if turned.upright else "")
     distances = m3c2.distances(
@@ -166,7 +156,7 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     if turned is not None and (note := turned_note(turned)):
         log(note)
     _log_warnings(summary, used, log)
-    hashes = {name: cloud.sha256 for name, cloud in zip(CLOUDS, clouds, strict=False)}
+    hashes = {name: cloud.sha256 for name, cloud in clouds.items()}
     if request.normals is not None:
         hashes["normals"] = _sha256(request.normals)
     return Comparison(
@@ -179,11 +169,30 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         summary=summary,
         unit=unit,
         units=units,
-        points={name: cloud.count for name, cloud in zip(CLOUDS, clouds, strict=False)},
+        points={name: cloud.count for name, cloud in clouds.items()},
         hashes=hashes,
         normals_from=source,
         turned=turned,
     )
+
+
+def _read_clouds(request: Request) -> dict[str, _Cloud]:
+    """Read the clouds of CLOUDS; without a core file there is no "core"."""
+    clouds = {name: _read(path) for name in CLOUDS if (path := getattr(request, name)) is not None}
+    for cloud in (clouds["reference"], clouds["compared"]):
+        if cloud.count < m3c2.FEWEST_FOR_LOD:
+            raise InputError(
+                f"{cloud.path}: holds {cloud.count} point{'s' * (cloud.count > 1)}; expected "
+                f"{m3c2.FEWEST_FOR_LOD} or more, which a level of detection needs"
+            )
+    return clouds
+
+
+def _fitted_normals(reference: _Cloud, grid: PointGrid, core: Floats, origin: Floats, diameter: float) -> Turned:
+    """Return oriented normals (k, 3) of planes fitted to the reference, whose points are in ``grid``."""
+    fitted = m3c2.normals(_sorted(grid, diameter), core, diameter)
+    scanner = _seen_from(reference, core, fitted, diameter, origin)
+    return normal_orientation.turned(fitted, core, diameter, scanner)
 
 
 def _seen_from(
