@@ -80,8 +80,10 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
     for run, _ in all_tables.grouped(execution.runs):
         report_of = section.of(run.step)
         head, said = report_of.summary(run.result)
-        title = text("{step}: {head}", step=report_of.title, head=head)
-        body = text("Method {method}. {text}", method=run.method, text=said)
+        title: Any = text("{step}: {head}", step=report_of.title, head=head)
+        body: Any = text("Method {method}. {text}", method=run.method, text=said)
+        if isinstance(head, str):
+            title, body = f"{report_of.title}: {head}", f"Method {run.method}. {said}".strip()
         found.append({"tone": _tone(run), "head": title, "text": body})
         found += [{"tone": "", "head": head, "text": text} for head, text in report_of.further(run.result)]
     if report.metrics:
@@ -152,7 +154,7 @@ def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
 def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
     note = table.note
     if len(table.rows) > MOST_ROWS:
-        note = text(
+        note: Any = text(
             "{note} The first {most} of {rows} rows; all are in {file}.csv.",
             note=note,
             most=MOST_ROWS,
