@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 OUT ?= out
 JOBS ?= 2
 
-.PHONY: demo test lint bench paper nightly weekend clean system
+.PHONY: demo test lint docs bench paper nightly weekend clean system
 
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
@@ -20,6 +20,10 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/mypy
+
+# docs/parameters.md from the code; the rest of docs/ is written by hand.
+docs: $(VENV)/.test
+	$(BIN)/python -m docs.make_parameters
 
 bench: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --editable ".[designgen,test,bench]"
