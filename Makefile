@@ -1,4 +1,4 @@
-# Everything runs in .venv; nothing is installed outside it but system libraries, and those only where they are missing.
+# Everything is installed into .venv, but for system libraries that are missing.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -10,6 +10,7 @@ JOBS ?= 2
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
 
+# All tests but the slow ones; weekend runs these, too.
 test: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -37,7 +38,7 @@ bench: $(VENV)/.test
 paper: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/paper
 
-# Exit code 4, as of the command: a limit was missed or a figure got worse. --again: today's night by other software is replaced.
+# Exit code 4: a limit was missed or a figure got worse. --again replaces a run of today by other software.
 nightly: $(VENV)/.demo
 	$(BIN)/processor validate -o $(OUT)/nightly --jobs $(JOBS) --again
 
