@@ -4,7 +4,7 @@ import numpy as np
 
 from processor.geometry import scanner_rays
 from processor.stitching.fine import edge_constraints
-from processor.stitching.planes import edges
+from processor.stitching.planes import borders, edges
 from processor.stitching.planes.extraction import Planes
 from tests.support.stitch_clouds import pose, scan
 
@@ -116,8 +116,6 @@ def test_far_edges_of_a_face_seen_at_a_slant_are_without_bias():
 
 def test_points_beside_the_next_face_are_left_out():
     """A box corner: the front 5 m ahead ends at y = 0, and its side runs away from there."""
-    from processor.stitching.planes import borders
-
     y = np.linspace(-500.0, 200.0, 15) + 3.0
     front = np.stack([np.full(15, 5000.0), y, np.zeros(15)], axis=1)
     side = y > 0.0

@@ -5,7 +5,7 @@ from scipy.spatial.transform import Rotation
 
 from processor.stitching.coarse import face_index
 from processor.stitching.planes import hashing
-from processor.stitching.planes.samples import Elements
+from processor.stitching.planes.samples import Patches
 
 
 def test_keys_are_numbered_as_numpy_does():
@@ -37,7 +37,7 @@ def test_sums_by_group_are_those_of_a_matrix():
 
 def faces(rng, n, spread):
     normals = rng.normal(size=(n, 3))
-    return Elements(rng.uniform(-spread, spread, (n, 3)), normals / np.linalg.norm(normals, axis=1)[:, None])
+    return Patches(rng.uniform(-spread, spread, (n, 3)), normals / np.linalg.norm(normals, axis=1)[:, None])
 
 
 def test_near_faces_are_those_of_all_distances():
@@ -49,19 +49,17 @@ def test_near_faces_are_those_of_all_distances():
     d = np.linalg.norm(x[:, None] - there.points, axis=2)
     off = np.abs(np.einsum("kni,ni->kn", x[:, None] - there.points, there.normals))
     like = n @ there.normals.T
-    nearest = np.argsort(d, axis=1)[:, : face_index.KEPT]
+    nearest = np.argsort(d, axis=1)[:, : face_index.NEAREST]
     fits = (d < 1.4) & (off < 0.6) & (like > 0.2)
     want = np.take_along_axis(fits, nearest, axis=1).any(axis=1)
     got = np.empty(600, np.bool_)
-    face_index.agreeing(face_index.of_faces(there, 1.5), T, asked.points, asked.normals, 1.4, 0.6, 0.2, got)
+    face_index.mark_matches(face_index.build(there, 1.5), T, asked, 1.4, 0.6, 0.2, got)
     np.testing.assert_array_equal(got, want)
     assert 20 < want.sum() < 580
 
     weight = rng.uniform(0.5, 2.0, 600)
-    small, large = face_index.of_faces(there, 0.5), face_index.of_faces(there, 1.5)
-    H, g, centre, reach, count = face_index.equations(
-        small, large, T, asked.points, asked.normals, weight, 1.2, 0.5, 0.1
-    )
+    small, large = face_index.build(there, 0.5), face_index.build(there, 1.5)
+    H, g, centre, reach, count = face_index.normal_equations(small, large, T, asked, weight, 1.2, 0.5, 0.1)
     one = nearest[:, 0]
     rows = np.arange(600)
     kept = (d[rows, one] < 1.2) & (off[rows, one] < 0.5) & (like[rows, one] > 0.1)

@@ -19,7 +19,7 @@ def test_three_points_worked_by_hand():
     """b is a turned a quarter about z and moved: x_a = (-y_b + 10, x_b + 20, z_b)."""
     b = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
     a = np.array([[10.0, 20.0, 0.0], [10.0, 120.0, 0.0], [-40.0, 20.0, 0.0]])
-    found = three_point.tie(a, b, scale_free=False)
+    found = three_point.fit_pair(a, b, scale_free=False)
     np.testing.assert_allclose(found.T_a_b, [[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12)
     assert found.scale == pytest.approx(1.0)
     assert np.abs(found.residuals).max() < 1e-12
@@ -28,12 +28,12 @@ def test_three_points_worked_by_hand():
 def test_seven_parameters_take_up_a_scale_six_show_it():
     R = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
     a = 1.0005 * CORNERS @ R.T + [100.0, 200.0, 300.0]
-    free = three_point.tie(a, CORNERS, scale_free=True)
+    free = three_point.fit_pair(a, CORNERS, scale_free=True)
     assert free.scale == pytest.approx(1.0005, abs=1e-12)
     assert np.abs(free.residuals).max() < 1e-9
     np.testing.assert_allclose(free.T_a_b[:3, :3], R, atol=1e-12)
     np.testing.assert_allclose(free.T_a_b[:3, 3], [100.0, 200.0, 300.0], atol=1e-6)
-    held = three_point.tie(a, CORNERS, scale_free=False)
+    held = three_point.fit_pair(a, CORNERS, scale_free=False)
     assert held.scale == pytest.approx(1.0005, abs=1e-9)
     assert np.abs(held.residuals).max() > 1.0
 
@@ -51,7 +51,7 @@ def test_a_scale_is_named_for_what_it_may_be():
 )
 def test_too_few_points_tell_no_pose(points):
     with pytest.raises(three_point.TooFewError):
-        three_point.tie(points, points, scale_free=False)
+        three_point.fit_pair(points, points, scale_free=False)
 
 
 def test_a_pairs_covariance_is_what_noisy_picks_scatter_by():
@@ -61,7 +61,7 @@ def test_a_pairs_covariance_is_what_noisy_picks_scatter_by():
     a = CORNERS @ T[:3, :3].T + T[:3, 3]
     drawn, stated = [], []
     for _ in range(2000):
-        found = three_point.tie(a + rng.normal(0, 5.0, a.shape), CORNERS + rng.normal(0, 5.0, a.shape), False)
+        found = three_point.fit_pair(a + rng.normal(0, 5.0, a.shape), CORNERS + rng.normal(0, 5.0, a.shape), False)
         turn = Rotation.from_matrix(found.T_a_b[:3, :3] @ T[:3, :3].T).as_rotvec()
         drawn.append([*turn, *(found.T_a_b[:3, 3] - T[:3, 3])])
         stated.append(found.covariance)

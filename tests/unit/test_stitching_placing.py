@@ -16,19 +16,20 @@ def test_a_pose_is_worth_what_the_best_of_its_versions_is(monkeypatch):
     def apart(pose, other):
         return float(np.linalg.norm(pose[:3, 3] - other[:3, 3]))
 
-    def held(views, T, i, j, pose, asked):
+    def score_beside(self, i, j, pose):
         against = 10.0 if apart(pose, turned) < 1.0 else 0.05 * apart(pose, right)
-        return pairwise.Placing(pose, 600.0, against, 0.4)
+        return pairwise.ScoredPose(pose, 600.0, against, 0.4)
 
-    monkeypatch.setattr(network, "held", held)
+    monkeypatch.setattr(network.Network, "score_beside", score_beside)
     monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: apart(T, S) < 500.0)
     candidates = {
-        (0, 2): [pairwise.Placing(near, 1.0, 0.0, 0.4), pairwise.Placing(turned, 0.9, 0.0, 0.4)],
-        (1, 2): [pairwise.Placing(right, 1.0, 0.0, 0.4), pairwise.Placing(turned, 0.9, 0.0, 0.4)],
+        (0, 2): [pairwise.ScoredPose(near, 1.0, 0.0, 0.4), pairwise.ScoredPose(turned, 0.9, 0.0, 0.4)],
+        (1, 2): [pairwise.ScoredPose(right, 1.0, 0.0, 0.4), pairwise.ScoredPose(turned, 0.9, 0.0, 0.4)],
     }
-    assert network.together([], np.zeros(0), [0], 2, near, {}) < network.together([], np.zeros(0), [0], 2, turned, {})
-    views = [SimpleNamespace(side_mm=700.0)] * 3
-    ranked = network.ranking(views, candidates, np.tile(np.eye(4), (3, 1, 1)), [0, 1], 2, {})
+    scans = [SimpleNamespace(side_mm=700.0)] * 3
+    placed = network.Network(scans=scans, candidates=candidates, T=np.tile(np.eye(4), (3, 1, 1)), placed=[0, 1])
+    assert network.joint_score(placed, 2, [0], near) < network.joint_score(placed, 2, [0], turned)
+    ranked = network.rank_poses(placed, 2, [0, 1])
     np.testing.assert_array_equal(ranked[0][1], right)
     np.testing.assert_array_equal(ranked[1][1], turned)
     assert ranked[0][0] > 0.9 > 0.1 > ranked[1][0]
@@ -37,7 +38,7 @@ def test_a_pose_is_worth_what_the_best_of_its_versions_is(monkeypatch):
 def test_a_pose_that_rests_on_one_scan_is_refuted_by_what_was_looked_through():
     """A bridge turned end for end: much agrees, and a few faces stand where the other scanner saw through."""
     T = np.eye(4)
-    right, turned, apart = (pairwise.Placing(T, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
+    right, turned, apart = (pairwise.ScoredPose(T, 50.0, a, o) for a, o in ((0.02, 0.3), (1.1, 0.5), (2.0, 0.01)))
     np.testing.assert_array_equal(network.refuted({(0, 1): right}, 2, 0), [0.0, 0.0])
     np.testing.assert_allclose(network.refuted({(0, 1): turned}, 2, 0), [0.0, 1.1 / 50.0])
     # Two scans that tell the same would have to be wrong together; one that shares next to nothing tells nothing.
