@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -45,14 +45,14 @@ class Matches:
     the piece; ``normal`` (n, 3) is that of the piece; ``gap`` and ``edge`` (n,) are those of :class:`Ends`.
     """
 
-    piece: Ints
-    scan: Ints
-    points: Floats
-    off: Floats
-    width: Floats
-    normal: Floats
-    gap: Ints
-    edge: Ints
+    piece: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    scan: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    points: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    off: Floats = field(default_factory=lambda: np.empty(0))
+    width: Floats = field(default_factory=lambda: np.empty(0))
+    normal: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    gap: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    edge: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
@@ -94,13 +94,7 @@ def match(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear:
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
     normal = planes.normal * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     half = REACH * np.sqrt(planes.variance[:, 1:]) + 2.0 * clouds[0].cell_mm
-    none = np.empty(0, np.int64)
-    parts = [
-        Matches(
-            piece=none, scan=none, points=np.empty((0, 3)), off=np.empty(0), width=np.empty(0),
-            normal=np.empty((0, 3)), gap=none, edge=none,
-        )
-    ]  # fmt: skip
+    parts = [Matches()]
     for s, cloud in enumerate(clouds):
         if not len(cloud.ends.points) or not np.isfinite(T[s]).all():
             continue
@@ -114,16 +108,7 @@ def match(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear:
                     normal=normal[piece], gap=cloud.ends.gap[rows], edge=cloud.ends.edge[rows],
                 )
             )  # fmt: skip
-    return Matches(
-        piece=np.concatenate([part.piece for part in parts]),
-        scan=np.concatenate([part.scan for part in parts]),
-        points=np.concatenate([part.points for part in parts]),
-        off=np.concatenate([part.off for part in parts]),
-        width=np.concatenate([part.width for part in parts]),
-        normal=np.concatenate([part.normal for part in parts]),
-        gap=np.concatenate([part.gap for part in parts]),
-        edge=np.concatenate([part.edge for part in parts]),
-    )
+    return Matches(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Matches)})
 
 
 def _match_scan(

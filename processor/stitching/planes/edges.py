@@ -7,7 +7,7 @@ with the distance of the two rays on the face as the width of a uniform distribu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from numba import njit
@@ -79,13 +79,7 @@ def ends_of(points: Floats, row: Ints, column: Ints, piece: Ints, planes: Planes
         middle = 0.5 * (a + b) - (b - a) * (2.0 / 3.0 * (far - near) / (far + near))[:, None]
         edge = len(DIRECTIONS) * face[good] + number
         parts.append(Ends(points=middle, across=b - a, normals=n[good], gap=gap[good], edge=edge))
-    return Ends(
-        points=np.concatenate([part.points for part in parts]),
-        across=np.concatenate([part.across for part in parts]),
-        normals=np.concatenate([part.normals for part in parts]),
-        gap=np.concatenate([part.gap for part in parts]),
-        edge=np.concatenate([part.edge for part in parts]),
-    )
+    return Ends(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Ends)})
 
 
 def _last_on_face(grid: Ints, on_face: Ints, row_step: int, column_step: int) -> tuple[Ints, Ints, Ints]:
