@@ -53,7 +53,12 @@ class RegisteredScans:
 
 
 def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked) -> RegisteredScans:
-    """Register scans; pairs with picked points have the pose by these among their candidates."""
+    """Register two or more scans in the frame of scan ``reference``, a row of ``scans``.
+
+    Candidate poses of all pairs are scored by matching patches and free space, the scans are placed by these one after
+    another, and all poses are adjusted on shared planar pieces and ends of faces. The pose by picked points is one of
+    the candidates of its pair. Scans that overlap with no other one have a pose of NaN.
+    """
     clouds = parallel.each(lambda scan: scan_planes.extract(scan, params.cell_mm), scans)
     patches = _sample_patches(clouds)
     candidates = _find_candidates(patches, params, picked)

@@ -12,7 +12,7 @@ from processor.stitching.coarse import pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 
 MOST_TRIED = 5
-AMBIGUOUS = 0.75  # of the best pose's score: a competing pose that reaches it cannot be told from it
+AMBIGUOUS = 0.75  # of the best pose's score: a competing pose that reaches it is as likely
 LEAST_OVERLAP = 0.08
 
 Pairs = dict[tuple[int, int], list[ScoredPose]]

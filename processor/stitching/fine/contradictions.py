@@ -21,7 +21,7 @@ from processor.stitching.planes import extraction, hashing
 
 AGREES = 4.0  # standard deviations of a face's misfit after the motion
 LEAST_FACES = 4  # three of a hundred agree by chance in one of 90 scans of a truss
-LEAST_SHARE = 0.14  # of the accepted faces that speak against the motion
+LEAST_SHARE = 0.14  # of the accepted faces that contradict the motion
 
 
 @dataclass(frozen=True)
