@@ -80,7 +80,8 @@ def _check_structure(path: Path) -> None:
         raise InputError(f"{path}: its XML declares a document type or entities, which is not allowed; export it again")
     declared = re.match(rb"\s*<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)", text.removeprefix(b"\xef\xbb\xbf"))
     if declared and declared[1].lower() not in (b"utf-8", b"utf8", b"us-ascii"):
-        raise InputError(f"{path}: expected XML in UTF-8, found {declared[1][:40].decode('latin-1')!r}; export it again")
+        encoding = declared[1][:40].decode("latin-1")
+        raise InputError(f"{path}: expected XML in UTF-8, found {encoding!r}; export it again")
 
 
 def names(stem: str, stored: Sequence[str]) -> list[str]:

@@ -19,10 +19,10 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import __version__
 from processor.model import Floats, InputError, Ints
 from processor.scan_folder.meshes import CAD_SUFFIXES as SUFFIXES
 from processor.scan_folder.meshes import read_mesh
+from processor.version import __version__
 
 __all__ = ["SUFFIXES", "read"]
 

@@ -54,7 +54,7 @@ CASES = {
     "PCD of text": ("a.pcd", "hello\n" * 10, "no DATA line"),
     "PCD of 1e9 points": ("a.pcd", pcd_header("binary", 10**9, 10**9) + bytes(48), "declares 10{9} points"),
     "PCD cut off": ("a.pcd", pcd_header("binary") + bytes(47), "declares 3 points"),
-    "PCD short of rows": ("a.pcd", pcd_header("ascii") + b"100 200 300 1\n" * 2, "expected 3 points as declared, found 2"),
+    "PCD short of rows": ("a.pcd", pcd_header("ascii") + b"100 200 300 1\n" * 2, "3 points as declared, found 2"),
     "PCD of other size": ("a.pcd", pcd_header("binary", 3, 4) + bytes(48), "is not POINTS 3"),
     "PCD all NaN": ("a.pcd", pcd_header("ascii") + b"nan nan nan 1\n" * 3, "no points"),
     "PCD with inf": ("a.pcd", pcd_header("ascii") + b"1 2 inf 1\n" * 3, "3 of 3 points"),

@@ -82,7 +82,7 @@ def test_a_unit_that_the_file_does_not_say(fake):
     ("says", "expected"),
     [
         ({"error": "is cut off"}, r"whole\.STEP: is cut off$"),
-        ({"problems": ["solid 3 is lost", "face 7"]}, r"converted to meshes completely \(solid 3 is lost, and 1 more\)"),
+        ({"problems": ["solid 3 is lost", "face 7"]}, r"to meshes completely \(solid 3 is lost, and 1 more\)"),
         ({"bodies": 0}, "expected solids or surfaces"),
         ({"mesh": "../../../x.ply"}, "expected solids or surfaces"),
     ],
