@@ -156,9 +156,7 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     if turned is not None and (note := turned_note(turned)):
         log(note)
     _log_warnings(summary, used, log)
-    hashes = {name: cloud.sha256 for name, cloud in clouds.items()}
-    if request.normals is not None:
-        hashes["normals"] = _sha256(request.normals)
+    given = {} if request.normals is None else {"normals": _sha256(request.normals)}
     return Comparison(
         request,
         origin=origin,
@@ -170,7 +168,7 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         unit=unit,
         units=units,
         points={name: cloud.count for name, cloud in clouds.items()},
-        hashes=hashes,
+        hashes={name: cloud.sha256 for name, cloud in clouds.items()} | given,
         normals_from=source,
         turned=turned,
     )

@@ -30,8 +30,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.model import InputError
-from processor.readers import common
-from processor.readers.common import RawScan
+from processor.readers.common import RawScan, give_room_by
 
 SLACK_BYTES = 1 << 30
 LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # the libraries are much faster than this
@@ -284,7 +283,7 @@ def serve() -> None:
         except (EOFError, OSError):
             return
         shared = _Shared()
-        common.give_room_by(shared.new)
+        give_room_by(shared.new)
         _limit_memory(SLACK_BYTES)
         signal.setitimer(signal.ITIMER_PROF, request["limit_s"])
         signal.setitimer(signal.ITIMER_REAL, PATIENCE * request["limit_s"])
@@ -294,7 +293,7 @@ def serve() -> None:
         _send(channel, answer, shared.descriptor)
         os.close(shared.descriptor)
         del shared
-        common.give_room_by(np.empty)
+        give_room_by(np.empty)
 
 
 def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:

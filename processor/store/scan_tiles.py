@@ -9,8 +9,9 @@ from typing import Any
 import h5py
 import numpy as np
 
+import processor.store.codec as codec
+import processor.store.tiles as tiles
 from processor.model import Floats, Ints, Scan
-from processor.store import codec, tiles
 from processor.store.codec import DecodeError
 
 AXES = ("x", "y", "z")

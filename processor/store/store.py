@@ -24,8 +24,10 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
+import processor.store.codec as codec
+import processor.store.safety as safety
+import processor.store.scan_tiles as scan_tiles
 from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
-from processor.store import codec, safety, scan_tiles
 from processor.store.codec import DecodeError
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import processor.store.scan_tiles as scan_tiles
 from processor.model import Floats, Labels
-from processor.store import scan_tiles, store
+from processor.store.store import opened
 
 PIECE = 1 << 20
 
@@ -60,6 +61,6 @@ class Boxed:
 @contextmanager
 def points_of(path: Path) -> Iterator[StoredPoints]:
     """Open a scene file for its points. Raises InputError for a file that is damaged or of another kind."""
-    with store.opened(path, ["scene"]) as file:
+    with opened(path, ["scene"]) as file:
         scans = file["scene"]["scans"]
         yield StoredPoints(tuple(scans[name] for name in scans) if hasattr(scans, "keys") else ())
