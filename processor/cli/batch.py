@@ -58,6 +58,7 @@ def batch(
     """
     from processor import pipeline
     from processor.batch import batch as whole
+    from processor.jobs.runner import StoppedError
 
     if jobs is not None and cluster is not None:
         raise UsageError("--jobs and --cluster exclude each other: a cluster does as many at a time as it has workers")
@@ -95,7 +96,7 @@ def batch(
 
     try:
         found = whole.run(settings, say, ended)
-    except whole.StoppedError:
+    except StoppedError:
         context.exit(IN_PART)
     counts = {name: count for name, count in found.counts.items() if count}
     if as_json:
