@@ -69,10 +69,10 @@ def software() -> dict[str, str]:
     """Return the versions of what results depend on; that of the processor with a hash of its files."""
     digest = hashlib.sha256()
     package = Path(processor.__file__).parent
-    for path in sorted(one for one in package.rglob("*") if one.suffix in (".py", ".toml", ".html", ".js", ".css")):
+    for path in sorted(path for path in package.rglob("*") if path.suffix in (".py", ".toml", ".html", ".js", ".css")):
         digest.update(f"{path.relative_to(package)}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
-    own = f"{processor.__version__} {digest.hexdigest()[:16]}"
-    return {"processor": own, "python": ".".join(map(str, sys.version_info[:3])), **versions(PACKAGES)}
+    sources = f"{processor.__version__} {digest.hexdigest()[:16]}"
+    return {"processor": sources, "python": ".".join(map(str, sys.version_info[:3])), **versions(PACKAGES)}
 
 
 def do(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
@@ -215,7 +215,7 @@ def _plain(job: Job, text: str, most: int = 2000) -> str:
     for folder in (job.root, job.out):
         text = text.replace(f"{folder}/", "") if str(folder) != "/" else text
     text = " ".join(text.replace(str(job.source), job.source.name).split())
-    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)[:most]
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)[:most]
 
 
 def _publish(job: Job, made: Path) -> None:

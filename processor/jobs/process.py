@@ -241,7 +241,7 @@ class _StandardError:
             try:
                 self.log.write(block[:room])
                 if 0 < room <= len(block):
-                    self.log.write(b"\n(more was said than is kept)\n")
+                    self.log.write(b"\n(the rest is not logged)\n")
                 self.log.flush()
             except OSError as error:
                 self.error = error

@@ -92,11 +92,11 @@ def run(
         open_cells = []
         for cell in cells:
             if cell.key not in done:
-                kept = _kept(out, night, cell, present.code)
-                if kept is None:
+                earlier = _earlier(out, night, cell, present.code)
+                if earlier is None:
                     open_cells.append(cell)
                 else:
-                    history.add(night, cell, kept)
+                    history.add(night, cell, earlier)
         ready = len(cells) - len(open_cells)
         progress(ready, len(cells), None, None)
         with closing(runner(open_cells)) as coming:
@@ -155,7 +155,7 @@ def _keep(out: Path, night: str, cell: Cell, outcome: Outcome, code: str) -> Non
     _write(folder / "cell.json", _json(content | cell.spec()).encode())  # last: it is there only with whole results
 
 
-def _kept(out: Path, night: str, cell: Cell, code: str) -> Outcome | None:
+def _earlier(out: Path, night: str, cell: Cell, code: str) -> Outcome | None:
     """Return the kept outcome of a cell that is not in the history; None if it is not whole or of other software."""
     folder = out / CELLS / night / cell.key
     try:

@@ -66,8 +66,8 @@ class Summary:
             if changed:
                 more = f"; {len(changed) - MOST_NAMED} more" if len(changed) > MOST_NAMED else ""
                 parts.append(f"{len(changed)} {word}: {'; '.join(map(_named, changed[:MOST_NAMED]))}{more}")
-        moved = len(self.found.of(CHANGED))
-        parts += [f"{moved} moved, neither worse nor better"] if moved else []
+        neither = len(self.found.of(CHANGED))
+        parts += [f"{neither} moved, neither worse nor better"] if neither else []
         if self.found.first:
             parts.append("nothing to compare with yet")
         elif not self.found.changes:
