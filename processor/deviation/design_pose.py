@@ -12,9 +12,11 @@ import numpy as np
 
 from processor.deviation import attitude, cloud
 from processor.deviation.cloud import Samples, ScanCloud
+from processor.deviation.result import Registration
 from processor.geometry import principal, rigid, surface_registration
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import thinned, voxel_means
+from processor.geometry.surface_registration import Motion
 from processor.model import Floats
 
 NEAR_MM = 100.0  # of the design's surface
@@ -33,14 +35,14 @@ class Placed:
     """
 
     T: Floats
-    registration: str
+    registration: Registration
     T_best_fit: Floats
     covariance: Floats
     ambiguity: float
     near_share: float
     shift: Floats
     turn: float
-    weak: tuple[str, ...]
+    weak: tuple[Motion, ...]
     sigma_mm: float
 
 
@@ -50,18 +52,18 @@ def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> Pla
     few = thinned(scan.points, FINE_POINTS)
     near, _ = surface.tree.query(rigid.apply(given, few), distance_upper_bound=NEAR_MM, workers=-1)
     near_share = float(np.isfinite(near).mean())
-    start, ambiguity, done = given, NAN, "as given"
+    start, ambiguity, done = given, NAN, Registration.AS_GIVEN
     if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
         spacing = np.sqrt(cloud.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
         samples = cloud.sampled(surface.vertices, surface.faces, spacing)
         found = attitude.coarse(even(scan.points), samples, axes)
-        start, ambiguity, done = found.T_design_scan, found.ambiguity, "coarse"
+        start, ambiguity, done = found.T_design_scan, found.ambiguity, Registration.COARSE
     elif how == "fine":
-        done = "fine"
+        done = Registration.FINE
     fine = surface_registration.fine(few, surface, axes.axes, start)
     fitted = np.isfinite(fine.covariance).all()
     best = fine.T_bridge_scan if fitted else np.full((4, 4), NAN)
-    T = start if done == "as given" or not fitted else best
+    T = start if done is Registration.AS_GIVEN or not fitted else best
     middle = few.mean(axis=0)
     between = best @ rigid.invert(T) if fitted else np.full((4, 4), NAN)
     at = rigid.apply(T, middle)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from processor.geometry import icp, rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import thinned
-from processor.model import NORMAL_95, Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints, Word
 
 Bools = npt.NDArray[np.bool_]
 
@@ -27,10 +27,17 @@ NO_FIT_MM = (10.0, 4.0)  # no noise and no form of a part is as large; the secon
 CLUTTER_SHARE = 0.15
 CELL_MM = 500.0  # residuals nearer to each other along the part, on one face, are taken as dependent
 WEAK_MM = 5.0  # a motion that may move a part's ends by more (95 %) is weak: they are looked for no further off
-MOTIONS = (
-    "a turn about its length", "a turn sideways", "a turn up and down", "a shift along its length", "a shift sideways",
-    "a shift up and down",
-)  # fmt: skip
+
+
+class Motion(Word):
+    """A motion of a part about its middle and principal axes."""
+
+    ROLL = "a turn about its length"
+    YAW = "a turn sideways"
+    PITCH = "a turn up and down"
+    ALONG = "a shift along its length"
+    SIDEWAYS = "a shift sideways"
+    UP = "a shift up and down"
 
 
 @dataclass(frozen=True)
@@ -44,7 +51,7 @@ class Registration:
     covariance: Floats
     sigma_mm: float
     used_share: float
-    weak: tuple[str, ...] = ()
+    weak: tuple[Motion, ...] = ()
 
 
 NOWHERE = Registration(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
@@ -74,7 +81,7 @@ def _iterate(
 ) -> tuple[Registration, float]:
     """Iterate until the pose stands still; also the variance of the cells' means against that of chance."""
     T, sigma, covariance, share, form = start.copy(), float("nan"), np.full((6, 6), np.nan), 0.0, float("inf")
-    weak: tuple[str, ...] = ()
+    weak: tuple[Motion, ...] = ()
     face: Ints | None = None
     for turn in range(MOST_TURNS):
         moved = rigid.apply(T, points)
@@ -142,13 +149,13 @@ def _scatter(gradient: Floats, cell: Ints) -> Floats:
     return found
 
 
-def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[str, ...]:
+def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion, ...]:
     """Name the motions about the part's middle and its axes that may move its ends by more than WEAK_MM."""
     turned = np.kron(np.eye(2), axes.T)
     spread = NORMAL_95 * np.sqrt(np.diag(turned @ covariance @ turned.T))
     arms = np.array([0.1 * half_length, half_length, half_length, 1.0, 1.0, 1.0])
     order = (0, 2, 1, 3, 4, 5)  # a turn about the third axis is sideways where the second one is
-    return tuple(name for name, k in zip(MOTIONS, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
+    return tuple(name for name, k in zip(Motion, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
 
 
 def about_origin(covariance: Floats, middle: Floats) -> Floats:
