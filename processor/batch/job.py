@@ -19,7 +19,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import processor
 from processor.batch import figures, record
 from processor.batch.record import FAILED, Record
 from processor.jobs import process
@@ -28,6 +27,7 @@ from processor.jobs.software import check_same, versions
 from processor.model import InputError
 from processor.scan_folder import fingerprint
 from processor.store.store import sync
+from processor.version import __version__
 
 PACKAGES = ("ezdxf", "h5py", "laspy", "lazrs", "numba", "numpy", "plyfile", "pye57", "pypcd4", "scipy", "trimesh")
 STATUS = {0: "done", 1: "in-part", 4: "limit-missed"}  # by the exit code of `processor run`
@@ -68,10 +68,10 @@ class Job:
 def software() -> dict[str, str]:
     """Return the versions of what results depend on; that of the processor with a hash of its files."""
     digest = hashlib.sha256()
-    package = Path(processor.__file__).parent
+    package = Path(__file__).parents[1]
     for path in sorted(path for path in package.rglob("*") if path.suffix in (".py", ".toml", ".html", ".js", ".css")):
         digest.update(f"{path.relative_to(package)}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
-    sources = f"{processor.__version__} {digest.hexdigest()[:16]}"
+    sources = f"{__version__} {digest.hexdigest()[:16]}"
     return {"processor": sources, "python": ".".join(map(str, sys.version_info[:3])), **versions(PACKAGES)}
 
 
