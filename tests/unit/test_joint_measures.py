@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from processor.limits import standards
 from processor.model import Limit, Tolerance
-from processor.preassembly.baselines import edge_features
+from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.verdicts import joint_measures, joints
 from processor.preassembly.verdicts.joint_measures import measure
 from processor.preassembly.verdicts.joints import judge
@@ -49,7 +49,7 @@ def only(**limits):
 def test_the_joints_axes_are_those_of_its_frame():
     T = tilted()
     there = POINTS @ T[:3, :3].T + T[:3, 3]
-    np.testing.assert_allclose(edge_features.joint_frame(there), T, atol=1e-9)
+    np.testing.assert_allclose(joint_frame(there), T, atol=1e-9)
     gaps = np.random.default_rng(1).normal(size=(8, 3))
     covariance = some_covariance(2)
     local, spread = joint_measures.in_joint_axes(gaps, covariance, T)
@@ -186,7 +186,7 @@ def test_a_lone_extreme_has_the_interval_of_a_single_value():
     ],
 )
 def test_guard_band(interval, verdict):
-    assert joints.guarded(interval, -1.0, 2.0) == verdict
+    assert joints.guard_band(interval, -1.0, 2.0) == verdict
 
 
 def lone(value, sd, point=5, axis=1):

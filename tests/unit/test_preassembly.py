@@ -12,7 +12,8 @@ from processor.model import InputError, Scene, UsageError
 from processor.preassembly import errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features, joint_alignment, methods
-from processor.preassembly.params import PAPER_METHODS
+from processor.preassembly.ends.joint_frame import joint_frame
+from processor.preassembly.params import PAPER_METHODS, BoxParams, MatchParams, SliceParams
 from processor.preassembly.parts import attitude
 from tests.support import arch_clouds
 
@@ -94,9 +95,7 @@ def box_end(spacing=4.0, sigma=0.0, width=900.0, height=1100.0, plate=24.0):
 
 def test_reduced_boxes_find_the_inner_edges_of_the_plates():
     # As published: the point nearest to P lies on the end's inner edge, a plate's thickness inside of the outer one.
-    edges = edge_features.reduced_boxes(
-        box_end(), 1.0, 4.0, edge_features.BoxParams(edge_box_mm=36.0), np.random.default_rng(0)
-    )
+    edges = edge_features.reduced_boxes(box_end(), 1.0, 4.0, BoxParams(edge_box_mm=36.0), np.random.default_rng(0))
     inner_b, inner_h = 450.0 - 24.0, 550.0 - 24.0
     expected = np.array(
         [[0, inner_b, -inner_h], [0, -inner_b, -inner_h], [0, -inner_b, inner_h], [0, inner_b, inner_h]]
@@ -109,13 +108,13 @@ def test_reduced_boxes_find_the_inner_edges_of_the_plates():
 def test_reduced_boxes_without_points_say_so():
     cut = box_end()
     rng = np.random.default_rng(0)
-    assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, edge_features.BoxParams(), rng) is None
-    assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, edge_features.BoxParams(), rng) is None
+    assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, BoxParams(), rng) is None
+    assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, BoxParams(), rng) is None
 
 
 def test_the_joint_frame_looks_along_the_bridge():
     points = arch_clouds.key_points(0.4 * arch_clouds.ARC)
-    T = edge_features.joint_frame(points)
+    T = joint_frame(points)
     ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))
     here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))
     np.testing.assert_allclose(T[:3, 0], (ahead - here)[0], atol=1e-4)
@@ -127,7 +126,7 @@ def test_slices_follow_the_bottom_edges():
     rng = np.random.default_rng(3)
     points = arch_clouds.scan_points(2, 8.0, 0.5, rng)
     part = arch_clouds.design().parts[2]
-    left, right = edge_features.slice_edges(points, np.eye(4), 8.0, 0.5, edge_features.SliceParams())
+    left, right = edge_features.slice_edges(points, np.eye(4), 8.0, 0.5, SliceParams())
     for found, design in ((left, part.bottom_edge_left), (right, part.bottom_edge_right)):
         offset = np.linalg.norm(Polyline.through(design).nearest(found)[1], axis=1)
         assert len(found) > 500
@@ -146,7 +145,7 @@ def test_linear_error_of_a_lifted_edge_by_hand():
     left = np.array(found.edge) == "left"
     assert found.deviation[left].mean() == pytest.approx(5.0, abs=0.3)  # the noise does not add to it
     np.testing.assert_allclose(found.deviation[~left], 0.0, atol=1e-12)
-    assert np.diff(found.station[left]) == pytest.approx(200.0)
+    assert np.diff(found.chainage[left]) == pytest.approx(200.0)
 
 
 def test_splicing_error_by_hand():
@@ -272,9 +271,7 @@ def test_a_coarse_pose_slid_along_the_bridge_is_not_believed(slide, believed, mo
     monkeypatch.setattr(pfh, "coarse_alignment", slid)
     x = np.linspace(0.0, 5000.0, 400)
     lines = np.vstack([np.column_stack([x, np.full_like(x, y), np.zeros_like(x)]) for y in (-450.0, 450.0)])
-    T, message = joint_alignment._coarse(
-        lines, lines, np.eye(4), joint_alignment.MatchParams(), np.random.default_rng(0)
-    )
+    T, message = joint_alignment._coarse(lines, lines, np.eye(4), MatchParams(), np.random.default_rng(0))
     assert (T[0, 3], message == "") == ((slide, True) if believed else (0.0, False))
     assert believed or "1500 mm from where the joint puts the part" in message
 

@@ -14,9 +14,9 @@ from processor.geometry import principal, rigid
 from processor.geometry.neighbors import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene
 from processor.preassembly import step as preassembly_step
-from processor.preassembly.baselines import edge_features
+from processor.preassembly.ends.joint_frame import joint_frame
+from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import attitude, identity, measure
-from processor.preassembly.parts.systematic_errors import SystematicParams
 from tests.support import arch_clouds
 from tests.support.arch_clouds import random_pose
 
@@ -56,7 +56,8 @@ def scanned(points, seed=1, name="scan", component=""):
 
 
 def measured(design, index, *scans):
-    return measure.measure(scans, index, design, 1.0, SystematicParams())
+    systematic = SystematicParams()
+    return measure.estimate([measure.fit(scans, index, design, 1.0, systematic)], systematic)[0]
 
 
 def pulls(design, index, part, found, T):
@@ -64,10 +65,10 @@ def pulls(design, index, part, found, T):
     result = {}
     for end, joint, s in (("start", index - 1, part.s0), ("end", index, part.s1)):
         own = found.member.ends[("start", "end").index(end)]
-        if own is None or not np.isfinite(own.moved).all():
+        if own is None or not np.isfinite(own.departure).all():
             continue
-        R = edge_features.joint_frame(design.joint_points[joint])[:3, :3]
-        there = design.joint_points[joint] + own.moved @ R.T
+        R = joint_frame(design.joint_points[joint])[:3, :3]
+        there = design.joint_points[joint] + own.departure @ R.T
         off = (rigid.apply(T @ rigid.invert(found.T_bridge_scan), there) - part.key_points(s)) @ R
         result[end] = off.ravel() / np.sqrt(np.diag(own.covariance))
     return result
@@ -180,7 +181,7 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
         far = np.linalg.norm(points - place, axis=1)
         up = part.point(np.array([s]), np.array([u]), np.array([1.0])) - part.point(np.array([s]), np.array([u]), [0.0])
         points = points + np.where(far < 700.0, 14.0, 0.0)[:, None] * up
-    assert identity.tell(points, np.eye(4), shape, design.parts[1], design) == identity.Told()
+    assert identity.identify(points, np.eye(4), shape, design.parts[1], design) == identity.Identity()
 
 
 @pytest.mark.parametrize(
@@ -225,10 +226,10 @@ def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot
     stated = attitude.Attitude(np.eye(4), np.eye(4), "ok", "")
     monkeypatch.setattr(attitude, "find", lambda *_: stated)
     found = measure._place(scan, design.parts[0], design, shape, 1.0)
-    assert 0.5 < found.fitted.used_share < 0.7
+    assert 0.5 < found.registration.used_share < 0.7
     if strays:
         assert found.doubt.endswith("of its sides; is this the right part, and whole?")
-        assert not found.rank[1]
+        assert not found.sure[1]
     else:
         assert found.trouble.endswith("of the points are away from the design's surface; by its size it is rather rib2")
 
@@ -241,8 +242,8 @@ def test_another_part_is_not_taken_for_a_foot(clutter, index):
     floor = np.random.default_rng(1).uniform([-9e3, -9e3, -5e3], [9e3, 9e3, -4.9e3], (int(clutter * len(points)), 3))
     every = np.vstack([points, floor + points.mean(axis=0)])
     wrong, right = placed(scene.arch, index, every), placed(scene.arch, 2, every)
-    assert wrong.trouble or wrong.doubt or wrong.found.status != "ok"
-    assert (right.found.status, right.trouble, right.doubt) == ("ok", "", "")
+    assert wrong.trouble or wrong.doubt or wrong.attitude.status != "ok"
+    assert (right.attitude.status, right.trouble, right.doubt) == ("ok", "", "")
 
 
 def test_how_much_of_a_part_its_points_lie_on():
@@ -260,7 +261,7 @@ def test_a_rival_farther_along_is_not_called_a_turn():
     _, design = bridge()
     surface = attitude.sample_surface(design.parts[1])
     along = rigid.transform(np.eye(3), 240.0 * surface.axes[:, 0])
-    assert attitude._said_of(np.eye(4), along, surface) == (
+    assert attitude._rival_message(np.eye(4), along, surface) == (
         "the part fits its design as well when shifted by 240 mm along itself; an end seen would tell"
     )
 

@@ -36,7 +36,7 @@ def bridge():
 
 def banded(design, parts, method, **given):
     params = preassembly_step.Params(method=method, **given)
-    repeated = bootstrap_bands.scanned_again(parts, design, params)
+    repeated = bootstrap_bands.repeat_scans(parts, design, params)
     return bootstrap_bands.with_bands(methods.assemble(parts, design, params), repeated, design, params)
 
 
@@ -68,7 +68,9 @@ def test_a_part_as_built_is_laid_on_its_design():
     T = arch_clouds.random_pose(rng)
     scan = Scan("rib2", rigid.apply(T, np.vstack([built, strays])), component="rib2")
     found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok", "")
-    part = methods.Part("rib2", scan, found, (None, None), np.empty((0, 3)), None, "")
+    part = methods.PartFeatures(
+        name="rib2", scan=scan, attitude=found, ends=(None, None), lines=np.empty((0, 3)), edges=None, trouble=""
+    )
     laid = bootstrap_bands._as_designed(part, design)
     assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)
     assert (~laid.near).sum() == 50
@@ -95,7 +97,7 @@ def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
         # The last points of a part may fall beside its last station in some repetitions, and not in others.
         apart = np.isfinite(band) != np.isfinite(said)
         assert apart.sum() <= 1
-        assert (np.abs(joints[:, None] - result.linear_station[apart]) < errors.STATION_MM).any(axis=0).all()
+        assert (np.abs(joints[:, None] - result.linear_station[apart]) < errors.INTERVAL_MM).any(axis=0).all()
         known = np.isfinite(said) & np.isfinite(band)
         assert (said <= band)[known].mean() > 0.9
     figures = [result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max]

@@ -11,8 +11,9 @@ from scipy.stats import norm
 
 from processor.limits import standards
 from processor.model import Checked, StepRun, Tolerance, UsageError
+from processor.preassembly.params import TrimParams
 from processor.preassembly.verdicts import joint_measures, joints, trim_and_shim
-from processor.preassembly.verdicts.trim_and_shim import TrimParams, propose
+from processor.preassembly.verdicts.trim_and_shim import propose
 from processor.store import store
 
 B, H = 700.0, 900.0  # half the width and the height of the section; y left, z up
