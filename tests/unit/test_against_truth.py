@@ -54,7 +54,7 @@ def member(i, ends, edges, unseen, without):
             own.append(joint_end.unknown("too few points on the end face"))
         else:
             moved = (ends[i, e] - DESIGN.joint_points[joint]) @ FRAMES[joint][:3, :3]
-            own.append(joint_end.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), 0.01, ""))
+            own.append(joint_end.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), ""))
     middle = part.vertices.mean(axis=0)
     if i in without:
         return Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))

@@ -1,4 +1,4 @@
-"""Parts without a mesh: their outer box against the generator's closed form, and what comes of it."""
+"""Parts without a mesh: their outer box against the generator's closed form, and the measurement with it."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def surrogate_of(parts_, i, **options):
 
 
 def sections(part, count=400):
-    """Arc lengths (n,), half widths, heights and a number in 0..1 each."""
+    """Chainages (n,), half widths, heights and a number in 0..1 each."""
     rng = np.random.default_rng(5)
     s = rng.uniform(part.s0, part.s1, count)
     return s, part.b(s), part.h(s), rng.uniform(0.0, 1.0, count)
@@ -59,7 +59,7 @@ def test_a_rib_is_its_outer_faces(bridge):
     s, b, h, w = sections(part)
     for u, v in (((2 * w - 1) * b, 0 * h), ((2 * w - 1) * b, h), (b, w * h), (-b, w * h)):
         assert off(mesh, part.point(s, u, v)).max() < 0.01
-    # Nothing besides: all of the box is within the outer faces' bounds.
+    # And nothing else: all of the box is within the outer faces' bounds.
     assert mesh.area < 1.02 * (2 * (part.s1 - part.s0) * (b[0] * 2 + h[0]) * 1.06 + 4 * 20 * (b[0] * 2 + h[0]))
 
 
@@ -186,7 +186,7 @@ def test_only_an_arch_bridge_goes_without_meshes(tmp_path):
         export_folder.export(tmp_path / "f.h5", tmp_path / "out", "ply", with_truth=True, with_meshes=False)
 
 
-# --- what comes of it ------------------------------------------------------------------------------------------------
+# --- measurement -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Limits of the whole chain: guard bands by hand, extremes by draws, what is stated and not held, and unsure chains."""
+"""Limits of the whole chain: guard bands by hand, extremes by draws, unused limits, and doubtful chains."""
 
 from types import SimpleNamespace
 
@@ -67,12 +67,12 @@ def test_edges_are_held_all_along_and_limits_hang_on_the_span():
     assert by_key == {"inner_arc_mm": "pass", "lateral_axis_mm": "pass", "elevation_mm": "pass"}
     np.testing.assert_allclose(found.high, [8.0, 5.0, 10.0])
     np.testing.assert_allclose(found.value, 4.5)
-    np.testing.assert_allclose(found.ci95, 1.96 * 0.1, rtol=1e-3)  # no other station may be the extreme
+    np.testing.assert_allclose(found.ci95, 1.96 * 0.1, rtol=1e-3)  # no other place can be the extreme
     values[17] = 4.9
     assert chain.judge(quantities, JTG, 30_000.0).each[1] == "indeterminate"
     values[17] = -5.4
     assert chain.judge(quantities, JTG, 30_000.0).each[1] == "fail"
-    # Where many may be it, the band holds all of them.
+    # Where many can be the extreme, the band covers all of them.
     low, high = [], []
     for _ in range(400):
         _, bottom, top = extremes.of_independent(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
@@ -81,8 +81,8 @@ def test_edges_are_held_all_along_and_limits_hang_on_the_span():
     assert np.mean((np.array(low) <= 0.0) & (np.array(high) >= 0.0)) >= 0.95
 
 
-def test_what_the_stations_say():
-    """Both edges 3 mm to the left and 2 mm up from an arch as steep as 3 : 4; height over a place is 2.5 mm."""
+def test_quantities_of_the_edges_by_hand():
+    """Both edges 3 mm to the left and 2 mm up from an arch with slope 3 : 4: the elevation is 2.5 mm."""
     axes = np.tile(np.array([[0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]), (4, 1, 1))
     edges = EdgeDepartures(
         side=("left", "left", "right", "right"),
@@ -128,7 +128,7 @@ def test_an_unsure_chain_is_left_open():
 
 
 def test_the_span_is_not_known_where_a_joint_is_not():
-    """Nothing measured says how far apart the parts beside it are: they are held where their registration has them."""
+    """Without gaps the distance between the parts beside a joint is not measured."""
     line = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0]])
     parts = tuple(DesignPart(str(i), bottom_edge_left=line, bottom_edge_right=line) for i in range(2))
     design = ArchDesign(parts, ("J1",), ("0",), ("1",), np.zeros((1, 8, 3)))
@@ -161,7 +161,7 @@ def test_a_joint_left_open_has_no_limit_that_is_sure():
 
 
 def test_mean_and_largest_of_many_alike_are_as_unsure_as_one():
-    """Of one number 1.96 sd; of a hundred that may err alike the mean still: 95 % or more holds."""
+    """1.96 sd for one value, and for the mean of a hundred values that may be fully correlated."""
     of = span_and_closure.mean_max_ci95
     np.testing.assert_allclose(of(np.array([[3.0]]), np.array([[0.04]])), 0.392, rtol=1e-3)
     assert of(np.zeros((100, 1)), np.full((100, 1), 0.04))[0] == pytest.approx(0.392, rel=1e-3)

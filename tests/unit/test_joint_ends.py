@@ -1,4 +1,4 @@
-"""Ends of a straight box whose corners were built elsewhere, by points made with numpy: closed forms throughout."""
+"""Ends of a straight box with displaced corners, by points made with numpy, against closed forms."""
 
 from dataclasses import replace
 
@@ -57,7 +57,7 @@ def cloud(rng, spacing, shares=(1.0, 1.0, 1.0, 1.0), inner=1.0):
 
 
 def built(points, corners):
-    """Move points by what the corners P1..P4 (4, 3) of the end moved, fading out within 1.5 m."""
+    """Move points by the movements of the end's corners P1..P4 (4, 3), fading out within 1.5 m."""
     a, c = points[:, 1] / B, 2.0 * points[:, 2] / H - 1.0
     shares = 0.25 * np.stack([(1 + a) * (1 - c), (1 - a) * (1 - c), (1 - a) * (1 + c), (1 + a) * (1 + c)])
     fade = np.clip(1.0 + points[:, 0] / 1500.0, 0.0, 1.0)
@@ -104,7 +104,7 @@ def test_corners_centimetres_off_are_found_within_their_intervals(seed):
 
 @pytest.mark.parametrize("side", range(4))
 def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
-    """The outer side then lies where the design has the inner one, and was seen in a fifth of the points."""
+    """The outer side then lies where the design has the inner one, and has a fifth of the points."""
     rng = np.random.default_rng(side)
     inward = np.array([[0.0, 0, 1], [0, 1, 0], [0, 0, -1], [0, -1, 0]])[side]
     on_side = ((0, 1), (1, 2), (2, 3), (3, 0))[side]
@@ -119,7 +119,9 @@ def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
 
 def test_a_face_of_which_one_side_alone_was_seen_may_be_the_inner_one():
     rng = np.random.default_rng(5)
-    end = fitted(built(cloud(rng, 8.0, (1.0, 1.0, 0.0, 1.0)), np.zeros((4, 3))), rng)  # of the top, the inside alone
+    end = fitted(
+        built(cloud(rng, 8.0, (1.0, 1.0, 0.0, 1.0)), np.zeros((4, 3))), rng
+    )  # no points on the outside of the top
     assert end.trouble == "the top face may be the plate's inner side"
 
 
@@ -127,7 +129,7 @@ def test_the_outermost_layer_of_a_tilted_plate():
     rng = np.random.default_rng(1)
     x, w = rng.uniform(size=4000), rng.uniform(-1.0, 1.0, 4000)
     basis = np.stack([np.ones(4000), x, w, x * w], axis=1)
-    level = basis @ np.array([3.0, -12.0, 18.0, 5.0])  # by more across the plate than it is thick
+    level = basis @ np.array([3.0, -12.0, 18.0, 5.0])  # across the plate it changes by more than the thickness
     inner = np.arange(4000) % 3 > 0
     out = level - 24.0 * inner + rng.standard_normal(4000)
     cell = (np.floor(5 * x) * 6 + np.floor(3.0 * (w + 1.0))).astype(np.int64)
@@ -137,7 +139,7 @@ def test_the_outermost_layer_of_a_tilted_plate():
 
 
 def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
-    """The edges of a shallow arch hardly hold it along itself: noise of 0.02 mm would move it by decimetres."""
+    """The edges of a shallow arch hardly constrain it along its chord: noise of 0.02 mm would move it by decimetres."""
     rng = np.random.default_rng(3)
     arc = np.linspace(-6000.0, 6000.0, 60)
     angle = arc / 60_000.0
@@ -168,7 +170,7 @@ def test_a_bridge_without_an_end_that_was_seen_has_none_to_judge():
 
 
 def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
-    """Drawn 400 times: intervals of gaps and movements are those of what was drawn, registrations' errors included."""
+    """Intervals of gaps and movements against 400 draws, with the registrations' errors included."""
     rng = np.random.default_rng(8)
     corners = np.array([[0.0, y, z] for y, z in ((700, -900), (-700, -900), (-700, 900), (700, 900))], float)
     joints = np.array([np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])])
@@ -191,13 +193,13 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
         )
         at_joint = rigid.motion(joints[0]).reshape(24, 6)
         covariance = at_joint @ pose @ at_joint.T + noise**2 * np.eye(24)
-        end = joint_end.JointEnd(np.zeros((8, 3)), covariance, at_joint, 0.0, "")
+        end = joint_end.JointEnd(np.zeros((8, 3)), covariance, at_joint, "")
         middle = np.array([3000.0 * sense, 0.0, 0.0])
         parts.append(Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
     stated = adjustment.adjust(parts, joints, np.eye(4)[None], 0.1)
     for end in (parts[0].ends[1], parts[1].ends[0]):
         left = np.sqrt(np.diag(adjustment.without_pose(end, pose)))
-        np.testing.assert_allclose(left, noise, rtol=1e-3)  # what limits the gap: the rest cancels in it
+        np.testing.assert_allclose(left, noise, rtol=1e-3)  # the error of the registration cancels in the gap
     gaps, moved, at_rest, largest = [], [], [], []
     for _ in range(400):
         wrong = np.sqrt(np.diag(pose)) * rng.standard_normal((2, 6))
@@ -211,22 +213,24 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
             drawn.append(replace(part, ends=ends, edges=replace(part.edges, departure=departure)))
         found = adjustment.adjust(drawn, joints, np.eye(4)[None], 0.1)
         gaps.append(found.gaps.ravel())
-        # With the first part back on its design, edges lie off by what it was registered wrong by.
+        # With the first part on its design, all edges have the error of its registration.
         back = rigid.invert(found.motions[0])
         for edges, departure in zip((one.edges for one in drawn), found.departures, strict=True):
             there = edges.points + np.einsum("ka,kai->ki", departure, edges.axes)
             at_rest.append(np.einsum("kai,ki->ka", edges.axes, rigid.apply(back, there) - edges.points))
         largest.append([np.abs(found.gaps).mean(), np.abs(found.gaps).max()])
-        # Where the outer end of the last part comes to lie: by its movement, and by what it was wrong.
+        # Error of the last part's outer end: by its movement and by its registration.
         at = np.array([[6000.0, 0.0, 0.0]])
         moved.append((rigid.apply(found.motions[1], at) - at)[0] - rigid.motion(at)[0] @ wrong[1])
-    assert np.sqrt(np.diag(stated.gap_covariance[0])).max() < 2.0 * noise  # of 0.14 mm that both ends are wrong by
+    assert (
+        np.sqrt(np.diag(stated.gap_covariance[0])).max() < 2.0 * noise
+    )  # of the 0.14 mm that both ends have in common
     pulls = np.array(gaps) / np.sqrt(np.diag(stated.gap_covariance[0]))
     np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)
     drawn_sd = np.std(np.array(at_rest).reshape(400, 48, 2), axis=0)
     np.testing.assert_allclose(drawn_sd, np.sqrt(np.vstack(stated.at_rest_variance)), rtol=0.2)
     halves = span_and_closure.mean_max_ci95(stated.gaps.reshape(-1, 1), np.diag(stated.gap_covariance[0])[:, None])
-    assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # true gaps are none
+    assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # the true gaps are zero
     assert (np.quantile(largest, 0.95, axis=0) > 0.3 * np.array(halves)).all()
     J, own = rigid.motion(at - parts[1].centre)[0], rigid.motion(at)[0]
     both = J @ stated.motion_with_pose[6:, 6:] @ own.T

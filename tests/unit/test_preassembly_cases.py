@@ -1,4 +1,4 @@
-"""Parts and scans as they come: square, half missing, steep, dirty, unmarked, cut, in two scans, of other plates."""
+"""Difficult parts and scans: square, half missing, steep, cluttered, unmarked, cut, in two scans, of other plates."""
 
 import dataclasses
 from itertools import product
@@ -80,13 +80,13 @@ def assert_right(found, design, index, part, T, ends=("start", "end")):
     every = pulls(design, index, part, found, T)
     assert tuple(every) == ends
     for pull in every.values():
-        # Of 24 coordinates that hang on 22 numbers.
+        # 24 coordinates with 22 degrees of freedom.
         assert np.sqrt((pull**2).mean()) < 2.0
         assert np.abs(pull).max() < 4.5
 
 
 def assert_found_right(parts, design, points):
-    """Scan the rib as points from somewhere: it is found, sure, and right at both ends."""
+    """Scan the rib in a random frame: its pose is unambiguous, and both ends are right."""
     scan, T = scanned(points)
     found = measured(design, RIB, scan)
     assert found.status == "ok"
@@ -131,7 +131,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
     part = parts[RIB]
     points = cloud(part)
     s, u = part.pad
-    # Neither the mark nor the place where it would be with the part turned round.
+    # Without the mark, and without its place on the part turned round.
     pads = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
     bare = points[(np.linalg.norm(points[:, None] - pads, axis=2) > 400.0).all(axis=1)]
     scan, T = scanned(bare)
@@ -145,7 +145,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
 
 
 def test_parts_of_one_shape_are_told_apart_by_their_mark():
-    """Rib 3 turned round is rib 1 but for its mark: laid as rib 1 it fits to the noise."""
+    """Rib 3 turned round equals rib 1 but for its mark: it fits rib 1 to the noise."""
     parts, design = bridge()
     for asked, came in ((1, 3), (0, 4)):
         found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
@@ -156,7 +156,7 @@ def test_parts_of_one_shape_are_told_apart_by_their_mark():
 
 
 def without_the_marks_places(part, points):
-    """Points of a part but for about its mark, and about where its twin has its own."""
+    """Points of a part without those near its mark, and near the mark of the part of the same shape."""
     s, u = part.pad
     places = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
     return points[(np.linalg.norm(points[:, None] - places, axis=2) > 400.0).all(axis=1)]
@@ -177,7 +177,7 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
     points = cloud(part, spacing_mm=14.0)
     s, u = part.pad
     turned = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
-    for place in turned:  # the mark, and where rib 3 has its own: 14 mm up over half a metre
+    for place in turned:  # the mark, and the place of rib 3's mark: 14 mm up over half a metre
         far = np.linalg.norm(points - place, axis=1)
         up = part.point(np.array([s]), np.array([u]), np.array([1.0])) - part.point(np.array([s]), np.array([u]), [0.0])
         points = points + np.where(far < 700.0, 14.0, 0.0)[:, None] * up
@@ -193,7 +193,7 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
     ],
 )
 def test_neighbours_swapped_are_named(asked, came, said):
-    """By its size: also of scans that fit the wrong part well enough to be weak only."""
+    """By its size, also where the scan fits the wrong part well enough to be weak only."""
     parts, design = bridge()
     found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=20.0))[0])
     assert found.status != "ok"
@@ -218,7 +218,7 @@ def on_foot():
 
 @pytest.mark.parametrize("strays", [0, 3])
 def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot, strays, monkeypatch):
-    """The upper half of this foot has the rib's section: the rest passed for clutter. With clutter no size tells."""
+    """The upper half of this foot has the rib's section, and the rest looks like clutter. Clutter hides the size."""
     design, scan = on_foot
     clutter = np.random.default_rng(1).normal(0.0, 100.0, (40 * strays, 3)) + 9e3
     scan = dataclasses.replace(scan, points=np.vstack([scan.points, clutter]))
@@ -294,7 +294,7 @@ def test_a_scan_of_one_end_only_says_so():
 
 
 def test_two_scans_of_one_part_make_one():
-    """One scan sees the left side, the other the right: each holds the part, both ends are whole in the two only."""
+    """One scan shows the left side, the other the right: each constrains the part, only both show whole ends."""
     parts, design = bridge()
     part = parts[RIB]
     points = cloud(part, spacing_mm=12.0)
@@ -337,7 +337,7 @@ def with_a_floor(points, axes, share, rng):
     return np.vstack([points, floor @ axes.T])
 
 
-# By day a rib that was laid half a turn round: the right way was not tried.
+# The case that is not slow was once placed half a turn round: the right attitude had not been tried.
 @pytest.mark.parametrize(
     ("seed", "index", "share"),
     [
@@ -379,7 +379,7 @@ def test_no_random_pose_is_wrong_and_called_ok():
 
 @pytest.mark.slow
 def test_a_rib_of_even_curvature_is_not_laid_half_a_turn_round():
-    """The right attitude comes to rest 1.8 m along the arch here, and fits less well than the wrong one in place."""
+    """The right attitude converges 1.8 m off along the arch here, with a larger misfit than the wrong one."""
     recipe = recipes.overridden(recipes.load("arch-d3")[1], ["scan.sigma_mm=1.0", "scan.spacing_mm=5.0"])
     scene, truth = make("d3", recipe, 1)
     part = scene.arch.parts[2]

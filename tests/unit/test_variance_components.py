@@ -9,7 +9,7 @@ from processor.preassembly.ends import faces as ends_faces
 
 
 def drawn(rng, stations, apart, cells=40, points=60):
-    """Residuals of cells that four of the stations see each, a shift a station."""
+    """Residuals of cells with points of four stations each, shifted by station."""
     shift = apart * rng.normal(size=stations)
     station = np.concatenate([np.repeat(rng.permutation(stations)[:4], points) for _ in range(cells)])
     cell = np.repeat(np.arange(cells), 4 * points)

@@ -66,7 +66,6 @@ class JointEnd:
     departure: Floats
     covariance: Floats
     by_pose: Floats
-    sigma_mm: float  # noise of the points about the fitted faces
     trouble: str
 
 
@@ -82,7 +81,6 @@ class FittedEnd:
     motion: Floats
     pose: Floats
     place: EndPlace
-    sigma_mm: float
     third_order: Floats  # (8, 2) of the four faces, see variance_components.third_order
     trouble: str
 
@@ -97,7 +95,7 @@ class _Block(NamedTuple):
 
 def unknown(trouble: str) -> JointEnd:
     """Return an end without an answer, and the reason."""
-    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), np.full((24, 6), np.nan), float("nan"), trouble)
+    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), np.full((24, 6), np.nan), trouble)
 
 
 def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
@@ -129,7 +127,6 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
         motion=_motion(place),
         pose=part.pose,
         place=place,
-        sigma_mm=sigma,
         third_order=np.vstack([variance_components.third_order(f.used.basis, f.used.residual) for f in faces]),
         trouble=_inner_side(faces, thickness),
     )
@@ -174,7 +171,7 @@ def _corners_of(end: FittedEnd, averaged: Estimate, bending: float) -> JointEnd:
     at_joint = derivative[:, AT_JOINT]
     covariance += bending * at_joint @ at_joint.T
     by_pose = derivative @ averaged.not_followed(end.motion)
-    return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.sigma_mm, end.trouble)
+    return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.trouble)
 
 
 def _design_thickness(surface: MeshSurface, place: EndPlace) -> Floats:

@@ -35,11 +35,10 @@ FLOOR_MM = 0.01  # of the noise
 
 @dataclass(frozen=True)
 class Ring:
-    """Coefficients (k,) of the basis, their covariance (k, k), and the noise across the ring; empty without points."""
+    """Coefficients (k,) of the basis and their covariance (k, k); empty without an answer."""
 
     coefficients: Floats
     covariance: Floats
-    sigma_mm: float
 
 
 class _Densities(NamedTuple):
@@ -50,7 +49,7 @@ class _Densities(NamedTuple):
     inner: float
 
 
-NO_RING = Ring(np.empty(0), np.empty((0, 0)), float("nan"))
+NO_RING = Ring(np.empty(0), np.empty((0, 0)))
 
 
 def fit(x: Floats, e: Floats, thickness: Floats, basis: Floats, sigma_mm: float) -> Ring:
@@ -91,7 +90,7 @@ def fit(x: Floats, e: Floats, thickness: Floats, basis: Floats, sigma_mm: float)
             break
     if np.abs(basis @ coefficients - window).max() > reach:
         return NO_RING  # the solution left the points that are surely of the ring
-    return Ring(coefficients, covariance, sigma)
+    return Ring(coefficients, covariance)
 
 
 def sectors(basis: Floats) -> Ints:

@@ -240,10 +240,10 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
         if covered < LEAST_COVERED:
             doubt = f"{away} and the others cover {covered:.0%} of its sides; {WHICH}"
             placed = replace(placed, doubt=doubt)
-    found = identity.identify(points, registration.T_bridge_scan, shape, part, design)
+    others = identity.identify(points, registration.T_bridge_scan, shape, part, design)
     # A part of another size may by chance have its mark where the other part of this shape has its own.
-    wrong = found.contradiction and (_resemblance(points, design, part) or found.contradiction)
-    return replace(placed, identity=found, trouble=wrong)
+    wrong = others.contradiction and (_resemblance(points, design, part) or others.contradiction)
+    return replace(placed, identity=others, trouble=wrong)
 
 
 def _misfit(registration: surface_registration.Registration) -> str:

@@ -117,11 +117,11 @@ def propose(
     limits = {limit.measure: limit for limit in reversed(joint_limits(tolerance))}
     drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
 
-    def kept(limit: Limit, gaps: Floats) -> Bools | None:
+    def conforming(limit: Limit, gaps: Floats) -> Bools | None:
         bounds = allowed(limit, tolerance, sizes_mm)
         return conforms(gaps, measures.points, bounds) if bounds.known else None
 
-    across = [kept(limit, drawn) for limit in joint_limits(tolerance) if limit.measure != "groove_gap"]
+    across = [conforming(limit, drawn) for limit in joint_limits(tolerance) if limit.measure != "groove_gap"]
     groove, best = limits.get("groove_gap"), NO_WORK
     before: list[Bools | None] = []
     after: list[Bools | None] = []
@@ -132,7 +132,7 @@ def propose(
         if judge(measures, replace(tolerance, limits=(groove,)), sizes_mm).verdict != "pass":
             room = limits_of.bounds(groove, sizes_mm)[1] - params.aim_mm
             works += _works(measures, wanted, max(params.least_mm, SHOWN_MM), room)
-        marks = [kept(groove, work.on(drawn, error)) for work in works]
+        marks = [conforming(groove, work.on(drawn, error)) for work in works]
         chosen = _choice(works, [_share([mark]) for mark in marks])
         best, before, after = works[chosen], marks[:1], [marks[chosen]]
     proposal = Proposal(
