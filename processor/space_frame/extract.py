@@ -133,9 +133,9 @@ def extract(
     shared_offset = registered.shared_offset_at(spheres.centres)
     if registered.stations is not None:
         spheres = quality.with_shared_offset(spheres, shared_offset)
-    matched = moved = None
+    matched = movements = None
     if design is not None and (start.design_row >= 0).any():
-        matched, moved = _compare(registered, spheres, shared_offset, design, start.pose, options)
+        matched, movements = _compare(registered, spheres, shared_offset, design, start.pose, options)
     messages = [registered.stations.message] if registered.stations is not None else []
     return Extracted(
         source=registered.source,
@@ -146,7 +146,7 @@ def extract(
         datum=registered.datum_at(spheres.centres, options.datum_mm) + shared_offset,
         stations=registered.stations,
         matching=matched,
-        movement=moved,
+        movement=movements,
         messages=(*start.messages, *messages),
     )
 
@@ -181,21 +181,19 @@ def _designed(source: Source, design: FrameDesign, catalogue: Catalogue, options
     nominal, middle = matching.expanded(design, options.expansion)
     if len(pairs):
         positions = nominal + (middle - source.origin)
-        start = _measured(source, positions, pairs, np.arange(len(positions)), options.members)
-        off = np.linalg.norm(start.measured.nodes.positions - positions, axis=1)
+        nominal_start = _measured(source, positions, pairs, np.arange(len(positions)), options.members)
+        off = np.linalg.norm(nominal_start.measured.nodes.positions - positions, axis=1)
         if np.mean(off < NEAR_MM) >= SAME_FRAME_SHARE:
-            return start
-    found = blind(source, options.members)
-    if found is None:
-        return None
-    return _located(source, found, design, pairs, catalogue, options)
+            return nominal_start
+    start = blind(source, options.members)
+    return None if start is None else _located(source, start, design, pairs, catalogue, options)
 
 
 def _located(
-    source: Source, found: Start, design: FrameDesign, pairs: Ints, catalogue: Catalogue, options: Options
+    source: Source, start: Start, design: FrameDesign, pairs: Ints, catalogue: Catalogue, options: Options
 ) -> Start:
     """Locate the design among nodes found blind, and measure all members of both."""
-    seen = members.with_meeting_axes(found.measured, options.members.largest_scatter_mm)
+    seen = members.with_meeting_axes(start.measured, options.members.largest_scatter_mm)
     node_a, node_b = seen.members.node_a, seen.members.node_b
     pattern = NodePattern(seen.nodes.positions, source.origin, node_a=node_a, node_b=node_b)
 
@@ -205,7 +203,7 @@ def _located(
 
     pose = matching.match(pattern, design, expansion=options.expansion, sized=sized)
     if pose.status == "failed":
-        return replace(found, messages=(f"the design was not found in the cloud: {pose.message}",))
+        return replace(start, messages=(f"the design was not found in the cloud: {pose.message}",))
     nominal, middle = matching.expanded(design, options.expansion)
     positions = rigid.apply(rigid.invert(pose.T_design_scan), nominal + middle) - source.origin
     # Found nodes are where they were found, the others where the design has them.
@@ -229,11 +227,8 @@ def _register(source: Source, start: Start, control: ControlPoints | None, optio
     shifted = len(source.scanners) > 1 and measured.station_sd_mm > LEAST_STATION_SD_MM
     if not options.register_stations or not (shifted or control is not None):
         return _Registered(source, measured)
-    found = measured.members
-    stations = registration.register(
-        tube_points(measured.points, measured.lines, found), found.points, found.directions, found.radii,
-        source.scanners, control, options.datum_mm,
-    )  # fmt: skip
+    on_tubes = tube_points(measured.points, measured.lines, measured.members)
+    stations = registration.register(on_tubes, *measured.axes, source.scanners, control, options.datum_mm)
     if stations.status not in ("ok", "weak"):
         return _Registered(source, measured, stations)
     corrected = Corrected(source, stations)
@@ -311,13 +306,13 @@ def _compare(
     at, stations = pattern.positions.mean(axis=0), registered.trusted
     common = np.diag([0.0, 0.0, 0.0, *3 * [options.datum_mm**2]]) if stations is None else stations.common(at)
     covariance = spheres.covariance[rows, :3, :3] + shared_offset[rows]
-    moved = movement(matched, pattern, covariance, design, common, at, expansion=options.expansion)
+    movements = movement(matched, pattern, covariance, design, common, at, expansion=options.expansion)
     assignment, weight = np.full(len(spheres.radii), -1, np.int64), np.zeros(len(spheres.radii))
     assignment[rows], weight[rows] = matched.assignment, matched.weight
-    return replace(matched, assignment=assignment, weight=weight), replace(moved, found=rows[moved.found])
+    return replace(matched, assignment=assignment, weight=weight), replace(movements, found=rows[movements.found])
 
 
-def _pattern(spheres: Spheres, rows: Ints, found: Members, origin: Floats) -> NodePattern:
+def _pattern(spheres: Spheres, rows: Ints, joined: Members, origin: Floats) -> NodePattern:
     """Return the spheres of some rows as a pattern of nodes."""
     place = np.full(len(spheres.radii), -1, np.int64)
     place[rows] = np.arange(len(rows))
@@ -326,8 +321,8 @@ def _pattern(spheres: Spheres, rows: Ints, found: Members, origin: Floats) -> No
         origin=origin,
         radii=spheres.radii[rows],
         radius_sd=np.sqrt(spheres.covariance[rows, 3, 3]),
-        node_a=np.where(found.node_a >= 0, place[found.node_a], -1),
-        node_b=np.where(found.node_b >= 0, place[found.node_b], -1),
+        node_a=np.where(joined.node_a >= 0, place[joined.node_a], -1),
+        node_b=np.where(joined.node_b >= 0, place[joined.node_b], -1),
     )
 
 

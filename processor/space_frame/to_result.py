@@ -117,11 +117,12 @@ def _message(extracted: Extracted, scene: Scene) -> str:
 
 def _with_design(result: Result, extracted: Extracted, scene: Scene) -> Result:
     """Add the movements of nodes, and the pose of the design."""
-    k, matched, moved = len(result.ids), extracted.matching, extracted.movement
+    k, matched, movements = len(result.ids), extracted.matching, extracted.movement
     limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
     movement, ci95, covariance = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan)
-    if moved is not None:
-        movement[moved.found], ci95[moved.found], covariance[moved.found] = moved.vector, moved.ci95, moved.covariance
+    if movements is not None:
+        rows = movements.found
+        movement[rows], ci95[rows], covariance[rows] = movements.vector, movements.ci95, movements.covariance
     return replace(
         result,
         movement=movement,
@@ -129,7 +130,7 @@ def _with_design(result: Result, extracted: Extracted, scene: Scene) -> Result:
         movement_covariance=covariance,
         movement_limit=np.nan if limit is None else limit.high,
         movement_limit_source="" if limit is None else limit.source,
-        gauge="" if moved is None else moved.gauge,
+        gauge="" if movements is None else movements.gauge,
         matching="" if matched is None else matched.status,
         T_design_scan=np.empty(0) if matched is None else matched.T_design_scan,
         T_design_scan_covariance=np.empty(0) if matched is None else matched.covariance,

@@ -31,33 +31,33 @@ MOST = 64  # poses that are tested on all nodes
 SAME_SHARE = 0.5  # of the shortest distance of two nodes: poses that differ less are one
 
 
-def poses(found: Floats, design: Floats, tolerance_mm: float) -> Floats:
-    """Poses T_design_found (h, 4, 4) under which many of found nodes (k, 3) lie on nodes of the design (d, 3).
+def poses(nodes: Floats, design: Floats, tolerance_mm: float) -> Floats:
+    """Poses T_design_found (h, 4, 4) under which many of the found nodes (k, 3) lie on nodes of the design (d, 3).
 
     ``tolerance_mm`` is the largest deviation of a node from its place. Best first by the number of nodes that agree;
     coordinates are relative to their origin, which should be near.
     """
-    tree, found_tree = cKDTree(design), cKDTree(found)
+    tree, node_tree = cKDTree(design), cKDTree(nodes)
     around = _neighbours(design, tree)
-    middle = np.median(found, axis=0)
-    seeds = np.argsort(np.linalg.norm(found - middle, axis=1), kind="stable")
-    spread = _spread_out(found, SPREAD)
+    middle = np.median(nodes, axis=0)
+    seeds = np.argsort(np.linalg.norm(nodes - middle, axis=1), kind="stable")
+    spread = _spread_out(nodes, SPREAD)
     answers: list[Floats] = []
     best, successful, tried = 0, 0, 0
     distance = SAME_SHARE * float(np.min(tree.query(design, k=2)[0][:, 1]))
     for seed in seeds:
-        corner = _corner(found, found_tree, int(seed))
+        corner = _corner(nodes, node_tree, int(seed))
         if corner is None:
             continue
         tried += 1
-        start = _starts(found, corner, design, around, tolerance_mm)
-        near = found_tree.query(found[seed], k=min(STAGES[-1], len(found)))[1]
-        T = _grown(start, found, np.atleast_1d(near), spread, design, tree, tolerance_mm)
+        start = _starts(nodes, corner, design, around, tolerance_mm)
+        near = node_tree.query(nodes[seed], k=min(STAGES[-1], len(nodes)))[1]
+        T = _grown(start, nodes, np.atleast_1d(near), spread, design, tree, tolerance_mm)
         for pose in T:
-            count = int((tree.query(rigid.apply(pose, found))[0] < tolerance_mm).sum())
-            if count < LEAST_SHARE * min(len(found), len(design)):
+            count = int((tree.query(rigid.apply(pose, nodes))[0] < tolerance_mm).sum())
+            if count < LEAST_SHARE * min(len(nodes), len(design)):
                 continue
-            if not any(_same(pose, other, found, distance) for other in answers):
+            if not any(_same(pose, other, nodes, distance) for other in answers):
                 answers.append(pose)
                 best = max(best, count)
         successful += len(T) > 0 and best > 0
@@ -73,10 +73,10 @@ def _neighbours(points: Floats, tree: cKDTree) -> Ints:
     return rows
 
 
-def _corner(found: Floats, tree: cKDTree, seed: int) -> Ints | None:
+def _corner(nodes: Floats, tree: cKDTree, seed: int) -> Ints | None:
     """Rows (3,) of a seed and two of its neighbours that form a triangle with a wide angle at it; None without one."""
-    near = tree.query(found[seed], k=min(NEIGHBOURS + 1, len(found)))[1][1:]
-    out = found[near] - found[seed]
+    near = tree.query(nodes[seed], k=min(NEIGHBOURS + 1, len(nodes)))[1][1:]
+    out = nodes[near] - nodes[seed]
     length = np.linalg.norm(out, axis=1)
     sine = np.linalg.norm(np.cross(out[:, None], out[None]), axis=2) / np.maximum(length[:, None] * length, 1e-300)
     # The nearest two with a wide enough angle.
@@ -87,9 +87,9 @@ def _corner(found: Floats, tree: cKDTree, seed: int) -> Ints | None:
     return np.array([seed, near[a], near[b]])
 
 
-def _starts(found: Floats, corner: Ints, design: Floats, around: Ints, tolerance_mm: float) -> Floats:
+def _starts(nodes: Floats, corner: Ints, design: Floats, around: Ints, tolerance_mm: float) -> Floats:
     """Poses (h, 4, 4) that map a triangle of found nodes onto each triangle of the design with the same sides."""
-    u, v = found[corner[1]] - found[corner[0]], found[corner[2]] - found[corner[0]]
+    u, v = nodes[corner[1]] - nodes[corner[0]], nodes[corner[2]] - nodes[corner[0]]
     sides = design[around] - design[:, None]
     length = np.linalg.norm(sides, axis=2)
     slack = 2.0 * tolerance_mm
@@ -101,7 +101,7 @@ def _starts(found: Floats, corner: Ints, design: Floats, around: Ints, tolerance
     keep = (a != b) & (np.abs(third - np.linalg.norm(u - v)) < slack)
     at, a, b = at[keep], a[keep], b[keep]
     target = np.stack([design[at], design[around[at, a]], design[around[at, b]]], axis=1)
-    return fitted(np.broadcast_to(found[corner], target.shape), target, np.ones(target.shape[:2]))
+    return fitted(np.broadcast_to(nodes[corner], target.shape), target, np.ones(target.shape[:2]))
 
 
 def fitted(source: Floats, target: Floats, weight: Floats) -> Floats:
@@ -121,7 +121,7 @@ def fitted(source: Floats, target: Floats, weight: Floats) -> Floats:
 
 
 def _grown(
-    T: Floats, found: Floats, near: Ints, spread: Ints, design: Floats, tree: cKDTree, tolerance_mm: float
+    T: Floats, nodes: Floats, near: Ints, spread: Ints, design: Floats, tree: cKDTree, tolerance_mm: float
 ) -> Floats:
     """Return the poses among T (h, 4, 4) that remain through all stages, fitted; best first, MOST at most."""
     stages = [(near[:count], 1.5) for count in STAGES] + [(spread[:FEW], 2.5), (spread, 2.0)]
@@ -134,7 +134,7 @@ def _grown(
         gate = wide * tolerance_mm
         for refit in (True, False):
             parts = [
-                _supported(T[first : first + BLOCK], found[rows], design, tree, gate, tolerance_mm, refit=refit)
+                _supported(T[first : first + BLOCK], nodes[rows], design, tree, gate, tolerance_mm, refit=refit)
                 for first in range(0, len(T), BLOCK)
             ]
             if not parts:
@@ -149,14 +149,14 @@ def _supported(
     T: Floats, nodes: Floats, design: Floats, tree: cKDTree, gate: float, tolerance_mm: float, *, refit: bool
 ) -> tuple[Floats, Floats, Floats]:
     """Poses (h, 4, 4), fitted again with ``refit``; number (h,) of nodes (n, 3) that supported each, and error."""
-    moved = np.einsum("hij,nj->hni", T[:, :3, :3], nodes) + T[:, None, :3, 3]
-    distance, index = tree.query(moved, distance_upper_bound=gate, workers=-1)
+    placed = np.einsum("hij,nj->hni", T[:, :3, :3], nodes) + T[:, None, :3, 3]
+    distance, index = tree.query(placed, distance_upper_bound=gate, workers=-1)
     on = np.isfinite(distance)
     size = np.where(on, distance, 0.0)
     number = on.sum(axis=1)
     if refit:
         weight = on / (1.0 + (size / (0.5 * tolerance_mm)) ** 2)
-        T = fitted(np.broadcast_to(nodes, moved.shape), design[np.where(on, index, 0)], weight)
+        T = fitted(np.broadcast_to(nodes, placed.shape), design[np.where(on, index, 0)], weight)
     return T, number.astype(np.float64), size.sum(axis=1)
 
 

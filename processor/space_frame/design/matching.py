@@ -265,8 +265,8 @@ def _better_nearby(T: Floats, matched: int, problem: _Problem) -> bool:
     for quarter in range(1, 4):
         R = rigid.rotation_from_vector(np.array([0.0, 0.0, 0.5 * np.pi * quarter]))
         tried.append(rigid.transform(R, centre - R @ centre))
-    moved, reach = rigid.apply(T, problem.nodes.positions), problem.tolerance_mm
-    counts = [(tree.query(rigid.apply(pose, moved), distance_upper_bound=reach)[0] < np.inf).sum() for pose in tried]
+    placed, reach = rigid.apply(T, problem.nodes.positions), problem.tolerance_mm
+    counts = [(tree.query(rigid.apply(pose, placed), distance_upper_bound=reach)[0] < np.inf).sum() for pose in tried]
     return bool(max(counts) > matched)
 
 
@@ -344,8 +344,8 @@ def _answer(chosen: _Candidate, rivals: list[_Candidate], how: str, problem: _Pr
     if on.sum() >= 3:
         best = _weighted_fit(positions, places, weight)
         if how == REGISTERED:
-            moved = rigid.apply(best, positions)
-            covariance = _covariance(moved, moved - places, weight, middle)
+            placed = rigid.apply(best, positions)
+            covariance = _covariance(placed, placed - places, weight, middle)
     T = best if how == REGISTERED else rigid.transform(np.eye(3), nodes.origin - middle)
     missing = np.setdiff1d(np.arange(len(nominal)), chosen.assignment[on])
     summary = f"{how}: {int(on.sum())} nodes of {len(nominal)}, {len(missing)} missing, {int((~on).sum())} extra"

@@ -60,6 +60,11 @@ class Measured:
     lines: Ints
     station_sd_mm: float
 
+    @property
+    def axes(self) -> tuple[Floats, Floats, Floats]:
+        """Points (m, 3), directions (m, 3) and radii (m,) of the members' axes."""
+        return self.members.points, self.members.directions, self.members.radii
+
 
 def rough_lines(source: Source, params: Params) -> junctions.Lines:
     """Axes of everything that looks like a tube, to some mm, from a part of the points."""

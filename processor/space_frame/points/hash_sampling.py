@@ -31,8 +31,8 @@ def hashed(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def keep(points, threshold, kept, first, last):  # type: ignore[no-untyped-def]
-    """Write the steps of points first..last whose hash is below a threshold to ``kept`` from row ``first``.
+def sample(points, threshold, sampled, first, last):  # type: ignore[no-untyped-def]
+    """Write the steps of points first..last whose hash is below a threshold to ``sampled`` from row ``first``.
 
     Returns the number of points written.
     """
@@ -43,7 +43,7 @@ def keep(points, threshold, kept, first, last):  # type: ignore[no-untyped-def]
             continue
         x, y, z = np.int32(np.rint(fx)), np.int32(np.rint(fy)), np.int32(np.rint(fz))
         if hashed(x, y, z) < threshold:
-            kept[n, 0], kept[n, 1], kept[n, 2] = x, y, z
+            sampled[n, 0], sampled[n, 1], sampled[n, 2] = x, y, z
             n += 1
     return n - first
 
@@ -53,12 +53,12 @@ def thinned(source: Source, most: int, threads: int = 0) -> Steps:
     threshold = np.uint64(min(max(round(most / max(source.count, 1) * WHOLE), 0), WHOLE))
     pieces: list[Steps] = []
     for chunk in source.chunks():
-        kept = np.empty((len(chunk.points), 3), np.int32)
+        sampled = np.empty((len(chunk.points), 3), np.int32)
         parts: list[Steps] = []
 
-        def run(first: int, last: int, points=chunk.points, kept=kept, parts=parts) -> None:  # type: ignore[no-untyped-def]
-            number = keep(points, threshold, kept, first, last)
-            parts.append(kept[first : first + number])
+        def run(first: int, last: int, points=chunk.points, sampled=sampled, parts=parts) -> None:  # type: ignore[no-untyped-def]
+            number = sample(points, threshold, sampled, first, last)
+            parts.append(sampled[first : first + number])
 
         over_ranges(run, len(chunk.points), threads, least=100_000)
         pieces.extend(part.copy() for part in parts)

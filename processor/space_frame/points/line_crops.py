@@ -242,7 +242,9 @@ def arrange(counts, room, places, stations, most_station, first, last):  # type:
             heads[at[i] + 1] += 1
         for s in range(len(starts) - 1):
             if starts[s + 1] - starts[s] > 1:
-                places[base + starts[s] : base + starts[s + 1]].sort()
+                # Not .sort(): numba gives it the same symbols as argsort, and kernels cached by two processes collide.
+                run = places[base + starts[s] : base + starts[s + 1]]
+                run[:] = run[np.argsort(run)]
 
 
 def gather(

@@ -113,16 +113,16 @@ def pose_of(scan: Scan) -> Floats:
 
 def _moved(points: Floats, R: Floats, shift: Floats) -> Floats:
     """Move points (n, 3) by sums of products a coordinate: the same bytes for every place in a chunk."""
-    moved = np.empty(points.shape)
+    placed = np.empty(points.shape)
     points = np.ascontiguousarray(points, np.float64).view()
     points.flags.writeable = False  # the kernel is compiled for one kind of array only
-    over_ranges(partial(_move, points, np.ascontiguousarray(R), shift, moved), len(points), least=100_000)
-    return moved
+    over_ranges(partial(_move, points, np.ascontiguousarray(R), shift, placed), len(points), least=100_000)
+    return placed
 
 
 @njit(cache=True, nogil=True)
-def _move(points, R, shift, moved, first, last):  # type: ignore[no-untyped-def]
+def _move(points, R, shift, placed, first, last):  # type: ignore[no-untyped-def]
     for i in range(first, last):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         for k in range(3):
-            moved[i, k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + shift[k]
+            placed[i, k] = R[k, 0] * x + R[k, 1] * y + R[k, 2] * z + shift[k]

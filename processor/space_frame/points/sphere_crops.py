@@ -88,11 +88,11 @@ def gather(source: Source, nodes: Floats, reach_mm: float, threads: int = 0, mos
     if not len(nodes):
         return Crops(np.zeros(1, np.int64), np.empty((0, 3)), np.empty(0, np.int32))
     index = _indexed(nodes, reach_mm)
-    kept = Kept(len(nodes), max(most // len(nodes), LEAST_ROOM), threads)
+    buffer = PairBuffer(len(nodes), max(most // len(nodes), LEAST_ROOM), threads)
     for chunk in source.chunks():
         points, station = _frozen(chunk.points, np.float64), _frozen(chunk.station, np.int32)
-        kept.add(_near(points, station, index, kept.thresholds, threads))
-    return _sorted(kept.all(), len(nodes), threads)
+        buffer.add(_near(points, station, index, buffer.thresholds, threads))
+    return _sorted(buffer.all(), len(nodes), threads)
 
 
 def _frozen(values: npt.NDArray[Any], dtype: type) -> npt.NDArray[Any]:
@@ -300,7 +300,7 @@ def _sort(start, by_node, steps, station, points, seen_from, begin, end):  # typ
 # --- the choice of points, where a node has more than its room: those of the lowest hashes ----------------------------
 
 
-class Kept:
+class PairBuffer:
     """Pairs gathered so far, and the threshold of each node."""
 
     def __init__(self, nodes: int, room: int, threads: int = 0) -> None:

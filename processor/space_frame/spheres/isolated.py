@@ -159,14 +159,14 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     least = max(params.min_points, sphere_search.LEAST_POINTS)
     # fixed: the result must not depend on the seed
     fixed = _generator(replace(params, seed=0), "search")
-    found = sphere_search.find_balls(cloud.points, fixed, params.max_balls, least, radius, cloud.scanner)
-    if not found:
+    candidates = sphere_search.find_balls(cloud.points, fixed, params.max_balls, least, radius, cloud.scanner)
+    if not candidates:
         message = (
             f"no ball stands out of {len(cloud.points)} points; a whole frame needs a design (design.json) with this "
             "method: its balls are too small a share of the cloud to search for"
         )
         return Result("failed", params.method, message)
-    rows = [_searched(id_, sphere, cloud, params) for id_, sphere in enumerate(found)]
+    rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(candidates)]
     messages = ["searched without a design"]
     if params.method == "least-squares":
         messages.append("algebraic least squares on the points found to lie on each ball")
@@ -178,26 +178,28 @@ def search(cloud: MergedCloud, params: Params) -> Result:
         messages.append("robust fit of ranges from the known scanner positions")
     if radius is not None:
         messages.append(f"radius held at {radius:g} mm, its covariance is 0")
-    complete = len(found) < params.max_balls
+    complete = len(candidates) < params.max_balls
     if not complete:
-        messages.append(f"stopped at {len(found)} balls (max_balls), there may be more: a whole frame needs a design")
+        messages.append(
+            f"stopped at {len(candidates)} balls (max_balls), there may be more: a whole frame needs a design"
+        )
     result = _result(rows, cloud.origin, params, "; ".join(messages), complete)
     return _with_bounds(result, rows) if params.method == "ray" else result
 
 
-def _searched(id_: int, found: sphere_search.Found, cloud: MergedCloud, params: Params) -> _Row:
-    on = cloud.points[found.fit.inliers]
-    sphere: Sphere | None = found.fit.sphere
+def _searched(id_: int, candidate: sphere_search.Found, cloud: MergedCloud, params: Params) -> _Row:
+    on = cloud.points[candidate.fit.inliers]
+    sphere: Sphere | None = candidate.fit.sphere
     if params.method == "least-squares":
         sphere = algebraic(on)
     if sphere is None:
         return _Row(id_, NAN, None, len(on), reason="the points determine no sphere")
-    row = _assessed(id_, NAN, sphere, on, found.inlier_share, params, Tolerance())
+    row = _assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
     if params.method == "least-squares":
         return row
-    seen_from = None if cloud.scanner is None else cloud.scanner[found.fit.inliers]
+    seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
     stations = 0 if seen_from is None else len(np.unique(seen_from, axis=0))
-    least = bound(cloud.points, found.fit, not np.isnan(params.radius_mm), cloud.scanner)
+    least = bound(cloud.points, candidate.fit, not np.isnan(params.radius_mm), cloud.scanner)
     return replace(row, stations=stations, bound=least)
 
 
@@ -206,9 +208,9 @@ def _result(rows: list[_Row], origin: Floats, params: Params, message: str, comp
     spheres = [nowhere if row.sphere is None else row.sphere for row in rows]
     centres = np.array([sphere.centre + origin for sphere in spheres]).reshape(-1, 3)
     radii = np.array([sphere.radius for sphere in spheres])
-    found = sum(row.sphere is not None for row in rows)
+    fitted = sum(row.sphere is not None for row in rows)
     return Result(
-        status="failed" if found == 0 else "ok" if complete and found == len(rows) else "partial",
+        status="failed" if fitted == 0 else "ok" if complete and fitted == len(rows) else "partial",
         method=params.method,
         message=message,
         ids=np.array([row.id for row in rows], np.int64),

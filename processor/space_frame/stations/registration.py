@@ -72,8 +72,8 @@ def register(
 ) -> Stations:
     """Estimate the corrections of all stations from points on tubes with axes (m, 3), (m, 3) and radii (m,), mm.
 
-    ``scanners`` (s, 3) are the stations' places; coordinates are less one origin. ``datum_mm`` is
-    the standard deviation, along each axis, of a shift that all stations share beside their own.
+    ``scanners`` (s, 3) are the stations' places; coordinates are less the same origin. ``datum_mm`` is the standard
+    deviation, along each axis, of a shift common to all stations beside their own.
     """
     count = len(scanners)
     if count < 2 and control is None:
@@ -297,12 +297,12 @@ def _controlled(stations: Stations, x: Floats, control: ControlPoints, doubt: Do
     """Add the deviations at the control points, and their contradictions to the covariance."""
     M = common_motion(stations.places)[:, 3:]
     shift = np.mean(x.reshape(-1, kernels.STATION)[:, 3:6], axis=0)
-    moved = f"all stations were moved to them by {np.linalg.norm(shift):.2g} mm (mean)"
+    shifted = f"all stations were moved to them by {np.linalg.norm(shift):.2g} mm (mean)"
     C = stations.covariance + normals.product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
     return replace(
         stations,
         status="weak" if doubt.off.any() else stations.status,
-        message="; ".join([stations.message, f"datum: {stations.datum}", moved, *doubt.said]),
+        message="; ".join([stations.message, f"datum: {stations.datum}", shifted, *doubt.said]),
         covariance=C,
         control=control.ids,
         control_scan=control.scans,
