@@ -14,6 +14,7 @@ from processor.geometry.m3c2 import Distances
 from processor.geometry.merging import MergedCloud
 from processor.model import Floats, Reason, Status
 from processor.space_frame.params import Params
+from processor.space_frame.result import Flag
 from processor.space_frame.spheres import isolated
 
 LEAST_EXTENT_MM = 2.0  # nothing that is scanned is smaller: the coordinates are in metres
@@ -75,24 +76,25 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
         seen_from = np.broadcast_to(_finite(scanner, "scanner"), cloud.shape) - origin
     params = Params(radius_mm=float("nan") if radius is None else float(radius), max_balls=1)
     found = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
-    if not len(found.radii):
+    balls = found.balls
+    if not len(balls):
         return SphereFit(
             centre=np.full(3, np.nan),
             radius=float("nan"),
             covariance=np.full((4, 4), np.nan),
             status=Status.FAILED,
-            reasons=(),
+            reasons=found.reasons,
             points=0,
             rms=float("nan"),
         )
     return SphereFit(
-        centre=found.centres[0],
-        radius=float(found.radii[0]),
-        covariance=found.covariance[0],
-        status=Status.OK if found.flag[0] == "ok" else Status.WEAK,
-        reasons=(),
-        points=int(found.points[0]),
-        rms=float(found.rms[0]),
+        centre=balls.centres[0],
+        radius=float(balls.radii[0]),
+        covariance=balls.covariance[0],
+        status=Status.OK if balls.flag[0] is Flag.OK else Status.WEAK,
+        reasons=balls.reasons[0],
+        points=int(balls.points[0]),
+        rms=float(balls.rms[0]),
     )
 
 

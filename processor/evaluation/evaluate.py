@@ -76,7 +76,7 @@ def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:
     if true is None:
         return ErrorReport(tuple(metrics))
     rows = {
-        run.method: true_rows(execution.scene, run.result, true)
+        run.method: true_rows(execution.scene, run.result.balls, true)
         for run in execution.runs
         if isinstance(run.result, space_frame_step.Result)
     }

@@ -8,7 +8,7 @@ The catalogue of a language is the TOML files CODE-PART.toml beside this file, i
 
 Templates have the syntax of :meth:`str.format` with named fields. Fields without a format have three decimals where
 they are numbers. ``{n:?scan|scans}`` is the first word for n = 1 and the second otherwise. Values that are messages or
-words are translated; lists are joined.
+words are translated; lists are joined, those of reasons with semicolons.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ else:
 
 CODES = ("en", "zh")
 LIST = {"en": ", ", "zh": "、"}
+REASONS = {"en": "; ", "zh": "；"}
 NO_NUMBER = "–"
 
 
@@ -92,7 +93,8 @@ class Messages(string.Formatter):
             word = str(message)
             return self.words.get(f"{type(message).__name__}.{word}", self.words.get(word, word))
         if isinstance(message, list | tuple):
-            return LIST[self.code].join(map(self.text, message))
+            separators = REASONS if any(isinstance(item, Reason) for item in message) else LIST
+            return separators[self.code].join(map(self.text, message))
         return self.format_field(message, "")
 
     def format_field(self, value: Any, format_spec: str) -> str:

@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from processor.language.messages import messages
 from processor.model import Checked, Reason, Rows
 from processor.store.codec import reason_object
@@ -28,15 +30,23 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
         key, column = field.metadata.get("json", field.name), getattr(table, field.name)
         if not key or not len(column):
             continue
-        keys = field.metadata.get("keys", ())
-        for row, value in zip(rows, column, strict=True):
+        keys, present = field.metadata.get("keys", ()), _present(table, field.metadata)
+        for row, value in ((rows[i], column[i]) for i in present):
             for name, item in zip(keys, value, strict=True) if keys else [("", value)]:
                 _put(row, key.replace("*", name), _value(item))
     return rows
 
 
 def _absent(value: Any, metadata: Mapping[str, Any]) -> bool:
-    return value is None or bool(metadata.get("optional") and not value.size)
+    return value is None or bool(metadata.get("optional") and not len(value))
+
+
+def _present(table: Rows, metadata: Mapping[str, Any]) -> list[int]:
+    """Return the rows that have a value in a column: all, or those where column ``where`` is finite."""
+    if "where" not in metadata:
+        return list(range(len(table)))
+    known = getattr(table, metadata["where"])
+    return np.flatnonzero(np.isfinite(known.reshape(len(known), -1)).all(axis=1)).tolist() if len(known) else []
 
 
 def _put(target: dict[str, Any], key: str, value: Any) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
-from processor.model import Floats, FrameDesign, Ints, Tolerance
+from processor.model import Floats, FrameDesign, Ints, Reason, Status, Tolerance, reason
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.design import matching
 from processor.space_frame.design.matching import Matching, NodePattern
@@ -21,18 +21,20 @@ from processor.space_frame.members import junctions, members
 from processor.space_frame.members.members import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
+from processor.space_frame.result import Flag
 from processor.space_frame.spheres import fit_all, quality, visibility
 from processor.space_frame.spheres.quality import Bools
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
 from processor.space_frame.stations.control_points import ControlPoints
 from processor.space_frame.stations.corrected_source import Corrected, corrected_gathered
-from processor.space_frame.stations.records import Stations
+from processor.space_frame.stations.records import Stations, StationStatus
 from processor.space_frame.stations.tube_points import tube_points
 
 SAME_FRAME_SHARE = 0.6  # of the design's nodes that are found in their places: the frames are the same
 NEAR_MM = 40.0  # of a node's nominal place, in the same frame
 NOMINAL_SD_MM = 20.0  # of a node that no axes fix, about its nominal place
+USABLE = (StationStatus.OK, StationStatus.WEAK)  # corrections that are applied
 LEAST_STATION_SD_MM = 0.15  # stations with smaller shifts are not corrected
 
 
@@ -70,7 +72,7 @@ class Extracted:
     stations: Stations | None = None
     matching: Matching | None = None
     movement: Movement | None = None
-    messages: tuple[str, ...] = ()
+    reasons: tuple[Reason, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -85,7 +87,7 @@ class Start:
     design_row: Ints
     measured: Measured
     pose: Matching | None = None
-    messages: tuple[str, ...] = ()
+    reasons: tuple[Reason, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ class _Registered:
     @property
     def trusted(self) -> Stations | None:
         """The stations, if their covariance may be used."""
-        return self.stations if self.stations is not None and self.stations.status in ("ok", "weak") else None
+        return self.stations if self.stations is not None and self.stations.status in USABLE else None
 
     def shared_offset_at(self, points: Floats) -> Floats:
         """Covariance (k, 3, 3) at points (k, 3) by an offset common to all ranges."""
@@ -136,7 +138,7 @@ def extract(
     matched = movements = None
     if design is not None and (start.design_row >= 0).any():
         matched, movements = _compare(registered, spheres, shared_offset, design, start.pose, options)
-    messages = [registered.stations.message] if registered.stations is not None else []
+    of_stations = registered.stations.messages if registered.stations is not None else ()
     return Extracted(
         source=registered.source,
         nodes=nodes,
@@ -147,7 +149,7 @@ def extract(
         stations=registered.stations,
         matching=matched,
         movement=movements,
-        messages=(*start.messages, *messages),
+        reasons=(*start.reasons, *of_stations),
     )
 
 
@@ -202,8 +204,8 @@ def _located(
         return replace(pattern, radii=fitted.radii, radius_sd=np.sqrt(fitted.covariance[:, 3, 3]))
 
     pose = matching.match(pattern, design, expansion=options.expansion, sized=sized)
-    if pose.status == "failed":
-        return replace(start, messages=(f"the design was not found in the cloud: {pose.message}",))
+    if pose.status is Status.FAILED:
+        return replace(start, reasons=(reason("spheres.design-not-found", reasons=pose.reasons),))
     nominal, middle = matching.expanded(design, options.expansion)
     positions = rigid.apply(rigid.invert(pose.T_design_scan), nominal + middle) - source.origin
     # Found nodes are where they were found, the others where the design has them.
@@ -229,7 +231,7 @@ def _register(source: Source, start: Start, control: ControlPoints | None, optio
         return _Registered(source, measured)
     on_tubes = tube_points(measured.points, measured.lines, measured.members)
     stations = registration.register(on_tubes, *measured.axes, source.scanners, control, options.datum_mm)
-    if stations.status not in ("ok", "weak"):
+    if stations.status not in USABLE:
         return _Registered(source, measured, stations)
     corrected = Corrected(source, stations)
     points = corrected_gathered(measured.points, stations)
@@ -300,7 +302,7 @@ def _compare(
     options: Options,
 ) -> tuple[Matching, Movement]:
     """Match the fitted spheres with the design, and return the movement of each from its nominal place."""
-    rows = np.flatnonzero(np.array([flag != "not-found" for flag in spheres.flag], bool))
+    rows = np.flatnonzero(np.array([flag is not Flag.NOT_FOUND for flag in spheres.flag], bool))
     pattern = _pattern(spheres, rows, registered.measured.members, registered.source.origin)
     matched = _matched(pattern, design, pose, options.expansion)
     at, stations = pattern.positions.mean(axis=0), registered.trusted
@@ -335,10 +337,10 @@ def _matched(pattern: NodePattern, design: FrameDesign, pose: Matching | None, e
     refined = matching.match(there, design, expansion=expansion)
     return replace(
         refined,
-        how=matching.REGISTERED,
+        relation=matching.FrameRelation.REGISTERED,
         status=pose.status,
         rivals=pose.rivals,
-        message=pose.message,
+        reasons=pose.reasons,
         T_design_scan=refined.T_best_fit @ T,
         T_best_fit=refined.T_best_fit @ T,
     )

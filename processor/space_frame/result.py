@@ -2,117 +2,179 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
-from processor.model import NORMAL_95, Checked, Floats, Ints, column, names, optional
+from processor.model import (
+    Checked,
+    Floats,
+    Ints,
+    Reason,
+    Rows,
+    Status,
+    Verdict,
+    Word,
+    column,
+    described,
+    names,
+    reasons,
+    words,
+    worst,
+)
+
+BOUNDED = ("x", "y", "z", "radius", "lowest")  # columns of ``bound_sd``
+EFFICIENT = ("centre", "radius", "lowest")  # columns of ``efficiency``
+NAN = float("nan")
+
+
+class Flag(Word):
+    """Whether a sphere's numbers can be relied on."""
+
+    OK = "ok"
+    LOW_CONFIDENCE = "low-confidence"
+    WRONG_SIZE = "wrong-size"
+    NOT_FOUND = "not-found"
+
+
+class Evidence(Word):
+    """What a sphere's centre is estimated from."""
+
+    BALL = "ball"  # points on the sphere
+    FUSED = "fused"  # points on the sphere and the axes of members
+    AXES = "axes"  # axes of members alone
+
+
+class MovementGauge(Word):
+    """The datum that movements of nodes are relative to."""
+
+    DESIGN_FRAME = "design frame"
+    BEST_FIT = "best fit"
+
+
+class StationMotion(Word):
+    """A motion of a station in the project's frame."""
+
+    TURN_X = "turn about x"
+    TURN_Y = "turn about y"
+    TURN_Z = "turn about z"
+    SHIFT_X = "shift along x"
+    SHIFT_Y = "shift along y"
+    SHIFT_Z = "shift along z"
+
+
+@dataclass(frozen=True)
+class Balls(Rows):
+    """The spheres in the input's own frame (its offset added), mm. NaN = no value.
+
+    Only method ``ray`` fills the columns from ``sizes`` on. ``bound_sd`` are the Cramér-Rao bounds of x, y, z, radius
+    and lowest point, ``efficiency`` is bound over standard deviation of centre, radius and lowest point. Movements are
+    in the design's frame; ``verdict`` compares them with the limit.
+    """
+
+    ids: Ints = column("k", dtype=np.int64, json="id")
+    centres: Floats = column("k", 3, json="centre", unit="mm")
+    radii: Floats = column("k", json="radius", unit="mm")
+    lowest: Floats = column("k", 3, unit="mm")
+    lowest_sd: Floats = column("k", unit="mm")  # of the lowest point's z
+    covariance: Floats = column("k", 4, 4, unit="mm2")  # of centre x, y, z and radius
+    points: Ints = column("k", dtype=np.int64)  # used by the estimate
+    visible_fraction: Floats = column("k")  # of the sphere's surface that has points
+    rms: Floats = column("k", unit="mm")  # of the residuals of those points
+    nominal_radii: Floats = column("k", json="nominal_radius", unit="mm")  # from the design, NaN without
+    evidence: tuple[Evidence, ...] = words("k", Evidence)
+    flag: tuple[Flag, ...] = words("k", Flag)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("k")  # for the flag and the evidence
+    sizes: Floats = column("k", json="size", unit="mm")  # radii of the catalogue
+    axes: Ints = column("k", dtype=np.int64)  # number of members that meet at the node
+    stations: Ints = column("k", dtype=np.int64)  # number that saw the ball
+    bound_sd: Floats = column("k", 5, json="bound_sd.*", keys=BOUNDED, unit="mm")
+    efficiency: Floats = column("k", 3, json="efficiency.*", keys=EFFICIENT)
+    movement: Floats = column("k", 3, json="movement.vector", where="movement", unit="mm")
+    movement_ci95: Floats = column("k", 3, json="movement.ci95", where="movement", unit="mm")
+    movement_covariance: Floats = column("k", 3, 3, json="")
+    movement_size: Floats = column("k", json="movement.size", where="movement", unit="mm")
+    movement_size_ci95: Floats = column("k", json="movement.size_ci95", where="movement", unit="mm")
+    verdict: tuple[Verdict, ...] = words("k", Verdict, json="movement.verdict", where="movement")
+
+    @property
+    def placed(self) -> npt.NDArray[np.bool_]:
+        """Whether each sphere (k,) has a centre."""
+        return np.asarray(np.isfinite(self.centres).all(axis=1))
+
+    def flagged(self, flag: Flag) -> npt.NDArray[np.bool_]:
+        """Whether each sphere (k,) has this flag."""
+        return np.array([item is flag for item in self.flag], bool)
+
+
+@dataclass(frozen=True)
+class Tubes(Rows):
+    """Members as tubes from ``start`` to ``end`` of their axes, mm, between spheres of ids ``a`` and ``b``."""
+
+    a: Ints = column("m", dtype=np.int64)  # -1 = none
+    b: Ints = column("m", dtype=np.int64)
+    start: Floats = column("m", 3, unit="mm")
+    end: Floats = column("m", 3, unit="mm")
+    radii: Floats = column("m", json="radius", unit="mm")
+    bow: Floats = column("m", unit="mm")  # largest distance of the axis from a straight line
+
+
+@dataclass(frozen=True)
+class StationCorrections(Rows):
+    """Corrections of the stations: ``T`` (s, 4, 4) map places as registered to corrected places."""
+
+    names: tuple[str, ...] = names("s", json="name")
+    T: Floats = column("s", 4, 4)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("s")
+
+
+@dataclass(frozen=True)
+class ControlDeviations(Rows):
+    """Sightings of control points after the corrections of the stations."""
+
+    points: tuple[str, ...] = names("c", json="name")
+    scans: tuple[str, ...] = names("c", json="scan")
+    off: Floats = column("c", 3, unit="mm")  # known place minus sighting
+    used: npt.NDArray[np.bool_] = column("c", dtype=np.bool_)  # False = left out: it contradicts the others
+
+
+@dataclass(frozen=True)
+class DesignPose(Checked):
+    """Pose of the design, its covariance, and other poses ``rivals`` (r, 4, 4) that explain the nodes as well."""
+
+    status: Status = described(words=Status)
+    T_design_scan: Floats = column(4, 4)
+    covariance: Floats = column(6, 6)
+    rivals: Floats = column("r", 4, 4)
+
+
+@dataclass(frozen=True)
+class MovementReference(Checked):
+    """What movements are relative to, and the limit of their size; NaN = none."""
+
+    gauge: MovementGauge = described(words=MovementGauge)
+    limit: float = described(NAN, json="movement_limit.mm", unit="mm")
+    limit_source: str = described("", json="movement_limit.source")  # name of the file or standard
 
 
 @dataclass(frozen=True)
 class Result(Checked):
-    """The spheres, a row each, in the input's own frame (its offset added), mm. NaN = no answer.
+    """The spheres of a scene; only method ``ray`` has tubes, stations and movements."""
 
-    Only method ``ray`` fills the fields below ``reason``. ``bound_sd`` are the Cramér-Rao bounds of x, y, z, radius and
-    lowest point, ``efficiency`` is bound over standard deviation of centre, radius and lowest point. Movements are in
-    the design's frame, relative to ``gauge``; tubes run from ``tube_start`` to ``tube_end`` between spheres of these
-    ids (-1 = none). ``T_station`` (s, 4, 4) map places as registered to corrected ones.
-    """
+    status: Status = described(words=Status)
+    method: str = described()
+    reasons: tuple[Reason, ...] = reasons()
+    balls: Balls = dataclasses.field(default_factory=Balls)
+    movement_reference: MovementReference | None = described(None, json=".")
+    matching: DesignPose | None = None
+    tubes: Tubes = dataclasses.field(default_factory=Tubes, metadata={"optional": True})
+    stations: StationCorrections = dataclasses.field(default_factory=StationCorrections, metadata={"optional": True})
+    datum: tuple[Reason, ...] = described((), reasons="", optional=True)  # what fixes all stations together
+    control: ControlDeviations = dataclasses.field(default_factory=ControlDeviations, metadata={"optional": True})
 
-    status: str  # ok | partial | failed
-    method: str
-    message: str = ""
-    ids: Ints = column("k", dtype=np.int64)
-    centres: Floats = column("k", 3)
-    radii: Floats = column("k")
-    lowest: Floats = column("k", 3)
-    covariance: Floats = column("k", 4, 4)  # of centre x, y, z and radius
-    lowest_sd: Floats = column("k")  # of the lowest point's z
-    points: Ints = column("k", dtype=np.int64)  # that the estimate rests on
-    visible_fraction: Floats = column("k")  # of the sphere's surface that has points
-    rms: Floats = column("k")  # of the residuals of those points
-    nominal_radii: Floats = column("k")  # from the design, NaN without
-    evidence: tuple[str, ...] = names("k")  # ball | fused | axes
-    flag: tuple[str, ...] = names("k")  # ok | low-confidence | wrong-size | not-found
-    reason: tuple[str, ...] = names("k")  # why the flag is not ok
-    sizes: Floats = column("k")  # of the catalogue
-    axes: Ints = column("k", dtype=np.int64)  # of members that meet at the node
-    stations: Ints = column("k", dtype=np.int64)  # that saw the ball
-    bound_sd: Floats = column("k", 5)
-    efficiency: Floats = column("k", 3)
-    movement: Floats = column("k", 3)
-    movement_ci95: Floats = column("k", 3)
-    movement_covariance: Floats = column("k", 3, 3)
-    movement_limit: float = float("nan")  # of its size; NaN = none
-    movement_limit_source: str = ""  # where that stands
-    gauge: str = ""
-    matching: str = ""  # ok | ambiguous | failed
-    T_design_scan: Floats = optional(4, 4)
-    T_design_scan_covariance: Floats = optional(6, 6)
-    T_rivals: Floats = column("r", 4, 4)  # other poses of the design that explain as much
-    tube_start: Floats = column("m", 3)
-    tube_end: Floats = column("m", 3)
-    tube_radii: Floats = column("m")
-    tube_bow: Floats = column("m")  # largest departure of the axis from straight
-    tube_a: Ints = column("m", dtype=np.int64)
-    tube_b: Ints = column("m", dtype=np.int64)
-    station_names: tuple[str, ...] = names("s")
-    T_station: Floats = column("s", 4, 4)
-    station_said: tuple[str, ...] = names("s")
-    datum: str = ""  # what holds all stations together where they are
-    control_names: tuple[str, ...] = names("c")  # control points, a row a sighting
-    control_scan: tuple[str, ...] = names("c")  # that it was seen in
-    control_off: Floats = column("c", 3)  # known place minus the sighting after the stations were moved
-    control_used: Ints = column("c", dtype=np.int64)  # 1 = yes, 0 = left out: the others speak against it
-
-
-# --- movements of nodes compared with a limit ------------------------------------------------------------------------
-
-
-PASS, FAIL, INDETERMINATE, NO_LIMIT = "pass", "fail", "indeterminate", "no limit"
-
-
-@dataclass(frozen=True)
-class Judged:
-    """Size (k,) of each movement, its 95 % half-width (k,), mm, and the verdict; NaN and "" where none is known.
-
-    The half-width is along the movement: a size that is not well above it is mostly noise.
-    """
-
-    size: Floats
-    ci95: Floats
-    verdict: tuple[str, ...]
-
-
-def of_result(result: Result) -> Judged:
-    """Compare all movements of a result with the limit.
-
-    Pass where size and interval are within the limit, fail where the size exceeds it by more than the interval, else
-    indeterminate. Also indeterminate where other poses of the design fit the nodes as well, and for a sphere that was
-    not seen: the point where its axes meet is not the sphere's centre.
-    """
-    size = np.linalg.norm(result.movement, axis=1)
-    along = result.movement / np.where(size > 0.0, size, 1.0)[:, None]
-    variance = np.einsum("ki,kij,kj->k", along, result.movement_covariance, along)
-    ci95 = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
-    sure = result.matching == "ok"
-    limit = result.movement_limit
-    seen = [evidence != "axes" for evidence in result.evidence]
-    return Judged(
-        size,
-        ci95,
-        tuple(
-            _verdict(s, half, limit, sure and ball)
-            for s, half, ball in zip(size.tolist(), ci95.tolist(), seen, strict=True)
-        ),
-    )
-
-
-def _verdict(size: float, half: float, limit: float, sure: bool) -> str:
-    if np.isnan(size):
-        return ""
-    if np.isnan(limit):
-        return NO_LIMIT
-    if not sure or np.isnan(half):
-        return INDETERMINATE
-    return PASS if size + half <= limit else FAIL if size - half > limit else INDETERMINATE
+    @property
+    def overall(self) -> Verdict:
+        """The worst verdict of the nodes' movements."""
+        return worst(self.balls.verdict)

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 from processor.geometry.merging import merged
 from processor.limits import standards
-from processor.model import InputError, Scene, Tolerance
+from processor.model import InputError, Scene, Tolerance, reason
 from processor.space_frame import to_result
 from processor.space_frame.params import METHODS, Params
 from processor.space_frame.points.scene_source import PointReader
@@ -39,7 +39,7 @@ def run(scene: Scene, params: Params, points: PointReader | None = None, answer_
     params.check(scene.frame is not None)
     limits = standards.default_for(scene.tolerance)
     if params.method != "ray":
-        if answer_given is not None and answer_given.method == "ray" and len(answer_given.tube_radii):
+        if answer_given is not None and answer_given.method == "ray" and len(answer_given.tubes):
             same = to_result.of_same_points(scene, params)
             if same is not None:
                 return same
@@ -59,10 +59,10 @@ def run(scene: Scene, params: Params, points: PointReader | None = None, answer_
 
 
 def _with_unused_control(scene: Scene, result: Result) -> Result:
-    """Add the message that control points were not used, where there are any."""
+    """Add the reason that control points were not used, where there are any."""
     if scene.control is None:
         return result
-    return replace(result, message="; ".join(filter(None, (result.message, to_result.UNUSED))))
+    return replace(result, reasons=(*result.reasons, to_result.UNUSED_CONTROL))
 
 
 def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
@@ -71,5 +71,4 @@ def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
         return isolated.search(merged(scene, with_scanner=True), params)
     ransac = replace(params, method="ransac")
     result = isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, ransac, limits)
-    message = "no members that meet: each ball was fitted at the design's node, by ransac and without its axes"
-    return replace(result, method=params.method, message=f"{message}; {result.message}")
+    return replace(result, method=params.method, reasons=(reason("spheres.no-members"), *result.reasons))

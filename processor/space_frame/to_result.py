@@ -5,25 +5,36 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 
 from processor.limits import standards
-from processor.model import Floats, FrameDesign, Ints, Scene
+from processor.model import Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
 from processor.space_frame import catalogue
 from processor.space_frame.catalogue import Catalogue
+from processor.space_frame.design.matching import Matching
+from processor.space_frame.design.movement import Movement, size_of, verdict_of
 from processor.space_frame.extract import Extracted, Options, extract
+from processor.space_frame.members.records import Members
 from processor.space_frame.params import Params
 from processor.space_frame.points.scene_source import PointReader, SceneSource, of_scene
-from processor.space_frame.result import Result
+from processor.space_frame.result import (
+    NAN,
+    Balls,
+    ControlDeviations,
+    DesignPose,
+    Evidence,
+    Flag,
+    MovementReference,
+    Result,
+    StationCorrections,
+    Tubes,
+)
 from processor.space_frame.spheres import baselines
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
 
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
-NOWHERE = "not in the design"
-FRAME_ALONE = "balls that no member meets, such as targets beside the frame, are not looked for"
-UNUSED = "control points were not used: that takes members that meet, scanner positions, and stations that may be moved"
+UNUSED_CONTROL = reason("spheres.unused-control")
 
 
 def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
@@ -63,108 +74,129 @@ def _catalogue(params: Params) -> Catalogue:
 
 
 def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
+    balls = _balls(extracted, source.origin, scene)
+    matched, movements, stations = extracted.matching, extracted.movement, extracted.stations
+    limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
+    reference = pose = None
+    if movements is not None:
+        reference = MovementReference(
+            gauge=movements.gauge,
+            limit=NAN if limit is None else limit.high,
+            limit_source="" if limit is None else limit.source,
+        )
+        balls = _with_movements(balls, movements, reference.limit, matched is not None and matched.status is Status.OK)
+    if matched is not None:
+        pose = DesignPose(
+            status=matched.status,
+            T_design_scan=matched.T_design_scan,
+            covariance=matched.covariance,
+            rivals=matched.rivals,
+        )
+    return Result(
+        status=_status(balls, matched),
+        method="ray",
+        reasons=_reasons(extracted, scene),
+        balls=balls,
+        movement_reference=reference,
+        matching=pose,
+        tubes=_tubes(extracted.members, balls.ids, source.origin),
+        stations=StationCorrections() if stations is None else _corrections(stations, source),
+        datum=() if stations is None else stations.datum,
+        control=ControlDeviations() if stations is None else _control(stations),
+    )
+
+
+def _balls(extracted: Extracted, origin: Floats, scene: Scene) -> Balls:
     spheres = extracted.spheres
     covariance = spheres.covariance.copy()
     covariance[:, :3, :3] += extracted.datum
-    ids = _ids(extracted.design_row, scene.frame)
-    reason = list(spheres.reason)
+    reasons = list(spheres.reasons)
     for i in np.flatnonzero(extracted.design_row < 0).tolist() if scene.frame is not None else ():
-        reason[i] = "; ".join(filter(None, (reason[i], NOWHERE)))
-    missing = np.array([flag == "not-found" for flag in spheres.flag], bool)
-    found_only = np.where(missing, np.nan, 1.0)  # of a missing sphere the nominal values are no answer
-    result = Result(
-        status=_status(missing, extracted),
-        method="ray",
-        message=_message(extracted, scene),
-        ids=ids,
-        centres=(spheres.centres + source.origin) * found_only[:, None],
+        reasons[i] += (reason("spheres.not-in-design"),)
+    missing = np.array([flag is Flag.NOT_FOUND for flag in spheres.flag], bool)
+    found_only = np.where(missing, np.nan, 1.0)  # of a missing sphere the nominal values are no result
+    return Balls(
+        ids=_ids(extracted.design_row, scene.frame),
+        centres=(spheres.centres + origin) * found_only[:, None],
         radii=spheres.radii * found_only,
-        lowest=(spheres.lowest + source.origin) * found_only[:, None],
-        covariance=covariance * found_only[:, None, None],
+        lowest=(spheres.lowest + origin) * found_only[:, None],
         lowest_sd=np.sqrt(spheres.lowest_sd**2 + extracted.datum[:, 2, 2]) * found_only,
+        covariance=covariance * found_only[:, None, None],
         points=spheres.points,
         visible_fraction=spheres.visible_fraction,
         rms=spheres.rms,
         nominal_radii=spheres.expected,
         evidence=spheres.evidence,
         flag=spheres.flag,
-        reason=tuple(reason),
+        reasons=tuple(reasons),
         sizes=spheres.sizes,
         axes=spheres.axes,
         stations=spheres.stations,
         bound_sd=np.hstack([np.sqrt(np.einsum("kii->ki", spheres.bound)), spheres.bound_lowest_sd[:, None]]),
         efficiency=np.stack([spheres.efficiency_centre, spheres.efficiency_radius, spheres.efficiency_lowest], axis=1),
+        verdict=(Verdict.NONE,) * len(spheres.flag),
     )
-    result = _with_members(_with_design(result, extracted, scene), extracted, source.origin)
-    return result if extracted.stations is None else _with_stations(result, extracted.stations, source)
 
 
-def _status(missing: npt.NDArray[np.bool_], extracted: Extracted) -> str:
+def _status(balls: Balls, matched: Matching | None) -> Status:
+    missing = balls.flagged(Flag.NOT_FOUND)
     if missing.all():
-        return "failed"
-    matched = extracted.matching
-    return "ok" if not missing.any() and (matched is None or matched.status == "ok") else "partial"
+        return Status.FAILED
+    complete = not missing.any() and (matched is None or matched.status is Status.OK)
+    return Status.OK if complete else Status.PARTIAL
 
 
-def _message(extracted: Extracted, scene: Scene) -> str:
-    messages = [*extracted.messages, extracted.spheres.message, FRAME_ALONE]
+def _reasons(extracted: Extracted, scene: Scene) -> tuple[Reason, ...]:
+    reasons = [*extracted.reasons, *extracted.spheres.messages, reason("spheres.joined-only")]
     if scene.control is not None and (extracted.stations is None or not extracted.stations.control):
-        messages.append(UNUSED)
-    if extracted.matching is not None:
-        messages.append(extracted.matching.message)
-    return "; ".join(filter(None, messages))
+        reasons.append(UNUSED_CONTROL)
+    return (*reasons, *(() if extracted.matching is None else extracted.matching.reasons))
 
 
-def _with_design(result: Result, extracted: Extracted, scene: Scene) -> Result:
-    """Add the movements of nodes, and the pose of the design."""
-    k, matched, movements = len(result.ids), extracted.matching, extracted.movement
-    limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
-    movement, ci95, covariance = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan)
-    if movements is not None:
-        rows = movements.found
-        movement[rows], ci95[rows], covariance[rows] = movements.vector, movements.ci95, movements.covariance
+def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bool) -> Balls:
+    """Add the movements of nodes, and their verdicts; ``matched`` is False where the matching is not certain."""
+    k, rows = len(balls), movements.found
+    vector, ci95, covariance = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan)
+    vector[rows], ci95[rows], covariance[rows] = movements.vector, movements.ci95, movements.covariance
+    size, size_ci95 = size_of(vector, covariance)
     return replace(
-        result,
-        movement=movement,
+        balls,
+        movement=vector,
         movement_ci95=ci95,
         movement_covariance=covariance,
-        movement_limit=np.nan if limit is None else limit.high,
-        movement_limit_source="" if limit is None else limit.source,
-        gauge="" if movements is None else movements.gauge,
-        matching="" if matched is None else matched.status,
-        T_design_scan=np.empty(0) if matched is None else matched.T_design_scan,
-        T_design_scan_covariance=np.empty(0) if matched is None else matched.covariance,
-        T_rivals=np.empty((0, 4, 4)) if matched is None else matched.rivals,
+        movement_size=size,
+        movement_size_ci95=size_ci95,
+        verdict=tuple(
+            verdict_of(length, half, limit, matched and evidence is not Evidence.AXES)
+            for length, half, evidence in zip(size.tolist(), size_ci95.tolist(), balls.evidence, strict=True)
+        ),
     )
 
 
-def _with_members(result: Result, extracted: Extracted, origin: Floats) -> Result:
-    """Add the members' tubes."""
-    members = extracted.members
+def _tubes(members: Members, ids: Ints, origin: Floats) -> Tubes:
     half = 0.5 * members.lengths[:, None] * members.directions
-    return replace(
-        result,
-        tube_start=members.points - half + origin,
-        tube_end=members.points + half + origin,
-        tube_radii=members.radii,
-        tube_bow=np.hypot(*members.bow.T),
-        tube_a=np.where(members.node_a >= 0, result.ids[members.node_a], -1),
-        tube_b=np.where(members.node_b >= 0, result.ids[members.node_b], -1),
+    return Tubes(
+        a=np.where(members.node_a >= 0, ids[members.node_a], -1),
+        b=np.where(members.node_b >= 0, ids[members.node_b], -1),
+        start=members.points - half + origin,
+        end=members.points + half + origin,
+        radii=members.radii,
+        bow=np.hypot(*members.bow.T),
     )
 
 
-def _with_stations(result: Result, stations: Stations, source: SceneSource) -> Result:
-    """Add the stations' corrections, and the deviations at control points."""
-    return replace(
-        result,
-        station_names=source.names,
-        T_station=_in_place(stations.T_project_station, source.origin),
-        station_said=stations.weak,
-        datum=stations.datum,
-        control_names=stations.control,
-        control_scan=stations.control_scan,
-        control_off=stations.control_off,
-        control_used=stations.control_used,
+def _corrections(stations: Stations, source: SceneSource) -> StationCorrections:
+    return StationCorrections(
+        names=source.names, T=_in_place(stations.T_project_station, source.origin), reasons=stations.reasons
+    )
+
+
+def _control(stations: Stations) -> ControlDeviations:
+    return ControlDeviations(
+        points=stations.control,
+        scans=stations.control_scan,
+        off=stations.control_off,
+        used=stations.control_used.astype(bool),
     )
 
 

@@ -16,10 +16,21 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
-from processor.model import Checked, Floats, FrameDesign, Ints, column
+from processor.model import (
+    Checked,
+    Floats,
+    FrameDesign,
+    Ints,
+    Reason,
+    Status,
+    Word,
+    column,
+    described,
+    reason,
+    reasons,
+)
 from processor.space_frame.design import constellation
 
-SAME, REGISTERED = "same frame", "registered"
 TOLERANCE_MM = 60.0  # largest deviation of a node from its nominal place
 LEAST_SHARE = 0.5  # of the smaller pattern's nodes that must agree
 DOUBTFUL_SHARE = 0.05  # of missing and of extra nodes: beyond it another pose may explain them
@@ -35,6 +46,13 @@ MEDIAN_OF_3 = 1.538  # of the length of a normal vector in space, per sd
 RADIUS_ODDS = 4.0  # lost at most by a sphere of another size
 RADIUS_SD_MM = 1.0  # of spheres against the catalogue, beside the measurement's
 MEMBER_ODDS = 2.0  # lost by a member that is not in the design
+
+
+class FrameRelation(Word):
+    """How the frame of the found nodes is related to the design's."""
+
+    SAME = "same frame"
+    REGISTERED = "registered"
 
 
 @dataclass(frozen=True)
@@ -62,9 +80,9 @@ class Matching(Checked):
     either case.
     """
 
-    status: str  # ok | ambiguous | failed
-    how: str = ""  # same frame | registered
-    message: str = ""
+    status: Status = described(words=Status)  # ok | ambiguous | failed
+    relation: FrameRelation = described(FrameRelation.REGISTERED, words=FrameRelation)
+    reasons: tuple[Reason, ...] = reasons()
     T_design_scan: Floats = column(4, 4)
     covariance: Floats = column(6, 6)
     T_best_fit: Floats = column(4, 4)
@@ -131,7 +149,7 @@ def match(
     nominal, middle = expanded(design, expansion)
     k, d = len(nodes.positions), len(nominal)
     if k == 0 or d == 0:
-        return _failed(k, d, "no nodes" if k == 0 else "the design has no nodes")
+        return _failed(k, d, reason("spheres.no-nodes") if k == 0 else reason("spheres.no-design-nodes"))
     problem = _Problem(nodes, design, nominal, middle, tolerance_mm)
     to_design = rigid.transform(np.eye(3), nodes.origin - middle)
     least = LEAST_SHARE * problem.fewer
@@ -141,7 +159,7 @@ def match(
     if same is not None:
         few = min(1.0 - same.matched / d, 1.0 - same.matched / k) <= DOUBTFUL_SHARE or k < 4
         if few or not _better_nearby(to_design, same.matched, problem):
-            return _answer(same, [], SAME, problem, "")
+            return _answer(same, [], FrameRelation.SAME, problem, ())
     candidates = _searched(problem) if k >= 4 and d >= 4 else []
     candidates = [candidate for candidate in candidates if candidate.matched >= max(least, 4)]
     every = _with_radii([same, *candidates] if same is not None else candidates, problem, sized)
@@ -151,10 +169,10 @@ def match(
             rival for rival in candidates
             if rival.odds < same.odds - DECISIVE and not _alike(rival.T, to_design, nodes.positions, 5.0 * tolerance_mm)
         ]  # fmt: skip
-        message = "the frames agree, but another pose explains more nodes" if rivals else ""
-        return _answer(same, rivals[:1], SAME, problem, message)
+        doubts = (reason("spheres.better-pose"),) if rivals else ()
+        return _answer(same, rivals[:1], FrameRelation.SAME, problem, doubts)
     if not every:
-        return _failed(k, d, "no pose lays half of the nodes onto the design's")
+        return _failed(k, d, reason("spheres.no-pose"))
     return _best(every, problem)
 
 
@@ -326,33 +344,46 @@ def _best(candidates: list[_Candidate], problem: _Problem) -> Matching:
     """Take the best candidate if it leads decisively; else prefer upright ones, and report the rest as rivals."""
     candidates = sorted(candidates, key=lambda candidate: candidate.odds)
     level = [candidate for candidate in candidates if candidate.odds < candidates[0].odds + DECISIVE]
-    message = ""
+    doubts: tuple[Reason, ...] = ()
     upright = [candidate for candidate in level if candidate.T[2, 2] > UPRIGHT_COS]
     if upright and len(upright) < len(level):
-        message = "the pattern turned over fits as well: taken as it stands upright, gravity along -Z in both frames"
+        doubts = (reason("spheres.turned-over"),)
         level = upright
     if len(level) > 1:
-        message = f"{len(level)} poses explain the pattern alike"
-    return _answer(level[0], level[1:], REGISTERED, problem, message)
+        doubts = (reason("spheres.equal-poses", poses=len(level)),)
+    return _answer(level[0], level[1:], FrameRelation.REGISTERED, problem, doubts)
 
 
-def _answer(chosen: _Candidate, rivals: list[_Candidate], how: str, problem: _Problem, message: str) -> Matching:
+def _answer(
+    chosen: _Candidate,
+    rivals: list[_Candidate],
+    relation: FrameRelation,
+    problem: _Problem,
+    doubts: tuple[Reason, ...],
+) -> Matching:
     nodes, nominal, middle = problem.nodes, problem.nominal, problem.middle
     on = chosen.assignment >= 0
     positions, places, weight = nodes.positions[on], nominal[chosen.assignment[on]], chosen.weight[on]
     best, covariance = chosen.T, np.zeros((6, 6))
     if on.sum() >= 3:
         best = _weighted_fit(positions, places, weight)
-        if how == REGISTERED:
+        if relation is FrameRelation.REGISTERED:
             placed = rigid.apply(best, positions)
             covariance = _covariance(placed, placed - places, weight, middle)
-    T = best if how == REGISTERED else rigid.transform(np.eye(3), nodes.origin - middle)
+    T = best if relation is FrameRelation.REGISTERED else rigid.transform(np.eye(3), nodes.origin - middle)
     missing = np.setdiff1d(np.arange(len(nominal)), chosen.assignment[on])
-    summary = f"{how}: {int(on.sum())} nodes of {len(nominal)}, {len(missing)} missing, {int((~on).sum())} extra"
+    summary = reason(
+        "spheres.matched",
+        frame=relation,
+        nodes=int(on.sum()),
+        nominal=len(nominal),
+        missing=len(missing),
+        extra=int((~on).sum()),
+    )
     return Matching(
-        status="ambiguous" if rivals else "ok",
-        how=how,
-        message="; ".join(filter(None, (summary, message))),
+        status=Status.AMBIGUOUS if rivals else Status.OK,
+        relation=relation,
+        reasons=(summary, *doubts),
         T_design_scan=_full(T, nodes.origin, middle),
         covariance=covariance,
         T_best_fit=_full(best, nodes.origin, middle),
@@ -387,11 +418,11 @@ def _covariance(placed: Floats, off: Floats, weight: Floats, middle: Floats) -> 
     return symmetric
 
 
-def _failed(k: int, d: int, message: str) -> Matching:
+def _failed(k: int, d: int, cause: Reason) -> Matching:
     nothing = np.full((4, 4), np.nan)
     return Matching(
-        status="failed",
-        message=message,
+        status=Status.FAILED,
+        reasons=(cause,),
         T_design_scan=nothing,
         covariance=np.full((6, 6), np.nan),
         T_best_fit=nothing,

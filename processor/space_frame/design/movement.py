@@ -13,10 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Checked, Floats, FrameDesign, Ints, column
-from processor.space_frame.design.matching import SAME, Matching, NodePattern, expanded
-
-FRAME, BEST_FIT = "design frame", "best fit"
+from processor.model import NORMAL_95, Checked, Floats, FrameDesign, Ints, Verdict, column, described
+from processor.space_frame.design.matching import FrameRelation, Matching, NodePattern, expanded
+from processor.space_frame.result import MovementGauge
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Movement(Checked):
     ``gauge`` names the datum. ``ci95`` is the half-width of the 95 % interval along each axis.
     """
 
-    gauge: str  # design frame | best fit
+    gauge: MovementGauge = described(words=MovementGauge)
     found: Ints = column("n", dtype=np.int64)  # rows of the found nodes
     design: Ints = column("n", dtype=np.int64)  # and of the design
     vector: Floats = column("n", 3)
@@ -41,7 +40,7 @@ def movement(
     design: FrameDesign,
     datum: Floats | None = None,
     datum_place: Floats | None = None,
-    gauge: str = "",
+    gauge: MovementGauge | None = None,
     expansion: float = 1.0,
 ) -> Movement:
     """Return the movements of all matched nodes.
@@ -51,22 +50,25 @@ def movement(
     covariance : (k, 3, 3) of the found nodes, without the motion common to all
     datum : (6, 6) covariance of the common motion: turn about ``datum_place`` (3,), which is less the nodes' origin,
         and translation; None = none. A best fit removes it.
-    gauge : ``design frame`` or ``best fit``; by default the first where the frames are the same.
+    gauge : by default the design's frame where the frames are the same, else the best fit
     expansion : factor of all lengths by temperature; nominal places are expanded about their mean
     """
-    gauge = gauge or (FRAME if matching.how == SAME else BEST_FIT)
+    if gauge is None:
+        same = matching.relation is FrameRelation.SAME
+        gauge = MovementGauge.DESIGN_FRAME if same else MovementGauge.BEST_FIT
+    in_frame = gauge is MovementGauge.DESIGN_FRAME
     rows = np.flatnonzero(matching.assignment >= 0)
     assigned = matching.assignment[rows]
     nominal, middle = expanded(design, expansion)
-    T = matching.T_design_scan if gauge == FRAME else matching.T_best_fit
+    T = matching.T_design_scan if in_frame else matching.T_best_fit
     R = T[:3, :3]
     # offset less offset first: adding either to the nodes would lose digits
     positions = nodes.positions[rows] @ R.T + (R @ nodes.origin + T[:3, 3] - middle)
     C = np.einsum("ij,njk,lk->nil", R, covariance[rows], R)
-    if gauge == FRAME and datum is not None:
+    if in_frame and datum is not None:
         J = rigid.motion(nodes.positions[rows] - (np.zeros(3) if datum_place is None else datum_place))
         C = C + np.einsum("ij,njp,pq,nkq,lk->nil", R, J, datum, J, R, optimize=False)
-    elif gauge != FRAME and len(rows):
+    elif not in_frame and len(rows):
         C = _relative(positions, C, matching.weight[rows])
     return Movement(
         gauge=gauge,
@@ -89,3 +91,33 @@ def _relative(nodes: Floats, C: Floats, weight: Floats) -> Floats:
     cross = np.einsum("nip,npj,njk->nik", J, gain, C)
     relative: Floats = C - cross - np.swapaxes(cross, 1, 2) + np.einsum("nip,pq,njq->nij", J, fit, J)
     return relative
+
+
+# --- comparison with a limit -----------------------------------------------------------------------------------------
+
+
+def size_of(vector: Floats, covariance: Floats) -> tuple[Floats, Floats]:
+    """Return the sizes (k,) of movements (k, 3) of covariance (k, 3, 3), and their 95 % half-widths (k,), mm.
+
+    The half-width is along the movement: a size that is not well above it is mostly noise.
+    """
+    size: Floats = np.linalg.norm(vector, axis=1)
+    along = vector / np.where(size > 0.0, size, 1.0)[:, None]
+    variance = np.einsum("ki,kij,kj->k", along, covariance, along)
+    return size, NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
+
+
+def verdict_of(size: float, ci95: float, limit: float, certain: bool) -> Verdict:
+    """Compare the size of a movement and its half-width with a limit, mm; NaN = none.
+
+    Pass where size and interval are within the limit, fail where the size exceeds it by more than the interval, else
+    indeterminate. ``certain`` is False where other poses of the design fit the nodes as well, and for a sphere that was
+    not seen: the point where its axes meet is not the sphere's centre. Such a movement is indeterminate.
+    """
+    if np.isnan(size) or np.isnan(limit):
+        return Verdict.NONE
+    if not certain or np.isnan(ci95):
+        return Verdict.INDETERMINATE
+    if size + ci95 <= limit:
+        return Verdict.PASS
+    return Verdict.FAIL if size - ci95 > limit else Verdict.INDETERMINATE

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from processor.geometry import unit_ratio
-from processor.model import Floats
+from processor.model import Floats, Reason, reason
 
 FACTORS = (1000.0, 304.8, 25.4)  # m, feet and inches read as mm, or the other way round
 NEAR = 0.02  # relative tolerance of a factor
@@ -25,13 +25,13 @@ def between(known: Floats, seen: Floats) -> str:
     return f"{factor:g}" if factor > 1.0 else f"1/{1.0 / factor:g}"
 
 
-def implausible(radius: float) -> str:
-    """Return a message if a radius (mm) is outside of those of spheres and targets; else an empty text."""
+def implausible(radius: float) -> Reason | None:
+    """Return a reason if a radius (mm) is outside of those of spheres and targets; else None."""
     if PLAUSIBLE_MM[0] <= radius <= PLAUSIBLE_MM[1]:
-        return ""
-    message = f"no ball or target has a radius of {radius:.{0 if radius >= 100.0 else 3}f} mm"
+        return None
+    shown = round(radius) if radius >= 100.0 else radius
     for factor in FACTORS:
-        for scale, how in ((1.0 / factor, f"1/{factor:g}"), (factor, f"{factor:g}")):
+        for scale, name in ((1.0 / factor, f"1/{factor:g}"), (factor, f"{factor:g}")):
             if COMMON_MM[0] <= radius * scale <= COMMON_MM[1]:
-                return f"{message}: the unit may be wrong, {how} of it would be {radius * scale:.1f} mm"
-    return message
+                return reason("spheres.unit-mistake", radius=shown, factor=name, scaled=radius * scale)
+    return reason("spheres.implausible-radius", radius=shown)

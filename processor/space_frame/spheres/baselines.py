@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.model import Floats, Ints, Tolerance
+from processor.model import Floats, Ints, Tolerance, reason
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.params import Params as PaperParams
 from processor.space_frame.points.source import Source
@@ -20,7 +20,7 @@ from processor.space_frame.spheres.records import Spheres
 
 MARGIN_MM = 8.0  # on both sides of a sphere's surface: about what the ray fit uses with 2 mm of noise
 SLEEVES_MM = 26.0  # beyond a sphere: sleeves are measured there
-SAME = "fitted to the points that method ray took for each ball, off sleeves and process hole; covariances are formal"
+SAME = reason("spheres.points-of-ray")
 
 
 def compared(
@@ -38,7 +38,7 @@ def compared(
     off = np.linalg.norm(spheres.centres - nodes.positions, axis=1)[spheres.points > 0].max(initial=0.0)
     crops = gather(source, nodes.positions, largest + float(off) + SLEEVES_MM)
     points = points_of_spheres(crops, nodes, members, spheres)
-    return isolated.fit_points(points, nodes.positions, ids, spheres.expected, source.origin, params, limits, SAME)
+    return isolated.fit_points(points, nodes.positions, ids, spheres.expected, source.origin, params, limits, (SAME,))
 
 
 def points_of_spheres(crops: Crops, nodes: Nodes, members: Members, spheres: Spheres) -> list[Floats]:

@@ -17,10 +17,10 @@ from processor.geometry.crops import nearest_crops
 from processor.geometry.merging import MergedCloud
 from processor.geometry.sphere import Mask, Sphere, algebraic, ransac, visible_fraction
 from processor.geometry.sphere_robust import bound
-from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Tolerance
+from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Status, Tolerance, Verdict, reason
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import NAN, Params
-from processor.space_frame.result import Result
+from processor.space_frame.result import Balls, Evidence, Flag, Result
 from processor.space_frame.spheres.quality import beyond, blank_tolerance
 
 LEAST_VISIBLE = 0.05  # share of the sphere
@@ -32,7 +32,7 @@ PAPER_RADIUS_ERROR_MM = 3.0  # paper 001, table 2: RANSAC keeps radii within 0-3
 
 @dataclass(frozen=True)
 class _Row:
-    """One row of the Result, less the cloud's origin; without a sphere it was not found, for the ``reason``."""
+    """One row of the result, less the cloud's origin; without a sphere it was not found, for the ``reasons``."""
 
     id: int
     nominal: float
@@ -40,8 +40,8 @@ class _Row:
     points: int = 0
     visible: float = 0.0
     rms: float = NAN
-    flag: str = "not-found"
-    reason: str = ""
+    flag: Flag = Flag.NOT_FOUND
+    reasons: tuple[Reason, ...] = ()
     stations: int = 0  # number that saw it; 0 = unknown
     bound: Floats = field(default_factory=lambda: np.full((4, 4), NAN))  # Cramér-Rao, of x, y, z, radius
 
@@ -61,7 +61,7 @@ def fit_nodes(cloud: MergedCloud, design: FrameDesign, params: Params, limits: T
         _fit_node(int(design.ids[i]), nodes[i], float(design.radii[i]), cloud.points[crop], params, limits)
         for i, crop in enumerate(crops)
     ]
-    return _result(rows, cloud.origin, params, "covariances are formal: bias by sleeves and mixed pixels is left out")
+    return _result(rows, cloud.origin, params, (reason("spheres.formal-covariances"),))
 
 
 def fit_points(
@@ -72,19 +72,19 @@ def fit_points(
     origin: Floats,
     params: Params,
     limits: Tolerance,
-    message: str,
+    reasons: tuple[Reason, ...],
 ) -> Result:
     """Fit a sphere to each set of points (n, 3), given less nodes (k, 3), by one of the paper's methods."""
     rows = [
         _fit_node(id_, node, size, crop + node, params, limits)
         for id_, node, size, crop in zip(ids.tolist(), nodes, nominal.tolist(), points, strict=True)
     ]
-    return _result(rows, origin, params, message)
+    return _result(rows, origin, params, reasons)
 
 
 def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Params, limits: Tolerance) -> _Row:
     if len(crop) < 4:
-        return _Row(id_, nominal, None, len(crop), reason=f"{len(crop)} points in the crop; a sphere needs 4")
+        return _missing(id_, nominal, len(crop), reason("spheres.few-crop-points", points=len(crop)))
     on: Mask = np.ones(len(crop), bool)
     sphere: Sphere | None
     if params.method == "least-squares":
@@ -95,15 +95,19 @@ def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Para
         sphere = None if consensus is None else consensus.sphere
         on = on if consensus is None else consensus.inliers
     if sphere is None:
-        return _Row(id_, nominal, None, len(crop), reason="the points of the crop determine no sphere")
+        return _missing(id_, nominal, len(crop), reason("spheres.no-sphere"))
     reach = nominal + params.crop_margin_mm
     away = float(np.linalg.norm(sphere.centre))
     if away > reach or sphere.radius > 2.0 * reach:
-        reason = f"the fit left the crop: centre {away:.0f} mm off, radius {sphere.radius:.0f} mm"
-        return _Row(id_, nominal, None, int(on.sum()), reason=reason)
+        cause = reason("spheres.fit-left-crop", distance=away, radius=sphere.radius)
+        return _missing(id_, nominal, int(on.sum()), cause)
     share = float(on.mean()) if params.method == "ransac" else 1.0
     placed = Sphere(sphere.centre + node, sphere.radius, sphere.covariance)
     return _assessed(id_, nominal, placed, crop[on], share, params, limits)
+
+
+def _missing(id_: int, nominal: float, points: int, cause: Reason) -> _Row:
+    return _Row(id=id_, nominal=nominal, sphere=None, points=points, reasons=(cause,))
 
 
 def _assessed(
@@ -113,31 +117,31 @@ def _assessed(
     visible = visible_fraction(points, sphere.centre)
     rms = float(np.sqrt(np.mean(sphere.residuals(points) ** 2)))
     sd = float(np.sqrt(sphere.covariance[3, 3]))
-    strange = unit_mistakes.implausible(sphere.radius)
-    doubts = [
-        text
-        for doubtful, text in (
-            (len(points) < params.min_points, f"{len(points)} points, fewer than {params.min_points}"),
-            (visible < LEAST_VISIBLE, f"{visible:.0%} of the surface seen"),
-            (share < LEAST_INLIERS, f"{share:.0%} of the points around lie on it"),
-            (not sd <= LARGEST_SD * sphere.radius, f"ill-conditioned: sd of the radius {sd:.1f} mm"),
-            (bool(strange), strange),
-            (rms > LARGEST_RMS * sphere.radius, f"not round: residuals of {rms:.1f} mm rms"),
-        )
-        if doubtful
-    ]
-    flag = "low-confidence" if doubts else "ok"
+    implausible = unit_mistakes.implausible(sphere.radius)
+    doubts = []
+    if len(points) < params.min_points:
+        doubts.append(reason("spheres.few-points", points=len(points), least=params.min_points))
+    if visible < LEAST_VISIBLE:
+        doubts.append(reason("spheres.little-visible", share=visible))
+    if share < LEAST_INLIERS:
+        doubts.append(reason("spheres.few-inliers", share=share))
+    if not sd <= LARGEST_SD * sphere.radius:
+        doubts.append(reason("spheres.uncertain-radius", sd=sd))
+    if implausible is not None:
+        doubts.append(implausible)
+    if rms > LARGEST_RMS * sphere.radius:
+        doubts.append(reason("spheres.large-residuals", rms=rms))
+    flag = Flag.LOW_CONFIDENCE if doubts else Flag.OK
     error = sphere.radius - nominal
     below, above = blank_tolerance(nominal, limits)
     if not doubts and not np.isnan(nominal) and not -below <= error <= above:
         # The interval is formal: a size is wrong only beyond the errors that the method is known to have.
         margin = max(NORMAL_95 * sd, PAPER_RADIUS_ERROR_MM)
-        message = beyond(sphere.radius, nominal, margin, limits)
-        if params.method == "ransac" and message:
-            flag, doubts = "wrong-size", [message]
+        wrong = beyond(sphere.radius, nominal, margin, limits)
+        if params.method == "ransac" and wrong is not None:
+            flag, doubts = Flag.WRONG_SIZE, [wrong]
         elif params.method == "least-squares":
-            flag = "low-confidence"
-            doubts = [f"radius {error:+.1f} mm from nominal: this method cannot tell a wrong size from sleeves"]
+            flag, doubts = Flag.LOW_CONFIDENCE, [reason("spheres.size-or-sleeves", error=error)]
     return _Row(
         id=id_,
         nominal=nominal,
@@ -146,7 +150,7 @@ def _assessed(
         visible=visible,
         rms=rms,
         flag=flag,
-        reason="; ".join(doubts),
+        reasons=tuple(doubts),
     )
 
 
@@ -161,29 +165,21 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     fixed = _generator(replace(params, seed=0), "search")
     candidates = sphere_search.find_balls(cloud.points, fixed, params.max_balls, least, radius, cloud.scanner)
     if not candidates:
-        message = (
-            f"no ball stands out of {len(cloud.points)} points; a whole frame needs a design (design.json) with this "
-            "method: its balls are too small a share of the cloud to search for"
-        )
-        return Result("failed", params.method, message)
+        return Result(Status.FAILED, params.method, (reason("spheres.no-ball", points=len(cloud.points)),))
     rows = [_searched(id_, candidate, cloud, params) for id_, candidate in enumerate(candidates)]
-    messages = ["searched without a design"]
+    messages = [reason("spheres.searched")]
     if params.method == "least-squares":
-        messages.append("algebraic least squares on the points found to lie on each ball")
+        messages.append(reason("spheres.algebraic-fit"))
     elif cloud.scanner is None:
-        messages.append(
-            "robust fit of orthogonal distances, for the scanner's position is unknown: range noise biases them"
-        )
+        messages.append(reason("spheres.robust-distances"))
     else:
-        messages.append("robust fit of ranges from the known scanner positions")
+        messages.append(reason("spheres.robust-ranges"))
     if radius is not None:
-        messages.append(f"radius held at {radius:g} mm, its covariance is 0")
+        messages.append(reason("spheres.radius-held", radius=radius))
     complete = len(candidates) < params.max_balls
     if not complete:
-        messages.append(
-            f"stopped at {len(candidates)} balls (max_balls), there may be more: a whole frame needs a design"
-        )
-    result = _result(rows, cloud.origin, params, "; ".join(messages), complete)
+        messages.append(reason("spheres.most-balls", balls=len(candidates)))
+    result = _result(rows, cloud.origin, params, tuple(messages), complete)
     return _with_bounds(result, rows) if params.method == "ray" else result
 
 
@@ -193,7 +189,7 @@ def _searched(id_: int, candidate: sphere_search.Found, cloud: MergedCloud, para
     if params.method == "least-squares":
         sphere = algebraic(on)
     if sphere is None:
-        return _Row(id_, NAN, None, len(on), reason="the points determine no sphere")
+        return _missing(id_, NAN, len(on), reason("spheres.no-sphere"))
     row = _assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
     if params.method == "least-squares":
         return row
@@ -203,16 +199,15 @@ def _searched(id_: int, candidate: sphere_search.Found, cloud: MergedCloud, para
     return replace(row, stations=stations, bound=least)
 
 
-def _result(rows: list[_Row], origin: Floats, params: Params, message: str, complete: bool = True) -> Result:
+def _result(
+    rows: list[_Row], origin: Floats, params: Params, reasons: tuple[Reason, ...], complete: bool = True
+) -> Result:
     nowhere = Sphere(np.full(3, NAN), NAN, np.full((4, 4), NAN))
     spheres = [nowhere if row.sphere is None else row.sphere for row in rows]
     centres = np.array([sphere.centre + origin for sphere in spheres]).reshape(-1, 3)
     radii = np.array([sphere.radius for sphere in spheres])
     fitted = sum(row.sphere is not None for row in rows)
-    return Result(
-        status="failed" if fitted == 0 else "ok" if complete and fitted == len(rows) else "partial",
-        method=params.method,
-        message=message,
+    balls = Balls(
         ids=np.array([row.id for row in rows], np.int64),
         centres=centres,
         radii=radii,
@@ -223,26 +218,30 @@ def _result(rows: list[_Row], origin: Floats, params: Params, message: str, comp
         visible_fraction=np.array([row.visible for row in rows]),
         rms=np.array([row.rms for row in rows]),
         nominal_radii=np.array([row.nominal for row in rows]),
-        evidence=("ball",) * len(rows),
+        evidence=(Evidence.BALL,) * len(rows),
         flag=tuple(row.flag for row in rows),
-        reason=tuple(row.reason for row in rows),
+        reasons=tuple(row.reasons for row in rows),
+        verdict=(Verdict.NONE,) * len(rows),
     )
+    status = Status.FAILED if fitted == 0 else Status.OK if complete and fitted == len(rows) else Status.PARTIAL
+    return Result(status=status, method=params.method, reasons=reasons, balls=balls)
 
 
 def _with_bounds(result: Result, rows: list[_Row]) -> Result:
     """Add the Cramér-Rao bounds of each sphere, and the efficiencies."""
-    bounds = np.array([row.bound for row in rows])
+    balls, bounds = result.balls, np.array([row.bound for row in rows])
     down = np.array([0.0, 0.0, 1.0, -1.0])
-    variance, least = (np.einsum("kii->ki", C) for C in (result.covariance, bounds))
+    variance, least = (np.einsum("kii->ki", C) for C in (balls.covariance, bounds))
     least_lowest = np.sqrt(np.einsum("i,kij,j->k", down, bounds, down))
     with np.errstate(invalid="ignore", divide="ignore"):
         centre = np.sqrt(least[:, :3].sum(axis=1) / variance[:, :3].sum(axis=1))
-        efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / result.lowest_sd], axis=1)
-    return replace(
-        result,
+        efficiency = np.stack([centre, np.sqrt(least[:, 3] / variance[:, 3]), least_lowest / balls.lowest_sd], axis=1)
+    balls = replace(
+        balls,
         sizes=np.full(len(rows), NAN),
         axes=np.zeros(len(rows), np.int64),
         stations=np.array([row.stations for row in rows], np.int64),
         bound_sd=np.column_stack([np.sqrt(least), least_lowest]),
         efficiency=efficiency,
     )
+    return replace(result, balls=balls)

@@ -9,9 +9,10 @@ import numpy.typing as npt
 from scipy.special import chdtrc
 
 from processor.limits import standards
-from processor.model import NORMAL_95, Floats, Tolerance
+from processor.model import NORMAL_95, Floats, Reason, Tolerance, reason
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.members.records import Nodes
+from processor.space_frame.result import Evidence, Flag
 from processor.space_frame.spheres.final_fit import BANDS, SECTORS
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
@@ -28,7 +29,6 @@ from processor.space_frame.spheres.records import (
 
 Bools = npt.NDArray[np.bool_]
 
-AMBIGUOUS_DESIGN = "ambiguous which ball of the design this is, and these differ in size: none is called wrong"
 LEAST_POINTS = 8
 LARGEST_LOWEST_SD_MM = 0.8  # an error of 3 mm is then nearly four standard deviations
 LARGEST_RADIUS_SD = 0.05
@@ -63,9 +63,9 @@ class Conditions:
 
 
 def assess(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -> Spheres:
-    """Return the spheres with evidence, flag and reason; ``expected`` (k,) are nominal radii, NaN = none."""
+    """Return the spheres with evidence, flag and reasons; ``expected`` (k,) are nominal radii, NaN = none."""
     state, covariance = _states(fits, nodes, expected, conditions)
-    evidence, flags, reasons = _verdicts(fits, nodes, expected, conditions, state, covariance)
+    evidence, flags, reasons = _assessments(fits, nodes, expected, conditions, state, covariance)
     centres = nodes.positions + state[:, :3]
     bound = fits.bound
     lowest_sd = np.sqrt(np.einsum("i,kij,j->k", DOWN, covariance, DOWN))
@@ -96,11 +96,11 @@ def assess(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -
         expected=expected,
         evidence=tuple(evidence),
         flag=tuple(flags),
-        reason=tuple(reasons),
+        reasons=tuple(reasons),
         noise=conditions.noise,
         radius_sd=conditions.radius_sd,
         station_sd=conditions.station_sd,
-        message=_message(conditions),
+        messages=_messages(conditions),
     )
 
 
@@ -123,81 +123,85 @@ def _states(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) 
     return state, covariance
 
 
-def _verdicts(
+def _assessments(
     fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions, state: Floats, covariance: Floats
-) -> tuple[list[str], list[str], list[str]]:
-    """Evidence, flag and reason of each node."""
+) -> tuple[list[Evidence], list[Flag], list[tuple[Reason, ...]]]:
+    """Evidence, flag and reasons of each node."""
     sized = len(conditions.catalogue.radii) > 0
     axes_known = np.asarray(np.isfinite(nodes.covariance).all(axis=(1, 2)))
     agreement = agreements(fits, nodes, conditions.radius_sd if sized else np.inf)
     margin = fits.margin
-    evidence, flags, reasons = [], [], []
+    evidence: list[Evidence] = []
+    flags: list[Flag] = []
+    reasons: list[tuple[Reason, ...]] = []
     for i, fitted in enumerate(fits.fitted.tolist()):
         if not fitted:
-            flag, reason = _without_points(int(nodes.axes[i]), bool(axes_known[i]), bool(np.isfinite(expected[i])))
-            evidence.append("axes")
+            flag, causes = _without_points(int(nodes.axes[i]), bool(axes_known[i]), bool(np.isfinite(expected[i])))
+            evidence.append(Evidence.AXES)
         else:
-            evidence.append("fused" if axes_known[i] and fits.numbers[i, CENTRE_CHI2] > 0.0 else "ball")
+            fused = axes_known[i] and fits.numbers[i, CENTRE_CHI2] > 0.0
+            evidence.append(Evidence.FUSED if fused else Evidence.BALL)
             doubts = _doubts(fits, i, margin[i], state[i], covariance[i])
-            flag, reason = _verdict(
+            flag, causes = _assessment(
                 doubts, state[i], float(np.sqrt(covariance[i, 3, 3])), fits.sizes[i], expected[i],
                 bool(agreement[i] < UNLIKELY), conditions,
             )  # fmt: skip
         flags.append(flag)
-        reasons.append(reason)
+        reasons.append(causes)
     return evidence, flags, reasons
 
 
-def _without_points(axes: int, axes_known: bool, radius_known: bool) -> tuple[str, str]:
-    """Flag and reason of a node whose sphere no point lies on."""
+def _without_points(axes: int, axes_known: bool, radius_known: bool) -> tuple[Flag, tuple[Reason, ...]]:
+    """Flag and reasons of a node whose sphere no point lies on."""
     if not axes_known or axes < 2:
-        return "not-found", "no ball seen, and no two axes that fix the node"
-    source = "the radius is the design's" if radius_known else "the radius is unknown"
-    return "low-confidence", f"no ball seen, known from {axes} axes alone; {source}"
+        return Flag.NOT_FOUND, (reason("spheres.no-ball-no-axes"),)
+    source = reason("spheres.nominal-radius") if radius_known else reason("spheres.unknown-radius")
+    return Flag.LOW_CONFIDENCE, (reason("spheres.axes-alone", axes=axes), source)
 
 
-def _doubts(fits: Fits, i: int, margin: float, state: Floats, C: Floats) -> list[str]:
+def _doubts(fits: Fits, i: int, margin: float, state: Floats, C: Floats) -> list[Reason]:
     """Reasons against relying on fit ``i``, from its points alone."""
     n, scale = int(fits.numbers[i, POINTS]), fits.numbers[i, SCALE]
     lowest_sd = float(np.sqrt(max(C[2, 2] + C[3, 3] - 2.0 * C[2, 3], 0.0)))
-    doubts: list[str] = []
+    doubts: list[Reason] = []
     if n < LEAST_POINTS:
-        doubts.append(f"{n} points, fewer than {LEAST_POINTS}")
+        doubts.append(reason("spheres.few-points", points=n, least=LEAST_POINTS))
     if not lowest_sd <= LARGEST_LOWEST_SD_MM:
-        doubts.append(f"ill-conditioned: sd of the lowest point {lowest_sd:.1f} mm")
+        doubts.append(reason("spheres.uncertain-lowest-point", sd=lowest_sd))
     if not np.sqrt(C[3, 3]) <= LARGEST_RADIUS_SD * state[3]:
-        doubts.append(f"ill-conditioned: sd of the radius {np.sqrt(C[3, 3]):.1f} mm")
+        doubts.append(reason("spheres.uncertain-radius", sd=np.sqrt(C[3, 3])))
     if margin < AMBIGUOUS + (FEW_MARGIN if n < FEW else 0.0):
-        doubts.append(f"size ambiguous: {fits.second[i]:.0f} mm fits nearly as well ({margin:.0f})")
+        doubts.append(reason("spheres.ambiguous-size", size=fits.second[i], margin=margin))
     if scale > LARGEST_SCALE:
-        doubts.append(f"not round: residuals {scale:.1f} times the noise of all balls")
+        doubts.append(reason("spheres.not-round", times=scale))
     return doubts
 
 
-def _verdict(
-    doubts: list[str],
+def _assessment(
+    doubts: list[Reason],
     state: Floats,
     radius_sd: float,
     size: float,
     expected: float,
     disagrees: bool,
     conditions: Conditions,
-) -> tuple[str, str]:
-    """Flag and reason of a fitted sphere, by its doubts, its priors (``disagrees``) and its nominal radius."""
+) -> tuple[Flag, tuple[Reason, ...]]:
+    """Flag and reasons of a fitted sphere, by its doubts, its priors (``disagrees``) and its nominal radius."""
     catalogue = conditions.catalogue
     away, off = float(np.linalg.norm(state[:3])), float(state[3] - size)
     if not doubts and _unlisted(disagrees, off, conditions.radius_sd, catalogue):
-        message = beyond(state[3], expected, NORMAL_95 * radius_sd, conditions.limits)
-        if message:
-            return "wrong-size", message
-    if disagrees:
-        sized = f" and its radius off the size by {off:+.1f} mm" if len(catalogue.radii) else ""
-        doubts = [*doubts, f"ball and axes disagree: centres {away:.1f} mm apart{sized}"]
+        wrong = beyond(state[3], expected, NORMAL_95 * radius_sd, conditions.limits)
+        if wrong is not None:
+            return Flag.WRONG_SIZE, (wrong,)
+    if disagrees and len(catalogue.radii):
+        doubts = [*doubts, reason("spheres.axes-and-size-disagree", distance=away, off=off)]
+    elif disagrees:
+        doubts = [*doubts, reason("spheres.axes-disagree", distance=away)]
     if doubts:
-        return "low-confidence", "; ".join(doubts)
+        return Flag.LOW_CONFIDENCE, tuple(doubts)
     if np.isfinite(expected) and len(catalogue.radii) and size != expected:
-        return "wrong-size", f"size {size:g} mm instead of {expected:g} mm"
-    return "ok", ""
+        return Flag.WRONG_SIZE, (reason("spheres.other-size", size=size, nominal=expected),)
+    return Flag.OK, ()
 
 
 def _unlisted(disagrees: bool, off: float, radius_sd: float, catalogue: Catalogue) -> bool:
@@ -211,24 +215,18 @@ def _unlisted(disagrees: bool, off: float, radius_sd: float, catalogue: Catalogu
     return disagrees and abs(off) > UNLISTED * radius_sd
 
 
-def _message(conditions: Conditions) -> str:
-    """Return the message about all spheres of a fit."""
+def _messages(conditions: Conditions) -> tuple[Reason, ...]:
+    """Return the reasons that are about all spheres of a fit."""
     offset, offset_sd = conditions.radius_offset
     catalogue = conditions.catalogue
-    message = (
-        "ranges from the known scanners"
-        if conditions.rays
-        else "orthogonal distances, for the scanners are unknown: the bias of range noise stands, from none to that of "
-        "noise in all directions; the middle is taken off, the rest is in the intervals"
-    )
+    messages = [reason("spheres.ranges") if conditions.rays else reason("spheres.orthogonal-distances")]
     if conditions.station_sd > 0.0:
-        message += f"; stations disagree by {conditions.station_sd:.1f} mm an axis (sd), which every covariance holds"
+        messages.append(reason("spheres.stations-disagree", sd=conditions.station_sd))
     if abs(offset) > SURE * offset_sd:
-        message += f"; radii lie {offset:+.2f} mm off their sizes on the whole, as where all ranges err alike or "
-        message += "the beam is wide: their intervals hold that"
+        messages.append(reason("spheres.radius-offset", offset=offset))
     if len(catalogue.radii) and not catalogue.verified:
-        message += f"; the catalogue of radii ({catalogue.name}) was not held against a published one"
-    return message
+        messages.append(reason("spheres.unverified-catalogue", catalogue=catalogue.name))
+    return tuple(messages)
 
 
 def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:
@@ -264,20 +262,20 @@ def agreements(fits: Fits, nodes: Nodes, radius_sd: float) -> Floats:
 def with_shared_offset(spheres: Spheres, covariance: Floats) -> Spheres:
     """Flag spheres whose lowest points are too uncertain with a further covariance (k, 3, 3) of their centres."""
     sd = np.sqrt(spheres.lowest_sd**2 + covariance[:, 2, 2])
-    rows = [i for i, flag in enumerate(spheres.flag) if flag == "ok" and not sd[i] <= LARGEST_LOWEST_SD_MM]
-    flags, reasons = list(spheres.flag), list(spheres.reason)
+    rows = [i for i, flag in enumerate(spheres.flag) if flag is Flag.OK and not sd[i] <= LARGEST_LOWEST_SD_MM]
+    flags, reasons = list(spheres.flag), list(spheres.reasons)
     for i in rows:
-        flags[i] = "low-confidence"
-        reasons[i] = f"what all ranges may be off alike leaves an sd of the lowest point of {sd[i]:.1f} mm"
-    return replace(spheres, flag=tuple(flags), reason=tuple(reasons))
+        flags[i] = Flag.LOW_CONFIDENCE
+        reasons[i] = (reason("spheres.common-offset", sd=sd[i]),)
+    return replace(spheres, flag=tuple(flags), reasons=tuple(reasons))
 
 
 def with_ambiguous_design(spheres: Spheres, rows: Bools) -> Spheres:
     """Add a reason to spheres (k,) for which poses of the design give different nominal radii: none is wrong then."""
-    reasons = list(spheres.reason)
+    reasons = list(spheres.reasons)
     for i in np.flatnonzero(rows).tolist():
-        reasons[i] = "; ".join(filter(None, (reasons[i], AMBIGUOUS_DESIGN)))
-    return replace(spheres, reason=tuple(reasons))
+        reasons[i] = (*reasons[i], reason("spheres.ambiguous-node"))
+    return replace(spheres, reasons=tuple(reasons))
 
 
 # --- deviation of a radius from the nominal one, by a standard's limits on the blank's diameter ----------------------
@@ -296,10 +294,10 @@ def blank_tolerance(radius: float, limits: Tolerance) -> tuple[float, float]:
     return NAN, NAN
 
 
-def beyond(radius: float, nominal: float, margin: float, limits: Tolerance) -> str:
-    """Return a message if a radius exceeds the blank's tolerance by more than ``margin`` mm; else an empty text."""
+def beyond(radius: float, nominal: float, margin: float, limits: Tolerance) -> Reason | None:
+    """Return a reason if a radius exceeds the blank's tolerance by more than ``margin`` mm; else None."""
     below, above = blank_tolerance(nominal, limits)
     error = radius - nominal
     if not (error < -below - margin or error > above + margin):
-        return ""
-    return f"radius {error:+.1f} mm from nominal, beyond the blank's +{above:g}/-{below:g} by {margin:.1f} mm"
+        return None
+    return reason("spheres.beyond-blank", error=error, above=above, below=below, margin=margin)

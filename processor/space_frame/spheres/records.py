@@ -8,7 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Checked, Floats, Ints, Labels, column, names
+from processor.model import Checked, Floats, Ints, Labels, Reason, column, described, reasons, words
+from processor.space_frame.result import Evidence, Flag
 
 AMBIGUOUS = 14.0  # in chi-square: below it the runner-up's size is more than a thousandth as likely
 POINTS, CELLS, STATIONS, RMS, SCALE, DEGREES, CENTRE_CHI2, FITTED = range(8)  # columns of ``Fits.numbers``
@@ -133,7 +134,7 @@ class Spheres(Checked):
 
     ``covariance`` is of x, y, z and radius. ``bound`` is the least covariance of any unbiased estimate from these
     points and priors (Cramér and Rao), the stations being fixed; ``efficiency_*`` is the bound's standard deviation
-    over the stated one. ``evidence``: ball (its points alone) | fused (with the axes) | axes (no points).
+    over the stated one. ``reasons`` are those of each sphere, ``messages`` those of all.
     """
 
     centres: Floats = column("k", 3)
@@ -156,10 +157,10 @@ class Spheres(Checked):
     second_sizes: Floats = column("k")
     margin: Floats = column("k")  # energy by which the second size loses
     expected: Floats = column("k")  # nominal radii given, NaN = none
-    evidence: tuple[str, ...] = names("k")
-    flag: tuple[str, ...] = names("k")  # ok | low-confidence | wrong-size | not-found
-    reason: tuple[str, ...] = names("k")
+    evidence: tuple[Evidence, ...] = words("k", Evidence)
+    flag: tuple[Flag, ...] = words("k", Flag)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("k")
     noise: Floats = column(3)  # variance of a range: constant, by range^2 / cosine, by tangent^2
     radius_sd: float = float("nan")  # scatter of radii about their sizes
     station_sd: float = float("nan")  # of each station's place along each axis, from the spheres; NaN = it was given
-    message: str = ""
+    messages: tuple[Reason, ...] = described((), reasons="")

@@ -10,15 +10,15 @@ import numpy as np
 from numba import njit
 
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints
+from processor.model import Floats, Ints, reason
 from processor.space_frame.points.source import Source
+from processor.space_frame.result import Evidence, Flag
 from processor.space_frame.spheres.records import Spheres
 
 CORE = 0.7  # of the radius: rays that pass the centre within this meet the sphere in spite of noise
 CLEAR = 1.5  # radii before or behind the centre: a ray that ends there does not end on the sphere
 LEAST_RAYS = 5
 UNKNOWN_RADIUS_MM = 40.0  # where neither design nor catalogue gives one
-MISSING = "not-found"
 
 
 def rays(source: Source, places: Floats, radii: Floats) -> Ints:
@@ -61,20 +61,20 @@ def classified(spheres: Spheres, source: Source, smallest_mm: float) -> Spheres:
     A sphere is not found where rays passed through its place: its node is known from the axes, but the sphere is
     missing. ``smallest_mm`` is the radius taken where none is expected; NaN = unknown.
     """
-    without_points = [evidence == "axes" and flag != MISSING
+    without_points = [evidence is Evidence.AXES and flag is not Flag.NOT_FOUND
                       for evidence, flag in zip(spheres.evidence, spheres.flag, strict=True)]  # fmt: skip
     rows = np.flatnonzero(np.array(without_points, bool))
     if not len(rows) or not len(source.scanners):
         return spheres
     radii = np.where(np.isfinite(spheres.expected[rows]), spheres.expected[rows], smallest_mm)
     counts = rays(source, spheres.centres[rows], np.where(np.isfinite(radii), radii, UNKNOWN_RADIUS_MM))
-    flags, reasons = list(spheres.flag), list(spheres.reason)
+    flags, reasons = list(spheres.flag), list(spheres.reasons)
     for row, (before, at, beyond) in zip(rows.tolist(), counts.tolist(), strict=True):
         if beyond >= max(LEAST_RAYS, at):
-            flags[row] = MISSING
-            reasons[row] += f"; it is missing: {beyond} rays went through where it should be"
+            flags[row] = Flag.NOT_FOUND
+            reasons[row] += (reason("spheres.missing", rays=beyond),)
         elif before >= LEAST_RAYS and before > at:
-            reasons[row] += "; what stands before it hides it"
+            reasons[row] += (reason("spheres.hidden"),)
         elif before + at + beyond < LEAST_RAYS:
-            reasons[row] += "; hardly a ray was measured its way"
-    return replace(spheres, flag=tuple(flags), reason=tuple(reasons))
+            reasons[row] += (reason("spheres.few-rays"),)
+    return replace(spheres, flag=tuple(flags), reasons=tuple(reasons))

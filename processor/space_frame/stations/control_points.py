@@ -10,7 +10,7 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from processor.geometry import rigid
-from processor.model import Checked, Floats, Ints, column, names
+from processor.model import Checked, Floats, Ints, Reason, column, names, reason
 from processor.space_frame.stations.normal_equations import cholesky, product, solve
 from processor.space_frame.stations.residual_kernels import STATION
 
@@ -121,7 +121,7 @@ class Doubt:
 
     kept: Bools
     off: Floats
-    said: tuple[str, ...] = ()
+    reasons: tuple[Reason, ...] = ()
 
 
 Solved = Callable[[ControlPoints], tuple[Floats, Floats]]
@@ -134,7 +134,7 @@ def doubted(control: ControlPoints, x: Floats, places: Floats, solved: Solved) -
     ``solved`` gives change (7 s,) and covariance of the stations' unknowns with some sightings alone. Where it cannot
     be told which target is wrong, all are kept, and what the worst lies off is returned.
     """
-    kept, said = np.ones(len(control.ids), bool), []
+    kept, reasons = np.ones(len(control.ids), bool), []
     while kept.any():
         worst, ratio, off = _worst(control, kept, x, places, solved)
         if ratio <= 1.0:
@@ -142,9 +142,8 @@ def doubted(control: ControlPoints, x: Floats, places: Floats, solved: Solved) -
         stray = _stray(control, kept, worst, x, places, solved)
         if stray:
             for row, away in stray:
-                name, scan = control.ids[row], control.scans[row]
-                said.append(
-                    f"sighting of control point {name} by {scan} left out: {away:.2g} mm off what the others say"
+                reasons.append(
+                    reason("spheres.sighting-left-out", point=control.ids[row], scan=control.scans[row], off=away)
                 )
                 kept[row] = False
             continue
@@ -155,14 +154,18 @@ def doubted(control: ControlPoints, x: Floats, places: Floats, solved: Solved) -
             number = without[0] if without else worst
             name = control.ids[int(np.argmax(control.points == number))]
             size = _apart(control, kept, control.points == number, x, places, solved)[1]
-            said.append(f"control point {name} left out: {np.linalg.norm(size):.2g} mm off what the others say")
+            reasons.append(reason("spheres.control-left-out", point=name, off=np.linalg.norm(size)))
             kept = kept & (control.points != number)
             continue
         name = control.ids[int(np.argmax(control.points == worst))]
-        others = "the other control points and the stations" if remain else "the stations"
-        what = f"control point {name} and {others} contradict each other by {np.linalg.norm(off):.2g} mm"
-        return Doubt(kept, off, (*said, f"{what}, and it cannot be told which is wrong: intervals hold that"))
-    return Doubt(kept, np.zeros(3), tuple(said))
+        values = {"point": name, "off": float(np.linalg.norm(off))}
+        contradiction = (
+            reason("spheres.control-contradicts", **values)
+            if remain
+            else reason("spheres.control-contradicts-stations", **values)
+        )
+        return Doubt(kept, off, (*reasons, contradiction))
+    return Doubt(kept, np.zeros(3), tuple(reasons))
 
 
 def _worst(control: ControlPoints, kept: Bools, x: Floats, places: Floats, solved: Solved) -> tuple[int, float, Floats]:

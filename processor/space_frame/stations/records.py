@@ -7,10 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Checked, Floats, Ints, Labels, column, names
+from processor.model import Checked, Floats, Ints, Labels, Reason, Word, column, described, names, reasons
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
 from processor.space_frame.stations.posterior import common_motion, mean_gain
+
+
+class StationStatus(Word):
+    """How far the corrections of the stations can be relied on."""
+
+    OK = "ok"
+    WEAK = "weak"  # tubes and control points do not determine all of them
+    SINGLE = "single"  # there is one station
+    UNKNOWN = "unknown"  # the stations have no tube in common
+    DOUBTFUL = "doubtful"  # the beam's width may explain the stations' errors
 
 
 @dataclass(frozen=True)
@@ -37,8 +47,8 @@ class Stations(Checked):
     common to all; NaN where it is unknown.
     """
 
-    status: str  # ok | weak | single | unknown | doubtful: the beam's width may explain the stations' errors
-    message: str
+    status: StationStatus = described(words=StationStatus)
+    messages: tuple[Reason, ...] = described((), reasons="")  # about all stations
     T_project_station: Floats = column("s", 4, 4)
     places: Floats = column("s", 3)
     covariance: Floats = column("p", "p")
@@ -48,13 +58,13 @@ class Stations(Checked):
     range_offset_sd: float = float("nan")  # of all stations, as scanned
     shared_offset_sd: float = 0.0  # of an error common to all ranges, by an offset or a wide beam; in no covariance
     observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
-    weak: tuple[str, ...] = names("s")  # motions of a station that the tubes do not determine; empty = none
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("s")  # why a station's correction is weak
     range_sd: Floats = column("s")  # scale of the residuals along the ray, mm
     floor_mm: float = 0.0  # sd by which an observation of a tube deviates beyond the points' noise
     axis_points: Floats = column("m", 3)  # of the tubes after the corrections, and their directions and radii
     axis_directions: Floats = column("m", 3)
     axis_radii: Floats = column("m")
-    datum: str = ""  # what fixes all stations together, and its uncertainty
+    datum: tuple[Reason, ...] = described((), reasons="")  # what fixes all stations together, and its uncertainty
     control: tuple[str, ...] = names("c")  # control points, a row a sighting
     control_scan: tuple[str, ...] = names("c")  # the stations that saw them
     control_off: Floats = column("c", 3)  # target minus sighting after the corrections

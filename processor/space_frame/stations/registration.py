@@ -19,12 +19,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Floats, Ints
+from processor.model import Floats, Ints, Reason, reason
+from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
 from processor.space_frame.stations.control_points import ControlPoints, Doubt
 from processor.space_frame.stations.posterior import Posterior, common_motion, corrections
-from processor.space_frame.stations.records import Stations, TubePoints
+from processor.space_frame.stations.records import Stations, StationStatus, TubePoints
 
 Bools = npt.NDArray[np.bool_]
 
@@ -45,7 +46,6 @@ WEAK_MM, WEAK_RAD = 0.1, 1e-5  # a motion of a smaller sd is not weak
 REPORTED_MM = 0.3  # offset of all ranges that is reported
 WIDE_MM = 0.5  # offset of all ranges beyond which a wide beam may explain the stations' errors
 WEAK_SHARE = 0.5  # of the prior variance remaining: the motion is weakly determined
-MOTIONS = ("turn about x", "turn about y", "turn about z", "shift along x", "shift along y", "shift along z")
 
 
 @dataclass(frozen=True)
@@ -77,15 +77,16 @@ def register(
     """
     count = len(scanners)
     if count < 2 and control is None:
-        return _unmoved("single", "one station: its frame is the datum", scanners, axis_points, axis_directions, radii)
+        return _unmoved(
+            StationStatus.SINGLE, reason("spheres.one-station"), scanners, axis_points, axis_directions, radii
+        )
     order, pair_start = kernels.grouped(points.start, points.station.astype(np.int64), count, MOST_STATIONS)
     layout = _layout(pair_start, count, len(axis_points))
     shared = np.diff(layout.of_tube)[layout.tube] > 1
     if not shared.any() and control is None:
         return _unmoved(
-            "unknown", "no tube is seen from two stations: nothing tells how they lie to each other", scanners,
-            axis_points, axis_directions, radii,
-        )  # fmt: skip
+            StationStatus.UNKNOWN, reason("spheres.no-common-tube"), scanners, axis_points, axis_directions, radii
+        )
     ordered = np.ascontiguousarray(points.points[order])
     start = np.append(layout.start[layout.of_tube[:-1]], layout.start[-1])
     axes = _axes(ordered, start, axis_points, axis_directions, radii)
@@ -238,21 +239,19 @@ def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
     places, count = posterior.places, len(posterior.places)
     before_rad, before_mm, offset_mm = np.sqrt(posterior.variance).tolist()
     weak = _weak_motions(C, posterior)
-    message = [f"stations lay {before_mm:.2g} mm and {1e3 * before_rad:.2g} mrad (sd an axis) off before"]
+    messages = [reason("spheres.stations-before", mm=before_mm, mrad=1e3 * before_rad)]
     if abs(shared) > REPORTED_MM:
-        message.append(
-            f"an offset of {shared:+.1f} mm that all ranges seem to share is not applied: a wide beam looks alike"
-        )
-    message += [f"station {i}: {what} hardly told by the tubes" for i, what in enumerate(weak) if what]
+        messages.append(reason("spheres.range-offset", offset=shared))
+    messages += [reason("spheres.weak-station", station=i, motions=motions) for i, motions in enumerate(weak) if motions]
     spread = float(np.std(x[6 :: kernels.STATION], ddof=1)) / np.sqrt(count) if count > 1 else 0.0
     # The effect of a wide beam on thin tubes grows with the range; over many stations that looks like a common bend.
     beam = posterior.control is None and abs(shared) > WIDE_MM + 3.0 * spread and abs(shared) > before_mm
     if beam:
-        message.append("which explains as much as the stations seem off: they were left where they are")
+        messages.append(reason("spheres.stations-left"))
         x = np.zeros_like(x)
     return Stations(
-        status="doubtful" if beam else "weak" if any(weak) else "ok",
-        message="; ".join(message),
+        status=StationStatus.DOUBTFUL if beam else StationStatus.WEAK if any(weak) else StationStatus.OK,
+        messages=tuple(messages),
         T_project_station=corrections(x, places),
         places=places,
         covariance=C,
@@ -262,47 +261,51 @@ def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
         range_offset_sd=offset_mm,
         shared_offset_sd=abs(shared) if beam else spread,
         observations=estimate.seen_by,
-        weak=weak,
+        reasons=tuple(map(_weak, weak)),
         range_sd=estimate.scale,
         floor_mm=float(np.sqrt(estimate.floor)),
         axis_points=estimate.axes.line[:, :3],
         axis_directions=estimate.axes.line[:, 3:],
         axis_radii=estimate.axes.radius,
-        datum=_datum(posterior, before_mm),
+        datum=(_datum(posterior, before_mm),),
     )
 
 
-def _weak_motions(C: Floats, posterior: Posterior) -> tuple[str, ...]:
-    """Names of the motions of each station that the tubes hardly determine."""
+def _weak(motions: tuple[StationMotion, ...]) -> tuple[Reason, ...]:
+    return (reason("spheres.weak-motions", motions=motions),) if motions else ()
+
+
+def _weak_motions(C: Floats, posterior: Posterior) -> tuple[tuple[StationMotion, ...], ...]:
+    """Motions of each station that the tubes hardly determine."""
     count = len(posterior.places)
     variance = np.diag(C).reshape(-1, kernels.STATION)[:, :6]
     remaining = variance / np.repeat(posterior.variance[:2], 3)
     # The common motion is never determined; its share of the variance is that of one station in their number.
     bound = 1.0 / count + WEAK_SHARE * (1.0 - 1.0 / count)
     weak = (remaining > bound) & (variance > np.repeat([WEAK_RAD**2, WEAK_MM**2], 3))
-    return tuple(", ".join(name for name, is_weak in zip(MOTIONS, row, strict=True) if is_weak) for row in weak)
+    return tuple(tuple(motion for motion, is_weak in zip(StationMotion, row, strict=True) if is_weak) for row in weak)
 
 
-def _datum(posterior: Posterior, before_mm: float) -> str:
+def _datum(posterior: Posterior, before_mm: float) -> Reason:
     count = len(posterior.places)
     if posterior.control is None:
         common = np.hypot(before_mm / np.sqrt(count), posterior.datum_mm)
-        return f"mean of {count} stations, {common:.2g} mm (sd an axis): no control points"
+        return reason("spheres.datum-stations", stations=count, sd=common)
     if posterior.free:
-        return f"{posterior.control.count} control points"
-    return f"mean of {count} stations and {posterior.control.count} control points, too few to hold it alone"
+        return reason("spheres.datum-control", points=posterior.control.count)
+    return reason("spheres.datum-stations-and-control", stations=count, points=posterior.control.count)
 
 
 def _controlled(stations: Stations, x: Floats, control: ControlPoints, doubt: Doubt) -> Stations:
     """Add the deviations at the control points, and their contradictions to the covariance."""
     M = common_motion(stations.places)[:, 3:]
     shift = np.mean(x.reshape(-1, kernels.STATION)[:, 3:6], axis=0)
-    shifted = f"all stations were moved to them by {np.linalg.norm(shift):.2g} mm (mean)"
+    shifted = reason("spheres.moved-to-control", distance=np.linalg.norm(shift))
     C = stations.covariance + normals.product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
     return replace(
         stations,
-        status="weak" if doubt.off.any() else stations.status,
-        message="; ".join([stations.message, f"datum: {stations.datum}", shifted, *doubt.said]),
+        status=StationStatus.WEAK if doubt.off.any() else stations.status,
+        messages=(*stations.messages, reason("spheres.datum", datum=stations.datum), shifted, *doubt.reasons),
         covariance=C,
         control=control.ids,
         control_scan=control.scans,
@@ -311,20 +314,22 @@ def _controlled(stations: Stations, x: Floats, control: ControlPoints, doubt: Do
     )
 
 
-def _unmoved(status: str, message: str, places: Floats, at: Floats, along: Floats, radii: Floats) -> Stations:
-    count = len(places)
+def _unmoved(
+    status: StationStatus, cause: Reason, places: Floats, at: Floats, along: Floats, radii: Floats
+) -> Stations:
+    count, single = len(places), status is StationStatus.SINGLE
     return Stations(
         status=status,
-        message=message,
+        messages=(cause,),
         T_project_station=np.tile(np.eye(4), (count, 1, 1)),
         places=places,
-        covariance=np.full((kernels.STATION * count, kernels.STATION * count), 0.0 if status == "single" else np.nan),
+        covariance=np.full((kernels.STATION * count, kernels.STATION * count), 0.0 if single else np.nan),
         range_offset=np.zeros(count),
         observations=np.zeros(count, np.int64),
-        weak=("",) * count if status == "single" else (", ".join(MOTIONS),) * count,
+        reasons=(_weak(() if single else tuple(StationMotion)),) * count,
         range_sd=np.full(count, np.nan),
         axis_points=at,
         axis_directions=along,
         axis_radii=radii,
-        datum=message,
+        datum=(cause,),
     )
