@@ -11,7 +11,7 @@ import numpy as np
 from processor.model import Floats, Ints
 
 
-def write(path: Path, columns: Mapping[str, Any], faces: Ints | None = None) -> None:
+def write_columns(path: Path, columns: Mapping[str, Any], faces: Ints | None = None) -> None:
     """Write vertices from columns (n,) by name, with their types, and triangles (f, 3)."""
     from plyfile import PlyData, PlyElement
 
@@ -28,4 +28,4 @@ def write(path: Path, columns: Mapping[str, Any], faces: Ints | None = None) -> 
 
 def write_mesh(path: Path, vertices: Floats, faces: Ints) -> None:
     """Write a mesh of vertices (v, 3), mm, and triangles (f, 3)."""
-    write(path, {axis: vertices[:, i] for i, axis in enumerate("xyz")}, faces)
+    write_columns(path, {axis: vertices[:, i] for i, axis in enumerate("xyz")}, faces)

@@ -31,7 +31,7 @@ def on_sphere(number: int) -> Floats:
     The heights of the pairs follow the van der Corput sequence; each pair is turned by 3/8 from the one before.
     """
     pair, second = divmod(number, 2)
-    # The start 3/16 and the turn 3/8 were chosen by a search: they see most of the sides and ends of long boxes.
+    # The start 3/16 and the turn 3/8 were chosen by a search: they cover most of the sides and ends of long boxes.
     height = 1.0 - (van_der_corput(pair) + 0.1875) % 1.0
     level, turn = np.sqrt(1.0 - height**2), 0.75 * np.pi * pair
     unit = np.array([height, level * np.cos(turn), level * np.sin(turn)])

@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from designgen import curves
 from designgen.checks import expect, expect_positive
+from designgen.curves import NAMES as CURVES
+from designgen.curves import make as make_curve
 from designgen.designs import arch_foot, arch_rib
 from designgen.designs.arch_part import ArchPart, Plates
 
@@ -37,7 +38,7 @@ class Params:
         plates = self.plate_bottom_mm + self.plate_top_mm
         rising = len(self.joints) == 4 and all(a < z for a, z in pairwise((0.0, *self.joints, 1.0)))
         for fits, key, value, expected in (
-            (self.curve in curves.NAMES, "curve", self.curve, f"one of {', '.join(curves.NAMES)}"),
+            (self.curve in CURVES, "curve", self.curve, f"one of {', '.join(CURVES)}"),
             (self.rise_mm < 0.5 * self.span_mm, "rise_mm", self.rise_mm, "less than half of span_mm"),
             (self.plate_web_mm < 0.5 * self.width_mm, "plate_web_mm", self.plate_web_mm, "less than half of width_mm"),
             (plates < self.height_mm, "plate_bottom_mm + plate_top_mm", plates, "less than height_mm"),
@@ -51,7 +52,7 @@ class Params:
 
 def build(params: Params) -> tuple[ArchPart, ...]:
     """Build the five parts, in order."""
-    curve = curves.make(params.curve, params.span_mm, params.rise_mm)
+    curve = make_curve(params.curve, params.span_mm, params.rise_mm)
     plates = Plates(params.plate_bottom_mm, params.plate_top_mm, params.plate_web_mm)
     cuts = [curve.length * c for c in (0.0, *params.joints, 1.0)]
     parts = []

@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
-from designgen import ply
 from designgen.export import formats, solids
 from designgen.export.formats import Written
+from designgen.ply import write_mesh
 from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Picks, PointLabels, Scan, Scene, UsageError
 from processor.store import store
 
@@ -190,7 +190,7 @@ def _design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool) -> s
     elif scene.structure is not None:
         (folder / "design").mkdir(exist_ok=True)
         vertices = scene.structure.vertices * scale
-        ply.write_mesh(folder / "design/structure.ply", vertices, scene.structure.faces)
+        write_mesh(folder / "design/structure.ply", vertices, scene.structure.faces)
         return "design/structure.ply"
     else:
         return ""
@@ -207,7 +207,7 @@ def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
         }
         if folder is not None:
             (folder / "design").mkdir(exist_ok=True)
-            ply.write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
+            write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
             components[part.name] = {"mesh": f"design/{part.name}.ply", **components[part.name]}
     joints = [
         {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, points.tolist(), strict=True))}

@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from designgen import ply
 from designgen.export import e57
+from designgen.ply import write_columns
 from processor.model import Floats, Ints, Scan, Stations, UsageError
 
 METRES = 0.001  # of a millimetre
@@ -33,7 +33,7 @@ def write_ply(path: Path, scan: Scan) -> None:
         columns["intensity"] = scan.intensity.astype(np.float32)
     if len(scan.point_station):
         columns["station"] = station_numbers(scan).astype(np.int32)
-    ply.write(path, columns)
+    write_columns(path, columns)
 
 
 def write_las(path: Path, scan: Scan) -> None:

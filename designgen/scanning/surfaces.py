@@ -143,19 +143,19 @@ class Builder:
         radii = [np.array([p[2] for p in self._pieces])]
         count = plain
         numbered: dict[tuple[int, str], int] = {}
-        for number, (one_patch, of_part) in enumerate(self._nets):
-            knots, faces = one_patch.net()
-            corners = one_patch.at(knots[:, 0], knots[:, 1])[faces]
+        for number, (face, of_part) in enumerate(self._nets):
+            knots, faces = face.net()
+            corners = face.at(knots[:, 0], knots[:, 1])[faces]
             rows = np.zeros((len(faces), NUMBERS))
             rows[:, :9] = corners.reshape(-1, 9)
             kinds.append(np.full(len(faces), TRIANGLE, np.int8))
             numbers.append(rows)
-            key = of_part, one_patch.name  # patches of the same part and name are pieces of one smooth surface
+            key = of_part, face.name  # patches of the same part and name are pieces of one smooth surface
             if key not in numbered:
-                numbered[key] = self._name(one_patch.name)
+                numbered[key] = self._name(face.name)
             surface.append(np.full(len(faces), numbered[key], np.int32))
             part.append(np.full(len(faces), of_part, np.int32))
-            patch.append(np.full(len(faces), -1 if _is_flat(one_patch, knots[faces], corners) else number, np.int32))
+            patch.append(np.full(len(faces), -1 if _is_flat(face, knots[faces], corners) else number, np.int32))
             pq.append(knots[faces])
             middle = corners.mean(axis=1)
             owner.append(np.arange(count, count + len(faces), dtype=np.int32))

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen import sequences
 from designgen.frames import perpendicular, rigid, translation
 from designgen.randomness import generator, small_motion
 from designgen.scanning import returns, scanner
 from designgen.scanning.surfaces import Surfaces
+from designgen.sequences import in_square, on_sphere
 from processor.model import Floats, PointLabels, Scan, Stations, StationTruth
 
 
@@ -32,7 +32,7 @@ def below(low: Floats, high: Floats, params: scanner.Params, seed: int) -> dict[
         if grid:
             fraction = (np.array(divmod(i, grid[1])) + 0.5 + rng.uniform(-0.15, 0.15, 2)) / grid
         else:
-            fraction = np.clip(sequences.in_square(i) + rng.uniform(-0.03, 0.03, 2), 0.0, 1.0)
+            fraction = np.clip(in_square(i) + rng.uniform(-0.03, 0.03, 2), 0.0, 1.0)
         at = low[:2] + fraction * size
         poses[name] = levelled(np.array([*at, params.height_mm]), rng.uniform(0.0, 2.0 * np.pi))
     return poses
@@ -50,7 +50,7 @@ def around(
     for i in range(int(np.prod(params.stations))):
         name = f"{prefix}S{i + 1}"
         rng = generator(seed, f"place {name}")
-        at = middle + (sequences.on_sphere(i) * (half + params.distance_mm) * rng.uniform(0.9, 1.1)) @ axes
+        at = middle + (on_sphere(i) * (half + params.distance_mm) * rng.uniform(0.9, 1.1)) @ axes
         ahead = (middle - at) / np.linalg.norm(middle - at)
         up = perpendicular(ahead)
         T = rigid(np.stack([ahead, np.cross(up, ahead), up], axis=1), at)

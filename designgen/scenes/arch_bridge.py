@@ -1,4 +1,4 @@
-"""Scenes of arch bridges: parts as designed or as built, each scanned in a frame of its own."""
+"""Scenes of arch bridges: parts as designed or as built, each scanned in a separate frame."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ EDGE_POINTS = 501  # on each bottom edge in the truth
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
-    """Make the scene of an arch bridge, a scan of each part in its own frame, and its truth."""
+    """Make the scene of an arch bridge, a scan of each part in a separate frame, and its truth."""
     parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
     errors = filled(imperfections.ArchParams, recipe, "asbuilt")
     ledger = imperfections.Ledger()

@@ -20,7 +20,7 @@ EXTRA = {"structure": {"picks"}}  # sections of one kind only
 
 
 def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple[Scene, Truth]:
-    """Make the scene of a recipe and its truth; ``seed`` replaces the recipe's own.
+    """Make the scene of a recipe and its truth; ``seed`` replaces that of the recipe.
 
     The result depends on the recipe and seed, not on time, host or number of threads. Raises UsageError that names the
     key for an unknown kind or key, a wrong type or an impossible size.

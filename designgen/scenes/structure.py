@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from designgen import sequences
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
 from designgen.designs import plate_row, structure, structure_types
@@ -19,6 +18,7 @@ from designgen.scanning import clutter, picking, sampler, scanner, survey
 from designgen.scanning.modes import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
+from designgen.sequences import van_der_corput
 from processor.model import (
     AsBuilt,
     DefectTruth,
@@ -179,7 +179,7 @@ def _places(kind: str, patches: PartPatches, params: scanner.Params, seed: int) 
     for i in range(int(np.prod(params.stations))):
         station = f"S{i + 1}"
         rng = generator(seed, f"place {station}")
-        fraction = sequences.van_der_corput(i + 1)  # independent of the number of stations
+        fraction = van_der_corput(i + 1)  # independent of the number of stations
         if kind == "plate-row":
             at = np.array([low[0] + fraction * (high[0] - low[0]), low[1] - params.distance_mm, params.height_mm])
         elif kind == "truss-bridge":
