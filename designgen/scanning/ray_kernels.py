@@ -206,8 +206,10 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
     are cast. No hit: -1 and infinite. The third result is the range at which the beam may touch a shape so thin that
     the grid's rays may all miss it; infinite where there is none.
     """
-    first, width, side = strip.first, strip.width, strip.side
-    boxes, kind, numbers, jitter = strip.boxes, shapes.kind, shapes.numbers, rays.jitter
+    boxes, first, width, side = strip  # in local variables, as the inner loops are faster with them
+    kind, numbers, cuts, cut_start = shapes
+    owner, centres, radii = pieces
+    jitter, largest_jitter, min_range, max_range = rays
     rows = jitter.shape[1]
     best = np.full((width + 2 * side, rows), np.inf)
     thin = np.full((width + 2 * side, rows), np.inf)
@@ -218,9 +220,8 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
         level[i], rise[i] = np.cos(grid.lowest + grid.step * i), np.sin(grid.lowest + grid.step * i)
     for b in range(len(boxes)):
         k = boxes[b, 0]
-        i = pieces.shape[k]
-        radius = pieces.radius[k]
-        cx, cy, cz, r2 = pieces.centre[k, 0], pieces.centre[k, 1], pieces.centre[k, 2], 1.000001 * radius * radius
+        i, radius = owner[k], radii[k]
+        cx, cy, cz, r2 = centres[k, 0], centres[k, 1], centres[k, 2], 1.000001 * radius * radius
         c2 = cx * cx + cy * cy + cz * cz
         # Thinner than 1.5 times the distance between rays of the grid there.
         slim = thickness(kind[i], numbers[i]) < 1.5 * grid.step * (np.sqrt(c2) + radius)
@@ -234,7 +235,7 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
             ca, sa = np.cos(azimuth), np.sin(azimuth)
             low, high = boxes[b, 3], boxes[b, 4]
             if wide:
-                low, high = rows_within(planes, ca, sa, rays.largest_jitter, grid, low, high)
+                low, high = rows_within(planes, ca, sa, largest_jitter, grid, low, high)
             for row in range(low, high + 1):
                 if away > beside[row]:
                     continue
@@ -248,10 +249,10 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
                         thin[j, row] = along
                 if c2 - along * along > r2 + 1e-9 * c2:
                     continue
-                t = hit(kind[i], numbers[i], shapes.cuts, shapes.cut_start[i], shapes.cut_start[i + 1], dx, dy, dz)
-                if t <= rays.max_range and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
+                t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
+                if t <= max_range and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
                     best[j, row], shape[j, row] = t, i
-    hide(shape, best, rays.min_range)
+    hide(shape, best, min_range)
     return shape, best, thin
 
 
@@ -323,8 +324,10 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
     ``number`` (width + 2 side, rows) is a ray's row in the result, -1 for none. The sub-rays' directions differ from
     the ray's by ``angle`` (m,) times ``offsets`` (k, 2).
     """
-    first, width, side = strip.first, strip.width, strip.side
-    boxes, kind, numbers, jitter = strip.boxes, shapes.kind, shapes.numbers, rays.jitter
+    boxes, first, width, side = strip  # in local variables, as the inner loops are faster with them
+    kind, numbers, cuts, cut_start = shapes
+    owner, centres, radii = pieces
+    jitter, largest_jitter, min_range, max_range = rays
     count, m = len(angle), len(offsets)
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
@@ -336,8 +339,8 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
         level[i], rise[i] = np.cos(grid.lowest + grid.step * i), np.sin(grid.lowest + grid.step * i)
     for b in range(len(boxes)):
         k = boxes[b, 0]
-        i = pieces.shape[k]
-        cx, cy, cz, r = pieces.centre[k, 0], pieces.centre[k, 1], pieces.centre[k, 2], pieces.radius[k]
+        i = owner[k]
+        cx, cy, cz, r = centres[k, 0], centres[k, 1], centres[k, 2], radii[k]
         c2 = cx * cx + cy * cy + cz * cz
         wide = kind[i] == TRIANGLE and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
         if wide:
@@ -348,7 +351,7 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
             ca, sa = np.cos(azimuth), np.sin(azimuth)
             low, high = boxes[b, 3], boxes[b, 4]
             if wide:
-                low, high = rows_within(planes, ca, sa, rays.largest_jitter + broadest, grid, low, high)
+                low, high = rows_within(planes, ca, sa, largest_jitter + broadest, grid, low, high)
             for row in range(low, high + 1):
                 ray = number[j, row]
                 if ray < 0:
@@ -363,13 +366,13 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
                     da = jitter[j, row, 0] + angle[ray] * offsets[o, 0]
                     de = jitter[j, row, 1] + angle[ray] * offsets[o, 1]
                     dx, dy, dz = direction(ca, sa, level[row], rise[row], da, de)
-                    t = hit(kind[i], numbers[i], shapes.cuts, shapes.cut_start[i], shapes.cut_start[i + 1], dx, dy, dz)
-                    if t <= rays.max_range and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
+                    t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
+                    if t <= max_range and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
                         best[ray, o], shape[ray, o] = t, i
                         changed = True
                 if changed:
                     farthest[ray] = best[ray].max()
-    hide(shape, best, rays.min_range)
+    hide(shape, best, min_range)
     return shape, best
 
 
