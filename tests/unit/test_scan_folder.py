@@ -255,7 +255,7 @@ def test_what_cannot_be_written_is_refused(tmp_path):
     loose = dataclasses.replace(loose, stations=Stations(loose.stations.ids, loose.stations.positions))
     with pytest.raises(UsageError, match="no poses of its stations"):
         exported(loose, tmp_path, "ptx")
-    with pytest.raises(UsageError, match="by which recipe"):
+    with pytest.raises(UsageError, match="does not name the recipe"):
         exported(scene, tmp_path, "ply", step=True)
 
 
