@@ -34,7 +34,8 @@ def made():
     ]
     scans.append(Scan(NAMES[3], wall[:100], np.zeros(3)))
     stitched = step_results.stitching((*NAMES, "S5", "S6", "S7", "S8", "S9"))
-    result = dataclasses.replace(stitched, T_project_scan=poses, position=poses[:, :3, 3])
+    placed = dataclasses.replace(stitched.scans, T_project_scan=poses, position=poses[:, :3, 3])
+    result = dataclasses.replace(stitched, scans=placed)
     execution = step_results.execution(("stitch", "automatic", "{}", result), names=NAMES)
     return dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, scans=tuple(scans)))
 

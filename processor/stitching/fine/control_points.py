@@ -1,4 +1,4 @@
-"""Control points in the adjustment: they say where the network lies, and correct it where several scans saw them.
+"""Control points in the adjustment: they fix the frame of a network of scans, and correct the poses.
 
 The network comes as poses with their joint covariance, and enters as an observation of each scan's pose. Unknown are
 these poses, the motion of the whole into the frame of the control points, and the control points' true places, of which
@@ -17,9 +17,9 @@ from scipy.linalg import cho_factor, cho_solve
 
 from processor.adjustment import data_snooping
 from processor.geometry import rigid
-from processor.model import Control, Floats, InputError, Ints
-from processor.stitching import three_point
-from processor.stitching.result import Held
+from processor.model import Control, Floats, InputError, Ints, Reason, reason
+from processor.stitching import common_points
+from processor.stitching.result import ControlPoints, ControlSightings
 
 Bools = npt.NDArray[np.bool_]
 
@@ -89,9 +89,9 @@ class Fit:
 
 @dataclass(frozen=True)
 class Placed:
-    """The network in the control points' frame less ``centre``; covariance (6k, 6k) of turns about scans' origins.
+    """The network in the control points' frame less ``centre``; covariance (6k, 6k) of rotations about scans' origins.
 
-    ``against`` (k,) says of a scan what its control points have against its pose. Where ``held.holds`` is 0 the
+    ``contradictions`` (k,) are those of each scan's pose by its control points. Where ``control.holds`` is False the
     network stays as it was, and ``M`` is no motion.
     """
 
@@ -99,60 +99,62 @@ class Placed:
     covariance: Floats
     M: Floats
     centre: Floats
-    held: Held
-    said: tuple[str, ...]
-    against: tuple[str, ...]
+    control: ControlPoints
+    reasons: tuple[Reason, ...]
+    contradictions: tuple[Reason | None, ...]
 
 
-def hold(
+def adjust(
     control: Control, names: Sequence[str], T: Floats, covariance: Floats, origins: Floats, point_mm: float
 ) -> Placed:
-    """Lay a network of poses T (k, 4, 4), covariance (6k, 6k), to the control points that its scans saw.
+    """Adjust a network of poses T (k, 4, 4), covariance (6k, 6k), on the control points that its scans saw.
 
-    ``origins`` (k, 3) were taken off the scans' coordinates; ``point_mm`` is the standard deviation of a sighting that
-    comes without its own: none is exact, and taken so it would be contradicted by any other. Raises InputError where
-    units are mixed up.
+    ``origins`` (k, 3) were subtracted from the scans' coordinates. ``point_mm`` is the standard deviation of a sighting
+    that comes without its own: taken as exact, it would be contradicted by any other. Raises InputError where units
+    are mixed up.
     """
     if len(control.scan) > MOST:
         raise InputError(f"{len(control.scan)} sightings of control points; expected {MOST} at most")
     k = len(T)
-    sure = np.array([np.isfinite(T[s]).all() and np.isfinite(_block(covariance, s)).all() for s in range(k)])
-    there = sure[control.scan]
-    centre = control.positions[control.point[there]].mean(axis=0) if there.any() else np.zeros(3)
+    known = np.array([np.isfinite(T[s]).all() and np.isfinite(_block(covariance, s)).all() for s in range(k)])
+    placed = known[control.scan]
+    centre = control.positions[control.point[placed]].mean(axis=0) if placed.any() else np.zeros(3)
     point_mm = max(point_mm, LEAST_SD_MM)  # also where it is not known
     seen_sd = np.where(control.seen_sd > 0.0, control.seen_sd, point_mm)
     every = Sightings(
-        control.point, control.scan, control.seen - origins[control.scan], np.maximum(seen_sd, LEAST_SD_MM),
-        control.positions[control.point] - centre, control.sd[control.point],
+        point=control.point, scan=control.scan, seen=control.seen - origins[control.scan],
+        seen_sd=np.maximum(seen_sd, LEAST_SD_MM), known=control.positions[control.point] - centre,
+        known_sd=control.sd[control.point],
     )  # fmt: skip
-    used = every.only(there)
-    why = _too_few(used)
-    if why:
-        few = f"control points not used: {why}, three that span a plane are needed"
-        return Placed(T, covariance, np.eye(4), centre, _held(control, names), (few,), ("",) * k)
-    rows = np.repeat(sure, 6)
-    known = np.where(rows[:, None] & rows, covariance, 0.0)
-    known = 0.5 * (known + known.T)
-    poses = np.where(sure[:, None, None], T, np.eye(4))
-    found, kept, said, against, loosened = _settled(used, poses, known, control, names)
-    at = there.copy()
-    at[there] = kept
-    off, sd, share = _residuals(every, at, there, found, loosened)
-    n, m = len(np.unique(every.point[at])), int(at.sum())
-    rms = float(np.sqrt((off[at] ** 2).mean()))
-    head = [f"held by {n} control points seen {m} times: residuals {rms:.2g} mm (rms), redundancy {found.free}"]
-    if not control.seen_sd[at].all():
-        head.append(
-            f"control points seen without a standard deviation are taken to be seen to {point_mm:.2g} mm, as a single "
-            "point of the scans or a pick is"
-        )
-    ratio = found.chi2 / found.free
-    held = replace(
-        _held(control, names), off=off, sd=sd, share=share, used=at.astype(np.uint8), holds=1, redundancy=found.free,
-        ratio=ratio, loosened=loosened,
+    shortage = _shortage(every.only(placed))
+    if shortage:
+        return Placed(
+            T=T, covariance=covariance, M=np.eye(4), centre=centre, contradictions=(None,) * k,
+            control=ControlPoints(sightings=_unused(control, names)),
+            reasons=(reason("stitch.control-not-used", shortage=shortage),),
+        )  # fmt: skip
+    rows = np.repeat(known, 6)
+    prior = np.where(rows[:, None] & rows, covariance, 0.0)
+    prior = 0.5 * (prior + prior.T)
+    poses = np.where(known[:, None, None], T, np.eye(4))
+    fit, accepted, reasons, contradictions, factor = _without_blunders(every.only(placed), poses, prior, control, names)
+    used = placed.copy()
+    used[placed] = accepted
+    off, sd, share = _residuals(every, used, placed, fit, factor)
+    sightings = replace(_unused(control, names), off=off, sd=sd, share=share, used=used)
+    about = [reason(
+        "stitch.control-used", points=len(np.unique(every.point[used])), sightings=int(used.sum()),
+        rms_mm=float(np.sqrt((off[used] ** 2).mean())), redundancy=fit.free,
+    )]  # fmt: skip
+    if not control.seen_sd[used].all():
+        about.append(reason("stitch.control-sd-assumed", sd_mm=point_mm))
+    moved, C = _carried(fit, T, known)
+    return Placed(
+        T=moved, covariance=C, M=fit.M, centre=centre, reasons=(*about, *reasons), contradictions=contradictions,
+        control=ControlPoints(
+            holds=True, redundancy=fit.free, ratio=fit.chi2 / fit.free, loosened=factor, sightings=sightings
+        ),
     )  # fmt: skip
-    moved, C = _carried(found, T, sure)
-    return Placed(moved, C, found.M, centre, held, (*head, *said), against)
 
 
 def fitted(own: Sightings, T: Floats, known: Floats, loosened: float = 1.0) -> Fit:
@@ -163,7 +165,7 @@ def fitted(own: Sightings, T: Floats, known: Floats, loosened: float = 1.0) -> F
     Q = loosened**2 * own.covariance
     m, d = len(own.scan), np.zeros((len(T), 6))
     M = rigid.fit(_placed(own, T), own.known)
-    slip = three_point.units_slip(_scale(own, T))
+    slip = common_points.units_slip(_scale(own, T))
     if slip:
         raise InputError(
             f"control points lie {_scale(own, T):.5g} times as far apart as scans have them: units mixed up ({slip})?"
@@ -194,52 +196,54 @@ def fitted(own: Sightings, T: Floats, known: Floats, loosened: float = 1.0) -> F
     cross = -motion @ follows.T
     own_of_scans = known - gain @ J @ known + follows @ motion @ follows.T
     both = np.block([[motion, cross], [cross.T, own_of_scans]])
-    return Fit(M, _corrected(T, d), b, Q, weight, cofactor, A, J, 0.5 * (both + both.T))
+    return Fit(
+        M=M, T=_corrected(T, d), misfit=b, own=Q, weight=weight, cofactor=cofactor, by_motion=A, by_scans=J,
+        covariance=0.5 * (both + both.T),
+    )  # fmt: skip
 
 
-def _settled(
+def _without_blunders(
     used: Sightings, T: Floats, known: Floats, control: Control, names: Sequence[str]
-) -> tuple[Fit, Bools, list[str], tuple[str, ...], float]:
-    """Leave out what the others speak against, one at a time; loosen all where it cannot be told which it is."""
-    kept, said, against = np.ones(len(used.scan), bool), list[str](), [""] * len(T)
-    loosened = 1.0
+) -> tuple[Fit, Bools, list[Reason], tuple[Reason | None, ...], float]:
+    """Leave out what the others contradict, one at a time; where it is undecided which, raise all standard deviations.
+
+    Returns the fit, the sightings accepted (m,), reasons, contradictions of the scans' poses (k,), and the factor of
+    the standard deviations.
+    """
+    accepted, reasons = np.ones(len(used.scan), bool), list[Reason]()
+    contradictions: list[Reason | None] = [None] * len(T)
+    factor = 1.0
     while True:
-        own = used.only(kept)
-        found = fitted(own, T, known)
-        verdict = data_snooping.strongest(found, own.point, own.scan)
-        if verdict is None:
+        rest = used.only(accepted)
+        fit = fitted(rest, T, known)
+        suspicion = data_snooping.strongest(fit, rest.point, rest.scan)
+        if suspicion is None:
             break
-        out = np.zeros(len(kept), bool)
-        out[np.flatnonzero(kept)[verdict.rows]] = True
-        called = [_called(kind, number, own, control.ids, names) for kind, number in verdict.rivals]
-        if len(called) > 1 or _too_few(used.only(kept & ~out)):
-            found, loosened = _loosened(own, T, known)
-            who = ", ".join(called[:3])
-            said.append(
-                f"what control points say is contradicted by {who}, and it cannot be told by which: their standard "
-                f"deviations are taken to be {loosened:.2g} times as large"
-            )
+        out = np.zeros(len(accepted), bool)
+        out[np.flatnonzero(accepted)[suspicion.rows]] = True
+        suspects = [_suspect(kind, number, rest, control.ids, names) for kind, number in suspicion.rivals]
+        if len(suspects) > 1 or _shortage(used.only(accepted & ~out)):
+            fit, factor = _loosened(rest, T, known)
+            reasons.append(reason("stitch.control-undecided", suspects=tuple(suspects[:3]), factor=factor))
             break
-        if verdict.kind == "scan":
-            against[verdict.number] = f"its control points say that it stands {verdict.size_mm:.1f} mm elsewhere"
+        if suspicion.kind == "scan":
+            contradictions[suspicion.number] = reason("stitch.control-contradicts", shift_mm=suspicion.size_mm)
         else:
-            said.append(f"{called[0]} left out: {verdict.size_mm:.1f} mm off what the others say")
-        kept &= ~out
-    if loosened == 1.0 and data_snooping.beyond_chance(found.chi2, found.free):
-        found, loosened = _loosened(used.only(kept), T, known)
-        said.append(
-            "control points scatter more than they should: their standard deviations are taken to be "
-            f"{loosened:.2g} times as large"
-        )
-    return found, kept, said, tuple(against), loosened
+            reasons.append(reason("stitch.control-left-out", suspect=suspects[0], size_mm=suspicion.size_mm))
+        accepted &= ~out
+    if factor == 1.0 and data_snooping.beyond_chance(fit.chi2, fit.free):
+        fit, factor = _loosened(used.only(accepted), T, known)
+        reasons.append(reason("stitch.control-scatters", factor=factor))
+    return fit, accepted, reasons, tuple(contradictions), factor
 
 
-def _called(kind: str, number: int, own: Sightings, ids: Sequence[str], names: Sequence[str]) -> str:
+def _suspect(kind: str, number: int, sightings: Sightings, ids: Sequence[str], names: Sequence[str]) -> Reason:
     if kind == "scan":
-        return f"the pose of {names[number]}"
+        return reason("stitch.suspect-pose", scan=names[number])
     if kind == "point":
-        return f"control point {ids[number]}"
-    return f"the sighting of control point {ids[own.point[number]]} in {names[own.scan[number]]}"
+        return reason("stitch.suspect-point", point=ids[number])
+    point, scan = ids[sightings.point[number]], names[sightings.scan[number]]
+    return reason("stitch.suspect-sighting", point=point, scan=scan)
 
 
 def _loosened(own: Sightings, T: Floats, known: Floats) -> tuple[Fit, float]:
@@ -254,17 +258,17 @@ def _loosened(own: Sightings, T: Floats, known: Floats) -> tuple[Fit, float]:
     return found, factor
 
 
-def _too_few(own: Sightings) -> str:
-    """Say why sightings cannot tell where the whole lies, or nothing: fewer than three points, or near a line."""
+def _shortage(own: Sightings) -> Reason | None:
+    """Return why sightings do not determine the frame, or None: fewer than three points, or nearly on a line."""
     first = np.unique(own.point, return_index=True)[1]
     if len(first) < LEAST_POINTS:
-        return f"{len(first)} of them seen in scans that were placed"
+        return reason("stitch.control-few", points=len(first))
     known = own.known[first]
     widths = np.linalg.svd(known - known.mean(axis=0), compute_uv=False)
     sd = float(np.hypot(own.known_sd, own.seen_sd).max())
-    if widths[1] < max(three_point.LEAST_HEIGHT * widths[0], CLEAR * sd):
-        return "all of them nearly on a line"
-    return ""
+    if widths[1] < max(common_points.LEAST_HEIGHT * widths[0], CLEAR * sd):
+        return reason("stitch.control-on-a-line")
+    return None
 
 
 def _scale(own: Sightings, T: Floats) -> float:
@@ -333,10 +337,10 @@ def _block(covariance: Floats, s: int) -> Floats:
     return covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
 
 
-def _held(control: Control, names: Sequence[str]) -> Held:
+def _unused(control: Control, names: Sequence[str]) -> ControlSightings:
     """Return the sightings, none of them used."""
     m = len(control.scan)
-    return Held(
-        tuple(control.ids[p] for p in control.point), tuple(names[s] for s in control.scan),
-        np.full((m, 3), np.nan), np.full((m, 3), np.nan), np.full(m, np.nan), np.zeros(m, np.uint8),
+    return ControlSightings(
+        point=tuple(control.ids[p] for p in control.point), scan=tuple(names[s] for s in control.scan),
+        off=np.full((m, 3), np.nan), sd=np.full((m, 3), np.nan), share=np.full(m, np.nan), used=np.zeros(m, bool),
     )  # fmt: skip
