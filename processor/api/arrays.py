@@ -76,8 +76,15 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     params = Params(radius_mm=float("nan") if radius is None else float(radius), max_balls=1)
     found = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
     if not len(found.radii):
-        nan = np.full(4, np.nan)
-        return SphereFit(nan[:3], np.nan, np.diag(nan), Status.FAILED, (), 0, np.nan)
+        return SphereFit(
+            centre=np.full(3, np.nan),
+            radius=float("nan"),
+            covariance=np.full((4, 4), np.nan),
+            status=Status.FAILED,
+            reasons=(),
+            points=0,
+            rms=float("nan"),
+        )
     return SphereFit(
         centre=found.centres[0],
         radius=float(found.radii[0]),
@@ -127,19 +134,7 @@ def m3c2(
     """
     first, second = _points(reference, "reference", 1), _points(compared, "compared", 1)
     places = first if core is None else _points(core, "core", 1)
-    for name, value in (
-        ("normal_diameter", normal_diameter),
-        ("projection_diameter", projection_diameter),
-        ("max_depth", max_depth),
-    ):
-        if not 0.0 < value < np.inf:
-            raise ValueError(f"{name}: expected a positive length, got {value}")
-    extent = float(np.ptp(first, axis=0).max())
-    if projection_diameter > extent > 0.0:
-        raise ValueError(
-            f"projection_diameter: {projection_diameter:g} is wider than the reference, which spans {extent:g};"
-            " expected lengths and coordinates in one unit"
-        )
+    _check_lengths(first, normal_diameter, projection_diameter, max_depth)
     origin = first.mean(axis=0)
     local = places - origin
     grid = m3c2_distances.grid(first - origin, projection_diameter)
@@ -160,6 +155,22 @@ def m3c2(
         registration_error_mm=registration_error,
     )
     return CorePoints(**vars(found), core=places, normals=directions)
+
+
+def _check_lengths(reference: Floats, normal_diameter: float, projection_diameter: float, max_depth: float) -> None:
+    for name, value in (
+        ("normal_diameter", normal_diameter),
+        ("projection_diameter", projection_diameter),
+        ("max_depth", max_depth),
+    ):
+        if not 0.0 < value < np.inf:
+            raise ValueError(f"{name}: expected a positive length, got {value}")
+    extent = float(np.ptp(reference, axis=0).max())
+    if projection_diameter > extent > 0.0:
+        raise ValueError(
+            f"projection_diameter: {projection_diameter:g} is wider than the reference, which spans {extent:g};"
+            " expected lengths and coordinates in one unit"
+        )
 
 
 def _points(values: npt.ArrayLike, name: str, least: int) -> Floats:

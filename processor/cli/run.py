@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from processor.cli import batch, compare
+from processor.cli import batch, compare, init, validate
 from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, named, say
 from processor.model import InputError, Metric, Statistic, Status
 from processor.version import __version__
@@ -27,8 +27,9 @@ def commands() -> None:
 
 
 commands.add_command(batch.batch)
-commands.add_command(batch.init)
+commands.add_command(init.init)
 commands.add_command(compare.compare)
+commands.add_command(validate.validate)
 
 
 @commands.command()
@@ -144,47 +145,3 @@ def _read_results(output: Path) -> dict[str, Any]:
     if found.get("format") != "processor-results" or not isinstance(found.get("checks"), list):
         raise InputError(f"{path}: expected results of processor, found something else")
     return found
-
-
-@commands.command()
-@click.argument("matrix", metavar="[MATRIX.toml]", required=False, type=click.Path(path_type=Path, dir_okay=False))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of all nights")
-@click.option("--jobs", type=click.IntRange(min=1), help="cells at a time  [default: 1]")
-@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers do them, e.g. tcp://10.0.0.1:8786")
-@click.option("--full", is_flag=True, help="the cells that are marked full as well")
-@click.option("--history", type=click.Path(path_type=Path, dir_okay=False), help="[default: history.sqlite in OUT]")
-@click.option("--night", metavar="YYYY-MM-DD", help="whose seeds are used  [default: today, UTC]")
-@click.option("--again", is_flag=True, help="do all of a night again that other software began")
-@click.option("--accept", is_flag=True, help="do nothing but accept what got worse in the night as the new level")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the pages")
-@click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
-@click.pass_context
-def validate(
-    context: click.Context,
-    matrix: Path | None,
-    output: Path,
-    jobs: int | None,
-    cluster: str | None,
-    full: bool,
-    history: Path | None,
-    night: str | None,
-    again: bool,
-    accept: bool,
-    lang: str,
-    as_json: bool,
-) -> None:
-    """Make, run and check a matrix of scenes, and say what changed since the nights before.
-
-    Without MATRIX.toml the default one, which covers every step. Run again, it goes on where it was.
-    Exit codes: 0 done, 1 some cells failed, 4 a limit was missed or a figure got worse.
-    """
-    from processor.validation import command
-
-    if jobs is not None and cluster is not None:
-        raise click.UsageError("--jobs and --cluster exclude each other: a cluster has as many processes as workers")
-    if accept:
-        click.echo(command.accept(output, history, night))
-        return
-    told = command.run(matrix, output, jobs or 1, cluster, full, history, night, again, lang)
-    click.echo(json.dumps(told.as_object(), ensure_ascii=False) if as_json else told.line)
-    context.exit(LIMIT_MISSED if not told.passed else IN_PART if told.failed else DONE)

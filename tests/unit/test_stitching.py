@@ -157,7 +157,7 @@ def test_a_given_pose_of_the_reference_defines_the_project_frame():
     want = given @ np.linalg.inv(T[0]) @ T[2]
     np.testing.assert_allclose(result.scans.T_project_scan[0], given)
     assert result.frame == "GLCS"
-    np.testing.assert_allclose(result.position[2], want[:3, 3], atol=0.5)
+    np.testing.assert_allclose(result.scans.position[2], want[:3, 3], atol=0.5)
 
 
 def test_bad_input_is_rejected_with_a_message():
