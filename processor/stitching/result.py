@@ -60,8 +60,7 @@ class Scans(Rows):
     @property
     def placed(self) -> Flags:
         """Which scans (k,) have a pose."""
-        placed: Flags = np.isfinite(self.T_project_scan).all(axis=(1, 2))
-        return placed
+        return np.asarray(np.isfinite(self.T_project_scan).all(axis=(1, 2)))
 
 
 @dataclass(frozen=True)
