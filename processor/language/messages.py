@@ -76,7 +76,7 @@ class Messages(string.Formatter):
             self.words |= sections.get("words", {})
         for sections in catalogue(code).values():  # sections of steps that are not converted yet
             for section in sections.values():
-                known = section.get("words", {})
+                known: Any = section.get("words", {})
                 for key, value in (known if isinstance(known, dict) else {}).items():
                     self.texts.setdefault(key.split("|")[-1], value)
 
