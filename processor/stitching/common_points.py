@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from processor.geometry import unit_ratio
 from processor.model import Word
 
 LEAST_POINTS = 3
@@ -20,7 +21,7 @@ class UnitSlip(Word):
     FEET_M = "feet and m"
 
 
-RATIOS = {
+FACTORS = {
     UnitSlip.M_MM: 1000.0,
     UnitSlip.FEET_MM: 304.8,
     UnitSlip.INCHES_M: 39.3701,
@@ -33,7 +34,6 @@ RATIOS = {
 
 def units_slip(scale: float) -> UnitSlip | None:
     """Return the two units whose ratio a scale is, within 2 %, or None."""
-    return next(
-        (slip for slip, ratio in RATIOS.items() if min(abs(scale / ratio - 1.0), abs(scale * ratio - 1.0)) < 0.02),
-        None,
-    )
+    slips = {ratio: slip for slip, factor in FACTORS.items() for ratio in (factor, 1.0 / factor)}
+    ratio = unit_ratio.nearest_factor(scale, slips, 0.02)
+    return slips[ratio] if ratio else None

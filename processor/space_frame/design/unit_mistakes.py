@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.geometry import unit_ratio
 from processor.model import Floats
 
 FACTORS = (1000.0, 304.8, 25.4)  # m, feet and inches read as mm, or the other way round
@@ -18,12 +19,10 @@ def between(known: Floats, seen: Floats) -> str:
     if not sound.any():
         return ""
     ratio = float(np.median(known[sound] / seen[sound]))
-    for factor in FACTORS:
-        if abs(ratio / factor - 1.0) < NEAR:
-            return f"{factor:g}"
-        if abs(ratio * factor - 1.0) < NEAR:
-            return f"1/{factor:g}"
-    return ""
+    factor = unit_ratio.nearest_factor(ratio, unit_ratio.with_inverses(FACTORS), NEAR)
+    if factor is None:
+        return ""
+    return f"{factor:g}" if factor > 1.0 else f"1/{1.0 / factor:g}"
 
 
 def implausible(radius: float) -> str:
