@@ -31,8 +31,10 @@ from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun,
 from processor.store.codec import DecodeError
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.3"
-READABLE = ("1.2", FORMAT_VERSION)  # of scenes and truths: fields added since may be absent
+FORMAT_VERSION = "1.3"  # of scenes and truths
+READABLE = ("1.2", FORMAT_VERSION)  # fields added since may be absent
+RESULTS_VERSION = "2.0"
+RESULTS_HISTORY = ["1.0 to 1.3: one flat record a step", "2.0: nested tables; words and reasons with codes"]
 HISTORY = [
     "1.0: first",
     "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
@@ -90,8 +92,8 @@ def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterat
     small = kind != "scene"
     driver: dict[str, Any] = {"driver": "core", "backing_store": False} if small else {}
     with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest", **driver) as file:
-        header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "units": "mm"}
-        header["history"] = json.dumps(HISTORY)
+        version, history = (RESULTS_VERSION, RESULTS_HISTORY) if kind == "results" else (FORMAT_VERSION, HISTORY)
+        header = {"format": FORMATS[kind], "format_version": version, "units": "mm", "history": json.dumps(history)}
         for name, text in header.items():
             file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
         codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
@@ -218,9 +220,12 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
     if header["format"] not in wanted:
         return [f"expected format {' or '.join(wanted)}, found {header['format'] or 'none'}"]
     faults = []
-    readable = (FORMAT_VERSION,) if header["format"] == FORMATS["results"] else READABLE
+    results = header["format"] == FORMATS["results"]
+    readable = (RESULTS_VERSION,) if results else READABLE
     if header["format_version"] not in readable:
-        faults.append(f"expected format_version {' or '.join(readable)}, found {header['format_version'] or 'none'}")
+        found = header["format_version"] or "none"
+        advice = "; run processor run again" if results else ""
+        faults.append(f"expected format_version {' or '.join(readable)}, found {found}{advice}")
     if header["units"] != "mm":
         faults.append(f"expected units mm, found {header['units'] or 'none'}")
     return faults

@@ -352,3 +352,12 @@ def test_scenes_that_are_not_written(tmp_path):
         with pytest.raises(InputError, match=why):
             store.write_scene(path, scene, truth, {})
     assert not path.exists()
+
+
+def test_results_of_the_old_format_are_refused_with_what_to_do(tmp_path):
+    path = tmp_path / "results.h5"
+    store.write_results(path, [], {})
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = np.bytes_("1.3")
+    with pytest.raises(InputError, match=r"expected format_version 2\.0, found 1\.3; run processor run again"):
+        store.read_results(path, {})
