@@ -251,7 +251,7 @@ def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[An
 
 
 def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
-    """Read an array with ``ndim`` axes, of bool from uint8; an absent optional array is empty, with any number of axes."""
+    """Read an array with ``ndim`` axes, bool from uint8; an absent optional array is empty, with any number of axes."""
     stored = np.dtype(np.uint8 if dtype is np.bool_ else dtype).str[1:]
     if name in group and isinstance(group[name], h5py.Dataset) and group[name].size == 0:
         ndim = group[name].ndim
