@@ -11,7 +11,8 @@ from processor.geometry import local_translation as moving
 from processor.geometry import m3c2, mesh_distance, neighbors, point_neighbors, principal, rigid
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError
-from tests.unit.test_m3c2 import wavy
+from tests.support.m3c2_clouds import wavy
+from tests.support.meshes import bracket
 
 UP = np.array([0.0, 0.0, 1.0])
 
@@ -118,14 +119,6 @@ def test_the_summary_counts_what_has_no_level():
 
 
 # --- attitude ------------------------------------------------------------------------------------------------------
-
-
-def bracket():
-    """A body without symmetry."""
-    boxes = [((4000, 300, 200), (0, 0, 0)), ((300, 1500, 200), (1500, 600, 0)), ((200, 200, 900), (-1700, 0, 500))]
-    return trimesh.util.concatenate(
-        [trimesh.creation.box(extents, trimesh.transformations.translation_matrix(at)) for extents, at in boxes]
-    )
 
 
 def coarse(mesh, T, seed):

@@ -32,7 +32,7 @@ from processor.model import (
 from processor.pipeline import Execution
 from processor.report import record_json, results_folder, results_json
 from processor.report.deviation import figures, section
-from tests.unit.test_deviation_parts import bracket
+from tests.support.meshes import bracket
 
 FAR = np.array([5.0e8, 3.2e9, 1.0e5])  # mm
 SIGMA = 1.0

@@ -6,7 +6,7 @@ import pytest
 from processor.geometry import m3c2, normal_orientation, point_neighbors
 from processor.geometry.m3c2 import oriented
 from processor.geometry.normal_orientation import UP
-from tests.unit.test_m3c2 import wavy
+from tests.support.m3c2_clouds import wavy
 
 ACROSS = 120.0  # normal diameter, mm
 
