@@ -13,7 +13,8 @@ import numpy as np
 from numba import njit
 from scipy.special import stdtrit
 
-from processor.geometry.m3c2 import FEWEST_FOR_LOD, HALF_DIAGONAL, LEAST_RANGE, Z95, eigen
+from processor.geometry.linalg_small import eigen
+from processor.geometry.m3c2 import FEWEST_FOR_LOD, HALF_DIAGONAL, LEAST_RANGE, Z95
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at
 from processor.model import Floats, Ints

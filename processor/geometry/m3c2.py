@@ -14,6 +14,7 @@ import numpy.typing as npt
 from numba import njit
 
 from processor.geometry import point_grid
+from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at
 from processor.model import Floats, Ints
@@ -136,7 +137,6 @@ def _along(
 
 HALF_DIAGONAL = 0.5 * SIDE * 3.0**0.5 * (1.0 + 1e-9)  # of a block, in cells
 FEWEST_OF_PLANE = 4
-SWEEPS = 12
 
 
 @njit(cache=True, nogil=True)
@@ -265,34 +265,3 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
         for k in range(3):
             normals[row, k] = V[k, least] / length
         roughness[row] = np.sqrt(max(0.0, A[least, least]))
-
-
-@njit(cache=True, nogil=True)
-def eigen(A, V):  # type: ignore[no-untyped-def]
-    """Turn a symmetric A (3, 3) into its eigenvalues on the diagonal, V into its vectors as columns (Jacobi)."""
-    for i in range(3):
-        for j in range(3):
-            V[i, j] = 1.0 if i == j else 0.0
-    for _ in range(SWEEPS):
-        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
-        if off <= 1e-18 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
-            return
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if A[p, q] == 0.0:
-                    continue
-                theta = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
-                t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-                c = 1.0 / np.sqrt(t * t + 1.0)
-                s = t * c
-                h = t * A[p, q]
-                A[p, p] -= h
-                A[q, q] += h
-                A[p, q] = A[q, p] = 0.0
-                r = 3 - p - q
-                g, h = A[r, p], A[r, q]
-                A[r, p] = A[p, r] = c * g - s * h
-                A[r, q] = A[q, r] = s * g + c * h
-                for k in range(3):
-                    g, h = V[k, p], V[k, q]
-                    V[k, p], V[k, q] = c * g - s * h, s * g + c * h

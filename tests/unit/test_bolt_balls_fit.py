@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
+from processor.geometry.linalg_small import inverse_of
 from processor.space_frame import catalogue
 from processor.space_frame.members.records import Nodes, Tubes
 from processor.space_frame.points.sphere_crops import Crops
 from processor.space_frame.spheres import fit_all
-from processor.space_frame.spheres.gauss_newton import inverse_of, residual, select, solve, weight
+from processor.space_frame.spheres.gauss_newton import residual, select, solve, weight
 from processor.space_frame.spheres.noise_model import limb_cosine, noise_model, radius_offset, radius_scatter
 from tests.bench import ball_fit
 

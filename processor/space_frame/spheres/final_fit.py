@@ -8,9 +8,10 @@ import math
 import numpy as np
 from numba import njit
 
+from processor.geometry.linalg_small import inverse_of
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints, Labels
-from processor.space_frame.spheres.gauss_newton import inverse_of, normal_equations, residual, solve, variance, weight
+from processor.space_frame.spheres.gauss_newton import normal_equations, residual, solve, variance, weight
 from processor.space_frame.spheres.size_selection import AROUND_MM, COARSE_MM, fit_one, rows_within, segments, taken
 
 SETTLED_MM = 1e-6

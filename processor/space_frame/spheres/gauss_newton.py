@@ -9,39 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def inverse_of(A, out):  # type: ignore[no-untyped-def]
-    """Inverse of a positive definite matrix by Cholesky's factors; False where it has none."""
-    n = len(A)
-    L = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 1e-12 * A[i, i]:
-                    return False
-                L[i, i] = np.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    M = np.zeros((n, n))  # inverse of L
-    for i in range(n):
-        M[i, i] = 1.0 / L[i, i]
-        for j in range(i):
-            s = 0.0
-            for k in range(j, i):
-                s -= L[i, k] * M[k, j]
-            M[i, j] = s / L[i, i]
-    for i in range(n):
-        for j in range(i + 1):
-            s = 0.0
-            for k in range(i, n):
-                s += M[k, i] * M[k, j]
-            out[i, j] = s
-            out[j, i] = s
-    return True
+from processor.geometry.linalg_small import inverse_of
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

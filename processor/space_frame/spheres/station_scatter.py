@@ -10,9 +10,10 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from processor.geometry.linalg_small import inverse_of, log_det
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints, Labels
-from processor.space_frame.spheres.gauss_newton import inverse_of, residual, variance
+from processor.space_frame.spheres.gauss_newton import residual, variance
 
 # In mm; the first is what the others must beat by EVIDENCE in chi-square.
 GRID = np.array([0.0, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8, 1.1, 1.6, 2.2, 3.2, 4.5, 6.4])
@@ -61,25 +62,6 @@ def shift_sd(
         if a > 0.0:
             return float(np.exp(x[1] + np.clip(-0.5 * b / a, x[0] - x[1], x[2] - x[1])))
     return float(GRID[best])
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def log_det(A):  # type: ignore[no-untyped-def]
-    """Return the logarithm of the determinant of a positive definite matrix, by Cholesky's factor."""
-    n = len(A)
-    L = np.zeros((n, n))
-    total = 0.0
-    for i in range(n):
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                L[i, i] = np.sqrt(s)
-                total += np.log(s)
-            else:
-                L[i, j] = s / L[j, j]
-    return total
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -10,8 +10,8 @@ import numpy.typing as npt
 from scipy.special import chdtri
 
 from processor.geometry import rigid
+from processor.geometry.linalg_small import cholesky, product, solve
 from processor.model import Checked, Floats, Ints, column, names
-from processor.space_frame.stations.normal_equations import cholesky, product, solve
 from processor.space_frame.stations.residual_kernels import STATION
 
 Bools = npt.NDArray[np.bool_]

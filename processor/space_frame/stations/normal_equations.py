@@ -1,6 +1,6 @@
-"""Compiled kernels of the stations' self-registration: the normal equations, tubes eliminated, and small algebra.
+"""Compiled kernels of the stations' self-registration: the normal equations, tubes eliminated.
 
-All sums run in one order, whatever the threads; LAPACK's and BLAS's digits vary with theirs.
+All sums run in one order, whatever the number of threads.
 """
 # Numba infers the types of the arguments: they stay without annotations.
 
@@ -11,62 +11,13 @@ from functools import partial
 import numpy as np
 from numba import njit
 
+from processor.geometry.linalg_small import cholesky, solve
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
 from processor.space_frame.stations.residual_kernels import LEAST, STATION, TUBE
 
 MOVED = (0, 1, 2, 3, 7)  # of what an observation tells of, what follows the station
 BLOCKS = 16  # of tubes, that are summed apart and then together
-
-
-@njit(cache=True, nogil=True)
-def cholesky(A):  # type: ignore[no-untyped-def]
-    """Lower factor of a positive definite matrix, in one thread's fixed order; LAPACK's digits vary with threads."""
-    n = len(A)
-    L = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return np.full((n, n), np.nan)
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    return L
-
-
-@njit(cache=True, nogil=True)
-def solve(L, B):  # type: ignore[no-untyped-def]
-    """Solve L L' X = B (n, m)."""
-    n, m = B.shape
-    X = B.copy()
-    for i in range(n):
-        for k in range(i):
-            for c in range(m):
-                X[i, c] -= L[i, k] * X[k, c]
-        for c in range(m):
-            X[i, c] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            for c in range(m):
-                X[i, c] -= L[k, i] * X[k, c]
-        for c in range(m):
-            X[i, c] /= L[i, i]
-    return X
-
-
-@njit(cache=True, nogil=True)
-def product(A, B):  # type: ignore[no-untyped-def]
-    """Multiply A by B, summed in one order; that of a BLAS depends on its threads."""
-    found = np.zeros((A.shape[0], B.shape[1]))
-    for i in range(A.shape[0]):
-        for k in range(A.shape[1]):
-            for j in range(B.shape[1]):
-                found[i, j] += A[i, k] * B[k, j]
-    return found
 
 
 @njit(cache=True, nogil=True)
