@@ -22,7 +22,6 @@ from processor.geometry import local_translation, m3c2, mesh_distance, rigid
 from processor.geometry.local_translation import Movement
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface
-from processor.geometry.surface_registration import about_origin
 from processor.model import Floats, Ints, Scene
 
 SURFACE_SAMPLES = 1_000_000
@@ -196,7 +195,7 @@ def _result(
         registration_error=error,
         registration_error_from=source,
         T_best_fit=global_pose(placed.T_best_fit, scan.origin, origin),
-        covariance=about_origin(placed.covariance, origin),
+        covariance=rigid.about_origin(placed.covariance, origin),
         best_fit_shift=placed.shift,
         best_fit_turn=placed.turn,
         ambiguity=placed.ambiguity,

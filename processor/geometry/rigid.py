@@ -43,8 +43,7 @@ def rotation_from_vector(w: Floats) -> Floats:
     angle = float(np.linalg.norm(w))
     if angle == 0.0:
         return np.eye(3)
-    x, y, z = np.asarray(w) / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    K = cross_matrix(np.asarray(w) / angle)
     R: Floats = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
     return R
 
@@ -66,6 +65,23 @@ def motion(points: Floats) -> Floats:
     found[:, 2, 0], found[:, 2, 1] = y, -x
     found[:, :, 3:] = np.eye(3)
     return found
+
+
+def about_origin(covariance: Floats, position: Floats) -> Floats:
+    """Covariance (6, 6) of a motion about the frame's origin from that of the same motion about a ``position`` (3,).
+
+    A motion is a small turn (rad), then a translation (mm): t_origin = t_position + position x turn.
+    """
+    J = np.eye(6)
+    J[3:, :3] = cross_matrix(position)
+    at_origin: Floats = J @ covariance @ J.T
+    return at_origin
+
+
+def cross_matrix(v: Floats) -> Floats:
+    """Matrix (3, 3) of the cross product of ``v`` (3,) with another vector."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def fit(source: Floats, target: Floats) -> Floats:

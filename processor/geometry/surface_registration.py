@@ -106,7 +106,7 @@ def _iterate(
             inverse = np.linalg.inv(normal)
             at_middle = inverse @ _scatter(J * (weight * r)[:, None], cell) @ inverse
             weak = _weak(at_middle, axes, float(np.abs((moved[used] - middle) @ axes[:, 0]).max()))
-            covariance = about_origin(at_middle, middle)
+            covariance = rigid.about_origin(at_middle, middle)
             break
         face = face if move < SMALL_MM else None
     return Registration(T, covariance, sigma, share, weak), form
@@ -149,12 +149,3 @@ def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[str, ..
     arms = np.array([0.1 * half_length, half_length, half_length, 1.0, 1.0, 1.0])
     order = (0, 2, 1, 3, 4, 5)  # a turn about the third axis is sideways where the second one is
     return tuple(name for name, k in zip(MOTIONS, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
-
-
-def about_origin(covariance: Floats, middle: Floats) -> Floats:
-    """Covariance of a turn and a translation about ``middle`` (3,) as one about the frame's origin."""
-    x, y, z = middle
-    move = np.eye(6)
-    move[3:, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]  # t_origin = t_middle - w x middle
-    found: Floats = move @ covariance @ move.T
-    return found

@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from processor.geometry import rigid, surface_registration
+from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
 from processor.limits import standards
 from processor.model import NORMAL_95, ArchDesign, Floats, Scan, Scene, Tolerance
@@ -191,7 +191,7 @@ def _pose_covariances(parts: Sequence[Measured], adjusted: adjustment.Adjusted, 
     for i, part in enumerate(parts):
         if np.isfinite(placed[i]).all():
             own = slice(6 * i, 6 * i + 6)
-            found[i] = surface_registration.about_origin(adjusted.motion_covariance[own, own], part.member.middle)
+            found[i] = rigid.about_origin(adjusted.motion_covariance[own, own], part.member.middle)
     return found
 
 

@@ -8,20 +8,6 @@ from processor.geometry import rigid
 from processor.model import Floats
 
 
-def about_origin(covariance: Floats, position: Floats) -> Floats:
-    """Covariance (6, 6) of turns about ``position`` (3,) and its shift, as of turns about the frame's origin."""
-    J = np.eye(6)
-    J[3:, :3] = cross_matrix(position)
-    found: Floats = J @ covariance @ J.T
-    return found
-
-
-def cross_matrix(v: Floats) -> Floats:
-    """Matrix (3, 3) that crosses ``v`` with a vector."""
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def turned(covariance: Floats, R: Floats) -> Floats:
     """Covariance (6, 6) along other axes, R (3, 3)."""
     J = np.zeros((6, 6))

@@ -87,7 +87,7 @@ def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
     own = np.linalg.inv(J.T @ J) * both**2
     T = rigid.transform(R, middle_a - used * R @ middle_b)
     # Turns about the middle of the points -> about b's origin in a.
-    covariance = frames.about_origin(own, middle_a - T[:3, 3])
+    covariance = rigid.about_origin(own, middle_a - T[:3, 3])
     if scale_free:  # what the scale takes up of the way from b's origin to the points, the shift has to answer for
         way = R @ middle_b
         covariance[3:, 3:] += (both**2 / float((moved**2).sum())) * np.outer(way, way)
@@ -219,7 +219,7 @@ def _equation(one: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
     A = np.zeros((6, 12))
     A[:3, :3], A[:3, 6:9] = -R.T, R.T
     A[3:, 3:6], A[3:, 9:] = -R.T, R.T
-    A[3:, :3] = R.T @ frames.cross_matrix(arm)
+    A[3:, :3] = R.T @ rigid.cross_matrix(arm)
     weight: Floats = np.asarray(np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True), np.float64)
     return A, r, weight
 

@@ -91,7 +91,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
         place[s] = posed[:3, 3]
         own = network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
         own = frames.turned(own, base[:3, :3])
-        C[s] = frames.about_origin(own, place[s])
+        C[s] = rigid.about_origin(own, place[s])
         turn_sd[s], place_sd[s] = np.sqrt(np.diag(own)[:3]), np.sqrt(np.diag(own)[3:])
         if np.isfinite(network.T_rival[s]).all():
             rival[s] = frames.of_file(base @ network.T_rival[s], network.origins[s])
@@ -161,4 +161,4 @@ def _pair_of_files(pair: Pair, origins: Floats) -> Floats:
 
 
 def _pair_covariance(pair: Pair, origins: Floats) -> Floats:
-    return frames.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a])
+    return rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a])

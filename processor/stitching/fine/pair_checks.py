@@ -105,7 +105,7 @@ def _loop(path: list[Pair], start: int) -> Loop:
     for pair in path:
         forward = pair.a == at
         # Covariance as turns about a's origin, which is the frame's: then it is carried along by the adjoint.
-        own = frames.about_origin(pair.covariance, pair.T_a_b[:3, 3])
+        own = rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
             C = C + _carried(T, own)
             T = T @ pair.T_a_b
@@ -123,6 +123,6 @@ def _carried(T: Floats, covariance: Floats) -> Floats:
     """Covariance (6, 6) of a small motion in a frame, as one in the frame that T (4, 4) leads to."""
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = T[:3, :3]
-    J[3:, :3] = frames.cross_matrix(T[:3, 3]) @ T[:3, :3]
+    J[3:, :3] = rigid.cross_matrix(T[:3, 3]) @ T[:3, :3]
     found: Floats = J @ covariance @ J.T
     return found
