@@ -16,7 +16,7 @@ from processor.compare import diagnosis
 from processor.deviation import scales, statistics
 from processor.deviation.scales import Scales
 from processor.deviation.statistics import Summary
-from processor.geometry import m3c2, normal_orientation, point_neighbors
+from processor.geometry import m3c2, neighbors, normal_orientation
 from processor.geometry.m3c2 import CloudNormals, Distances
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
@@ -133,7 +133,7 @@ def compare(request: Request, say: Callable[[str], None] = lambda _: None) -> Co
     unit = _unit(clouds)
     origin = _origin(reference)
     core = np.ascontiguousarray(core_cloud.less(origin))
-    first, second = (point_neighbors.of_spacing(one.less(origin)) for one in (reference, compared))
+    first, second = (neighbors.of_spacing(one.less(origin)) for one in (reference, compared))
     used = scales.derived(first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth)
     if why := diagnosis.other_unit(first.cells.points, second.cells.points, used):
         raise InputError(f"{request.reference} and {request.compared}: {why}")

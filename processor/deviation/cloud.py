@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.geometry import merging, point_neighbors
+from processor.geometry import merging, neighbors
 from processor.model import Floats, InputError, Ints, Scan, Scene, StructureDesign
 
 ORIGIN_STEP_MM = 1000.0
@@ -48,13 +48,13 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     cloud = merging.merged(scene, with_scanner=True)
     if len(cloud.points) < FEWEST_POINTS:
         raise InputError(f"{scene.name}: expected a scan of {FEWEST_POINTS} points or more, got {len(cloud.points)}")
-    grid = point_neighbors.of_spacing(cloud.points)
-    spacing = point_neighbors.spacing(grid)
+    grid = neighbors.of_spacing(cloud.points)
+    spacing = neighbors.spacing(grid)
     if not spacing > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
     rows = np.arange(grid.count)
     if ratio > 0.0:
-        rows = np.flatnonzero(point_neighbors.statistical_inliers(grid, neighbours, ratio))
+        rows = np.flatnonzero(neighbors.statistical_inliers(grid, neighbours, ratio))
     kept = len(rows)
     rows = rows[:: max(1, -(-kept // MOST_POINTS))]
     thinner = np.sqrt(kept / len(rows))

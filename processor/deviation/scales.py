@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import m3c2, point_neighbors
+from processor.geometry import m3c2, neighbors
 from processor.geometry.point_grid import PointGrid
 from processor.model import Floats, InputError
 
@@ -49,7 +49,7 @@ def derived(
 
     Raises InputError for clouds that have no density.
     """
-    spacings = point_neighbors.spacing(reference), point_neighbors.spacing(compared)
+    spacings = neighbors.spacing(reference), neighbors.spacing(compared)
     projection = projection_diameter_mm or rounded(diameter_for(POINTS_A_CYLINDER, max(spacings)))
     if not (projection > 0.0 and math.isfinite(projection)):
         raise InputError(
@@ -85,7 +85,7 @@ def _normal_diameter(reference: PointGrid, projection: float) -> float:
 
 def _depth(compared: PointGrid, core: Floats, projection: float) -> float:
     """Take twice what most core points have to the other cloud, within bounds; what is beyond has no answer."""
-    near = point_neighbors.nearest(compared, _sample(core))
+    near = neighbors.nearest(compared, _sample(core))
     far = float(np.quantile(near[np.isfinite(near)], FAR_SHARE)) if np.isfinite(near).any() else 0.0
     return min(max(projection, DEPTH_TO_DISTANCE * far), DEEPEST * projection)
 

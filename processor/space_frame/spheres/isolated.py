@@ -12,8 +12,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from processor.geometry.crops import nearest_crops
 from processor.geometry.merging import MergedCloud
+from processor.geometry.neighbors import nearest_crops
 from processor.geometry.sphere import Mask, Sphere, algebraic, ransac, visible_fraction
 from processor.geometry.sphere_robust import bound
 from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
