@@ -22,7 +22,7 @@ from processor.defects.pictures import MOST_PLACES
 from processor.defects.result import Result
 from processor.defects.surface_charts import of_mesh
 from processor.deviation import cloud as deviation_cloud
-from processor.geometry import icp, pfh, rigid, visible_facets
+from processor.geometry import icp, mesh_distance, pfh, rigid
 from processor.geometry.merging import merged
 from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import NORMAL_95, Floats, Ints, Scene
@@ -53,7 +53,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     points = points[kept]
     if len(points) < paper.feature_points:
         return Result("failed", params.method, "too few points are left after the removal of noise")
-    design = deviation_cloud.sampled(vertices, scene.structure.faces, size)
+    design = mesh_distance.sampled(vertices, scene.structure.faces, size)
     rng = np.random.default_rng([params.seed, 4])
     start = _first_pose(points, design.points, design.normals, size, paper, rng)
     T, rms = start, np.inf
@@ -66,8 +66,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         return Result("failed", params.method, "the scan could not be laid on the design")
     surface = of_mesh(vertices, scene.structure.faces, 1000.0)
     placed = rigid.apply(T, points)
-    grid = visible_facets.grid_of(surface.vertices, surface.faces, surface.normals, params.reach_mm)
-    facet, distance = visible_facets.nearest(grid, placed, np.zeros((1, 3)), np.full(len(placed), -1, np.int64))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, params.reach_mm)
+    facet, distance = mesh_distance.nearest_visible(grid, placed, np.zeros((1, 3)), np.full(len(placed), -1, np.int64))
     on = facet >= 0
     placed, facet, distance = placed[on], facet[on], distance[on]
     sigma = 1.4826 * float(np.median(np.abs(distance - np.median(distance)))) if len(distance) else 0.0

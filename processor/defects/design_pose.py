@@ -11,9 +11,9 @@ import numpy as np
 
 from processor.defects.params import Params
 from processor.deviation import cloud as deviation_cloud
-from processor.deviation import design_pose, measure
+from processor.deviation import design_pose
 from processor.deviation.attitude import AMBIGUOUS
-from processor.geometry import rigid
+from processor.geometry import mesh_distance, rigid
 from processor.geometry.merging import merged
 from processor.model import Floats, Scene
 
@@ -60,7 +60,7 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> Placing:
     few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
     thin = deviation_cloud.ScanCloud(few, cloud.origin, None, 1.0, len(cloud.points), len(few))
     given = rigid.transform(np.eye(3), cloud.origin - origin)
-    placed = design_pose.place(thin, measure.surface_of(vertices, scene.structure.faces), given, "auto")
+    placed = design_pose.place(thin, mesh_distance.of_design(vertices, scene.structure.faces), given, "auto")
     if placed.registration == "as given":
         return Placing(np.eye(4), error)
     if not np.isfinite(placed.T_best_fit).all():

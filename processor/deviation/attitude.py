@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.deviation.cloud import Samples
 from processor.geometry import icp, principal, rigid
+from processor.geometry.mesh_distance import Samples
 from processor.geometry.neighbors import thinned
 from processor.model import Floats
 

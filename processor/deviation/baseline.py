@@ -16,7 +16,7 @@ from processor.deviation.attitude import AMBIGUOUS
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
 from processor.deviation.result import Result
-from processor.geometry import icp, m3c2, principal, rigid
+from processor.geometry import icp, m3c2, mesh_distance, principal, rigid
 from processor.geometry.neighbors import thinned
 from processor.model import Floats, Scene
 
@@ -29,7 +29,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     """Deviations of a scan from a design with vertices (v, 3) less ``origin`` (3,), as in the paper."""
     assert scene.structure is not None
     preset = params.paper
-    design = cloud.sampled(vertices, scene.structure.faces, scan.spacing_mm)
+    design = mesh_distance.sampled(vertices, scene.structure.faces, scan.spacing_mm)
     group = cloud.adaptive_voxels(design.points, preset.voxel_mm, preset.voxel_points)
     core = cloud.group_means(design.points, group)
     towards = cloud.group_means(design.normals, group)

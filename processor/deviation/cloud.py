@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.geometry import merging, neighbors
+from processor.geometry import merging, mesh_distance, neighbors
 from processor.model import Floats, InputError, Ints, Scan, Scene, StructureDesign
 
 ORIGIN_STEP_MM = 1000.0
@@ -26,15 +26,6 @@ class ScanCloud:
     read: int
     kept: int
     unposed: int = 0  # scans without a pose
-
-
-@dataclass(frozen=True)
-class Samples:
-    """Points (m, 3) on a mesh with unit normals (m, 3), and the facet (m,) of each."""
-
-    points: Floats
-    normals: Floats
-    facet: Ints
 
 
 def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) -> ScanCloud:
@@ -77,33 +68,9 @@ def local_design(design: StructureDesign) -> tuple[Floats, Floats]:
     middle = 0.5 * (design.vertices.min(axis=0) + design.vertices.max(axis=0)) if len(design.vertices) else np.zeros(3)
     origin = np.floor(middle / ORIGIN_STEP_MM) * ORIGIN_STEP_MM
     vertices = design.vertices - origin
-    if not len(design.faces) or not area(vertices, design.faces) > 0.0:
+    if not len(design.faces) or not mesh_distance.area(vertices, design.faces) > 0.0:
         raise InputError(f"design {design.name}: expected a mesh with a surface, found none")
     return vertices, origin
-
-
-def area(vertices: Floats, faces: Ints) -> float:
-    """Area of a mesh, mm2."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-
-
-def sampled(vertices: Floats, faces: Ints, spacing_mm: float) -> Samples:
-    """Points on a mesh, one in ``spacing_mm`` squared, on a fixed low-discrepancy pattern."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    double = np.linalg.norm(cross, axis=1)
-    cumulative = np.cumsum(double)
-    count = max(1, round(0.5 * float(cumulative[-1]) / spacing_mm**2))
-    i = np.arange(count)
-    facet = np.searchsorted(cumulative, (i + 0.5) / count * cumulative[-1]).astype(np.int64)
-    # The R2 sequence (plastic number), folded from the square onto the triangle.
-    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
-    fold = u + v > 1.0
-    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
-    at = a[facet]
-    points = at + u[:, None] * (b[facet] - at) + v[:, None] * (c[facet] - at)
-    return Samples(points, cross[facet] / double[facet, None], facet)
 
 
 def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.deviation import attitude, cloud
-from processor.deviation.cloud import Samples, ScanCloud
-from processor.geometry import principal, rigid, surface_registration
+from processor.deviation import attitude
+from processor.deviation.cloud import ScanCloud
+from processor.geometry import mesh_distance, principal, rigid, surface_registration
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.model import Floats
@@ -52,8 +52,8 @@ def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> Pla
     near_share = float(np.isfinite(near).mean())
     start, ambiguity, done = given, NAN, "as given"
     if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
-        spacing = np.sqrt(cloud.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
-        samples = cloud.sampled(surface.vertices, surface.faces, spacing)
+        spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
+        samples = mesh_distance.sampled(surface.vertices, surface.faces, spacing)
         found = attitude.coarse(even(scan.points), samples, axes)
         start, ambiguity, done = found.T_design_scan, found.ambiguity, "coarse"
     elif how == "fine":
@@ -81,6 +81,3 @@ def error_along(covariance: Floats, places: Floats, normals: Floats) -> float:
     J = np.hstack([np.cross(places, normals), normals])
     variance = np.einsum("ki,ij,kj->k", J, covariance, J)
     return float(np.sqrt(max(np.mean(variance), 0.0))) if len(J) else NAN
-
-
-__all__ = ["Placed", "Samples", "error_along", "even", "place"]

@@ -12,20 +12,18 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import cloud, design_pose, scales, statistics
+from processor.deviation import design_pose, scales, statistics
 from processor.deviation.attitude import AMBIGUOUS
-from processor.deviation.cloud import Samples, ScanCloud
+from processor.deviation.cloud import ScanCloud
 from processor.deviation.design_pose import Placed
 from processor.deviation.params import Params
 from processor.deviation.result import Result
 from processor.geometry import local_translation, m3c2, mesh_distance, rigid
 from processor.geometry.local_translation import Movement
 from processor.geometry.m3c2 import Distances
-from processor.geometry.mesh_distance import CurvedFacets, MeshSurface
+from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
 from processor.model import Floats, Ints, Scene
 
-SURFACE_SAMPLES = 1_000_000
-SAMPLE_MM = (8.0, 40.0)  # least and greatest spacing of samples on the design
 MOST_CORE = 150_000
 POINTS_A_CORE = 40.0  # scanned points about a core point; fewer where a surface is narrow
 CORE_SHARE = 0.5  # of the projection diameter: the spacing of core points
@@ -46,23 +44,17 @@ class OnSurface:
     facet: Ints
 
 
-def surface_of(vertices: Floats, faces: Ints) -> MeshSurface:
-    """Prepare a design's mesh, with samples as dense as its area allows."""
-    spacing = np.sqrt(cloud.area(vertices, faces) / SURFACE_SAMPLES)
-    return mesh_distance.of_mesh(vertices, faces, float(np.clip(spacing, *SAMPLE_MM)))
-
-
 def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, params: Params) -> Result:
     """Deviations of a scan from a design with vertices (v, 3) less ``origin`` (3,)."""
     assert scene.structure is not None
-    surface = surface_of(vertices, scene.structure.faces)
+    surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
     placed = design_pose.place(scan, surface, given, params.register)
     diameter = params.projection_diameter_mm or scales.rounded(scales.diameter_for(POINTS_A_CORE, scan.spacing_mm))
-    area = cloud.area(vertices, surface.faces)
+    area = mesh_distance.area(vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
-    core = cloud.sampled(vertices, surface.faces, core_spacing)
+    core = mesh_distance.sampled(vertices, surface.faces, core_spacing)
     seen = on_surface(scan, curved, placed.T)
     depth = params.max_depth_mm or _depth(seen.distance)
     near = np.abs(seen.distance) <= depth

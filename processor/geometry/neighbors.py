@@ -149,7 +149,7 @@ def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
 
 
 def _cell_keys(cell: Ints) -> Ints:
-    """Number (n,) of cells (n, 3), all indices 0 or more, in the order of x, y, z."""
+    """Return the number (n,) of cells (n, 3), all indices 0 or more, in the order of x, y, z."""
     extent = cell.max(axis=0) + 1
     key: Ints = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
     return key
@@ -169,7 +169,7 @@ def _distances(grid: PointGrid, places: Floats, own: Ints, k: int) -> tuple[Floa
 
 @njit(cache=True, nogil=True)
 def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type: ignore[no-untyped-def]
-    """Fill the mean distance of the k nearest points and that of the k-th, for places order[first] to order[last - 1]."""
+    """Fill mean distance of the k nearest points and that of the k-th, for places order[first] to order[last - 1]."""
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
     tops = SIDE * cells.extent - 1
     points, starts = cells.points, cells.starts

@@ -133,7 +133,7 @@ def coarse(mesh, T, seed):
     points = np.asarray(trimesh.sample.sample_surface(mesh, 20_000, seed=seed)[0])
     moved = rigid.apply(rigid.invert(T), points) + np.random.default_rng(seed).normal(0.0, 2.0, points.shape)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    samples = deviation_cloud.sampled(vertices, faces, 30.0)
+    samples = mesh_distance.sampled(vertices, faces, 30.0)
     return attitude.coarse(moved, samples, principal.of_mesh(vertices, faces))
 
 
@@ -181,7 +181,7 @@ def test_adaptive_voxels_hold_their_points():
 
 def test_samples_of_a_mesh_are_even():
     mesh = trimesh.creation.box((2000.0, 1000.0, 500.0))
-    found = deviation_cloud.sampled(np.asarray(mesh.vertices), np.asarray(mesh.faces), 20.0)
+    found = mesh_distance.sampled(np.asarray(mesh.vertices), np.asarray(mesh.faces), 20.0)
     assert len(found.points) == pytest.approx(mesh.area / 400.0, rel=0.01)
     on_top = found.normals[:, 2] > 0.5
     assert on_top.mean() == pytest.approx(2e6 / mesh.area, rel=0.02)

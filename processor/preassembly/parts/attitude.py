@@ -75,22 +75,10 @@ class _Candidate:
 
 def samples_of(part: DesignPart) -> tuple[Floats, Floats]:
     """Spread samples (n, 3), with unit normals, over the part's triangles, on a fixed low-discrepancy pattern."""
-    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
-    cross = np.cross(b - a, c - a)
-    double_area = np.linalg.norm(cross, axis=1)
-    used = double_area > 0.0
-    a, b, c, cross, double_area = a[used], b[used], c[used], cross[used], double_area[used]
-    cumulative = np.cumsum(double_area)
-    count = int(np.clip(0.5 * cumulative[-1] / SAMPLE_SPACING_MM**2, 2_000, 400_000))
-    i = np.arange(count)
-    triangle = np.searchsorted(cumulative, (i + 0.5) / count * cumulative[-1])
-    # The R2 sequence (plastic number), folded from the square onto the triangle.
-    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
-    fold = u + v > 1.0
-    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
-    at = a[triangle]
-    points = at + u[:, None] * (b[triangle] - at) + v[:, None] * (c[triangle] - at)
-    return points, (cross / double_area[:, None])[triangle]
+    samples = mesh_distance.spread(
+        part.vertices, part.faces, lambda area_mm2: int(np.clip(area_mm2 / SAMPLE_SPACING_MM**2, 2_000, 400_000))
+    )
+    return samples.points, samples.normals
 
 
 def sample_surface(part: DesignPart) -> Surface:
