@@ -16,14 +16,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.defects import design_pose, pictures
+from processor.defects import pictures
 from processor.defects.params import Paper, Params
 from processor.defects.pictures import MOST_PLACES
 from processor.defects.result import Result
 from processor.defects.surface_charts import of_mesh
-from processor.deviation import cloud as deviation_cloud
-from processor.geometry import icp, mesh_distance, pfh, rigid
-from processor.geometry.merging import merged
+from processor.geometry import icp, merging, mesh_distance, pfh, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import NORMAL_95, Floats, Ints, Scene
 
@@ -42,8 +40,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     """Find the defects of a structure as in paper 004."""
     paper = params.paper
     assert scene.structure is not None
-    vertices, origin = deviation_cloud.local_design(scene.structure)
-    cloud = merged(design_pose.stitched(scene, earlier), with_scanner=False)
+    vertices, origin = merging.local_design(scene.structure)
+    cloud = merging.merged(merging.stitched(scene, earlier.get("stitch")), with_scanner=False)
     local = cloud.points + (cloud.origin - origin)
     size, points = _thinned(local, paper)
     radius = paper.cluster_radius_mm or RADIUS_VOXELS * size

@@ -10,14 +10,14 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.deviation import attitude, cloud, scales, statistics
+from processor.deviation import cloud, scales, statistics
 from processor.deviation import measure as deviation_measure
-from processor.deviation.attitude import AMBIGUOUS
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
 from processor.deviation.result import Result
 from processor.geometry import icp, m3c2, mesh_distance, principal, rigid
 from processor.geometry.neighbors import thinned
+from processor.geometry.principal import AMBIGUOUS, CoarsePose
 from processor.model import Floats, Scene
 
 MOST_ICP_POINTS = 60_000
@@ -40,7 +40,8 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     if params.register in ("none", "fine"):
         start, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN
     else:
-        start, ambiguity = coarse(source, target)
+        pose = coarse(source, target)
+        start, ambiguity = pose.T_target_source, pose.ambiguity
     T, error = start, 0.0
     if params.register != "none":
         T = icp.point_to_point(source, target, start).T_target_source
@@ -96,29 +97,18 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     )
 
 
-def coarse(source: Floats, target: Floats) -> tuple[Floats, float]:
-    """Lay principal axes on each other: the rotation with the least mean square distance (eq. 9) after a short ICP.
-
-    The paper compares its cases as the axes have them. These are a little off, by as much as cases of a structure that
-    is about symmetric differ: what is left then is chance. Axes that spread alike are swapped, too. Returns
-    T_target_source (4, 4) and the ratio of the rms of the next best pose, of those that differ, to the best one's.
-    """
-    own, other = principal.of_points(source), principal.of_points(target)
-    size = float(np.linalg.norm(np.ptp(target, axis=0)))
+def coarse(source: Floats, target: Floats) -> CoarsePose:
+    """Lay principal axes on each other: the pose with the least mean square distance (eq. 9) after a short ICP."""
     few = thinned(source, COARSE_POINTS)
-    found = []
-    for turn in attitude.rotations(other.variances, own.variances):
-        R = other.axes @ turn @ own.axes.T
-        start = rigid.transform(R, other.centre - R @ own.centre)
+
+    def refined(start: Floats) -> tuple[float, Floats]:
         T = icp.point_to_point(few, target, start, max_iterations=COARSE_ITERATIONS).T_target_source
-        found.append((icp.point_to_point(few, target, T, max_iterations=1).rms, T))
-    order = sorted(range(len(found)), key=lambda k: (found[k][0], k))
-    error, best = found[order[0]]
-    rivals = (found[k][0] for k in order[1:] if attitude.differ(found[k][1], best, own.centre, size))
-    return best, next(rivals, NAN) / max(error, 1e-9)
+        return icp.point_to_point(few, target, T, max_iterations=1).rms, T
+
+    size = float(np.linalg.norm(np.ptp(target, axis=0)))
+    return principal.coarse(principal.of_points(source), principal.of_points(target), size, refined)
 
 
 def clone_error(points: Floats) -> float:
     """Rms in mm that the same registration leaves between points (n, 3) and a clone of them."""
-    start, _ = coarse(points, points)
-    return icp.point_to_point(points, points, start).rms
+    return icp.point_to_point(points, points, coarse(points, points).T_target_source).rms

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from processor.geometry import merging, mesh_distance, neighbors
-from processor.model import Floats, InputError, Ints, Scan, Scene, StructureDesign
+from processor.geometry import merging, neighbors
+from processor.model import Floats, InputError, Ints, Scene
 
-ORIGIN_STEP_MM = 1000.0
 MOST_POINTS = 3_000_000  # of a scan: more are thinned evenly, which no core point's answer needs
-FEWEST_POINTS = 100
 
 
 @dataclass(frozen=True)
@@ -33,12 +31,13 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
 
     Raises InputError for too few points.
     """
-    if stitched is not None:
-        scene = replace(scene, scans=posed(scene, stitched))
+    scene = merging.stitched(scene, stitched)
     unposed = sum(not scan.T_project_scan.size for scan in scene.scans)
     cloud = merging.merged(scene, with_scanner=True)
-    if len(cloud.points) < FEWEST_POINTS:
-        raise InputError(f"{scene.name}: expected a scan of {FEWEST_POINTS} points or more, got {len(cloud.points)}")
+    if len(cloud.points) < merging.FEWEST_POINTS:
+        raise InputError(
+            f"{scene.name}: expected a scan of {merging.FEWEST_POINTS} points or more, got {len(cloud.points)}"
+        )
     grid = neighbors.of_spacing(cloud.points)
     spacing = neighbors.spacing(grid)
     if not spacing > 0.0:
@@ -51,26 +50,6 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     thinner = np.sqrt(kept / len(rows))
     scanner = None if cloud.scanner is None else cloud.scanner[grid.order[rows]]
     return ScanCloud(grid.cells.points[rows], cloud.origin, scanner, spacing * thinner, grid.count, kept, unposed)
-
-
-def posed(scene: Scene, stitched: Any) -> tuple[Scan, ...]:
-    """Return the scans with the poses that stitching found, without those that it could not place."""
-    T = dict(zip(stitched.scans, stitched.T_project_scan, strict=True))
-    return tuple(
-        replace(scan, T_project_scan=T[scan.name]) if scan.name in T else scan
-        for scan in scene.scans
-        if scan.name not in T or np.isfinite(T[scan.name]).all()
-    )
-
-
-def local_design(design: StructureDesign) -> tuple[Floats, Floats]:
-    """Vertices (v, 3) less an origin (3,) of whole metres amid them. Raises InputError for a mesh without area."""
-    middle = 0.5 * (design.vertices.min(axis=0) + design.vertices.max(axis=0)) if len(design.vertices) else np.zeros(3)
-    origin = np.floor(middle / ORIGIN_STEP_MM) * ORIGIN_STEP_MM
-    vertices = design.vertices - origin
-    if not len(design.faces) or not mesh_distance.area(vertices, design.faces) > 0.0:
-        raise InputError(f"design {design.name}: expected a mesh with a surface, found none")
-    return vertices, origin
 
 
 def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:

@@ -12,16 +12,16 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import design_pose, scales, statistics
-from processor.deviation.attitude import AMBIGUOUS
+from processor.deviation import scales, statistics
 from processor.deviation.cloud import ScanCloud
-from processor.deviation.design_pose import Placed
 from processor.deviation.params import Params
 from processor.deviation.result import Result
-from processor.geometry import local_translation, m3c2, mesh_distance, rigid
+from processor.geometry import local_translation, m3c2, mesh_distance, rigid, surface_registration
 from processor.geometry.local_translation import Movement
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
+from processor.geometry.principal import AMBIGUOUS
+from processor.geometry.surface_registration import NEAR_MM, Placed
 from processor.model import Floats, Ints, Scene
 
 MOST_CORE = 150_000
@@ -50,7 +50,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
-    placed = design_pose.place(scan, surface, given, params.register)
+    placed = surface_registration.place(scan.points, surface, given, params.register)
     diameter = params.projection_diameter_mm or scales.rounded(scales.diameter_for(POINTS_A_CORE, scan.spacing_mm))
     area = mesh_distance.area(vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
@@ -146,7 +146,7 @@ def distances(core: Samples, moved: Movement, placed: Placed, stated_error_mm: f
     if np.isfinite(stated_error_mm):
         error, source = stated_error_mm, "given"
     elif np.isfinite(placed.covariance).all() and known.any():
-        error = design_pose.error_along(placed.covariance, core.points[known], core.normals[known])
+        error = surface_registration.error_along(placed.covariance, core.points[known], core.normals[known])
         source = "covariance of the best fit, rms over the core points"
     else:
         error, source = 0.0, "not known: the best fit is not held by what was seen"
@@ -218,7 +218,7 @@ def _status(placed: Placed, total: statistics.Summary, params: Params) -> tuple[
     if total.core_points == total.without_lod:
         return "failed", (
             f"no core point has enough scanned points: {100.0 * placed.near_share:.0f} % of the scan lie within "
-            f"{design_pose.NEAR_MM:g} mm of the design as given; is the design of this structure, and in its unit?"
+            f"{NEAR_MM:g} mm of the design as given; is the design of this structure, and in its unit?"
         )
     said = []
     status = "ok"

@@ -45,8 +45,9 @@ def test_mesh_axes_of_a_box_surface():
 
 
 def test_the_sign_choices_are_rotations():
-    assert [np.prod(signs) for signs in principal.proper_sign_choices()] == [1.0] * 4
-    assert len({tuple(signs) for signs in principal.proper_sign_choices()}) == 4
+    turns = principal.turns(((0, 1, 2),))
+    assert [np.linalg.det(turn) for turn in turns] == [1.0] * 4
+    assert len({tuple(np.diag(turn)) for turn in turns}) == 4
 
 
 def test_line_distance_and_crossing_by_hand():

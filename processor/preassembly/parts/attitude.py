@@ -114,12 +114,8 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
 
 def _rotations(scan_axes: Floats, design_axes: Floats) -> list[Floats]:
     """Return the eight proper rotations (3, 3) that lay one long axis on the other and either cross axis on either."""
-    quarter_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    return [
-        design_axes @ np.diag(signs) @ turn @ scan_axes.T
-        for turn in (np.eye(3), quarter_turn)
-        for signs in principal.proper_sign_choices()
-    ]
+    turns = principal.turns(((0, 1, 2), (0, 2, 1)))
+    return [design_axes @ turn @ scan_axes.T for turn in turns]
 
 
 def piece_hypotheses(seeds: Floats, part: DesignPart) -> list[Floats]:
