@@ -13,11 +13,8 @@ from scipy.spatial import cKDTree
 
 from processor import readers
 from processor.compare import diagnosis
-from processor.deviation import scales, statistics
-from processor.deviation.scales import Scales
-from processor.deviation.statistics import Summary
 from processor.geometry import m3c2, neighbors, normal_orientation
-from processor.geometry.m3c2 import CloudNormals, Distances
+from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
 from processor.model import Floats, InputError, UsageError
@@ -134,7 +131,9 @@ def compare(request: Request, say: Callable[[str], None] = lambda _: None) -> Co
     origin = _origin(reference)
     core = np.ascontiguousarray(core_cloud.less(origin))
     first, second = (neighbors.of_spacing(one.less(origin)) for one in (reference, compared))
-    used = scales.derived(first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth)
+    used = m3c2.derive_scales(
+        first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth
+    )
     if why := diagnosis.other_unit(first.cells.points, second.cells.points, used):
         raise InputError(f"{request.reference} and {request.compared}: {why}")
     units = {name: one.unit for name, one in zip(CLOUDS, clouds, strict=False)}
@@ -158,7 +157,7 @@ def compare(request: Request, say: Callable[[str], None] = lambda _: None) -> Co
         max_depth_mm=used.max_depth_mm,
         registration_error_mm=request.registration_error,
     )
-    total = statistics.of_distances(found, core, normals, used.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER)
+    total = m3c2.summary(found, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     if not np.isfinite(found.distance).any():
         why = diagnosis.no_answer(first.cells.points, second.cells.points, core, total.without_normal, used)
         raise InputError(f"{request.reference} and {request.compared}: no core point has an answer: {why}")
@@ -306,6 +305,6 @@ def _say_doubts(total: Summary, used: Scales, say: Callable[[str], None]) -> Non
         )
     if total.few_points > 0.1 * max(total.core_points - total.without_lod, 1):
         say(
-            f"{total.few_points} core points have fewer than {scales.PAPER_POINTS_A_CYLINDER} points of a cloud in "
+            f"{total.few_points} core points have fewer than {m3c2.PAPER_POINTS_A_CYLINDER} points of a cloud in "
             "their cylinder: their levels of detection are too small (a larger --projection-diameter helps)"
         )

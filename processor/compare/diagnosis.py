@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.deviation.scales import Scales
+from processor.geometry.m3c2 import Scales
 from processor.model import Floats
 
 # What lengths in one unit are of those in another: mm and cm, inch, ft, m; cm and inch, ft, m; m and inch.

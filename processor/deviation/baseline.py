@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.deviation import cloud, scales, statistics
+from processor.deviation import cloud
 from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
@@ -56,11 +56,11 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
         projection_diameter_mm=preset.projection_diameter_mm, max_depth_mm=preset.max_depth_mm,
         registration_error_mm=error,
     )  # fmt: skip
-    total = statistics.of_distances(found, core, normals, preset.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER)
+    total = m3c2.summary(found, core, normals, preset.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     status = "ok" if total.core_points > total.without_lod else "failed"
     said = (
         f"{total.without_lod} of {total.core_points} core points have no level of detection at the paper's scales, and "
-        f"{total.few_points} of the others rest on fewer points than the {scales.PAPER_POINTS_A_CYLINDER} it asks for."
+        f"{total.few_points} of the others rest on fewer points than the {m3c2.PAPER_POINTS_A_CYLINDER} it asks for."
     )
     if ambiguity < AMBIGUOUS:
         status = "ambiguous" if status == "ok" else status

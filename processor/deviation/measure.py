@@ -12,7 +12,6 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import scales, statistics
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
 from processor.deviation.result import Result
@@ -51,7 +50,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
     placed = surface_registration.place(scan.points, surface, given, params.register)
-    diameter = params.projection_diameter_mm or scales.rounded(scales.diameter_for(POINTS_A_CORE, scan.spacing_mm))
+    diameter = params.projection_diameter_mm or m3c2.rounded(m3c2.diameter_for(POINTS_A_CORE, scan.spacing_mm))
     area = mesh_distance.area(vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
     core = mesh_distance.sampled(vertices, surface.faces, core_spacing)
@@ -158,9 +157,7 @@ def _depth(distance: Floats) -> float:
     known = np.abs(distance[np.isfinite(distance)])
     if not len(known):
         return LEAST_DEPTH_MM
-    return float(
-        np.clip(scales.rounded(DEPTH_TIMES * float(np.quantile(known, DEPTH_SHARE))), LEAST_DEPTH_MM, REACH_MM)
-    )
+    return float(np.clip(m3c2.rounded(DEPTH_TIMES * float(np.quantile(known, DEPTH_SHARE))), LEAST_DEPTH_MM, REACH_MM))
 
 
 def _result(
@@ -173,7 +170,7 @@ def _result(
     used: tuple[float, float, float, str, float],
 ) -> Result:
     diameter, depth, error, source, share = used
-    total = statistics.of_distances(found, core.points, core.normals, diameter, scales.PAPER_POINTS_A_CYLINDER)
+    total = m3c2.summary(found, core.points, core.normals, diameter, m3c2.PAPER_POINTS_A_CYLINDER)
     status, said = _status(placed, total, params)
     if scan.unposed > 1:
         said += f" {scan.unposed} scans have no pose: they were taken to be in one frame already."
@@ -213,7 +210,7 @@ def _result(
     )
 
 
-def _status(placed: Placed, total: statistics.Summary, params: Params) -> tuple[str, str]:
+def _status(placed: Placed, total: m3c2.Summary, params: Params) -> tuple[str, str]:
     """Return the status and what to say of the registration."""
     if total.core_points == total.without_lod:
         return "failed", (

@@ -1,13 +1,15 @@
-"""How a surface moved about a place: a small translation fitted to the distances of points from where it should be.
+"""Movement of a surface about a place: a small translation fitted to the distances of points from the surface.
 
-On a plane this is the mean distance, as in M3C2. On a tube points about the place look elsewhere than the place does,
-so their mean would be too small; distances s_i = n_i u of a common movement u are solved for u instead.
+On a plane this is the mean distance, as in M3C2. On a tube the normals at the points about a place differ from that at
+the place, so that their mean distance would be too small. Distances s_i = n_i u of a common translation u are therefore
+solved for u.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,23 +21,49 @@ from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at
 from processor.model import Floats, Ints
 
-SEEN = 0.05  # least eigenvalue of the mean of n n': a direction along which points look less is not held
+DETERMINED = 0.05  # least eigenvalue of the mean of n n' for which the translation along its vector is estimated
 
 
 @dataclass(frozen=True)
 class Movement:
-    """At each place (k,): movement along its normal, how many points tell it, and the sd of one point's worth.
+    """At each place (k,): movement along its normal, number of points used, and standard deviation of one point.
 
-    ``vector`` (k, 3) is the movement itself, without what the points do not hold.
-
-    The movement's standard error is sd / sqrt(count); sd holds what the fit costs and, for few points, Student's
-    factor, so that 1.96 standard errors are 95 %. NaN below FEWEST_FOR_LOD points.
+    ``vector`` (k, 3) is the translation itself, without the directions that the points do not determine. The standard
+    error of ``along`` is sd / sqrt(count). ``sd`` includes the estimated unknowns and, for few points, Student's factor,
+    so that 1.96 standard errors are 95 %. NaN below FEWEST_FOR_LOD points.
     """
 
     along: Floats
     count: Ints
     sd: Floats
     vector: Floats
+
+
+class _Feet(NamedTuple):
+    """Signed distance (n,) measured at each foot, unit normal (n, 3) of the surface there, and which feet to use."""
+
+    distance: Floats
+    normals: Floats
+    radius: float
+    least_cos: float
+
+
+class _Places(NamedTuple):
+    """Places (k, 3) on a surface with unit normals (k, 3), and the order (k,) to visit them in."""
+
+    places: Floats
+    directions: Floats
+    order: Ints
+
+
+class _Moved(NamedTuple):
+    """What the kernel fills; ``free`` (k,) are degrees of freedom, ``variance`` (k,) that of one point."""
+
+    along: Floats
+    variance: Floats
+    vector: Floats
+    count: Ints
+    free: Ints
 
 
 def movement(
@@ -51,54 +79,40 @@ def movement(
     """Movement of a surface at places (k, 3) on it, along unit normals ``directions`` (k, 3).
 
     ``feet`` are points on the surface, with the signed ``distance`` (n,) of what was measured there and the unit
-    ``normals`` (n, 3), both in the grid's order. Feet count within half ``diameter_mm`` where the surface looks the
-    way of the place's normal, by ``least_cos`` at least.
+    ``normals`` (n, 3), both in the grid's order. Feet are used within half ``diameter_mm`` of a place, where the cosine
+    between the surface's normal and the place's is at least ``least_cos``.
     """
     places, directions = np.ascontiguousarray(places), np.ascontiguousarray(directions)
-    along, variance, vector = np.empty(len(places)), np.empty(len(places)), np.empty((len(places), 3))
-    count, free = np.empty(len(places), np.int64), np.empty(len(places), np.int64)
-    order = feet.beside(places)
-    over_ranges(
-        lambda a, b: _movement(
-            feet.cells, distance, normals, places, directions, order, a, b, 0.5 * diameter_mm, least_cos, along,
-            variance, count, free, vector,
-        ),
-        len(places), least=LEAST_RANGE,
+    k = len(places)
+    measured = _Feet(distance, normals, 0.5 * float(diameter_mm), float(least_cos))
+    wanted = _Places(places, directions, feet.beside(places))
+    moved = _Moved(
+        along=np.empty(k), variance=np.empty(k), vector=np.empty((k, 3)), count=np.empty(k, np.int64),
+        free=np.empty(k, np.int64),
     )  # fmt: skip
+    over_ranges(lambda a, b: _movement(feet.cells, measured, wanted, a, b, moved), k, least=LEAST_RANGE)
     table = stdtrit(np.arange(1.0, 401.0), 0.975) / Z95
-    factor = np.where(free > 0, table[np.clip(free, 1, 400) - 1], np.nan)
-    return Movement(along, count, np.sqrt(variance) * factor, vector)
+    factor = np.where(moved.free > 0, table[np.clip(moved.free, 1, 400) - 1], np.nan)
+    return Movement(moved.along, moved.count, np.sqrt(moved.variance) * factor, moved.vector)
 
 
 @njit(cache=True, nogil=True)
-def _movement(  # type: ignore[no-untyped-def]
-    cells,
-    distance,
-    normals,
-    places,
-    directions,
-    order,
-    first,
-    last,
-    radius,
-    least_cos,
-    along,
-    variance,
-    count,
-    free,
-    vector,
-):
+def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyped-def]
+    """Fit the movement at places order[first] to order[last - 1]."""
+    places, directions, order = wanted.places, wanted.directions, wanted.order
+    distance, normals, radius, least_cos = feet.distance, feet.normals, feet.radius, feet.least_cos
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
     tops = SIDE * cells.extent - 1
     points, starts = cells.points, cells.starts
     rim, extent = radius * radius, radius * (1.0 + 1e-9)
     reach2 = (radius + HALF_DIAGONAL * size) ** 2
-    A, V, g, w = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3)
+    A, g = np.empty((3, 3)), np.empty(3)
     for at in range(first, last):
         row = order[at]
         x, y, z = places[row, 0], places[row, 1], places[row, 2]
         a, b, c = directions[row, 0], directions[row, 1], directions[row, 2]
-        along[row], variance[row], count[row], free[row], vector[row, :] = np.nan, np.nan, 0, 0, np.nan
+        moved.along[row], moved.variance[row], moved.vector[row, :] = np.nan, np.nan, np.nan
+        moved.count[row], moved.free[row] = 0, 0
         if not np.isfinite(a + b + c + x + y + z) or len(points) == 0:
             continue
         if x + extent < xl or y + extent < yl or z + extent < zl:
@@ -142,34 +156,41 @@ def _movement(  # type: ignore[no-untyped-def]
                                 g[0] += e * s
                                 g[1] += m * s
                                 g[2] += o * s
-        count[row] = n
-        if n < FEWEST_FOR_LOD:
-            continue
+        moved.count[row] = n
+        if n >= FEWEST_FOR_LOD:
+            _solve(A, g, square, n, directions[row], row, moved)
+
+
+@njit(cache=True, nogil=True)
+def _solve(A, g, square, n, direction, row, moved):  # type: ignore[no-untyped-def]
+    """Solve for the translation by the sums A of n n', g of n s and ``square`` of s s over ``n`` points."""
+    for i in range(3):
+        g[i] /= n
+        for j in range(i, 3):
+            A[i, j] /= n
+            A[j, i] = A[i, j]
+    V, w = np.empty((3, 3)), np.empty(3)
+    eigen(A, V)
+    a, b, c = direction[0], direction[1], direction[2]
+    # Sums of n u, and of its variance over that of one distance, over the directions determined, strongest first.
+    total, cost, explained, number = 0.0, 0.0, 0.0, 0
+    for k in range(3):
+        w[k], moved.vector[row, k] = A[k, k], 0.0
+    for _ in range(3):
+        k = 0
+        for i in range(1, 3):
+            k = i if w[i] > w[k] else k
+        if w[k] < DETERMINED or (number > 0 and n - number < FEWEST_FOR_LOD):
+            break
+        e = V[0, k] * a + V[1, k] * b + V[2, k] * c
+        f = V[0, k] * g[0] + V[1, k] * g[1] + V[2, k] * g[2]
+        total += e * f / w[k]
         for i in range(3):
-            g[i] /= n
-            for j in range(i, 3):
-                A[i, j] /= n
-                A[j, i] = A[i, j]
-        eigen(A, V)
-        # n u and its variance over that of one distance: sums over the directions that are held, strongest first.
-        total, cost, explained, held = 0.0, 0.0, 0.0, 0
-        for k in range(3):
-            w[k], vector[row, k] = A[k, k], 0.0
-        for _ in range(3):
-            k = 0
-            for i in range(1, 3):
-                k = i if w[i] > w[k] else k
-            if w[k] < SEEN or (held > 0 and n - held < FEWEST_FOR_LOD):
-                break
-            e = V[0, k] * a + V[1, k] * b + V[2, k] * c
-            f = V[0, k] * g[0] + V[1, k] * g[1] + V[2, k] * g[2]
-            total += e * f / w[k]
-            for i in range(3):
-                vector[row, i] += V[i, k] * f / w[k]
-            cost += e * e / w[k]
-            explained += f * f / w[k]
-            held += 1
-            w[k] = -1.0
-        along[row] = total
-        free[row] = n - held
-        variance[row] = max(0.0, square / n - explained) * n / (n - held) * cost
+            moved.vector[row, i] += V[i, k] * f / w[k]
+        cost += e * e / w[k]
+        explained += f * f / w[k]
+        number += 1
+        w[k] = -1.0
+    moved.along[row] = total
+    moved.free[row] = n - number
+    moved.variance[row] = max(0.0, square / n - explained) * n / (n - number) * cost

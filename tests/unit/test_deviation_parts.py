@@ -6,7 +6,6 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from processor.deviation import cloud as deviation_cloud
-from processor.deviation import scales, statistics
 from processor.geometry import local_translation as moving
 from processor.geometry import m3c2, mesh_distance, neighbors, principal, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
@@ -39,20 +38,20 @@ def test_spacing_is_of_a_plane_with_one_point_a_square():
 
 
 def test_scales_hold_the_points_they_promise():
-    assert scales.diameter_for(20, np.sqrt(1e6 / 500.0)) == pytest.approx(225.7, abs=0.1)  # 500 points/m2
-    assert [scales.rounded(x) for x in (0.12345, 225.7, 1e-7, 100.0)] == [0.124, 226.0, 1e-7, 100.0]
+    assert m3c2.diameter_for(20, np.sqrt(1e6 / 500.0)) == pytest.approx(225.7, abs=0.1)  # 500 points/m2
+    assert [m3c2.rounded(x) for x in (0.12345, 225.7, 1e-7, 100.0)] == [0.124, 226.0, 1e-7, 100.0]
     cloud, other = wavy(20_000, 5), wavy(5000, 6, 30.0)
     grids = [neighbors.of_spacing(one) for one in (cloud, other)]
-    found = scales.derived(*grids, cloud)
+    found = m3c2.derive_scales(*grids, cloud)
     assert found.compared_spacing_mm > 1.8 * found.reference_spacing_mm
     held = 5000 / 1e6 * np.pi / 4.0 * found.projection_diameter_mm**2
     assert 45.0 < held < 60.0  # of the sparser cloud
     assert 60.0 <= found.max_depth_mm <= 10.0 * found.projection_diameter_mm
-    given = scales.derived(*grids, cloud, 7.0, 8.0, 9.0)
+    given = m3c2.derive_scales(*grids, cloud, 7.0, 8.0, 9.0)
     assert (given.normal_diameter_mm, given.projection_diameter_mm, given.max_depth_mm) == (7.0, 8.0, 9.0)
     same = neighbors.of_spacing(np.zeros((9, 3)))
     with pytest.raises(InputError, match="density"):
-        scales.derived(same, same, cloud)
+        m3c2.derive_scales(same, same, cloud)
 
 
 def test_a_share_of_independent_places_has_the_interval_of_its_count():
@@ -60,7 +59,7 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
     covered = 0
     for _ in range(200):
         marks = rng.random(400) < 0.05
-        found = statistics.share(marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0)
+        found = m3c2.share(marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0)
         assert found.low <= found.share <= found.high
         covered += found.low <= 0.05 <= found.high
     assert 0.9 <= covered / 200 <= 1.0
@@ -69,13 +68,13 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
 def test_a_share_of_places_that_agree_counts_them_once():
     marks = np.repeat(np.random.default_rng(8).random(100) < 0.3, 50)
     places = np.repeat(np.arange(100.0), 50)[:, None] * [100.0, 0.0, 0.0]
-    found = statistics.share(marks, places, 60.0)
-    alone = statistics.share(marks[::50], places[::50], 60.0)
+    found = m3c2.share(marks, places, 60.0)
+    alone = m3c2.share(marks[::50], places[::50], 60.0)
     assert found.high - found.low == pytest.approx(alone.high - alone.low, rel=0.05)
-    none = statistics.share(np.zeros(5000, bool), places, 60.0)
+    none = m3c2.share(np.zeros(5000, bool), places, 60.0)
     assert none.low == 0.0
     assert 0.02 < none.high < 0.05  # rule of three for 100 cells
-    assert np.isnan(statistics.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
+    assert np.isnan(m3c2.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
 
 
 def planes_compared(seed, off=0.0, error=0.0):
@@ -85,7 +84,7 @@ def planes_compared(seed, off=0.0, error=0.0):
     grids = [neighbors.of_spacing(one + k * off * UP) for k, one in enumerate(pair)]
     x, y = (one.ravel() for one in np.meshgrid(*[np.arange(100.0, 2901.0, 40.0)] * 2))
     core = np.column_stack([x, y, 0.0 * x])
-    used = scales.derived(*grids, core)
+    used = m3c2.derive_scales(*grids, core)
     normals = m3c2.oriented(m3c2.normals(grids[0], core, used.normal_diameter_mm).normals, UP)
     return m3c2.distances(
         *grids, core, normals, projection_diameter_mm=used.projection_diameter_mm, max_depth_mm=used.max_depth_mm,
@@ -112,7 +111,7 @@ def test_the_summary_counts_what_has_no_level():
         np.array([30, 10, 30, 3]), np.ones(4), np.ones(4),
     )  # fmt: skip
     normals = np.array([UP, UP, [nan] * 3, UP])
-    total = statistics.of_distances(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
+    total = m3c2.summary(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
     assert (total.core_points, total.without_lod, total.without_normal) == (4, 2, 1)
     assert (total.few_points, total.significant) == (1, 1)
     assert (total.mean, total.min, total.max, total.rms) == (-1.0, -3.0, 1.0, pytest.approx(np.sqrt(5.0)))
