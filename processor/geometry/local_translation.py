@@ -29,7 +29,7 @@ class Movement:
     """At each place (k,): movement along its normal, number of points used, and standard deviation of one point.
 
     ``vector`` (k, 3) is the translation itself, without the directions that the points do not determine. The standard
-    error of ``along`` is sd / sqrt(count). ``sd`` includes the estimated unknowns and, for few points, Student's factor,
+    error of ``along`` is sd / sqrt(count); ``sd`` includes the estimated unknowns and Student's factor for few points,
     so that 1.96 standard errors are 95 %. NaN below FEWEST_FOR_LOD points.
     """
 
@@ -62,7 +62,7 @@ class _Moved(NamedTuple):
     along: Floats
     variance: Floats
     vector: Floats
-    count: Ints
+    number: Ints
     free: Ints
 
 
@@ -87,13 +87,13 @@ def movement(
     measured = _Feet(distance, normals, 0.5 * float(diameter_mm), float(least_cos))
     wanted = _Places(places, directions, feet.beside(places))
     moved = _Moved(
-        along=np.empty(k), variance=np.empty(k), vector=np.empty((k, 3)), count=np.empty(k, np.int64),
+        along=np.empty(k), variance=np.empty(k), vector=np.empty((k, 3)), number=np.empty(k, np.int64),
         free=np.empty(k, np.int64),
     )  # fmt: skip
     over_ranges(lambda a, b: _movement(feet.cells, measured, wanted, a, b, moved), k, least=LEAST_RANGE)
     table = stdtrit(np.arange(1.0, 401.0), 0.975) / Z95
     factor = np.where(moved.free > 0, table[np.clip(moved.free, 1, 400) - 1], np.nan)
-    return Movement(moved.along, moved.count, np.sqrt(moved.variance) * factor, moved.vector)
+    return Movement(moved.along, moved.number, np.sqrt(moved.variance) * factor, moved.vector)
 
 
 @njit(cache=True, nogil=True)
@@ -112,7 +112,7 @@ def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyp
         x, y, z = places[row, 0], places[row, 1], places[row, 2]
         a, b, c = directions[row, 0], directions[row, 1], directions[row, 2]
         moved.along[row], moved.variance[row], moved.vector[row, :] = np.nan, np.nan, np.nan
-        moved.count[row], moved.free[row] = 0, 0
+        moved.number[row], moved.free[row] = 0, 0
         if not np.isfinite(a + b + c + x + y + z) or len(points) == 0:
             continue
         if x + extent < xl or y + extent < yl or z + extent < zl:
@@ -156,7 +156,7 @@ def _movement(cells, feet, wanted, first, last, moved):  # type: ignore[no-untyp
                                 g[0] += e * s
                                 g[1] += m * s
                                 g[2] += o * s
-        moved.count[row] = n
+        moved.number[row] = n
         if n >= FEWEST_FOR_LOD:
             _solve(A, g, square, n, directions[row], row, moved)
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
+from processor.geometry.linalg_small import product
 from processor.model import Checked, Floats, Ints, Labels, column, names
-from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
 from processor.space_frame.stations.posterior import common_motion, mean_gain
 
@@ -77,10 +77,10 @@ class Stations(Checked):
             influence = influence[:, :, None, None] * np.eye(3)
         covariance = self.covariance
         if relative and np.isfinite(self.before_mm):
-            own = np.eye(len(covariance)) - normals.product(
+            own = np.eye(len(covariance)) - product(
                 common_motion(self.places), mean_gain(common_motion(self.places), self._precision())
             )
-            covariance = normals.product(normals.product(own, covariance), np.ascontiguousarray(own.T))
+            covariance = product(product(own, covariance), np.ascontiguousarray(own.T))
         return kernels.effect(np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance)
 
     def common(self, place: Floats) -> Floats:
@@ -92,7 +92,7 @@ class Stations(Checked):
             known: Floats = self.covariance[:6, :6].copy()
             return known
         gain = mean_gain(common_motion(self.places - place), self._precision())
-        found: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
+        found: Floats = product(product(gain, self.covariance), np.ascontiguousarray(gain.T))
         return found
 
     def shared_offset_at(self, points: Floats) -> Floats:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from processor.geometry.linalg_small import product
 from processor.model import Floats, Ints
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
@@ -133,7 +134,11 @@ def _apart(x: Floats, C: Floats) -> tuple[Floats, Floats, float]:
     count = len(x) // kernels.STATION
     shared = float(x[of_range > 0.0].mean())
     own = np.eye(len(x)) - np.outer(of_range, of_range) / count
-    return x - shared * of_range, normals.product(normals.product(own, C), np.ascontiguousarray(own.T)), shared
+    return (
+        x - shared * of_range,
+        product(product(own, C), np.ascontiguousarray(own.T)),
+        shared,
+    )
 
 
 def _tubes(points: Floats, start: Ints, at: Floats, along: Floats, radii: Floats) -> _Tubes:
@@ -263,7 +268,7 @@ def _controlled(found: Stations, x: Floats, control: ControlPoints, doubt: Doubt
     M = common_motion(found.places)[:, 3:]
     shift = np.mean(x.reshape(-1, kernels.STATION)[:, 3:6], axis=0)
     moved = f"all stations were moved to them by {np.linalg.norm(shift):.2g} mm (mean)"
-    C = found.covariance + normals.product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
+    C = found.covariance + product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
     return replace(
         found,
         status="weak" if doubt.off.any() else found.status,
