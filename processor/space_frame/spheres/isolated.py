@@ -14,9 +14,8 @@ import numpy as np
 
 from processor.geometry.merging import MergedCloud
 from processor.geometry.neighbors import nearest_crops
-from processor.geometry.sphere import Mask, Sphere, algebraic, ransac, visible_fraction
-from processor.geometry.sphere_robust import bound
-from processor.geometry.sphere_search import LEAST_POINTS, Found, find_balls
+from processor.geometry.sphere import Mask, Sphere, algebraic, bound, ransac, visible_fraction
+from processor.geometry.sphere_search import LEAST_POINTS, Ball, find_balls
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Tolerance
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import NAN, Params
@@ -175,7 +174,7 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     return _with_bounds(made, balls) if params.method == "ray" else made
 
 
-def _searched(id_: int, found: Found, cloud: MergedCloud, params: Params) -> _Ball:
+def _searched(id_: int, found: Ball, cloud: MergedCloud, params: Params) -> _Ball:
     on = cloud.points[found.fit.inliers]
     sphere: Sphere | None = found.fit.sphere
     if params.method == "least-squares":
