@@ -255,9 +255,7 @@ def robust_fit(
         else:
             considered &= np.isfinite(residual)
         near = considered & (np.abs(residual) < TUKEY * scale)
-        if np.count_nonzero(near) < LEAST:
-            return None
-        step = _step(residual[near], J[near, :free], scale)
+        step = _step(residual[near], J[near, :free], scale) if np.count_nonzero(near) >= LEAST else None
         if step is None:
             return None
         largest = float(np.linalg.norm(step))
