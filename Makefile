@@ -1,15 +1,16 @@
-# Everything runs in .venv; nothing is installed outside it but system libraries, and those only where they are missing.
+# Everything is installed into .venv, but for system libraries that are missing.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 OUT ?= out
 JOBS ?= 2
 
-.PHONY: demo test lint bench paper nightly weekend clean system
+.PHONY: demo test lint docs bench paper nightly weekend clean system
 
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
 
+# All tests but the slow ones; weekend runs these, too.
 test: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -20,6 +21,10 @@ lint: $(VENV)/.test
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 	$(BIN)/mypy
+
+# docs/parameters.md from the code; the rest of docs/ is written by hand.
+docs: $(VENV)/.test
+	$(BIN)/python -m docs.make_parameters
 
 bench: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --editable ".[designgen,test,bench]"
@@ -33,7 +38,7 @@ bench: $(VENV)/.test
 paper: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/paper
 
-# Exit code 4, as of the command: a limit was missed or a figure got worse. --again: today's night by other software is replaced.
+# Exit code 4: a limit was missed or a figure got worse. --again replaces a run of today by other software.
 nightly: $(VENV)/.demo
 	$(BIN)/processor validate -o $(OUT)/nightly --jobs $(JOBS) --again
 

@@ -11,7 +11,9 @@ The records are also the HDF5 schema: :mod:`processor.store` walks their fields,
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
+from enum import Enum
 from typing import Any
 
 import numpy as np
@@ -29,28 +31,84 @@ class RecordError(ValueError):
     """A record was given a value that does not fit its field."""
 
 
-def column(*shape: int | str, dtype: type = np.float64) -> Any:
+VOCABULARIES: dict[str, type[Word]] = {}  # by name, for files that hold words among other values
+
+
+class Word(str, Enum):
+    """A word of a fixed vocabulary; its value is the word in files. Subclasses list the words."""
+
+    def __init_subclass__(cls) -> None:
+        VOCABULARIES[cls.__name__] = cls
+
+    def __str__(self) -> str:
+        return str(self.value)
+
+
+@dataclass(frozen=True)
+class Reason:
+    """A statement about a result: a code of the catalogue of messages, and the values that its text names.
+
+    ``values`` are numbers, words of a :class:`Word`, names from the input, further reasons, or tuples of these. The
+    text is made by :mod:`processor.language`, in English or Chinese; no program reads it again.
+    """
+
+    code: str
+    values: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+
+def reason(code: str, /, **values: Any) -> Reason:
+    """Return a :class:`Reason`; NumPy numbers among the values become Python numbers."""
+    return Reason(
+        code, {name: value.item() if isinstance(value, np.generic) else value for name, value in values.items()}
+    )
+
+
+# --- How a record declares its fields, and how they are checked
+
+
+def column(*shape: int | str, dtype: type = np.float64, **shown: Any) -> Any:
     """Declare an array field.
 
     ``shape`` holds a number for a fixed axis and a name for a free one; axes of one name have one length within the
-    record. Without a value the array is empty.
+    record. Without a value the array is empty. ``shown`` is the metadata of :func:`described`.
     """
     return dataclasses.field(
         default_factory=lambda: np.empty([0 if isinstance(n, str) else n for n in shape] if shape else 0, dtype),
-        metadata={"shape": shape, "dtype": dtype},
+        metadata={"shape": shape, "dtype": dtype, **shown},
     )
 
 
-def optional(*shape: int, dtype: type = np.float64) -> Any:
+def optional(*shape: int, dtype: type = np.float64, **shown: Any) -> Any:
     """Declare an array field of fixed shape that may be absent (then it has size 0)."""
     return dataclasses.field(
-        default_factory=lambda: np.empty(0, dtype), metadata={"shape": shape, "dtype": dtype, "optional": True}
+        default_factory=lambda: np.empty(0, dtype), metadata={"shape": shape, "dtype": dtype, "optional": True, **shown}
     )
 
 
-def names(axis: str) -> Any:
+def names(axis: str, **shown: Any) -> Any:
     """Declare a tuple of strings, as long as the axis of that name in the record's arrays."""
-    return dataclasses.field(default=(), metadata={"axis": axis})
+    return dataclasses.field(default=(), metadata={"axis": axis, **shown})
+
+
+def words(axis: str, vocabulary: type[Word], **shown: Any) -> Any:
+    """Declare a tuple of words of a vocabulary, as long as the axis of that name in the record's arrays."""
+    return dataclasses.field(default=(), metadata={"axis": axis, "words": vocabulary, **shown})
+
+
+def reasons(axis: str = "", **shown: Any) -> Any:
+    """Declare a tuple of reasons; with an axis a tuple of reasons for each row along it."""
+    return dataclasses.field(default=(), metadata={"reasons": axis, **shown})
+
+
+def described(default: Any = dataclasses.MISSING, **shown: Any) -> Any:
+    """Declare a field of a single value with the metadata that files and reports show of it.
+
+    ``words``: the vocabulary of a single word.
+    ``unit``: of its numbers. ``heading``: its English name in tables; the field's name without one. ``json``: its key
+    in results.json, "a.b" for a key b within a, "" where it is not written; the field's name without one. A star in
+    the key of a column stands for the names in ``keys``, which the column's second axis is for.
+    """
+    return dataclasses.field(default=default, metadata=shown)
 
 
 def newer() -> Any:
@@ -64,15 +122,38 @@ class Checked:
     def __post_init__(self) -> None:
         lengths: dict[str, tuple[int, str]] = {}
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
+            value, metadata = getattr(self, field.name), field.metadata
             where = f"{type(self).__name__}.{field.name}"
-            if "axis" in field.metadata:
-                value = tuple(str(item) for item in value)
-                _same_length(lengths, field.metadata["axis"], len(value), where)
+            if "words" in metadata and "axis" not in metadata:
+                object.__setattr__(self, field.name, _word(metadata["words"], value, where))
+            elif "axis" in metadata:
+                kind = metadata.get("words", str)
+                value = tuple(_word(kind, item, where) for item in value)
+                _same_length(lengths, metadata["axis"], len(value), where)
                 object.__setattr__(self, field.name, value)
-            elif "shape" in field.metadata:
-                array = _checked_array(value, field.metadata, where, lengths)
+            elif "reasons" in metadata:
+                value = tuple(tuple(row) if metadata["reasons"] else row for row in value)
+                if metadata["reasons"]:
+                    _same_length(lengths, metadata["reasons"], len(value), where)
+                object.__setattr__(self, field.name, value)
+            elif "shape" in metadata:
+                array = _checked_array(value, metadata, where, lengths)
                 object.__setattr__(self, field.name, array)
+
+
+class Rows(Checked):
+    """A table stored as columns of one length, a row an item; results.json has a list of its rows."""
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return max((len(getattr(self, field.name)) for field in dataclasses.fields(self)), default=0)  # type: ignore[arg-type]
+
+
+def _word(kind: type[str], item: Any, where: str) -> str:
+    try:
+        return kind(item)
+    except ValueError:
+        raise RecordError(f"{where}: {item!r} is no {kind.__name__}") from None
 
 
 def _checked_array(
@@ -106,13 +187,32 @@ def _same_length(lengths: dict[str, tuple[int, str]], axis: str, length: int, wh
         raise RecordError(f"{where}: length {length} along '{axis}', but {first} has {known}")
 
 
-# --- The records that travel between the parts of the project.
+# --- Vocabularies and constants
 
 
 NORMAL_95 = 1.959963984540054  # standard deviations of a normal value that hold it in 95 % of cases
 KEY_POINTS = ("P1", "P2", "P3", "P4", "P5", "P6", "P7", "P8")
 ENDS = ("start", "end")
 KINDS = ("arch-bridge", "space-frame", "structure")
+
+
+class Status(Word):
+    """How far a result can be relied on: of a step, or of one of its components or scans."""
+
+    OK = "ok"
+    PARTIAL = "partial"  # of a step: some of its parts have no result
+    AMBIGUOUS = "ambiguous"  # another solution fits about as well
+    WEAK = "weak"  # the data do not determine it well
+    FAILED = "failed"
+
+
+class Verdict(Word):
+    """The outcome of a comparison with limits, at 95 % confidence."""
+
+    PASS = "pass"
+    FAIL = "fail"
+    INDETERMINATE = "indeterminate"
+    NONE = "none"  # nothing is limited
 
 
 class InputError(Exception):
@@ -407,15 +507,78 @@ class Truth(Checked):
 # --- checks ---------------------------------------------------------------------------------------------------------
 
 
+class Statistic(Word):
+    """What a metric takes of a quantity; the word is its part of the metric's name."""
+
+    VALUE = "value"
+    COUNT = "count"
+    SHARE = "share"
+    MEDIAN = "median"
+    MEAN = "mean"
+    RMS = "rms"
+    P95 = "95th percentile"
+    MAX = "max"
+    BIAS = "bias"
+    SD = "standard deviation"
+    ERROR_95 = "95 % error"
+    NUMBER = "number"  # of errors that the other statistics are made from
+    EFFICIENCY = "efficiency"  # least possible standard deviation by the real one
+    COVERAGE = "coverage"  # share of errors within their 95 % intervals
+    PULL_RMS = "rms of error by standard deviation"
+
+
+class Better(Word):
+    """Which way a metric is better."""
+
+    LOW = "low"
+    HIGH = "high"
+    ZERO = "zero"
+    ONE = "one"
+    NOMINAL_95 = "95"
+
+
+BETTER = {
+    Statistic.BIAS: Better.ZERO,
+    Statistic.NUMBER: Better.HIGH,
+    Statistic.EFFICIENCY: Better.HIGH,
+    Statistic.COVERAGE: Better.NOMINAL_95,
+    Statistic.PULL_RMS: Better.ONE,
+}  # of all other statistics low, where the metric does not state otherwise
+METRIC_NAMES = {
+    Statistic.VALUE: "{quantity}",
+    Statistic.COUNT: "{quantity}",
+    Statistic.SHARE: "{quantity}",
+    Statistic.COVERAGE: "{quantity} within their 95 % intervals",
+}
+
+
 @dataclass(frozen=True)
 class Metric:
-    """One figure held against the truth. Without a limit (NaN) it informs and always passes."""
+    """One figure compared with the truth. Without a limit (NaN) it informs and always passes.
+
+    ``quantity`` is an English name, of which a catalogue has the translation; ``method`` names the step's method where
+    the run was made for comparison.
+    """
 
     step: str
-    name: str
+    quantity: str
     value: float
-    limit: float
-    unit: str
+    statistic: Statistic = Statistic.VALUE
+    unit: str = ""
+    limit: float = float("nan")
+    better: Better | None = None  # None: as BETTER has it for the statistic
+    method: str = ""
+
+    def __post_init__(self) -> None:
+        if self.better is None:
+            object.__setattr__(self, "better", BETTER.get(self.statistic, Better.LOW))
+
+    @property
+    def name(self) -> str:
+        """The name of the figure in files: quantity and statistic, after the method of a comparison."""
+        name = METRIC_NAMES.get(self.statistic, "{quantity}, {statistic}")
+        name = name.format(quantity=self.quantity, statistic=self.statistic)
+        return f"{self.method}: {name}" if self.method else name
 
     @property
     def passed(self) -> bool:

@@ -5,15 +5,16 @@ import importlib
 import pkgutil
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 
 from designgen import recipes
 from designgen.scenes.make import make
 from processor import pipeline, readers
-from processor.model import Metric, Scene, StepRun, UsageError
+from processor.model import Scene, StepRun, UsageError
 from processor.report import section
 from processor.store import store
+from tests.support.metrics import metric
+from tests.support.records import assert_equal
 
 STEPS = pipeline.step_modules()
 
@@ -37,8 +38,7 @@ def test_an_empty_result_goes_through_the_store(name, tmp_path):
     store.write_results(tmp_path / "r.h5", [StepRun(name, result.method, "{}", result)], {})
     (back,) = store.read_results(tmp_path / "r.h5", pipeline.result_classes())
     assert (back.step, back.method) == (name, result.method)
-    for field in dataclasses.fields(result):
-        np.testing.assert_array_equal(getattr(back.result, field.name), getattr(result, field.name))
+    assert_equal(back.result, result)
 
 
 def test_every_reader_says_what_it_reads():
@@ -114,7 +114,7 @@ def test_steps_run_after_those_they_need_and_are_given_what_these_found(monkeypa
 
 
 def test_a_metric_passes_only_within_its_limit():
-    assert Metric("s", "n", 1.0, 1.0, "mm").passed
-    assert not Metric("s", "n", 1.1, 1.0, "mm").passed
-    assert not Metric("s", "n", float("nan"), 1.0, "mm").passed
-    assert Metric("s", "n", 99.0, float("nan"), "mm").passed
+    assert metric("n", 1.0, 1.0).passed
+    assert not metric("n", 1.1, 1.0).passed
+    assert not metric("n", float("nan"), 1.0).passed
+    assert metric("n", 99.0).passed

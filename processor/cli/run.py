@@ -11,7 +11,7 @@ import click
 from processor import __version__
 from processor.cli import batch, compare
 from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, named, say
-from processor.model import InputError, Metric
+from processor.model import InputError, Metric, Statistic
 from processor.progress import stage
 
 if TYPE_CHECKING:
@@ -135,7 +135,16 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
 
     found = _read_results(output)
     metrics = tuple(
-        Metric(c["step"], c["name"], _number(c["value"]), _number(c["limit"]), c["unit"]) for c in found["checks"]
+        Metric(
+            c["step"],
+            c["quantity"],
+            _number(c["value"]),
+            Statistic(c["statistic"]),
+            unit=c["unit"],
+            limit=_number(c["limit"]),
+            method=c["method"],
+        )
+        for c in found["checks"]
     )
     report = ErrorReport(metrics)
     if as_json:

@@ -11,6 +11,7 @@ import numpy as np
 from processor.defects.params import Params
 from processor.geometry import merging, mesh_distance, rigid, surface_registration
 from processor.geometry.principal import AMBIGUOUS
+from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Scene
 
 ADVICE = "run the steps stitch and deviation first, or give the scans poses in the design's frame"
@@ -49,7 +50,7 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> Placing:
     given = rigid.transform(np.eye(3), cloud.origin - origin)
     surface = mesh_distance.of_design(vertices, scene.structure.faces)
     placed = surface_registration.place(few, surface, given, "auto")
-    if placed.registration == "as given":
+    if placed.registration is Registration.AS_GIVEN:
         return Placing(np.eye(4), error)
     if not np.isfinite(placed.T_best_fit).all():
         return Placing(None, error, f"the scans are not in the design's frame and could not be placed there; {ADVICE}")

@@ -10,15 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.deviation import cloud
+from processor.deviation import cloud, to_result
 from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
-from processor.deviation.result import Result
+from processor.deviation.result import ErrorSource, Result
 from processor.geometry import icp, m3c2, mesh_distance, principal, rigid
 from processor.geometry.neighbors import thinned
 from processor.geometry.principal import AMBIGUOUS, CoarsePose
-from processor.model import Floats, Scene
+from processor.geometry.surface_registration import Registration
+from processor.model import Floats, Scene, Status, reason
 
 MOST_ICP_POINTS = 60_000
 COARSE_POINTS, COARSE_ITERATIONS = 3_000, 30
@@ -57,23 +58,30 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
         registration_error_mm=error,
     )  # fmt: skip
     total = m3c2.summary(found, core, normals, preset.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
-    status = "ok" if total.core_points > total.without_lod else "failed"
-    said = (
-        f"{total.without_lod} of {total.core_points} core points have no level of detection at the paper's scales, and "
-        f"{total.few_points} of the others rest on fewer points than the {m3c2.PAPER_POINTS_A_CYLINDER} it asks for."
-    )
+    status = Status.OK if total.core_points > total.without_lod else Status.FAILED
+    reasons = [
+        reason(
+            "deviation.paper-scales",
+            without=total.without_lod,
+            core_points=total.core_points,
+            few=total.few_points,
+            least=m3c2.PAPER_POINTS_A_CYLINDER,
+        )
+    ]
     if ambiguity < AMBIGUOUS:
-        status = "ambiguous" if status == "ok" else status
-        said += f" Another attitude fits about as well (ratio of errors {ambiguity:.2f})."
+        status = Status.AMBIGUOUS if status is Status.OK else status
+        reasons.append(reason("deviation.paper-ambiguous", ratio=ambiguity))
     used = known if (known := found.std2[np.isfinite(found.lod95)]).size else np.array([NAN])
+    points = to_result.core_points(core, normals, found)
+    how = {"none": Registration.AS_GIVEN, "fine": Registration.FINE}.get(params.register, Registration.COARSE)
     return Result(
         status=status,
         method=params.method,
-        message=said,
+        reasons=tuple(reasons),
         T_design_scan=deviation_measure.global_pose(T, scan.origin, origin),
-        registration={"none": "as given", "fine": "fine"}.get(params.register, "coarse"),
+        registration=how,
         registration_error=error,
-        registration_error_from="given" if np.isfinite(params.registration_error_mm) else "a clone of the scan",
+        registration_error_from=ErrorSource.GIVEN if np.isfinite(params.registration_error_mm) else ErrorSource.CLONE,
         ambiguity=ambiguity,
         spacing=scan.spacing_mm,
         sigma=float(np.median(used)),
@@ -82,18 +90,9 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
         normal_diameter=preset.normal_diameter_mm,
         projection_diameter=preset.projection_diameter_mm,
         max_depth=preset.max_depth_mm,
-        significant_share=total.significant_share.share,
-        significant_low=total.significant_share.low,
-        significant_high=total.significant_share.high,
         origin=origin,
-        core=core,
-        normals=normals,
-        distance=found.distance,
-        lod95=found.lod95,
-        n1=found.n1,
-        n2=found.n2,
-        std1=found.std1,
-        std2=found.std2,
+        core=points,
+        **to_result.statistics(points, total),
     )
 
 

@@ -12,16 +12,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from processor.deviation import to_result
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
-from processor.deviation.result import Result
+from processor.deviation.result import ErrorSource, Result
 from processor.geometry import local_translation, m3c2, mesh_distance, rigid, surface_registration
 from processor.geometry.local_translation import Movement
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
 from processor.geometry.principal import AMBIGUOUS
-from processor.geometry.surface_registration import NEAR_MM, Placed
-from processor.model import Floats, Ints, Scene
+from processor.geometry.surface_registration import NEAR_MM, Placed, Registration
+from processor.model import Floats, Ints, Reason, Scene, Status, reason
 
 MOST_CORE = 150_000
 POINTS_A_CORE = 40.0  # scanned points about a core point; fewer where a surface is narrow
@@ -139,16 +140,18 @@ def _fitted(
     )  # fmt: skip
 
 
-def distances(core: Samples, moved: Movement, placed: Placed, stated_error_mm: float) -> tuple[Distances, float, str]:
+def distances(
+    core: Samples, moved: Movement, placed: Placed, stated_error_mm: float
+) -> tuple[Distances, float, ErrorSource]:
     """Distances at core points with LOD95, the registration error in it (one sd, mm), and where that is from."""
     known = np.isfinite(moved.along)
     if np.isfinite(stated_error_mm):
-        error, source = stated_error_mm, "given"
+        error, source = stated_error_mm, ErrorSource.GIVEN
     elif np.isfinite(placed.covariance).all() and known.any():
         error = surface_registration.error_along(placed.covariance, core.points[known], core.normals[known])
-        source = "covariance of the best fit, rms over the core points"
+        source = ErrorSource.COVARIANCE
     else:
-        error, source = 0.0, "not known: the best fit is not held by what was seen"
+        error, source = 0.0, ErrorSource.UNKNOWN
     lod95 = m3c2.Z95 * (moved.sd / np.sqrt(np.maximum(moved.count, 1)) + error)
     return Distances(moved.along, lod95, moved.count, moved.count, np.zeros(len(lod95)), moved.sd), error, source
 
@@ -167,18 +170,19 @@ def _result(
     found: Distances,
     origin: Floats,
     params: Params,
-    used: tuple[float, float, float, str, float],
+    used: tuple[float, float, float, ErrorSource, float],
 ) -> Result:
     diameter, depth, error, source, share = used
     total = m3c2.summary(found, core.points, core.normals, diameter, m3c2.PAPER_POINTS_A_CYLINDER)
-    status, said = _status(placed, total, params)
+    points = to_result.core_points(core.points, core.normals, found)
+    status, reasons = _status(placed, total, params)
     if scan.unposed > 1:
-        said += f" {scan.unposed} scans have no pose: they were taken to be in one frame already."
+        reasons.append(reason("deviation.unposed-scans", scans=scan.unposed))
     known = found.std2[np.isfinite(found.lod95)]
     return Result(
         status=status,
         method=params.method,
-        message=said,
+        reasons=tuple(reasons),
         T_design_scan=global_pose(placed.T, scan.origin, origin),
         registration=placed.registration,
         registration_error=error,
@@ -195,57 +199,39 @@ def _result(
         on_surface_share=share,
         projection_diameter=diameter,
         max_depth=depth,
-        significant_share=total.significant_share.share,
-        significant_low=total.significant_share.low,
-        significant_high=total.significant_share.high,
         origin=origin,
-        core=core.points,
-        normals=core.normals,
-        distance=found.distance,
-        lod95=found.lod95,
-        n1=found.n1,
-        n2=found.n2,
-        std1=found.std1,
-        std2=found.std2,
+        core=points,
+        **to_result.statistics(points, total),
     )
 
 
-def _status(placed: Placed, total: m3c2.Summary, params: Params) -> tuple[str, str]:
-    """Return the status and what to say of the registration."""
+def _status(placed: Placed, total: m3c2.Summary, params: Params) -> tuple[Status, list[Reason]]:
+    """Return the status, and its reasons: how the scan was registered."""
     if total.core_points == total.without_lod:
-        return "failed", (
-            f"no core point has enough scanned points: {100.0 * placed.near_share:.0f} % of the scan lie within "
-            f"{NEAR_MM:g} mm of the design as given; is the design of this structure, and in its unit?"
-        )
-    said = []
-    status = "ok"
-    if placed.registration == "as given":
-        why = "asked for" if params.register == "none" else f"{100.0 * placed.near_share:.0f} % of it lie there"
-        said.append(f"The scan is taken to be in the design's frame ({why}): deviations hold what moved as a whole.")
+        share = 100.0 * placed.near_share
+        return Status.FAILED, [reason("deviation.no-core-point", share=share, near_mm=NEAR_MM)]
+    reasons: list[Reason] = []
+    status = Status.OK
+    if placed.registration is Registration.AS_GIVEN:
+        if params.register == "none":
+            reasons.append(reason("deviation.as-requested"))
+        else:
+            reasons.append(reason("deviation.as-given", share=100.0 * placed.near_share))
         if np.isfinite(placed.turn):
-            shift = " / ".join(f"{one:.2f}" for one in placed.shift.tolist())
-            said.append(
-                f"A best fit would move its middle by {shift} mm and turn it by {1000.0 * placed.turn:.3f} mrad; "
-                'deviation.register = "fine" applies it.'
-            )
+            x, y, z = placed.shift.tolist()
+            reasons.append(reason("deviation.best-fit-would-move", x=x, y=y, z=z, turn_mrad=1000.0 * placed.turn))
     else:
-        said.append(
-            "The scan was registered to the design by a best fit: what the structure moved as a whole is taken up by "
-            "it and not among the deviations."
-        )
+        reasons.append(reason("deviation.best-fit"))
         if not np.isfinite(placed.T_best_fit).all():
-            status = "weak"
-            said.append("What was seen does not hold the best fit: the attitude is the coarse one.")
+            status = Status.WEAK
+            reasons.append(reason("deviation.coarse-only"))
     if placed.ambiguity < AMBIGUOUS:
-        status = "ambiguous"
-        said.append(
-            f"Another attitude fits about as well (its error is {placed.ambiguity:.2f} times the best one's): the "
-            "structure looks the same from there; give the scan in about the design's frame to tell them apart."
-        )
-    if placed.weak and placed.registration != "as given" and status == "ok":
-        status = "weak"
-        said.append(f"Not held well by what was seen: {', '.join(placed.weak)}.")
-    return status, " ".join(said)
+        status = Status.AMBIGUOUS
+        reasons.append(reason("deviation.ambiguous", ratio=placed.ambiguity))
+    if placed.weak and placed.registration is not Registration.AS_GIVEN and status is Status.OK:
+        status = Status.WEAK
+        reasons.append(reason("deviation.weak", motions=placed.weak))
+    return status, reasons
 
 
 def global_pose(T: Floats, scan_origin: Floats, design_origin: Floats) -> Floats:

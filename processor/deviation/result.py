@@ -8,57 +8,101 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry.m3c2 import Distances
-from processor.model import Checked, Floats, Ints, column, optional
+from processor.geometry.surface_registration import Registration
+from processor.model import (
+    Checked,
+    Floats,
+    Ints,
+    Reason,
+    Rows,
+    Status,
+    Word,
+    column,
+    described,
+    optional,
+    reasons,
+)
 
 NAN = float("nan")
 
 
-@dataclass(frozen=True)
-class Result(Checked):
-    """Deviations at core points of the design's surface, mm; a distance outward is positive, NaN = no answer.
+class ErrorSource(Word):
+    """Where the registration error within LOD95 is from."""
 
-    Core points are less ``origin``, in the design's frame. ``T_design_scan`` maps the frame of the scans as merged;
-    ``T_best_fit`` is that of a best fit, applied or not, with ``covariance`` (design frame, turn about its origin and
-    translation). By method ``default``, ``n1`` is the number of the surface's places that points were held against,
-    and ``std1`` is 0.
+    UNKNOWN = "not known: the scan does not determine the best fit"
+    COVARIANCE = "covariance of the best fit, rms over the core points"
+    GIVEN = "given"
+    CLONE = "a clone of the scan"
+
+
+@dataclass(frozen=True)
+class CorePoints(Rows):
+    """Core points of the design's surface, design frame less the result's origin, and M3C2 at each; NaN = no value.
+
+    A distance outward is positive. By method ``default``, ``n1`` is the number of the surface's places that points
+    were compared with, and ``std1`` is 0.
     """
 
-    status: str  # ok | ambiguous | weak | failed
-    method: str
-    message: str = ""
-    T_design_scan: Floats = optional(4, 4)
-    registration: str = ""  # as given | fine | coarse
-    registration_error: float = NAN  # one standard deviation as a length: E of the level of detection
-    registration_error_from: str = ""
-    T_best_fit: Floats = optional(4, 4)
-    covariance: Floats = optional(6, 6)
-    best_fit_shift: Floats = optional(3)  # of the scan's middle by the best fit against the frame used
-    best_fit_turn: float = NAN
-    ambiguity: float = NAN  # error of the second best attitude over that of the best; near 1: either could be right
-    spacing: float = NAN
-    sigma: float = NAN
-    points_read: int = 0
-    points_kept: int = 0  # by the outlier removal
-    on_surface_share: float = NAN  # of them within the depth of the design
-    normal_diameter: float = NAN
-    projection_diameter: float = NAN
-    max_depth: float = NAN
-    significant_share: float = NAN
-    significant_low: float = NAN
-    significant_high: float = NAN
-    origin: Floats = dataclasses.field(
-        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
-    )
-    core: Floats = column("k", 3)
+    points: Floats = column("k", 3, unit="mm")
     normals: Floats = column("k", 3)
-    distance: Floats = column("k")
-    lod95: Floats = column("k")
+    distance: Floats = column("k", unit="mm")
+    lod95: Floats = column("k", unit="mm")
     n1: Ints = column("k", dtype=np.int64)
     n2: Ints = column("k", dtype=np.int64)
-    std1: Floats = column("k")
-    std2: Floats = column("k")
+    std1: Floats = column("k", unit="mm")
+    std2: Floats = column("k", unit="mm")
 
     @property
     def distances(self) -> Distances:
-        """What M3C2 says at each core point."""
-        return Distances(self.distance, self.lod95, self.n1, self.n2, self.std1, self.std2)
+        """The columns of M3C2."""
+        return Distances(
+            distance=self.distance, lod95=self.lod95, n1=self.n1, n2=self.n2, std1=self.std1, std2=self.std2
+        )
+
+
+@dataclass(frozen=True)
+class Result(Checked):
+    """Deviations of a scanned surface from its design.
+
+    ``T_design_scan`` maps the frame of the scans as merged; ``T_best_fit`` is that of a best fit, applied or not, with
+    ``covariance`` (design frame, rotation about its origin and translation). The statistics are of the core points
+    that have a level of detection.
+    """
+
+    status: Status = described(words=Status)
+    method: str = described()
+    reasons: tuple[Reason, ...] = reasons()
+    T_design_scan: Floats = optional(4, 4)
+    registration: Registration = described(Registration.AS_GIVEN, words=Registration, heading="registration")
+    registration_error: float = described(NAN, unit="mm", heading="registration error, one sd")
+    registration_error_from: ErrorSource = described(ErrorSource.UNKNOWN, words=ErrorSource, heading="from")
+    covariance: Floats = optional(6, 6)
+    ambiguity: float = described(NAN, unit="times", heading="ambiguity: error of the next best attitude")
+    T_best_fit: Floats = optional(4, 4, json="best_fit.T_design_scan")
+    best_fit_shift: Floats = optional(3, json="best_fit.shift", unit="mm")  # of the scan's middle, from T_design_scan
+    best_fit_turn: float = described(NAN, json="best_fit.turn", unit="rad")
+    core_points: int = described(0, heading="core points")
+    core_points_measured: int = described(0, heading="core points measured")
+    significant_share: float = described(NAN, percent=True, heading="beyond LOD95")
+    significant_share_ci95: Floats = optional(2, percent=True, heading="beyond LOD95, 95 % interval")
+    within_10mm_share: float = described(NAN, percent=True, heading="within 10 mm")
+    mean: float = described(NAN, unit="mm", heading="mean")
+    median: float = described(NAN, unit="mm", heading="median")
+    sd: float = described(NAN, unit="mm", heading="standard deviation")
+    min: float = described(NAN, unit="mm", heading="least")
+    min_ci95: Floats = optional(2, unit="mm", heading="least, 95 % interval")
+    max: float = described(NAN, unit="mm", heading="greatest")
+    max_ci95: Floats = optional(2, unit="mm", heading="greatest, 95 % interval")
+    lod95_median: float = described(NAN, unit="mm", heading="LOD95, median")
+    points_read: int = described(0, json="points.read", heading="points read")
+    points_kept: int = described(0, json="points.kept", heading="points kept by the outlier removal")
+    on_surface_share: float = described(NAN, json="points.on_surface", percent=True, heading="points on the surface")
+    spacing: float = described(NAN, unit="mm", heading="spacing of the scan")
+    sigma: float = described(NAN, unit="mm", heading="sd of a point from the surface")
+    normal_diameter: float = described(NAN, unit="mm", heading="normal diameter")
+    projection_diameter: float = described(NAN, unit="mm", heading="projection diameter")
+    max_depth: float = described(NAN, unit="mm", heading="depth to either side")
+    origin: Floats = dataclasses.field(
+        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64, "json": ""}
+    )
+    core: CorePoints = dataclasses.field(default_factory=CorePoints, metadata={"json": ""})

@@ -5,12 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from processor.defects.result import Result
-from processor.model import DefectTruth, Floats, Ints, Metric, Scene, Truth
+from processor.model import Better, DefectTruth, Floats, Ints, Metric, Scene, Statistic, Truth
 
 DEPTH_SHARE = 0.10
 DEPTH_LODS = 2.0
 CLASS_SHARE = 0.9
 NAN = float("nan")
+WRONG_DEPTHS = "depths off by more than a tenth and 2 LOD95"
 WHOLE = ("bend", "twist", "waviness", "step", "misalignment")
 WHOLE_SHARE = 0.6  # of a component's reach that the centre of its shape may be off
 NEAR_MM = 30.0
@@ -64,7 +65,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         own = kinds == kind
         metrics.append(
             Metric(
-                "defects", f"{kind}: missed of {int(own.sum())}", float((rows[own] < 0).sum()), 0.0 if held else NAN, ""
+                "defects", f"missed: {kind}", float((rows[own] < 0).sum()), Statistic.COUNT, limit=0.0 if held else NAN
             )
         )
     false = len(result.ids) - int((rows >= 0).sum())
@@ -77,30 +78,35 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     judged = got & ~bound
     metrics += [
         Metric(
-            "defects", "false alarms", float(false), float(np.floor(likely)) if np.isfinite(area) and held else NAN, ""
+            "defects",
+            "false alarms",
+            float(false),
+            Statistic.COUNT,
+            limit=float(np.floor(likely)) if np.isfinite(area) and held else NAN,
         ),
-        Metric("defects", "surface examined", result.examined_mm2 / 1e6, NAN, "m2"),
+        Metric("defects", "surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
     ]
     if got.any():
         wrong = float((named[rows[got]] != kinds[got]).mean())
         off = np.abs(error[judged]) - allowed[judged]
         metrics += [
-            Metric("defects", "class wrong", 100.0 * wrong, 100.0 * (1.0 - CLASS_SHARE) + 1e-9 if held else NAN, "%"),
             Metric(
                 "defects",
-                "depths off by more than a tenth and 2 LOD95",
-                float((off > 0.0).sum()),
-                0.0 if held else NAN,
-                "",
+                "class wrong",
+                100.0 * wrong,
+                Statistic.SHARE,
+                unit="%",
+                limit=100.0 * (1.0 - CLASS_SHARE) + 1e-9 if held else NAN,
             ),
+            Metric("defects", WRONG_DEPTHS, float((off > 0.0).sum()), Statistic.COUNT, limit=0.0 if held else NAN),
             Metric(
                 "defects",
-                "depth error, median",
+                "depth error",
                 float(np.median(np.abs(error[judged]))) if judged.any() else NAN,
-                NAN,
-                "mm",
+                Statistic.MEDIAN,
+                unit="mm",
             ),
-            Metric("defects", "depth error, max", float(np.abs(error[judged]).max(initial=0.0)), NAN, "mm"),
-            Metric("defects", "depths that are bounds alone", float(bound.sum()), NAN, ""),
+            Metric("defects", "depth error", float(np.abs(error[judged]).max(initial=0.0)), Statistic.MAX, unit="mm"),
+            Metric("defects", "depths that are bounds alone", float(bound.sum()), Statistic.COUNT),
         ]
     return metrics

@@ -8,12 +8,13 @@ from scipy.spatial import cKDTree
 from processor.deviation.result import Result
 from processor.evaluation.error_statistics import signed
 from processor.geometry import principal, rigid
-from processor.model import Floats, Metric, Scene, StructureTruth, Truth
+from processor.model import Floats, Metric, Scene, Statistic, StructureTruth, Truth
 
 NEIGHBOURS = 24
 REACH_MM = 500.0  # of a core point: a movement is smooth
 LEAST_MM = 50.0  # nearer points count the same
 NAN = float("nan")
+OTHER_POSE = "not compared with the truth: the pose found is another of those that fit about as well, turned by"
 BEYOND_LIMIT = 5.0  # % of core points farther from the truth than their level of detection
 
 
@@ -29,28 +30,28 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     if any(not scan.T_project_scan.size for scan in scene.scans) and len(scene.scans) > 1:
         return []
     if result.status == "ambiguous" and (turn := _otherwise(result)) is not None:
-        said = "not compared with the truth: the pose found is another of those that fit about as well, turned by"
-        return [Metric("deviation", said, turn, NAN, "deg")]
+        return [Metric("deviation", OTHER_POSE, turn, unit="deg")]
     true = true_deviation(result, truth.structure)
-    error = result.distance - true
-    known = np.isfinite(error) & np.isfinite(result.lod95)
+    error = result.core.distance - true
+    known = np.isfinite(error) & np.isfinite(result.core.lod95)
     if not known.any():
         return []
     size = np.abs(error[known])
-    beyond = 100.0 * float(np.mean(size > result.lod95[known]))
+    beyond = 100.0 * float(np.mean(size > result.core.lod95[known]))
     return [
         Metric(
             "deviation",
             "core points farther from the truth than their LOD95",
             beyond,
-            BEYOND_LIMIT if result.method == "default" else NAN,
-            "%",
+            Statistic.SHARE,
+            unit="%",
+            limit=BEYOND_LIMIT if result.method == "default" else NAN,
         ),
-        Metric("deviation", "deviation error, median", float(np.median(size)), NAN, "mm"),
-        Metric("deviation", "deviation error, 95th percentile", float(np.quantile(size, 0.95)), NAN, "mm"),
-        Metric("deviation", "deviation error, mean", float(np.mean(error[known])), NAN, "mm"),
-        Metric("deviation", "true deviation, rms", float(np.sqrt(np.mean(true[known] ** 2))), NAN, "mm"),
-        Metric("deviation", "LOD95, median", float(np.median(result.lod95[known])), NAN, "mm"),
+        Metric("deviation", "deviation error", float(np.median(size)), Statistic.MEDIAN, unit="mm"),
+        Metric("deviation", "deviation error", float(np.quantile(size, 0.95)), Statistic.P95, unit="mm"),
+        Metric("deviation", "deviation error", float(np.mean(error[known])), Statistic.MEAN, unit="mm"),
+        Metric("deviation", "true deviation", float(np.sqrt(np.mean(true[known] ** 2))), Statistic.RMS, unit="mm"),
+        Metric("deviation", "LOD95", float(np.median(result.core.lod95[known])), Statistic.MEDIAN, unit="mm"),
         *signed("deviation", "deviations", error[known]),
     ]
 
@@ -60,8 +61,8 @@ def _otherwise(result: Result) -> float | None:
     if not len(result.core):
         return None
     T = result.T_design_scan
-    centre = result.origin + result.core.mean(axis=0)
-    size = float(np.linalg.norm(np.ptp(result.core, axis=0)))
+    centre = result.origin + result.core.points.mean(axis=0)
+    size = float(np.linalg.norm(np.ptp(result.core.points, axis=0)))
     if not principal.differ(T, np.eye(4), centre, size):
         return None
     return float(np.degrees(rigid.rotation_angle(T[:3, :3])))
@@ -70,11 +71,13 @@ def _otherwise(result: Result) -> float | None:
 def true_deviation(result: Result, truth: StructureTruth) -> Floats:
     """Movement (k,) along the normal of each core point by the nearest points of the truth, NaN where none is near."""
     places = truth.points - result.origin
-    distance, index = cKDTree(places).query(result.core, k=min(NEIGHBOURS, len(places)), distance_upper_bound=REACH_MM)
+    distance, index = cKDTree(places).query(
+        result.core.points, k=min(NEIGHBOURS, len(places)), distance_upper_bound=REACH_MM
+    )
     distance, index = distance.reshape(len(result.core), -1), index.reshape(len(result.core), -1)
     near = np.isfinite(distance)
     at = np.minimum(index, len(places) - 1)
-    off = (places[at] - result.core[:, None]) / REACH_MM
+    off = (places[at] - result.core.points[:, None]) / REACH_MM
     weight = np.where(near, 1.0 / (distance**2 + LEAST_MM**2), 0.0)
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)  # a plane: the movement at the core point
     normal = np.einsum("nk,nki,nkj->nij", weight, basis, basis)
@@ -85,5 +88,7 @@ def true_deviation(result: Result, truth: StructureTruth) -> Floats:
     moved[~near.any(axis=1)] = np.nan
     T = rigid.with_origin(result.T_design_scan, -result.origin)
     T = rigid.transform(T[:3, :3], T[:3, 3] - result.origin)
-    found: Floats = np.einsum("ni,ni->n", rigid.apply(T, result.core + moved) - result.core, result.normals)
+    found: Floats = np.einsum(
+        "ni,ni->n", rigid.apply(T, result.core.points + moved) - result.core.points, result.core.normals
+    )
     return found

@@ -64,7 +64,7 @@ def evaluate(path: Path, execution: Execution) -> ErrorReport:
                 f"{source}: the truth does not fit what step {run.step} found ({error!r}); is it of another scene?"
             ) from error
         if run.step in answered:
-            found = [dataclasses.replace(metric, name=f"{run.method}: {metric.name}") for metric in found]
+            found = [dataclasses.replace(metric, method=run.method) for metric in found]
         answered.add(run.step)
         metrics += found
     true = truth.frame

@@ -15,12 +15,14 @@ from scipy.optimize import least_squares
 from processor.evaluation.error_statistics import signed
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
-from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Truth
+from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Truth
 from processor.preassembly import errors
 from processor.preassembly.chain.adjustment import HOLD
 from processor.preassembly.result import Result
 
 WRONG_POSE_RAD = 0.1
+TRUE_SPLICING = "splicing error of the true key points"
+TRUE_LINEAR = "linear error of the true edges"
 
 
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
@@ -44,21 +46,20 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     errors_at_points = np.vstack(key_error)
     mean, largest = _true_linear_error(scene.arch, result, truth.arch, true, true_poses)
     limit = 5.0 if truth.spacing_mm <= 5.0 else float("nan")
-    none = float("nan")
     own = np.abs(_gaps_of_truth(result, truth.arch, true, true_poses))
     return [
-        Metric("preassemble", "wrong poses called ok", float(wrong), 0.0, ""),
-        Metric("preassemble", "splicing error, mean", result.splicing_mean, limit, "mm"),
-        Metric("preassemble", "splicing error, max", result.splicing_max, none, "mm"),
-        Metric("preassemble", "splicing error of the true key points, mean", _over(np.mean, own), none, "mm"),
-        Metric("preassemble", "splicing error of the true key points, max", _over(np.max, own), none, "mm"),
-        Metric("preassemble", "linear error of the true edges, mean", mean, none, "mm"),
-        Metric("preassemble", "linear error of the true edges, max", largest, none, "mm"),
-        Metric("preassemble", "key points in the scan, rms", _rms(errors_at_points), none, "mm"),
+        Metric("preassemble", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
+        Metric("preassemble", "splicing error", result.splicing_mean, Statistic.MEAN, unit="mm", limit=limit),
+        Metric("preassemble", "splicing error", result.splicing_max, Statistic.MAX, unit="mm"),
+        Metric("preassemble", TRUE_SPLICING, _over(np.mean, own), Statistic.MEAN, unit="mm"),
+        Metric("preassemble", TRUE_SPLICING, _over(np.max, own), Statistic.MAX, unit="mm"),
+        Metric("preassemble", TRUE_LINEAR, mean, Statistic.MEAN, unit="mm"),
+        Metric("preassemble", TRUE_LINEAR, largest, Statistic.MAX, unit="mm"),
+        Metric("preassemble", "key points in the scan", _rms(errors_at_points), Statistic.RMS, unit="mm"),
         *_coverage(result, truth.arch, true),
         *signed("preassemble", "key points", errors_at_points),
         *_gaps_as_they_should_be(scene.arch, result, truth.arch, true),
-        Metric("preassemble", "pose, largest turn", 1000.0 * max(turns, default=none), none, "mrad"),
+        Metric("preassemble", "pose, largest turn", 1000.0 * max(turns, default=float("nan")), unit="mrad"),
     ]
 
 
@@ -69,7 +70,7 @@ def _coverage(result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Me
     if not known.any():
         return []
     share = float((np.abs(off[known]) <= NORMAL_95 * result.key_points_sd[known]).mean())
-    return [Metric("preassemble", "key points within their 95 % intervals", 100.0 * share, float("nan"), "%")]
+    return [Metric("preassemble", "key points", 100.0 * share, Statistic.COVERAGE, unit="%")]
 
 
 def _rms(vectors: Floats) -> float:
@@ -107,10 +108,9 @@ def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth
     gaps, linear = by_objective(design, ends, edges, result.weight)
     off = (result.gaps - gaps)[known]
     share = 100.0 * float((np.abs(off) <= result.gap_ci95[known]).mean())
-    none = float("nan")
     return [
-        Metric("preassemble", "gaps against the truth's, rms", float(np.sqrt(np.mean(off**2))), none, "mm"),
-        Metric("preassemble", "gaps within their 95 % intervals", share, none, "%"),
+        Metric("preassemble", "gaps against the truth's", float(np.sqrt(np.mean(off**2))), Statistic.RMS, unit="mm"),
+        Metric("preassemble", "gaps", share, Statistic.COVERAGE, unit="%"),
         *_errors_held(result, gaps[known], linear),
         *signed("preassemble", "gaps", off),
     ]
@@ -124,8 +124,7 @@ def _errors_held(result: Result, gaps: Floats, linear: Floats) -> list[Metric]:
     size = np.abs(gaps)
     true = np.array([size.mean(), size.max(), _over(np.mean, linear), _over(np.max, linear)])
     share = float((np.abs(stated - true) <= result.errors_ci95[:4]).mean())
-    name = "mean and largest errors within their intervals"
-    return [Metric("preassemble", name, 100.0 * share, float("nan"), "%")]
+    return [Metric("preassemble", "mean and largest errors", 100.0 * share, Statistic.COVERAGE, unit="%")]
 
 
 def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: float) -> tuple[Floats, Floats]:

@@ -7,7 +7,7 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.evaluation.error_statistics import signed
-from processor.model import NORMAL_95, Floats, FrameTruth, Ints, Metric, Scene, Truth
+from processor.model import NORMAL_95, Better, Floats, FrameTruth, Ints, Metric, Scene, Statistic, Truth
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Result
 from processor.space_frame.spheres import isolated
@@ -40,6 +40,9 @@ FOUND_MM = 3.0  # a node this near to the true one is found
 
 
 LOWEST_MM = 3.0  # an unflagged lowest point farther off is a wrong answer
+NEAR = f"nodes found within {FOUND_MM:g} mm"
+WRONG_CENTRE = f"balls called ok, centre over {WRONG_MM:g} mm off"
+WRONG_LOWEST = f"balls called ok, lowest point over {LOWEST_MM:g} mm off"
 
 
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
@@ -62,26 +65,25 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     limit = isolated.PAPER_RADIUS_ERROR_MM if result.method == "ransac" and scene.frame is not None else NAN
     metrics = [
         Metric(
-            "spheres", f"{name}, {which}", value, limit if (name, which) == ("radius error", "median") else NAN, "mm"
+            "spheres",
+            quantity,
+            value,
+            statistic,
+            unit="mm",
+            limit=limit if (quantity, statistic) == ("radius error", Statistic.MEDIAN) else NAN,
         )
-        for name, errors in (("radius error", radius), ("centre error", centre), ("lowest point error", lowest))
-        for which, value in _summary(np.abs(errors[np.isfinite(errors)]))
+        for quantity, errors in (("radius error", radius), ("centre error", centre), ("lowest point error", lowest))
+        for statistic, value in _summary(np.abs(errors[np.isfinite(errors)]))
     ]
     wrong = int((ok & (centre > WRONG_MM)).sum())
     low = int((ok & (np.abs(lowest) > LOWEST_MM)).sum())
     sd = np.sqrt(np.einsum("kii->ki", result.covariance[rows]))
     metrics += [
-        Metric("spheres", "balls not found", float(len(true.ids) - len(set(matches.tolist()))), NAN, ""),
-        Metric("spheres", f"nodes found within {FOUND_MM:g} mm", _share(len(near), len(true.ids)), NAN, "%"),
-        Metric("spheres", "nodes that are none", float(found.sum() - len(rows)), NAN, ""),
-        Metric("spheres", f"balls called ok, centre over {WRONG_MM:g} mm off", float(wrong), 0.0, ""),
-        Metric(
-            "spheres",
-            f"balls called ok, lowest point over {LOWEST_MM:g} mm off",
-            float(low),
-            0.0 if result.method == "ray" else NAN,
-            "",
-        ),
+        Metric("spheres", "balls not found", float(len(true.ids) - len(set(matches.tolist()))), Statistic.COUNT),
+        Metric("spheres", NEAR, _share(len(near), len(true.ids)), Statistic.SHARE, unit="%", better=Better.HIGH),
+        Metric("spheres", "nodes that are none", float(found.sum() - len(rows)), Statistic.COUNT),
+        Metric("spheres", WRONG_CENTRE, float(wrong), Statistic.COUNT, limit=0.0),
+        Metric("spheres", WRONG_LOWEST, float(low), Statistic.COUNT, limit=0.0 if result.method == "ray" else NAN),
         *_honesty("centres", off, sd[:, :3], ok),
         *_honesty("radii", radius, sd[:, 3], ok),
         *_honesty("lowest points", lowest, result.lowest_sd[rows], ok),
@@ -112,7 +114,7 @@ def _matched(scene: Scene, result: Result, true: FrameTruth) -> tuple[Ints, Ints
     return got[inside], nearest[inside].astype(np.int64)
 
 
-def _honesty(name: str, off: Floats, sd: Floats, ok: npt.NDArray[np.bool_]) -> list[Metric]:
+def _honesty(quantity: str, off: Floats, sd: Floats, ok: npt.NDArray[np.bool_]) -> list[Metric]:
     """How many errors of balls called ok lie within their 95 % intervals, and their rms in standard deviations."""
     known = np.isfinite(off[ok]) & (sd[ok] > 0.0)
     pull = off[ok][known] / sd[ok][known]
@@ -121,12 +123,12 @@ def _honesty(name: str, off: Floats, sd: Floats, ok: npt.NDArray[np.bool_]) -> l
     return [
         Metric(
             "spheres",
-            f"{name} within their 95 % intervals",
+            quantity,
             _share(int((np.abs(pull) < NORMAL_95).sum()), len(pull)),
-            NAN,
-            "%",
+            Statistic.COVERAGE,
+            unit="%",
         ),
-        Metric("spheres", f"{name}, rms of error by standard deviation", float(np.sqrt(np.mean(pull**2))), NAN, ""),
+        Metric("spheres", quantity, float(np.sqrt(np.mean(pull**2))), Statistic.PULL_RMS),
     ]
 
 
@@ -134,8 +136,8 @@ def _share(part: int, whole: int) -> float:
     return 100.0 * part / whole if whole else NAN
 
 
-def _summary(errors: Floats) -> list[tuple[str, float]]:
+def _summary(errors: Floats) -> list[tuple[Statistic, float]]:
     if len(errors) == 0:
-        return [("median", NAN), ("95th percentile", NAN), ("max", NAN)]
+        return [(Statistic.MEDIAN, NAN), (Statistic.P95, NAN), (Statistic.MAX, NAN)]
     median, high = np.percentile(errors, [50.0, 95.0])
-    return [("median", float(median)), ("95th percentile", float(high)), ("max", float(errors.max()))]
+    return [(Statistic.MEDIAN, float(median)), (Statistic.P95, float(high)), (Statistic.MAX, float(errors.max()))]

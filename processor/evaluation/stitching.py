@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, Metric, Scene, Truth
+from processor.model import NORMAL_95, Floats, Metric, Scene, Statistic, Truth
 from processor.stitching import frames
 from processor.stitching.result import Result
 
 POSITION_MM, ROTATION_MRAD = 0.5, 0.02
 WRONG_MM = 50.0
+AFTER_FIT = "station positions after datum fit"
+WRONG_BUT_OK = f"scans called ok, over {WRONG_MM:g} mm off"
 LEAST_SURE = 3  # scans without a flag that hold the datum alone
 NAN = float("nan")
 
@@ -36,7 +38,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     known = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
     rows = [i for i, name in enumerate(result.scans) if name in known and np.isfinite(result.T_project_scan[i]).all()]
     failed = sum(not np.isfinite(T).all() for T in result.T_project_scan)
-    metrics = [Metric("stitch", "scans not placed", float(failed), NAN, "")]
+    metrics = [Metric("stitch", "scans not placed", float(failed), Statistic.COUNT)]
     if len(rows) < 2:
         return metrics
     T = result.T_project_scan[rows]
@@ -50,18 +52,18 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     # What picks by hand allow is no limit of the software's.
     position, rotation = (NAN, NAN) if result.method == "three-point" else (POSITION_MM, ROTATION_MRAD)
     metrics += [
-        Metric("stitch", "station positions after datum fit, max", float(off.max()), position, "mm"),
-        Metric("stitch", "station positions after datum fit, rms", float(np.sqrt((off**2).mean())), NAN, "mm"),
-        Metric("stitch", "rotations after datum fit, max", float(turn.max()), rotation, "mrad"),
-        Metric("stitch", f"scans called ok, over {WRONG_MM:g} mm off", float((off[sure] > WRONG_MM).sum()), 0.0, ""),
+        Metric("stitch", AFTER_FIT, float(off.max()), Statistic.MAX, unit="mm", limit=position),
+        Metric("stitch", AFTER_FIT, float(np.sqrt((off**2).mean())), Statistic.RMS, unit="mm"),
+        Metric("stitch", "rotations after datum fit", float(turn.max()), Statistic.MAX, unit="mrad", limit=rotation),
+        Metric("stitch", WRONG_BUT_OK, float((off[sure] > WRONG_MM).sum()), Statistic.COUNT, limit=0.0),
     ]
     if result.by_control:
         apart = float(np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)[fit].max())
-        metrics.append(Metric("stitch", "station positions by control points, max", apart, NAN, "mm"))
+        metrics.append(Metric("stitch", "station positions by control points", apart, Statistic.MAX, unit="mm"))
     pulls = pulls_of(result, rows, true)
     if len(pulls):
         share = 100.0 * float((np.abs(pulls) < NORMAL_95).mean())
-        metrics.append(Metric("stitch", "pose components within their 95 % intervals", share, NAN, "%"))
+        metrics.append(Metric("stitch", "pose components", share, Statistic.COVERAGE, unit="%"))
     return metrics
 
 

@@ -15,7 +15,7 @@ from processor.geometry import icp, mesh_distance, principal, rigid
 from processor.geometry.mesh_distance import Bools, MeshSurface, Samples, on_face
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.principal import CoarsePose, PrincipalAxes
-from processor.model import NORMAL_95, Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints, Word
 
 # --- Fine registration
 
@@ -32,14 +32,21 @@ NO_FIT_MM = (10.0, 4.0)  # sigma above which the scan is not of the design; the 
 CLUTTER_SHARE = 0.15
 CELL_MM = 500.0  # residuals on one face in one such length of the part are taken as dependent
 WEAK_MM = 5.0  # a motion that may move the part's ends by more (95 %) is weakly determined
-MOTIONS = (
-    "a turn about its length", "a turn sideways", "a turn up and down", "a shift along its length", "a shift sideways",
-    "a shift up and down",
-)  # fmt: skip
+
+
+class Motion(Word):
+    """A motion of a part about its middle and principal axes."""
+
+    ROLL = "a turn about its length"
+    YAW = "a turn sideways"
+    PITCH = "a turn up and down"
+    ALONG = "a shift along its length"
+    SIDEWAYS = "a shift sideways"
+    UP = "a shift up and down"
 
 
 @dataclass(frozen=True)
-class Registration:
+class SurfaceFit:
     """T_bridge_scan (4, 4), its covariance (6, 6: turn about the design frame's axes, translation), sigma and shares.
 
     ``weak`` names the motions that the points seen do not determine. ``used_share`` is that of points on the surface.
@@ -49,13 +56,13 @@ class Registration:
     covariance: Floats
     sigma_mm: float
     used_share: float
-    weak: tuple[str, ...] = ()
+    weak: tuple[Motion, ...] = ()
 
 
-NOWHERE = Registration(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
+NOWHERE = SurfaceFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
 
 
-def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> Registration:
+def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> SurfaceFit:
     """Robust point-to-surface least squares of points (n, 3), scan frame, from ``start`` (4, 4).
 
     First, faces that look along each of the design's principal ``axes`` (3, 3, columns) have the same weight, so that
@@ -70,17 +77,17 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> R
     return _iterate(thinned(points, LAST_POINTS), surface, axes, balanced.T_bridge_scan, GATES_MM[1], even=False)[0]
 
 
-def fits(fitted: Registration) -> bool:
+def fits(fitted: SurfaceFit) -> bool:
     """Whether the scan is of the design's part: the points that are not clutter lie on its surface."""
     return fitted.sigma_mm < NO_FIT_MM[fitted.used_share < 1.0 - CLUTTER_SHARE]
 
 
 def _iterate(
     points: Floats, surface: MeshSurface, axes: Floats, start: Floats, gate: float, *, even: bool
-) -> tuple[Registration, float]:
+) -> tuple[SurfaceFit, float]:
     """Iterate to convergence; also return the ratio of the cells' mean squares to those of chance."""
     T, sigma, covariance, share, form = start.copy(), float("nan"), np.full((6, 6), np.nan), 0.0, float("inf")
-    weak: tuple[str, ...] = ()
+    weak: tuple[Motion, ...] = ()
     face: Ints | None = None
     for iteration in range(MOST_ITERATIONS):
         placed = rigid.apply(T, points)
@@ -115,7 +122,7 @@ def _iterate(
             covariance = rigid.about_origin(at_middle, middle)
             break
         face = face if move < SMALL_MM else None
-    return Registration(T, covariance, sigma, share, weak), form
+    return SurfaceFit(T, covariance, sigma, share, weak), form
 
 
 def _spread(residual: Floats) -> float:
@@ -152,13 +159,13 @@ def _scatter(gradient: Floats, cell: Ints) -> Floats:
     return scatter
 
 
-def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[str, ...]:
+def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion, ...]:
     """Name the motions about the part's middle and its axes that may move its ends by more than WEAK_MM."""
     turned = np.kron(np.eye(2), axes.T)
     spread = NORMAL_95 * np.sqrt(np.diag(turned @ covariance @ turned.T))
     arms = np.array([0.1 * half_length, half_length, half_length, 1.0, 1.0, 1.0])
     order = (0, 2, 1, 3, 4, 5)  # a turn about the third axis is sideways where the second one is
-    return tuple(name for name, k in zip(MOTIONS, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
+    return tuple(name for name, k in zip(Motion, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
 
 
 # --- Coarse registration, and the choice between the two
@@ -173,6 +180,14 @@ FINE_POINTS = 30_000
 NAN = float("nan")
 
 
+class Registration(Word):
+    """How a scan was registered to its design."""
+
+    AS_GIVEN = "as given"
+    FINE = "fine"
+    COARSE = "coarse"
+
+
 @dataclass(frozen=True)
 class Placed:
     """``T`` (4, 4) and ``T_best_fit`` (4, 4) map the scan's local frame to the design's; ``registration`` says how.
@@ -182,14 +197,14 @@ class Placed:
     """
 
     T: Floats
-    registration: str  # as given | fine | coarse
+    registration: Registration
     T_best_fit: Floats
     covariance: Floats
     ambiguity: float
     near_share: float
     shift: Floats
     turn: float
-    weak: tuple[str, ...]
+    weak: tuple[Motion, ...]
     sigma_mm: float
 
 
@@ -203,17 +218,17 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Plac
     few = thinned(points, FINE_POINTS)
     near, _ = surface.tree.query(rigid.apply(given, few), distance_upper_bound=NEAR_MM, workers=-1)
     near_share = float(np.isfinite(near).mean())
-    start, ambiguity, registration = given, NAN, "as given"
+    start, ambiguity, registration = given, NAN, Registration.AS_GIVEN
     if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
         spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
         pose = coarse(even(points), mesh_distance.sampled(surface.vertices, surface.faces, spacing), axes)
-        start, ambiguity, registration = pose.T_target_source, pose.ambiguity, "coarse"
+        start, ambiguity, registration = pose.T_target_source, pose.ambiguity, Registration.COARSE
     elif how == "fine":
-        registration = "fine"
+        registration = Registration.FINE
     fitted = fine(few, surface, axes.axes, start)
     determined = np.isfinite(fitted.covariance).all()
     best = fitted.T_bridge_scan if determined else np.full((4, 4), NAN)
-    T = start if registration == "as given" or not determined else best
+    T = start if registration is Registration.AS_GIVEN or not determined else best
     between = best @ rigid.invert(T) if determined else np.full((4, 4), NAN)
     middle = rigid.apply(T, few.mean(axis=0))
     return Placed(

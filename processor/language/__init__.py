@@ -18,6 +18,9 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
+from processor.language.messages import messages
+from processor.model import Word
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -57,10 +60,14 @@ class Language:
             sections = catalogue(code).values()
             self.words = {key: text for section in sections for key, text in section.get("words", {}).items()}
             sentences = {key: text for section in sections for key, text in section.get("sentences", {}).items()}
+            self.words |= {key: text for key, text in messages(code).texts.items() if "{" not in key}
+            self.words |= {key.split(".")[-1]: text for key, text in messages(code).words.items()}
             self._patterns = [(_pattern(key), text) for key, text in sentences.items()]
 
-    def say(self, text: str, within: str = "") -> str:
-        """Translate a text; as it is where it is not known. ``within`` tells words of two senses apart."""
+    def say(self, text: Any, within: str = "") -> str:
+        """Write a message, or translate a text where it is known; ``within`` distinguishes words of two senses."""
+        if not isinstance(text, str) or isinstance(text, Word):
+            return messages(self.code).text(text)
         if not self.words:
             return text
         if within and (special := self.words.get(f"{within}|{text}")) is not None:
@@ -98,6 +105,7 @@ class Language:
 
     def in_figures(self, data: Any) -> Any:
         """Translate what live figures show: texts, or lists of them, under the keys SAID_IN_FIGURES, at any depth."""
+        data = messages(self.code).rendered(data)
         if isinstance(data, dict):
             return {
                 key: self._shown(value) if key in SAID_IN_FIGURES else self.in_figures(value)

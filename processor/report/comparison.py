@@ -15,6 +15,7 @@ from processor.compare.compare import Comparison, turned_note, unit_note
 from processor.geometry.m3c2 import FEWEST_FOR_LOD
 from processor.geometry.normal_orientation import CONVENTION, Turned
 from processor.language import language
+from processor.language.messages import Message
 from processor.report import results_folder
 from processor.report.deviation import csv
 from processor.report.deviation import figures as deviation_figures
@@ -145,7 +146,7 @@ def lines(record: dict[str, Any]) -> list[str]:
     return found + [note for note in (record.get("unit_note"), record.get("normals_note")) if note]
 
 
-def _page(record: dict[str, Any], drawn: list[tuple[str, bytes]], lang: str) -> str:
+def _page(record: dict[str, Any], drawn: list[tuple[Message, bytes]], lang: str) -> str:
     import jinja2
 
     environment = jinja2.Environment(

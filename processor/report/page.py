@@ -9,16 +9,19 @@ from collections.abc import Container, Mapping
 from typing import Any
 
 import jinja2
+import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language import language
-from processor.model import StepRun
+from processor.language.messages import messages, text
+from processor.model import StepRun, Word
 from processor.pipeline import Execution
 from processor.report import all_tables, section, view
 from processor.report.style import Drawn
 from processor.report.table import headings, numeric, shown
 
 GOOD = "ok"
+LONG_CELL = 24  # characters
 LEAD = ("what-to-do", "limits", "limits-chain", "limits-not-held")  # tables above the figures
 PROVENANCE = ("input", "input_sha256", "seed", "software", "parameters")
 NAMES = (
@@ -54,7 +57,7 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         if (data := section.of(run.step).live(scene, [run, *others])) is not None
     }
     script, digest = view.script()
-    text: str = environment.get_template("page.html").render(
+    page: str = environment.get_template("page.html").render(
         title=scene.name,
         input_said=(
             f"{scene.kind}, {len(scene.scans)} scan{'' if len(scene.scans) == 1 else 's'}, "
@@ -66,19 +69,22 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),
-        sections=_sections(execution, report, figures, set(live)),
+        sections=_sections(execution, report, figures, set(live), lang),
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
-    return text
+    return page
 
 
-def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, str]]:
-    found = []
+def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = []
     for run, _ in all_tables.grouped(execution.runs):
         report_of = section.of(run.step)
         head, said = report_of.summary(run.result)
-        title = f"{report_of.title}: {head}"
-        found.append({"tone": _tone(run), "head": title, "text": f"Method {run.method}. {said}".strip()})
+        title: Any = text("{step}: {head}", step=report_of.title, head=head)
+        body: Any = text("Method {method}. {text}", method=run.method, text=said)
+        if isinstance(head, str):
+            title, body = f"{report_of.title}: {head}", f"Method {run.method}. {said}".strip()
+        found.append({"tone": _tone(run), "head": title, "text": body})
         found += [{"tone": "", "head": head, "text": text} for head, text in report_of.further(run.result)]
     if report.metrics:
         limited = [m for m in report.metrics if m.limit == m.limit]
@@ -102,8 +108,12 @@ def _tone(run: StepRun) -> str:
     return "" if getattr(run.result, "judged", ()) and "indeterminate" in verdicts else "good"
 
 
+def _message(result: Any, lang: str) -> str:
+    return messages(lang).sentences(result.reasons) if hasattr(result, "reasons") else str(result.message)
+
+
 def _sections(
-    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str]
+    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str], lang: str
 ) -> list[dict[str, Any]]:
     sections = []
     for run, others in all_tables.grouped(execution.runs):
@@ -111,9 +121,9 @@ def _sections(
         sections.append(
             {
                 "title": section.of(run.step).title,
-                "message": run.result.message,
-                "lead": [_table(one) for one in shown_tables if one.file in LEAD],
-                "tables": [_table(one) for one in shown_tables if one.file not in LEAD],
+                "message": _message(run.result, lang),
+                "lead": [_table(one, lang) for one in shown_tables if one.file in LEAD],
+                "tables": [_table(one, lang) for one in shown_tables if one.file not in LEAD],
                 "step": run.step,
                 "live": run.step in live,
                 "figures": [
@@ -123,22 +133,41 @@ def _sections(
             }
         )
     if report.metrics:
-        checks = _table(all_tables.of_checks(report))
+        checks = _table(all_tables.of_checks(report), lang)
         sections.append(
             {"title": "Truth", "message": "", "lead": [], "tables": [checks], "figures": [], "live": False, "step": ""}
         )
     return sections
 
 
-def _table(table: all_tables.Table) -> dict[str, Any]:
+def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
+    """Return the style of a cell and its text; names from the input are not translated."""
+    if isinstance(cell, int | float | np.number):
+        return "number", shown(cell)
+    if not isinstance(cell, str) or isinstance(cell, Word):
+        written = shown(messages(lang).text(cell))
+    else:
+        written = shown(cell) if column in NAMES else language(lang).say(shown(cell), column)
+    return "long" if len(shown(cell)) > LONG_CELL else "text", written
+
+
+def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
     note = table.note
     if len(table.rows) > MOST_ROWS:
-        note = f"{note} The first {MOST_ROWS} of {len(table.rows)} rows; all are in {table.file}.csv.".strip()
+        note: Any = text(
+            "{note} The first {most} of {rows} rows; all are in {file}.csv.",
+            note=note,
+            most=MOST_ROWS,
+            rows=len(table.rows),
+            file=table.file,
+        )
     return {
         "title": table.title,
         "note": note,
         "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
         "columns": list(zip(table.columns, headings(table), numeric(table), strict=True)),
-        "named": [column in NAMES for column in table.columns],
-        "rows": table.rows[:MOST_ROWS],
+        "rows": [
+            [_cell(cell, column, lang) for cell, column in zip(row, table.columns, strict=True)]
+            for row in table.rows[:MOST_ROWS]
+        ],
     }

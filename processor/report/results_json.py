@@ -40,9 +40,13 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
             {
                 "step": metric.step,
                 "name": metric.name,
+                "method": metric.method,
+                "quantity": metric.quantity,
+                "statistic": metric.statistic,
                 "value": metric.value,
                 "limit": metric.limit,
                 "unit": metric.unit,
+                "better": metric.better,
                 "passed": metric.passed,
             }
             for metric in report.metrics

@@ -1,4 +1,4 @@
-"""What a step says of itself in a report: ``REPORT`` of the module ``of_<step>``, found by the step's name."""
+"""The report of a step: ``REPORT`` of the module ``section`` in the folder of the step's name."""
 
 from __future__ import annotations
 
@@ -8,21 +8,23 @@ from dataclasses import dataclass
 from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import Message
 from processor.model import Scene, StepRun
 from processor.pipeline import Execution, package_of
+from processor.report.record_json import as_object
 from processor.report.style import Drawn
 from processor.report.table import Table
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """How a step's answer is told; ``runs`` are the answer, then other methods on the same scene for comparison."""
+    """What a step reports; ``runs`` are its result, then those of other methods on the same scene for comparison."""
 
-    title: str
-    summary: Callable[[Any], tuple[str, str]]  # of a result: the verdict's head, and what is said below it
-    written: Callable[[Any], dict[str, Any]]  # of a result: its object in results.json, arrays and NaN as they are
+    title: str | Message
+    summary: Callable[[Any], tuple[Any, Any]]  # of a result: the verdict's head, and what is said below it
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
     figures: Callable[[Execution, Sequence[StepRun], ErrorReport], Drawn]  # file names are the step's own
+    written: Callable[[Any], dict[str, Any]] = as_object  # of a result: its object in results.json
     further: Callable[[Any], list[tuple[str, str]]] = lambda _: []  # heads and texts beside the verdict
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     live: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None  # what the page's script draws

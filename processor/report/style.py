@@ -19,6 +19,7 @@ from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
 
+from processor.language.messages import Message
 from processor.model import Floats
 
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
@@ -33,7 +34,7 @@ LEAST_SHOWN_MM = 1e-3
 BEHIND_TEXT = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 LONGEST_LABEL = 24
 
-Drawn = dict[str, tuple[str, bytes]]  # file name -> (caption, PNG)
+Drawn = dict[str, tuple[str | Message, bytes]]  # file name -> (caption, PNG)
 
 
 def png(figure: Figure) -> bytes:

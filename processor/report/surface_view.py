@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from processor.language.messages import Message
 from processor.model import Floats, Ints
 from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS, colour_limit
@@ -34,7 +35,7 @@ class Region:
 
 
 def of_points(
-    title: str,
+    title: str | Message,
     method: str,
     points: Floats,
     values: Floats,

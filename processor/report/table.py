@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import io
 import itertools
 import math
 import unicodedata
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+
+from processor.language.messages import Message, Text, messages, text
+from processor.model import Checked, Reason, StepRun
 
 NAN = float("nan")
 
@@ -22,14 +27,39 @@ class Table:
     ``groups`` are headings above the columns, one each, equal neighbours taken together; CSV files have none.
     """
 
-    title: str
+    title: str | Message
     columns: tuple[str, ...]
     rows: tuple[tuple[Any, ...], ...]
     file: str = ""
-    note: str = ""
-    groups: tuple[str, ...] = ()
+    note: str | Message = ""
+    groups: tuple[str | Message, ...] = ()
     on_page: bool = True
     on_terminal: bool = True
+
+
+def figures_of(title: str, runs: Sequence[StepRun], file: str) -> Table:
+    """Tabulate the fields of results that have a heading, a column a method; see :func:`processor.model.described`."""
+    columns = [list(_figures(run.result)) for run in runs]
+    rows = tuple(
+        (heading, *(column[i][1] for column in columns), unit) for i, (heading, _, unit) in enumerate(columns[0])
+    )
+    return Table(text(title), ("figure", *(run.method for run in runs), "unit"), rows, file)
+
+
+def _figures(result: Checked) -> Iterator[tuple[Message, Any, str]]:
+    yield text("status"), result.status, ""  # type: ignore[attr-defined]
+    for field in dataclasses.fields(result):  # type: ignore[arg-type]
+        heading = field.metadata.get("heading")
+        if not heading:
+            continue
+        percent, value = field.metadata.get("percent", False), getattr(result, field.name)
+        unit = "%" if percent else field.metadata.get("unit", "")
+        if isinstance(value, np.ndarray):
+            low, high = (value * (100.0 if percent else 1.0)).tolist() if value.size else (NAN, NAN)
+            yield text("{quantity}, from", quantity=text(heading)), low, unit
+            yield text("{quantity}, to", quantity=text(heading)), high, unit
+        else:
+            yield text(heading), 100.0 * value if percent else value, unit
 
 
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # how a cell begins that a spreadsheet would execute
@@ -47,14 +77,16 @@ def csv_text(table: Table) -> str:
 def _csv_cell(cell: Any) -> Any:
     if isinstance(cell, float | np.floating):
         return "" if not math.isfinite(cell) else repr(round(float(cell), 6))
-    if isinstance(cell, str):
+    if isinstance(cell, str | Text | Reason | list | tuple):
         text = shown(cell)
         return "'" + text if text.startswith(FORMULA) else text
     return cell
 
 
 def shown(cell: Any) -> str:
-    """Write a cell for people: three decimals, a dash where there is no number, no control characters."""
+    """Write a cell for people, messages in English: three decimals, a dash for no number, no control characters."""
+    if isinstance(cell, Text | Reason | list | tuple):
+        cell = messages("en").text(cell)
     if isinstance(cell, float | np.floating):
         return "–" if not math.isfinite(cell) else f"{cell:.3f}"
     return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in str(cell))
@@ -89,10 +121,10 @@ def _group_line(table: Table, widths: list[int]) -> str:
     start = 0
     for group, members in itertools.groupby(table.groups):
         columns = range(start, start + len(list(members)))
-        start = columns.stop
+        start, heading = columns.stop, shown(group)
         width = sum(widths[i] for i in columns) + 2 * (len(columns) - 1)
-        widths[columns[-1]] += max(0, _width(group) - width)
-        line += shown(group) + " " * (max(width, _width(group)) - _width(group) + 2)
+        widths[columns[-1]] += max(0, _width(heading) - width)
+        line += heading + " " * (max(width, _width(heading)) - _width(heading) + 2)
     return line
 
 

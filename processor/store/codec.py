@@ -8,16 +8,17 @@ refers to a heap, and its size is known before it is read.
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import types
 import typing
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, TypeVar
 
 import h5py
 import numpy as np
 
-from processor.model import RecordError
+from processor.model import VOCABULARIES, Reason, RecordError, Word
 
 CHUNK_ROWS = 65_536
 PLAIN_ITEMS = 1_024  # arrays up to this size are stored plainly
@@ -63,6 +64,38 @@ def write_text(group: Any, name: str, text: str) -> None:
     _create(group, name, np.array(data, _text_type(len(data))))
 
 
+def write_texts(group: Any, name: str, texts: Sequence[str]) -> None:
+    """Write a list of texts, each as long as the longest."""
+    data = [_encoded(text) for text in texts]
+    _create(group, name, np.array(data, _text_type(max([1, *map(len, data)]))))
+
+
+def reason_object(item: Reason) -> dict[str, Any]:
+    """Return a reason as JSON objects, its words and reasons within as well."""
+    return {"code": item.code, "values": {name: _value_object(value) for name, value in item.values.items()}}
+
+
+def _value_object(value: Any) -> Any:
+    if isinstance(value, Reason):
+        return reason_object(value)
+    if isinstance(value, Word):
+        return {"word": str(value), "of": type(value).__name__}
+    return [_value_object(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def _reason(found: Any) -> Reason:
+    """Return the reason that an object of :func:`reason_object` holds. Raises KeyError and TypeError for another."""
+    return Reason(str(found["code"]), {str(name): _value(value) for name, value in dict(found["values"]).items()})
+
+
+def _value(found: Any) -> Any:
+    if isinstance(found, dict):
+        if "word" not in found:
+            return _reason(found)
+        return VOCABULARIES[found["of"]](found["word"])
+    return tuple(_value(item) for item in found) if isinstance(found, list) else found
+
+
 def _encoded(text: str) -> bytes:
     if "\0" in text:
         raise RecordError(f"text with a zero character cannot be stored: {text[:40]!r}")
@@ -90,6 +123,13 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
         return
     if "shape" in metadata:
         write_array(group, name, value)
+    elif "reasons" in metadata:
+        rows = (
+            [[reason_object(item) for item in row] for row in value]
+            if metadata["reasons"]
+            else map(reason_object, value)
+        )
+        write_texts(group, name, [json.dumps(row, ensure_ascii=False, allow_nan=True) for row in rows])
     elif isinstance(value, str):
         write_text(group, name, value)
     elif isinstance(value, bool):
@@ -103,8 +143,7 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
         for i, item in enumerate(value):
             _write(members, f"{i:04d}", item, {}, hooks)
     elif isinstance(value, tuple) and all(isinstance(item, str) for item in value):
-        data = [_encoded(item) for item in value]
-        _create(group, name, np.array(data, _text_type(max([1, *map(len, data)]))))
+        write_texts(group, name, value)
     elif dataclasses.is_dataclass(value):
         hook = hooks.get(type(value))
         member = group.create_group(name)
@@ -157,12 +196,14 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     kind = allowed[0] if union else hint
     if "shape" in metadata:
         return read_array(group, name, metadata["dtype"], len(metadata["shape"]))
-    if kind is str:
+    if "reasons" in metadata:
+        return _read_reasons(group, name, bool(metadata["reasons"]))
+    if kind is str or ("words" in metadata and "axis" not in metadata):
         return read_text(group, name)
     if kind in (bool, int, float):
         stored = {bool: "u1", int: "i8", float: "f8"}[kind]
         return kind(_dataset(group, name, stored, 0)[()])
-    if typing.get_origin(kind) is tuple and typing.get_args(kind)[0] is str:
+    if typing.get_origin(kind) is tuple and issubclass(typing.get_args(kind)[0], str):
         return tuple(_decoded(item, where) for item in _dataset(group, name, "S", 1)[()].tolist())
     if not isinstance(group[name], h5py.Group):
         if typing.get_origin(kind) is tuple and group[name].shape == (0,):
@@ -171,6 +212,15 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     if typing.get_origin(kind) is tuple:
         return _read_members(group[name], typing.get_args(kind)[0], hooks)
     return _read_one(group[name], kind, hooks)
+
+
+def _read_reasons(group: Any, name: str, by_row: bool) -> Any:
+    where = f"{group.name}/{name}"
+    try:
+        rows = [json.loads(_decoded(item, where)) for item in _dataset(group, name, "S", 1)[()].tolist()]
+        return tuple(tuple(map(_reason, row)) if by_row else _reason(row) for row in rows)
+    except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
+        raise DecodeError([f"{where}: expected reasons as JSON ({error})"]) from None
 
 
 def _read_one(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:

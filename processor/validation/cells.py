@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from processor.model import Better, Metric, Statistic
+
 HASH_DIGITS = 16
 SEED_DIGITS = 7  # of a fresh seed, in base 16
 
@@ -79,6 +81,9 @@ class Figure:
     value: float
     limit: float
     unit: str
+    quantity: str = ""
+    statistic: str = ""
+    better: str = Better.LOW
 
     @property
     def passed(self) -> bool:
@@ -105,20 +110,22 @@ def fresh_seed(case: Case, number: int, i: int) -> int:
 
 
 def figures_of(results: Mapping[str, Any]) -> list[Figure]:
-    """Read the checks of a results.json, each with the method it is of."""
-    answers = {step: str(found.get("method", "")) for step, found in results["steps"].items()}
-    others = {
-        step: [str(one.get("method", "")) for one in found] for step, found in results.get("comparison", {}).items()
-    }
-    figures = []
-    for check in results["checks"]:
-        step, name = str(check["step"]), str(check["name"])
-        method = answers.get(step, "")
-        prefix, colon, rest = name.partition(": ")
-        if colon and prefix in others.get(step, ()):
-            method, name = prefix, rest
-        figures.append(Figure(step, method, name, _number(check["value"]), _number(check["limit"]), str(check["unit"])))
-    return figures
+    """Read the checks of a results.json, each with the method it is of; names are without the method."""
+    main = {step: str(result.get("method", "")) for step, result in results["steps"].items()}
+    return [
+        Figure(
+            step=check["step"],
+            method=check["method"] or main.get(check["step"], ""),
+            name=Metric(check["step"], check["quantity"], 0.0, Statistic(check["statistic"])).name,
+            value=_number(check["value"]),
+            limit=_number(check["limit"]),
+            unit=check["unit"],
+            quantity=check["quantity"],
+            statistic=check["statistic"],
+            better=check["better"],
+        )
+        for check in results["checks"]
+    ]
 
 
 def _number(value: Any) -> float:

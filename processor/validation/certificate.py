@@ -22,6 +22,7 @@ from typing import Any
 import jinja2
 
 from processor.language import language
+from processor.model import Statistic
 from processor.validation.cells import Case
 from processor.validation.history import Row
 from processor.validation.matrix import Matrix
@@ -56,6 +57,9 @@ NOT_SHOWN = (
     "u_p pools errors within scenes, which may have a part in common; where scenes differ more than errors within "
     "them, u_b shows it, once there are three scenes.",
 )
+
+
+_Rows = dict[tuple[str, str], Row]  # of one scene, by quantity and statistic
 
 
 @dataclass(frozen=True)
@@ -104,14 +108,17 @@ def make(
     """Make the certificate from the figures of ``nights``, all by the present software."""
     of_case = {case.key: case for case in cases}
     # A fixed seed is one scene, however many nights it was run in.
-    scenes: dict[tuple[str, str, str], dict[int, dict[str, Row]]] = defaultdict(lambda: defaultdict(dict))
+    scenes: dict[tuple[str, str, str], dict[int, _Rows]] = defaultdict(lambda: defaultdict(dict))
     for row in rows:
         if row.night in nights and row.case in of_case:
-            scenes[row.case, row.name[0], row.name[1]][row.seed][row.name[2]] = row
+            scenes[row.case, row.name[0], row.name[1]][row.seed][row.quantity, row.statistic] = row
     lines: list[Line] = []
     for (case, step, method), by_seed in scenes.items():
         quantities = {
-            name.removesuffix(", bias"): None for found in by_seed.values() for name in found if name.endswith(", bias")
+            quantity: None
+            for figures in by_seed.values()
+            for quantity, statistic in figures
+            if statistic == Statistic.BIAS
         }
         lines += [_line(of_case[case], step, method, quantity, list(by_seed.values())) for quantity in quantities]
     order = {case.key: i for i, case in enumerate(cases)}
@@ -129,12 +136,11 @@ def make(
     )
 
 
-def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Mapping[str, Row]]) -> Line:
-    def of(figure: str) -> list[float]:
-        return [scene[figure].value if figure in scene else math.nan for scene in scenes]
+def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[_Rows]) -> Line:
+    def of(statistic: Statistic) -> list[float]:
+        return [scene[quantity, statistic].value if (quantity, statistic) in scene else math.nan for scene in scenes]
 
-    numbers, biases = of(f"{quantity}, number"), of(f"{quantity}, bias")
-    deviations = of(f"{quantity}, standard deviation")
+    numbers, biases, deviations = of(Statistic.NUMBER), of(Statistic.BIAS), of(Statistic.SD)
     used = [
         (n, b, s if n > 1 else 0.0)
         for n, b, s in zip(numbers, biases, deviations, strict=True)
@@ -149,7 +155,8 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Ma
         count = len(used)
         # The mean of the scenes, weighted as the bias is.
         u_b = math.sqrt(sum((n * (b - bias)) ** 2 for n, b, _ in used) * count / (count - 1.0)) / total
-    unit = next(scene[f"{quantity}, bias"].unit for scene in scenes if f"{quantity}, bias" in scene)
+    of_bias = (quantity, Statistic.BIAS)
+    unit = next(scene[of_bias].unit for scene in scenes if of_bias in scene)
     known_u_b = u_b if math.isfinite(u_b) else (u_p / math.sqrt(total) if total > 1 else math.nan)
     scanner, noise, density = conditions(case)
     return Line(
@@ -168,9 +175,9 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[Ma
         u_b,
         u_p,
         COVERAGE_FACTOR * math.hypot(u_p, known_u_b) + abs(bias),
-        _median(of(f"{quantity}, 95 % error")),
-        _weighted(of(f"{quantity} within their 95 % intervals"), numbers),
-        _weighted(of(f"{quantity}, efficiency"), numbers),
+        _median(of(Statistic.ERROR_95)),
+        _weighted(of(Statistic.COVERAGE), numbers),
+        _weighted(of(Statistic.EFFICIENCY), numbers),
     )
 
 

@@ -34,6 +34,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import special, stats
 
+from processor.model import Better
 from processor.validation.aims import Badness, badness
 from processor.validation.history import Name, Row
 
@@ -107,6 +108,7 @@ class _Series:
     """All rows of one figure: fixed cells of this night and the last before it, seeds of this night and the earlier."""
 
     unit: str = ""
+    better: str = ""
     last: dict[tuple[str, int], Row] = field(default_factory=dict)
     mine: dict[tuple[str, int], Row] = field(default_factory=dict)
     earlier: _ByCase = field(default_factory=dict)
@@ -114,6 +116,7 @@ class _Series:
 
     def add(self, row: Row, tonight: bool) -> None:
         self.unit = row.unit
+        self.better = row.better or self.better
         if row.fixed:
             (self.mine if tonight else self.last)[row.case, row.seed] = row
         else:
@@ -144,7 +147,7 @@ def find(
     other_scenes: set[tuple[str, int]] = set()
     judged: dict[Name, tuple[Badness, str]] = {}
     for name, own in series.items():
-        measure = badness(name[2], own.unit, aims or {})
+        measure = badness(name[2], own.unit, Better(own.better or Better.LOW), aims or {})
         judged[name] = measure, own.unit
         pairs, lost, scenes = _pairs(own, there, name, measure)
         other_scenes |= scenes

@@ -22,7 +22,10 @@ from processor.model import InputError
 from processor.validation.cells import Cell, Figure, Outcome, figures_of
 from processor.validation.software import Software
 
-VERSION = 1
+VERSION = 2
+# What a file of an earlier version lacks. Earlier figures have no statistic: certificates are of the present software.
+ADDED = ("quantity", "statistic", "better")
+UPGRADES = {1: tuple(f"ALTER TABLE figures ADD COLUMN {name} TEXT NOT NULL DEFAULT ''" for name in ADDED)}
 BUSY_S = 60.0
 SCHEMA = """
 CREATE TABLE nights (
@@ -45,6 +48,7 @@ CREATE TABLE cells (
 CREATE TABLE figures (
   night TEXT NOT NULL, cell TEXT NOT NULL, step TEXT NOT NULL, method TEXT NOT NULL, name TEXT NOT NULL,
   value REAL, limit_ REAL, unit TEXT NOT NULL,        -- NULL = not a number, no limit
+  quantity TEXT NOT NULL DEFAULT '', statistic TEXT NOT NULL DEFAULT '', better TEXT NOT NULL DEFAULT '',
   PRIMARY KEY (night, cell, step, method, name),
   FOREIGN KEY (night, cell) REFERENCES cells ON DELETE CASCADE
 ) WITHOUT ROWID;
@@ -73,6 +77,9 @@ class Row:
     name: Name
     value: float
     unit: str
+    quantity: str = ""
+    statistic: str = ""
+    better: str = ""
 
 
 @dataclass(frozen=True)
@@ -102,8 +109,11 @@ class History:
                 if version == 0 and not self.db.execute("SELECT name FROM sqlite_master").fetchall():
                     for statement in SCHEMA.split(";\n"):
                         self.db.execute(statement)
-                    self.db.execute(f"PRAGMA user_version = {VERSION}")
                     version = VERSION
+                for statement in UPGRADES.get(version, ()):
+                    self.db.execute(statement)
+                    version = VERSION
+                self.db.execute(f"PRAGMA user_version = {version}")
         except (sqlite3.Error, OSError) as error:
             raise InputError(f"{path}: expected a history of nights, could not open it ({error})") from error
         if version != VERSION:
@@ -165,9 +175,23 @@ class History:
             )  # fmt: skip
             if added.rowcount:
                 self.db.executemany(
-                    "INSERT INTO figures VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+                    "INSERT INTO figures"
+                    " (night, cell, step, method, name, value, limit_, unit, quantity, statistic, better)"
+                    " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
                     [
-                        [night, cell.key, f.step, f.method, f.name, _stored(f.value), _stored(f.limit), f.unit]
+                        [
+                            night,
+                            cell.key,
+                            f.step,
+                            f.method,
+                            f.name,
+                            _stored(f.value),
+                            _stored(f.limit),
+                            f.unit,
+                            f.quantity,
+                            str(f.statistic),
+                            str(f.better),
+                        ]
                         for f in figures
                     ],
                 )
@@ -205,9 +229,10 @@ class History:
     def rows(self, first: str, last: str) -> list[Row]:
         """Return the figures of the nights from ``first`` to ``last``, the earliest first."""
         return [
-            Row(night, case, recipe, seed, bool(fixed), digest, (step, method, name), _number(value), unit)
-            for night, case, recipe, seed, fixed, digest, step, method, name, value, unit in self.db.execute(
-                "SELECT night, case_, recipe, seed, fixed, input_sha256, step, method, name, value, unit"
+            Row(night, case, recipe, seed, bool(fixed), digest, (step, method, name), _number(value), unit, *named)
+            for night, case, recipe, seed, fixed, digest, step, method, name, value, unit, *named in self.db.execute(
+                "SELECT night, case_, recipe, seed, fixed, input_sha256, step, method, name, value, unit,"
+                " quantity, statistic, better"
                 " FROM figures JOIN cells USING (night, cell) WHERE night BETWEEN ? AND ?"
                 " ORDER BY night, case_, seed, step, method, name",
                 [first, last],

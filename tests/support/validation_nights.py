@@ -1,5 +1,6 @@
 """Nights without processes: cells whose figures are given, or drawn from stored ones."""
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -10,6 +11,7 @@ from processor.validation.cells import Outcome
 from processor.validation.history import Row
 from processor.validation.matrix import Entry, Matrix
 from processor.validation.software import Software
+from tests.support.metrics import described
 
 STORED = Path(__file__).resolve().parents[2] / "fixtures" / "validation" / "stored-cells.json"
 SOFTWARE = Software("code-1", "c0ffee" * 6, {"steel-scan-check": "0.1.0", "numpy": "2"})
@@ -26,9 +28,16 @@ def matrix(*cases, seeds=(1, 2, 3), fresh=1, aim=None):
 
 
 def results(figures, step="spheres", method="ray", digest="abc"):
-    """A results.json of figures {name: value} or {name: (value, limit, unit)}."""
-    rows = [(name, *(given if isinstance(given, tuple) else (given, None, "mm"))) for name, given in figures.items()]
-    checks = [{"step": step, "name": n, "value": v, "limit": lim, "unit": u} for n, v, lim, u in rows]
+    """A results.json of figures {name: value} or {name: (value, limit, unit)}; "ransac | radii, bias" is of ransac."""
+    checks = []
+    for name, given in figures.items():
+        value, limit, unit = given if isinstance(given, tuple) else (given, None, "mm")
+        other, _, rest = name.rpartition(" | ")
+        quantity, statistic, better = described(rest)
+        checks.append({
+            "step": step, "name": rest, "method": other, "quantity": quantity, "statistic": str(statistic),
+            "better": str(better), "value": value, "limit": limit, "unit": unit,
+        })  # fmt: skip
     return {"input_sha256": digest, "steps": {step: {"method": method}}, "comparison": {}, "checks": checks}
 
 
@@ -74,8 +83,11 @@ class Simulated:
                     if stored is None:
                         continue
                     key = (one["step"], figure["method"], figure["name"])
-                    row = Row(name, f"case {i}", one["recipe"], seed, fixed, f"{i} {seed}", key, stored, figure["unit"])
-                    self.rows.append(Row(*(*vars(row).values(),)[:7], spoil(row, stored), figure["unit"]))
+                    row = Row(
+                        name, f"case {i}", one["recipe"], seed, fixed, f"{i} {seed}", key, stored, figure["unit"],
+                        *map(str, described(figure["name"])),
+                    )  # fmt: skip
+                    self.rows.append(dataclasses.replace(row, value=spoil(row, stored)))
         found = changes.find(self.rows, name, self.worse)
         for one in found.of(*changes.ALARMS):
             self.alarms.append((name, one))

@@ -9,9 +9,9 @@ import pytest
 
 from processor import language
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import Metric
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, view
+from tests.support.metrics import metric
 from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
 from tests.unit.test_report_balls import of_frame, whole, with_truth
 
@@ -206,9 +206,9 @@ def a_frame():
         station_said=("", "turn about x, shift along z"),
     )
     metrics = (
-        Metric("spheres", "radius error, median", 0.5, 3.0, "mm"),
-        Metric("spheres", "ransac: centres within their 95 % intervals", 93.0, float("nan"), "%"),
-        Metric("spheres", "ransac: balls called ok, lowest point over 3 mm off", 1.0, 0.0, ""),
+        metric("radius error, median", 0.5, 3.0, step="spheres"),
+        metric("centres within their 95 % intervals", 93.0, unit="%", step="spheres", method="ransac"),
+        metric("balls called ok, lowest point over 3 mm off", 1.0, 0.0, unit="", step="spheres", method="ransac"),
     )
     execution, truth = of_frame(result, with_truth()[0])
     scene = dataclasses.replace(execution.scene, units_reason="said by project.toml")

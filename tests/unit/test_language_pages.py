@@ -1,8 +1,6 @@
 """Pages other than of a bridge or a frame in Chinese: steps for structures, a batch, a comparison, the nights."""
 
-import ast
 import dataclasses
-import importlib.resources
 import re
 from pathlib import Path
 
@@ -19,13 +17,13 @@ from processor.defects.result import CLASSES
 from processor.defects.result import Result as Defects
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
-from processor.model import Metric
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import Held
 from processor.validation import changes, night
 from processor.validation import summary as nights_summary
 from tests.support import step_results, validation_nights
-from tests.unit.test_language import CODES, STAYS, Visible, latin
+from tests.support.metrics import metric
+from tests.unit.test_language import STAYS, Visible, latin
 
 SOURCES = Path(language.__file__).parents[1]
 NAMES = {
@@ -43,77 +41,11 @@ def left_in_english(text, *more):
     return latin(seen.texts, STAYS | NAMES | set(more))
 
 
-# --- what the catalogue holds ---------------------------------------------------------------------------------------
-
-
-def literals():
-    """Texts in the sources, places in them as \\0, without docstrings; and pages, scripts, tables of limits."""
-    found = []
-    for path in sorted([*SOURCES.rglob("*.py"), *(SOURCES.parent / "designgen").rglob("*.py")]):
-        tree = ast.parse(path.read_text("utf-8"))
-        inner = {
-            id(part)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.JoinedStr)
-            for part in ast.walk(node)
-            if part is not node and not (isinstance(part, ast.Constant) and part not in node.values)
-        }
-        for node in ast.walk(tree):
-            if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant):
-                inner.add(id(node.value))  # a docstring
-        for node in ast.walk(tree):
-            if isinstance(node, ast.JoinedStr):
-                found.append("".join(one.value if isinstance(one, ast.Constant) else "\0" for one in node.values))
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in inner:
-                found.append(node.value)
-    others = [path for pattern in ("*.html", "*.js") for path in SOURCES.rglob(pattern)]
-    others += (SOURCES / "tolerances").glob("*.toml")
-    return found, [path.read_text("utf-8") for path in sorted(others)]
-
-
-def pieced(piece, whole):
-    """Whether a piece of a phrase is put together of pieces of texts: the end of one, whole ones, the start of one."""
-    words = piece.split()
-    reached = {0}
-    for end in range(1, len(words) + 1):
-        for start in list(reached):
-            part = " ".join(words[start:end])
-            if (
-                part in whole
-                or (start == 0 and any(one.endswith(f" {part}") for one in whole))
-                or (end == len(words) and any(one.startswith(f"{part} ") for one in whole))
-            ):
-                reached.add(end)
-    return len(words) in reached
-
-
-@pytest.mark.parametrize("code", CODES)
-def test_no_phrase_is_of_a_text_that_is_gone(code):
-    """Every piece of a phrase is said somewhere in the sources; a column's name may stand there with underscores."""
-    found, others = literals()
-    text = "\n".join([*found, *others])
-    text += "\n" + text.replace("_", " ")
-    whole = {part.strip(" .)?%±/-") for one in found for part in re.split("[\0_:;,(]", one)}
-    stale = []
-    for section in language.catalogue(code).values():
-        for key in [*section.get("words", {}), *section.get("sentences", {})]:
-            pieces = [one for part in re.split(r"\{[;#]?\}", key.split("|")[-1]) for one in re.split(r"[:;,(] ?", part)]
-            words = [one.strip(" .)?%±/-") for one in pieces]
-            stale += [(key, one) for one in words if len(one) > 2 and one not in text and not pieced(one, whole)]
-    assert stale == []
-
-
-@pytest.mark.parametrize("code", CODES)
-def test_every_file_of_a_catalogue_is_read(code):
-    there = {path.name for path in importlib.resources.files("processor.language").iterdir() if code in path.name}
-    assert there == {f"{code}-{part}.toml" for part in language.PARTS}
-
-
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 
 def checks_of(step, *names):
-    return tuple(Metric(step, name, 1.0, 0.0 if i % 2 else float("nan"), "mm") for i, name in enumerate(names))
+    return tuple(metric(name, 1.0, 0.0 if i % 2 else float("nan"), step=step) for i, name in enumerate(names))
 
 
 STITCH_CHECKS = (
@@ -237,40 +169,6 @@ def test_a_word_of_two_senses_has_that_of_its_column():
     assert (say("step"), say("step", "class"), say("step: missed of 2")) == ("步骤", "错台", "错台：2 处中漏检")
     assert (say("misalignment"), say("misalignment", "what")) == ("接口错边", "整体偏位")
     assert (say("side"), say("side", "heading")) == ("立面", "边长")
-
-
-SPOKEN = ("stitching", "defects", "deviation")
-
-
-def messages(package):
-    """Texts of a package that are not of errors or of the code: with blanks, some words, places filled by 7."""
-    for path in sorted((SOURCES / package).glob("*.py")):
-        tree = ast.parse(path.read_text("utf-8"))
-        silent = {
-            id(part)
-            for node in ast.walk(tree)
-            if isinstance(node, ast.Raise) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant))
-            for part in ast.walk(node)
-        }
-        whole = [node for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) and id(node) not in silent]
-        silent |= {id(part) for node in whole for part in ast.walk(node) if part is not node}
-        for node in ast.walk(tree):
-            if id(node) in silent:
-                continue
-            if isinstance(node, ast.JoinedStr):
-                yield "".join(one.value if isinstance(one, ast.Constant) else "7" for one in node.values)
-            elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-                yield node.value
-
-
-@pytest.mark.parametrize("package", SPOKEN)
-def test_all_that_a_step_may_say_is_known(package):
-    """Read from its sources, so that no sentence is changed there and stays English here."""
-    say = language.language("zh").say
-    said = [text for text in messages(package) if len(re.findall(r"\b[a-z]{2,}\b", text)) >= 3 and "->" not in text]
-    assert len(said) > 10
-    stays = STAYS | NAMES | {"cm", "register", "fine"}
-    assert [text for text in said if latin([say(text.strip("; "))], stays)] == []
 
 
 # --- a batch --------------------------------------------------------------------------------------------------------

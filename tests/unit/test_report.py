@@ -20,6 +20,7 @@ from processor.report import all_figures, all_tables, page, results_folder, resu
 from processor.report import table as report_table
 from processor.space_frame import step as space_frame_step
 from processor.store import store
+from tests.support.metrics import metric
 
 NAN = float("nan")
 KEYS = [f"P{i}" for i in range(1, 9)]
@@ -115,7 +116,7 @@ def of_frame():
         StepRun("spheres", "least-squares", "{}", balls("least-squares", (44.0, NAN, 60.0))),
     )
     true = np.array([45.0, 50.0, 60.0])
-    report = ErrorReport((Metric("spheres", "a", 1.0, 0.5, "mm"),), {"ransac": true, "least-squares": true})
+    report = ErrorReport((metric("a", 1.0, 0.5, step="spheres"),), {"ransac": true, "least-squares": true})
     return Execution(frame_scene(), runs, PROVENANCE), report
 
 
@@ -198,8 +199,11 @@ def test_results_json_of_balls():
     assert np.shape(ok["covariance"]) == (4, 4)
     assert (missing["radius"], missing["centre"], missing["flag"]) == (None, [None] * 3, "not-found")
     assert found["checks"] == [
-        {"step": "spheres", "name": "a", "value": 1.0, "limit": 0.5, "unit": "mm", "passed": False}
-    ]
+        {
+            "step": "spheres", "name": "a", "method": "", "quantity": "a", "statistic": "value", "value": 1.0,
+            "limit": 0.5, "unit": "mm", "better": "low", "passed": False,
+        }
+    ]  # fmt: skip
 
 
 # --- tables --------------------------------------------------------------------------------------------------------
@@ -341,7 +345,9 @@ def test_a_run_without_any_answer_is_drawn_too():
 def test_the_page_escapes_names_and_loads_nothing():
     bad = "<script>alert(1)</script>"
     scene = dataclasses.replace(arch_scene((bad, "rib1", "foot2")), name=bad, units_reason=bad)
-    text = render(of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric("s", bad, 1.0, 2.0, bad),)))
+    text = render(
+        of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric("s", bad, 1.0, unit=bad, limit=2.0),))
+    )
     found = Page(text)
     assert found.tags.count("script") == 2  # the page's own, and its data
     assert "alert" not in "".join(re.findall("<script>.*?</script>", text, re.DOTALL))

@@ -270,7 +270,7 @@ def test_control_points_in_other_units_are_refused():
 
 
 def targets(T, known_sd=0.3, seen_sd=0.5, seed=0, count=6):
-    """Control points in the room of tests.support.stitch_clouds, known in the site's frame; T (k, 4, 4) leads to the room."""
+    """Control points in the room of stitch_clouds, known in the site's frame; T (k, 4, 4) leads to the room."""
     rng = np.random.default_rng(seed)
     places = rng.uniform([-5e3, -3e3, 200.0], [6e3, 4e3, 3e3], (count, 3))
     point, scan = np.divmod(np.arange(count * len(T)), len(T))

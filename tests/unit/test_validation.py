@@ -105,7 +105,7 @@ def test_the_default_matrix_covers_every_step_that_is_there():
 
 
 def test_figures_are_told_apart_by_method():
-    found = validation_nights.results({"radii, bias": 0.5, "ransac: radii, bias": None, "other: x": (2.0, 1.0, "%")})
+    found = validation_nights.results({"radii, bias": 0.5, "ransac | radii, bias": None, "other: x": (2.0, 1.0, "%")})
     found["comparison"] = {"spheres": [{"method": "ransac"}]}
     figures = cells.figures_of(found)
     assert [(f.method, f.name) for f in figures] == [
@@ -241,7 +241,7 @@ def test_folders_and_files_that_are_something_else(tmp_path):
         History(tmp_path / "text")
     with closing(sqlite3.connect(tmp_path / "later")) as db:
         db.execute("PRAGMA user_version = 9")
-    with pytest.raises(InputError, match="version 1, found 9"):
+    with pytest.raises(InputError, match="version 2, found 9"):
         History(tmp_path / "later")
     with pytest.raises(UsageError, match="expected a date"):
         night.number_of("tomorrow")

@@ -11,13 +11,14 @@ from scipy import stats
 
 from processor.evaluation import space_frame
 from processor.geometry.sphere import algebraic
-from processor.model import FrameDesign, FrameTruth, Scan, Scene, Truth
+from processor.model import Better, FrameDesign, FrameTruth, Scan, Scene, Truth
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.spheres import isolated
 from processor.validation import changes
 from processor.validation.aims import badness
 from processor.validation.history import Row
 from tests.support import validation_nights
+from tests.support.metrics import described
 from tests.support.validation_nights import night_name
 
 NAME = ("spheres", "ray", "radii, standard deviation")
@@ -26,7 +27,18 @@ NAME = ("spheres", "ray", "radii, standard deviation")
 def rows(night, values, fixed=True, name=NAME, unit="mm", recipe=None, digest=None):
     """A row a value: each a case and a seed of its own."""
     return [
-        Row(night, f"case {i}", recipe or f"recipe {i}", i, fixed, digest or f"{i}", name, value, unit)
+        Row(
+            night,
+            f"case {i}",
+            recipe or f"recipe {i}",
+            i,
+            fixed,
+            digest or f"{i}",
+            name,
+            value,
+            unit,
+            *map(str, described(name[2])),
+        )
         for i, value in enumerate(values)
     ]
 
@@ -51,13 +63,15 @@ def rows(night, values, fixed=True, name=NAME, unit="mm", recipe=None, digest=No
     ],
 )
 def test_where_better_lies(name, unit, better, worse):
-    measure = badness(name, unit, {})
+    measure = badness(name, unit, described(name)[2], {})
     assert measure.of(worse) - measure.of(better) > 0.0
 
 
 def test_the_matrix_may_say_where_better_lies():
-    assert badness("share", "%", {"share": "low"}).of(2.0) > badness("share", "%", {"share": "low"}).of(1.0)
-    toward = badness("ratio", "", {"ratio": 1.0})
+    assert badness("share", "%", Better.HIGH, {"share": "low"}).of(2.0) > badness(
+        "share", "%", Better.HIGH, {"share": "low"}
+    ).of(1.0)
+    toward = badness("ratio", "", Better.LOW, {"ratio": 1.0})
     assert toward.of(2.0) == pytest.approx(toward.of(0.5))
 
 
@@ -133,7 +147,7 @@ def test_the_rank_test_is_exact():
     series = changes._Series()
     for row in given:
         series.add(row, row.night == night_name(6))
-    test = changes._fresh(NAME, series.fresh, series.earlier, badness(NAME[2], "mm", {}))
+    test = changes._fresh(NAME, series.fresh, series.earlier, badness(NAME[2], "mm", Better.LOW, {}))
     scores = [np.rint(64 * stats.norm.ppf(stats.rankdata(own) / 7)) for own in table]
     seen = sum(own[0] for own in scores)
     sums = np.array([sum(one) for one in itertools.product(*scores)])
@@ -184,7 +198,20 @@ def checks(seed, sigma):
 def figures(night, seed, sigma, fixed, found):
     names = [("spheres", "least-squares", m.name) for m in found]
     return [
-        Row(night, f"{sigma}", "balls", seed, fixed, f"{seed} {sigma}", name, m.value, m.unit)
+        Row(
+            night,
+            f"{sigma}",
+            "balls",
+            seed,
+            fixed,
+            f"{seed} {sigma}",
+            name,
+            m.value,
+            m.unit,
+            m.quantity,
+            str(m.statistic),
+            str(m.better),
+        )
         for name, m in zip(names, found, strict=True)
     ]
 

@@ -55,7 +55,7 @@ class _Placed:
     points: Floats
     station: Ints
     found: attitude.Attitude
-    fitted: surface_registration.Registration
+    fitted: surface_registration.SurfaceFit
     trouble: str
     told: identity.Told = field(default_factory=identity.Told)
     doubt: str = ""  # why it may be of another part

@@ -11,6 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from processor.geometry.m3c2 import Distances
+from processor.language.messages import Message, text
 from processor.model import Floats, Ints
 from processor.report.style import COLOURS, DIVERGING, HATCHES, png
 
@@ -22,7 +23,7 @@ LEGEND_COLOUR = "#404040"
 BOTH_SIDES = 0.1  # share of core points that look away from which they get a panel of their own
 
 
-def deviation_map(core: Floats, normals: Floats, found: Distances, unit: str) -> tuple[str, bytes]:
+def deviation_map(core: Floats, normals: Floats, found: Distances, unit: str) -> tuple[Message, bytes]:
     """Draw core points (k, 3) with normals (k, 3) by distance, seen along the axis on which they spread least.
 
     What is beyond its level of detection is a large dot, what is within a small one, so that grey print tells too. A
@@ -49,9 +50,9 @@ def deviation_map(core: Floats, normals: Floats, found: Distances, unit: str) ->
     bar = ScalarMappable(norm, DIVERGING)
     label = f"compared minus reference along the normal{_in(unit)}"
     figure.colorbar(bar, ax=panels.tolist(), label=label, shrink=0.7)
-    part = "" if len(drawn) == len(core) else f"; {len(drawn):,} of {len(core):,} core points drawn"
-    caption = f"Deviations seen along {AXES[along]}; large dots are beyond their level of detection{part}"
-    return caption, png(figure)
+    part = "" if len(drawn) == len(core) else "; {drawn:,} of {all:,} core points drawn"
+    template = "Deviations seen along {axis}; large dots are beyond their level of detection" + part
+    return text(template, axis=AXES[along], drawn=len(drawn), all=len(core)), png(figure)
 
 
 def _panel(axes: Axes, places: Floats, rows: Ints, found: Distances, norm: TwoSlopeNorm) -> None:
@@ -84,7 +85,7 @@ def _legend(unknown: int, within: int, beyond: int) -> list[Line2D]:
     ]
 
 
-def histogram(found: Distances, unit: str) -> tuple[str, bytes]:
+def histogram(found: Distances, unit: str) -> tuple[Message, bytes]:
     """Draw how distances are spread, those beyond their level of detection hatched, and the median level."""
     figure = Figure(figsize=(8.0, 3.9), layout="constrained")
     axes = figure.subplots()
@@ -108,7 +109,7 @@ def histogram(found: Distances, unit: str) -> tuple[str, bytes]:
     axes.set(xlabel=f"compared minus reference{_in(unit)}", ylabel="core points")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
-    return "Deviations; the outermost bars hold all beyond", png(figure)
+    return text("Deviations; the outermost bars hold all beyond"), png(figure)
 
 
 def _in(unit: str) -> str:

@@ -35,7 +35,7 @@ TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest 
 def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
     """Draw the first run's bridge beside the linear error of all; what a result does not hold is left out."""
     result: preassembly_step.Result = runs[0].result
-    found = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
+    found: Drawn = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
     if np.isfinite(result.linear_offset_ci95).any():
         found["linear-offset.png"] = _linear_offset(scene, runs[0])
     if any(np.isfinite(one.gaps).all() for one in result.measures):

@@ -1,0 +1,31 @@
+"""Take the picture of the README: ``python -m docs.make_picture out/demo/bridge/report.html``, after ``make demo``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+WIDTH, HEIGHT = 1060, 1240
+PICTURE = Path(__file__).resolve().parent / "report.png"
+# The verdicts and the view in space stand next to each other in the picture; on the page tables lie between them.
+HIDE_TABLES = """() => {
+    for (const element of document.querySelectorAll('ul.verdicts ~ *')) {
+        if (element.classList.contains('live')) break;
+        element.style.display = 'none';
+    }
+    window.dispatchEvent(new Event('resize'));
+}"""
+
+
+def main(page: Path) -> None:
+    """Write docs/report.png: verdicts and view of a report."""
+    from tests.support.browser import opened
+
+    with opened(page.resolve(), WIDTH, HEIGHT) as shown:
+        shown.evaluate(HIDE_TABLES)
+        shown.wait_for_timeout(500)
+        shown.screenshot(path=str(PICTURE))
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

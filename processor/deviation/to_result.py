@@ -1,0 +1,48 @@
+"""What both methods of step ``deviation`` put into its result alike."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from processor.deviation.result import NAN, CorePoints
+from processor.geometry.m3c2 import Distances, Summary
+from processor.model import Floats
+
+NEAR_MM = 10.0
+
+
+def core_points(points: Floats, normals: Floats, distances: Distances) -> CorePoints:
+    """Return core points (k, 3) with normals (k, 3) and the distances at them."""
+    return CorePoints(
+        points=points,
+        normals=normals,
+        distance=distances.distance,
+        lod95=distances.lod95,
+        n1=distances.n1,
+        n2=distances.n2,
+        std1=distances.std1,
+        std2=distances.std2,
+    )
+
+
+def statistics(core: CorePoints, total: Summary) -> dict[str, Any]:
+    """Return the fields of the result that are statistics of its core points."""
+    distance = core.distance[np.isfinite(core.lod95)]
+    share = total.significant_share
+    return {
+        "core_points": total.core_points,
+        "core_points_measured": total.core_points - total.without_lod,
+        "significant_share": share.share,
+        "significant_share_ci95": (share.low, share.high),
+        "within_10mm_share": float(np.mean(np.abs(distance) <= NEAR_MM)) if len(distance) else NAN,
+        "mean": total.mean,
+        "median": total.median,
+        "sd": total.sd,
+        "min": total.min,
+        "min_ci95": (total.min - total.min_lod95, total.min + total.min_lod95),
+        "max": total.max,
+        "max_ci95": (total.max - total.max_lod95, total.max + total.max_lod95),
+        "lod95_median": total.lod95_median,
+    }

@@ -1,0 +1,127 @@
+"""Messages in English and Chinese: templates with named values, looked up by code or by their English text.
+
+The catalogue of a language is the TOML files CODE-PART.toml beside this file, in sections:
+
+- ``[reasons]``: the template of each code of a :class:`processor.model.Reason`; all languages have the same codes.
+- ``[texts]`` (not English): the template for each English template of a :class:`Text`.
+- ``[words]`` (not English): words of vocabularies, ``Class.word`` or, for all classes, ``word``.
+
+Templates have the syntax of :meth:`str.format` with named fields. Fields without a format have three decimals where
+they are numbers. ``{n:?scan|scans}`` is the first word for n = 1 and the second otherwise. Values that are messages or
+words are translated; lists are joined.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+import math
+import string
+import sys
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Any
+
+from processor.model import Reason, Word
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+CODES = ("en", "zh")
+LIST = {"en": ", ", "zh": "、"}
+NO_NUMBER = "–"
+
+
+@dataclass(frozen=True)
+class Text:
+    """A text of the program's own: its English template, and the values of the template's fields."""
+
+    template: str
+    values: Mapping[str, Any] = field(default_factory=dict)
+
+    def __str__(self) -> str:
+        """Return the text in English."""
+        return messages("en").text(self)
+
+
+def text(template: str, /, **values: Any) -> Text:
+    """Return a :class:`Text`."""
+    return Text(template, values)
+
+
+Message = Text | Reason | Word
+
+
+class Messages(string.Formatter):
+    """The catalogue of one language."""
+
+    def __init__(self, code: str) -> None:
+        self.code = code
+        self.reasons: dict[str, str] = {}
+        self.texts: dict[str, str] = {}
+        self.words: dict[str, str] = {}
+        for sections in catalogue(code).values():
+            self.reasons |= sections.get("reasons", {})
+            self.texts |= sections.get("texts", {})
+            self.words |= sections.get("words", {})
+
+    def text(self, message: Any) -> str:
+        """Write a message, a list of messages, a number, or a name, which stays as it is."""
+        if isinstance(message, Text):
+            return self.vformat(self.texts.get(message.template, message.template), (), message.values)
+        if isinstance(message, Reason):
+            template = self.reasons.get(message.code)
+            return message.code if template is None else self.vformat(template, (), message.values)
+        if isinstance(message, Word):
+            word = str(message)
+            return self.words.get(f"{type(message).__name__}.{word}", self.words.get(word, word))
+        if isinstance(message, list | tuple):
+            return LIST[self.code].join(map(self.text, message))
+        return self.format_field(message, "")
+
+    def format_field(self, value: Any, format_spec: str) -> str:
+        """Write one value of a template."""
+        if format_spec.startswith("?"):
+            one, _, many = format_spec[1:].partition("|")
+            return one if value == 1 else many
+        if isinstance(value, float) and not math.isfinite(value):
+            return NO_NUMBER
+        if isinstance(value, Text | Reason | Word | list | tuple):
+            return self.text(value)
+        if isinstance(value, float) and not format_spec:
+            return f"{value:.3f}"
+        return format(value, format_spec)
+
+    def sentences(self, reasons: tuple[Reason, ...]) -> str:
+        """Write reasons one after the other, as sentences."""
+        stop, space = ("。", "") if self.code == "zh" else (".", " ")
+        written = (self.text(one) for one in reasons)
+        return space.join(one[:1].upper() + one[1:] + ("" if one.endswith((stop, "?")) else stop) for one in written)
+
+    def rendered(self, data: Any) -> Any:
+        """Write all messages within dictionaries and lists; all else stays as it is."""
+        if isinstance(data, Text | Reason | Word):
+            return self.text(data)
+        if isinstance(data, Mapping):
+            return {key: self.rendered(value) for key, value in data.items()}
+        return [self.rendered(value) for value in data] if isinstance(data, list | tuple) else data
+
+
+def catalogue(code: str) -> dict[str, dict[str, dict[str, str]]]:
+    """Read the files of a language: by file and section a dictionary of templates."""
+    return {path.name: tomllib.loads(path.read_text("utf-8")) for path in _files(code)}
+
+
+def _files(code: str) -> Iterator[Any]:
+    folder = importlib.resources.files("processor.language")
+    return iter(
+        sorted((file for file in folder.iterdir() if file.name.startswith(f"{code}-")), key=lambda one: one.name)
+    )
+
+
+@cache
+def messages(code: str) -> Messages:
+    """Return the catalogue of a language, one of CODES; its files are read once."""
+    return Messages(code)

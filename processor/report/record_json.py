@@ -1,0 +1,62 @@
+"""Records as JSON objects, by the metadata of their fields; arrays and numbers stay as they are."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from typing import Any
+
+from processor.language.messages import messages
+from processor.model import Checked, Reason, Rows
+from processor.store.codec import reason_object
+
+
+def as_object(record: Checked) -> dict[str, Any]:
+    """Write a record as the metadata of its fields have it; see :func:`processor.model.described`."""
+    found: dict[str, Any] = {}
+    for field in dataclasses.fields(record):  # type: ignore[arg-type]
+        key, value = field.metadata.get("json", field.name), getattr(record, field.name)
+        if key and not _absent(value, field.metadata):
+            _put(found, key, _value(value))
+    return found
+
+
+def as_rows(table: Rows) -> list[dict[str, Any]]:
+    """Write a table as a list of its rows; a column without values is left out."""
+    rows: list[dict[str, Any]] = [{} for _ in range(len(table))]
+    for field in dataclasses.fields(table):  # type: ignore[arg-type]
+        key, column = field.metadata.get("json", field.name), getattr(table, field.name)
+        if not key or not len(column):
+            continue
+        keys = field.metadata.get("keys", ())
+        for row, value in zip(rows, column, strict=True):
+            for name, item in zip(keys, value, strict=True) if keys else [("", value)]:
+                _put(row, key.replace("*", name), _value(item))
+    return rows
+
+
+def _absent(value: Any, metadata: Mapping[str, Any]) -> bool:
+    return value is None or bool(metadata.get("optional") and not value.size)
+
+
+def _put(target: dict[str, Any], key: str, value: Any) -> None:
+    """Set a value by a key with dots; "." merges an object into the target."""
+    if key == ".":
+        target |= value
+        return
+    *sections, last = key.split(".")
+    for section in sections:
+        target = target.setdefault(section, {})
+    target[last] = value
+
+
+def _value(value: Any) -> Any:
+    if isinstance(value, Reason):
+        return {**reason_object(value), "text": messages("en").text(value)}
+    if isinstance(value, Rows):
+        return as_rows(value)
+    if isinstance(value, Checked):
+        return as_object(value)
+    if isinstance(value, tuple):
+        return [_value(item) for item in value]
+    return value

@@ -1,0 +1,287 @@
+"""README and docs: their commands exist and run, their links lead somewhere, their tables say what the code says."""
+
+import itertools
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+import designgen.cli
+import processor.cli.run
+from docs import make_parameters
+from processor import pipeline
+from processor.limits import standards
+from processor.scan_folder import folder
+from processor.scan_folder.folder import read_input
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
+MODULES = {"processor": processor, "designgen": designgen}
+PROGRAMS = {"processor": processor.cli.run.commands, "designgen": designgen.cli.commands}
+README_LINES = 120
+LARGEST_PICTURE = 300_000
+# Commands of the pages that take seconds, in an order in which each finds what it needs; as they stand in the pages.
+RUN = (
+    "designgen list",
+    "processor init my-frame",
+    "processor run my-frame -o results",
+    "processor run my-frame -o results --lang zh",
+    "processor run my-frame -o results --params mine.toml",
+    "processor run my-frame -o results --method ray,ransac",
+    "processor check results",
+    "processor report results my-frame",
+    "processor run target.e57 -o results --steps spheres",
+    "processor batch projects -o all-results --jobs 2",
+    "processor batch projects -o all-results --jobs 4",
+    "processor compare before.laz after.laz -o change",
+    "processor compare before.laz after.laz -o change --registration-error 0.002",
+    "processor compare before.ply after.ply -o change --core places.csv "
+    "--normal-diameter 0.4 --projection-diameter 0.2 --max-depth 0.5",
+    "designgen export s1.h5 -o example --format ply",
+    "designgen export roof.h5 -o roof --format e57",
+    "designgen import design.step -o meshes",
+    "processor run my-roof -o results --steps deviation",
+    "processor run my-plates -o results --steps deviation,defects",
+)
+# Commands that take minutes or need other machines, and what runs them, or the same with less to do.
+ELSEWHERE = {
+    "processor run my-bridge -o results": "make demo",
+    "processor run my-bridge -o results --method adjustment,design-aided": "make demo",
+    "processor run my-truss -o results --steps stitch": "tests/unit/test_stitching.py",
+    "processor run my-truss -o results --steps stitch --method three-point": "tests/unit/test_stitching_picks.py",
+    "processor batch /scans -o /results --cluster tcp://10.0.0.1:8786": "tests/unit/test_batch.py",
+    "processor validate mine.toml -o nights --jobs 2": "tests/unit/test_validation_running.py",
+    "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
+    "processor validate -o nights --accept": "tests/unit/test_validation.py",
+    "designgen make frame-1040 -o roof.h5 --seed 3": "make weekend",
+    "designgen make arch-s1-rays -o set --count 100 --vary scanner.noise_mm=0.3,1,2 --jobs 4": (
+        "tests/unit/test_designgen_batch.py"
+    ),
+    "designgen make frame-small -o set --count 100 --cluster tcp://10.0.0.1:8786": "tests/unit/test_designgen_batch.py",
+}
+
+
+def blocks(path, language):
+    """Lines of the fenced blocks of a language."""
+    found, inside = [], None
+    for line in path.read_text("utf-8").splitlines():
+        if line.startswith("```"):
+            inside = line[3:].strip() if inside is None else None
+        elif inside == language:
+            found.append(line)
+    return found
+
+
+def commands_of(path):
+    """Every command of a page: lines of console blocks, and what stands between backticks without an ellipsis."""
+    lines = [line.partition(" # ")[0] for line in blocks(path, "console")]
+    text = re.sub(r"```.*?```", "", path.read_text("utf-8"), flags=re.DOTALL)
+    lines += [span for span in re.findall(r"`([^`\n]+)`", text) if "..." not in span]
+    found = []
+    for line in itertools.chain.from_iterable(line.split("&&") for line in lines):
+        words = line.strip().removeprefix(".venv/bin/")
+        if words.split(" ")[0] in (*PROGRAMS, "make") and " " in words:
+            found.append(words)
+    return found
+
+
+COMMANDS = sorted({(path.name, command) for path in PAGES for command in commands_of(path)})
+
+
+def test_there_are_commands():
+    assert len(COMMANDS) > 40
+    assert {"make demo", "make test"} <= {command for _, command in COMMANDS}
+    assert commands_of(ROOT / "README.md")[:2] == ["make demo", "make test"]
+    for path in PAGES:
+        assert not [line for line in blocks(path, "") if line.split(" ")[0] in (*PROGRAMS, "make")], path.name
+
+
+def targets():
+    return set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text("utf-8"), flags=re.MULTILINE))
+
+
+@pytest.mark.parametrize(("page", "line"), COMMANDS)
+def test_a_command_exists_with_its_options(page, line):
+    program, *words = shlex.split(line)
+    if program == "make":
+        assert set(words) <= targets()
+        return
+    group = PROGRAMS[program]
+    assert words[0] in group.commands or words[0].startswith("--")
+    if words[0] not in group.commands:
+        assert set(words) <= {name for option in group.params for name in option.opts} | {"--help"}
+        return
+    command = group.commands[words[0]]
+    context = click.Context(command)
+    # Whole lines only: `processor run` in a sentence has no arguments.
+    if len(words) == 1 and any(parameter.required for parameter in command.params):
+        return
+    values, rest, order = command.make_parser(context).parse_args(list(words[1:]))
+    assert not rest
+    for parameter in order:
+        given = values.get(parameter.name)
+        if isinstance(parameter.type, click.Choice | click.IntRange | click.FloatRange) and isinstance(given, str):
+            parameter.type.convert(given, parameter, context)
+    for parameter in command.params:
+        assert not parameter.required or values.get(parameter.name) is not None, parameter.name
+
+
+def test_every_command_is_run_somewhere():
+    whole = {line for path in PAGES for line in (text.partition(" # ")[0].strip() for text in blocks(path, "console"))}
+    assert {line for line in whole if not line.startswith("make ")} == {*RUN, *ELSEWHERE}
+    assert all(place.startswith("make ") or (ROOT / place).exists() for place in ELSEWHERE.values())
+
+
+def invoke(line):
+    program, *words = shlex.split(line)
+    done = CliRunner().invoke(PROGRAMS[program], words, standalone_mode=False)
+    assert done.exception is None, (line, done.output, done.exception)
+    assert done.exit_code == 0, (line, done.output)
+
+
+def merged_cloud(folder_of_scans):
+    """Every second point (n, 3) of a folder's scans in the project's frame, m."""
+    clouds = []
+    for scan in read_input(folder_of_scans).scans:
+        T = scan.T_project_scan
+        clouds.append((scan.points + scan.origin) @ T[:3, :3].T + T[:3, 3])
+    return np.concatenate(clouds)[::2] / 1000.0
+
+
+def write_plane(path, count, seed, header):
+    """Write random points of a plane of 4 m, m; of a PLY file with its header."""
+    x, y, noise = np.random.default_rng(seed).normal(size=(3, count))
+    head = f"ply\nformat ascii 1.0\nelement vertex {count}\n" + "".join(f"property double {a}\n" for a in "xyz")
+    text = f"{head}end_header" if header == "ply" else header
+    np.savetxt(path, np.column_stack([x, y, 0.001 * noise]), header=text, comments="", fmt="%.6f")
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A folder with everything that the commands in RUN name."""
+    import cadquery
+
+    fixtures = ROOT / "fixtures"
+    frame = tmp_path / "my-frame"
+    frame.mkdir()
+    shutil.copy(fixtures / "scan-folder/design.json", frame)
+    np.savetxt(frame / "roof.xyz", merged_cloud(fixtures / "scan-folder"), fmt="%.5f")
+    shutil.copytree(fixtures / "scan-folder", tmp_path / "projects/frame-1")
+    shutil.copytree(fixtures / "scan-folder", tmp_path / "projects/frame-2")
+    shutil.copy(fixtures / "formats/ball.e57", tmp_path / "target.e57")
+    for number, name in enumerate(("before", "after")):
+        shutil.copy(fixtures / "formats/ball.laz", tmp_path / f"{name}.laz")
+        write_plane(tmp_path / f"{name}.ply", 4000, number, "ply")
+    write_plane(tmp_path / "places.csv", 20, 2, "x y z")
+    (tmp_path / "mine.toml").write_text("\n".join(blocks(ROOT / "docs/parameters.md", "toml")))
+    cadquery.exporters.export(cadquery.Workplane().box(200.0, 100.0, 20.0), str(tmp_path / "design.step"))
+    monkeypatch.chdir(tmp_path)
+    invoke("designgen make arch-s1 -o s1.h5 --set scan.spacing_mm=100")
+    invoke(f"designgen make {fixtures / 'frame-of-four.toml'} -o roof.h5 --set scan.step_mrad=10")
+    plates = '--set scan.step_mrad=3 --set \'structure.components=["none", "none", "dent"]\''
+    invoke(f"designgen make plates-defects -o plates.h5 {plates}")
+    for name in ("my-plates", "my-roof"):
+        invoke(f"designgen export plates.h5 -o {name} --format ply")
+    return tmp_path
+
+
+def test_cheap_commands_run(place):
+    for line in RUN:
+        invoke(line)
+        if line == "processor run target.e57 -o results --steps spheres":
+            balls = json.loads((place / "results/results.json").read_text("utf-8"))["steps"]["spheres"]["balls"]
+            assert [ball["radius"] for ball in balls] == pytest.approx([75.0], abs=0.5)
+    assert json.loads((place / "results/results.json").read_text("utf-8"))["steps"]["defects"]["status"] == "ok"
+    assert (place / "change/compare.csv").exists()
+    assert read_input(place / "example").arch is not None
+
+
+def anchors(path):
+    """Anchors of a page's headings, as GitHub makes them."""
+    headings = re.findall(r"^#+ (.*)$", path.read_text("utf-8"), flags=re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).strip().replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("path", PAGES, ids=lambda path: path.name)
+def test_links_lead_somewhere(path):
+    links = re.findall(r"\]\(([^)\s]+)\)", path.read_text("utf-8"))
+    for link in links:
+        target, _, anchor = link.partition("#")
+        assert not target.startswith(("http", "/")), link
+        linked = (path.parent / target).resolve() if target else path
+        assert linked.is_relative_to(ROOT), link
+        assert linked.exists(), link
+        assert not anchor or anchor in anchors(linked), link
+
+
+def test_the_index_names_every_page():
+    text = (ROOT / "docs/index.md").read_text("utf-8")
+    assert all(f"]({path.name})" in text for path in PAGES if path.parent == ROOT / "docs" and path.name != "index.md")
+
+
+def test_the_readme_is_short_and_says_what_it_must():
+    text = (ROOT / "README.md").read_text("utf-8")
+    assert len(text.splitlines()) <= README_LINES
+    assert "No licence has been chosen" in text
+    assert ".venv/bin/processor" in text
+    assert "pip install ." in text
+    assert "slow" in text
+    assert (ROOT / "docs/report.png").stat().st_size < LARGEST_PICTURE
+
+
+def test_the_page_of_parameters_is_that_of_the_code():
+    stored = (ROOT / "docs/parameters.md").read_text("utf-8")
+    assert stored == make_parameters.page(), "run make docs"
+
+
+def test_parameters_in_the_pages_exist():
+    for path in PAGES:
+        for table in re.findall(r"`\[([a-z_.]+)\]( [a-z_]+)?`", path.read_text("utf-8")):
+            first, *within = [*table[0].split("."), *table[1].split()]
+            if first not in pipeline.step_modules():
+                continue
+            record = pipeline.step_modules()[first].Params()
+            for name in within:
+                record = getattr(record, name)
+
+
+def test_the_functions_of_the_python_page_exist():
+    code = "\n".join(blocks(ROOT / "docs/python.md", "python"))
+    names = re.findall(r"\b(processor|designgen)\.(\w+)\(", code)
+    assert len(names) == 7
+    missing = [f"{module}.{name}" for module, name in names if not hasattr(MODULES[module], name)]
+    if missing:
+        pytest.skip(f"not in this version yet: {', '.join(missing)}")
+
+
+def test_the_table_of_standards_is_that_of_the_files():
+    text = (ROOT / "docs/limits.md").read_text("utf-8")
+    for path in sorted((ROOT / "processor/limits").glob("*.toml")):
+        content = standards.tomllib.loads(path.read_text("utf-8"))
+        rows = content["limit"]
+        used = list(dict.fromkeys(f"`{row['key']}`" for row in rows if row.get("measure")))
+        cells = (f"`{path.name}`", content["standard"], len(rows), sum(row["verified"] for row in rows))
+        assert f"| {' | '.join(map(str, cells))} | {', '.join(used) or '-'} |" in text
+
+
+def test_the_page_of_the_scan_folder_names_every_key():
+    text = (ROOT / "docs/scan-folder.md").read_text("utf-8")
+    for key in (*folder.KEYS, *folder.SCAN_KEYS):
+        assert re.search(rf"`(\[+)?{key}(\]+)?`", text), key
+    examples = re.findall(r"```json\n(.*?)```", text, flags=re.DOTALL)
+    assert [sorted(json.loads(example))[0] for example in examples] == ["components", "kind", "S1"]
+
+
+def test_the_runner_installs_what_the_check_asks_for():
+    asked = set(re.findall(r"\.so\.\d+=(\S+?)[\s\"]", (ROOT / ".ci/system-libraries").read_text("utf-8")))
+    assert len(asked) == 5
+    for path in (ROOT / ".github/workflows").glob("*.yml"):
+        line = re.search(r"apt-get install.*?\n\n|apt-get install.*?- name", path.read_text("utf-8"), flags=re.DOTALL)
+        assert line is not None, path.name
+        assert asked <= set(line[0].split()), path.name
