@@ -15,7 +15,8 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
-from processor.adjustment import data_snooping
+from processor.adjustment import control_points, data_snooping
+from processor.adjustment.control_points import LEAST_POINTS
 from processor.geometry import rigid
 from processor.model import Control, Floats, InputError, Ints
 from processor.stitching import three_point
@@ -23,7 +24,6 @@ from processor.stitching.result import Held
 
 Bools = npt.NDArray[np.bool_]
 
-LEAST_POINTS = 3
 CLEAR = 10.0  # standard deviations that points must lie off a line by, or the scans might be laid round it either way
 LEAST_SD_MM = 1e-3  # of a sighting, or no matrix could be inverted
 ROUNDS, STILL = 12, 1e-10
@@ -53,9 +53,7 @@ class Sightings:
     @property
     def covariance(self) -> Floats:
         """Covariance (3m, 3m) of known less seen places, without that of the scans' poses; the same along all axes."""
-        shared = (self.point[:, None] == self.point) * np.outer(self.known_sd, self.known_sd)
-        found: Floats = np.kron(shared + np.diag(self.seen_sd**2), np.eye(3))
-        return found
+        return control_points.covariance(self.point, self.known_sd, self.seen_sd)
 
 
 @dataclass(frozen=True)
@@ -259,10 +257,8 @@ def _too_few(own: Sightings) -> str:
     first = np.unique(own.point, return_index=True)[1]
     if len(first) < LEAST_POINTS:
         return f"{len(first)} of them seen in scans that were placed"
-    known = own.known[first]
-    widths = np.linalg.svd(known - known.mean(axis=0), compute_uv=False)
     sd = float(np.hypot(own.known_sd, own.seen_sd).max())
-    if widths[1] < max(three_point.LEAST_HEIGHT * widths[0], CLEAR * sd):
+    if not control_points.determine_motion(own.known[first], three_point.LEAST_HEIGHT, CLEAR * sd):
         return "all of them nearly on a line"
     return ""
 
