@@ -180,7 +180,7 @@ def leave_out(point: Ints, predicted: Prediction) -> Snooped:
         stray = _stray(point, accepted, worst, predicted)
         if stray:
             rejected += stray
-            accepted[[sighting.row for sighting in stray]] = False
+            accepted[[sighting.row for sighting in stray if sighting.row is not None]] = False
             continue
         numbers = np.unique(point[accepted])
         without = [n for n in numbers.tolist() if _worst(point, accepted & (point != n), predicted)[1] <= 1.0]

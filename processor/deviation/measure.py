@@ -12,12 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import to_result
+from processor.deviation import local_translation, to_result
 from processor.deviation.cloud import ScanCloud
+from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
 from processor.deviation.result import ErrorSource, Result
-from processor.geometry import local_translation, m3c2, mesh_distance, rigid, surface_registration
-from processor.geometry.local_translation import Movement
+from processor.geometry import m3c2, mesh_distance, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
 from processor.geometry.principal import AMBIGUOUS

@@ -6,7 +6,7 @@ import trimesh
 from scipy.spatial import cKDTree
 
 from processor.deviation import cloud as deviation_cloud
-from processor.geometry import local_translation as moving
+from processor.deviation import local_translation as moving
 from processor.geometry import m3c2, mesh_distance, neighbors, principal, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError
