@@ -20,12 +20,12 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-import processor
 from processor.batch import figures, record
 from processor.batch.record import FAILED, Record
 from processor.jobs import process
 from processor.model import InputError
 from processor.scan_folder import fingerprint
+from processor.version import __version__
 
 PACKAGES = ("ezdxf", "h5py", "laspy", "lazrs", "numba", "numpy", "plyfile", "pye57", "pypcd4", "scipy", "trimesh")
 PROGRAM = (sys.executable, "-m", "processor.batch.child")
@@ -72,10 +72,10 @@ def software() -> dict[str, str]:
         with suppress(PackageNotFoundError):
             found[name] = version(name)
     digest = hashlib.sha256()
-    package = Path(processor.__file__).parent
+    package = Path(__file__).parents[1]
     for path in sorted(one for one in package.rglob("*") if one.suffix in (".py", ".toml", ".html", ".js", ".css")):
         digest.update(f"{path.relative_to(package)}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
-    return {"processor": f"{processor.__version__} {digest.hexdigest()[:16]}", **found}
+    return {"processor": f"{__version__} {digest.hexdigest()[:16]}", **found}
 
 
 def do(job: Job, stopped: Callable[[], bool] = lambda: False) -> Record:

@@ -152,9 +152,9 @@ def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
 
 
 def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
-    note = table.note
+    note: Any = table.note
     if len(table.rows) > MOST_ROWS:
-        note: Any = text(
+        note = text(
             "{note} The first {most} of {rows} rows; all are in {file}.csv.",
             note=note,
             most=MOST_ROWS,

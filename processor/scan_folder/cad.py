@@ -19,8 +19,8 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import __version__
 from processor.model import Floats, InputError, Ints
+from processor.version import __version__
 
 SUFFIXES = (".step", ".stp", ".ifc")
 LIMIT_S = 900.0  # designgen has a limit of its own, with a better message, below this one
