@@ -34,30 +34,16 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     group = cloud.adaptive_voxels(design.points, preset.voxel_mm, preset.voxel_points)
     core = cloud.group_means(design.points, group)
     towards = cloud.group_means(design.normals, group)
-    own_group = cloud.adaptive_voxels(scan.points, preset.voxel_mm, preset.voxel_points)
-    reduced = cloud.group_means(scan.points, own_group)
-    target = thinned(core, MOST_ICP_POINTS)
-    source = thinned(reduced, MOST_ICP_POINTS)
-    if params.register in ("none", "fine"):
-        start, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN
-    else:
-        pose = coarse(source, target)
-        start, ambiguity = pose.T_target_source, pose.ambiguity
-    T, error = start, 0.0
-    if params.register != "none":
-        T = icp.point_to_point(source, target, start).T_target_source
-        error = clone_error(rigid.apply(T, source))
-    if np.isfinite(params.registration_error_mm):
-        error = params.registration_error_mm
-    moved = rigid.apply(T, scan.points)
+    T, error, ambiguity = _registered(scan, core, origin, params)
     grid = m3c2.grid(design.points, preset.projection_diameter_mm)
     normals = m3c2.oriented(m3c2.normals(grid, core, preset.normal_diameter_mm).normals, towards)
-    found = m3c2.distances(
-        grid, m3c2.grid(moved, preset.projection_diameter_mm), core, normals,
+    compared = m3c2.grid(rigid.apply(T, scan.points), preset.projection_diameter_mm)
+    distances = m3c2.distances(
+        grid, compared, core, normals,
         projection_diameter_mm=preset.projection_diameter_mm, max_depth_mm=preset.max_depth_mm,
         registration_error_mm=error,
     )  # fmt: skip
-    total = m3c2.summary(found, core, normals, preset.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
+    total = m3c2.summary(distances, core, normals, preset.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     status = Status.OK if total.core_points > total.without_lod else Status.FAILED
     reasons = [
         reason(
@@ -71,8 +57,8 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     if ambiguity < AMBIGUOUS:
         status = Status.AMBIGUOUS if status is Status.OK else status
         reasons.append(reason("deviation.paper-ambiguous", ratio=ambiguity))
-    used = known if (known := found.std2[np.isfinite(found.lod95)]).size else np.array([NAN])
-    points = to_result.core_points(core, normals, found)
+    used = known if (known := distances.std2[np.isfinite(distances.lod95)]).size else np.array([NAN])
+    points = to_result.core_points(core, normals, distances)
     how = {"none": Registration.AS_GIVEN, "fine": Registration.FINE}.get(params.register, Registration.COARSE)
     return Result(
         status=status,
@@ -94,6 +80,25 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
         core=points,
         **to_result.statistics(points, total),
     )
+
+
+def _registered(scan: ScanCloud, core: Floats, origin: Floats, params: Params) -> tuple[Floats, float, float]:
+    """Pose T (4, 4) of the scan in the design's local frame, registration error in mm, and ambiguity."""
+    preset = params.paper
+    reduced = cloud.group_means(scan.points, cloud.adaptive_voxels(scan.points, preset.voxel_mm, preset.voxel_points))
+    target, source = thinned(core, MOST_ICP_POINTS), thinned(reduced, MOST_ICP_POINTS)
+    if params.register in ("none", "fine"):
+        T, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN
+    else:
+        pose = coarse(source, target)
+        T, ambiguity = pose.T_target_source, pose.ambiguity
+    error = 0.0
+    if params.register != "none":
+        T = icp.point_to_point(source, target, T).T_target_source
+        error = clone_error(rigid.apply(T, source))
+    if np.isfinite(params.registration_error_mm):
+        error = params.registration_error_mm
+    return T, error, ambiguity
 
 
 def coarse(source: Floats, target: Floats) -> CoarsePose:

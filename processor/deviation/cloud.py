@@ -1,4 +1,4 @@
-"""The scan of a structure, cleaned; its design's surface as points; density-adaptive voxels. Paper 002, section 2."""
+"""The scan of a structure without outliers, and density-adaptive voxels (paper 002, section 2)."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from processor.geometry import merging, neighbors
 from processor.model import Floats, InputError, Ints, Scene
 
-MOST_POINTS = 3_000_000  # of a scan: more are thinned evenly, which no core point's answer needs
+MOST_POINTS = 3_000_000  # of a scan; more are thinned evenly
 
 
 @dataclass(frozen=True)
 class ScanCloud:
-    """Points (n, 3) of a scan less ``origin`` (3,), outliers removed, in an order of their own, and scanners."""
+    """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order, and scanners (n, 3)."""
 
     points: Floats
     origin: Floats
@@ -49,13 +49,21 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     rows = rows[:: max(1, -(-kept // MOST_POINTS))]
     thinner = np.sqrt(kept / len(rows))
     scanner = None if cloud.scanner is None else cloud.scanner[grid.order[rows]]
-    return ScanCloud(grid.cells.points[rows], cloud.origin, scanner, spacing * thinner, grid.count, kept, unposed)
+    return ScanCloud(
+        points=grid.cells.points[rows],
+        origin=cloud.origin,
+        scanner=scanner,
+        spacing_mm=spacing * thinner,
+        read=grid.count,
+        kept=kept,
+        unposed=unposed,
+    )
 
 
 def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:
-    """Group (n,) of each point (n, 3): its voxel of ``size_mm``, or of double edges until it holds ``least`` points.
+    """Group (n,) of each point (n, 3): its voxel of ``size_mm``, doubled in size until it holds ``least`` points.
 
-    Density-adaptive down-sampling of paper 002, section 2.2; what never fills a voxel is one last group.
+    Density-adaptive down-sampling of paper 002, section 2.2; points that never fill a voxel are one last group.
     """
     group = np.full(len(points), -1, np.int64)
     left, groups = np.arange(len(points)), 0
@@ -76,8 +84,8 @@ def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:
 def group_means(values: Floats, group: Ints) -> Floats:
     """Means (g, 3) of values (n, 3) in groups (n,)."""
     count = np.bincount(group)
-    found: Floats = np.stack([np.bincount(group, values[:, k]) for k in range(values.shape[1])], axis=1)
-    return found / count[:, None]
+    total: Floats = np.stack([np.bincount(group, values[:, k]) for k in range(values.shape[1])], axis=1)
+    return total / count[:, None]
 
 
 def _voxels(points: Floats, size: float) -> tuple[Ints, Ints]:

@@ -28,7 +28,7 @@ def applies(scene: Scene) -> bool:
 
 
 def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) -> Result:
-    """Hold the scan of a scene against its design; scans that were stitched ``earlier`` are placed as found there.
+    """Compare the scan of a scene with its design; scans stitched ``earlier`` have the poses of that result.
 
     Raises InputError without a design or points, UsageError for parameters that make no sense.
     """

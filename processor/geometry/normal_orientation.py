@@ -86,7 +86,7 @@ def turned(fitted: CloudNormals, core: Floats, normal_diameter: float, scanner: 
         open_ = open_ & ~facing
         seen = int(facing.sum())
     if not open_.any():
-        return Turned(normals, up, seen, 0, 0, 0)
+        return Turned(normals=normals, up=up, scanner=seen, neighbours=0, convention=0, surfaces=0)
     rows = np.flatnonzero(np.isfinite(normals).all(axis=1))
     rows = rows[np.lexsort(core[rows].T)]  # the result must not depend on the order of the points
     first, node = _nodes(core[rows], normals[rows], open_[rows], normal_diameter)
@@ -96,7 +96,10 @@ def turned(fitted: CloudNormals, core: Floats, normal_diameter: float, scanner: 
     alike = np.where(np.einsum("ni,ni->n", normals[rows], normals[some][node]) < 0.0, -1.0, 1.0)
     normals[rows] *= np.where(open_[rows], alike * sign[node], 1.0)[:, None]
     joined = int((follows[node] & open_[rows]).sum())
-    return Turned(normals, up, seen, joined, int(open_.sum()) - joined, surfaces)
+    convention = int(open_.sum()) - joined
+    return Turned(
+        normals=normals, up=up, scanner=seen, neighbours=joined, convention=convention, surfaces=surfaces
+    )  # fmt: skip
 
 
 def _noise(fitted: CloudNormals, normal_diameter: float) -> Floats:
