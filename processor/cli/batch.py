@@ -62,11 +62,12 @@ def batch(context: click.Context, /, root: Path, **options: Any) -> None:
     (it is listed), 4 where none did and an accuracy limit was missed.
     """
     from processor.batch import batch as whole
+    from processor.jobs.runner import StoppedError
 
     chosen = BatchOptions(**options)
     try:
         summary = whole.run(_settings(root, chosen), say, lambda record: _report_input(record, chosen.as_json))
-    except whole.StoppedError:
+    except StoppedError:
         context.exit(IN_PART)
     counts = {name: count for name, count in summary.counts.items() if count}
     if chosen.as_json:
