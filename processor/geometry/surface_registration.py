@@ -47,12 +47,12 @@ class Motion(Word):
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """T_bridge_scan (4, 4), its covariance (6, 6: turn about the design frame's axes, translation), sigma and shares.
+    """T_design_scan (4, 4), its covariance (6, 6: turn about the design frame's axes, translation), sigma and shares.
 
     ``weak`` names the motions that the points seen do not determine. ``used_share`` is that of points on the surface.
     """
 
-    T_bridge_scan: Floats
+    T_design_scan: Floats
     covariance: Floats
     sigma_mm: float
     used_share: float
@@ -74,7 +74,7 @@ def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> S
     balanced, form = _iterate(thinned(points, POINTS), surface, axes, start, GATES_MM[0], even=True)
     if not form < NO_FORM:
         return balanced
-    return _iterate(thinned(points, LAST_POINTS), surface, axes, balanced.T_bridge_scan, GATES_MM[1], even=False)[0]
+    return _iterate(thinned(points, LAST_POINTS), surface, axes, balanced.T_design_scan, GATES_MM[1], even=False)[0]
 
 
 def fits(fitted: SurfaceFit) -> bool:
@@ -227,7 +227,7 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Plac
         registration = Registration.FINE
     fitted = fine(few, surface, axes.axes, start)
     determined = np.isfinite(fitted.covariance).all()
-    best = fitted.T_bridge_scan if determined else np.full((4, 4), NAN)
+    best = fitted.T_design_scan if determined else np.full((4, 4), NAN)
     T = start if registration is Registration.AS_GIVEN or not determined else best
     between = best @ rigid.invert(T) if determined else np.full((4, 4), NAN)
     middle = rigid.apply(T, few.mean(axis=0))

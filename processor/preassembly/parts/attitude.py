@@ -231,7 +231,7 @@ def _decide(points: Floats, box: Floats, seeds: Floats, surface: Surface, candid
     """Choose, of candidates that fit, the one that no other beats by the surface that the scan shows."""
     if len(candidates) > 1:
         # Evidence is counted at a scale of tens of millimetres: poses must be more accurate than that.
-        fine = [surface_registration.fine(seeds, surface.mesh, surface.axes, c.T).T_bridge_scan for c in candidates]
+        fine = [surface_registration.fine(seeds, surface.mesh, surface.axes, c.T).T_design_scan for c in candidates]
         candidates = _distinct([replace(c, T=T) for c, T in zip(candidates, fine, strict=True)], box)
 
     @cache
