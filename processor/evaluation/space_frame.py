@@ -11,7 +11,6 @@ from processor.model import NORMAL_95, Better, Floats, FrameTruth, Ints, Metric,
 from processor.space_frame.result import Balls, Flag, Result
 from processor.space_frame.spheres import isolated
 
-
 NAN = float("nan")
 WRONG_MM = 10.0  # a centre farther off is that of another ball
 FOUND_MM = 3.0  # a node this near to the true one is found

@@ -33,7 +33,8 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
         keys, present = field.metadata.get("keys", ()), _present(table, field.metadata)
         for row, value in ((rows[i], column[i]) for i in present):
             for name, item in zip(keys, value, strict=True) if keys else [("", value)]:
-                _put(row, key.replace("*", name), _value(item))
+                null = field.metadata.get("nullable") and np.isnan(item).all()
+                _put(row, key.replace("*", name), None if null else _value(item))
     return rows
 
 

@@ -1,4 +1,4 @@
-"""A figure a ball to look at: the points about it from the side and from above, what was fitted, what was designed."""
+"""A figure of each ball to look at: the points about it in elevation and plan, the fitted and the nominal sphere."""
 
 from __future__ import annotations
 
@@ -14,11 +14,12 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from processor.geometry import rigid
+from processor.language.messages import messages, text
 from processor.model import NORMAL_95, Floats, Scene
 from processor.report.space_frame.dxf import nominal_places
 from processor.report.style import COLOURS, Drawn, pdf, png, write_beside
-from processor.space_frame import step as space_frame_step
 from processor.space_frame.points.scene_source import SceneSource, of_scene
+from processor.space_frame.result import Balls, Flag, Result
 from processor.store.streaming import StoredPoints, points_of
 
 PREFIX = "ball-to-see-"
@@ -26,54 +27,58 @@ MOST_BALLS = 12  # on the page
 MOST_PAGES = 500
 DOCUMENT = "balls-to-look-at.pdf"
 LINE = 0.052  # of the panel's height
-ORDER = ("wrong-size", "not-found", "low-confidence")  # of what is drawn first
-ROUND_MM = 60.0  # about the ball, that is shown
+ORDER = (Flag.WRONG_SIZE, Flag.NOT_FOUND, Flag.LOW_CONFIDENCE)  # of what is drawn first
+ROUND_MM = 60.0  # shown about the ball
 SLICE_MM = 8.0  # on either side of the plane through the centre
 SLACK_MM = 0.1  # of a box, beyond what is shown
-MOST_POINTS = 20_000  # of a panel; more are no more to see
+MOST_POINTS = 20_000  # of a panel; more are not visible
 LEAST_RADIUS_MM = 30.0
 VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
 
 
-def of_result(scene: Scene, result: space_frame_step.Result, stored: Path | None = None) -> Drawn:
+def of_result(scene: Scene, result: Result, stored: Path | None = None) -> Drawn:
     """Draw the balls that are not ok, MOST_BALLS of them at most; none where the scene's points are not at hand.
 
     ``stored`` is the scene's file, where its points were left there.
     """
-    as_is = ", each station where it was registered" if result.station_names else ""
-    every = len(doubtful(scene, result))
-    more = f" (the first {MOST_BALLS} of {every} to look at, all in {DOCUMENT})" if every > MOST_BALLS else ""
+    balls, every = result.balls, len(doubtful(scene, result))
+    more = text(" (the first {most} of {all} to look at, all in {file})", most=MOST_BALLS, all=every, file=DOCUMENT)
     return {
-        f"{PREFIX}{int(result.ids[i])}.png": (
-            f"Ball {int(result.ids[i])}, {result.flag[i]}: the points about it{as_is}; dark are those within "
-            f"{SLICE_MM:g} mm of the plane through its centre{more}",
+        f"{PREFIX}{int(balls.ids[i])}.png": (
+            text(
+                "Ball {id}, {flag}: the points about it{stations}; dark are those within {slice:g} mm of the plane "
+                "through its centre{more}",
+                id=int(balls.ids[i]),
+                flag=balls.flag[i],
+                stations=text(", each station as registered") if len(result.stations) else "",
+                slice=SLICE_MM,
+                more=more if every > MOST_BALLS else "",
+            ),
             png(figure),
         )
         for i, figure in _drawn(scene, result, stored, MOST_BALLS)
     }
 
 
-def document(scene: Scene, result: space_frame_step.Result, stored: Path | None = None) -> bytes:
+def document(scene: Scene, result: Result, stored: Path | None = None) -> bytes:
     """Draw a page for each ball that is not ok, MOST_PAGES at most; empty where there is none, or no points."""
     first = next(drawn := _drawn(scene, result, stored, MOST_PAGES), None)
     return pdf(figure for _, figure in (first, *drawn)) if first is not None else b""
 
 
-def doubtful(scene: Scene, result: space_frame_step.Result) -> list[int]:
-    """Rows of the balls that are not ok and of which it is known where to look, those to see first before others."""
+def doubtful(scene: Scene, result: Result) -> list[int]:
+    """Rows of the flagged balls with a known place, in the order in which they are drawn."""
     there = np.isfinite(_places(result, designed_places(scene, result))).all(axis=1)
-    return [i for flag in ORDER for i in np.flatnonzero(there).tolist() if result.flag[i] == flag]
+    return [i for flag in ORDER for i in np.flatnonzero(there).tolist() if result.balls.flag[i] is flag]
 
 
-def _places(result: space_frame_step.Result, nominal: Floats) -> Floats:
+def _places(result: Result, nominal: Floats) -> Floats:
     """Return where each ball is (k, 3), or where the design has it."""
-    found: Floats = np.where(np.isfinite(result.centres), result.centres, nominal)
+    found: Floats = np.where(np.isfinite(result.balls.centres), result.balls.centres, nominal)
     return found
 
 
-def _drawn(
-    scene: Scene, result: space_frame_step.Result, stored: Path | None, most: int
-) -> Iterator[tuple[int, Figure]]:
+def _drawn(scene: Scene, result: Result, stored: Path | None, most: int) -> Iterator[tuple[int, Figure]]:
     nominal = designed_places(scene, result)
     centres = _places(result, nominal)
     shown = doubtful(scene, result)[:most]
@@ -86,20 +91,20 @@ def _drawn(
         yield i, _ball(result, i, centres[i], nominal[i] - centres[i], crops[k], reach[k])
 
 
-def designed_places(scene: Scene, result: space_frame_step.Result) -> Floats:
+def designed_places(scene: Scene, result: Result) -> Floats:
     """Return where the design has each ball (k, 3), in the input's own frame; NaN where it has none.
 
-    Where the node was found that is its own place less its movement, else the design's by the pose that was found.
+    Where the node was found that is its place less its movement, else the design's place by the estimated pose.
     """
     places = nominal_places(result)
     if scene.frame is None:
         return places
     nodes = scene.frame.centres
-    if result.T_design_scan.size:
-        nodes = rigid.apply(rigid.invert(result.T_design_scan), nodes)
+    if result.matching is not None:
+        nodes = rigid.apply(rigid.invert(result.matching.T_design_scan), nodes)
     known = dict(zip(scene.frame.ids.tolist(), nodes, strict=True))
     for i in np.flatnonzero(~np.isfinite(places).all(axis=1)).tolist():
-        places[i] = known.get(int(result.ids[i]), places[i])
+        places[i] = known.get(int(result.balls.ids[i]), places[i])
     return places
 
 
@@ -137,33 +142,31 @@ def _within(source: SceneSource, centres: Floats, reach: Floats) -> list[Floats]
     return [np.vstack(parts) if parts else np.empty((0, 3)) for parts in found]
 
 
-def _radius(result: space_frame_step.Result, i: int) -> float:
-    known = [float(one[i]) for one in (result.radii, result.nominal_radii) if np.isfinite(one[i])]
+def _radius(result: Result, i: int) -> float:
+    known = [float(one[i]) for one in (result.balls.radii, result.balls.nominal_radii) if np.isfinite(one[i])]
     return max([LEAST_RADIUS_MM, *known])
 
 
-def _ball(
-    result: space_frame_step.Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float
-) -> Figure:
+def _ball(result: Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float) -> Figure:
     """Draw a ball about ``middle`` (3,), its numbers beside it; ``nominal`` (3,) is less it."""
-    figure = Figure(figsize=(12.4, 5.3), layout="constrained")
+    balls, figure = result.balls, Figure(figsize=(12.4, 5.3), layout="constrained")
     *views, beside = figure.subplots(1, 3, width_ratios=[4.6, 4.6, 3.0])
     for axes, (name, across) in zip(views, VIEWS, strict=True):
         _points(axes, points, across)
         _members(axes, result, i, middle, across, reach)
-        if np.isfinite(nominal).all() and np.isfinite(result.nominal_radii[i]):
-            _circle(axes, nominal, float(result.nominal_radii[i]), across, COLOURS[1], "--")
-        if np.isfinite(result.radii[i]) and result.flag[i] != "not-found":
-            _circle(axes, np.zeros(3), float(result.radii[i]), across, COLOURS[0], "-")
+        if np.isfinite(nominal).all() and np.isfinite(balls.nominal_radii[i]):
+            _circle(axes, nominal, float(balls.nominal_radii[i]), across, COLOURS[1], "--")
+        if np.isfinite(balls.radii[i]) and balls.flag[i] is not Flag.NOT_FOUND:
+            _circle(axes, np.zeros(3), float(balls.radii[i]), across, COLOURS[0], "-")
         axes.set(
             xlim=(-reach, reach), ylim=(-reach, reach), title=name,
             xlabel="x less the centre's, mm", ylabel=f"{'xyz'[across[1]]} less the centre's, mm",
         )  # fmt: skip
         axes.set_aspect("equal")
         axes.grid(alpha=0.3)
-    heading = f"Ball {int(result.ids[i])}: {result.flag[i]}. {result.reason[i]}"
+    heading = f"Ball {int(balls.ids[i])}: {balls.flag[i]}. {messages('en').sentences(balls.reasons[i])}"
     figure.suptitle("\n".join(textwrap.wrap(heading, 130)[:3]), fontsize=11)
-    write_beside(beside, _numbers(result, i, nominal), LINE, 8.0)
+    write_beside(beside, _numbers(balls, i, nominal), LINE, 8.0)
     handles = [
         Line2D([], [], marker=".", linestyle="", color="black", label=f"points within {SLICE_MM:g} mm of the plane"),
         Line2D([], [], marker=".", linestyle="", color="0.72", label="points before and behind it"),
@@ -175,29 +178,29 @@ def _ball(
     return figure
 
 
-def _numbers(result: space_frame_step.Result, i: int, nominal: Floats) -> list[tuple[str, str]]:
-    """Return what is known of a ball, in words and as text; ``nominal`` (3,) is the design's place less its own."""
-    sd = np.sqrt(np.where((variance := np.diag(result.covariance[i])) >= 0.0, variance, np.nan))
-    bound = result.bound_sd[i]
+def _numbers(balls: Balls, i: int, nominal: Floats) -> list[tuple[str, str]]:
+    """Return names and values of a ball's figures; ``nominal`` (3,) is the design's place less the ball's."""
+    sd = np.sqrt(np.where((variance := np.diag(balls.covariance[i])) >= 0.0, variance, np.nan))
+    bound = balls.bound_sd[i]
     rows = [("mm", "± 95 %")]
     for k, axis in enumerate("xyz"):
-        rows.append((f"centre {axis}", _with(result.centres[i, k], NORMAL_95 * sd[k], 1)))
+        rows.append((f"centre {axis}", _with(balls.centres[i, k], NORMAL_95 * sd[k], 1)))
     rows += [
-        ("radius", _with(result.radii[i], NORMAL_95 * sd[3], 2)),
-        ("size in the catalogue", f"{result.sizes[i]:g}"),
-        ("radius designed", f"{result.nominal_radii[i]:g}"),
-        ("lowest point z", _with(result.lowest[i, 2], NORMAL_95 * result.lowest_sd[i], 2)),
+        ("radius", _with(balls.radii[i], NORMAL_95 * sd[3], 2)),
+        ("size in the catalogue", f"{balls.sizes[i]:g}"),
+        ("radius designed", f"{balls.nominal_radii[i]:g}"),
+        ("lowest point z", _with(balls.lowest[i, 2], NORMAL_95 * balls.lowest_sd[i], 2)),
     ]
     off = zip("xyz", (-nominal).tolist(), strict=True)
     rows += [(f"off the design's place, {axis}", f"{value:.2f}") for axis, value in off]
     rows += [(f"least possible ±, {what}", f"{NORMAL_95 * bound[k]:.2f}") for k, what in ((2, "z"), (3, "radius"))]
     rows += [
-        ("residuals, rms", f"{result.rms[i]:.2f}"),
-        ("points", f"{int(result.points[i])}"),
-        ("visible, %", f"{100.0 * result.visible_fraction[i]:.0f}"),
-        ("stations", f"{int(result.stations[i])}"),
-        ("axes of members", f"{int(result.axes[i])}"),
-        ("evidence", result.evidence[i]),
+        ("residuals, rms", f"{balls.rms[i]:.2f}"),
+        ("points", f"{int(balls.points[i])}"),
+        ("visible, %", f"{100.0 * balls.visible_fraction[i]:.0f}"),
+        ("stations", f"{int(balls.stations[i])}"),
+        ("axes of members", f"{int(balls.axes[i])}"),
+        ("evidence", balls.evidence[i]),
     ]
     return rows
 
@@ -214,13 +217,12 @@ def _points(axes: Axes, points: Floats, across: tuple[int, int]) -> None:
         axes.plot(*few[:, across].T, ".", markersize=2.0, color=colour, zorder=order, rasterized=True)
 
 
-def _members(
-    axes: Axes, result: space_frame_step.Result, i: int, middle: Floats, across: tuple[int, int], reach: float
-) -> None:
-    """Draw the axes of the members that meet at a ball, through it to where they end on the picture."""
-    for tube in np.flatnonzero((result.tube_a == result.ids[i]) | (result.tube_b == result.ids[i])).tolist():
-        start, end = (result.tube_start[tube] - middle, result.tube_end[tube] - middle)
-        away = end - start if result.tube_a[tube] == result.ids[i] else start - end
+def _members(axes: Axes, result: Result, i: int, middle: Floats, across: tuple[int, int], reach: float) -> None:
+    """Draw the axes of the members that meet at a ball, through it to the border of the picture."""
+    tubes, id_ = result.tubes, result.balls.ids[i]
+    for tube in np.flatnonzero((tubes.a == id_) | (tubes.b == id_)).tolist():
+        start, end = tubes.start[tube] - middle, tubes.end[tube] - middle
+        away = end - start if tubes.a[tube] == id_ else start - end
         away = away / np.linalg.norm(away)
         foot = start - (start @ away) * away
         line = foot + np.array([[-0.25], [2.0]]) * reach * away

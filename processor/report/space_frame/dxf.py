@@ -23,10 +23,11 @@ TEXT_HEIGHT_MM = 50.0
 
 def nominal_places(result: Result) -> Floats:
     """Return where the design has each node (k, 3), in the input's own frame; NaN where no movement is known."""
-    if not result.gauge:
-        return np.full_like(result.centres, np.nan)
-    found: Floats = result.centres - result.movement @ result.T_design_scan[:3, :3]
-    return found
+    balls = result.balls
+    if result.movement_reference is None or result.matching is None:
+        return np.full_like(balls.centres, np.nan)
+    places: Floats = balls.centres - balls.movement @ result.matching.T_design_scan[:3, :3]
+    return places
 
 
 def drawing(result: Result) -> bytes:
@@ -54,27 +55,27 @@ def drawing(result: Result) -> bytes:
 
 
 def _draw(space: Any, result: Result) -> None:
-    nominal = nominal_places(result)
-    for i, centre in enumerate(result.centres.tolist()):
+    balls, nominal = result.balls, nominal_places(result)
+    for i, centre in enumerate(balls.centres.tolist()):
         if not np.isfinite(centre).all():
             continue
         on_nodes, on_ids = {"layer": "NODES"}, {"layer": "IDS"}
         space.add_point(centre, dxfattribs=on_nodes)
         aside = 0.0
-        if np.isfinite(result.radii[i]):
-            aside = float(result.radii[i])
+        if np.isfinite(balls.radii[i]):
+            aside = float(balls.radii[i])
             space.add_circle(centre, aside, dxfattribs=on_nodes)
-        text = space.add_text(str(int(result.ids[i])), height=TEXT_HEIGHT_MM, dxfattribs=on_ids)
+        text = space.add_text(str(int(balls.ids[i])), height=TEXT_HEIGHT_MM, dxfattribs=on_ids)
         text.set_placement((centre[0] + aside, centre[1] + aside, centre[2]))
         if np.isfinite(nominal[i]).all():
             space.add_line(nominal[i].tolist(), centre, dxfattribs={"layer": "MOVEMENTS"})
-    for start, end in zip(result.tube_start.tolist(), result.tube_end.tolist(), strict=True):
+    for start, end in zip(result.tubes.start.tolist(), result.tubes.end.tolist(), strict=True):
         space.add_line(start, end, dxfattribs={"layer": "AXES"})
 
 
 def _extent(result: Result) -> tuple[list[float], list[float]]:
     """Corners of all places, so that a viewer opens on the frame and not on the origin."""
-    places = np.vstack([result.centres, result.tube_start, result.tube_end])
+    places = np.vstack([result.balls.centres, result.tubes.start, result.tubes.end])
     places = places[np.isfinite(places).all(axis=1)]
     if not len(places):
         return [0.0] * 3, [0.0] * 3

@@ -1,4 +1,4 @@
-"""Figures of balls: where they are and how they moved, their errors against the bound, and each one to look at."""
+"""Figures of balls: plan with movements, errors beside the bound, and each ball to look at."""
 
 from __future__ import annotations
 
@@ -15,14 +15,15 @@ from matplotlib.ticker import NullFormatter
 from scipy.spatial import cKDTree
 
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import Message, text
 from processor.model import Floats, Scene, StepRun
 from processor.report.space_frame import close_ups
 from processor.report.space_frame.dxf import nominal_places
 from processor.report.space_frame.tables import has_bounds
 from processor.report.style import COLOURS, DASHES, DIVERGING, HATCHES, LEAST_SHOWN_MM, MARKERS, Drawn, png, rounded
-from processor.space_frame import step as space_frame_step
+from processor.space_frame.result import Flag, Result
 
-FLAGS = ("ok", "low-confidence", "wrong-size")
+FLAGS = (Flag.OK, Flag.LOW_CONFIDENCE, Flag.WRONG_SIZE)
 MOST_LABELS = 30
 ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest arrows are drawn
 PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
@@ -30,9 +31,9 @@ PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors
 
 def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> Drawn:
     """Draw balls; ``runs`` are the answer and those compared with it, ``stored`` the file that still has the points."""
-    first: space_frame_step.Result = runs[0].result
+    first: Result = runs[0].result
     found: Drawn = {}
-    if len(first.ids) > 1:
+    if len(first.balls) > 1:
         found[PLAN] = _plan(scene, runs[0])
         if report.true_radii:
             found[RADIUS_ERRORS] = _radius_errors(runs, report)
@@ -46,52 +47,54 @@ def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: 
 # --- plan ----------------------------------------------------------------------------------------------------------
 
 
-def _plan(scene: Scene, run: StepRun) -> tuple[str, bytes]:
-    """Plan of the balls; one that was not found stands where the design has it."""
+def _plan(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
+    """Draw a plan of the balls; one that was not found is at the design's place."""
     figure = Figure(figsize=(7.5, 6.5), layout="constrained")
     axes = figure.subplots()
-    result: space_frame_step.Result = run.result
-    flags = np.array(result.flag, dtype=object)
-    said = _movements(figure, axes, result) if result.gauge else ""
+    result: Result = run.result
+    balls = result.balls
+    arrows = _movements(figure, axes, result)
     for k, flag in enumerate(FLAGS):
-        on = (flags == flag) & np.isfinite(result.centres).all(axis=1)
+        on = balls.flagged(flag) & balls.placed
         if on.any():
             axes.scatter(
-                result.centres[on, 0] / 1000.0,
-                result.centres[on, 1] / 1000.0,
+                balls.centres[on, 0] / 1000.0,
+                balls.centres[on, 1] / 1000.0,
                 s=36.0,
                 marker=MARKERS[k],
                 facecolors="none",
                 edgecolors=COLOURS[k],
                 label=f"{flag} ({on.sum()})",
             )
-    where = result.centres.copy()
-    missing = ~np.isfinite(where).all(axis=1) | (flags == "not-found")
+    where = balls.centres.copy()
+    missing = ~balls.placed | balls.flagged(Flag.NOT_FOUND)
     where[missing] = close_ups.designed_places(scene, result)[missing]
     drawn = missing & np.isfinite(where).all(axis=1)
     if drawn.any():
         label = f"not found, place of the design ({drawn.sum()})"
         x, y = (where[drawn, :2] / 1000.0).T
         axes.scatter(x, y, s=36.0, marker="x", color="black", label=label)
-    to_see = np.flatnonzero((flags != "ok") & np.isfinite(where).all(axis=1))[:MOST_LABELS]
+    to_see = np.flatnonzero(~balls.flagged(Flag.OK) & np.isfinite(where).all(axis=1))[:MOST_LABELS]
     for i in to_see.tolist():
-        axes.annotate(str(result.ids[i]), where[i, :2] / 1000.0, xytext=(5, 4), textcoords="offset points", fontsize=8)
+        axes.annotate(str(balls.ids[i]), where[i, :2] / 1000.0, xytext=(5, 4), textcoords="offset points", fontsize=8)
     axes.set(xlabel="x, m", ylabel="y, m")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3)
-    return f"Plan of the balls, method {run.method}; those to look at bear their ids{said}", png(figure)
+    caption: Message = text("Plan of the balls, method {method}; those to look at have their ids", method=run.method)
+    return caption if arrows is None else text("{plan}; {arrows}", plan=caption, arrows=arrows), png(figure)
 
 
-def _movements(figure: Figure, axes: Axes, result: space_frame_step.Result) -> str:
-    """Draw how nodes moved in plan as arrows and in height as colours; returns what to say of it."""
-    vector = result.centres - nominal_places(result)
+def _movements(figure: Figure, axes: Axes, result: Result) -> Message | None:
+    """Draw the movements of nodes in plan as arrows and in height as colours; return a caption, None without any."""
+    centres, reference = result.balls.centres, result.movement_reference
+    vector = centres - nominal_places(result)
     known = np.isfinite(vector).all(axis=1)
-    if not known.any():
-        return ""
-    vector, places = vector[known], result.centres[known, :2] / 1000.0
-    apart = cKDTree(result.centres[known]).query(result.centres[known], k=2)[0][:, 1] if known.sum() > 1 else np.ones(1)
+    if reference is None or not known.any():
+        return None
+    vector, places = vector[known], centres[known, :2] / 1000.0
+    apart = cKDTree(centres[known]).query(centres[known], k=2)[0][:, 1] if known.sum() > 1 else np.ones(1)
     long = max(float(np.quantile(np.hypot(vector[:, 0], vector[:, 1]), 0.95)), LEAST_SHOWN_MM)
     times = rounded(ARROW_SHARE * float(np.median(apart)) / long)
     limit = max(float(np.quantile(np.abs(vector[:, 2]), 0.98)), LEAST_SHOWN_MM)
@@ -105,17 +108,21 @@ def _movements(figure: Figure, axes: Axes, result: space_frame_step.Result) -> s
         color="black", zorder=3,
     )  # fmt: skip
     axes.plot([], [], color="black", marker=">", markersize=4.0, label=f"movement in plan, drawn {times:,.0f} times")
-    return f"; arrows are movements in plan, found minus nominal ({result.gauge}), drawn {times:,.0f} times their size"
+    return text(
+        "arrows are movements in plan, found minus nominal ({gauge}), drawn {times:,.0f} times their size",
+        gauge=reference.gauge,
+        times=times,
+    )
 
 
 # --- errors --------------------------------------------------------------------------------------------------------
 
 
-def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[str, bytes]:
+def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[Message, bytes]:
     """Histogram of the radius errors and cumulative share of their sizes."""
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
     histogram, cumulative = figure.subplots(1, 2)
-    errors = [run.result.radii - report.true_radii[run.method] for run in runs]
+    errors = [run.result.balls.radii - report.true_radii[run.method] for run in runs]
     errors = [error[np.isfinite(error)] for error in errors]
     everything = np.concatenate(errors)
     low, high = np.quantile(everything, (0.01, 0.99)) if len(everything) else (-1.0, 1.0)
@@ -131,7 +138,7 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[str, b
             label=run.method,
         )
         size = np.sort(np.maximum(np.abs(error), LEAST_SHOWN_MM))
-        share = np.arange(1, len(size) + 1) / len(run.result.ids)
+        share = np.arange(1, len(size) + 1) / len(run.result.balls)
         cumulative.step(
             size, share, DASHES[k % 4], color=COLOURS[k % 4], where="post", label=f"{run.method} (n = {len(size)})"
         )
@@ -145,32 +152,38 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> tuple[str, b
     for axes in (histogram, cumulative):
         axes.grid(alpha=0.3)
         axes.legend(fontsize=8)
-    return "Radius errors by method, estimate minus truth; the outermost bars hold all beyond", png(figure)
+    return text("Radius errors by method, estimate minus truth; the outermost bars contain all beyond"), png(figure)
 
 
-def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[str, bytes]:
-    """Histograms of radius and centre: errors where the truth is known, else standard deviations; and the bound's."""
-    result: space_frame_step.Result = run.result
+def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[Message, bytes]:
+    """Draw histograms of radius and centre: errors, or without a truth standard deviations, and those of the bound."""
+    balls = run.result.balls
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
-    found = np.array([flag != "not-found" for flag in result.flag], bool)
-    sd = np.sqrt(np.maximum(np.einsum("kii->ki", result.covariance), 0.0))[found]
-    bound = result.bound_sd[found]
+    found = ~balls.flagged(Flag.NOT_FOUND)
+    sd = np.sqrt(np.maximum(np.einsum("kii->ki", balls.covariance), 0.0))[found]
+    bound = balls.bound_sd[found]
     radii, centres = report.true_radii.get(run.method), report.true_centres.get(run.method)
     panels = figure.subplots(1, 2)
     if radii is None or centres is None:
         _deviations(panels[0], sd[:, 3], bound[:, 3], "sd of the radius, mm", "balls")
         _deviations(panels[1], sd[:, :3], bound[:, :3], "sd of the centre along x, y and z, mm", "coordinates")
-        said = "Standard deviations as stated, and the least that any estimate could have (Cramér-Rao bound)"
+        caption = text(
+            "Standard deviations as estimated, and the least of any estimate (Cramér-Rao bound); the outermost bars "
+            "contain all beyond"
+        )
     else:
-        off = (result.radii - radii)[found], (result.centres - centres)[found]
+        off = (balls.radii - radii)[found], (balls.centres - centres)[found]
         _errors(panels[0], off[0], sd[:, 3], bound[:, 3], "radius error, mm", "balls")
         _errors(panels[1], off[1], sd[:, :3], bound[:, :3], "centre error along x, y and z, mm", "coordinates")
-        said = "Errors of radius and centre, estimate minus truth, and how they would spread as stated and at best"
+        caption = text(
+            "Errors of radius and centre, estimate minus truth, with their distributions by the estimated standard "
+            "deviations and by the bound; the outermost bars contain all beyond"
+        )
     for axes in panels:
         axes.grid(alpha=0.3)
         axes.set_ylim(0.0, 1.3 * max(axes.get_ylim()[1], 1.0))  # room for the legend
         axes.legend(fontsize=8, loc="upper left")
-    return f"{said}; the outermost bars hold all beyond", png(figure)
+    return caption, png(figure)
 
 
 def _errors(axes: Axes, off: Floats, sd: Floats, bound: Floats, what: str, of: str) -> None:

@@ -1,35 +1,42 @@
-"""How bolt balls report."""
+"""The report of step ``spheres``."""
 
 from __future__ import annotations
 
 import collections
 
+from processor.language.messages import Message, text
 from processor.model import StepRun
 from processor.pipeline import Execution
 from processor.report.section import StepReport
-from processor.report.space_frame import close_ups, dxf, figures, results, tables, view
-from processor.space_frame import step as space_frame_step
+from processor.report.space_frame import close_ups, dxf, figures, tables, view
+from processor.space_frame.result import Flag, Result
 
 
-def _summary(result: space_frame_step.Result) -> tuple[str, str]:
-    flags = collections.Counter(result.flag)
-    named = ", ".join(f"{flags[name]} {name}" for name in ("low-confidence", "wrong-size", "not-found") if flags[name])
-    head = f"{result.status}, {flags['ok']} of {len(result.flag)} balls without a flag"
-    return head, f"Flagged: {named}." if named else ""
+def _summary(result: Result) -> tuple[Message, Message | str]:
+    flags = collections.Counter(result.balls.flag)
+    counts = [
+        text("{count} {flag}", count=flags[flag], flag=flag) for flag in Flag if flag is not Flag.OK and flags[flag]
+    ]
+    head = text(
+        "{status}, {count} of {balls} balls without a flag",
+        status=result.status,
+        count=flags[Flag.OK],
+        balls=len(result.balls),
+    )
+    return head, text("Flagged: {counts}.", counts=counts) if counts else ""
 
 
 def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
-    found = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tube_radii) else {}
+    files = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tubes) else {}
     if tables.has_bounds(run.result):
         pages = close_ups.document(execution.scene, run.result, execution.stored)
-        found |= {close_ups.DOCUMENT: pages} if pages else {}
-    return found
+        files |= {close_ups.DOCUMENT: pages} if pages else {}
+    return files
 
 
 REPORT = StepReport(
-    title="Bolt balls",
+    title=text("Bolt balls"),
     summary=_summary,
-    written=results.written,
     tables=tables.of_runs,
     figures=lambda execution, runs, report: figures.of_runs(execution.scene, runs, report, execution.stored),
     files=_files,

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from processor.geometry.linalg_small import product
 from processor.model import Floats, Ints, Reason, reason
 from processor.space_frame.result import StationMotion
 from processor.space_frame.stations import normal_equations as normals
@@ -161,7 +162,7 @@ def _without_mean_offset(x: Floats, C: Floats) -> tuple[Floats, Floats, float]:
     count = len(x) // kernels.STATION
     shared = float(x[of_range > 0.0].mean())
     relative = np.eye(len(x)) - np.outer(of_range, of_range) / count
-    C = normals.product(normals.product(relative, C), np.ascontiguousarray(relative.T))
+    C = product(product(relative, C), np.ascontiguousarray(relative.T))
     return x - shared * of_range, C, shared
 
 
@@ -242,7 +243,7 @@ def _result(estimate: _Estimate, posterior: Posterior) -> Stations:
     messages = [reason("spheres.stations-before", mm=before_mm, mrad=1e3 * before_rad)]
     if abs(shared) > REPORTED_MM:
         messages.append(reason("spheres.range-offset", offset=shared))
-    messages += [reason("spheres.weak-station", station=i, motions=motions) for i, motions in enumerate(weak) if motions]
+    messages += [reason("spheres.weak-station", station=i, motions=names) for i, names in enumerate(weak) if names]
     spread = float(np.std(x[6 :: kernels.STATION], ddof=1)) / np.sqrt(count) if count > 1 else 0.0
     # The effect of a wide beam on thin tubes grows with the range; over many stations that looks like a common bend.
     beam = posterior.control is None and abs(shared) > WIDE_MM + 3.0 * spread and abs(shared) > before_mm
@@ -301,7 +302,7 @@ def _controlled(stations: Stations, x: Floats, control: ControlPoints, doubt: Do
     M = common_motion(stations.places)[:, 3:]
     shift = np.mean(x.reshape(-1, kernels.STATION)[:, 3:6], axis=0)
     shifted = reason("spheres.moved-to-control", distance=np.linalg.norm(shift))
-    C = stations.covariance + normals.product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
+    C = stations.covariance + product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
     return replace(
         stations,
         status=StationStatus.WEAK if doubt.off.any() else stations.status,
