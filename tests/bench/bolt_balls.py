@@ -21,6 +21,7 @@ from scipy.spatial import cKDTree
 from designgen import recipes
 from designgen.scenes.make import make
 from processor.space_frame import step as space_frame_step
+from processor.space_frame.result import Flag
 
 ROOF = ["frame.nodes_x=6", "frame.nodes_y=6", "scan.stations=[2,3]", "scan.clutter=8"]
 CASES = {
@@ -46,21 +47,21 @@ def scene_of(case, seed, settings=()):
 
 def errors(scene, result, truth):
     """Errors of all nodes of a result against the nearest true one, and what was said of them."""
-    found = np.array([flag != "not-found" for flag in result.flag]) & np.isfinite(result.centres).all(axis=1)
-    distance, nearest = cKDTree(truth.centres).query(result.centres[found])
-    back = cKDTree(result.centres[found]).query(truth.centres)[0]
-    sd = np.sqrt(np.einsum("kii->ki", result.covariance[found]))
+    found = ~result.balls.flagged(Flag.NOT_FOUND) & result.balls.placed
+    distance, nearest = cKDTree(truth.centres).query(result.balls.centres[found])
+    back = cKDTree(result.balls.centres[found]).query(truth.centres)[0]
+    sd = np.sqrt(np.einsum("kii->ki", result.balls.covariance[found]))
     return {
         "recall": back < 3.0,
         "precision": distance < 30.0,
-        "centre": result.centres[found] - truth.centres[nearest],
+        "centre": result.balls.centres[found] - truth.centres[nearest],
         "centre sd": sd[:, :3],
-        "radius": result.radii[found] - truth.radii[nearest],
+        "radius": result.balls.radii[found] - truth.radii[nearest],
         "radius sd": sd[:, 3],
-        "lowest": result.lowest[found, 2] - truth.lowest[nearest, 2],
-        "lowest sd": result.lowest_sd[found],
-        "ok": np.array([flag == "ok" for flag in result.flag])[found],
-        "size": np.abs(result.sizes[found] - truth.radii[nearest]) < 2.5,
+        "lowest": result.balls.lowest[found, 2] - truth.lowest[nearest, 2],
+        "lowest sd": result.balls.lowest_sd[found],
+        "ok": result.balls.flagged(Flag.OK)[found],
+        "size": np.abs(result.balls.sizes[found] - truth.radii[nearest]) < 2.5,
     }
 
 

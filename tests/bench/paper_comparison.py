@@ -92,7 +92,7 @@ def balls(seeds):
             result = space_frame_step.run(
                 scene, dataclasses.replace(space_frame_step.Params(), method=method, seed=seed)
             )
-            errors.append(np.abs(result.radii - truth.frame.radii))
+            errors.append(np.abs(result.balls.radii - truth.frame.radii))
         quantiles = np.nanquantile(np.array(errors), [0.5, 0.95, 1.0], axis=1)
         rows.append(
             {

@@ -56,8 +56,8 @@ def ours(scene, truth):
         started = time.monotonic()
         result = space_frame_step.run(blind, space_frame_step.Params())
         seconds = time.monotonic() - started
-    known = np.isfinite(result.centres).all(axis=1)
-    return scored("ray, whole cloud", seconds, result.centres[known], result.radii[known], truth)
+    known = np.isfinite(result.balls.centres).all(axis=1)
+    return scored("ray, whole cloud", seconds, result.balls.centres[known], result.balls.radii[known], truth)
 
 
 def crops(scene, truth):

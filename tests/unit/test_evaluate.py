@@ -10,6 +10,7 @@ from processor.evaluation.evaluate import ErrorReport, evaluate
 from processor.evaluation.space_frame import true_rows
 from processor.model import ArchTruth, FrameDesign, FrameTruth, InputError, Scan, Scene, StepRun, Truth
 from processor.space_frame import step as space_frame_step
+from processor.space_frame.result import Balls
 from processor.store import store
 from tests.support.metrics import metric
 
@@ -19,9 +20,7 @@ TRUE = FrameTruth(np.array([3, 5, 8]), np.array([[0.0, 0, 0], [1000, 0, 0], [200
 
 def result(ids, centres, radii, method="ransac"):
     k = len(ids)
-    return space_frame_step.Result(
-        "ok",
-        method,
+    found = Balls(
         ids=np.array(ids),
         centres=np.array(centres, np.float64).reshape(k, 3),
         radii=np.array(radii, np.float64),
@@ -34,8 +33,10 @@ def result(ids, centres, radii, method="ransac"):
         nominal_radii=np.full(k, NAN),
         evidence=("ball",) * k,
         flag=("ok",) * k,
-        reason=("",) * k,
+        reasons=((),) * k,
+        verdict=("none",) * k,
     )
+    return space_frame_step.Result("ok", method, balls=found)
 
 
 def scene(with_design=True):
@@ -49,16 +50,16 @@ def execution(made_of, *runs):
 
 def test_with_a_design_a_ball_is_known_by_its_id():
     found = result([8, 3, 99], [[0.0, 0, 0], [0, 0, 0], [0, 0, 0]], [1.0, 1.0, 1.0])
-    np.testing.assert_array_equal(true_rows(scene(), found, TRUE), [2, 0, -1])
+    np.testing.assert_array_equal(true_rows(scene(), found.balls, TRUE), [2, 0, -1])
 
 
 def test_without_a_design_a_ball_is_known_by_its_place():
     found = result([3, 5, 8], [[1990.0, 0, 10], [1049, 0, 0], [500, 0, 0]], [60.0, 50.0, 45.0])
-    np.testing.assert_array_equal(true_rows(scene(False), found, TRUE), [2, 1, -1])
+    np.testing.assert_array_equal(true_rows(scene(False), found.balls, TRUE), [2, 1, -1])
     lost = result([0], [[NAN] * 3], [NAN])
-    np.testing.assert_array_equal(true_rows(scene(False), lost, TRUE), [-1])
-    np.testing.assert_array_equal(true_rows(scene(False), found, FrameTruth()), [-1] * 3)
-    assert true_rows(scene(False), result([], [], []), TRUE).shape == (0,)
+    np.testing.assert_array_equal(true_rows(scene(False), lost.balls, TRUE), [-1])
+    np.testing.assert_array_equal(true_rows(scene(False), found.balls, FrameTruth()), [-1] * 3)
+    assert true_rows(scene(False), result([], [], []).balls, TRUE).shape == (0,)
 
 
 def test_checks_of_comparison_runs_bear_the_methods_name(tmp_path):

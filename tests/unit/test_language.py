@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import string
 from html.parser import HTMLParser
 
 import numpy as np
@@ -9,8 +10,12 @@ import pytest
 
 from processor import language
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import messages, text
+from processor.model import reason
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, view
+from processor.space_frame.design.matching import FrameRelation
+from processor.space_frame.result import Flag
 from tests.support.metrics import metric
 from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
 from tests.unit.test_report_balls import of_frame, whole, with_truth
@@ -68,9 +73,9 @@ CODES = [code for code in language.CODES if code != "en"]
 @pytest.mark.parametrize("code", CODES)
 def test_a_catalogue_fills_all_its_places(code):
     found = language.Language(code)
-    for pattern, text in found._patterns:
-        text.format(*range(pattern.groups))
-        assert all(f"{{{i}}}" in text for i in range(pattern.groups)), text
+    for pattern, template in found._patterns:
+        template.format(*range(pattern.groups))
+        assert all(f"{{{i}}}" in template for i in range(pattern.groups)), template
 
 
 @pytest.mark.parametrize("code", CODES)
@@ -97,7 +102,11 @@ def test_names_from_files_are_left_alone():
 
 def test_live_figures_are_translated_but_for_names():
     found = language.language("zh").in_figures(
-        {"title": "Balls in space", "parts": [{"name": "top", "text": "balls: wrong-size"}], "stops": ["left", 1.0]}
+        {
+            "title": text("Balls in space"),
+            "parts": [{"name": "top", "text": text("balls: {flag}", flag=Flag.WRONG_SIZE)}],
+            "stops": ["left", 1.0],
+        }
     )
     assert found == {
         "title": "螺栓球的三维视图",
@@ -126,7 +135,7 @@ IN_FILES = {
     "plausible",
     "candidates",
 }
-SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm"}
+SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm", "max_balls"}
 STAYS = UNITS | METHODS | STANDARDS | IN_FILES | SYMBOLS
 
 
@@ -194,16 +203,24 @@ def a_bridge():
 
 def a_frame():
     result = whole(
-        message="ranges from the known scanners; the catalogue of radii (plausible) was not held against a published "
-        "one; registered: 4 nodes of 5, 1 missing, 0 extra",
-        reason=(
-            "",
-            "size 60 mm instead of 50 mm",
-            "no ball seen, known from 2 axes alone; the radius is the design's",
-            "12 points, fewer than 20; ill-conditioned: sd of the radius 2.5 mm",
-            "not in the design",
+        reasons=(
+            reason("spheres.ranges"),
+            reason("spheres.unverified-catalogue", catalogue="plausible"),
+            reason("spheres.matched", frame=FrameRelation.REGISTERED, nodes=4, nominal=5, missing=1, extra=0),
         ),
-        station_said=("", "turn about x, shift along z"),
+        changed={
+            "reasons": (
+                (),
+                (reason("spheres.other-size", size=60.0, nominal=50.0),),
+                (reason("spheres.axes-alone", axes=2), reason("spheres.nominal-radius")),
+                (
+                    reason("spheres.few-points", points=12, least=20),
+                    reason("spheres.uncertain-radius", sd=2.5),
+                ),
+                (reason("spheres.not-in-design"),),
+            )
+        },
+        datum=(reason("spheres.datum-stations", stations=2, sd=0.5),),
     )
     metrics = (
         metric("radius error, median", 0.5, 3.0, step="spheres"),
@@ -237,20 +254,6 @@ def test_no_proposal_keeps_a_word_of_english(size_mm):
     assert latin(said) == []
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "sighting of control point T2 by S2 left out: 30 mm off what the others say",
-        "no ball or target has a radius of 50018 mm: the unit may be wrong, 1/1000 of it would be 50.0 mm",
-        "no ball or target has a radius of 2.100 mm",
-        "ambiguous which ball of the design this is, and these differ in size: none is called wrong",
-        "radius +9.9 mm from nominal, beyond the blank's +1/-0.5 by 0.3 mm",
-        "no ball seen, known from 8 axes alone; it is missing: 23 rays went through where it should be",
-        "what stands before it hides it; hardly a ray was measured its way",
-        "fitted to the points that method ray took for each ball, off sleeves and process hole; covariances are formal",
-        "balls that no member meets, such as targets beside the frame, are not looked for",
-        "points used; its own choice; those of ray; all of its crop",
-    ],
-)
-def test_what_is_said_of_balls_is_known(text):
-    assert latin([language.language("zh").say(text)]) == []
+@pytest.mark.parametrize("code", [code for code in messages("zh").reasons if code.startswith("spheres.")])
+def test_what_is_said_of_balls_is_known(code):
+    assert latin([literal for literal, *_ in string.Formatter().parse(messages("zh").reasons[code])]) == []

@@ -13,12 +13,24 @@ import numpy as np
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import ArchDesign, DesignPart, FrameDesign, InputError, Metric, Scan, Scene, StepRun, UsageError
+from processor.model import (
+    ArchDesign,
+    DesignPart,
+    FrameDesign,
+    InputError,
+    Metric,
+    Scan,
+    Scene,
+    StepRun,
+    UsageError,
+    reason,
+)
 from processor.pipeline import Execution
 from processor.preassembly import step as preassembly_step
 from processor.report import all_figures, all_tables, page, results_folder, results_json
 from processor.report import table as report_table
 from processor.space_frame import step as space_frame_step
+from processor.space_frame.result import Balls
 from processor.store import store
 from tests.support.metrics import metric
 
@@ -79,9 +91,7 @@ def balls(method="ransac", radii=(45.5, 60.0, NAN), flag=("ok", "wrong-size", "n
     radii = np.array(radii)
     k = len(radii)
     centres = np.where(np.isfinite(radii)[:, None], np.arange(3.0 * k).reshape(k, 3) * 1000.0, NAN)
-    return space_frame_step.Result(
-        status="partial",
-        method=method,
+    found = Balls(
         ids=np.arange(k) + 7,
         centres=centres,
         radii=radii,
@@ -94,8 +104,10 @@ def balls(method="ransac", radii=(45.5, 60.0, NAN), flag=("ok", "wrong-size", "n
         nominal_radii=np.full(k, 45.0),
         evidence=("ball",) * k,
         flag=tuple(flag),
-        reason=tuple("" if one == "ok" else one for one in flag),
+        reasons=tuple(() if one == "ok" else (reason("spheres.no-sphere"),) for one in flag),
+        verdict=("none",) * k,
     )
+    return space_frame_step.Result(status="partial", method=method, balls=found)
 
 
 def frame_scene(k=3):
@@ -331,8 +343,8 @@ def test_a_run_without_any_answer_is_drawn_too():
     assert "0 of 2 balls" in render(
         Execution(frame_scene(2), (StepRun("spheres", "ransac", "{}", none),), PROVENANCE), report
     )
-    empty = space_frame_step.Result("failed", "ransac", "no ball stands out")
-    assert "no ball stands out" in render(
+    empty = space_frame_step.Result("failed", "ransac", (reason("spheres.no-ball", points=9),))
+    assert "o ball stands out" in render(
         Execution(frame_scene(2), (StepRun("spheres", "ransac", "{}", empty),), PROVENANCE), ErrorReport()
     )
     exact = balls(radii=(45.0, 45.0), flag=("ok", "ok"))

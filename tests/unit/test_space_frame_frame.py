@@ -10,10 +10,10 @@ from designgen.scenes.make import make
 from processor import pipeline
 from processor.evaluation import space_frame
 from processor.geometry import parallel, rigid
-from processor.model import Scan
-from processor.space_frame import result as space_frame_result
+from processor.model import Scan, reason
 from processor.space_frame import step as space_frame_step
 from processor.space_frame import to_result
+from processor.space_frame.design.movement import verdict_of
 from processor.space_frame.points.scene_source import of_scene
 from processor.space_frame.spheres import baselines
 
@@ -27,32 +27,32 @@ def roof():
 
 def errors(result, truth, rows=slice(None)):
     """Distances (k,) of the balls of the design's nodes, in its order, from the true ones."""
-    return np.linalg.norm(result.centres[rows] - truth.frame.centres[rows], axis=1)
+    return np.linalg.norm(result.balls.centres[rows] - truth.frame.centres[rows], axis=1)
 
 
 def test_every_ball_is_found_blind(roof):
     scene, truth = roof
     result = space_frame_step.run(dataclasses.replace(scene, frame=None), space_frame_step.Params())
     assert result.status == "ok"
-    assert len(result.ids) == len(truth.frame.ids)
+    assert len(result.balls.ids) == len(truth.frame.ids)
     checks = {
         metric.name: metric for metric in space_frame.check(dataclasses.replace(scene, frame=None), result, truth)
     }
     assert all(metric.passed for metric in checks.values())
     assert checks["nodes found within 3 mm"].value == 100.0
     assert checks["nodes that are none"].value == 0.0
-    assert "targets beside the frame, are not looked for" in result.message
+    assert "spheres.joined-only" in codes(result.reasons)
     assert 0.7 < checks["centres, rms of error by standard deviation"].value < 1.3
 
 
 def test_rows_are_the_designs_nodes_in_its_order(roof):
     scene, truth = roof
     result = space_frame_step.run(scene, space_frame_step.Params())
-    assert result.ids.tolist() == scene.frame.ids.tolist()
-    assert result.gauge == "design frame"
+    assert result.balls.ids.tolist() == scene.frame.ids.tolist()
+    assert result.movement_reference.gauge == "design frame"
     assert errors(result, truth).max() < 1.5
     true = truth.frame.centres - scene.frame.centres
-    pull = (result.movement - true) / (result.movement_ci95 / 1.96)
+    pull = (result.balls.movement - true) / (result.balls.movement_ci95 / 1.96)
     assert 0.7 < np.sqrt(np.mean(pull**2)) < 1.3
 
 
@@ -61,12 +61,12 @@ def test_a_design_of_another_frame_is_found(roof):
     R, t = rigid.rotation_from_vector(np.array([0.02, -0.01, 0.7])), np.array([5.0e8, 4.3e9, 1e3])
     moved = dataclasses.replace(scene.frame, centres=scene.frame.centres @ R.T + t)
     result = space_frame_step.run(dataclasses.replace(scene, frame=moved), space_frame_step.Params())
-    assert result.matching == "ok"
-    assert result.gauge == "best fit"
+    assert result.matching.status == "ok"
+    assert result.movement_reference.gauge == "best fit"
     assert errors(result, truth).max() < 1.5
-    turn = result.T_design_scan[:3, :3] @ R.T
+    turn = result.matching.T_design_scan[:3, :3] @ R.T
     assert np.degrees(rigid.rotation_angle(turn)) < 0.1  # nodes move by 5 mm over 12 m
-    back = rigid.apply(result.T_design_scan, result.centres) - moved.centres
+    back = rigid.apply(result.matching.T_design_scan, result.balls.centres) - moved.centres
     assert np.linalg.norm(back, axis=1).max() < 30.0
 
 
@@ -85,8 +85,8 @@ def test_a_node_that_was_not_built_is_not_found_and_one_that_was_not_designed_is
         tube_diameters=frame.tube_diameters[own],
     )
     result = space_frame_step.run(dataclasses.replace(scene, frame=other), space_frame_step.Params())
-    assert result.flag[7] == "not-found"
-    assert np.isnan(result.centres[7]).all()
+    assert result.balls.flag[7] == "not-found"
+    assert np.isnan(result.balls.centres[7]).all()
     rest = np.arange(len(ids)) != 7
     assert errors(result, truth, rest).max() < 1.5
     assert result.status == "partial"
@@ -99,7 +99,7 @@ def test_a_ball_of_another_size_is_named(roof):
     result = space_frame_step.run(
         dataclasses.replace(scene, frame=dataclasses.replace(scene.frame, radii=radii)), space_frame_step.Params()
     )
-    assert [i for i, flag in enumerate(result.flag) if flag == "wrong-size"] == [3]
+    assert [i for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"] == [3]
 
 
 @pytest.mark.parametrize(("chunk", "threads_used"), [(1 << 20, 2), (70_001, 1), (12_345, 3)])
@@ -118,10 +118,12 @@ def test_order_chunks_and_threads_give_the_same_bytes(roof, chunk, threads_used,
         scans.append(dataclasses.replace(scan, **{k: v[order] if len(v) else v for k, v in columns.items()}))
     again = space_frame_step.run(dataclasses.replace(scene, scans=tuple(scans)), space_frame_step.Params())
     assert pools == {threads_used} - {1}  # one thread needs no pool
-    for field in dataclasses.fields(first):
-        one, other = getattr(first, field.name), getattr(again, field.name)
-        same = one.tobytes() == other.tobytes() if isinstance(one, np.ndarray) else repr(one) == repr(other)
-        assert same, field.name
+    for name in ("balls", "tubes", "stations", "matching"):
+        for field in dataclasses.fields(getattr(first, name)):
+            one, other = getattr(getattr(first, name), field.name), getattr(getattr(again, name), field.name)
+            same = one.tobytes() == other.tobytes() if isinstance(one, np.ndarray) else repr(one) == repr(other)
+            assert same, f"{name}.{field.name}"
+    assert repr((first.status, first.reasons, first.datum)) == repr((again.status, again.reasons, again.datum))
 
 
 # --- a square roof -------------------------------------------------------------------------------------------------
@@ -153,8 +155,12 @@ def elsewhere(frame, without=(), extra=(), radius=50.0):
     ), R  # fmt: skip
 
 
+def codes(reasons):
+    return {one.code for one in reasons}
+
+
 def wrong_sizes(result):
-    return set(result.ids[np.array(result.flag) == "wrong-size"].tolist())
+    return set(result.balls.ids[np.array(result.balls.flag) == "wrong-size"].tolist())
 
 
 def truly_wrong(scene, truth):
@@ -169,10 +175,10 @@ def test_the_balls_sizes_tell_how_a_square_roof_is_turned(square):
     for without, extra in (((), ()), (scene.frame.ids[[7, 20]], beyond)):
         design, R = elsewhere(scene.frame, without, extra)
         result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
-        assert result.matching == "ok"
-        assert np.degrees(rigid.rotation_angle(result.T_design_scan[:3, :3] @ R.T)) < 0.2
+        assert result.matching.status == "ok"
+        assert np.degrees(rigid.rotation_angle(result.matching.T_design_scan[:3, :3] @ R.T)) < 0.2
         assert wrong_sizes(result) == truly_wrong(scene, truth) - set(without)
-        assert (np.array(result.flag) == "not-found").sum() == len(extra)
+        assert (np.array(result.balls.flag) == "not-found").sum() == len(extra)
 
 
 def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(square):
@@ -184,11 +190,11 @@ def test_where_the_pose_stays_ambiguous_no_ball_is_called_wrong_on_its_account(s
     radii = np.where(corner, 60.0, 50.0)
     design, _ = elsewhere(dataclasses.replace(scene.frame, radii=radii))
     result = space_frame_step.run(dataclasses.replace(scene, frame=design), space_frame_step.Params())
-    assert result.matching == "ambiguous"
-    disputed = np.isnan(result.nominal_radii)
-    assert disputed.sum() == len(result.T_rivals) + 1 >= 2
-    assert all("ambiguous" in result.reason[i] for i in np.flatnonzero(disputed))
-    assert not wrong_sizes(result) & set(result.ids[disputed].tolist())
+    assert result.matching.status == "ambiguous"
+    disputed = np.isnan(result.balls.nominal_radii)
+    assert disputed.sum() == len(result.matching.rivals) + 1 >= 2
+    assert all("spheres.ambiguous-node" in codes(result.balls.reasons[i]) for i in np.flatnonzero(disputed))
+    assert not wrong_sizes(result) & set(result.balls.ids[disputed].tolist())
     assert len(wrong_sizes(result)) > 10  # whatever the pose, they are not of the one size
 
 
@@ -211,16 +217,23 @@ def emptied(scene, truth, row, onward):
 def test_a_ball_that_rays_went_through_is_missing_and_one_that_was_not_seen_has_no_verdict(square):
     scene, truth = square
     row = int(np.argmin(np.linalg.norm(truth.frame.centres - truth.frame.centres.mean(axis=0), axis=1)))
-    for onward, flag, said in ((900.0, "not-found", "rays went through"), (None, "low-confidence", "hardly a ray"),
-                               (-900.0, "low-confidence", "hides it")):  # fmt: skip
+    for onward, flag, code in (
+        (900.0, "not-found", "spheres.missing"),
+        (None, "low-confidence", "spheres.few-rays"),
+        (-900.0, "low-confidence", "spheres.hidden"),
+    ):
         result = space_frame_step.run(emptied(scene, truth, row, onward), space_frame_step.Params())
-        assert result.flag[row] == flag, onward
-        assert said in result.reason[row]
-        assert "8 axes" in result.reason[row]
-        held = space_frame_result.of_result(dataclasses.replace(result, movement_limit=1.0))
-        assert held.verdict[row] == ("" if flag == "not-found" else "indeterminate")
-        assert "fail" in held.verdict
-        assert np.isnan(result.centres[row]).all() == (flag == "not-found")
+        assert result.balls.flag[row] == flag, onward
+        assert code in codes(result.balls.reasons[row])
+        assert reason("spheres.axes-alone", axes=8) in result.balls.reasons[row]
+        found = result.balls
+        verdicts = [
+            verdict_of(size, half, 1.0, evidence != "axes")
+            for size, half, evidence in zip(found.movement_size, found.movement_size_ci95, found.evidence, strict=True)
+        ]
+        assert verdicts[row] == ("none" if flag == "not-found" else "indeterminate")
+        assert "fail" in verdicts
+        assert np.isnan(result.balls.centres[row]).all() == (flag == "not-found")
 
 
 def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
@@ -229,29 +242,31 @@ def test_beside_ray_the_papers_methods_are_run_on_its_points(square, tmp_path):
     jobs = pipeline.plan(("spheres",), ("ray", "ransac", "least-squares"), params, 0)
     runs = pipeline.execute(tmp_path / "s.h5", scene, jobs).runs
     ray = runs[0].result
-    error = {run.method: np.abs(run.result.radii - truth.frame.radii)[ray.points > 30] for run in runs}
+    error = {run.method: np.abs(run.result.balls.radii - truth.frame.radii)[ray.balls.points > 30] for run in runs}
     alone = space_frame_step.run(scene, space_frame_step.Params(method="least-squares"))
     for run in runs[1:]:
-        np.testing.assert_array_equal(run.result.ids, ray.ids)
-        assert baselines.SAME in run.result.message
+        np.testing.assert_array_equal(run.result.balls.ids, ray.balls.ids)
+        assert baselines.SAME in run.result.reasons
         # tens of points of a ball and sleeves beside: hundreds are in the crop
-        assert (run.result.points <= 1.3 * ray.points + 10).all()
-        assert run.result.points.sum() < 0.8 * alone.points.sum()
-    assert np.median(error["least-squares"]) < 0.7 * np.median(np.abs(alone.radii - truth.frame.radii)[ray.points > 30])
+        assert (run.result.balls.points <= 1.3 * ray.balls.points + 10).all()
+        assert run.result.balls.points.sum() < 0.8 * alone.balls.points.sum()
+    assert np.median(error["least-squares"]) < 0.7 * np.median(
+        np.abs(alone.balls.radii - truth.frame.radii)[ray.balls.points > 30]
+    )
     assert np.median(error["ray"]) < np.median(error["least-squares"])
     again = pipeline.execute(tmp_path / "s.h5", scene, jobs[1:]).runs[0].result
-    assert baselines.SAME not in again.message
+    assert baselines.SAME not in again.reasons
 
 
 def test_a_wrong_size_is_told_without_a_catalogue(square):
     scene, truth = square
     result = space_frame_step.run(scene, space_frame_step.Params(catalogue="none"))
-    said = [result.reason[i] for i, flag in enumerate(result.flag) if flag == "wrong-size"]
-    assert all("beyond the blank's" in one for one in said)
+    reasons = [result.balls.reasons[i] for i, flag in enumerate(result.balls.flag) if flag == "wrong-size"]
+    assert all("spheres.beyond-blank" in codes(one) for one in reasons)
     assert wrong_sizes(result) >= truly_wrong(scene, truth)
     off = truth.frame.radii - scene.frame.radii
     assert wrong_sizes(result) <= set(scene.frame.ids[(off > 1.0) | (off < -0.5)].tolist())
-    assert "low-confidence" not in {result.flag[i] for i in np.flatnonzero(result.points > 30)}
+    assert "low-confidence" not in {result.balls.flag[i] for i in np.flatnonzero(result.balls.points > 30)}
 
 
 def test_a_wrong_size_that_the_catalogue_lacks_is_told_where_the_interval_excludes_the_designed_one(square):
@@ -259,6 +274,6 @@ def test_a_wrong_size_that_the_catalogue_lacks_is_told_where_the_interval_exclud
     result = space_frame_step.run(scene, space_frame_step.Params(radii_mm=(45.0, 50.0)))
     largest = scene.frame.ids[np.argmax(truth.frame.radii)]
     assert wrong_sizes(result) == {largest}
-    assert "beyond the blank's" in result.reason[list(result.ids).index(largest)]
-    flag = dict(zip(result.ids.tolist(), result.flag, strict=True))
+    assert "spheres.beyond-blank" in codes(result.balls.reasons[list(result.balls.ids).index(largest)])
+    flag = dict(zip(result.balls.ids.tolist(), result.balls.flag, strict=True))
     assert all(flag[one] != "ok" for one in truly_wrong(scene, truth))

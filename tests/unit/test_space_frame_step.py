@@ -5,8 +5,9 @@ import numpy as np
 import pytest
 
 from processor.evaluation import space_frame
-from processor.model import FrameDesign, FrameTruth, Scan, Scene, Stations, Truth, UsageError
+from processor.model import FrameDesign, FrameTruth, Scan, Scene, Stations, Truth, UsageError, reason
 from processor.space_frame import step as space_frame_step
+from processor.space_frame.result import Balls
 from processor.space_frame.step import Params
 
 PITCH = 1500.0
@@ -77,12 +78,14 @@ def test_rows_are_the_designs_nodes_in_its_order():
     scene, _ = frame(k=5)
     result = space_frame_step.run(scene, paper())
     assert (result.status, result.method) == ("ok", "ransac")
-    np.testing.assert_array_equal(result.ids, scene.frame.ids)
-    np.testing.assert_allclose(result.lowest, result.centres - result.radii[:, None] * [0.0, 0.0, 1.0])
-    assert set(result.evidence) == {"ball"}
-    assert (np.linalg.eigvalsh(result.covariance) > 0.0).all()
-    variance = [c[2, 2] + c[3, 3] - 2.0 * c[2, 3] for c in result.covariance]
-    np.testing.assert_allclose(result.lowest_sd, np.sqrt(variance))
+    np.testing.assert_array_equal(result.balls.ids, scene.frame.ids)
+    np.testing.assert_allclose(
+        result.balls.lowest, result.balls.centres - result.balls.radii[:, None] * [0.0, 0.0, 1.0]
+    )
+    assert set(result.balls.evidence) == {"ball"}
+    assert (np.linalg.eigvalsh(result.balls.covariance) > 0.0).all()
+    variance = [c[2, 2] + c[3, 3] - 2.0 * c[2, 3] for c in result.balls.covariance]
+    np.testing.assert_allclose(result.balls.lowest_sd, np.sqrt(variance))
 
 
 def test_a_ball_without_points_is_data_and_no_exception():
@@ -94,10 +97,10 @@ def test_a_ball_without_points_is_data_and_no_exception():
         fewer = replace(scene, scans=(Scan("all", scene.scans[0].points[keep]),))
         result = space_frame_step.run(fewer, paper())
         assert result.status == "partial"
-        assert result.flag[2] == "not-found"
-        assert f"{left} points" in result.reason[2]
-        assert np.isnan(result.centres[2]).all()
-        assert np.isnan(result.radii[2])
+        assert result.balls.flag[2] == "not-found"
+        assert result.balls.reasons[2] == (reason("spheres.few-crop-points", points=left),)
+        assert np.isnan(result.balls.centres[2]).all()
+        assert np.isnan(result.balls.radii[2])
         assert metrics(fewer, result, truth)["balls not found"].value == 1.0
     nothing = replace(scene, scans=())
     assert space_frame_step.run(nothing, Params(method="least-squares")).status == "failed"
@@ -109,12 +112,12 @@ def test_a_cloud_without_members_is_still_held_against_its_design():
     fewer = replace(scene, scans=(Scan("all", scene.scans[0].points[~gone]),))
     result = space_frame_step.run(fewer, Params())
     assert (result.status, result.method) == ("partial", "ray")
-    assert "no members that meet" in result.message
-    np.testing.assert_array_equal(result.ids, scene.frame.ids)
-    assert result.flag[2] == "not-found"
+    assert result.reasons[0] == reason("spheres.no-members")
+    np.testing.assert_array_equal(result.balls.ids, scene.frame.ids)
+    assert result.balls.flag[2] == "not-found"
     assert metrics(fewer, result, truth)["balls not found"].value == 1.0
     small = replace(scene, frame=replace(scene.frame, radii=np.full(4, 60.0)))
-    assert set(space_frame_step.run(small, Params()).flag) == {"wrong-size"}
+    assert set(space_frame_step.run(small, Params()).balls.flag) == {"wrong-size"}
 
 
 def test_four_points_give_a_sphere_of_low_confidence():
@@ -122,9 +125,10 @@ def test_four_points_give_a_sphere_of_low_confidence():
     quad = scene.frame.centres[0] + 45.0 * np.array([[1.0, 0, 0], [-1.0, 0, 0], [0, 1.0, 0], [0, 0, -1.0]])
     for method in PAPERS:
         result = space_frame_step.run(replace(scene, scans=(Scan("s", quad),)), Params(method=method))
-        assert result.radii[0] == pytest.approx(45.0)
-        assert result.flag == ("low-confidence",)
-        assert "4 points" in result.reason[0]
+        assert result.balls.radii[0] == pytest.approx(45.0)
+        assert result.balls.flag == ("low-confidence",)
+        assert result.balls.reasons[0][0].code == "spheres.few-points"
+        assert result.balls.reasons[0][0].values["points"] == 4
 
 
 def test_a_fit_that_leaves_its_crop_is_not_found():
@@ -133,8 +137,8 @@ def test_a_fit_that_leaves_its_crop_is_not_found():
     wall = scene.frame.centres[0] + np.column_stack([rng.uniform(-40, 40, (300, 2)), 30.0 + rng.normal(0, 0.2, 300)])
     result = space_frame_step.run(replace(scene, scans=(Scan("s", wall),)), Params(method="least-squares"))
     assert result.status == "failed"
-    assert result.flag == ("not-found",)
-    assert "left the crop" in result.reason[0]
+    assert result.balls.flag == ("not-found",)
+    assert [one.code for one in result.balls.reasons[0]] == ["spheres.fit-left-crop"]
 
 
 def test_wrong_size_and_right_size():
@@ -145,9 +149,10 @@ def test_wrong_size_and_right_size():
     points = np.vstack([50.0 * d[0], 45.4 * d[1] + nodes[1]]) + rng.normal(0.0, 0.5, (800, 3))
     design = FrameDesign(ids=[1, 2], centres=nodes, radii=[45.0, 45.0])
     result = space_frame_step.run(Scene("s", "space-frame", (Scan("s", points),), frame=design), paper())
-    assert result.flag == ("wrong-size", "ok")
-    assert "+5.0 mm" in result.reason[0]
-    np.testing.assert_allclose(result.radii, [50.0, 45.4], atol=0.2)
+    assert result.balls.flag == ("wrong-size", "ok")
+    assert result.balls.reasons[0][0].code == "spheres.beyond-blank"
+    assert result.balls.reasons[0][0].values["error"] == pytest.approx(5.0, abs=0.05)
+    np.testing.assert_allclose(result.balls.radii, [50.0, 45.4], atol=0.2)
 
 
 def test_offsets_and_poses_change_nothing():
@@ -157,8 +162,8 @@ def test_offsets_and_poses_change_nothing():
     here = space_frame_step.run(scene, paper())
     far = replace(scene, scans=(Scan("s", points, utm),), frame=replace(scene.frame, centres=scene.frame.centres + utm))
     there = space_frame_step.run(far, paper())
-    np.testing.assert_allclose(there.centres - utm, here.centres, atol=1e-6)
-    np.testing.assert_allclose(there.radii, here.radii, atol=1e-6)
+    np.testing.assert_allclose(there.balls.centres - utm, here.balls.centres, atol=1e-6)
+    np.testing.assert_allclose(there.balls.radii, here.balls.radii, atol=1e-6)
 
     # the same points as two posed scans: a quarter turn about z and a shift, and as they are
     turn = np.array([[0.0, -1.0, 0.0, 10.0], [1.0, 0.0, 0.0, -20.0], [0.0, 0.0, 1.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
@@ -166,8 +171,8 @@ def test_offsets_and_poses_change_nothing():
     in_scan = (points[:half] - turn[:3, 3]) @ turn[:3, :3]
     posed = (Scan("a", in_scan, T_project_scan=turn), Scan("b", points[half:], T_project_scan=np.eye(4)))
     merged = space_frame_step.run(replace(scene, scans=posed), paper())
-    np.testing.assert_allclose(merged.centres, here.centres, atol=1e-6)
-    np.testing.assert_allclose(merged.radii, here.radii, atol=1e-6)
+    np.testing.assert_allclose(merged.balls.centres, here.balls.centres, atol=1e-6)
+    np.testing.assert_allclose(merged.balls.radii, here.balls.radii, atol=1e-6)
 
 
 def test_same_seed_same_answer_whatever_the_order_of_points():
@@ -175,8 +180,8 @@ def test_same_seed_same_answer_whatever_the_order_of_points():
     points = scene.scans[0].points
     shuffled = replace(scene, scans=(Scan("s", points[np.random.default_rng(1).permutation(len(points))]),))
     first, again, other = (space_frame_step.run(s, paper(seed=3)) for s in (scene, scene, shuffled))
-    assert first.centres.tobytes() == again.centres.tobytes()
-    np.testing.assert_allclose(other.centres, first.centres, atol=1e-8)
+    assert first.balls.centres.tobytes() == again.balls.centres.tobytes()
+    np.testing.assert_allclose(other.balls.centres, first.balls.centres, atol=1e-8)
 
 
 def target(rng, n=800, view=(0.0, 0.0, 1.0)):
@@ -202,12 +207,12 @@ def test_search_without_a_design_uses_known_scanners():
         space_frame_step.run(Scene("t", "structure", (listed,), stations=stations), Params()),
     ]
     for result in results:
-        assert "known scanner positions" in result.message
-        assert np.linalg.norm(result.centres[0]) < 0.3
-        assert result.radii[0] == pytest.approx(70.0, abs=0.2)
-    np.testing.assert_allclose(results[0].centres, results[1].centres, atol=1e-6)
+        assert reason("spheres.robust-ranges") in result.reasons
+        assert np.linalg.norm(result.balls.centres[0]) < 0.3
+        assert result.balls.radii[0] == pytest.approx(70.0, abs=0.2)
+    np.testing.assert_allclose(results[0].balls.centres, results[1].balls.centres, atol=1e-6)
     unknown = space_frame_step.run(Scene("t", "structure", (Scan("s", points),)), Params())
-    assert "orthogonal" in unknown.message
+    assert reason("spheres.robust-distances") in unknown.reasons
 
 
 def test_the_bound_of_a_target_is_what_its_points_allow():
@@ -220,24 +225,24 @@ def test_the_bound_of_a_target_is_what_its_points_allow():
         ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
         scan = Scan("s", points + ray * rng.normal(0.0, 0.5, (len(points), 1)), position=position)
         result = space_frame_step.run(Scene("t", "structure", (scan,)), Params())
-        off.append(np.append(result.centres[0], [result.radii[0] - 70.0, result.lowest[0, 2] + 70.0]))
-        bounds.append(result.bound_sd[0])
-        sd.append(np.append(np.sqrt(np.diag(result.covariance[0])), result.lowest_sd[0]))
+        off.append(np.append(result.balls.centres[0], [result.balls.radii[0] - 70.0, result.balls.lowest[0, 2] + 70.0]))
+        bounds.append(result.balls.bound_sd[0])
+        sd.append(np.append(np.sqrt(np.diag(result.balls.covariance[0])), result.balls.lowest_sd[0]))
     by_bound = np.sqrt(np.mean((np.array(off) / bounds) ** 2, axis=0))
     assert (by_bound > 0.7).all()
     assert (by_bound < 1.6).all()
     assert np.median(np.array(bounds) / sd) == pytest.approx(0.95, abs=0.15)  # the biweight's
 
 
-@pytest.mark.parametrize(("scale", "said"), [(1000.0, "1/1000"), (1e-3, "1000 of it"), (1e6, "")])
-def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, said):
+@pytest.mark.parametrize(("scale", "factor"), [(1000.0, "1/1000"), (1e-3, "1000"), (1e6, "")])
+def test_a_ball_of_no_plausible_radius_is_doubted_and_the_unit_named(scale, factor):
     rng = np.random.default_rng(5)
     points = scale * (target(rng) + rng.normal(0.0, 0.3, (800, 3)))
     result = space_frame_step.run(Scene("t", "structure", (Scan("s", points),)), Params())
-    assert result.flag == ("low-confidence",)
-    assert "no ball or target has a radius" in result.reason[0]
-    assert said in result.reason[0]
-    assert ("unit" in result.reason[0]) == bool(said)
+    assert result.balls.flag == ("low-confidence",)
+    (doubt,) = (one for one in result.balls.reasons[0] if "radius" in one.values)
+    assert doubt.code == ("spheres.unit-mistake" if factor else "spheres.implausible-radius")
+    assert doubt.values.get("factor", "") == factor
 
 
 def test_search_says_when_it_stopped_early_and_when_there_is_nothing():
@@ -247,14 +252,14 @@ def test_search_says_when_it_stopped_early_and_when_there_is_nothing():
     )
     scene = Scene("targets", "structure", (Scan("s", points),))
     all_three = space_frame_step.run(scene, Params())
-    assert (all_three.status, sorted(np.round(all_three.centres[:, 0] / 500.0))) == ("ok", [0.0, 1.0, 2.0])
+    assert (all_three.status, sorted(np.round(all_three.balls.centres[:, 0] / 500.0))) == ("ok", [0.0, 1.0, 2.0])
     two = space_frame_step.run(scene, Params(max_balls=2))
-    assert (two.status, len(two.radii)) == ("partial", 2)
-    assert "design" in two.message
+    assert (two.status, len(two.balls)) == ("partial", 2)
+    assert reason("spheres.most-balls", balls=2) in two.reasons
     flat = np.column_stack([rng.uniform(-500.0, 500.0, (3000, 2)), rng.normal(0.0, 0.5, 3000)])
     none = space_frame_step.run(Scene("flat", "structure", (Scan("s", flat),)), Params())
-    assert (none.status, len(none.ids)) == ("failed", 0)
-    assert "design" in none.message
+    assert (none.status, len(none.balls)) == ("failed", 0)
+    assert [one.code for one in none.reasons] == ["spheres.no-ball"]
     assert space_frame_step.run(Scene("empty", "structure"), Params()).status == "failed"
 
 
@@ -263,9 +268,7 @@ def test_check_by_numbers_worked_by_hand():
     truth = FrameTruth(ids=[7, 8, 9], centres=centres, radii=[45.0, 45.0, 45.0], lowest=centres - [0.0, 0.0, 45.0])
     got = centres[[2, 0, 1]] + np.array([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 30.0]])
     radii = np.array([46.0, 43.0, 45.0])
-    result = space_frame_step.Result(
-        "ok",
-        "ransac",
+    found = Balls(
         ids=[9, 7, 8],
         centres=got,
         radii=radii,
@@ -278,8 +281,10 @@ def test_check_by_numbers_worked_by_hand():
         nominal_radii=[45.0] * 3,
         evidence=("ball",) * 3,
         flag=("ok",) * 3,
-        reason=("",) * 3,
+        reasons=((),) * 3,
+        verdict=("none",) * 3,
     )
+    result = space_frame_step.Result("ok", "ransac", balls=found)
     design = FrameDesign(ids=[7, 8, 9], centres=centres, radii=[45.0] * 3)
     for scene in (Scene("s", "space-frame", frame=design), Scene("s", "space-frame")):
         value = {name: metric.value for name, metric in metrics(scene, result, Truth(frame=truth)).items()}

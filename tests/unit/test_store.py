@@ -23,8 +23,10 @@ from processor.model import (
     Truth,
     column,
     names,
+    reason,
 )
 from processor.space_frame import step as space_frame_step
+from processor.space_frame.result import Balls
 from tests.support.store_scenes import a_scene, surface_points
 
 HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm
@@ -259,13 +261,16 @@ def test_results_come_back(tmp_path):
     balls = space_frame_step.Result(
         "partial",
         "ransac",
-        "two lines\nof text",
-        [1],
-        np.ones((1, 3)),
-        [75.0],
-        evidence=["ball"],
-        flag=["ok"],
-        reason=[""],
+        (reason("two.lines", text="two lines\nof text"),),
+        Balls(
+            ids=[1],
+            centres=np.ones((1, 3)),
+            radii=[75.0],
+            evidence=["ball"],
+            flag=["ok"],
+            reasons=[()],
+            verdict=["none"],
+        ),
     )
     runs = (StepRun("outer", "m", json.dumps({"seed": 1}), outer), StepRun("spheres", "ransac", "{}", balls))
     classes = {"spheres": space_frame_step.Result, "outer": Outer}
