@@ -192,7 +192,7 @@ def _whole(left: Floats, variance: Floats, J: Floats, component: Ints) -> tuple[
     return x, covariance
 
 
-def moved(T_design_project: Floats, alignment: Alignment) -> Floats:
+def corrected_pose(T_design_project: Floats, alignment: Alignment) -> Floats:
     """Return the pose with the whole's movement taken off."""
     R = rigid.rotation_from_vector(-alignment.whole[:3])
     shift = alignment.centre - R @ alignment.centre - R @ alignment.whole[3:]

@@ -93,7 +93,7 @@ def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[
     return found
 
 
-def shaped_ones(shaped: list[ComponentShape]) -> frozenset[int]:
+def deformed(shaped: list[ComponentShape]) -> frozenset[int]:
     """Return the components that have a shape of their own beyond doubt, as far as the whole's place is known."""
     return frozenset(one.component for one in shaped if any(gain > APART_GAIN for gain in one.fitted.gain))
 
@@ -136,7 +136,7 @@ def jumps(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int, 
 
 
 @dataclass(frozen=True)
-class Judged:
+class SignificantShape:
     """A shape that is more than chance: its largest value (mm, signed, outward) and the 95 % interval."""
 
     shape: shape_models.Shape
@@ -183,13 +183,13 @@ def significant(
     alignment: Alignment,
     levels: Levels,
     alarms_per_mm2: float,
-) -> dict[int, list[Judged]]:
+) -> dict[int, list[SignificantShape]]:
     """Keep the shapes that chance brings no more often than asked for, by component.
 
     Of the largest deviation of a shape three things are uncertain: noise, what means of large places share, and where
     the whole is in the design's frame.
     """
-    found: dict[int, list[Judged]] = {}
+    found: dict[int, list[SignificantShape]] = {}
     for one in shaped:
         real = [(k, s) for k, s in enumerate(one.fitted.shapes) if s.kind != "bump"]
         if not real:
@@ -212,6 +212,13 @@ def significant(
             if z > threshold:
                 chance = 2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area
                 found.setdefault(one.component, []).append(
-                    Judged(shape, float(value[top]), NORMAL_95 * sd, z, chance, one.fitted.margin / inflation**2)
+                    SignificantShape(
+                        shape=shape,
+                        peak=float(value[top]),
+                        ci95=NORMAL_95 * sd,
+                        z=z,
+                        chance=chance,
+                        margin=one.fitted.margin / inflation**2,
+                    )
                 )
     return found

@@ -212,7 +212,7 @@ ROBUST = 2.0  # standard deviations of a point, from which on it counts less
 
 
 @dataclass(frozen=True)
-class Near:
+class CellPoints:
     """The points of a scene in the order of their cells, to be had by place."""
 
     seen: Observed
@@ -240,14 +240,14 @@ class Near:
         return self.seen.uv[points], self.seen.deviation[points] - off - shape_values[cell]
 
 
-def near_of(seen: Observed, surface: DesignSurface, alignment: Alignment) -> Near:
+def points_by_cell(seen: Observed, surface: DesignSurface, alignment: Alignment) -> CellPoints:
     """Sort the points of a scene by their cells."""
     cell = cells_of(seen, surface)
     order = np.argsort(cell, kind="stable")
-    return Near(seen, surface, alignment, order, cell[order])
+    return CellPoints(seen, surface, alignment, order, cell[order])
 
 
-def refined(got: Measures, region: Region, near: Near, field: Field, shape_values: Floats) -> Measures:
+def refined(got: Measures, region: Region, near: CellPoints, field: Field, shape_values: Floats) -> Measures:
     """Return measures with the depth of a bump d (1 - r^2 / R^2)^2 fitted to points; as they were where none fits."""
     uv, deviation = near.of(region, shape_values)
     middle = flat(near.surface, region).mean(axis=0)

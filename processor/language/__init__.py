@@ -61,7 +61,8 @@ class Language:
             self.words = {key: text for section in sections for key, text in section.get("words", {}).items()}
             sentences = {key: text for section in sections for key, text in section.get("sentences", {}).items()}
             self.words |= {key: text for key, text in messages(code).texts.items() if "{" not in key}
-            self.words |= {key.split(".")[-1]: text for key, text in messages(code).words.items()}
+            # A word of a vocabulary may mean something else elsewhere: there the texts come first.
+            self.words = {key.split(".")[-1]: text for key, text in messages(code).words.items()} | self.words
             self._patterns = [(_pattern(key), text) for key, text in sentences.items()]
 
     def say(self, text: Any, within: str = "") -> str:
