@@ -33,10 +33,8 @@ class DesignPose:
 
 def stitched(scene: Scene, earlier: dict[str, Any]) -> Scene:
     """Return the scene with the poses of step stitch, where it ran."""
-    found = earlier.get("stitch")
-    if found is None:
-        return scene
-    return dataclasses.replace(scene, scans=deviation_cloud.posed(scene, found))
+    result = earlier.get("stitch")
+    return scene if result is None else dataclasses.replace(scene, scans=deviation_cloud.posed(scene, result))
 
 
 def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
@@ -58,7 +56,9 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
         return DesignPose(None, error, (reason("defects.too-few-points"),))
     vertices, origin = deviation_cloud.local_design(scene.structure)
     few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
-    thin = deviation_cloud.ScanCloud(few, cloud.origin, None, 1.0, len(cloud.points), len(few))
+    thin = deviation_cloud.ScanCloud(
+        points=few, origin=cloud.origin, scanner=None, spacing_mm=1.0, read=len(cloud.points), kept=len(few)
+    )
     given = rigid.transform(np.eye(3), cloud.origin - origin)
     placed = design_pose.place(thin, measure.surface_of(vertices, scene.structure.faces), given, "auto")
     if placed.registration == "as given":

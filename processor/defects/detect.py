@@ -75,7 +75,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         status=pose.status if result.status is Status.OK else result.status,
         reasons=(*pose.reasons, *result.reasons),
         T_design_project=rigid.transform(np.eye(3), origin) @ T,
-        points=registered.observed.offered,
+        points=registered.observed.points,
         points_used=len(registered.observed.chart),
     )
 
@@ -108,11 +108,11 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     surface, observed, pairs = registered.surface, registered.observed, registered.pairs
     alarms_per_mm2 = params.false_alarms / (1e6 * params.per_m2)
     aligned, field, shapes = _fitted_shapes(registered, error_mm, params)
-    candidates = {one.component: [s for s in one.fitted.shapes if s.kind != "bump"] for one in shapes}
+    candidates = {fit.component: [s for s in fit.fitted.shapes if s.kind != "bump"] for fit in shapes}
     residuals = field.less(component_shapes.values(surface, shapes, candidates))
     levels = scan_statistic.levels_of(residuals, surface, alarms_per_mm2, params.systematic_mm)
     significant = component_shapes.significant(shapes, surface, field, aligned, levels, alarms_per_mm2)
-    chosen = {number: [one.shape for one in judged] for number, judged in significant.items()}
+    chosen = {number: [judged.shape for judged in of_one] for number, of_one in significant.items()}
     shape_values = component_shapes.values(surface, shapes, chosen)
     residuals = field.less(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
     finding = scan_statistic.search(residuals, surface, levels)
@@ -143,7 +143,7 @@ def _fitted_shapes(
 
     def fitted(aligned: Alignment) -> tuple[Alignment, Field, list[ComponentShape]]:
         field = deviation_field.of_pairs(pairs, surface, stations, aligned, params.edge_mm)
-        return aligned, field, component_shapes.fit_all(field, surface, aligned)
+        return aligned, field, component_shapes.fit_all(field, surface)
 
     first = fitted(registered.alignment)
     deformed = component_shapes.deformed(first[2])

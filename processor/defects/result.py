@@ -126,7 +126,7 @@ class Defects(Rows):
     @property
     def depth_is_bound(self) -> npt.NDArray[np.bool_]:
         """Return which depths (k,) are lower bounds."""
-        return np.array([any(one.code == "defects.depth-bound" for one in row) for row in self.reasons], np.bool_)
+        return np.array([any(reason.code == "defects.depth-bound" for reason in row) for row in self.reasons], np.bool_)
 
 
 @dataclass(frozen=True)

@@ -12,10 +12,9 @@ import numpy as np
 from processor.defects import classes, measures, pictures
 from processor.defects.alignment import Alignment
 from processor.defects.classes import Classification
-from processor.defects.component_shapes import ComponentShape, SignificantShape, seen_front
+from processor.defects.component_shapes import ComponentShape, SignificantShape, front_of
 from processor.defects.deviation_field import Field
 from processor.defects.measures import CellPoints, Measures
-from processor.defects.missing_material import Expected
 from processor.defects.params import Params
 from processor.defects.regions import Region
 from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Result, Windows
@@ -44,7 +43,7 @@ class Search:
     shapes: list[ComponentShape]
     significant: dict[int, list[SignificantShape]]
     places: list[list[Region]]
-    expected: Expected
+    expected: Floats  # points (cells,)
     shape_values: Floats
     points: CellPoints
 
@@ -62,7 +61,7 @@ class Defect:
 def result_of(search: Search, params: Params, origin: Floats) -> Result:
     """Return the result, the largest defects first, in the design's frame; ``origin`` (3,) was subtracted from it."""
     defects = [*_shape_defects(search), *_place_defects(search)]
-    defects.sort(key=lambda one: (-abs(one.values["volume_mm3"]), one.values["centre"].tolist()))
+    defects.sort(key=lambda defect: (-abs(defect.values["volume_mm3"]), defect.values["centre"].tolist()))
     surface, field = search.surface, search.field
     seen = field.seen > 0
     cell = surface.charts.cell_mm
@@ -73,7 +72,7 @@ def result_of(search: Search, params: Params, origin: Floats) -> Result:
     reasons = [reason("defects.examined", examined=examined / 1e6, surface=surface.area_mm2 / 1e6)]
     if not search.alignment.fitted:
         reasons.append(reason("defects.not-fitted"))
-    drawn = [(one.values["centre"], one.cells, one.field, one.component) for one in defects[: params.pictures]]
+    drawn = [(d.values["centre"], d.cells, d.field, d.component) for d in defects[: params.pictures]]
     return Result(
         status=Status.OK if seen.any() else Status.FAILED,
         method=params.method,
@@ -83,11 +82,11 @@ def result_of(search: Search, params: Params, origin: Floats) -> Result:
         noise=noise,
         lod95=NORMAL_95 * _median(np.hypot(formal, registration)),
         examined_mm2=examined,
-        expected_mm2=float(surface.share[search.expected.points > 0.0].sum()) * cell**2,
+        expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
         least_depth=_least_depth(search.levels, cell, noise, _median(field.count[seen])),
-        defects=table([one.values for one in defects], origin),
+        defects=table([defect.values for defect in defects], origin),
         pictures=pictures.of_defects(drawn, surface),
-        surface=pictures.of_surface([one.cells for one in defects], field, surface, origin),
+        surface=pictures.of_surface([defect.cells for defect in defects], field, surface, origin),
     )
 
 
@@ -132,60 +131,60 @@ def _row(classification: Classification, component: int, **values: Any) -> dict[
 def _shape_defects(search: Search) -> Iterator[Defect]:
     """Yield a defect for each significant shape of a component."""
     surface = search.surface
-    frames = {one.component: one.frame for one in search.shapes}
+    frames = {fit.component: fit.frame for fit in search.shapes}
     for component, shapes in sorted(search.significant.items()):
-        rows = seen_front(surface, component, search.field)
+        rows = front_of(surface, component, search.field)
         rows = rows[surface.share[rows] > 0.5]
-        for one in shapes:
-            yield _shape_defect(search, component, rows, one, frames[component])
+        for shape in shapes:
+            yield _shape_defect(search, component, rows, shape, frames[component])
 
 
-def _shape_defect(search: Search, component: int, rows: Ints, one: SignificantShape, frame: Frame) -> Defect:
+def _shape_defect(search: Search, component: int, rows: Ints, judged: SignificantShape, frame: Frame) -> Defect:
     """Measure a shape of a component on the cells ``rows`` of its largest face."""
-    surface, kind = search.surface, one.shape.kind
-    value = one.shape.values(frame, surface.centres[rows], surface.outward[rows])
+    surface, kind = search.surface, judged.shape.kind
+    value = judged.shape.values(frame, surface.centres[rows], surface.outward[rows])
     extent = 2.0 * frame.half[:2]
     part = np.ones(len(rows), bool)
     if kind == "step":  # the part beyond the step
-        part = np.abs(value) > max(one.ci95, STEP_SHARE * abs(one.peak))
-        extent[int(one.shape.at[0])] *= 0.5 * (1.0 - one.shape.at[1])
+        part = np.abs(value) > max(judged.ci95, STEP_SHARE * abs(judged.peak))
+        extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
     area = surface.share[rows] * surface.charts.cell_mm**2
     both_ways = kind in ("twist", "waviness")
     volume = float((np.abs(value) if both_ways else -value) @ area)
     values = _row(
-        classes.of_shape(kind, one.margin),
+        classes.of_shape(kind, judged.margin),
         component,
         centre=surface.centres[rows[part]].mean(axis=0),
         axes=frame.axes,
         extent=extent,
         area_mm2=float(area[part].sum()),
-        depth_max=abs(one.peak) if both_ways else -one.peak,
-        depth_ci95=one.ci95,
+        depth_max=abs(judged.peak) if both_ways else -judged.peak,
+        depth_ci95=judged.ci95,
         depth_mean=volume / float(area[part].sum()),
         volume_mm3=volume,
-        volume_ci95=one.ci95 * float(area.sum()) / NORMAL_95,
+        volume_ci95=judged.ci95 * float(area.sum()) / NORMAL_95,
         edge_distance=float(frame.half[:2].min()),
-        curvature_per_m=_curvature(one, frame.half),
-        lod95=one.ci95,
-        z=one.z,
-        chance=one.chance * CHANCE_MM2,
+        curvature_per_m=_curvature(judged, frame.half),
+        lod95=judged.ci95,
+        z=judged.z,
+        chance=judged.chance * CHANCE_MM2,
     )
     seen = rows[(search.field.seen[rows] > 0) & part]
     if kind == "bend" and len(seen):
-        along = frame.local(surface.centres[seen])[:, int(one.shape.at[0])]
+        along = frame.local(surface.centres[seen])[:, int(judged.shape.at[0])]
         bent = search.residuals.deviation[seen] + value[np.searchsorted(rows, seen)]
         values["deflection"] = pictures.by_strips(along, bent, search.field.variance[seen], CURVE_STRIPS)
     return Defect(values=values, component=component, cells=rows[part], field=search.field)
 
 
-def _curvature(one: SignificantShape, half: Floats) -> float:
+def _curvature(judged: SignificantShape, half: Floats) -> float:
     """Return the largest curvature of a shape on a component of half sizes (3,), 1/m."""
-    if one.shape.kind == "bend":
-        axis, order = int(one.shape.at[0]), one.shape.at[1]
-        amplitude = abs(float(one.shape.factors[0]))
+    if judged.shape.kind == "bend":
+        axis, order = int(judged.shape.at[0]), judged.shape.at[1]
+        amplitude = abs(float(judged.shape.factors[0]))
         return float(1000.0 * amplitude * (2.0 if order == 2.0 else (0.5 * np.pi) ** 2) / half[axis] ** 2)
-    if one.shape.kind == "waviness":
-        return 1000.0 * abs(one.peak) * (2.0 * np.pi / one.shape.at[1]) ** 2
+    if judged.shape.kind == "waviness":
+        return 1000.0 * abs(judged.peak) * (2.0 * np.pi / judged.shape.at[1]) ** 2
     return 0.0
 
 
@@ -194,7 +193,7 @@ def _curvature(one: SignificantShape, half: Floats) -> float:
 
 def _place_defects(search: Search) -> Iterator[Defect]:
     """Yield a defect for each place that deviates or is missing."""
-    amplitudes = {number: max(abs(one.peak) for one in shapes) for number, shapes in search.significant.items()}
+    amplitudes = {number: max(abs(shape.peak) for shape in shapes) for number, shapes in search.significant.items()}
     for group in search.places:
         component = int(search.surface.charts.component[group[0].chart])
         values = _place_values(search, group[0], component, amplitudes.get(component, 0.0))
@@ -255,7 +254,7 @@ def _crack_depth(
 ) -> tuple[Measures, tuple[Reason, ...]]:
     """Return the depth of a crack: the plate's thickness if rays went through, else what was measured as a bound."""
     points = (search.field.count + search.field.stray)[region.cells].sum()
-    expected = search.expected.points[region.cells].sum()
+    expected = search.expected[region.cells].sum()
     if expected > 0.0 and points < THROUGH_SHARE * expected and np.isfinite(thickness):
         return dataclasses.replace(measured, depth=thickness), (reason("defects.through"),)
     return measured, (reason("defects.depth-bound"),)

@@ -16,10 +16,10 @@ def _summary(result: Result) -> tuple[Message, Message]:
         return result.status, text("{reasons}", reasons=result.reasons)
     doubtful = int(result.defects.doubtful.sum())
     certain = len(result.defects) - doubtful
-    found = text("{count} {count:?defect|defects} found", count=certain) if certain else text("no defects found")
-    head = text("{status}, {found}", status=result.status, found=found)
+    number = text("{count} {count:?defect|defects} found", count=certain) if certain else text("no defects found")
+    head = text("{status}, {found}", status=result.status, found=number)
     if doubtful:
-        head = text("{status}, {found} and {doubtful} doubtful", status=result.status, found=found, doubtful=doubtful)
+        head = text("{status}, {found} and {doubtful} doubtful", status=result.status, found=number, doubtful=doubtful)
     counts = collections.Counter(result.defects.defect_class)
     classes = tuple(text("{count} {kind}", count=counts[kind], kind=kind) for kind in DefectClass if counts[kind])
     body = text("{area:.1f} m2 examined", area=result.examined_mm2 / 1e6)

@@ -83,7 +83,7 @@ def _list(run: StepRun, is_first: bool) -> Table:
         "doubtful": tuple("yes" if doubtful else "no" for doubtful in defects.doubtful),
         "remark": defects.reasons,
     }
-    rows = zip(*(one.tolist() if isinstance(one, np.ndarray) else one for one in columns.values()), strict=True)
+    rows = zip(*(x.tolist() if isinstance(x, np.ndarray) else x for x in columns.values()), strict=True)
     title = text("Defects, method {method} (mm)", method=run.method)
     file = "defects" if is_first else f"defects-{run.method}"
     note = LIST_NOTE if is_first else text("{reasons}", reasons=run.result.reasons)
