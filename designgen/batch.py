@@ -1,15 +1,14 @@
-"""Many scenes from one recipe: a file for every combination of seed and varied values, and an index of them all.
+"""Many scenes from one recipe: a file for every combination of seed and varied values, and an index of all files.
 
-A scene's bytes depend on its recipe, its parameters, its seed and the versions of the software, on nothing else. So a
-scene that is in the folder already, made from the same, is kept, and the folder is the same whatever made it: one
-process, several, a cluster, or a run that was killed and started again.
+The bytes of a scene depend only on its recipe, its parameters, its seed and the versions of the software. A scene in
+the folder that was made from the same is therefore kept, and the folder is the same whether one process, several, a
+cluster, or a run that was killed and started again has made it.
 """
 
 from __future__ import annotations
 
 import copy
 import csv
-import fcntl
 import hashlib
 import io
 import itertools
@@ -17,14 +16,17 @@ import json
 import os
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
-from importlib.metadata import PackageNotFoundError, version
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from designgen import __version__, recipes, spread
+from designgen import __version__, recipes
+from processor.jobs import process, runner
+from processor.jobs.child import Loss, Lost
+from processor.jobs.software import check_same, versions
 from processor.model import InputError, UsageError
 
 INDEX = "index.csv"
@@ -33,20 +35,26 @@ MOST_SEED = 2**63
 SOFTWARE = ("cadquery", "cadquery-ocp", "h5py", "numba", "numpy", "scipy")  # what a scene's bytes depend on
 SCENE_FILE = re.compile(r".+-\d{5}-seed\d+\.h5")
 LEFTOVER = re.compile(rf"\.({SCENE_FILE.pattern}|{re.escape(INDEX)})\.\d+-[0-9a-f]{{8}}\.tmp")
+LOSSES = {
+    Loss.DIED: "the process that made it died twice (out of memory?); run again, with fewer jobs at a time",
+    Loss.STOPPED: "stopped",
+    Loss.NOT_RUN: "could not be run ({error})",
+    Loss.NOT_RUN_BY_WORKER: "a worker of the cluster could not run it ({error})",
+}
 
 
 def make_scene(path: Path, name: str, recipe: recipes.Recipe, seed: int | None) -> tuple[int, int, int]:
-    """Make the scene of a recipe with its truth and write it to ``path``: its seed, number of scans, and of points.
+    """Make the scene of a recipe with its truth and write it to ``path``; returns seed, number of scans, and of points.
 
-    ``seed`` replaces the recipe's own. The same recipe and seed give the same bytes, whatever the time, host and number
-    of processors. Raises UsageError for a recipe that cannot be made, InputError where ``path`` cannot be written.
+    ``seed`` replaces the recipe's. The same recipe and seed give the same bytes, whatever the time, host and number of
+    processors. Raises UsageError for a recipe that cannot be made, InputError where ``path`` cannot be written.
     """
     from threadpoolctl import threadpool_limits
 
     from designgen.scenes import make
     from processor.store import store
 
-    # BLAS cuts its sums differently for other numbers of threads, and with them the last bits.
+    # The last bits of BLAS results depend on the number of threads.
     with threadpool_limits(1, user_api="blas"):
         made, truth = make.make(name, recipe, seed)
         used = recipe.get("seed", 0) if seed is None else seed
@@ -55,24 +63,20 @@ def make_scene(path: Path, name: str, recipe: recipes.Recipe, seed: int | None) 
 
 
 def software() -> dict[str, str]:
-    """Versions of what a scene's bytes depend on, by name; what is not installed is left out."""
-    found = {"designgen": __version__}
-    for name in SOFTWARE:
-        with suppress(PackageNotFoundError):
-            found[name] = version(name)
-    return found
+    """Return the versions of what a scene's bytes depend on, by name; what is not installed is left out."""
+    return {"designgen": __version__, **versions(SOFTWARE)}
 
 
 def _provenance(name: str, recipe: recipes.Recipe, seed: int, software: dict[str, str]) -> dict[str, Any]:
     return {"software": software, "recipe": name, "parameters": recipe, "seed": seed}
 
 
-# --- what is to be made -----------------------------------------------------------------------------------------------
+# --- the jobs ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Content:
-    """What the index says of a scene file; both hashes in hex."""
+    """A scene file in the index; both hashes in hex."""
 
     scans: int
     points: int
@@ -82,32 +86,32 @@ class Content:
 
 @dataclass(frozen=True)
 class Job:
-    """One scene to make: all that a process elsewhere needs, and no arrays."""
+    """One scene to make: all that another process needs, and no arrays."""
 
-    folder: str  # absolute: a cluster's workers have another working directory
+    folder: str  # absolute, as a cluster's workers have another working directory
     file: str
     recipe: str
     parameters: recipes.Recipe
     seed: int
-    varied: tuple[str, ...]  # values as they were typed, in the order of their keys
+    varied: tuple[str, ...]  # values as typed, in the order of their keys
     software: dict[str, str]
     known: Content | None = None  # from the index of an earlier run
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job: the content of its file, or the reason why there is none."""
+    """The end of a job: the content of its file, or the reason why there is none."""
 
     content: Content | None
     reason: str = ""
-    made: bool = True  # False: was there already
-    said: str = ""  # why a file that was there was not kept
+    made: bool = True  # False: the file of an earlier run is kept
+    replaced: str = ""  # why a file of an earlier run was not kept
 
 
 def check_usage(
     output: Path, settings: Sequence[str], vary: Sequence[str], *, many: bool, jobs: int | None, cluster: str | None
 ) -> None:
-    """Raise UsageError for options that do not go together, and for a folder where the one scene should be."""
+    """Raise UsageError for options that exclude each other, and if the path of a single scene is a folder."""
     if not many and (jobs is not None or cluster is not None):
         raise UsageError("--jobs and --cluster are for many scenes: add --count or --vary")
     if not many and output.is_dir():
@@ -122,7 +126,7 @@ def check_usage(
 
 
 def parse_varied(texts: Sequence[str]) -> dict[str, list[str]]:
-    """Read ``section.key=v1,v2`` settings: the values' texts by key, in the order given.
+    """Read settings ``section.key=v1,v2``; returns the values' texts by key, in the order given.
 
     Commas inside brackets, braces and quotes belong to a value. Raises UsageError for a setting without key or values,
     and for a key or a value given twice.
@@ -140,29 +144,29 @@ def parse_varied(texts: Sequence[str]) -> dict[str, list[str]]:
 
 
 def _split(values: str, text: str) -> list[str]:
-    found, pending = [], ""
+    parts, pending = [], ""
     for part in values.split(","):
         pending = f"{pending},{part}" if pending else part
         paired = pending.count("[") == pending.count("]") and pending.count("{") == pending.count("}")
         if paired and pending.count('"') % 2 == 0 and pending.count("'") % 2 == 0:
-            found.append(pending.strip())
+            parts.append(pending.strip())
             pending = ""
     if pending:
         raise UsageError(f"--vary {text}: a bracket or quote is not closed in {pending!r}")
-    if not all(found):
+    if not all(parts):
         raise UsageError(f"--vary {text}: expected values separated by commas, got an empty one")
-    if repeated := [value for value in found if found.count(value) > 1]:
+    if repeated := [value for value in parts if parts.count(value) > 1]:
         raise UsageError(f"--vary {text}: {repeated[0]} is given twice")
-    return found
+    return parts
 
 
 def plan(
     folder: Path, name: str, recipe: recipes.Recipe, varied: dict[str, list[str]], first: int | None, count: int
 ) -> list[Job]:
-    """List the jobs of ``count`` seeds from ``first`` (default: the recipe's own) times all varied values.
+    """List the jobs of ``count`` seeds from ``first`` (default: the recipe's) times all varied values.
 
-    The last key varies fastest and the seed slowest, so that a larger count later leaves the numbers of the scenes as
-    they are. Raises UsageError for too many scenes, a seed that is none, and a key that does not fit the recipe.
+    The last key varies fastest and the seed slowest, so that a larger count later does not change the numbers of the
+    scenes. Raises UsageError for too many scenes, an invalid seed, and a key that does not fit the recipe.
     """
     first = recipe.get("seed", 0) if first is None else first
     if not isinstance(first, int) or isinstance(first, bool) or not 0 <= first <= MOST_SEED - count:
@@ -176,15 +180,25 @@ def plan(
             f"a folder holds at most {MOST_SCENES:,}: take several folders"
         )
     stem = re.sub(r"[^\w.+-]+", "_", name).lstrip(".-")[:60] or "scene"
-    place, versions = str(folder.resolve()), software()
+    place, installed = str(folder.resolve()), software()
     jobs: list[Job] = []
     for seed in range(first, first + count):
         for combination in itertools.product(*varied.values()):
             settings = [f"{key}={value}" for key, value in zip(varied, combination, strict=True)]
-            # A copy, as settings of deeper sections would reach into the recipe that all jobs come from.
+            # A copy, as settings of inner sections would change the recipe of the other jobs.
             parameters = recipes.overridden(copy.deepcopy(recipe), settings)
             file = f"{stem}-{len(jobs) + 1:05d}-seed{seed}.h5"
-            jobs.append(Job(place, file, name, parameters, seed, combination, versions))
+            jobs.append(
+                Job(
+                    folder=place,
+                    file=file,
+                    recipe=name,
+                    parameters=parameters,
+                    seed=seed,
+                    varied=combination,
+                    software=installed,
+                )
+            )
     return jobs
 
 
@@ -192,44 +206,41 @@ def plan(
 
 
 def run_job(job: Job) -> Outcome:
-    """Make one scene, or keep the one that is there; whatever goes wrong is in the outcome."""
+    """Make one scene, or keep that of an earlier run; failures are returned as outcomes."""
     try:
-        return _done(job)
-    except Exception as error:  # the one place where a batch catches: the rest of the jobs go on
-        # On one line, without the folder: the index is the same in another place.
+        return _made_or_kept(job)
+    except Exception as error:  # the other jobs go on
+        # On one line, without the folder, so that the index is the same in another place.
         text = " ".join(str(error).split()).replace(f"{job.folder}/", "")
         foreseen = isinstance(error, (UsageError, InputError))
         return Outcome(None, text if foreseen else f"{type(error).__name__}: {text}".rstrip(": "))
 
 
-def _done(job: Job) -> Outcome:
-    here = software()
-    if other := sorted(name for name in {*here, *job.software} if here.get(name) != job.software.get(name)):
-        said = ", ".join(f"{name} {here.get(name, 'none')}, not {job.software.get(name, 'none')}" for name in other)
-        raise InputError(f"a worker has other software: {said}; install the same everywhere")
+def _made_or_kept(job: Job) -> Outcome:
+    check_same(software(), job.software)
     path = Path(job.folder, job.file)
-    found = _kept(path, job) if path.exists() else ""
-    if isinstance(found, Content):
-        return Outcome(found, made=False)
+    earlier = _earlier(path, job) if path.exists() else ""
+    if isinstance(earlier, Content):
+        return Outcome(earlier, made=False)
     try:
         make_scene(path, job.recipe, job.parameters, job.seed)
-        return Outcome(_content(path), said=f"{found}; made again" if found else "")
+        return Outcome(_content(path), replaced=f"{earlier}; made again" if earlier else "")
     except Exception:
         with suppress(OSError):
-            path.unlink(missing_ok=True)  # what is there is not the scene that the index speaks of
+            path.unlink(missing_ok=True)  # a scene made from other parameters than those in the index
         raise
 
 
-def _kept(path: Path, job: Job) -> Content | str:
-    """Return the content of a scene that is there already, or why it cannot be kept."""
+def _earlier(path: Path, job: Job) -> Content | str:
+    """Return the content of the scene of an earlier run, or the reason why it cannot be kept."""
     from processor.store import store
 
     try:
-        found = store.read_provenance(path)
+        provenance = store.read_provenance(path)
     except InputError:
         return "is damaged or no scene"
     wanted = json.loads(json.dumps(_provenance(job.recipe, job.parameters, job.seed, job.software)))
-    if other := [key for key in wanted if found.get(key) != wanted[key]]:
+    if other := [key for key in wanted if provenance.get(key) != wanted[key]]:
         return f"was made with other {' and '.join(other)}"
     digest = _sha256(path)
     if job.known is not None:
@@ -255,54 +266,76 @@ def _sha256(path: Path) -> str:
     return digest.hexdigest()
 
 
-# --- all of them ------------------------------------------------------------------------------------------------------
+# --- the folder -------------------------------------------------------------------------------------------------------
 
 
 def make_many(
     folder: Path, jobs: Sequence[Job], keys: Sequence[str], processes: int = 1, cluster: str | None = None
 ) -> dict[str, Any]:
-    """Do all jobs and write the index, ``keys`` the varied ones: what there is to say, as JSON can hold it.
+    """Do all jobs and write the index with the varied ``keys``; returns a summary that JSON can hold.
 
-    Progress and what is remarkable go to standard error. For the main thread, as it answers SIGTERM. Raises UsageError
-    where the folder is a file or another run is at work in it, or where the cluster does not answer; InputError where
-    the cluster is lost on the way or the folder cannot be written.
+    Progress and warnings go to standard error. For the main thread. SIGTERM and SIGINT end the program (SystemExit).
+    Raises UsageError if the folder is a file or another run is at work in it, or if the cluster does not answer;
+    InputError if the cluster is lost on the way or the folder cannot be written.
     """
+    _make_folder(folder)
+    busy = f"{folder}: another designgen is making scenes here; wait for it or stop it"
+    try:
+        with (
+            runner.executor(cluster, processes, _say) as executor,
+            runner.stoppable() as check_stop,
+            runner.locked(folder, busy),
+        ):
+            known = _read_index(folder / INDEX)
+            # There is no index until all is done: an older one would list scenes that are being replaced.
+            (folder / INDEX).unlink(missing_ok=True)
+            _remove_leftovers(folder)
+            _report_strangers(folder, jobs)
+            jobs = [replace(job, known=known.get(job.file)) for job in jobs]
+            try:
+                with closing(executor.run(partial(process.in_process, run_job), jobs, check_stop)) as results:
+                    outcomes = _outcomes(results, len(jobs))
+            finally:
+                process.POOL.close()
+                _remove_leftovers(folder)
+            outcomes = _present(folder, outcomes)
+            _write_index(folder / INDEX, jobs, keys, outcomes)
+    except runner.StoppedError as stop:
+        raise SystemExit(stop.exit_code) from None
+    return _summary(folder, jobs, outcomes)
+
+
+def _say(line: str) -> None:
     from tqdm import tqdm
 
-    _make_folder(folder)
-    spreading = spread.over_cluster(cluster) if cluster else spread.over_processes(processes)
-    with (
-        spread.stoppable(),
-        _alone_in(folder),
-        spreading as do,
-        tqdm(total=len(jobs), unit="scene", disable=not sys.stderr.isatty()) as bar,
-    ):
+    tqdm.write("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line), file=sys.stderr)
 
-        def say(line: str) -> None:
-            tqdm.write("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line), file=sys.stderr)
 
-        known = _read_index(folder / INDEX)
-        # Until all is done there is no index: a stale one would speak of scenes that are being replaced.
-        (folder / INDEX).unlink(missing_ok=True)
-        _remove_leftovers(folder)
-        _name_strangers(folder, jobs, say)
-        jobs = [replace(job, known=known.get(job.file)) for job in jobs]
-        outcomes: dict[str, Outcome] = {}
-        try:
-            with closing(do(run_job, jobs)) as results:
-                for job, result in results:
-                    outcome = Outcome(None, result.reason) if isinstance(result, spread.Lost) else result
-                    outcomes[job.file] = outcome
-                    if outcome.said:
-                        say(f"{job.file}: {outcome.said}")
-                    bar.update()
-        except BaseException:
-            say(f"stopped: {len(outcomes)} of {len(jobs)} scene(s) are done; run again to go on")
-            raise
-        finally:
-            _remove_leftovers(folder)
-        outcomes = _seen_here(folder, outcomes)
-        _write_index(folder / INDEX, jobs, keys, outcomes)
+def _outcomes(results: runner.Results[Job, Outcome | Lost], total: int) -> dict[str, Outcome]:
+    """Collect the outcomes of all jobs by file, with a progress bar on a terminal."""
+    from tqdm import tqdm
+
+    outcomes: dict[str, Outcome] = {}
+    try:
+        with tqdm(total=total, unit="scene", disable=not sys.stderr.isatty()) as bar:
+            for job, result in results:
+                outcome = Outcome(None, reason_of(result)) if isinstance(result, Lost) else result
+                outcomes[job.file] = outcome
+                if outcome.replaced:
+                    _say(f"{job.file}: {outcome.replaced}")
+                bar.update()
+    except BaseException:
+        _say(f"stopped: {len(outcomes)} of {total} scene(s) are done; run again to go on")
+        raise
+    return outcomes
+
+
+def reason_of(lost: Lost) -> str:
+    """Return the reason in the index of a scene whose job has no result."""
+    return LOSSES[lost.loss].format(error=lost.error)
+
+
+def _summary(folder: Path, jobs: Sequence[Job], outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
     failed = [job for job in jobs if outcomes[job.file].content is None]
     done = [(outcome.made, outcome.content) for outcome in outcomes.values() if outcome.content]
     return {
@@ -324,22 +357,6 @@ def _make_folder(folder: Path) -> None:
         raise UsageError(f"{folder}: many scenes need a folder, and there is a file of this name") from None
 
 
-@contextmanager
-def _alone_in(folder: Path) -> Iterator[None]:
-    """Hold the folder, so that two runs cannot remove each other's temporary files."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            raise UsageError(f"{folder}: another designgen is making scenes here; wait for it or stop it") from None
-        except OSError:
-            pass  # a file system without locks
-        yield
-    finally:
-        os.close(handle)
-
-
 def _remove_leftovers(folder: Path) -> None:
     """Remove the temporary files of runs that were killed."""
     for path in folder.iterdir():
@@ -347,26 +364,26 @@ def _remove_leftovers(folder: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def _name_strangers(folder: Path, jobs: Sequence[Job], say: Callable[[str], None]) -> None:
+def _report_strangers(folder: Path, jobs: Sequence[Job]) -> None:
     ours = {job.file for job in jobs}
     strangers = sorted(p.name for p in folder.iterdir() if SCENE_FILE.fullmatch(p.name) and p.name not in ours)
     if strangers:
-        say(f"{folder}: {len(strangers)} scene(s) of other runs are left as they are, e.g. {strangers[0]}")
+        _say(f"{folder}: {len(strangers)} scene(s) of other runs are left as they are, e.g. {strangers[0]}")
 
 
-def _seen_here(folder: Path, outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
-    """Let those fail whose file is not in the folder: a cluster's worker may have written to a disk of its own."""
-    there = set(os.listdir(folder))
-    lost = Outcome(None, "made, but not in this folder: all workers must share the folder under the same path")
-    return {file: one if one.content is None or file in there else lost for file, one in outcomes.items()}
+def _present(folder: Path, outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
+    """Replace outcomes whose file is not in the folder: a cluster's worker may have written to a disk of its own."""
+    files = set(os.listdir(folder))
+    absent = Outcome(None, "made, but not in this folder: all workers must share the folder under the same path")
+    return {file: outcome if outcome.content is None or file in files else absent for file, outcome in outcomes.items()}
 
 
 def _read_index(path: Path) -> dict[str, Content]:
-    """Contents by file name from the index of an earlier run; empty where there is none that can be read."""
+    """Return contents by file name from the index of an earlier run; empty if there is none that can be read."""
     known = {}
     try:
         for row in csv.DictReader(io.StringIO(path.read_text("utf-8"), newline="")):
-            with suppress(KeyError, TypeError, ValueError):  # of a failed scene, or by another hand
+            with suppress(KeyError, TypeError, ValueError):  # of a failed scene, or edited
                 content = Content(int(row["scans"]), int(row["points"]), row["scene_hash"], row["sha256"])
                 known[row["file"]] = content
     except (OSError, UnicodeDecodeError, csv.Error):
@@ -382,9 +399,9 @@ def _write_index(path: Path, jobs: Sequence[Job], keys: Sequence[str], outcomes:
     table.writerow(["file", "recipe", "seed", *keys, "points", "scans", "scene_hash", "sha256", "status", "reason"])
     for job in jobs:
         outcome = outcomes[job.file]
-        one = outcome.content
-        content = [one.points, one.scans, one.scene_hash, one.sha256] if one else [""] * 4
-        status = "done" if one else "failed"
-        table.writerow([job.file, job.recipe, job.seed, *job.varied, *content, status, outcome.reason])
+        content = outcome.content
+        cells = [content.points, content.scans, content.scene_hash, content.sha256] if content else [""] * 4
+        status = "done" if content else "failed"
+        table.writerow([job.file, job.recipe, job.seed, *job.varied, *cells, status, outcome.reason])
     with store.replacing(path) as temporary:
         temporary.write_text(text.getvalue(), "utf-8")

@@ -1,4 +1,4 @@
-"""Sections of a recipe read into Params records, every key and type checked."""
+"""Sections of a recipe, read into Params records with every key and type checked."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ P = TypeVar("P")
 
 
 def filled(cls: type[P], recipe: Mapping[str, Any], section: str) -> P:
-    """Fill a Params record from a section of the recipe, with every key and type checked."""
+    """Fill a Params record from a section of the recipe. Raises UsageError for unknown keys and wrong types."""
     table = recipe.get(section, {})
     if not isinstance(table, Mapping):
         raise UsageError(f"{section}: expected a section, got {table!r}")
@@ -27,7 +27,7 @@ def filled(cls: type[P], recipe: Mapping[str, Any], section: str) -> P:
 
 
 def _like(default: Any, value: Any, where: str) -> Any:
-    """Check a value against the type of a key's default; the value, as a tuple where the default is one."""
+    """Check a value against the type of the default and return it; as a tuple if the default is one."""
     if isinstance(default, tuple):
         items = value if isinstance(value, list) else [value]
         return tuple(_like(default[0], item, where) for item in items)

@@ -18,7 +18,7 @@ def main(folder: Path = FOLDER, output: Path | None = None) -> None:
     results = processor.run(folder, output=output)
     print(f"verdict: {results.verdict.value}")
     for name, step in results.steps.items():
-        print(f"step {name}: {step.status.value}")
+        print(f"step {name}: {step.status}")
     for metric in results.checks:
         if metric.limit == metric.limit:  # NaN: for information
             print(f"check {metric.name}: {metric.value:g} {metric.unit}, {'passed' if metric.passed else 'MISSED'}")

@@ -1,3 +1,37 @@
-"""Checks steel structures from laser scans, on machines without a screen."""
+"""Checks steel structures from laser scans, on machines without a screen.
 
-__version__ = "0.1.0"
+The functions below are the Python interface. Lengths are in mm, angles in rad, points are arrays (n, 3) of float.
+Each is loaded when it is first used, so ``import processor`` is quick.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from processor.version import __version__
+
+if TYPE_CHECKING:
+    from processor.api.arrays import CorePoints, SphereFit, fit_sphere, m3c2
+    from processor.api.runs import Results, check, read, run
+
+__all__ = [
+    "CorePoints",
+    "Results",
+    "SphereFit",
+    "__version__",
+    "check",
+    "fit_sphere",
+    "m3c2",
+    "read",
+    "run",
+]
+_RUNS, _ARRAYS = ("Results", "check", "read", "run"), ("CorePoints", "SphereFit", "fit_sphere", "m3c2")
+_HOMES = dict.fromkeys(_RUNS, "processor.api.runs") | dict.fromkeys(_ARRAYS, "processor.api.arrays")
+
+
+def __getattr__(name: str) -> Any:
+    """Load a function of the interface at its first use."""
+    if name not in _HOMES:
+        raise AttributeError(f"module 'processor' has no attribute {name!r}")
+    return getattr(importlib.import_module(_HOMES[name]), name)

@@ -11,7 +11,7 @@ The records are also the HDF5 schema: :mod:`processor.store` walks their fields,
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any
@@ -217,6 +217,14 @@ class Verdict(Word):
 
 class InputError(Exception):
     """Input that cannot be used. The message names the file, what was expected, what came and what to do."""
+
+
+def worst(verdicts: Iterable[Verdict]) -> Verdict:
+    """Return the worst of verdicts: fail, then indeterminate, then pass; none of none."""
+    known = set(verdicts)
+    return next(
+        (verdict for verdict in (Verdict.FAIL, Verdict.INDETERMINATE, Verdict.PASS) if verdict in known), Verdict.NONE
+    )
 
 
 class UsageError(Exception):

@@ -20,10 +20,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-import processor
-from processor import __version__
 from processor.model import InputError, Scene, StepRun, UsageError
 from processor.progress import stage
+from processor.version import __version__
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -56,7 +55,7 @@ class Execution:
 @cache
 def step_modules() -> dict[str, ModuleType]:
     """All steps by name: the module ``step`` of each package of processor that has one, with the step's NAME."""
-    packages = [found.name for found in pkgutil.iter_modules(processor.__path__) if found.ispkg]
+    packages = [found.name for found in pkgutil.iter_modules([str(Path(__file__).parent)]) if found.ispkg]
     modules = [
         importlib.import_module(f"processor.{package}.step")
         for package in packages
@@ -135,6 +134,30 @@ def steps_for(scene: Scene) -> tuple[str, ...]:
             f"no step runs by itself on a scene of kind {scene.kind}; name one with --steps: {', '.join(modules)}"
         )
     return found
+
+
+def jobs_for(
+    scene: Scene, wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None
+) -> tuple[Job, ...]:
+    """Plan the steps ``wanted``, or those that run by themselves on a scene; raises UsageError as :func:`plan` does."""
+    return plan(wanted or steps_for(scene), methods, params, seed)
+
+
+def prepare(
+    path: Path,
+    units: str | None,
+    wanted: Sequence[str],
+    methods: Sequence[str],
+    params: Mapping[str, Any],
+    seed: int | None,
+) -> tuple[Scene, tuple[Job, ...], bool]:
+    """Read an input and plan its steps; also whether its points stay in the file, to be read piece by piece."""
+    piecewise = is_large(path)
+    scene = read(path, units, piecewise)
+    jobs = jobs_for(scene, wanted, methods, params, seed)
+    if piecewise and not streams(jobs):
+        return read(path, units), jobs, False
+    return scene, jobs, piecewise
 
 
 def _applies(module: ModuleType, scene: Scene) -> bool:

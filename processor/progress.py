@@ -1,4 +1,4 @@
-"""What is being done, on a terminal: a line on standard error for whatever lasts over two seconds, silent otherwise."""
+"""Progress on a terminal: a line on standard error for every stage that takes more than two seconds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNCOUNTED = "{desc}: {elapsed}"
 
 @dataclass
 class _Stage:
-    what: str
+    title: str
     done: int = 0
     total: int = 0
 
@@ -27,42 +27,42 @@ _stages: list[_Stage] = []
 
 
 @contextmanager
-def stage(what: str) -> Iterator[None]:
-    """Show ``what`` with the time it takes while the block lasts, and how far :func:`tracked` within it has come."""
+def stage(title: str) -> Iterator[None]:
+    """Show a title with the time elapsed while the block runs, and the progress of :func:`tracked` within it."""
     if not sys.stderr.isatty():
         yield
         return
-    ended, now = threading.Event(), _Stage(what)
-    shower = threading.Thread(target=_show, args=(now, ended), daemon=True)
-    _stages.append(now)
-    shower.start()
+    ended, current = threading.Event(), _Stage(title)
+    display = threading.Thread(target=_show, args=(current, ended), daemon=True)
+    _stages.append(current)
+    display.start()
     try:
         yield
     finally:
         ended.set()
-        shower.join()
-        _stages.remove(now)
+        display.join()
+        _stages.remove(current)
 
 
 def tracked(items: Sequence[Item]) -> Iterator[Item]:
-    """Yield items, counted in the line of the stage that this is part of."""
-    now = _stages[-1] if _stages else _Stage("")
-    now.done, now.total = 0, len(items)
+    """Yield items and count them in the line of the current stage."""
+    current = _stages[-1] if _stages else _Stage("")
+    current.done, current.total = 0, len(items)
     for item in items:
         yield item
-        now.done += 1
-    now.total = 0
+        current.done += 1
+    current.total = 0
 
 
-def _show(now: _Stage, ended: threading.Event) -> None:
+def _show(current: _Stage, ended: threading.Event) -> None:
     if ended.wait(PATIENCE_S):
         return
     from tqdm import tqdm
 
-    with tqdm(desc=now.what, leave=False, file=sys.stderr, bar_format=UNCOUNTED) as bar:
+    with tqdm(desc=current.title, leave=False, file=sys.stderr, bar_format=UNCOUNTED) as bar:
         while not ended.wait(REFRESH_S):
-            if bar.total != now.total:
-                bar.reset(now.total)
-                bar.bar_format = COUNTED if now.total else UNCOUNTED
-            bar.n = now.done
+            if bar.total != current.total:
+                bar.reset(current.total)
+                bar.bar_format = COUNTED if current.total else UNCOUNTED
+            bar.n = current.done
             bar.refresh()

@@ -49,10 +49,16 @@ def test_arrows_run_one_way(path):
         if not name.startswith("processor.store"):
             assert not within(used, "h5py"), "only the store uses HDF5"
     else:
-        shared = ("processor.model", "processor.store", "processor.progress")
+        shared = ("processor.model", "processor.store", "processor.progress", "processor.jobs")
         reached = {n for n in within(own, "processor") if not within({n}, *shared)}
-        assert reached <= {"processor"}, "designgen shares records and store with processor, and no geometry"
+        assert reached <= {"processor"}, "designgen shares records, store and jobs with processor, and no geometry"
         assert not within(used, "h5py")
+    if name.startswith("processor.jobs"):
+        assert own <= {"processor"} | within(own, "processor.jobs", "processor.model")
+    if within(own, "processor.batch", "processor.validation"):
+        assert name.startswith(("processor.batch", "processor.validation", "processor.cli"))
+    if within(own, "processor.cli"):
+        assert name == "processor.__main__" or name.startswith("processor.cli")
     if name == "processor.model":
         assert not own - {"processor"}
     if name.startswith("processor.language"):

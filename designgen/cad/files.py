@@ -10,8 +10,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 import tempfile
 import unicodedata
 from collections.abc import Mapping, Sequence
@@ -22,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 from designgen.cad.bodies import UNITS_MM, Body, CadFile
 from designgen.cad.process import escape, received
 from designgen.export.formats import write_mesh
+from processor.jobs.process import Cause, isolated, run
 from processor.model import InputError, UsageError
 from processor.store import store
 
@@ -34,10 +33,7 @@ STEP_SUFFIXES, IFC_SUFFIXES = (".step", ".stp"), (".ifc",)
 MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"
 LIMIT_S = 600.0  # for reading a file
 MEMORY_BYTES = 8 * 10**9  # for reading a file, where the platform can limit it
-CHILD = (
-    "import json, sys; job = json.loads(sys.stdin.buffer.readline()); sys.path[:] = job['sys_path']; "
-    "from designgen.cad import process; process.serve(job)"
-)
+CHILD = "from designgen.cad import process; process.serve()"
 FILE_NAME_BYTES = 200
 WRITTEN = "1970-01-01T00:00:00"  # for every file, so that the same design makes the same bytes
 
@@ -90,26 +86,19 @@ def _read(path: Path, content: bytes, units: str, limit_s: float, memory_bytes: 
     if units:
         unit_mm(units)
     job: dict[str, Any] = {"path": str(path), "suffix": path.suffix.lower(), "units": units.lower()}
-    job |= {"sys_path": sys.path, "limit_s": limit_s, "memory_bytes": memory_bytes}
+    job |= {"limit_s": limit_s, "memory_bytes": memory_bytes}
     # Damaged files can end the process at once, and the kernels print what they like.
     with tempfile.TemporaryFile() as question, tempfile.TemporaryFile() as answer:
         question.write(json.dumps(job).encode("ascii") + b"\n" + content)
         question.seek(0)
-        try:
-            done = subprocess.run(
-                [sys.executable, "-I", "-c", CHILD],
-                stdin=question,
-                stdout=answer,
-                stderr=subprocess.DEVNULL,
-                timeout=limit_s,
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
+        number = question.fileno()
+        ended = run(isolated(CHILD, str(number)), stdout=answer, pass_fds=[number], own_group=False, timeout_s=limit_s)
+        if ended.cause is Cause.TIME:
             raise InputError(
                 f"{path}: the CAD kernel did not read it within {limit_s:g} s; export it in parts, or again"
-            ) from None
-        if done.returncode:
-            why = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+            )
+        if ended.code:
+            why = f"signal {ended.code}" if ended.cause is Cause.SIGNAL else f"exit code {ended.code}"
             raise InputError(
                 f"{path}: reading it ended the CAD kernel ({why}): it is damaged, or takes more than "
                 f"{memory_bytes / 1e9:g} GB of memory; export it again, or in parts"

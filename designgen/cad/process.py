@@ -12,20 +12,24 @@ import os
 import re
 import signal
 import sys
-from collections.abc import Mapping
 from typing import IO, Any
 
 import numpy as np
 
 from designgen.cad.bodies import Body, CadFile
+from processor.jobs.child import end_with_parent
 from processor.model import InputError, UsageError
 
 
-def serve(job: Mapping[str, Any]) -> None:
-    """Read the file whose content follows on standard input; the answer goes to standard output.
+def serve() -> None:
+    """Read the file in the file descriptor of the command line; the answer goes to standard output.
 
-    ``job`` holds ``path``, ``suffix``, ``units``, ``limit_s`` and ``memory_bytes``.
+    The descriptor holds a line of JSON with ``path``, ``suffix``, ``units``, ``limit_s`` and ``memory_bytes``, and the
+    file's content.
     """
+    end_with_parent()
+    with os.fdopen(int(sys.argv[1]), "rb") as question:
+        job, content = json.loads(question.readline()), question.read()
     answers = os.fdopen(os.dup(1), "wb")
     nowhere = os.open(os.devnull, os.O_WRONLY)
     for stream in (1, 2):
@@ -33,7 +37,7 @@ def serve(job: Mapping[str, Any]) -> None:
     _limit(job["limit_s"], job["memory_bytes"])
     path, found = job["path"], None
     try:
-        found = parse(path, job["suffix"], sys.stdin.buffer.read(), job["units"])
+        found = parse(path, job["suffix"], content, job["units"])
         header = _header(found)
     except (InputError, UsageError) as error:
         header = {"error": type(error).__name__, "message": str(error)}

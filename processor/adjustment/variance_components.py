@@ -1,8 +1,12 @@
-"""What the points of one station have in common: they err alike, by its registration and its scanner's offset.
+"""Variance components of fitted surfaces: between scanner stations, and the lack of fit of the surface's basis.
 
-Within a cell of a face the stations' mean residuals scatter by more than the noise of their points explains; the
-surplus is the variance between stations (DerSimonian and Laird 1986), taken over all cells of a part. A station moves
-what is fitted by the sum of its own points' rows, so many points of few stations are worth no more than these are.
+Between stations: all points of one station share the error of its registration and of its scanner's offset. Within a
+cell of a face the stations' mean residuals scatter by more than point noise explains; the surplus, over all cells of a
+part, is the variance between stations (DerSimonian and Laird 1986). Many points of few stations then weigh no more than
+the number of stations justifies.
+
+Lack of fit: variance between the cell means of a fit's residuals, and the amplitude of the next (third-order) Legendre
+term.
 """
 
 from __future__ import annotations
@@ -14,94 +18,94 @@ from scipy.special import stdtrit
 
 from processor.model import NORMAL_95, Floats, Ints
 
-LEAST_POINTS = 25  # of a station on a face
+LEAST_POINTS = 25  # of a station in a cell
 
 
-def variance(residual: Floats, station: Ints, cell: Ints) -> float:
-    """Return the variance between stations, mm^2, by residuals (n,); 0 where no cell was seen by two.
+def between_stations(residual: Floats, station: Ints, cell: Ints) -> float:
+    """Variance between stations, mm^2, by residuals (n,); 0 where no cell was seen from two stations.
 
-    It is the estimate times (t / 1.96)^2 of as many stations as there are.
+    The estimate is multiplied by (t / 1.96)^2, with Student's t for the number of stations.
     """
     key, group = np.unique(np.stack([cell, station], axis=1), axis=0, return_inverse=True)
     group = group.reshape(-1)
     number = np.bincount(group)
     mean = np.bincount(group, residual) / number
-    rest = residual - mean[group]
-    kept = number >= LEAST_POINTS
-    noise = np.bincount(group, rest**2) / np.maximum(number - 1, 1)
-    w = np.where(kept, number / np.maximum(noise, 1e-12), 0.0)
-    at = key[:, 0]
-    total, square = np.bincount(at, w), np.bincount(at, w**2)
-    count = np.bincount(at, kept)
+    within = residual - mean[group]
+    enough = number >= LEAST_POINTS
+    noise = np.bincount(group, within**2) / np.maximum(number - 1, 1)
+    w = np.where(enough, number / np.maximum(noise, 1e-12), 0.0)
+    cell_of_group = key[:, 0]
+    total, square = np.bincount(cell_of_group, w), np.bincount(cell_of_group, w**2)
+    count = np.bincount(cell_of_group, enough)
     several = count >= 2
     if not several.any():
         return 0.0
-    middle = np.bincount(at, w * mean) / np.where(total > 0.0, total, 1.0)
-    scatter = np.bincount(at, w * (mean - middle[at]) ** 2)
-    # Each cell by itself, then their mean: a cell with many points knows the stations no better than another.
+    middle = np.bincount(cell_of_group, w * mean) / np.where(total > 0.0, total, 1.0)
+    scatter = np.bincount(cell_of_group, w * (mean - middle[cell_of_group]) ** 2)
+    # Cells count alike: one with many points tells no more about the stations than another.
     surplus = (scatter - (count - 1))[several]
     weight = (total - square / np.where(total > 0.0, total, 1.0))[several]
-    # A variance known from k stations only: widened so that 1.96 standard deviations hold what Student's t would.
-    widened = (float(stdtrit(len(np.unique(station[kept[group]])) - 1, 0.975)) / NORMAL_95) ** 2
-    return widened * max(float(np.mean(surplus / weight)), 0.0)
+    # The variance comes from few stations: widen it so that 1.96 standard deviations cover what Student's t covers.
+    widening = (float(stdtrit(len(np.unique(station[enough[group]])) - 1, 0.975)) / NORMAL_95) ** 2
+    return widening * max(float(np.mean(surplus / weight)), 0.0)
 
 
-def added(basis: Floats, station: Ints, between: float) -> Floats:
-    """Covariance (k, k) that a variance between stations adds to what is fitted with a basis (n, k)."""
+def group_covariance(basis: Floats, group: Ints, variance: float) -> Floats:
+    """Covariance (k, k) of a least-squares fit by an error that each group of points shares.
+
+    ``basis`` (n, k) of the fit, ``group`` (n,) the number of each point's group (its station or cell), ``variance`` of
+    the shared errors, mm^2.
+    """
     inverse = np.linalg.inv(basis.T @ basis)
-    moves = np.stack([np.bincount(station, column) for column in basis.T], axis=1) @ inverse
-    found: Floats = between * moves.T @ moves
-    return found
+    by_group = np.stack([np.bincount(group, column) for column in basis.T], axis=1) @ inverse
+    covariance: Floats = variance * by_group.T @ by_group
+    return covariance
 
 
-def share(station: Ints) -> float:
-    """Return the part of a variance between stations that is left in the mean of all points (n,)."""
-    number = np.bincount(station)
-    return float((number.astype(np.float64) ** 2).sum() / max(len(station), 1) ** 2)
+def share_in_mean(group: Ints) -> float:
+    """Part of a variance between groups that is left in the mean of all points (n,)."""
+    number = np.bincount(group)
+    return float((number.astype(np.float64) ** 2).sum() / max(len(group), 1) ** 2)
 
 
-# --- What a fitted surface does not follow, by its points' rests: the means of cells, and the next shape in order.
+def lack_of_fit_variance(fits: Sequence[tuple[Floats, Ints]], coefficients: int) -> float:
+    """Variance of the cells' means about fitted surfaces beyond noise, mm^2, one for all surfaces (method of moments).
 
-
-def lack_of_fit_variance(fits: Sequence[tuple[Floats, Ints]], numbers: int) -> float:
-    """Return the variance of cells' means about fitted surfaces beyond noise, mm^2, for all surfaces together.
-
-    A fit is the rests (n,) of its points and their cells (n,); each surface has so many ``numbers``. By moments: the
-    sum of squares between the cells less what noise would give it.
+    Each fit is its residuals (n,) and their cells (n,), with so many ``coefficients``.
     """
     between = within = 0.0
     freedom, points, inside = 0, 0, 0
-    for rest, cell in fits:
+    for residual, cell in fits:
         number = np.bincount(cell)
-        kept = number > 0
-        mean = np.bincount(cell, rest)[kept] / number[kept]
-        between += float((number[kept] * mean**2).sum())
-        within += float(((rest - (np.bincount(cell, rest) / np.maximum(number, 1))[cell]) ** 2).sum())
-        freedom += int(kept.sum()) - numbers
-        points += len(rest)
-        inside += len(rest) - int(kept.sum())
+        used = number > 0
+        mean = np.bincount(cell, residual)[used] / number[used]
+        between += float((number[used] * mean**2).sum())
+        within += float(((residual - (np.bincount(cell, residual) / np.maximum(number, 1))[cell]) ** 2).sum())
+        freedom += int(used.sum()) - coefficients
+        points += len(residual)
+        inside += len(residual) - int(used.sum())
     if freedom <= 0 or inside <= 0:
         return 0.0
     noise = within / inside
     return max((between - freedom * noise) / points, 0.0)
 
 
-def third_order(basis: Floats, rest: Floats) -> Floats:
-    """Return how far a face departs at the joint by the next shapes its numbers do not follow, with variances (2, 2).
+def third_order(basis: Floats, residual: Floats) -> Floats:
+    """Amplitudes of two third-order terms of a face, and their variances by noise: (2, 2), a row a term.
 
-    The numbers follow a bend along the part; the third Legendre polynomial, 1 at the joint, is the simplest shape that
-    they do not, alike all across the face and from one side to the other. ``basis`` (n, 8) and ``rest`` (n,) are those
-    of the points of the face's zone, see :func:`processor.preassembly.ends.faces.basis`.
-    Where the zone is evenly seen these shapes and the numbers' have nothing in common: variance 7 sigma^2 / n.
+    The terms are the third Legendre polynomial along the part, 1 at the joint, constant across the face and linear
+    across it: the simplest shapes beyond the fitted basis. ``basis`` (n, 8), see
+    :func:`processor.preassembly.ends.faces.basis`, and ``residual`` (n,) are of the points of the face's zone. In an
+    evenly sampled zone the terms are orthogonal to the basis: variance 7 sigma^2 / n.
     """
     t = 1.0 - 2.0 * np.abs(basis[:, 1])
-    shapes = (0.5 * (5.0 * t**3 - 3.0 * t))[:, None] * np.stack([np.ones_like(t), basis[:, 2]], axis=1)
-    own = shapes - basis @ np.linalg.lstsq(basis, shapes, rcond=None)[0]
-    inverse = np.linalg.inv(own.T @ own)
-    noise = float(rest @ rest) / max(len(rest) - basis.shape[1], 1)
-    return np.stack([inverse @ (own.T @ rest), noise * np.diag(inverse)], axis=1)
+    terms = (0.5 * (5.0 * t**3 - 3.0 * t))[:, None] * np.stack([np.ones_like(t), basis[:, 2]], axis=1)
+    orthogonal = terms - basis @ np.linalg.lstsq(basis, terms, rcond=None)[0]
+    inverse = np.linalg.inv(orthogonal.T @ orthogonal)
+    noise = float(residual @ residual) / max(len(residual) - basis.shape[1], 1)
+    return np.stack([inverse @ (orthogonal.T @ residual), noise * np.diag(inverse)], axis=1)
 
 
-def excess(departures: Floats) -> float:
-    """Return the variance of departures (n, 2), each with its variance by noise, beyond what noise explains."""
-    return max(float(np.mean(departures[:, 0] ** 2 - departures[:, 1])), 0.0)
+def excess_variance(amplitudes: Floats) -> float:
+    """Variance of amplitudes beyond noise; ``amplitudes`` (n, 2) are each with its variance by noise."""
+    return max(float(np.mean(amplitudes[:, 0] ** 2 - amplitudes[:, 1])), 0.0)

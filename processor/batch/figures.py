@@ -1,4 +1,4 @@
-"""What the summary says of one job's results."""
+"""The figures of one job's results in the summary."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 Figures = dict[str, Any]
-VERDICTS = ("fail", "indeterminate", "pass")  # the first that is there is the whole's
+VERDICTS = ("fail", "indeterminate", "pass")  # the worst first
 COLUMNS = {
     "steps": "steps, with the status of those that did not end well",
     "verdict": "the worst of joints, chain and nodes against their limits",
@@ -32,50 +32,50 @@ COLUMNS = {
 
 
 def of_results(results: Mapping[str, Any]) -> Figures:
-    """Figures of a results.json by the names of COLUMNS; what was not run, or was not found, is left out."""
+    """Return the figures of a results.json by the names of COLUMNS; absent are those of steps not run and of nulls."""
     steps: Mapping[str, Mapping[str, Any]] = results["steps"]
-    found: Figures = {"steps": ", ".join(_said(name, step) for name, step in steps.items())}
+    figures: Figures = {"steps": ", ".join(_with_status(name, step) for name, step in steps.items())}
     verdicts: Counter[str] = Counter()
     if "preassemble" in steps:
-        verdicts += _preassembled(steps["preassemble"], found)
+        verdicts += _add_preassembly(steps["preassemble"], figures)
     if "spheres" in steps:
-        verdicts += _balls(steps["spheres"], found)
+        verdicts += _add_spheres(steps["spheres"], figures)
     if "stitch" in steps:
         states = [scan.get("status") for scan in steps["stitch"].get("scans", [])]
-        found |= {"scans_stitched": states.count("ok"), "scans_not_stitched": len(states) - states.count("ok")}
+        figures |= {"scans_stitched": states.count("ok"), "scans_not_stitched": len(states) - states.count("ok")}
     if "deviation" in steps:
         keys = ("min", "max", "significant_share")
         names = ("deviation_min_mm", "deviation_max_mm", "deviation_significant_share")
-        found |= {name: steps["deviation"].get(key) for name, key in zip(names, keys, strict=True)}
+        figures |= {name: steps["deviation"].get(key) for name, key in zip(names, keys, strict=True)}
     if "defects" in steps:
-        found["defects"] = len(steps["defects"].get("defects", []))
-    found["verdict"] = next((verdict for verdict in VERDICTS if verdicts[verdict]), None)
+        figures["defects"] = len(steps["defects"].get("defects", []))
+    figures["verdict"] = next((verdict for verdict in VERDICTS if verdicts[verdict]), None)
     if results["checks"]:
         passed = sum(bool(check["passed"]) for check in results["checks"])
-        found |= {"checks_passed": passed, "checks_missed": len(results["checks"]) - passed}
-    return {name: found[name] for name in COLUMNS if found.get(name) is not None}
+        figures |= {"checks_passed": passed, "checks_missed": len(results["checks"]) - passed}
+    return {name: figures[name] for name in COLUMNS if figures.get(name) is not None}
 
 
-def _said(name: str, step: Mapping[str, Any]) -> str:
+def _with_status(name: str, step: Mapping[str, Any]) -> str:
     status = step.get("status", "ok")
     return name if status == "ok" else f"{name} ({status})"
 
 
-def _preassembled(step: Mapping[str, Any], found: Figures) -> Counter[str]:
+def _add_preassembly(step: Mapping[str, Any], figures: Figures) -> Counter[str]:
     verdicts = Counter(str(joint.get("verdict")) for joint in step.get("joints", []) if joint.get("verdict"))
-    found.update({f"joints_{name}": verdicts[name] for name in VERDICTS} if verdicts else {})
+    figures.update({f"joints_{name}": verdicts[name] for name in VERDICTS} if verdicts else {})
     for error in ("splicing", "linear"):
-        for figure in ("mean", "max"):
-            found[f"{error}_{figure}_mm"] = step.get(f"{error}_error", {}).get(figure)
+        for statistic in ("mean", "max"):
+            figures[f"{error}_{statistic}_mm"] = step.get(f"{error}_error", {}).get(statistic)
     return verdicts + _count(chain.get("verdict") for chain in step.get("chain_limits", []))
 
 
-def _balls(step: Mapping[str, Any], found: Figures) -> Counter[str]:
+def _add_spheres(step: Mapping[str, Any], figures: Figures) -> Counter[str]:
     flags = [ball.get("flag") for ball in step.get("balls", [])]
-    there = len(flags) - flags.count("not-found")
-    found |= {"balls_found": there, "balls_flagged": len(flags) - flags.count("ok")}
+    present = len(flags) - flags.count("not-found")
+    figures |= {"balls_found": present, "balls_flagged": len(flags) - flags.count("ok")}
     return _count((ball.get("movement") or {}).get("verdict") for ball in step.get("balls", []))
 
 
 def _count(verdicts: Iterable[Any]) -> Counter[str]:
-    return Counter(one for one in verdicts if one in VERDICTS)
+    return Counter(verdict for verdict in verdicts if verdict in VERDICTS)

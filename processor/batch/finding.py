@@ -1,4 +1,4 @@
-"""The inputs below a folder: scan folders, scene files, and scan files that lie about."""
+"""The inputs below a folder: scan folders, scene files, and single scan files."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ PROJECT, SCANS = "project.toml", "scans"
 MARKS = (PROJECT, "design.json", "design.csv")
 RESULTS = ("results.json", "results.h5")
 NOT_INPUTS = ("truth.h5", "results.h5", "design.csv", "picks.csv", "deviation.csv", "stations.json")
-STATE = ".batch"  # of a batch, in its folder of results
-PROSE = (".txt", ".csv", ".asc")  # may be anything
+STATE = ".batch"  # folder of a batch's state, in that of its results
+PROSE = (".txt", ".csv", ".asc")  # may hold anything
 PEEK = 1 << 16
 POINT = re.compile(rb"^[^\w+-]*(?:[+-]?\d[\d.,eE+-]*[\s;,|]+){2}[+-]?\d", re.M)
 
@@ -29,39 +29,39 @@ class Input:
 
 
 @dataclass
-class Found:
-    """The inputs, and what looks like one and is left out, with the reason."""
+class Inputs:
+    """The inputs, and the reasons by name of what looks like one and is left out."""
 
     inputs: list[Input] = field(default_factory=list)
     left_out: dict[str, str] = field(default_factory=dict)
 
 
-def find(root: Path, out: Path) -> Found:
-    """Find every input below ``root``, in the order of their names; nothing in ``out``, and no link is followed.
+def find(root: Path, out: Path) -> Inputs:
+    """Find every input below ``root`` outside ``out``, in the order of their names; links are not followed.
 
-    A folder with project.toml or a design is one input with all that is in it. So is any other below ``root`` that
-    holds scans, in itself or in scans/, and no further inputs; where it does hold some, its scan files are an input
-    each, as those of ``root`` are.
+    A folder with project.toml or a design is one input with all its content. So is any other folder below ``root``
+    with scans, in itself or in scans/, and no further inputs. If it has further inputs, each of its scan files is an
+    input, as are those of ``root``.
     """
-    found = Found()
-    found.inputs = sorted(_look(root, "", out, found), key=lambda one: os.fsencode(one.name))
-    return found
+    left_out: dict[str, str] = {}
+    inputs = sorted(_search(root, "", out, left_out), key=lambda each: os.fsencode(each.name))
+    return Inputs(inputs, left_out)
 
 
-def _look(folder: Path, name: str, out: Path, found: Found) -> list[Input]:
+def _search(folder: Path, name: str, out: Path, left_out: dict[str, str]) -> list[Input]:
     if folder == out:
         return []
     try:
         entries = sorted(os.scandir(folder), key=lambda entry: os.fsencode(entry.name))
     except OSError as error:
-        found.left_out[name or "."] = f"cannot be read ({error.strerror or error})"
+        left_out[name or "."] = f"cannot be read ({error.strerror or error})"
         return []
     names = {entry.name for entry in entries}
     if STATE in names or names.issuperset(RESULTS):
-        found.left_out[name or "."] = "holds results of an earlier run"
+        left_out[name or "."] = "holds results of an earlier run"
         return []
     if names.intersection(MARKS):
-        _name_inner(folder, name, found)
+        _leave_out_inner(folder, name, left_out)
         return [Input(name or ".", folder)]
     below: list[Input] = []
     scans: list[Input] = []
@@ -73,20 +73,20 @@ def _look(folder: Path, name: str, out: Path, found: Found) -> list[Input]:
             continue
         if entry.is_symlink():
             if entry.is_dir() or _is_scan(path) or _is_scene(path):
-                found.left_out[inner] = "a link; the batch follows none"
+                left_out[inner] = "a link; the batch follows none"
         elif readers.is_closed(path):
             scans.append(Input(inner, path))
         elif entry.is_dir():
             in_scans = in_scans or (entry.name == SCANS and _holds_scans(path))
-            below += _look(path, inner, out, found)
+            below += _search(path, inner, out, left_out)
         elif _is_scene(path):
             scenes.append(Input(inner, path, True))
         elif _is_scan(path):
             scans.append(Input(inner, path))
         elif path.suffix.lower() in readers.SUFFIXES and entry.name not in NOT_INPUTS:
-            found.left_out[inner] = "holds no rows of coordinates, so it is taken for no scan"
-    # scans/ belongs to this folder where nothing else is in it that would be an input of its own.
-    only_scans = in_scans and [one.name for one in below] == [f"{name}/{SCANS}".lstrip("/")]
+            left_out[inner] = "holds no rows of coordinates, so it is taken for no scan"
+    # scans/ belongs to this folder unless something else in it would be an input of its own.
+    only_scans = in_scans and [each.name for each in below] == [f"{name}/{SCANS}".lstrip("/")]
     if not scenes and ((only_scans and (name or not scans)) or (name and scans and not below)):
         return [Input(name or ".", folder)]
     return [*below, *scenes, *scans]
@@ -106,21 +106,21 @@ def _is_scan(path: Path) -> bool:
         with path.open("rb") as file:
             head = file.read(PEEK)
     except OSError:
-        return True  # a scan that cannot be read is to be reported, not passed over
+        return True  # reported later as a scan that cannot be read
     return bool(POINT.search(head.replace(b"\0", b"")))
 
 
 def _holds_scans(folder: Path) -> bool:
     try:
-        return any(readers.is_closed(one) or _is_scan(one) for one in folder.iterdir())
+        return any(readers.is_closed(path) or _is_scan(path) for path in folder.iterdir())
     except OSError:
         return False
 
 
-def _name_inner(folder: Path, name: str, found: Found) -> None:
-    """Name projects within a scan folder: they are taken as parts of it, and not run."""
+def _leave_out_inner(folder: Path, name: str, left_out: dict[str, str]) -> None:
+    """List projects within a scan folder, which are parts of it, as left out."""
     for place, folders, files in os.walk(folder):
-        folders[:] = sorted(one for one in folders if not one.startswith("."))
+        folders[:] = sorted(each for each in folders if not each.startswith("."))
         if PROJECT in files and Path(place) != folder:
             inner = Path(name, Path(place).relative_to(folder))
-            found.left_out[str(inner)] = f"lies within the scan folder {name or '.'}"
+            left_out[str(inner)] = f"lies within the scan folder {name or '.'}"

@@ -1,22 +1,19 @@
-"""What is kept of a job: one small file, written whole or not at all.
+"""The record of a job: one small file with hashes of what the results were made from, and figures for the summary.
 
-Of a job with results it lies among them, so that both come to be there by one renaming; of one that failed, beside
-those of the other jobs that did. It says what the results were made from, by hashes, and the figures for the summary.
+The record of a job with results lies among them, so that one renaming puts both in place. Records of failed jobs lie
+together in a folder of the batch's state.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
-import tempfile
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from processor.model import InputError
+from processor.store.store import replacing
 
 FORMAT, FORMAT_VERSION = "processor-batch-job", "1.0"
 RECORD, RESULTS = "job.json", "results.json"
@@ -26,7 +23,7 @@ FAILED = "failed"
 
 @dataclass(frozen=True)
 class Record:
-    """A job as it ended. ``status`` is done | in-part | limit-missed | failed; ``identity`` what it was made from."""
+    """How a job ended. ``status``: done | in-part | limit-missed | failed; ``identity``: hash of what it depends on."""
 
     input: str
     identity: str
@@ -35,68 +32,45 @@ class Record:
     input_sha256: str = ""
     results_sha256: str = ""
     figures: dict[str, Any] = field(default_factory=dict)
-    limits: dict[str, float] = field(default_factory=dict)  # that ended it, by name
-    lasting: bool = True  # False: nothing of the input; it may go well the next time
+    limits: dict[str, float] = field(default_factory=dict)  # by name, of those that ended it
+    lasting: bool = True  # False: the failure is not the input's, and the job is tried again
     kept: bool = False  # from an earlier run of the batch
     seconds: float = 0.0
     peak_mb: float = 0.0
 
 
 def identity(input_sha256: str, parameters: Mapping[str, Any], software: Mapping[str, str]) -> str:
-    """SHA-256 (hex) of all that a result depends on."""
-    made_from = {"input": input_sha256, "parameters": parameters, "software": software}
-    return hashlib.sha256(json.dumps(made_from, sort_keys=True).encode()).hexdigest()
+    """Return the SHA-256 (hex) of all that a result depends on."""
+    parts = {"input": input_sha256, "parameters": parameters, "software": software}
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()
 
 
 def read(path: Path) -> Record | None:
-    """Read a record; None where there is none that can be read."""
+    """Read a record; None if there is none that can be read."""
     try:
-        found = json.loads(path.read_text("utf-8"))
-        if (found.pop("format"), found.pop("format_version")) != (FORMAT, FORMAT_VERSION):
+        stored = json.loads(path.read_text("utf-8"))
+        if (stored.pop("format"), stored.pop("format_version")) != (FORMAT, FORMAT_VERSION):
             return None
-        names = {one.name for one in fields(Record)}
-        return Record(**{name: value for name, value in found.items() if name in names})
+        names = {each.name for each in fields(Record)}
+        return Record(**{name: value for name, value in stored.items() if name in names})
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 
 
 def write(path: Path, record: Record) -> None:
-    """Write a record. Raises InputError where that cannot be done."""
+    """Write a record. Raises InputError if it cannot be written."""
     text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(record)}, indent=1, allow_nan=False)
     write_text(path, text + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that is there whole, or as it was before. Raises InputError where it cannot be written."""
-    temporary = ""
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:100]}-", suffix=".tmp", dir=path.parent)
-        with open(handle, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.chmod(temporary, 0o644)
-        os.replace(temporary, path)
-        sync(path.parent)
-    except OSError as error:
-        raise InputError(f"{path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        if temporary:
-            with suppress(OSError):
-                os.unlink(temporary)
-
-
-def sync(folder: Path) -> None:
-    """Wait until what a folder holds is known to the disk."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    """Write a file whole, or leave it as it was. Raises InputError if it cannot be written."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, "utf-8", newline="")
 
 
 def sha256_of(path: Path) -> str:
-    """SHA-256 (hex) of a small file; empty where it cannot be read."""
+    """Return the SHA-256 (hex) of a small file; empty if it cannot be read."""
     try:
         return hashlib.sha256(path.read_bytes()).hexdigest()
     except OSError:

@@ -29,14 +29,14 @@ FILES = (CSV, JSON, PAGE, TIMINGS)
 FORMAT, FORMAT_VERSION = "processor-batch", "1.0"
 STATES = ("done", "in-part", "limit-missed", FAILED)
 ENDS = ("report", "log", "input_sha256")  # of a row, after the reason
-FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # how a cell begins that a spreadsheet would execute
+FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
 TONES = {"done": "good", "in-part": "between", "limit-missed": "bad", FAILED: "bad"}
 VERDICT_TONES = {"pass": "good", "fail": "bad", "indeterminate": "between"}
 
 
 @dataclass(frozen=True)
 class Summary:
-    """What became of the inputs: how many of each state, and the page that says it."""
+    """How many inputs came to each state, the page that lists them, and those that failed."""
 
     counts: Mapping[str, int]
     page: Path
@@ -44,7 +44,7 @@ class Summary:
 
 
 def remove(out: Path) -> None:
-    """Take an earlier summary away."""
+    """Remove an earlier summary."""
     for name in FILES:
         (out / name).unlink(missing_ok=True)
 
@@ -52,22 +52,22 @@ def remove(out: Path) -> None:
 def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, str], lang: str = "en") -> Summary:
     """Write the summary of all jobs into ``out``, its page in the language ``lang``.
 
-    Raises InputError where it cannot be written.
+    Raises InputError if it cannot be written.
     """
-    rows = [_row(out, job, one) for job, one in done]
-    states = Counter(one.status for _, one in done)
+    rows = [_row(out, job, ending) for job, ending in done]
+    states = Counter(ending.status for _, ending in done)
     counts = {name: states[name] for name in STATES}
     left = sorted((readable(name), readable(reason)) for name, reason in left_out.items())
     columns = ["input", "status", "verdict", *(name for name in COLUMNS if name != "verdict"), "reason", *ENDS]
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, "units": "mm", "counts": counts}
     named = [{"input": name, "reason": reason} for name, reason in left]
-    found = head | {"inputs": rows, "left_out": named}
+    content = head | {"inputs": rows, "left_out": named}
     record.write_text(out / CSV, _csv(columns, ([row.get(name) for name in columns] for row in rows)))
-    record.write_text(out / JSON, json.dumps(found, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
-    times = ([readable(one.input), one.status, one.seconds, one.peak_mb, "yes" if one.kept else ""] for _, one in done)
+    record.write_text(out / JSON, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    times = ([readable(r.input), r.status, r.seconds, r.peak_mb, "yes" if r.kept else ""] for _, r in done)
     record.write_text(out / TIMINGS, _csv(["input", "status", "seconds", "peak_mb", "kept"], times))
     try:
-        record.write_text(out / PAGE, _html(rows, counts, left, lang))  # last: where it is, all is
+        record.write_text(out / PAGE, _html(rows, counts, left, lang))  # last: it is there only if all are
     except InputError:
         remove(out)
         raise
@@ -76,18 +76,18 @@ def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, 
 
 
 def readable(text: str) -> str:
-    """Return a name as it can be written as UTF-8 on one line: what cannot, is escaped."""
+    """Return a name on one line, with bytes that are not UTF-8 escaped."""
     plain = os.fsencode(text).decode("utf-8", "backslashreplace")
-    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in plain)
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in plain)
 
 
-def _row(out: Path, job: Job, one: Record) -> dict[str, Any]:
-    with_results = one.status != FAILED
-    row: dict[str, Any] = {"input": readable(one.input), "status": one.status}
-    row |= {"verdict": None, "reason": readable(one.reason), **one.figures}
+def _row(out: Path, job: Job, ending: Record) -> dict[str, Any]:
+    with_results = ending.status != FAILED
+    row: dict[str, Any] = {"input": readable(ending.input), "status": ending.status}
+    row |= {"verdict": None, "reason": readable(ending.reason), **ending.figures}
     row["report"] = _link(out, job.place / "report.html") if with_results else ""
     row["log"] = _link(out, job.log) if job.log.is_file() else ""
-    return row | {"input_sha256": one.input_sha256}
+    return row | {"input_sha256": ending.input_sha256}
 
 
 def _link(out: Path, path: Path) -> str:

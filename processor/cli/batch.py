@@ -1,11 +1,12 @@
-"""Commands of ``processor`` about folders: many of them as a batch, and a first project.toml for one."""
+"""Command ``processor batch``: many inputs below one folder."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -13,7 +14,27 @@ from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, 
 from processor.model import UsageError
 
 if TYPE_CHECKING:
+    from processor.batch.batch import Settings
     from processor.batch.record import Record
+
+
+@dataclass(frozen=True)
+class BatchOptions:
+    """The options of the command, as click has them."""
+
+    output: Path
+    jobs: int | None
+    cluster: str | None
+    timeout_s: float
+    memory_mb: int | None
+    retry: bool
+    steps: tuple[str, ...]
+    methods: tuple[str, ...]
+    params: Path | None
+    units: str | None
+    seed: int | None
+    lang: str
+    as_json: bool
 
 
 @click.command()
@@ -33,110 +54,68 @@ if TYPE_CHECKING:
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 @click.pass_context
-def batch(
-    context: click.Context,
-    root: Path,
-    output: Path,
-    jobs: int | None,
-    cluster: str | None,
-    timeout_s: float,
-    memory_mb: int | None,
-    retry: bool,
-    steps: tuple[str, ...],
-    methods: tuple[str, ...],
-    params: Path | None,
-    units: str | None,
-    seed: int | None,
-    lang: str,
-    as_json: bool,
-) -> None:
+def batch(context: click.Context, /, root: Path, **options: Any) -> None:
     """Process every scan folder, scene file and scan file below ROOT, each in a process of its own.
 
     Run again, it goes on where it was: what is done is kept while input, parameters and software are the same. Writes
     a folder of results for each input, index.html, summary.csv and summary.json. Exit codes: 1 where an input failed
     (it is listed), 4 where none did and an accuracy limit was missed.
     """
+    from processor.batch import batch as whole
+    from processor.jobs.runner import StoppedError
+
+    chosen = BatchOptions(**options)
+    try:
+        summary = whole.run(_settings(root, chosen), say, lambda record: _report_input(record, chosen.as_json))
+    except StoppedError:
+        context.exit(IN_PART)
+    counts = {name: count for name, count in summary.counts.items() if count}
+    if chosen.as_json:
+        click.echo(json.dumps({"event": "summary", "counts": summary.counts, "page": str(summary.page)}))
+    else:
+        click.echo(f"{summary.page}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
+    if summary.failed:
+        context.exit(IN_PART)
+    context.exit(LIMIT_MISSED if "limit-missed" in counts else IN_PART if "in-part" in counts else DONE)
+
+
+def _settings(root: Path, options: BatchOptions) -> Settings:
+    """Check the options and turn them into the settings of a batch."""
     from processor import pipeline
     from processor.batch import batch as whole
 
-    if jobs is not None and cluster is not None:
+    if options.jobs is not None and options.cluster is not None:
         raise UsageError("--jobs and --cluster exclude each other: a cluster does as many at a time as it has workers")
-    parameters = pipeline.read_params(params)
-    if steps or methods or parameters:  # what is wrong with them is said once, not by every input
-        pipeline.plan(steps or tuple(pipeline.step_modules()), methods, parameters, seed)
-    given = {"--steps": ",".join(steps), "--method": ",".join(methods), "--seed": "" if seed is None else str(seed)}
-    given["--lang"] = lang
-    settings = whole.Settings(
-        root,
-        output,
-        tuple(text for name, value in given.items() if value for text in (name, value)),
-        params.read_bytes() if params else b"",
-        {
-            "steps": steps,
-            "methods": methods,
-            "seed": seed,
-            "lang": lang,
+    parameters = pipeline.read_params(options.params)
+    if options.steps or options.methods or parameters:  # wrong names are reported once, not by every input
+        pipeline.plan(options.steps or tuple(pipeline.step_modules()), options.methods, parameters, options.seed)
+    seed = "" if options.seed is None else str(options.seed)
+    arguments = {"--steps": ",".join(options.steps), "--method": ",".join(options.methods), "--seed": seed}
+    arguments["--lang"] = options.lang
+    return whole.Settings(
+        root=root,
+        out=options.output,
+        arguments=tuple(text for name, value in arguments.items() if value for text in (name, value)),
+        params=options.params.read_bytes() if options.params else b"",
+        parameters={
+            "steps": options.steps,
+            "methods": options.methods,
+            "seed": options.seed,
+            "lang": options.lang,
             "params": json.loads(json.dumps(parameters, default=str)),
         },
-        units,
-        jobs or 1,
-        cluster,
-        timeout_s,
-        memory_mb,
-        retry,
-        lang=lang,
-    )
-
-    def ended(one: Record) -> None:
-        if as_json:
-            click.echo(json.dumps({"event": "input", **dataclasses.asdict(one)}))
-        elif one.status == "failed":
-            say(f"{one.input}: failed: {one.reason}")
-
-    try:
-        found = whole.run(settings, say, ended)
-    except whole.StoppedError:
-        context.exit(IN_PART)
-    counts = {name: count for name, count in found.counts.items() if count}
-    if as_json:
-        click.echo(json.dumps({"event": "summary", "counts": found.counts, "page": str(found.page)}))
-    else:
-        click.echo(f"{found.page}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
-    context.exit(
-        IN_PART
-        if found.failed
-        else LIMIT_MISSED
-        if "limit-missed" in counts
-        else IN_PART
-        if "in-part" in counts
-        else DONE
+        units=options.units,
+        jobs=options.jobs or 1,
+        cluster=options.cluster,
+        timeout_s=options.timeout_s,
+        memory_mb=options.memory_mb,
+        retry=options.retry,
+        lang=options.lang,
     )
 
 
-@click.command()
-@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
-@click.option("--force", is_flag=True, help="replace the project.toml that is there")
-@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
-def init(folder: Path, force: bool, as_json: bool) -> None:
-    """Write FOLDER/project.toml as its files suggest: kind, units, design, and which scan is which component.
-
-    Components are told by their names and by their shape against the design. What was unsure is said, and marked in
-    the file: look at it before the first run.
-    """
-    from processor.scan_folder import guess
-    from processor.store import store
-
-    path = folder / guess.PROJECT
-    if path.exists() and not force:
-        raise UsageError(f"{path}: is there already; --force replaces it")
-    found = guess.guess(folder)
-    text = guess.written(found)
-    with store.replacing(path) as temporary:
-        temporary.write_text(text, "utf-8")
+def _report_input(record: Record, as_json: bool) -> None:
     if as_json:
-        click.echo(json.dumps(guess.as_json(found), ensure_ascii=False))
-        return
-    click.echo(f"{path}: kind {found.kind}, {len(found.scans)} file(s) of scans")
-    for one in found.unsure:
-        click.echo(f"? {one}")
+        click.echo(json.dumps({"event": "input", **dataclasses.asdict(record)}))
+    elif record.status == "failed":
+        say(f"{record.input}: failed: {record.reason}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -43,19 +44,7 @@ class _Diameters(click.Command):
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print compare.json")
 @click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
-def compare(
-    reference: Path,
-    compared: Path,
-    output: Path,
-    core: Path | None,
-    normal_diameter: float | None,
-    projection_diameter: float | None,
-    max_depth: float | None,
-    registration_error: float,
-    normals: Path | None,
-    lang: str,
-    as_json: bool,
-) -> None:
+def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: bool, **options: Any) -> None:
     """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
 
     All lengths are in the clouds' own unit; what is not given is made from their density.
@@ -63,11 +52,9 @@ def compare(
     from processor.compare import compare as comparing
     from processor.report import comparison
 
-    comparison.check_output(output, (reference, compared, core, normals))
-    request = comparing.Request(
-        reference, compared, core, normals, normal_diameter or 0.0, projection_diameter or 0.0, max_depth or 0.0,
-        registration_error,
-    )  # fmt: skip
+    lengths = ("normal_diameter", "projection_diameter", "max_depth")
+    request = comparing.Request(reference, compared, **options | {name: options[name] or 0.0 for name in lengths})
+    comparison.check_output(output, (reference, compared, request.core, request.normals))
     record = comparison.write(output, comparing.compare(request, say), lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))

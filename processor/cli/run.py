@@ -8,15 +8,13 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from processor import __version__
-from processor.cli import batch, compare
+from processor.cli import batch, compare, init, validate
 from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, named, say
-from processor.model import InputError, Metric, Statistic
-from processor.progress import stage
+from processor.model import InputError, Metric, Statistic, Status
+from processor.version import __version__
 
 if TYPE_CHECKING:
-    from processor.evaluation.evaluate import ErrorReport
-    from processor.pipeline import Execution
+    from processor.api.runs import Results
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
@@ -29,8 +27,9 @@ def commands() -> None:
 
 
 commands.add_command(batch.batch)
-commands.add_command(batch.init)
+commands.add_command(init.init)
 commands.add_command(compare.compare)
+commands.add_command(validate.validate)
 
 
 @commands.command()
@@ -58,35 +57,13 @@ def run(
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
-    from processor import pipeline
-    from processor.evaluation.evaluate import evaluate
-    from processor.report import results_folder
-    from processor.scan_folder import fingerprint
+    from processor.api import runs
 
-    if not input_.exists():
-        raise InputError(f"{input_}: there is no such file or folder")
-    results_folder.check_output(output, input_)
-    parameters = pipeline.read_params(params)
-    if steps:
-        pipeline.plan(steps, methods, parameters, seed)  # what is wrong with the names is said before long reading
-    before = fingerprint.signature(input_.resolve(), output.resolve())
-    piecewise = pipeline.is_large(input_)
-    with stage(f"reading {input_.name}"):
-        scene = pipeline.read(input_, units, piecewise)
-    jobs = pipeline.plan(steps or pipeline.steps_for(scene), methods, parameters, seed)
-    if piecewise and not pipeline.streams(jobs):
-        piecewise = False
-        scene = pipeline.read(input_, units)
-    say(f"{input_.name}: read as {scene.units} ({scene.units_reason})")
-    execution = pipeline.execute(input_, scene, jobs, say, piecewise)
-    report = evaluate(input_, execution)
-    fingerprint.check_unchanged(input_.resolve(), before, output.resolve())
-    with stage("drawing and writing the report"):
-        results_folder.write(output, execution, report, lang)
-    _show(context, output, execution, report, as_json)
+    results = runs.run(input_, output, steps, methods, params, units, seed, lang=lang, log=say)
+    _show(context, output, results, as_json)
 
 
-def _show(context: click.Context, output: Path, execution: Execution, report: ErrorReport, as_json: bool) -> None:
+def _show(context: click.Context, output: Path, results: Results, as_json: bool) -> None:
     """Print what was found and set the exit code."""
     from processor.report import all_tables, results_folder
     from processor.report import table as report_table
@@ -94,12 +71,12 @@ def _show(context: click.Context, output: Path, execution: Execution, report: Er
     if as_json:
         click.echo((output / results_folder.RESULTS).read_text("utf-8"), nl=False)
     else:
-        for table in all_tables.all_of(execution, report):
+        for table in all_tables.all_of(results.execution, results.report):
             if table.on_terminal:
                 click.echo(report_table.plain_text(table) + "\n")
         click.echo(f"report: {output / 'report.html'}")
-    complete = all(one.result.status == "ok" for one, _ in all_tables.grouped(execution.runs))
-    context.exit(LIMIT_MISSED if not report.passed else DONE if complete else IN_PART)
+    complete = all(result.status == Status.OK for result in results.steps.values())
+    context.exit(LIMIT_MISSED if not results.report.passed else DONE if complete else IN_PART)
 
 
 @commands.command()
@@ -112,15 +89,14 @@ def _show(context: click.Context, output: Path, execution: Execution, report: Er
 def report(context: click.Context, output: Path, input_: Path, units: str | None, lang: str, as_json: bool) -> None:
     """Check and report again what is in OUT, without running its steps on INPUT anew."""
     from processor import pipeline
+    from processor.api import runs
     from processor.evaluation.evaluate import evaluate
     from processor.report import results_folder
 
     results_folder.check_output(output, input_)
     execution = pipeline.read_execution(output / results_folder.RUNS, input_, units)
-    found = evaluate(input_, execution)
-    with stage("drawing and writing the report"):
-        results_folder.write(output, execution, found, lang)
-    _show(context, output, execution, found, as_json)
+    results = runs.write(runs.Results(execution, evaluate(input_, execution)), output, lang)
+    _show(context, output, results, as_json)
 
 
 @commands.command()
@@ -169,47 +145,3 @@ def _read_results(output: Path) -> dict[str, Any]:
     if found.get("format") != "processor-results" or not isinstance(found.get("checks"), list):
         raise InputError(f"{path}: expected results of processor, found something else")
     return found
-
-
-@commands.command()
-@click.argument("matrix", metavar="[MATRIX.toml]", required=False, type=click.Path(path_type=Path, dir_okay=False))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of all nights")
-@click.option("--jobs", type=click.IntRange(min=1), help="cells at a time  [default: 1]")
-@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers do them, e.g. tcp://10.0.0.1:8786")
-@click.option("--full", is_flag=True, help="the cells that are marked full as well")
-@click.option("--history", type=click.Path(path_type=Path, dir_okay=False), help="[default: history.sqlite in OUT]")
-@click.option("--night", metavar="YYYY-MM-DD", help="whose seeds are used  [default: today, UTC]")
-@click.option("--again", is_flag=True, help="do all of a night again that other software began")
-@click.option("--accept", is_flag=True, help="do nothing but accept what got worse in the night as the new level")
-@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the pages")
-@click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
-@click.pass_context
-def validate(
-    context: click.Context,
-    matrix: Path | None,
-    output: Path,
-    jobs: int | None,
-    cluster: str | None,
-    full: bool,
-    history: Path | None,
-    night: str | None,
-    again: bool,
-    accept: bool,
-    lang: str,
-    as_json: bool,
-) -> None:
-    """Make, run and check a matrix of scenes, and say what changed since the nights before.
-
-    Without MATRIX.toml the default one, which covers every step. Run again, it goes on where it was.
-    Exit codes: 0 done, 1 some cells failed, 4 a limit was missed or a figure got worse.
-    """
-    from processor.validation import command
-
-    if jobs is not None and cluster is not None:
-        raise click.UsageError("--jobs and --cluster exclude each other: a cluster has as many processes as workers")
-    if accept:
-        click.echo(command.accept(output, history, night))
-        return
-    told = command.run(matrix, output, jobs or 1, cluster, full, history, night, again, lang)
-    click.echo(json.dumps(told.as_object(), ensure_ascii=False) if as_json else told.line)
-    context.exit(LIMIT_MISSED if not told.passed else IN_PART if told.failed else DONE)

@@ -43,10 +43,8 @@ class Params:
     cell_mm: float = 0.0
     false_alarms: float = 1.0
     per_m2: float = 100.0
-    systematic_mm: float = (
-        0.02  # systematic error of a surface by the scanner, one sd, independent of the number of points
-    )
-    edge_mm: float = 8.0  # border of every face that is left out, as beams there hit other faces too
+    systematic_mm: float = 0.02  # systematic error of a surface by the scanner, one sd, however many points
+    edge_mm: float = 8.0  # border of every face that is left out: beams there hit other faces too
     align: bool = True  # fit stations and whole to the design before the search
     registration_error_mm: float = math.nan  # one standard deviation; nan = from the fit to the design
     pictures: int = 200  # most defects with a picture

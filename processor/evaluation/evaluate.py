@@ -45,15 +45,20 @@ def _check_of(step: str) -> Callable[[Scene, Any, Truth], list[Metric]]:
 
 
 def evaluate(path: Path, execution: Execution) -> ErrorReport:
-    """Check every run against the truth of the input at ``path``; empty where it holds none.
+    """Compare every run with the truth of the input at ``path``; empty where it holds none.
 
-    The name of a check begins with the method's where the run was made for comparison. Raises InputError for a truth
-    that cannot be read, or is that of another scene.
+    Raises InputError for a truth that cannot be read, or is that of another scene.
     """
     source = folder.truth_file(path)
     truth = None if source is None else store.read_truth(source, labels=execution.stored is None)
-    if source is None or truth is None:
-        return ErrorReport()
+    return ErrorReport() if source is None or truth is None else against(truth, execution, str(source))
+
+
+def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:
+    """Compare every run with a truth, which ``source`` names in errors.
+
+    A metric of a run made for comparison names the method. Raises InputError for a truth of another scene.
+    """
     metrics: list[Metric] = []
     answered: set[str] = set()
     for run in execution.runs:

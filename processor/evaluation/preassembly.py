@@ -169,8 +169,8 @@ def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: 
 def _at_stations(edge: Floats, line: Polyline) -> Floats:
     """Points of an edge as built at the design's stations."""
     arc = line.nearest(edge)[0]
-    count = max(1, int(line.length / errors.STATION_MM))
-    at = errors.STATION_MM * (np.arange(count) + 0.5)
+    count = max(1, int(line.length / errors.INTERVAL_MM))
+    at = errors.INTERVAL_MM * (np.arange(count) + 0.5)
     return np.stack([np.interp(at, arc, edge[:, k]) for k in range(3)], axis=1)
 
 

@@ -18,7 +18,7 @@ from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
-from processor.language.messages import messages
+from processor.language.messages import Text, messages
 from processor.model import Word
 
 if sys.version_info >= (3, 11):
@@ -67,6 +67,10 @@ class Language:
 
     def say(self, text: Any, within: str = "") -> str:
         """Write a message, or translate a text where it is known; ``within`` distinguishes words of two senses."""
+        if isinstance(text, Text) and text.values is None:
+            special = self.words.get(f"heading|{text.template}")
+            if special is not None or text.template not in messages(self.code).texts:
+                text, within = text.template, within or "heading"
         if not isinstance(text, str) or isinstance(text, Word):
             return messages(self.code).text(text)
         if not self.words:

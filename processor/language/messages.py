@@ -36,10 +36,13 @@ NO_NUMBER = "–"
 
 @dataclass(frozen=True)
 class Text:
-    """A text of the program's own: its English template, and the values of the template's fields."""
+    """A text of the program's own: its English template, and the values of the template's fields.
+
+    Without values (None) the template is a text without fields, whatever braces it has.
+    """
 
     template: str
-    values: Mapping[str, Any] = field(default_factory=dict)
+    values: Mapping[str, Any] | None = field(default_factory=dict)
 
     def __str__(self) -> str:
         """Return the text in English."""
@@ -49,6 +52,11 @@ class Text:
 def text(template: str, /, **values: Any) -> Text:
     """Return a :class:`Text`."""
     return Text(template, values)
+
+
+def label(english: str) -> Text:
+    """Return a text without fields, which may be a name: translated where a catalogue has exactly this text."""
+    return Text(english, None)
 
 
 Message = Text | Reason | Word
@@ -66,14 +74,20 @@ class Messages(string.Formatter):
             self.reasons |= sections.get("reasons", {})
             self.texts |= sections.get("texts", {})
             self.words |= sections.get("words", {})
+        for sections in catalogue(code).values():  # sections of steps that are not converted yet
+            for section in sections.values():
+                known: Any = section.get("words", {})
+                for key, value in (known if isinstance(known, dict) else {}).items():
+                    self.texts.setdefault(key.split("|")[-1], value)
 
     def text(self, message: Any) -> str:
         """Write a message, a list of messages, a number, or a name, which stays as it is."""
         if isinstance(message, Text):
-            return self.vformat(self.texts.get(message.template, message.template), (), message.values)
+            template = self.texts.get(message.template, message.template)
+            return template if message.values is None else self.vformat(template, (), message.values)
         if isinstance(message, Reason):
-            template = self.reasons.get(message.code)
-            return message.code if template is None else self.vformat(template, (), message.values)
+            known = self.reasons.get(message.code)
+            return message.code if known is None else self.vformat(known, (), message.values)
         if isinstance(message, Word):
             word = str(message)
             return self.words.get(f"{type(message).__name__}.{word}", self.words.get(word, word))
@@ -99,6 +113,10 @@ class Messages(string.Formatter):
         stop, space = ("。", "") if self.code == "zh" else (".", " ")
         written = (self.text(one) for one in reasons)
         return space.join(one[:1].upper() + one[1:] + ("" if one.endswith((stop, "?")) else stop) for one in written)
+
+    def of_scripts(self, scripts: str) -> dict[str, str]:
+        """Return the texts that the page's own scripts show: those that stand there between quotation marks."""
+        return {key: value for key, value in self.texts.items() if f'"{key}"' in scripts}
 
     def rendered(self, data: Any) -> Any:
         """Write all messages within dictionaries and lists; all else stays as it is."""

@@ -1,1 +1,1 @@
-"""The parts of virtual preassembly: attitude, features, matching, errors."""
+"""Virtual preassembly of arch bridges from scans of their parts."""

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from processor.model import UsageError
-from processor.preassembly.baselines.edge_features import BoxParams, SliceParams
-from processor.preassembly.baselines.joint_alignment import MatchParams
-from processor.preassembly.parts.systematic_errors import SystematicParams
-from processor.preassembly.verdicts.trim_and_shim import TrimParams
 
 PAPER_METHODS = ("design-aided", "line", "corner")
 METHODS = ("adjustment", *PAPER_METHODS)  # the first is the default
@@ -23,6 +20,86 @@ class AdjustParams:
     def __post_init__(self) -> None:
         if not self.weight > 0.0:
             raise UsageError(f"preassemble.adjust.weight: expected a number above 0, got {self.weight!r}")
+
+
+@dataclass(frozen=True)
+class SystematicParams:
+    """Standard deviations of the errors common to all points of a scan; 0 = not stated."""
+
+    registration_mm: float = 0.0  # of the stations of one scan against each other, each axis
+    offset_mm: float = 0.0  # zero offset of the scanner
+    scale_ppm: float = 0.0
+    temperature_C: float = 0.0  # of the steel's stated temperature
+
+    def __post_init__(self) -> None:
+        for key, value in self.__dict__.items():
+            if not 0.0 <= value < math.inf:
+                raise UsageError(f"preassemble.systematic.{key}: expected 0 or more, got {value!r}")
+
+    @property
+    def known(self) -> bool:
+        """Whether anything was stated."""
+        return any(value > 0.0 for value in self.__dict__.values())
+
+
+@dataclass(frozen=True)
+class TrimParams:
+    """Parameters of the proposals (mm)."""
+
+    cut_sd_mm: float = 1.0  # of a cut or build-up, at the corners of the section
+    aim_mm: float = 0.0  # wanted gap after it, less the design's root gap
+    least_mm: float = 0.5  # less, at its deepest, is not worth a cut or build-up
+
+    def __post_init__(self) -> None:
+        amounts = self.cut_sd_mm, self.least_mm
+        if not (all(0.0 <= amount < math.inf for amount in amounts) and math.isfinite(self.aim_mm)):
+            raise UsageError(f"preassemble.trim: expected numbers, cut_sd_mm and least_mm of 0 or more, got {self}")
+
+
+@dataclass(frozen=True)
+class BoxParams:
+    """Parameters of the reduced boxes (mm); the paper's values where it gives them."""
+
+    joint_zone_mm: float = 500.0  # length of the joint's zone
+    edge_box_mm: float = 42.0  # L_edge: 1.5 times the plates' thickness
+    box_count: int = 10  # boxes an edge
+    box_range: float = 0.4  # k1, k2 run from -range to +range
+    search_offset_mm: float = 200.0  # of P beyond the end
+    line_threshold_mm: float = 5.0  # of the RANSAC line
+    line_probability: float = 0.99
+    line_iterations: int = 500
+    distance_threshold: float = 1.0  # d_t in spacings
+    denoise_neighbours: int = 20
+    denoise_ratio: float = 3.0
+
+
+@dataclass(frozen=True)
+class SliceParams:
+    """Parameters of the slices; the paper's values where it gives them."""
+
+    thickness: float = 0.5  # of a slice, in spacings
+    check_thickness: float = 4.0  # of a slice for the linear error, in spacings
+    search_offset_mm: float = 200.0  # of the lines l1, l2 outside the part's bounding box
+    filter_radius: float = 4.0  # of the radius filter, in spacings or slices, whichever is longer
+    filter_neighbours: int = 3
+    direction_radius: float = 20.0  # neighbourhood of the direction filter, in the same unit
+    direction_limit_deg: float = 30.0  # from the part's main direction
+
+
+@dataclass(frozen=True)
+class MatchParams:
+    """Parameters of the registration (mm); PFH with 5 bins and ICP as in the paper."""
+
+    pfh_bins: int = 5
+    pfh_voxel_mm: float = 100.0  # features are thinned to this before the histograms
+    pfh_radius_mm: float = 500.0
+    pfh_tolerance_mm: float = 100.0
+    pfh_iterations: int = 2000
+    pfh_limit_deg: float = 15.0  # largest turn of the coarse pose from the principal axes' attitude
+    pfh_limit_mm: float = 500.0  # largest move of a feature point from its place by joint and attitude
+    icp_max_distance_mm: float = 200.0
+    icp_iterations: int = 200
+    icp_tolerance: float = 1e-7
 
 
 @dataclass(frozen=True)

@@ -1,9 +1,8 @@
 """Virtual preassembly of an arch bridge from scans of its parts: ``adjustment``, or the source paper's three methods.
 
-``adjustment`` registers every part to its design and adjusts the whole chain at once, with an interval for every gap.
-``corner`` (the paper's W1) chains the parts by the four corners of each joint, ``line`` (W2) by the points on the
-joint's edges, ``design-aided`` (W3) by these and the bottom edges held against the design's. They are baselines: their
-band is what they make of parts as designed, and their key points lie on the plates' inner edges. Source: paper 000.
+``adjustment`` registers every part to its design and adjusts the whole chain at once, with an interval for every gap,
+see :mod:`processor.preassembly.assemble`. The paper's methods are baselines, see
+:mod:`processor.preassembly.baselines.methods`.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "run"]
 
 NAME = "preassemble"
 NEEDS: tuple[str, ...] = ()
-KEEPS = True  # methods keep for each other what they have in common
+KEEPS = True  # methods share intermediate results
 KIND = "arch-bridge"
 
 
 def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Result:
     """Assemble the bridge of a scene by one of METHODS.
 
-    What the paper's three have in common, the features of the parts, is ``kept`` for the next of them.
+    The features of the parts, common to the paper's three methods, are ``kept`` for the next of them.
     Raises InputError without an arch design or with a part that has no scan, UsageError for an unknown method.
     """
     if params.method not in METHODS:
@@ -41,26 +40,26 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
     scans = scans_in_order(scene, design)
     if params.method == "adjustment":
         return assemble.assemble(scans, scene, design, params)
-    several = [part.name for part, own in zip(design.parts, scans, strict=True) if len(own) > 1]
+    several = [part.name for part, of_part in zip(design.parts, scans, strict=True) if len(of_part) > 1]
     if several:
         raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")
     kept = {} if kept is None else kept
     if "parts" not in kept:
-        kept["parts"] = methods.extract([own[0] for own in scans], design, params)
-        kept["scanned again"] = bootstrap_bands.scanned_again(kept["parts"], design, params)
+        kept["parts"] = methods.extract([of_part[0] for of_part in scans], design, params)
+        kept["scanned again"] = bootstrap_bands.repeat_scans(kept["parts"], design, params)
     result = methods.assemble(kept["parts"], design, params)
     result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != assemble.REFERENCE_C:
-        said = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
-        result = replace(result, message=f"{result.message}; {said}")
+        remark = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
+        result = replace(result, message=f"{result.message}; {remark}")
     return result
 
 
 def scans_in_order(scene: Scene, design: ArchDesign) -> list[list[Scan]]:
     """Return the scans of each part in the design's order. Raises InputError for a part without any."""
     scans = [[scan for scan in scene.scans if scan.component == part.name] for part in design.parts]
-    for part, own in zip(design.parts, scans, strict=True):
-        if not own:
+    for part, of_part in zip(design.parts, scans, strict=True):
+        if not of_part:
             named = ", ".join(sorted(scan.component or scan.name for scan in scene.scans))
             raise InputError(
                 f"{scene.name}: expected a scan of component {part.name!r}, found none "

@@ -28,6 +28,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from processor.jobs.child import end_with_parent
+from processor.jobs.process import end, isolated, start
 from processor.model import InputError
 from processor.readers import common
 from processor.readers.common import RawScan
@@ -38,9 +40,7 @@ PATIENCE = 4.0  # times as long by the clock: the machine may be busy with other
 START_S = 120.0
 ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column")
 SMALL = 1 << 16
-START = (
-    "import json, sys; sys.path[:] = json.loads(sys.argv[1]); from processor.readers import sandbox; sandbox.serve()"
-)
+START = "from processor.readers import sandbox; sandbox.serve()"
 
 
 @dataclass
@@ -52,9 +52,9 @@ class _Helper:
         """End the process and return its exit code, negative for a signal."""
         self.channel.close()
         with contextlib.suppress(subprocess.TimeoutExpired):
-            return self.process.wait(0.5)
-        self.process.kill()
-        return self.process.wait()
+            self.process.wait(0.5)
+        end(self.process)
+        return int(self.process.returncode)
 
 
 _helper: _Helper | None = None
@@ -98,13 +98,11 @@ def _running() -> _Helper:
         _helper.end()
     ours, theirs = socket.socketpair()
     with theirs:
-        process = subprocess.Popen(
-            [sys.executable, "-I", "-c", START, json.dumps(sys.path), str(theirs.fileno())],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            pass_fds=[theirs.fileno()],
+        process = start(
+            isolated(START, str(theirs.fileno())),
             env={**os.environ, "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"},
+            pass_fds=[theirs.fileno()],
+            own_group=False,
         )
     ours.settimeout(START_S)
     try:
@@ -227,9 +225,9 @@ class _Shared:
     def place(self, array: Any) -> int:
         """Offset of an array's content in the shared memory, where it is put if it is not there yet."""
         address = _address(array)
-        for start, size, offset in self.blocks:
-            if start <= address and address + array.nbytes <= start + size:
-                return offset + address - start
+        for first, size, offset in self.blocks:
+            if first <= address and address + array.nbytes <= first + size:
+                return offset + address - first
         offset = self.end
         self.end += -(-array.nbytes // 16) * 16
         os.ftruncate(self.descriptor, self.end)
@@ -263,7 +261,8 @@ def _limit_memory(slack: int) -> None:
 
 def serve() -> None:
     """Answer requests until the other side closes."""
-    channel = socket.socket(fileno=int(sys.argv[2]))
+    end_with_parent()
+    channel = socket.socket(fileno=int(sys.argv[1]))
     for name in ("laspy", "pye57"):
         importlib.import_module(name)
     for number in (signal.SIGPROF, signal.SIGALRM):

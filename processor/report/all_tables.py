@@ -6,7 +6,8 @@ import math
 from collections.abc import Sequence
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import StepRun
+from processor.language.messages import Text, label, text
+from processor.model import METRIC_NAMES, Metric, StepRun
 from processor.pipeline import Execution
 from processor.report import section
 from processor.report.table import Table
@@ -21,12 +22,24 @@ def of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> lis
 
 def of_checks(report: ErrorReport) -> Table:
     """Table of all checks against the truth."""
-    rows = tuple((m.step, m.name, m.value, m.limit, m.unit, _outcome(m.limit, m.passed)) for m in report.metrics)
-    return Table("Checks against the truth", ("step", "check", "value", "limit", "unit", "outcome"), rows, "checks")
+    rows = tuple(
+        (label(m.step), metric_name(m), m.value, m.limit, m.unit, _outcome(m.limit, m.passed)) for m in report.metrics
+    )
+    columns = ("step", "check", "value", "limit", "unit", "outcome")
+    return Table(text("Checks against the truth"), columns, rows, "checks")
 
 
-def _outcome(limit: float, passed: bool) -> str:
-    return "for information" if math.isnan(limit) else "passed" if passed else "MISSED"
+def metric_name(metric: Metric) -> Text:
+    """Return the name of a figure as a text."""
+    template = METRIC_NAMES.get(metric.statistic, "{quantity}, {statistic}")
+    name = text(template, quantity=label(metric.quantity), statistic=metric.statistic)
+    return text("{method}: {figure}", method=metric.method, figure=name) if metric.method else name
+
+
+def _outcome(limit: float, passed: bool) -> Text:
+    if math.isnan(limit):
+        return text("for information")
+    return text("passed") if passed else text("MISSED")
 
 
 def all_of(execution: Execution, report: ErrorReport) -> list[Table]:

@@ -13,8 +13,8 @@ import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language import language
-from processor.language.messages import messages, text
-from processor.model import StepRun, Word
+from processor.language.messages import Text, label, messages, text
+from processor.model import Scene, StepRun, Word
 from processor.pipeline import Execution
 from processor.report import all_tables, section, view
 from processor.report.style import Drawn
@@ -50,7 +50,6 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
     environment.filters["shown"] = shown
     environment.filters["say"] = language(lang).say
     scene = execution.scene
-    points = sum(len(scan.points) for scan in scene.scans)
     live = {
         run.step: data
         for run, others in all_tables.grouped(execution.runs)
@@ -59,13 +58,9 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
     script, digest = view.script()
     page: str = environment.get_template("page.html").render(
         title=scene.name,
-        input_said=(
-            f"{scene.kind}, {len(scene.scans)} scan{'' if len(scene.scans) == 1 else 's'}, "
-            f"{f'{points:,} points' if points else 'points left in the file'}. "
-            f"Coordinates read as {scene.units} ({scene.units_reason}). All lengths in mm."
-        ),
+        about=_about(scene),
         lang=lang,
-        live=view.embedded({"words": language(lang).of_scripts(script), "steps": language(lang).in_figures(live)}),
+        live=view.embedded({"words": messages(lang).of_scripts(script), "steps": language(lang).in_figures(live)}),
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),
@@ -73,6 +68,24 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
     return page
+
+
+def _about(scene: Scene) -> Text:
+    """State the kind of a scene, its size, and how its coordinates were read."""
+    points = sum(len(scan.points) for scan in scene.scans)
+    template = (
+        "{kind}, {scans} {scans:?scan|scans}, {points:,} points. "
+        if points
+        else ("{kind}, {scans} {scans:?scan|scans}, points left in the file. ")
+    )
+    return text(
+        template + "Coordinates read as {units} ({reason}). All lengths in mm.",
+        kind=label(scene.kind),
+        scans=len(scene.scans),
+        points=points,
+        units=scene.units,
+        reason=label(scene.units_reason),
+    )
 
 
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
@@ -86,18 +99,24 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
             title, body = f"{report_of.title}: {head}", f"Method {run.method}. {said}".strip()
         found.append({"tone": _tone(run), "head": title, "text": body})
         found += [{"tone": "", "head": head, "text": text} for head, text in report_of.further(run.result)]
-    if report.metrics:
-        limited = [m for m in report.metrics if m.limit == m.limit]
-        missed = [m for m in limited if not m.passed]
-        head = (
-            f"Truth: {len(missed)} of {len(limited)} limits missed" if missed else f"Truth: {len(limited)} limits kept"
-        )
-        informed = len(report.metrics) - len(limited)
-        said = "; ".join(f"{m.step}: {m.name}" for m in missed) or f"{informed} further figures have no limit"
-        found.append({"tone": "bad" if missed else "good", "head": head, "text": said})
-    else:
-        found.append({"tone": "", "head": "No truth", "text": "a real scan: nothing to check against"})
-    return found
+    return [*found, _truth(report)]
+
+
+def _truth(report: ErrorReport) -> dict[str, Any]:
+    """Summarise the checks against the truth."""
+    if not report.metrics:
+        return {"tone": "", "head": text("No truth"), "text": text("a real scan: nothing to check against")}
+    limited = [metric for metric in report.metrics if metric.limit == metric.limit]
+    missed = [metric for metric in limited if not metric.passed]
+    if not missed:
+        head = text("Truth: {limited} limits kept", limited=len(limited))
+        body = text("{free} further figures have no limit", free=len(report.metrics) - len(limited))
+        return {"tone": "good", "head": head, "text": body}
+    head = text("Truth: {missed} of {limited} limits missed", missed=len(missed), limited=len(limited))
+    names = [
+        text("{step}: {figure}", step=label(metric.step), figure=all_tables.metric_name(metric)) for metric in missed
+    ]
+    return {"tone": "bad", "head": head, "text": text("{names}", names=names)}
 
 
 def _tone(run: StepRun) -> str:
@@ -135,7 +154,15 @@ def _sections(
     if report.metrics:
         checks = _table(all_tables.of_checks(report), lang)
         sections.append(
-            {"title": "Truth", "message": "", "lead": [], "tables": [checks], "figures": [], "live": False, "step": ""}
+            {
+                "title": text("Truth"),
+                "message": "",
+                "lead": [],
+                "tables": [checks],
+                "figures": [],
+                "live": False,
+                "step": "",
+            }
         )
     return sections
 
@@ -152,9 +179,9 @@ def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
 
 
 def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
-    note = table.note
+    note: Any = table.note
     if len(table.rows) > MOST_ROWS:
-        note: Any = text(
+        note = text(
             "{note} The first {most} of {rows} rows; all are in {file}.csv.",
             note=note,
             most=MOST_ROWS,
@@ -165,7 +192,7 @@ def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
         "title": table.title,
         "note": note,
         "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
-        "columns": list(zip(table.columns, headings(table), numeric(table), strict=True)),
+        "columns": list(zip(table.columns, map(label, headings(table)), numeric(table), strict=True)),
         "rows": [
             [_cell(cell, column, lang) for cell, column in zip(row, table.columns, strict=True)]
             for row in table.rows[:MOST_ROWS]

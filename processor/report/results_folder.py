@@ -22,14 +22,14 @@ OWN_NAMES = (RESULTS, RUNS, "report.html", "figures", "job.json")  # the last is
 OWN_ENDINGS = (".csv", ".dxf", ".pdf")
 
 
-def check_output(out: Path, source: Path, mark: str = RESULTS, own: Collection[str] = OWN_NAMES) -> None:
+def check_output(out: Path, source: Path | None, mark: str = RESULTS, own: Collection[str] = OWN_NAMES) -> None:
     """Refuse a folder that holds anything but earlier results, for it will be replaced as a whole: UsageError.
 
     Earlier results are known by the file ``mark`` among files of their ``own`` names.
     """
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; name a folder for the results")
-    if source.resolve().is_relative_to(out.resolve()):
+    if source is not None and source.resolve().is_relative_to(out.resolve()):
         raise UsageError(f"{out}: holds the input {source}, which the results would replace; name another folder")
     inside = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
     if inside and mark not in inside:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.language.messages import Message, Text, messages, text
+from processor.language.messages import Message, Text, label, messages, text
 from processor.model import Checked, Reason, StepRun
 
 NAN = float("nan")
@@ -43,7 +43,7 @@ def figures_of(title: str, runs: Sequence[StepRun], file: str) -> Table:
     rows = tuple(
         (heading, *(column[i][1] for column in columns), unit) for i, (heading, _, unit) in enumerate(columns[0])
     )
-    return Table(text(title), ("figure", *(run.method for run in runs), "unit"), rows, file)
+    return Table(label(title), ("figure", *(run.method for run in runs), "unit"), rows, file)
 
 
 def _figures(result: Checked) -> Iterator[tuple[Message, Any, str]]:
@@ -56,10 +56,10 @@ def _figures(result: Checked) -> Iterator[tuple[Message, Any, str]]:
         unit = "%" if percent else field.metadata.get("unit", "")
         if isinstance(value, np.ndarray):
             low, high = (value * (100.0 if percent else 1.0)).tolist() if value.size else (NAN, NAN)
-            yield text("{quantity}, from", quantity=text(heading)), low, unit
-            yield text("{quantity}, to", quantity=text(heading)), high, unit
+            yield text("{quantity}, from", quantity=label(heading)), low, unit
+            yield text("{quantity}, to", quantity=label(heading)), high, unit
         else:
-            yield text(heading), 100.0 * value if percent else value, unit
+            yield label(heading), 100.0 * value if percent else value, unit
 
 
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # how a cell begins that a spreadsheet would execute

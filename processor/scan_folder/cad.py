@@ -10,7 +10,6 @@ import importlib.util
 import json
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -19,8 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from processor import __version__
+from processor.jobs import process
 from processor.model import Floats, InputError, Ints
+from processor.version import __version__
 
 SUFFIXES = (".step", ".stp", ".ifc")
 LIMIT_S = 900.0  # designgen has a limit of its own, with a better message, below this one
@@ -124,17 +124,10 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
 def _run(command: list[str], source: Path, out: Path, unit: str) -> str:
     """Run designgen import; what it says where there are no meshes in the end."""
     units = ["--units", unit] if unit else []
-    try:
-        done = subprocess.run(
-            [*command, "import", str(source), "-o", str(out), *units],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            timeout=LIMIT_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
+    ended = process.run([*command, "import", str(source), "-o", str(out), *units], own_group=False, timeout_s=LIMIT_S)
+    if ended.cause is process.Cause.TIME:
         return f"designgen import did not end within {LIMIT_S:g} s"
     if (out / SAID).is_file():
         return ""
-    lines = done.stderr.decode("utf-8", "replace").strip().splitlines()
-    return lines[-1].removeprefix("error: ") if lines else f"designgen import ended with exit code {done.returncode}"
+    code = -ended.code if ended.cause is process.Cause.SIGNAL else ended.code
+    return ended.last_line.removeprefix("error: ") or f"designgen import ended with exit code {code}"

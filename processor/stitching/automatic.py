@@ -1,20 +1,18 @@
-"""Method ``automatic``: scans placed by the structure they saw, then adjusted all at once."""
+"""Method ``automatic``: scans registered by the planar faces of the structure, coarsely and then all together."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import rigid
+from processor.geometry import parallel, rigid
 from processor.model import Floats, Scan
 from processor.stitching import three_point
-from processor.stitching import three_point as stitching_three_point  # fmt: skip
 from processor.stitching.coarse import network, pairwise
-from processor.stitching.coarse.pairwise import Placing, View
+from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 from processor.stitching.fine import (
     bundle_adjustment,
     contradictions,
@@ -24,135 +22,156 @@ from processor.stitching.fine import (
     pair_checks,
 )
 from processor.stitching.fine.bundle_adjustment import Solution
-from processor.stitching.fine.contradictions import Dissent
-from processor.stitching.fine.correspondences import Blocks
+from processor.stitching.fine.contradictions import Contradiction
+from processor.stitching.fine.correspondences import Blocks, CellTable
 from processor.stitching.fine.pair_checks import Pair
 from processor.stitching.params import Params
 from processor.stitching.planes import scan_planes
 from processor.stitching.planes.scan_planes import Cloud
+from processor.stitching.three_point import Picked
 
-GATES = (0.25, 0.15, 0.08)  # how far faces of scans may still be apart, by cells' side
-REACH = 6.0  # the same of what only ends of faces tell
-END_GATES = (0.1, 0.05)  # and once these have been looked at
-LAST = 5  # adjustments at most without a gate
-STILL_MM = 0.02
+# Lengths in sides of the cells.
+GATES = (0.25, 0.15, 0.08)  # distance of faces of different scans that are taken as one, from adjustment to adjustment
+REACH = 6.0  # the same along motions that only the ends of faces determine
+END_GATES = (0.1, 0.05)  # distance of ends from the faces that bound them, in the first adjustments with ends
+MOST_FINAL = 5  # adjustments without a gate
+STILL_MM = 0.02  # largest shift of a pose at convergence
 
 
 @dataclass(frozen=True)
-class Found:
-    """All that ``automatic`` finds, in the clouds' own frames; rows of ``pair_overlap`` are those of ``pairs``."""
+class RegisteredScans:
+    """Poses, covariance and checks of scans, in the frames of their clouds."""
 
     clouds: list[Cloud]
-    placed: network.Placed
+    coarse: network.CoarsePoses
     solution: Solution
-    blocks: Blocks
     pairs: list[Pair]
-    overlap: list[float]
-    elsewhere: list[bool]
-    gross: list[bool]
-    dissent: list[Dissent]  # about each scan's pose
-    refuted: Floats  # (k,), see placing.refuted
+    overlap: list[float]  # of each pair
+    elsewhere: list[bool]  # whether the best candidate pose of each pair is not the adjusted one
+    contradictions: list[Contradiction]  # of each scan's pose
+    refuted: Floats  # (k,), see network.refuted
 
 
-def stitch(
-    scans: Sequence[Scan], params: Params, reference: int, picked: stitching_three_point.Picked, threads: int = 0
-) -> Found:
-    """Place and adjust scans; see :class:`Found`. Pairs that were picked have the picks' pose among those tried."""
-    with ThreadPoolExecutor(threads or _usable()) as pool:
-        own = list(pool.map(lambda scan: scan_planes.prepared(scan, params.cell_mm), scans))
-        side = pairwise.side_of(own)
-        views = list(pool.map(lambda cloud: pairwise.view(cloud, side), own))
-        tilt = 2e-3 * params.levelled_mrad if params.levelled_mrad else np.inf
-        keys = list(itertools.combinations(range(len(own)), 2))
-        lists = list(pool.map(lambda key: _candidates(views, key, tilt, picked), keys))
-    candidates = dict(zip(keys, lists, strict=True))
-    placed = network.place(views, candidates, reference)
-    cells = correspondences.gather(own)
-    solution, blocks = _adjusted(own, cells, placed.T, reference)
-    measured, gross = _pairs(blocks, solution)
-    if any(gross):
-        bad = {(pair.a, pair.b) for pair, is_bad in zip(measured, gross, strict=True) if is_bad}
-        blocks = _without(blocks, bad)
-        solution = bundle_adjustment.solve(blocks, solution.T, reference)
-    solution = jackknife.honest(blocks, solution, reference)
-    standing = {key: rigid.invert(solution.T[key[0]]) @ solution.T[key[1]] for key in keys}
-    held = {
-        (a, b): pairwise.held(views[a], views[b], T, pairwise.NEAR * side, pairwise.MARGIN * side)
-        for (a, b), T in standing.items()
-        if np.isfinite(T).all()
-    }
-    elsewhere = []
-    for pair in measured:
-        first = candidates[pair.a, pair.b][:1]
-        elsewhere.append(not first or not pairwise.same(first[0].T_a_b, standing[pair.a, pair.b], side, views[pair.b]))
-    overlap = [held[pair.a, pair.b].overlap for pair in measured]
-    apart = contradictions.of_scans(cells, solution, GATES[0] * cells.size_mm)
-    refuted = network.refuted(held, len(own), reference)
-    return Found(own, placed, solution, blocks, measured, overlap, elsewhere, gross, apart, refuted)
+def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked) -> RegisteredScans:
+    """Register two or more scans in the frame of scan ``reference``, a row of ``scans``.
+
+    Candidate poses of all pairs are scored by matching patches and free space, the scans are placed by these one after
+    another, and all poses are adjusted on shared planar pieces and ends of faces. The pose by picked points is one of
+    the candidates of its pair. Scans that overlap with no other one have a pose of NaN.
+    """
+    clouds = parallel.each(lambda scan: scan_planes.extract(scan, params.cell_mm), scans)
+    patches = _sample_patches(clouds)
+    candidates = _find_candidates(patches, params, picked)
+    coarse = network.place(patches, candidates, reference)
+    cells = correspondences.gather(clouds)
+    solution, blocks = _adjust(clouds, cells, coarse.T, reference)
+    pairs = _measure_pairs(blocks, solution)
+    solution, blocks = _without_gross_pairs(blocks, solution, pairs, reference)
+    solution = jackknife.with_raised_covariance(blocks, solution, reference)
+    scores = _score_pairs(patches, solution.T)
+    return RegisteredScans(
+        clouds=clouds,
+        coarse=coarse,
+        solution=solution,
+        pairs=pairs,
+        overlap=[scores[pair.a, pair.b].overlap for pair in pairs],
+        elsewhere=[
+            _is_elsewhere(candidates[pair.a, pair.b], scores[pair.a, pair.b], patches[pair.b]) for pair in pairs
+        ],
+        contradictions=contradictions.of_scans(cells, solution, GATES[0] * cells.size_mm),
+        refuted=network.refuted(scores, len(scans), reference),
+    )
 
 
-def _usable() -> int:
-    import os
-
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
-def _candidates(
-    views: list[View], key: tuple[int, int], tilt: float, picked: stitching_three_point.Picked
-) -> list[Placing]:
-    a, b = views[key[0]], views[key[1]]
-    found = pairwise.placings(a, b, tilt)
-    if key in picked and len(a.coarse.points) and len(b.coarse.points):
-        in_a, in_b, _ = picked[key]
-        try:
-            T = three_point.tie(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b
-        except three_point.TooFewError:
-            return found
-        found.append(
-            pairwise.held(a, b, pairwise.refine(a, b, T)[0], pairwise.NEAR * a.side_mm, pairwise.MARGIN * a.side_mm)
-        )
-        found.sort(key=lambda one: -one.score)
-    return found
+def _sample_patches(clouds: list[Cloud]) -> list[ScanPatches]:
+    side = pairwise.cube_side(clouds)
+    return parallel.each(lambda cloud: pairwise.prepare(cloud, side), clouds)
 
 
-def _adjusted(own: list[Cloud], cells: correspondences.Gathered, T: Floats, reference: int) -> tuple[Solution, Blocks]:
-    """Adjust all poses, with narrowing gates for what is one face."""
+def _find_candidates(patches: list[ScanPatches], params: Params, picked: Picked) -> network.Pairs:
+    """Return the candidate poses of all pairs (a < b), the best first."""
+    most_tilt_rad = 2e-3 * params.levelled_mrad if params.levelled_mrad else np.inf
+
+    def candidates(key: tuple[int, int]) -> list[ScoredPose]:
+        a, b = patches[key[0]], patches[key[1]]
+        poses = pairwise.candidate_poses(a, b, most_tilt_rad)
+        if key in picked and len(a.patches.weight) and len(b.patches.weight):
+            poses += _pose_by_picks(a, b, *picked[key][:2])
+            poses.sort(key=lambda pose: -pose.score)
+        return poses
+
+    keys = list(itertools.combinations(range(len(patches)), 2))
+    return dict(zip(keys, parallel.each(candidates, keys), strict=True))
+
+
+def _pose_by_picks(a: ScanPatches, b: ScanPatches, in_a: Floats, in_b: Floats) -> list[ScoredPose]:
+    """Return the refined pose by picked points (n, 3) of both scans, or nothing if these determine none."""
+    try:
+        T = three_point.fit_pair(in_a - a.cloud.origin, in_b - b.cloud.origin, False).T_a_b
+    except three_point.TooFewError:
+        return []
+    return [pairwise.score_pose(a, b, pairwise.refine(a, b, T)[0])]
+
+
+def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) -> tuple[Solution, Blocks]:
+    """Adjust all poses on shared pieces with narrowing gates: faces alone, then along loose motions, then with ends."""
     if not len(cells.sums):
-        empty = np.empty(0, np.int64)
-        blocks = Blocks(empty, empty, np.empty((0, 10)), np.empty(0), empty, 0)
+        none = np.empty(0, np.int64)
+        blocks = Blocks(piece=none, scan=none, sums=np.empty((0, 10)), count=np.empty(0), kind=none, pieces=0)
         return bundle_adjustment.solve(blocks, T, reference), blocks
     for gate in GATES:
-        blocks = correspondences.shared(correspondences.pieces(cells, T, gate * cells.size_mm))
+        blocks = correspondences.segment(cells, T, gate * cells.size_mm).shared()
         T = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm).T
-    pieces = correspondences.pieces(cells, T, 0.0)
-    T = edge_constraints.settled(
-        own, pieces, bundle_adjustment.solve(correspondences.shared(pieces), T, reference), REACH * cells.size_mm
-    )
-    for end_gate in (*END_GATES, *[0.0] * LAST):
-        pieces = correspondences.pieces(cells, T, 0.0)
-        blocks = correspondences.shared(edge_constraints.bounded(own, pieces, T, end_gate * cells.size_mm))
-        before = T
-        solution = bundle_adjustment.solve(blocks, T, reference, slack_mm=end_gate * cells.size_mm)
-        T = solution.T
-        if end_gate == 0.0 and correspondences.moved_apart(T, before) < STILL_MM:
+    pieces = correspondences.segment(cells, T, 0.0)
+    faces = bundle_adjustment.solve(pieces.shared(), T, reference)
+    T = edge_constraints.resolve_loose_motions(clouds, pieces, faces, REACH * cells.size_mm)
+    for gate in (*END_GATES, *[0.0] * MOST_FINAL):
+        pieces = correspondences.segment(cells, T, 0.0)
+        blocks = edge_constraints.with_ends(clouds, pieces, T, gate * cells.size_mm).shared()
+        solution = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
+        before, T = T, solution.T
+        if gate == 0.0 and _largest_shift(T, before) < STILL_MM:
             break
     return solution, blocks
 
 
-def _pairs(blocks: Blocks, solution: Solution) -> tuple[list[Pair], list[bool]]:
-    there = np.flatnonzero(np.isfinite(solution.T).all(axis=(1, 2)))
-    found = [pair_checks.measure(blocks, solution, a, b) for a, b in itertools.combinations(there.tolist(), 2)]
-    kept = [one for one in found if one is not None]
-    return kept, [pair_checks.is_gross(one) for one in kept]
+def _largest_shift(T: Floats, S: Floats) -> float:
+    """Return the largest distance, mm, between the origins of two sets of poses (k, 4, 4)."""
+    shift = np.linalg.norm(T[:, :3, 3] - S[:, :3, 3], axis=1)
+    return float(np.nanmax(shift)) if np.isfinite(shift).any() else 0.0
 
 
-def _without(blocks: Blocks, bad: set[tuple[int, int]]) -> Blocks:
-    """Leave out pieces that only the two scans of a bad pair share."""
-    seen: dict[int, set[int]] = {}
+def _measure_pairs(blocks: Blocks, solution: Solution) -> list[Pair]:
+    """Register all pairs that share enough pieces, each by itself."""
+    placed = np.flatnonzero(np.isfinite(solution.T).all(axis=(1, 2)))
+    pairs = [pair_checks.measure(blocks, solution, a, b) for a, b in itertools.combinations(placed.tolist(), 2)]
+    return [pair for pair in pairs if pair is not None]
+
+
+def _without_gross_pairs(
+    blocks: Blocks, solution: Solution, pairs: list[Pair], reference: int
+) -> tuple[Solution, Blocks]:
+    """Adjust again without the pieces that only the two scans of a gross pair share, if there is such a pair."""
+    gross = {(pair.a, pair.b) for pair in pairs if pair.is_gross}
+    if not gross:
+        return solution, blocks
+    scans_of: dict[int, set[int]] = {}
     for piece, scan in zip(blocks.piece.tolist(), blocks.scan.tolist(), strict=True):
-        seen.setdefault(piece, set()).add(scan)
-    out = {piece for piece, who in seen.items() if len(who) == 2 and (min(who), max(who)) in bad}
+        scans_of.setdefault(piece, set()).add(scan)
+    out = {piece for piece, scans in scans_of.items() if len(scans) == 2 and (min(scans), max(scans)) in gross}
     keep = np.array([piece not in out for piece in blocks.piece.tolist()], bool)
-    return correspondences.shared(
-        Blocks(blocks.piece[keep], blocks.scan[keep], blocks.sums[keep], blocks.count[keep], blocks.kind[keep], 0)
-    )
+    blocks = blocks.take(keep).shared()
+    return bundle_adjustment.solve(blocks, solution.T, reference), blocks
+
+
+def _score_pairs(patches: list[ScanPatches], T: Floats) -> dict[tuple[int, int], ScoredPose]:
+    """Score the relative poses of all pairs of scans that have a pose in T (k, 4, 4)."""
+    placed = [s for s in range(len(T)) if np.isfinite(T[s]).all()]
+    return {
+        (a, b): pairwise.score_pose(patches[a], patches[b], rigid.invert(T[a]) @ T[b])
+        for a, b in itertools.combinations(placed, 2)
+    }
+
+
+def _is_elsewhere(candidates: list[ScoredPose], adjusted: ScoredPose, b: ScanPatches) -> bool:
+    return not candidates or not pairwise.same(candidates[0].T_a_b, adjusted.T_a_b, b.side_mm, b)

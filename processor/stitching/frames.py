@@ -1,4 +1,4 @@
-"""From clouds' own frames to those of their files and of the project, with covariances."""
+"""Covariances of poses and their differences under a change of frame. Order: rotation (rad), then translation (mm)."""
 
 from __future__ import annotations
 
@@ -9,32 +9,32 @@ from processor.model import Floats
 
 
 def about_origin(covariance: Floats, position: Floats) -> Floats:
-    """Covariance (6, 6) of turns about ``position`` (3,) and its shift, as of turns about the frame's origin."""
+    """Convert a covariance (6, 6) of a rotation about ``position`` (3,) and a shift to a rotation about the origin."""
     J = np.eye(6)
     J[3:, :3] = cross_matrix(position)
-    found: Floats = J @ covariance @ J.T
-    return found
+    converted: Floats = J @ covariance @ J.T
+    return converted
 
 
 def cross_matrix(v: Floats) -> Floats:
-    """Matrix (3, 3) that crosses ``v`` with a vector."""
+    """Return the matrix (3, 3) of the cross product v x."""
     x, y, z = v
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def turned(covariance: Floats, R: Floats) -> Floats:
-    """Covariance (6, 6) along other axes, R (3, 3)."""
+    """Rotate a covariance (6, 6) to other axes by R (3, 3)."""
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = R
-    found: Floats = J @ covariance @ J.T
-    return found
+    rotated: Floats = J @ covariance @ J.T
+    return rotated
 
 
 def of_file(T_frame_cloud: Floats, origin: Floats) -> Floats:
-    """Pose (4, 4) of a scan's file frame, of a cloud whose ``origin`` (3,) was taken off."""
+    """Return the pose (4, 4) of a scan's file frame from that of a cloud, from which ``origin`` (3,) was subtracted."""
     return rigid.with_origin(T_frame_cloud, origin)
 
 
 def difference(T: Floats, S: Floats) -> Floats:
-    """Small motion (6,) that brings S to T: turn about S's origin's place, and that place's shift."""
+    """Return the small motion (6,) that brings S to T: rotation about the origin of S, and the shift of that origin."""
     return np.concatenate([rigid.vector_from_rotation(T[:3, :3] @ S[:3, :3].T), T[:3, 3] - S[:3, 3]])

@@ -12,16 +12,16 @@ SCALES = ("fixed", "free")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters of both methods; zeros are worked out from the scans."""
+    """Parameters of both methods."""
 
     method: str = METHODS[0]
     seed: int = 0
-    reference: str = ""  # name of the scan that is held; empty: the first
+    reference: str = ""  # name of the scan whose pose is fixed; empty: the first
     scale: str = SCALES[0]  # three-point: fixed = six parameters with scale as a diagnostic, free = the paper's seven
-    scale_limit_ppm: float = 1000.0  # three-point: beyond, and beyond its own uncertainty, a scale is a blunder
-    cell_mm: float = 0.0  # side of the cells that points are gathered in
-    levelled_mrad: float = 0.0  # instruments stood upright within this; 0 = not relied upon
-    weak_mm: float = 5.0  # a scan whose position is less sure (one standard deviation) is called weak
+    scale_limit_ppm: float = 1000.0  # three-point: a significant scale beyond this is a blunder
+    cell_mm: float = 0.0  # side of the cells; 0 = from the density of the points
+    levelled_mrad: float = 0.0  # tilt of the instruments at most; 0 = unknown
+    weak_mm: float = 5.0  # largest standard deviations of a pose that is not called weak
     weak_mrad: float = 0.5
 
     def __post_init__(self) -> None:

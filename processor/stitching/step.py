@@ -11,8 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from processor.model import Floats, InputError, Scan, Scene, UsageError
-from processor.stitching import three_point, to_result
-from processor.stitching import three_point as stitching_three_point
+from processor.stitching import automatic, three_point, to_result
 from processor.stitching.params import METHODS, Params
 from processor.stitching.result import Result
 
@@ -48,7 +47,7 @@ def run(scene: Scene, params: Params) -> Result:
     if params.reference and params.reference not in names:
         raise UsageError(f"stitch.reference: no scan {params.reference!r}; there are {', '.join(names)}")
     reference = names.index(params.reference) if params.reference else 0
-    picked = stitching_three_point.by_pair(scene.picks, scene.scans)
+    picked = three_point.by_pair(scene.picks, scene.scans)
     if params.method == "three-point":
         network, said = _three_point(scene, picked, reference, params)
     else:
@@ -58,54 +57,53 @@ def run(scene: Scene, params: Params) -> Result:
 
 
 def _automatic(
-    scans: tuple[Scan, ...], picked: stitching_three_point.Picked, reference: int, params: Params
+    scans: tuple[Scan, ...], picked: three_point.Picked, reference: int, params: Params
 ) -> to_result.Network:
-    from processor.stitching import automatic
-
     found = automatic.stitch(scans, params, reference, picked)
     origins = np.stack([cloud.origin for cloud in found.clouds])
+    gross = [pair.is_gross for pair in found.pairs]
     messages = [
         "its own pose contradicts the others" if bad else "by itself it would stand elsewhere" if other else ""
-        for bad, other in zip(found.gross, found.elsewhere, strict=True)
+        for bad, other in zip(gross, found.elsewhere, strict=True)
     ]
     tau, noise = found.solution.tau, float(np.median([cloud.sigma_mm for cloud in found.clouds]))
     return to_result.Network(
-        found.solution.T, found.solution.covariance, origins, found.placed.rivalry, found.placed.T_rival,
-        found.placed.contrary, found.placed.overlap, found.pairs,
-        np.array(found.overlap), [not bad for bad in found.gross], messages,
-        dissent=found.dissent, refuted=found.refuted,
+        found.solution.T, found.solution.covariance, origins, found.coarse.rivalry, found.coarse.T_rival,
+        found.coarse.contrary, found.coarse.overlap, found.pairs,
+        np.array(found.overlap), [not bad for bad in gross], messages,
+        dissent=found.contradictions, refuted=found.refuted,
         spread=(noise, tau[0], tau[1]), point_mm=noise,
     )  # fmt: skip
 
 
 def _three_point(
-    scene: Scene, picked: stitching_three_point.Picked, reference: int, params: Params
+    scene: Scene, picked: three_point.Picked, reference: int, params: Params
 ) -> tuple[to_result.Network, list[str]]:
     if not picked:
         raise InputError(f"{scene.name}: method three-point needs common points; expected picks.csv in the scan folder")
     scans = scene.scans
     found, messages, scales, said = [], [], [], []
     lost: list[list[str]] = [[] for _ in scans]
-    ties: dict[tuple[int, int], three_point.Tie] = {}
+    ties: dict[tuple[int, int], three_point.PairFit] = {}
     origins = np.stack([_origin(scan) for scan in scans])
-    for (a, b), (in_a, in_b, _) in picked.items():
+    for (a, b), (in_a, in_b) in picked.items():
         try:
-            ties[a, b] = three_point.tie(in_a - origins[a], in_b - origins[b], params.scale == "free")
+            ties[a, b] = three_point.fit_pair(in_a - origins[a], in_b - origins[b], params.scale == "free")
         except three_point.TooFewError as error:
             said.append(f"pair {scans[a].name}, {scans[b].name} not used: {error}, three that span a plane are needed")
             lost[a].append(f"{error} with {scans[b].name}")
             lost[b].append(f"{error} with {scans[a].name}")
     pooled = three_point.pooled(list(ties.values())) if ties else []
     for (a, b), one in zip(ties, pooled, strict=True):
-        warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm, one.left_free)
-        if one.apart and not warning:
+        warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm, one.scaled_freedoms)
+        if one.is_outlier and not warning:
             warning = f"its picks scatter by {one.sd_mm:.2g} mm, far more than the others': a blunder among them"
         if warning:
             said.append(f"pair {scans[a].name}, {scans[b].name}: {warning}")
         found.append(three_point.as_pair(a, b, one))
         messages.append(warning)
-        scales.append((one.scale, three_point.widened(one.scale_sd, one.left_free)))
-    T, covariance = three_point.adjusted(found, len(scans), reference)
+        scales.append((one.scale, three_point.widened(one.scale_sd, one.scaled_freedoms)))
+    T, covariance = three_point.adjust(found, len(scans), reference)
     none = np.full((len(scans), 4, 4), np.nan)
     scale = np.array(scales).reshape(-1, 2)
     network = to_result.Network(

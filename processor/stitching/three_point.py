@@ -1,7 +1,7 @@
 """Method ``three-point``: pairs of scans by picked common points, chained into one frame. Source: paper 003, eq. 1-2.
 
-The paper's model x_a = t + lambda R x_b has seven parameters. A free scale takes up a blunder in one of three points
-without a trace, so six are the default, and scale is a diagnostic.
+The paper's model x_a = t + lambda R x_b has seven parameters. With three points a free scale absorbs a blunder in one
+of them without a trace. Six parameters are therefore the default, and the scale is a diagnostic.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from processor.stitching import frames
 from processor.stitching.fine.pair_checks import Pair
 
 LEAST_POINTS = 3
-LEAST_SD_MM = 1e-6  # of picks without any error, as tests make them
+LEAST_SD_MM = 1e-6  # of picks without any error, as in tests
 UNIT_SLIPS = (
     (1000.0, "m and mm"),
     (304.8, "feet and mm"),
@@ -29,40 +29,58 @@ UNIT_SLIPS = (
     (10.0, "cm and mm"),
     (3.28084, "feet and m"),
 )
-BY_CHANCE = 1e-3  # that picks of a network scatter so much in one pair
-SCALE_BY_CHANCE = 2.7e-3  # that a scale of 1 is doubted: beyond three standard deviations, were these known
-LEAST_HEIGHT = 1e-3  # of a triangle, by its longest side: nearer to a line than that is a line
+BY_CHANCE = 1e-3  # probability that the picks of any pair of a network scatter so much
+SCALE_BY_CHANCE = 2.7e-3  # probability of a scale that is called other than 1: three standard deviations, if known
+LEAST_HEIGHT = 1e-3  # of a triangle by its longest side: below this its corners count as on a line
+
+Picked = dict[tuple[int, int], tuple[Floats, Floats]]  # picks (n, 3) in the file frames of both scans, by rows a < b
+
+
+class TooFewError(ValueError):
+    """Fewer than three points, or all on a line: these determine no pose."""
 
 
 @dataclass(frozen=True)
-class Tie:
-    """One pair from picks: T_a_b (rotation and shift), scale of b in a, and how well the points agree.
+class PairFit:
+    """Pose of a pair of scans by its picks: T_a_b (rotation and shift), scale of b in a, and residuals.
 
-    ``covariance`` (6, 6): turn about a's axes at the middle of the points, and shift, carried to turns about b's
-    origin; NaN where three points leave nothing to judge by and no standard deviation was given.
+    ``covariance`` (6, 6): rotation along a's axes about the origin of b, and shift. ``freedoms`` are those that
+    ``sd_mm`` is known by; ``scaled_sd_mm`` and ``scaled_freedoms`` are the same for the difference of both scans' picks
+    with a free scale.
     """
 
     T_a_b: Floats
     scale: float
     scale_sd: float
-    residuals: Floats  # (n, 3) a less b moved, mm
+    residuals: Floats  # (n, 3) a less transformed b, mm
     sd_mm: float  # of a picked coordinate of one scan
     covariance: Floats
-    free: int  # freedoms that the standard deviation is known by
-    left_mm: float  # the same of a difference of two scans' picks, by what a free scale leaves
-    left_free: int
-    apart: bool = False  # its picks scatter more than those of the other pairs, beyond chance
+    freedoms: int
+    scaled_sd_mm: float
+    scaled_freedoms: int
+    is_outlier: bool = False  # its picks scatter more than those of the other pairs, beyond chance
 
 
-class TooFewError(ValueError):
-    """Fewer than three points, or all on a line: a pose cannot be told."""
+def by_pair(picks: Picks | None, scans: Sequence[Scan]) -> Picked:
+    """Group picks by pair of scans, the lesser row first."""
+    if picks is None:
+        return {}
+    row = {scan.name: i for i, scan in enumerate(scans)}
+    grouped: dict[tuple[int, int], list[tuple[Floats, Floats]]] = {}
+    for name_a, name_b, xa, xb in zip(picks.scan_a, picks.scan_b, picks.in_a, picks.in_b, strict=True):
+        a, b = row[name_a], row[name_b]
+        grouped.setdefault((min(a, b), max(a, b)), []).append((xa, xb) if a < b else (xb, xa))
+    return {
+        key: (np.array([xa for xa, _ in rows]), np.array([xb for _, xb in rows]))
+        for key, rows in sorted(grouped.items())
+    }
 
 
-def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
-    """Fit a pair's picked points (n, 3) of each scan, least squares; raises TooFewError.
+def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
+    """Fit a pair's picked points (n, 3) of each scan by least squares; raises TooFewError.
 
-    With six parameters three points leave three freedoms, with seven two: the standard deviation of a pick comes from
-    these. The scale is (sum of spreads in a) / (in b), the least-squares one by the moved points where it is free.
+    The standard deviation of a pick follows from the redundancy: with three points three freedoms for six parameters,
+    two for seven. The scale is the least-squares one of the rotated points.
     """
     n = len(points_a)
     if n < LEAST_POINTS:
@@ -73,134 +91,129 @@ def tie(points_a: Floats, points_b: Floats, scale_free: bool) -> Tie:
     if widths[0] <= 0.0 or widths[1] < LEAST_HEIGHT * widths[0]:
         raise TooFewError("all common points on a line")
     R = rigid.fit(b, a)[:3, :3]
-    moved = b @ R.T
-    scale = float((a * moved).sum() / (moved**2).sum())
+    rotated = b @ R.T
+    scale = float((a * rotated).sum() / (rotated**2).sum())
     used = scale if scale_free else 1.0
-    residuals = a - used * moved
-    free = 3 * n - 6 - scale_free
-    both = max(float(np.sqrt((residuals**2).sum() / free)), LEAST_SD_MM)  # of a difference: both scans' picks are in it
-    sd = both / np.sqrt(2.0)
-    # The scale's own standard deviation by what seven parameters leave: what a scale is off by is not in it.
-    left = max(float(np.sqrt(((a - scale * moved) ** 2).sum() / (3 * n - 7))), LEAST_SD_MM)
-    scale_sd = left / float(np.sqrt((moved**2).sum()))
-    J = rigid.motion(moved).reshape(-1, 6)
-    own = np.linalg.inv(J.T @ J) * both**2
+    residuals = a - used * rotated
+    freedoms = 3 * n - 6 - scale_free
+    # Of a difference, which contains the errors of both scans' picks.
+    difference_sd = max(float(np.sqrt((residuals**2).sum() / freedoms)), LEAST_SD_MM)
+    # The scale's standard deviation follows from the residuals of seven parameters, which do not contain its deviation.
+    scaled_sd = max(float(np.sqrt(((a - scale * rotated) ** 2).sum() / (3 * n - 7))), LEAST_SD_MM)
+    J = rigid.motion(rotated).reshape(-1, 6)
     T = rigid.transform(R, middle_a - used * R @ middle_b)
-    # Turns about the middle of the points -> about b's origin in a.
-    covariance = frames.about_origin(own, middle_a - T[:3, 3])
-    if scale_free:  # what the scale takes up of the way from b's origin to the points, the shift has to answer for
-        way = R @ middle_b
-        covariance[3:, 3:] += (both**2 / float((moved**2).sum())) * np.outer(way, way)
-    return Tie(T, scale, scale_sd, residuals, sd, covariance, free, left, 3 * n - 7)
+    # From rotations about the centroid of the points to rotations about the origin of b, in a.
+    covariance = frames.about_origin(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
+    if scale_free:  # the error of the scale acts on the vector from the origin of b to the points
+        arm = R @ middle_b
+        covariance[3:, 3:] += (difference_sd**2 / float((rotated**2).sum())) * np.outer(arm, arm)
+    return PairFit(
+        T_a_b=T, scale=scale, scale_sd=scaled_sd / float(np.sqrt((rotated**2).sum())), residuals=residuals,
+        sd_mm=difference_sd / np.sqrt(2.0), covariance=covariance, freedoms=freedoms,
+        scaled_sd_mm=scaled_sd, scaled_freedoms=3 * n - 7,
+    )  # fmt: skip
 
 
-def pooled(ties: list[Tie]) -> list[Tie]:
-    """Give all pairs the standard deviation of a pick that they have together.
+def pooled(fits: list[PairFit]) -> list[PairFit]:
+    """Give all pairs the standard deviation of a pick that is pooled over them.
 
-    Three points leave a pair two or three freedoms: its own standard deviation may be anything, and pairs weighed by it
-    would be weighed by luck. A pair that scatters beyond chance keeps its own. Covariances are such that 1.96 standard
-    deviations hold 95 %: with few freedoms (Student) more than the pooled one.
+    Three points leave a pair two or three freedoms: weights by its own standard deviation would be random. A pair that
+    scatters beyond chance (F test) keeps its own. Covariances are scaled such that 1.96 standard deviations contain
+    95 %: with few freedoms (Student's t) they are larger than those of the pooled standard deviation.
     """
-    used = list(ties)
+    used = list(fits)
     while True:
-        free = sum(one.free for one in used)
-        sd = float(np.sqrt(sum(one.free * one.sd_mm**2 for one in used) / free))
-        others = [(free * sd**2 - one.free * one.sd_mm**2) / max(free - one.free, 1) for one in used]
+        freedoms = sum(fit.freedoms for fit in used)
+        sd = float(np.sqrt(sum(fit.freedoms * fit.sd_mm**2 for fit in used) / freedoms))
+        rest = [max(freedoms - fit.freedoms, 1) for fit in used]
+        others = [(freedoms * sd**2 - fit.freedoms * fit.sd_mm**2) / n for fit, n in zip(used, rest, strict=True)]
         beyond = [
-            one.sd_mm**2 / max(rest, 1e-300) / f.isf(BY_CHANCE / len(ties), one.free, max(free - one.free, 1))
-            for one, rest in zip(used, others, strict=True)
+            fit.sd_mm**2 / max(variance, 1e-300) / f.isf(BY_CHANCE / len(fits), fit.freedoms, n)
+            for fit, variance, n in zip(used, others, rest, strict=True)
         ]
         if len(used) < 3 or max(beyond) <= 1.0:
             break
         del used[int(np.argmax(beyond))]
-    kept = {id(one) for one in used}
-    left_free = sum(one.left_free for one in used)
-    left = float(np.sqrt(sum(one.left_free * one.left_mm**2 for one in used) / left_free))
-    found = []
-    for one in ties:
-        apart = id(one) not in kept
-        freedoms, of = (one.free, one.sd_mm) if apart else (free, sd)
-        factor = of / one.sd_mm * float(student.isf(0.025, freedoms)) / NORMAL_95
-        own = (one.left_mm, one.left_free) if apart else (left, left_free)
-        found.append(
-            replace(
-                one, sd_mm=of, scale_sd=own[0] / one.left_mm * one.scale_sd, covariance=one.covariance * factor**2,
-                left_mm=own[0], left_free=own[1], apart=apart,
-            )
-        )  # fmt: skip
-    return found
+    scaled_freedoms = sum(fit.scaled_freedoms for fit in used)
+    scaled_sd = float(np.sqrt(sum(fit.scaled_freedoms * fit.scaled_sd_mm**2 for fit in used) / scaled_freedoms))
+    inliers = {id(fit) for fit in used}
+    return [
+        _with_sd(fit, sd, freedoms, scaled_sd, scaled_freedoms)
+        if id(fit) in inliers
+        else replace(_with_sd(fit, fit.sd_mm, fit.freedoms, fit.scaled_sd_mm, fit.scaled_freedoms), is_outlier=True)
+        for fit in fits
+    ]
 
 
-def verdict(scale: float, sd: float, limit_ppm: float, free: float = np.inf) -> str:
-    """Say what a scale other than 1 means, or nothing; ``free`` are the freedoms that ``sd`` is known by."""
+def _with_sd(fit: PairFit, sd: float, freedoms: int, scaled_sd: float, scaled_freedoms: int) -> PairFit:
+    """Scale the covariances of a pair to standard deviations that are known by so many freedoms."""
+    factor = sd / fit.sd_mm * float(student.isf(0.025, freedoms)) / NORMAL_95
+    return replace(
+        fit, sd_mm=sd, covariance=fit.covariance * factor**2, scale_sd=scaled_sd / fit.scaled_sd_mm * fit.scale_sd,
+        scaled_sd_mm=scaled_sd, scaled_freedoms=scaled_freedoms,
+    )  # fmt: skip
+
+
+def verdict(scale: float, sd: float, limit_ppm: float, freedoms: float = np.inf) -> str:
+    """Return the likely cause of a scale other than 1, or nothing; ``freedoms`` are those that ``sd`` is known by."""
     off = 1e6 * abs(scale - 1.0)
     slip = units_slip(scale)
     if slip:
         return f"scale {scale:.5g}: units mixed up ({slip})?"
-    if off <= float(student.isf(0.5 * SCALE_BY_CHANCE, free)) * 1e6 * sd:
+    if off <= float(student.isf(0.5 * SCALE_BY_CHANCE, freedoms)) * 1e6 * sd:
         return ""
     if off > limit_ppm:
         return f"scale {scale:.6f}: a blunder in the picks"
-    width = 1e6 * NORMAL_95 * widened(sd, free)
+    width = 1e6 * NORMAL_95 * widened(sd, freedoms)
     return f"scale {1e6 * (scale - 1.0):+.0f} ± {width:.0f} ppm: temperature (12 ppm a kelvin), instrument or picks"
 
 
-def widened(sd: float, free: float) -> float:
-    """Return a standard deviation such that 1.96 of it hold 95 %, of one that is known by a few freedoms alone."""
-    return float(student.isf(0.025, free)) / NORMAL_95 * sd
+def widened(sd: float, freedoms: float) -> float:
+    """Scale a standard deviation known by a few freedoms such that 1.96 of it contain 95 % (Student's t)."""
+    return float(student.isf(0.025, freedoms)) / NORMAL_95 * sd
 
 
 def units_slip(scale: float) -> str:
-    """Name the two units that a scale is the ratio of, to 2 %, or nothing."""
+    """Return the two units whose ratio a scale is, within 2 %, or nothing."""
     return next(
         (units for ratio, units in UNIT_SLIPS if min(abs(scale / ratio - 1.0), abs(scale * ratio - 1.0)) < 0.02), ""
     )
 
 
-def as_pair(a: int, b: int, found: Tie) -> Pair:
-    """Write a tie as a pair of the network."""
-    residual = float(np.sqrt((found.residuals**2).sum(axis=1).mean()))
-    return Pair(a, b, len(found.residuals), found.T_a_b, found.covariance, residual, 0.0)
+def as_pair(a: int, b: int, fit: PairFit) -> Pair:
+    """Convert the fit of scans a and b to a pair of the network."""
+    residual = float(np.sqrt((fit.residuals**2).sum(axis=1).mean()))
+    return Pair(
+        a=a, b=b, pieces=len(fit.residuals), T_a_b=fit.T_a_b, covariance=fit.covariance, residual=residual, chi2=0.0
+    )
 
 
-def adjusted(pairs: list[Pair], count: int, reference: int) -> tuple[Floats, Floats]:
-    """Poses T_ref_scan (k, 4, 4) and their covariance (6k, 6k) of a network of pairs; NaN of scans it does not reach.
+def adjust(pairs: list[Pair], count: int, reference: int) -> tuple[Floats, Floats]:
+    """Adjust a network of pairs: poses T_ref_scan (k, 4, 4) and their covariance (6k, 6k); NaN of scans not reached.
 
-    The first poses are the paper's chain, from the reference on by the surest pairs; then all pairs are adjusted.
-    Turns about the scans' own origins, along the reference's axes.
+    Initial poses are those of the paper's chain. Rotations are about the scans' own origins, along the reference's
+    axes.
     """
-    T = np.full((count, 4, 4), np.nan)
-    T[reference] = np.eye(4)
-    done = {reference}
-    order = sorted(pairs, key=lambda one: (float(np.trace(one.covariance[3:, 3:])), one.a, one.b))
-    while True:
-        one = next((p for p in order if (p.a in done) != (p.b in done)), None)
-        if one is None:
-            break
-        if one.a in done:
-            T[one.b] = T[one.a] @ one.T_a_b
-            done.add(one.b)
-        else:
-            T[one.a] = T[one.b] @ rigid.invert(one.T_a_b)
-            done.add(one.a)
-    used = [one for one in pairs if one.a in done and one.b in done]
-    free = sorted(done - {reference})
+    T = _chained(pairs, count, reference)
+    placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
+    used = [pair for pair in pairs if pair.a in placed and pair.b in placed]
+    unknown = [s for s in placed if s != reference]
     covariance = np.full((6 * count, 6 * count), np.nan)
-    own = slice(6 * reference, 6 * reference + 6)
-    covariance[own], covariance[:, own] = 0.0, 0.0
-    rows = np.array([6 * s + np.arange(6) for s in free], np.int64).ravel()
+    fixed = slice(6 * reference, 6 * reference + 6)
+    covariance[fixed], covariance[:, fixed] = 0.0, 0.0
+    rows = np.array([6 * s + np.arange(6) for s in unknown], np.int64).ravel()
     if not len(rows):
         return T, covariance
     for _ in range(10):
         N, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
-        for one in used:
-            A, r, W = _equation(one, T)
-            at = np.concatenate([6 * one.a + np.arange(6), 6 * one.b + np.arange(6)])
+        for pair in used:
+            A, r, W = _equation(pair, T)
+            at = np.concatenate([6 * pair.a + np.arange(6), 6 * pair.b + np.arange(6)])
             N[np.ix_(at, at)] += A.T @ W @ A
             g[at] += A.T @ W @ r
         step = np.zeros(6 * count)
         step[rows] = -np.linalg.solve(N[np.ix_(rows, rows)], g[rows])
-        for s in free:
+        for s in unknown:
             d = step[6 * s : 6 * s + 6]
             T[s, :3, :3] = rigid.rotation_from_vector(d[:3]) @ T[s, :3, :3]
             T[s, :3, 3] += d[3:]
@@ -210,38 +223,29 @@ def adjusted(pairs: list[Pair], count: int, reference: int) -> tuple[Floats, Flo
     return T, covariance
 
 
-def _equation(one: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the derivative (6, 12) by both scans' motions, the misclosure (6,) in a's axes, and the weight."""
-    R = T[one.a, :3, :3]
-    now = rigid.invert(T[one.a]) @ T[one.b]
-    r = frames.difference(now, one.T_a_b)
-    arm = T[one.b, :3, 3] - T[one.a, :3, 3]
+def _chained(pairs: list[Pair], count: int, reference: int) -> Floats:
+    """Chain pairs from the reference on, the smallest variance of the shift first (paper 003)."""
+    T = np.full((count, 4, 4), np.nan)
+    T[reference] = np.eye(4)
+    placed = {reference}
+    order = sorted(pairs, key=lambda pair: (float(np.trace(pair.covariance[3:, 3:])), pair.a, pair.b))
+    while pair := next((p for p in order if (p.a in placed) != (p.b in placed)), None):
+        if pair.a in placed:
+            T[pair.b] = T[pair.a] @ pair.T_a_b
+        else:
+            T[pair.a] = T[pair.b] @ rigid.invert(pair.T_a_b)
+        placed |= {pair.a, pair.b}
+    return T
+
+
+def _equation(pair: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
+    """Return the derivative (6, 12) by both scans' motions, the misclosure (6,) in a's axes, and the weight (6, 6)."""
+    R = T[pair.a, :3, :3]
+    r = frames.difference(rigid.invert(T[pair.a]) @ T[pair.b], pair.T_a_b)
+    arm = T[pair.b, :3, 3] - T[pair.a, :3, 3]
     A = np.zeros((6, 12))
     A[:3, :3], A[:3, 6:9] = -R.T, R.T
     A[3:, 3:6], A[3:, 9:] = -R.T, R.T
     A[3:, :3] = R.T @ frames.cross_matrix(arm)
-    weight: Floats = np.asarray(np.linalg.pinv(one.covariance, rcond=1e-14, hermitian=True), np.float64)
+    weight: Floats = np.asarray(np.linalg.pinv(pair.covariance, rcond=1e-14, hermitian=True), np.float64)
     return A, r, weight
-
-
-# --- Picked common points of a scene, by pair of scans.
-
-
-Picked = dict[tuple[int, int], tuple[Floats, Floats, tuple[str, ...]]]
-
-
-def by_pair(picks: Picks | None, scans: Sequence[Scan]) -> Picked:
-    """Gather picks by rows of two scans, the lesser first: points (n, 3) in each scan's file frame, and their names."""
-    if picks is None:
-        return {}
-    row = {scan.name: i for i, scan in enumerate(scans)}
-    found: dict[tuple[int, int], list[tuple[Floats, Floats, str]]] = {}
-    for name_a, name_b, point, xa, xb in zip(
-        picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True
-    ):
-        a, b = row[name_a], row[name_b]
-        found.setdefault((min(a, b), max(a, b)), []).append((xa, xb, point) if a < b else (xb, xa, point))
-    return {
-        key: (np.array([r[0] for r in rows]), np.array([r[1] for r in rows]), tuple(r[2] for r in rows))
-        for key, rows in sorted(found.items())
-    }

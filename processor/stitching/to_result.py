@@ -12,7 +12,7 @@ from processor.model import NORMAL_95, Floats, InputError, Scan, Scene
 from processor.stitching import frames
 from processor.stitching.coarse.network import AMBIGUOUS
 from processor.stitching.fine import control_points, pair_checks
-from processor.stitching.fine.contradictions import Dissent
+from processor.stitching.fine.contradictions import Contradiction
 from processor.stitching.fine.pair_checks import Pair
 from processor.stitching.params import Params
 from processor.stitching.result import Held, Result
@@ -40,7 +40,7 @@ class Network:
     scale: Floats = field(default_factory=lambda: np.empty(0))
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
     refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`placing.refuted`
-    dissent: Sequence[Dissent] = ()  # about each scan's pose, where faces hold it
+    dissent: Sequence[Contradiction] = ()  # about each scan's pose, where faces hold it
     spread: tuple[float, float, float] = (float("nan"),) * 3  # noise, patches, ends
     lost: Sequence[str] = ()  # why each scan that has no pose has none
     against: Sequence[str] = ()  # what control points have against each scan's pose

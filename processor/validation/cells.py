@@ -1,4 +1,4 @@
-"""Cells of a validation: one scene made from a recipe, run by some methods, and the figures of its checks."""
+"""Cells of a validation: a scene made from a recipe, run with some methods, and the figures of its checks."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ SEED_DIGITS = 7  # of a fresh seed, in base 16
 
 @dataclass(frozen=True)
 class Case:
-    """A scene but for its seed, and what is run on it; ``settings`` are those of ``designgen make --set``."""
+    """A scene without its seed, and what is run on it; ``settings`` are those of ``designgen make --set``."""
 
     name: str
-    recipe: str  # a name designgen knows, or the stem of a file
+    recipe: str  # a recipe of designgen, or the stem of a file
     recipe_text: str
     from_file: bool
     settings: tuple[str, ...]
@@ -35,13 +35,13 @@ class Case:
 
     @property
     def key(self) -> str:
-        """What figures of one method must share to be of the same case; the other methods are not in it."""
+        """Hash of the case without its methods: figures of one method are comparable if it is the same."""
         return _digest([self.recipe, self.recipe_text, self.settings, self.steps, dict(self.params)])
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A case with its seed; ``fixed`` seeds are those of every night."""
+    """A case with its seed; ``fixed`` seeds are the same every night."""
 
     case: Case
     seed: int
@@ -49,16 +49,16 @@ class Cell:
 
     @property
     def key(self) -> str:
-        """Hash of all that is asked for: two cells of one key have the same figures as long as the software is."""
+        """Hash of case, methods and seed: with the same software, cells of one key have the same figures."""
         return _digest([self.case.key, self.case.methods, self.seed])
 
     @property
     def title(self) -> str:
-        """Name the cell for a person."""
+        """Name of the cell in messages and tables."""
         return " ".join([self.case.name, *self.case.settings, f"seed {self.seed}"])
 
     def spec(self) -> dict[str, Any]:
-        """Return what a process elsewhere needs to do this cell, as JSON can hold it."""
+        """Return what is needed to run this cell, as JSON can hold it."""
         case = self.case
         return {
             "recipe": case.recipe,
@@ -73,7 +73,7 @@ class Cell:
 
 @dataclass(frozen=True)
 class Figure:
-    """One check of a cell. ``limit`` is NaN where there is none; a value that is not a number never keeps one."""
+    """One check of a cell. ``limit`` is NaN if there is none; a value of NaN passes no limit."""
 
     step: str
     method: str
@@ -87,13 +87,13 @@ class Figure:
 
     @property
     def passed(self) -> bool:
-        """Whether the value keeps within its limit."""
+        """Whether the value is within its limit."""
         return math.isnan(self.limit) or self.value <= self.limit
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a cell ended: ``results`` is its results.json, empty where it ``failed``; the message says why."""
+    """How a cell ended: ``results`` is its results.json, empty if it ``failed``, which is then the reason."""
 
     failed: str = ""
     results: Mapping[str, Any] = field(default_factory=dict)
@@ -102,9 +102,9 @@ class Outcome:
 
 
 def fresh_seed(case: Case, number: int, i: int) -> int:
-    """Seed ``i`` of a case in the night of that number: another one every night, and for every case.
+    """Return seed ``i`` of a case in the night of that number: another one every night, and for every case.
 
-    The figures of two cases are then independent, which the test of changes counts on.
+    The figures of two cases are then independent, as the test of changes assumes.
     """
     return int(_digest([case.key, number, i])[:SEED_DIGITS], 16)
 

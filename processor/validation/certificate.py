@@ -1,17 +1,18 @@
 """The certificate of accuracy: what was measured, on which scenes, how well, and what that does not show.
 
-In the form of ISO 15530-3, where a calibrated workpiece is measured over and over under the conditions of use: here
-the scene made by the generator is the workpiece and its truth the calibration, so u_cal = 0 but for rounding. Of each
-quantity u_p is the standard deviation of all errors, b their mean, u_b the standard uncertainty of b from the scatter
-between scenes, and, as results are not corrected by b, U = k sqrt(u_cal^2 + u_p^2 + u_b^2) + |b| with k = 2. The
-standard's u_w, for what workpieces differ in by material and make, is not in it: recipes "as built" vary the make,
-and are rows of their own.
+It has the form of ISO 15530-3, where a calibrated workpiece is measured repeatedly under the conditions of use. Here
+the scene made by the generator is the workpiece and its truth the calibration, so u_cal = 0 except for rounding. For
+each quantity u_p is the standard deviation of all errors, b their mean, and u_b the standard uncertainty of b from the
+scatter between scenes. As results are not corrected by b, U = k sqrt(u_cal^2 + u_p^2 + u_b^2) + |b| with k = 2. The
+standard's u_w, for differences of workpieces in material and make, is not included: recipes "as built" vary the make,
+and are separate rows.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import statistics
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
@@ -35,7 +36,7 @@ else:
 
 FORMAT, FORMAT_VERSION = "processor-certificate", "1.0"
 COVERAGE_FACTOR = 2.0
-LEAST_SCENES = 3  # that a scatter between scenes is taken from
+LEAST_SCENES = 3  # for a scatter between scenes
 METHOD = (
     "After ISO 15530-3 (uncertainty from repeated measurement of a calibrated workpiece): the simulated structure is "
     "the workpiece, its truth the calibration (u_cal = 0). u_p: standard deviation of all errors. b: their mean, u_b "
@@ -64,7 +65,7 @@ _Rows = dict[tuple[str, str], Row]  # of one scene, by quantity and statistic
 
 @dataclass(frozen=True)
 class Line:
-    """One quantity of one method on one kind of scene; NaN where it is not known. Lengths in ``unit``."""
+    """One quantity of one method on one kind of scene; NaN if it is not known. Lengths in ``unit``."""
 
     recipe: str
     settings: tuple[str, ...]
@@ -88,7 +89,7 @@ class Line:
 
 @dataclass(frozen=True)
 class Certificate:
-    """All lines, and what was run. ``nights``: those by this very software, from the first to the last."""
+    """All lines, and what was run. ``nights``: those of the same software, from the first to the last."""
 
     night: str
     nights: tuple[str, ...]
@@ -105,7 +106,7 @@ class Certificate:
 def make(
     night: str, rows: Sequence[Row], nights: Sequence[str], cases: Sequence[Case], software: Software, matrix: Matrix
 ) -> Certificate:
-    """Make the certificate from the figures of ``nights``, all by the present software."""
+    """Make the certificate from the figures of ``nights``, all made by the present software."""
     of_case = {case.key: case for case in cases}
     # A fixed seed is one scene, however many nights it was run in.
     scenes: dict[tuple[str, str, str], dict[int, _Rows]] = defaultdict(lambda: defaultdict(dict))
@@ -123,16 +124,16 @@ def make(
         lines += [_line(of_case[case], step, method, quantity, list(by_seed.values())) for quantity in quantities]
     order = {case.key: i for i, case in enumerate(cases)}
     by_title = {(case.recipe, case.settings): order[case.key] for case in reversed(cases)}
-    lines.sort(key=lambda one: (one.step, by_title[one.recipe, one.settings], one.method, one.quantity))
+    lines.sort(key=lambda line: (line.step, by_title[line.recipe, line.settings], line.method, line.quantity))
     return Certificate(
-        night,
-        tuple(nights),
-        software.commit,
-        software.versions,
-        matrix.name,
-        matrix.sha256,
-        {case.recipe: case.recipe_sha256 for case in cases},
-        tuple(one for one in lines if one.scenes),
+        night=night,
+        nights=tuple(nights),
+        commit=software.commit,
+        versions=software.versions,
+        matrix=matrix.name,
+        matrix_sha256=matrix.sha256,
+        recipes={case.recipe: case.recipe_sha256 for case in cases},
+        lines=tuple(line for line in lines if line.scenes),
     )
 
 
@@ -153,36 +154,36 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[_R
     u_b = math.nan
     if len(used) >= LEAST_SCENES:
         count = len(used)
-        # The mean of the scenes, weighted as the bias is.
+        # The scatter of the scenes, weighted as in the bias.
         u_b = math.sqrt(sum((n * (b - bias)) ** 2 for n, b, _ in used) * count / (count - 1.0)) / total
     of_bias = (quantity, Statistic.BIAS)
     unit = next(scene[of_bias].unit for scene in scenes if of_bias in scene)
     known_u_b = u_b if math.isfinite(u_b) else (u_p / math.sqrt(total) if total > 1 else math.nan)
     scanner, noise, density = conditions(case)
     return Line(
-        case.recipe,
-        case.settings,
-        scanner,
-        noise,
-        density,
-        step,
-        method,
-        quantity,
-        unit,
-        len(used),
-        int(total),
-        bias,
-        u_b,
-        u_p,
-        COVERAGE_FACTOR * math.hypot(u_p, known_u_b) + abs(bias),
-        _median(of(Statistic.ERROR_95)),
-        _weighted(of(Statistic.COVERAGE), numbers),
-        _weighted(of(Statistic.EFFICIENCY), numbers),
+        recipe=case.recipe,
+        settings=case.settings,
+        scanner=scanner,
+        noise=noise,
+        density=density,
+        step=step,
+        method=method,
+        quantity=quantity,
+        unit=unit,
+        scenes=len(used),
+        number=int(total),
+        bias=bias,
+        u_b=u_b,
+        u_p=u_p,
+        U95=COVERAGE_FACTOR * math.hypot(u_p, known_u_b) + abs(bias),
+        error_95=_median(of(Statistic.ERROR_95)),
+        coverage=_weighted(of(Statistic.COVERAGE), numbers),
+        efficiency=_weighted(of(Statistic.EFFICIENCY), numbers),
     )
 
 
 def conditions(case: Case) -> tuple[str, str, str]:
-    """Name scanner, noise and density of a case, from its recipe and settings."""
+    """Return the names of scanner, noise and density of a case, from its recipe and settings."""
     recipe: dict[str, Any] = tomllib.loads(case.recipe_text)
     for setting in case.settings:
         key, _, text = setting.partition("=")
@@ -193,37 +194,36 @@ def conditions(case: Case) -> tuple[str, str, str]:
         table[last] = tomllib.loads(f"value = {text}")["value"]
     scan, scanner = recipe.get("scan", {}), recipe.get("scanner", {})
     if scan.get("mode") == "rays":
-        own = ", ".join(f"{key} {value}" for key, value in scanner.items() if "noise" in key)
-        return str(scan.get("scanner", "default")), own or "the preset's", f"{scan.get('step_mrad', '?')} mrad"
+        noise = ", ".join(f"{key} {value}" for key, value in scanner.items() if "noise" in key)
+        return str(scan.get("scanner", "default")), noise or "the preset's", f"{scan.get('step_mrad', '?')} mrad"
     return "none (sampled)", f"{scan.get('sigma_mm', '?')} mm", f"{scan.get('spacing_mm', '?')} mm"
 
 
 def _median(values: Sequence[float]) -> float:
-    known = sorted(value for value in values if math.isfinite(value))
-    middle = len(known) // 2
-    return math.nan if not known else known[middle] if len(known) % 2 else 0.5 * (known[middle - 1] + known[middle])
+    finite = [value for value in values if math.isfinite(value)]
+    return statistics.median(finite) if finite else math.nan
 
 
 def _weighted(values: Sequence[float], weights: Sequence[float]) -> float:
-    known = [(v, w) for v, w in zip(values, weights, strict=True) if math.isfinite(v) and w > 0]
-    return sum(v * w for v, w in known) / sum(w for _, w in known) if known else math.nan
+    used = [(v, w) for v, w in zip(values, weights, strict=True) if math.isfinite(v) and w > 0]
+    return sum(v * w for v, w in used) / sum(w for _, w in used) if used else math.nan
 
 
 # --- as files -------------------------------------------------------------------------------------------------------
 
 
 def as_json(certificate: Certificate) -> str:
-    """Write the certificate as JSON; what is not known is null."""
-    found = {"format": FORMAT, "format_version": FORMAT_VERSION, "k": COVERAGE_FACTOR, **asdict(certificate)}
-    found["lines"] = [
+    """Return the certificate as JSON; what is not known is null."""
+    content = {"format": FORMAT, "format_version": FORMAT_VERSION, "k": COVERAGE_FACTOR, **asdict(certificate)}
+    content["lines"] = [
         {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in line.items()}
-        for line in found["lines"]
+        for line in content["lines"]
     ]
-    return json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
+    return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def as_html(certificate: Certificate, lang: str = "en") -> str:
-    """Write the certificate as a page of its own, in the language ``lang``."""
+    """Return the certificate as a page in the language ``lang``."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )

@@ -1,4 +1,4 @@
-"""What the command ``processor validate`` does with its arguments."""
+"""The command ``processor validate``."""
 
 from __future__ import annotations
 
@@ -30,30 +30,32 @@ def run(
     again: bool,
     lang: str = "en",
 ) -> Summary:
-    """Do a night; cells that fail are said on standard error, with a progress bar where that is a terminal."""
+    """Run a night; failed cells are reported on standard error, with a progress bar if that is a terminal."""
     night = _night(night)
     wanted = matrices.read(matrix or matrices.DEFAULT, full)
-    with nights.opened(out) as scratch:
-        spread = running.over_cluster(cluster) if cluster else running.over_processes(jobs, scratch)
-        with spread as runner, tqdm(total=0, unit="cell", disable=not sys.stderr.isatty()) as bar:
+    with (
+        nights.opened(out) as scratch,
+        running.opened(cluster, jobs, scratch, lambda line: print(line, file=sys.stderr)) as runner,
+        tqdm(total=0, unit="cell", disable=not sys.stderr.isatty()) as bar,
+    ):
 
-            def progress(ready: int, total: int, cell: Cell | None, outcome: Outcome | None) -> None:
-                bar.total, bar.n = total, ready
-                bar.refresh()
-                if cell is not None and outcome is not None and outcome.failed:
-                    with bar.external_write_mode(sys.stderr):
-                        print(f"{cell.title}: failed: {_printable(outcome.failed)}", file=sys.stderr)
+        def progress(ready: int, total: int, cell: Cell | None, outcome: Outcome | None) -> None:
+            bar.total, bar.n = total, ready
+            bar.refresh()
+            if cell is not None and outcome is not None and outcome.failed:
+                with bar.external_write_mode(sys.stderr):
+                    print(f"{cell.title}: failed: {_printable(outcome.failed)}", file=sys.stderr)
 
-            return nights.run(wanted, out, night, runner, history, again, progress=progress, lang=lang)
+        return nights.run(wanted, out, night, runner, history, again, progress=progress, lang=lang)
 
 
 def accept(out: Path, history: Path | None, night: str | None) -> str:
-    """Accept what got worse in a night, without its date in the last; return what to say of it."""
+    """Accept what got worse in a night, by default the last; returns the message."""
     path = history or out / nights.HISTORY
     if not path.exists():
         raise InputError(f"{path}: there is no such history; name it with --history")
     with closing(History(path)) as opened:
-        known = [one.night for one in opened.nights()]
+        known = [each.night for each in opened.nights()]
         if night is not None and _night(night) not in known:
             raise UsageError(f"--night {night}: the history has no such night")
         if not known:
@@ -69,4 +71,4 @@ def _night(night: str | None) -> str:
 
 
 def _printable(text: Any) -> str:
-    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in text)
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -1,10 +1,10 @@
 """The history of all nights: one SQLite file that can be kept for years.
 
-A cell is written with its figures in one transaction, so that whatever ends the program leaves whole cells behind;
-keys make a second row of one figure of one cell in one night impossible. The journal is a rollback journal, not WAL:
-the file is then all there is, to be copied or cached, also on a network's disk.
+A cell is written with its figures in one transaction, so that cells are whole whatever ends the program. Primary keys
+allow one row for a figure of a cell in a night. The journal is a rollback journal, not WAL: the history is then one
+file, which can be copied, cached, or lie on a network's disk.
 
-View ``rows`` has one row a figure a night with all that made it.
+View ``rows`` has one row for every figure of every night, with all that made it.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ Name = tuple[str, str, str]  # of a figure: step, method, name
 
 @dataclass(frozen=True)
 class Row:
-    """One figure of one cell in one night, as the test of changes takes it."""
+    """One figure of one cell in one night, input of the test of changes."""
 
     night: str
     case: str
@@ -84,7 +84,7 @@ class Row:
 
 @dataclass(frozen=True)
 class Night:
-    """One night as the history has it."""
+    """One night of the history."""
 
     night: str
     code: str
@@ -95,12 +95,12 @@ class Night:
 
 
 class History:
-    """An open history. Raises InputError for a file that is none, or of a later version."""
+    """An open history. Raises InputError for a file that is no history, or one of a later version."""
 
     def __init__(self, path: Path) -> None:
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            # Transactions are begun and ended below, by name.
+            # Transactions are begun and ended explicitly.
             self.db = sqlite3.connect(path, timeout=BUSY_S, isolation_level=None)
             self.db.execute("PRAGMA foreign_keys = ON")
             self.db.execute("PRAGMA synchronous = FULL")
@@ -134,15 +134,15 @@ class History:
             raise
         self.db.execute("COMMIT")
 
-    # --- a night that is under way ---------------------------------------------------------------------------------
+    # --- the present night -----------------------------------------------------------------------------------------
 
     def begun_by(self, night: str) -> str | None:
-        """Return the digest of the software a night was begun by, None where there is no such night."""
-        found = self.db.execute("SELECT code FROM nights WHERE night = ?", [night]).fetchone()
-        return None if found is None else str(found[0])
+        """Return the digest of the software that began a night; None if there is no such night."""
+        row = self.db.execute("SELECT code FROM nights WHERE night = ?", [night]).fetchone()
+        return None if row is None else str(row[0])
 
     def begin(self, night: str, software: Software, matrix: str, matrix_sha256: str, now: str) -> None:
-        """Begin a night, or go on with it."""
+        """Begin a night, or continue it."""
         with self._transaction():
             self.db.execute(
                 "INSERT INTO nights (night, code, commit_, software, matrix, matrix_sha256, begun)"
@@ -151,18 +151,18 @@ class History:
             )
 
     def forget(self, night: str) -> None:
-        """Delete a night, to be done again by other software."""
+        """Delete a night, which is to be done again by other software."""
         with self._transaction():
             self.db.execute("DELETE FROM nights WHERE night = ?", [night])
 
     def done(self, night: str) -> set[str]:
-        """Return the cells of a night that are done; those that failed are not."""
+        """Return the keys of the cells of a night that are done and did not fail."""
         return {
             str(cell) for (cell,) in self.db.execute("SELECT cell FROM cells WHERE night = ? AND failed = ''", [night])
         }
 
     def add(self, night: str, cell: Cell, outcome: Outcome) -> None:
-        """Write a cell with its figures, in place of an earlier attempt at it that failed."""
+        """Write a cell with its figures, in place of an earlier attempt that failed."""
         case = cell.case
         figures: list[Figure] = [] if outcome.failed else figures_of(outcome.results)
         with self._transaction():
@@ -197,30 +197,30 @@ class History:
                 )
 
     def end(self, night: str, changes: Iterable[tuple[Name, str, dict[str, Any]]], line: str, now: str) -> None:
-        """End a night with what changed in it: a figure's name, the kind of change, and what is said of it."""
+        """End a night with its changes: the name of the figure, the kind of change, and the change as an object."""
         with self._transaction():
             accepted = set(self._names("SELECT step, method, name FROM changes WHERE night = ? AND accepted", night))
             self.db.execute("DELETE FROM changes WHERE night = ?", [night])
             self.db.executemany(
                 "INSERT INTO changes VALUES (?, ?, ?, ?, ?, ?, ?)",
-                [[night, *name, kind, _json(said), int(name in accepted)] for name, kind, said in changes],
+                [[night, *name, kind, _json(change), int(name in accepted)] for name, kind, change in changes],
             )
             self.db.execute("UPDATE nights SET line = ?, ended = ? WHERE night = ?", [line, now, night])
 
     def accept(self, night: str) -> int:
-        """Accept what got worse in a night as the new level: how many figures."""
+        """Accept what got worse in a night as the new level; returns the number of figures."""
         with self._transaction():
             return self.db.execute(
                 "UPDATE changes SET accepted = 1 WHERE night = ? AND kind IN ('regression', 'lost') AND NOT accepted",
                 [night],
             ).rowcount
 
-    # --- what the history knows -------------------------------------------------------------------------------------
+    # --- queries -----------------------------------------------------------------------------------------------------
 
     def nights(self) -> list[Night]:
         """Return all nights, the earliest first."""
         return [
-            Night(night, code, commit, json.loads(software), ended or "", line)
+            Night(night=night, code=code, commit=commit, software=json.loads(software), ended=ended or "", line=line)
             for night, code, commit, software, ended, line in self.db.execute(
                 "SELECT night, code, commit_, software, ended, line FROM nights ORDER BY night"
             )
@@ -228,11 +228,14 @@ class History:
 
     def rows(self, first: str, last: str) -> list[Row]:
         """Return the figures of the nights from ``first`` to ``last``, the earliest first."""
+        keys = ("night", "case", "recipe", "seed", "input_sha256", "unit", "quantity", "statistic", "better")
         return [
-            Row(night, case, recipe, seed, bool(fixed), digest, (step, method, name), _number(value), unit, *named)
-            for night, case, recipe, seed, fixed, digest, step, method, name, value, unit, *named in self.db.execute(
-                "SELECT night, case_, recipe, seed, fixed, input_sha256, step, method, name, value, unit,"
-                " quantity, statistic, better"
+            Row(
+                name=(step, method, name), value=_number(value), fixed=bool(fixed), **dict(zip(keys, rest, strict=True))
+            )
+            for step, method, name, value, fixed, *rest in self.db.execute(
+                "SELECT step, method, name, value, fixed,"
+                " night, case_, recipe, seed, input_sha256, unit, quantity, statistic, better"
                 " FROM figures JOIN cells USING (night, cell) WHERE night BETWEEN ? AND ?"
                 " ORDER BY night, case_, seed, step, method, name",
                 [first, last],
@@ -241,35 +244,36 @@ class History:
 
     def missed(self, night: str) -> dict[str, list[Figure]]:
         """Return the figures of a night that are beyond their limits, by cell."""
-        found: dict[str, list[Figure]] = {}
+        beyond: dict[str, list[Figure]] = {}
         for cell, step, method, name, value, limit, unit in self.db.execute(
             "SELECT cell, step, method, name, value, limit_, unit FROM figures"
             " WHERE night = ? AND limit_ IS NOT NULL AND (value IS NULL OR value > limit_)",
             [night],
         ):
-            found.setdefault(cell, []).append(Figure(step, method, name, _number(value), _number(limit), unit))
-        return found
+            figure = Figure(step=step, method=method, name=name, value=_number(value), limit=_number(limit), unit=unit)
+            beyond.setdefault(cell, []).append(figure)
+        return beyond
 
     def cells(self, night: str) -> list[dict[str, Any]]:
         """Return the cells of a night: title, case, failed, seconds, peak_mb, fixed, seed and figures (a number)."""
         keys = ("cell", "title", "case", "failed", "seconds", "peak_mb", "fixed", "seed", "figures")
-        found = self.db.execute(
+        rows = self.db.execute(
             "SELECT cell, title, case_, failed, seconds, peak_mb, fixed, seed, (SELECT COUNT(*) FROM figures f"
             " WHERE f.night = c.night AND f.cell = c.cell) FROM cells c WHERE night = ? ORDER BY title, cell",
             [night],
         )
-        return [dict(zip(keys, row, strict=True)) for row in found]
+        return [dict(zip(keys, row, strict=True)) for row in rows]
 
     def worse(self, before: str) -> dict[Name, set[str]]:
-        """Return the earlier nights in which a figure was worse and not accepted as it was: no level to go by."""
-        found: dict[Name, set[str]] = {}
+        """Return the nights before in which a figure was worse and not accepted: they are no level to compare with."""
+        nights: dict[Name, set[str]] = {}
         for night, step, method, name in self.db.execute(
             "SELECT night, step, method, name FROM changes"
             " WHERE night < ? AND kind IN ('regression', 'lost') AND NOT accepted",
             [before],
         ):
-            found.setdefault((step, method, name), set()).add(night)
-        return found
+            nights.setdefault((step, method, name), set()).add(night)
+        return nights
 
     def _names(self, query: str, *values: str) -> list[Name]:
         return [(step, method, name) for step, method, name in self.db.execute(query, values)]

@@ -1,4 +1,4 @@
-"""JUnit XML of a night, as CI servers read it: a test case a cell, and one a figure that changed."""
+"""JUnit XML of a night, for CI servers: a test case for every cell, and one for every figure that changed."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ def xml(night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Seq
         if cell["failed"]:
             errors += 1
             ET.SubElement(case, "error", message=_clean(cell["failed"]))
-        own = missed.get(cell["cell"], ())
-        if own:
+        beyond = missed.get(cell["cell"], ())
+        if beyond:
             failures += 1
-            said = [f"{f.step} ({f.method}), {f.name}: {f.value:g} {f.unit}, limit {f.limit:g}" for f in own]
-            ET.SubElement(case, "failure", message=_clean(said[0])).text = _clean("\n".join(said))
+            lines = [f"{f.step} ({f.method}), {f.name}: {f.value:g} {f.unit}, limit {f.limit:g}" for f in beyond]
+            ET.SubElement(case, "failure", message=_clean(lines[0])).text = _clean("\n".join(lines))
     _counts(suite, len(cells), failures, errors, sum(cell["seconds"] for cell in cells))
     suite = ET.SubElement(root, "testsuite", name=f"changes.{night}")
     alarms = found.of(*ALARMS)
-    for one in alarms:
-        step, method, name = one.name
+    for change in alarms:
+        step, method, name = change.name
         case = _case(suite, f"changes.{step}.{method}", name, 0.0)
-        text = f"{one.kind}: {one.said} ({one.test} test, p {one.p:.2g}, {one.cases} cases)"
+        text = f"{change.kind}: {change.said} ({change.test} test, p {change.p:.2g}, {change.cases} cases)"
         ET.SubElement(case, "failure", message=_clean(text))
     if not alarms:
         _case(suite, "changes", f"{found.figures} figures, none worse", 0.0)
@@ -41,8 +41,8 @@ def xml(night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Seq
     return data + b"\n"
 
 
-def _case(suite: ET.Element, of: str, name: str, seconds: float) -> ET.Element:
-    return ET.SubElement(suite, "testcase", classname=_clean(of), name=_clean(name), time=f"{seconds:.3f}")
+def _case(suite: ET.Element, class_name: str, name: str, seconds: float) -> ET.Element:
+    return ET.SubElement(suite, "testcase", classname=_clean(class_name), name=_clean(name), time=f"{seconds:.3f}")
 
 
 def _counts(suite: ET.Element, tests: int, failures: int, errors: int, seconds: float) -> None:
@@ -53,5 +53,5 @@ def _counts(suite: ET.Element, tests: int, failures: int, errors: int, seconds: 
 
 
 def _clean(text: str) -> str:
-    """Leave out what XML 1.0 cannot hold."""
-    return "".join(one for one in text if one in "\t\n" or (one.isprintable() and ord(one) < 0xFFFE) or one == "\r")
+    """Remove characters that XML 1.0 does not allow."""
+    return "".join(c for c in text if c in "\t\n\r" or (c.isprintable() and ord(c) < 0xFFFE))

@@ -1,21 +1,21 @@
-"""The matrix: a TOML file that says which recipes, settings, seeds and methods are run every night.
+"""The matrix: a TOML file with the recipes, settings, seeds and methods that are run every night.
 
 Example::
 
-    fixed_seeds = [1, 2]       # of every night, for cells that name none: their figures move when the software does
-    fresh_seeds = 1            # so many more, other ones every night
+    fixed_seeds = [1, 2]       # of every night, for cells without seeds: their figures change only with the software
+    fresh_seeds = 1            # number of further seeds, which are other ones every night
 
     [[cell]]
     recipe = "frame-small"     # a name of designgen's, or a TOML file beside the matrix
     steps = ["spheres"]
     methods = ["ray", "ransac"]
     seeds = [1, 2, 3]          # fixed ones of this cell; fresh = 2: the number of others
-    set."scan.sigma_mm" = [1.0, 2.0]       # lists are multiplied with each other; of a value that is one, [[2, 2]]
+    set."scan.sigma_mm" = [1.0, 2.0]       # all combinations of lists are run; [[2, 2]] is a value that is a list
     set."scan.spacing_mm" = 5.0
     params.spheres.radius_mm = 50.0        # as in a parameter file
-    full = true                # with --full alone
+    full = true                # only with --full
 
-    [aim]                      # where better lies, of figures whose name does not tell: "low", "high" or a number
+    [aim]                      # the better direction of a figure, "low" or "high", or the best value
     "share of the sky" = "high"
 """
 
@@ -58,7 +58,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Matrix:
-    """What is run every night. ``aim`` says of figures by name where better lies: low, high, or a number."""
+    """What is run every night. ``aim``: by figure the better direction, low or high, or the best value."""
 
     name: str
     sha256: str
@@ -66,30 +66,30 @@ class Matrix:
     aim: Mapping[str, str | float]
 
     def cells(self, number: int) -> tuple[Cell, ...]:
-        """Return the cells of the night of that number, fixed seeds first: those of one key once."""
-        found = [Cell(entry.case, seed, True) for entry in self.entries for seed in entry.seeds]
-        found += [
+        """Return the cells of the night of that number, fixed seeds first, each key once."""
+        cells = [Cell(entry.case, seed, True) for entry in self.entries for seed in entry.seeds]
+        cells += [
             Cell(entry.case, fresh_seed(entry.case, number, i), False)
             for entry in self.entries
             for i in range(entry.fresh)
         ]
         unique: dict[str, Cell] = {}
-        for cell in found:
+        for cell in cells:
             unique.setdefault(cell.key, cell)
         return tuple(unique.values())
 
 
 def read(path: Path, full: bool) -> Matrix:
-    """Read a matrix; ``full`` takes the cells marked so as well.
+    """Read a matrix, with ``full`` also the cells marked so.
 
-    Raises InputError for a file that cannot be read, UsageError for what it says that is not known.
+    Raises InputError for a file that cannot be read, UsageError for unknown keys and wrong values.
     """
     try:
         raw = path.read_bytes()
         table: dict[str, Any] = tomllib.loads(raw.decode("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: expected a matrix in TOML, could not read it ({error})") from error
-    _known(table, TOP_KEYS, str(path))
+    _check_keys(table, TOP_KEYS, str(path))
     fixed = _seeds(table.get("fixed_seeds", [1]), f"{path}: fixed_seeds")
     fresh = _count(table.get("fresh_seeds", 1), f"{path}: fresh_seeds")
     aim = table.get("aim", {})
@@ -101,9 +101,9 @@ def read(path: Path, full: bool) -> Matrix:
     entries: list[Entry] = []
     for i, cell in enumerate(cells):
         where = f"{path}: cell {i + 1}"
-        _known(cell, CELL_KEYS, where)
-        own = _entries(cell, path, where, fixed, fresh)
-        entries += own if full or not _flag(cell, where) else []
+        _check_keys(cell, CELL_KEYS, where)
+        entries_of_cell = _entries(cell, path, where, fixed, fresh)
+        entries += entries_of_cell if full or not _flag(cell, where) else []
         if sum(len(entry.seeds) + entry.fresh for entry in entries) > MOST_CELLS:
             raise UsageError(f"{where}: more than {MOST_CELLS} cells; set fewer values or seeds")
     if not entries:
@@ -129,13 +129,26 @@ def _entries(cell: dict[str, Any], path: Path, where: str, fixed: tuple[int, ...
         raise UsageError(f"{where}: {error}") from None
     text, from_file = _recipe(recipe, path, where)
     seeds = _seeds(cell["seeds"], f"{where}: seeds") if "seeds" in cell else fixed
-    own_fresh = _count(cell.get("fresh", fresh), f"{where}: fresh")
+    fresh = _count(cell.get("fresh", fresh), f"{where}: fresh")
     stem = Path(recipe).stem if from_file else recipe
     name = cell.get("name", stem)
     if not isinstance(name, str):
         raise UsageError(f"{where}: name: expected a text, got {name!r}")
     return [
-        Entry(Case(name, stem, text, from_file, settings, steps, methods, params), seeds, own_fresh)
+        Entry(
+            Case(
+                name=name,
+                recipe=stem,
+                recipe_text=text,
+                from_file=from_file,
+                settings=settings,
+                steps=steps,
+                methods=methods,
+                params=params,
+            ),
+            seeds,
+            fresh,
+        )
         for settings in _combinations(cell.get("set", {}), where)
     ]
 
@@ -154,25 +167,25 @@ def _combinations(table: Any, where: str) -> list[tuple[str, ...]]:
 
 
 def _flat(table: dict[str, Any], above: str = "") -> dict[str, Any]:
-    found: dict[str, Any] = {}
+    flat: dict[str, Any] = {}
     for key, value in table.items():
-        found |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
-    return found
+        flat |= _flat(value, f"{above}{key}.") if isinstance(value, dict) else {f"{above}{key}": value}
+    return flat
 
 
 def _as_toml(value: Any) -> str:
-    return json.dumps(value, ensure_ascii=False)  # of numbers, texts, truth values and lists of these the same
+    return json.dumps(value, ensure_ascii=False)  # the same for numbers, texts, truth values and lists of these
 
 
 def _recipe(recipe: str, path: Path, where: str) -> tuple[str, bool]:
-    """Return the recipe's text, and whether it is a file of the user's. The generator itself is not imported."""
+    """Return the recipe's text, and whether it is a file of the user. The generator is not imported."""
     if recipe.endswith(".toml"):
         file, from_file = path.parent / recipe, True
     else:
-        found = importlib.util.find_spec("designgen")
-        if found is None or not found.submodule_search_locations:
+        spec = importlib.util.find_spec("designgen")
+        if spec is None or not spec.submodule_search_locations:
             raise UsageError(f"{where}: scenes are made by designgen, which is not installed")
-        file, from_file = Path(found.submodule_search_locations[0]) / "recipes" / f"{recipe}.toml", False
+        file, from_file = Path(spec.submodule_search_locations[0]) / "recipes" / f"{recipe}.toml", False
     try:
         return file.read_text("utf-8"), from_file
     except (OSError, UnicodeDecodeError) as error:
@@ -180,7 +193,7 @@ def _recipe(recipe: str, path: Path, where: str) -> tuple[str, bool]:
         raise UsageError(f"{where}: no recipe {recipe!r}{known}: {error}") from error
 
 
-def _known(table: dict[str, Any], keys: set[str], where: str) -> None:
+def _check_keys(table: dict[str, Any], keys: set[str], where: str) -> None:
     unknown = sorted(set(table) - keys)
     if unknown:
         raise UsageError(f"{where}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")
@@ -194,13 +207,13 @@ def _flag(cell: dict[str, Any], where: str) -> bool:
 
 
 def _names(value: Any, where: str) -> tuple[str, ...]:
-    if not isinstance(value, list) or not all(isinstance(one, str) for one in value):
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
         raise UsageError(f"{where}: expected a list of names, got {value!r}")
     return tuple(value)
 
 
 def _seeds(value: Any, where: str) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(type(one) is int and 0 <= one < MOST_SEED for one in value):
+    if not isinstance(value, list) or not all(type(seed) is int and 0 <= seed < MOST_SEED for seed in value):
         raise UsageError(f"{where}: expected a list of whole numbers from 0, got {value!r}")
     return tuple(dict.fromkeys(value))
 

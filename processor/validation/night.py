@@ -1,26 +1,26 @@
-"""One night: the cells of a matrix done, written to the history, compared with the nights before, and told.
+"""One night: the cells of a matrix are run, written to the history, compared with earlier nights, and reported.
 
-OUT holds ``cells/NIGHT/KEY/results.json`` of every cell (of the last nights), ``history.sqlite``, of every night
-``nights/NIGHT/`` with summary.json, junit.xml, certificate.json, certificate.html and line.txt, these again for the
-night done last, and ``nights.html``.
+OUT holds ``cells/NIGHT/KEY/results.json`` of every cell (of the last nights), ``history.sqlite``, ``nights.html``, and
+for every night ``nights/NIGHT/`` with summary.json, junit.xml, certificate.json, certificate.html and line.txt. Those
+of the last night are in OUT as well.
 
-A cell is first moved whole into its folder, then written to the history in one transaction; whatever ends the program
-in between, the next start takes up what is there.
+A cell is first moved whole into its folder, then written to the history in one transaction. If the program ends in
+between, the next run takes it from its folder.
 """
 
 from __future__ import annotations
 
 import datetime
-import fcntl
 import json
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from processor.jobs.runner import locked
 from processor.model import UsageError
+from processor.store.store import replacing
 from processor.validation import certificate, changes, junit, software, summary
 from processor.validation.cells import Cell, Outcome
 from processor.validation.history import History
@@ -31,12 +31,12 @@ from processor.validation.summary import Summary
 
 LOCK, SCRATCH, CELLS, NIGHTS = ".validation", ".making", "cells", "nights"
 HISTORY = "history.sqlite"
-KEPT_NIGHTS = 14  # whose results.json of cells stay
+KEPT_NIGHTS = 14  # whose results.json of cells are kept
 SEEN_NIGHTS = changes.MOST_NIGHTS + 10
 
 
 def number_of(night: str) -> int:
-    """Return the number of a night, which its seeds are drawn from. Raises UsageError for what is no date."""
+    """Return the number of a night, which its seeds depend on. Raises UsageError for what is no date."""
     try:
         return datetime.date.fromisoformat(night).toordinal()
     except ValueError:
@@ -45,18 +45,14 @@ def number_of(night: str) -> int:
 
 @contextmanager
 def opened(out: Path) -> Iterator[Path]:
-    """Take the folder of results for one program; give where scenes may be made. UsageError where it is not free."""
+    """Lock the folder of results and give the folder for scenes in it. Raises UsageError if it is not free."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; name a folder for the results")
     if out.is_dir() and any(out.iterdir()) and not (out / LOCK).exists():
         raise UsageError(f"{out}: is not empty and holds no earlier nights; name another folder")
     out.mkdir(parents=True, exist_ok=True)
-    with (out / LOCK).open("a") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            raise UsageError(f"{out}: another validation is at work here; wait for it") from None
-        shutil.rmtree(out / SCRATCH, ignore_errors=True)  # of one that was killed
+    with locked(out / LOCK, f"{out}: another validation is at work here; wait for it"):
+        shutil.rmtree(out / SCRATCH, ignore_errors=True)  # of a run that was killed
         (out / SCRATCH).mkdir()
         try:
             yield out / SCRATCH
@@ -75,10 +71,10 @@ def run(
     progress: Callable[[int, int, Cell | None, Outcome | None], None] = lambda *_: None,
     lang: str = "en",
 ) -> Summary:
-    """Do what is not done yet of a night and tell it, its pages in the language ``lang``; ``out`` must be ``opened``.
+    """Run the cells of a night that are not done, and report it in the language ``lang``; ``out`` must be ``opened``.
 
-    ``again`` deletes what other software has done of this night, which is refused otherwise (UsageError). ``progress``
-    is told how many of how many cells are done, and of the one that was last.
+    ``again`` deletes cells of this night that other software has done; without it, they raise UsageError. ``progress``
+    is called with the numbers of cells done and of all, and the last cell with its outcome.
     """
     cells = matrix.cells(number_of(night))
     present = made_by or software.present()
@@ -96,11 +92,11 @@ def run(
         open_cells = []
         for cell in cells:
             if cell.key not in done:
-                kept = _kept(out, night, cell, present.code)
-                if kept is None:
+                earlier = _earlier(out, night, cell, present.code)
+                if earlier is None:
                     open_cells.append(cell)
                 else:
-                    history.add(night, cell, kept)
+                    history.add(night, cell, earlier)
         ready = len(cells) - len(open_cells)
         progress(ready, len(cells), None, None)
         with closing(runner(open_cells)) as coming:
@@ -110,40 +106,41 @@ def run(
                 history.add(night, cell, outcome)
                 ready += 1
                 progress(ready, len(cells), cell, outcome)
-        told = _tell(matrix, out, night, cells, present, history, lang)
+        report = _report(matrix, out, night, cells, present, history, lang)
     _forget_old(out)
-    return told
+    return report
 
 
-def _tell(
+def _report(
     matrix: Matrix, out: Path, night: str, cells: tuple[Cell, ...], present: Software, history: History, lang: str
 ) -> Summary:
-    asked = {cell.key for cell in cells}
-    nights = [one for one in history.nights() if one.night <= night]
+    wanted = {cell.key for cell in cells}
+    nights = [each for each in history.nights() if each.night <= night]
     rows = history.rows(nights[-SEEN_NIGHTS:][0].night, night)
-    found = changes.find(rows, night, history.worse(night), matrix.aim)
-    own = tuple(cell for cell in history.cells(night) if cell["cell"] in asked)
-    missed = {key: figures for key, figures in history.missed(night).items() if key in asked}
-    told = Summary(night, present, own, missed, found)
-    same = [one.night for one in nights if one.code == present.code]
+    detected = changes.find(rows, night, history.worse(night), matrix.aim)
+    done = tuple(cell for cell in history.cells(night) if cell["cell"] in wanted)
+    missed = {key: figures for key, figures in history.missed(night).items() if key in wanted}
+    report = Summary(night=night, software=present, cells=done, missed=missed, found=detected)
+    same = [each.night for each in nights if each.code == present.code]
     cases = list({entry.case.key: entry.case for entry in matrix.entries}.values())
     certified = certificate.make(night, rows, same, cases, present, matrix)
     files = {
-        "summary.json": _json(told.as_object()).encode(),
-        "junit.xml": junit.xml(night, own, missed, found),
+        "summary.json": _json(report.as_object()).encode(),
+        "junit.xml": junit.xml(night, done, missed, detected),
         "certificate.json": certificate.as_json(certified).encode(),
         "certificate.html": certificate.as_html(certified, lang).encode(),
-        "line.txt": f"{told.line}\n".encode(),
+        "line.txt": f"{report.line}\n".encode(),
     }
     of_night = out / NIGHTS / night
     of_night.mkdir(parents=True, exist_ok=True)
     for name, data in files.items():
         _write(of_night / name, data)
         _write(out / name, data)
-    history.end(night, [(one.name, one.kind, summary.change_object(one)) for one in found.changes], told.line, _now())
-    page = summary.nights_html(told, [one for one in history.nights() if one.night <= night], rows, lang)
+    changed = [(change.name, change.kind, summary.change_object(change)) for change in detected.changes]
+    history.end(night, changed, report.line, _now())
+    page = summary.nights_html(report, [each for each in history.nights() if each.night <= night], rows, lang)
     _write(out / "nights.html", page.encode())
-    return told
+    return report
 
 
 # --- the folder of a cell -------------------------------------------------------------------------------------------
@@ -154,19 +151,19 @@ def _keep(out: Path, night: str, cell: Cell, outcome: Outcome, code: str) -> Non
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cell.json").unlink(missing_ok=True)
     _write(folder / "results.json", (json.dumps(outcome.results, ensure_ascii=False) + "\n").encode())
-    said = {"title": cell.title, "code": code, "seconds": outcome.seconds, "peak_mb": outcome.peak_mb, **cell.spec()}
-    _write(folder / "cell.json", _json(said).encode())  # last: where it is, the results are whole and its own
+    content = {"title": cell.title, "code": code, "seconds": outcome.seconds, "peak_mb": outcome.peak_mb}
+    _write(folder / "cell.json", _json(content | cell.spec()).encode())  # last: it is there only with whole results
 
 
-def _kept(out: Path, night: str, cell: Cell, code: str) -> Outcome | None:
-    """Return what was kept of a cell that the history has not got, None where it is not whole or of other software."""
+def _earlier(out: Path, night: str, cell: Cell, code: str) -> Outcome | None:
+    """Return the kept outcome of a cell that is not in the history; None if it is not whole or of other software."""
     folder = out / CELLS / night / cell.key
     try:
-        said = json.loads((folder / "cell.json").read_text("utf-8"))
-        if said["code"] != code:
+        content = json.loads((folder / "cell.json").read_text("utf-8"))
+        if content["code"] != code:
             return None
         results = json.loads((folder / "results.json").read_text("utf-8"))
-        return Outcome("", results, float(said["seconds"]), float(said["peak_mb"]))
+        return Outcome("", results, float(content["seconds"]), float(content["peak_mb"]))
     except (OSError, ValueError, LookupError, TypeError):
         return None
 
@@ -178,12 +175,8 @@ def _forget_old(out: Path) -> None:
 
 
 def _write(path: Path, data: bytes) -> None:
-    making = path.with_name(f".{path.name}.tmp")
-    with making.open("wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(making, path)
+    with replacing(path) as temporary:
+        temporary.write_bytes(data)
 
 
 def _json(value: dict[str, Any]) -> str:

@@ -1,134 +1,130 @@
-"""Cells done in processes of this machine, or on the workers of a Dask cluster."""
+"""Cells run in child processes of this machine, or on the workers of a Dask cluster."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import os
-import signal
-import subprocess
-import sys
 import tempfile
+import time
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from processor.model import InputError, UsageError
-from processor.validation import child
+from processor.jobs import process, runner
+from processor.jobs.child import Lost
+from processor.jobs.process import Cause, Ended
 from processor.validation.cells import Cell, Outcome
 
-# Does cells and gives each with its outcome as it comes; closing it stops what is under way.
+# Runs cells and yields each with its outcome as it comes; closing the generator stops those under way.
 Runner = Callable[[Sequence[Cell]], Generator[tuple[Cell, Outcome], None, None]]
 
 TIMEOUT_S = 3600.0
-CONNECT_S = 10
-THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
+WITH_RESULTS = (0, 1, 4)  # exit codes of processor run: done, done in part, an accuracy limit missed
+TAIL = 500  # characters of an error message
+
+
+class _FailedError(Exception):
+    """A command of a cell failed."""
 
 
 def do(
-    spec: dict[str, Any],
-    threads: int,
+    cell: Cell,
+    stopped: Callable[[], bool] = process.never,
+    *,
+    threads: int = 1,
     scratch: str | None = None,
-    live: set[int] | None = None,
     timeout_s: float = TIMEOUT_S,
 ) -> Outcome:
-    """Do one cell in processes of its own, which end when this one does; the scene is deleted afterwards.
+    """Make the scene of a cell and run it, in child processes; the scene is deleted afterwards."""
+    started = time.monotonic()
+    peak_mb = 0.0
 
-    ``live`` holds the number of its process group while it is under way.
-    """
-    live = set() if live is None else live
-    with tempfile.TemporaryDirectory(prefix="cell-", dir=scratch, ignore_cleanup_errors=True) as made:
-        folder = Path(made)
-        (folder / child.SPEC).write_text(json.dumps(spec, ensure_ascii=False), "utf-8")
-        process = subprocess.Popen(
-            [sys.executable, "-m", "processor.validation.child", str(folder)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.DEVNULL,
-            env={**os.environ, **dict.fromkeys(THREADS, str(threads))},
-            start_new_session=True,
+    def command(*words: str) -> Ended:
+        nonlocal peak_mb
+        ended = process.run(
+            (*process.GUARDED, "0", *words),
+            env=process.environment(threads),
+            timeout_s=timeout_s - (time.monotonic() - started),
+            stopped=stopped,
         )
-        live.add(process.pid)
+        peak_mb = max(peak_mb, ended.max_rss_mb)
+        if ended.cause is Cause.TIME:
+            raise _FailedError(f"took longer than {timeout_s:g} s")
+        return ended
+
+    with tempfile.TemporaryDirectory(prefix="cell-", dir=scratch, ignore_cleanup_errors=True) as made:
+        failed, results = "", {}
         try:
-            process.wait(timeout_s)
-        except subprocess.TimeoutExpired:
-            return Outcome(failed=f"took longer than {timeout_s:g} s", seconds=timeout_s)
-        finally:
-            if process.poll() is None:
-                with suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
-                process.wait()
-            live.discard(process.pid)
-            assert process.stdin
-            process.stdin.close()
-        try:
-            said = json.loads((folder / child.DONE).read_text("utf-8"))
-            text = "{}" if said["failed"] else (folder / child.RESULTS / "results.json").read_text("utf-8")
-            return Outcome(said["failed"], json.loads(text), said["seconds"], said["peak_mb"])
-        except (OSError, ValueError) as error:
-            return Outcome(failed=f"its process ended with code {process.returncode} and left no answer ({error})")
+            results = _results(cell.spec(), Path(made), command)
+        except _FailedError as error:
+            failed = str(error)
+        return Outcome(failed, results, time.monotonic() - started, peak_mb)
+
+
+def _results(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) -> dict[str, Any]:
+    """Return results.json of a cell made in a folder. Raises _FailedError if a command fails."""
+    recipe, scene, results = spec["recipe"], folder / "scene.h5", folder / "results"
+    if spec["recipe_text"]:
+        recipe = folder / f"{recipe}.toml"
+        recipe.write_text(spec["recipe_text"], "utf-8")
+    settings = [word for setting in spec["settings"] for word in ("--set", setting)]
+    made = command("designgen", "make", str(recipe), "-o", str(scene), "--seed", str(spec["seed"]), *settings)
+    if made.cause is not Cause.EXIT or made.code != 0:
+        raise _FailedError(_reason("designgen make", made))
+    options = ["--steps", ",".join(spec["steps"])]
+    options += ["--method", ",".join(spec["methods"])] if spec["methods"] else []
+    if spec["params"]:
+        (folder / "params.toml").write_text(_toml(spec["params"]), "utf-8")
+        options += ["--params", str(folder / "params.toml")]
+    ran = command("processor", "run", str(scene), "-o", str(results), *options)
+    if ran.cause is not Cause.EXIT or ran.code not in WITH_RESULTS:
+        raise _FailedError(_reason("processor run", ran))
+    try:
+        content: dict[str, Any] = json.loads((results / "results.json").read_text("utf-8"))
+    except (OSError, ValueError) as error:
+        raise _FailedError(f"processor run: ended with code {ran.code} and without results ({error})") from error
+    return content
+
+
+def _reason(program: str, ended: Ended) -> str:
+    if ended.cause is Cause.STOPPED:
+        return f"{program}: stopped"
+    how = f"signal {ended.code} (out of memory?)" if ended.cause is Cause.SIGNAL else f"exit code {ended.code}"
+    return f"{program}: {how}: {ended.last_line[:TAIL]}" if ended.last_line else f"{program}: {how}"
+
+
+def _toml(table: dict[str, Any], above: str = "") -> str:
+    """Write parameters as TOML; numbers, texts, truth values and lists are written as in JSON."""
+    values = [f"{_key(k)} = {json.dumps(v, ensure_ascii=False)}" for k, v in table.items() if not isinstance(v, dict)]
+    below = [
+        f"[{above}{_key(key)}]\n{_toml(value, f'{above}{_key(key)}.')}"
+        for key, value in table.items()
+        if isinstance(value, dict)
+    ]
+    return "\n".join([*values, *below]) + "\n"
+
+
+def _key(name: str) -> str:
+    return json.dumps(name, ensure_ascii=False)
 
 
 @contextmanager
-def over_processes(jobs: int, scratch: Path) -> Iterator[Runner]:
-    """Give what does so many cells at a time on this machine, in folders below ``scratch``."""
-    threads = max(1, (os.cpu_count() or 1) // jobs)
+def opened(cluster: str | None, jobs: int, scratch: Path, say: Callable[[str], None]) -> Iterator[Runner]:
+    """Give what runs cells: ``jobs`` at a time in folders below ``scratch``, or on a cluster, which shares no folder.
 
-    def run(cells: Sequence[Cell]) -> Generator[tuple[Cell, Outcome], None, None]:
-        pool, live = ThreadPoolExecutor(jobs), set[int]()
-        try:
-            waiting: dict[Future[Outcome], Cell] = {
-                pool.submit(do, cell.spec(), threads, str(scratch), live): cell for cell in cells
-            }
-            while waiting:
-                for future in wait(waiting, return_when=FIRST_COMPLETED).done:
-                    yield waiting.pop(future), future.result()
-        finally:
-            pool.shutdown(wait=False, cancel_futures=True)
-            for group in list(live):
-                with suppress(ProcessLookupError):
-                    os.killpg(group, signal.SIGKILL)
-            pool.shutdown()
-
-    yield run
-
-
-@contextmanager
-def over_cluster(address: str) -> Iterator[Runner]:
-    """Give what does cells on the Dask cluster whose scheduler is at ``address``; its workers share no folder.
-
-    Raises UsageError without the library and where no scheduler answers; InputError where it is lost on the way.
+    Raises UsageError if there is no cluster at the address ``cluster``; InputError if it is lost on the way.
     """
-    try:
-        distributed: Any = importlib.import_module("distributed")
-    except ImportError:
-        raise UsageError("--cluster needs Dask: pip install 'steel-scan-check[cluster]'") from None
-    try:
-        client = distributed.Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        why = " ".join(str(error).split())
-        raise UsageError(
-            f"--cluster {address}: expected the address of a Dask scheduler that answers ({why})"
-        ) from error
-    with client:
+    threads = max(1, (os.cpu_count() or 1) // jobs)
+    run_cell = do if cluster else partial(do, threads=threads, scratch=str(scratch))
+    with runner.executor(cluster, jobs, say) as executor:
 
         def run(cells: Sequence[Cell]) -> Generator[tuple[Cell, Outcome], None, None]:
-            # Impure: the same cell done tonight must not be taken from the scheduler's memory of last night.
-            waiting = {client.submit(do, cell.spec(), 1, pure=False): cell for cell in cells}
-            try:
-                for future in distributed.as_completed(list(waiting), loop=client.loop):
-                    cell = waiting.pop(future)
-                    try:
-                        outcome: Outcome = future.result()
-                    except distributed.CancelledError as error:
-                        waiting.clear()
-                        raise InputError(f"--cluster {address}: the connection is lost; run again to go on") from error
-                    except Exception as error:
-                        text = " ".join(str(error).split())
-                        outcome = Outcome(failed=f"a worker could not run it ({type(error).__name__}: {text})")
-                    yield cell, outcome
-            finally:
-                client.cancel(list(waiting))
+            with closing(executor.run(run_cell, cells)) as results:
+                for cell, result in results:
+                    if isinstance(result, Lost):
+                        result = Outcome(failed=f"a worker could not run it ({result.error or result.loss.value})")
+                    yield cell, result
 
         yield run

@@ -1,4 +1,4 @@
-"""What made a night's figures: versions, the commit, and a digest of the sources themselves."""
+"""The software that made a night's figures: versions, the commit, and a digest of the sources."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import platform
 import subprocess
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from processor.jobs.software import versions
 
 PACKAGES = ("processor", "designgen")
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "cadquery", "cadquery-ocp")
 SOURCES = (".py", ".toml")
-UNIMPORTANT = ("report", "validation")  # of processor: they move no figure
+UNIMPORTANT = ("report", "validation")  # of processor: no figure depends on them
 GIT_S = 10
 
 
@@ -23,7 +24,7 @@ GIT_S = 10
 class Software:
     """``code`` is a digest of what figures depend on: sources, committed or not, and the libraries' versions.
 
-    ``commit`` is git's, with + where files differ from it, empty where there is no git.
+    ``commit`` is git's, with + if files differ from it, empty without git.
     """
 
     code: str
@@ -33,26 +34,22 @@ class Software:
 
 @cache
 def present() -> Software:
-    """Look at what is installed here."""
-    versions = {"python": platform.python_version(), "machine": platform.machine()}
-    for name in ("steel-scan-check", *LIBRARIES):
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    digest = hashlib.sha256(repr(sorted(versions.items())).encode())
+    """Return the software installed here."""
+    machine = {"python": platform.python_version(), "machine": platform.machine()}
+    installed = machine | versions(("steel-scan-check", *LIBRARIES))
+    digest = hashlib.sha256(repr(sorted(installed.items())).encode())
     for package in PACKAGES:
         for path in _sources(package):
             digest.update(path.name.encode())
             digest.update(path.read_bytes())
-    return Software(digest.hexdigest()[:16], _commit(), versions)
+    return Software(digest.hexdigest()[:16], _commit(), installed)
 
 
 def _sources(package: str) -> list[Path]:
-    found = importlib.util.find_spec(package)
-    if found is None or not found.submodule_search_locations:
+    spec = importlib.util.find_spec(package)
+    if spec is None or not spec.submodule_search_locations:
         return []
-    root = Path(found.submodule_search_locations[0])
+    root = Path(spec.submodule_search_locations[0])
     return sorted(
         path
         for path in root.rglob("*")

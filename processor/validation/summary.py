@@ -1,4 +1,4 @@
-"""What is told of a night: one line, an object for programs, and the page of all nights."""
+"""The report of a night: one line, an object for programs, and the page of all nights."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TEST = (
 
 @dataclass(frozen=True)
 class Summary:
-    """All that a night has to say. ``missed``: figures beyond their limits, by cell."""
+    """Cells of a night, figures beyond their limits by cell (``missed``), and changes (``found``)."""
 
     night: str
     software: Software
@@ -44,7 +44,7 @@ class Summary:
 
     @property
     def failed(self) -> list[Mapping[str, Any]]:
-        """The cells that came to no answer."""
+        """The cells without results."""
         return [cell for cell in self.cells if cell["failed"]]
 
     @property
@@ -54,7 +54,7 @@ class Summary:
 
     @property
     def line(self) -> str:
-        """The night in one line, for a chat channel."""
+        """The night on one line, for a chat channel."""
         misses = sum(map(len, self.missed.values()))
         verdict = "ok" if self.passed and not self.failed else "NOT OK"
         parts = [f"{self.night} {verdict}", self._version()]
@@ -62,11 +62,12 @@ class Summary:
         parts += [f"{_count(len(self.failed), 'cell')} failed"] if self.failed else []
         parts.append(f"{_count(misses, 'limit')} missed" if misses else "limits kept")
         for kinds, word in ((ALARMS, "worse"), ((IMPROVEMENT,), "better")):
-            some = self.found.of(*kinds)
-            if some:
-                parts.append(f"{len(some)} {word}: {'; '.join(map(_named, some[:MOST_NAMED]))}{_more(some)}")
-        moved = len(self.found.of(CHANGED))
-        parts += [f"{moved} moved, neither worse nor better"] if moved else []
+            changed = self.found.of(*kinds)
+            if changed:
+                more = f"; {len(changed) - MOST_NAMED} more" if len(changed) > MOST_NAMED else ""
+                parts.append(f"{len(changed)} {word}: {'; '.join(map(_named, changed[:MOST_NAMED]))}{more}")
+        neither = len(self.found.of(CHANGED))
+        parts += [f"{neither} moved, neither worse nor better"] if neither else []
         if self.found.first:
             parts.append("nothing to compare with yet")
         elif not self.found.changes:
@@ -94,10 +95,10 @@ class Summary:
             "missed": [
                 {"cell": cell, "step": f.step, "method": f.method, "name": f.name, "value": _finite(f.value)}
                 | {"limit": f.limit, "unit": f.unit}
-                for cell, own in self.missed.items()
-                for f in own
+                for cell, figures in self.missed.items()
+                for f in figures
             ],
-            "changes": [change_object(one) for one in self.found.of(*ALARMS, IMPROVEMENT, CHANGED)],
+            "changes": [change_object(change) for change in self.found.of(*ALARMS, IMPROVEMENT, CHANGED)],
             "test": {
                 "about": TEST,
                 "alarm_rate": changes.ALARM_RATE,
@@ -108,21 +109,27 @@ class Summary:
         }
 
 
-def change_object(one: Change) -> dict[str, Any]:
-    """Write a change as an object; ``ratio`` of what is better low, else ``difference`` of how bad it is."""
-    step, method, name = one.name
-    size = {"ratio": _finite(math.exp(one.size))} if one.is_ratio else {"difference": _finite(one.size)}
-    said = {"kind": one.kind, "said": one.said, "test": one.test, "p": one.p, "cases": one.cases, "unit": one.unit}
-    return {"step": step, "method": method, "name": name, **said, **size}
+def change_object(change: Change) -> dict[str, Any]:
+    """Return a change as an object; its size is a ``ratio`` or a ``difference``, positive or above 1 if worse."""
+    step, method, name = change.name
+    size = {"ratio": _finite(math.exp(change.size))} if change.is_ratio else {"difference": _finite(change.size)}
+    return {
+        "step": step,
+        "method": method,
+        "name": name,
+        "kind": change.kind,
+        "said": change.said,
+        "test": change.test,
+        "p": change.p,
+        "cases": change.cases,
+        "unit": change.unit,
+        **size,
+    }
 
 
-def _named(one: Change) -> str:
-    step, method, name = one.name
-    return f"{step} ({method}) {name} {one.said}"
-
-
-def _more(some: Sequence[Change]) -> str:
-    return f"; {len(some) - MOST_NAMED} more" if len(some) > MOST_NAMED else ""
+def _named(change: Change) -> str:
+    step, method, name = change.name
+    return f"{step} ({method}) {name} {change.said}"
 
 
 def _count(number: int, word: str) -> str:
@@ -137,7 +144,7 @@ def _finite(value: float) -> float | None:
 
 
 def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], lang: str = "en") -> str:
-    """Write the page in a language: the nights, the latest first, and of every figure its course over them."""
+    """Return the page in a language: the nights, the latest first, and every figure over the nights."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
     )
@@ -148,13 +155,13 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], 
     for row in rows:
         course[row.name][row.night].append(row.value)
         units[row.name] = row.unit
-    said = {one.name: one for one in summary.found.changes}
+    change_of = {change.name: change for change in summary.found.changes}
     figures = []
     for name in sorted(course):
         if summary.night not in course[name]:
             continue
         levels = [_middle(course[name].get(night, [])) for night in shown]
-        change = said.get(name)
+        change = change_of.get(name)
         figures.append(
             {
                 "name": name,
@@ -178,16 +185,16 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], 
 
 
 def _middle(values: Sequence[float]) -> float:
-    known = [value for value in values if math.isfinite(value)]
-    return float(np.median(known)) if known else math.nan
+    finite = [value for value in values if math.isfinite(value)]
+    return float(np.median(finite)) if finite else math.nan
 
 
 def _spark(levels: Sequence[float]) -> list[str]:
-    """Points of a polyline through the levels, a polyline for every run of nights that have one."""
-    known = [level for level in levels if math.isfinite(level)]
-    if not known:
+    """Return the points of polylines through the levels, one for every run of nights that have a level."""
+    finite = [level for level in levels if math.isfinite(level)]
+    if not finite:
         return []
-    low, high = min(known), max(known)
+    low, high = min(finite), max(finite)
     scale = (SPARK_HEIGHT - 4) / (high - low) if high > low else 0.0
     step = (SPARK_WIDTH - 4) / max(1, len(levels) - 1)
     runs: list[list[str]] = [[]]
@@ -197,4 +204,4 @@ def _spark(levels: Sequence[float]) -> list[str]:
             runs[-1].append(f"{2 + i * step:.1f},{y:.1f}")
         elif runs[-1]:
             runs.append([])
-    return [" ".join([*run, run[-1]]) for run in runs if run]  # a point drawn twice is seen also where it is alone
+    return [" ".join([*run, run[-1]]) for run in runs if run]  # the last point twice: a single one would not be drawn

@@ -24,7 +24,7 @@ from designgen.scenes.make import make
 from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import rigid
 from processor.preassembly import step as preassembly_step
-from processor.preassembly.baselines import edge_features
+from processor.preassembly.ends.joint_frame import joint_frame
 
 CHECKED = {
     "splicing mean": "splicing error of the true key points, mean",
@@ -57,7 +57,7 @@ def figures(recipe, settings, seed):
 def key_point_errors(design, result, truth):
     """Errors (n, 3) of all key points along the axes of their joints."""
     found = []
-    frames = [edge_features.joint_frame(points)[:3, :3] for points in design.joint_points]
+    frames = [joint_frame(points)[:3, :3] for points in design.joint_points]
     for i in range(len(result.components)):
         turn = truth.T_bridge_scan[i][:3, :3]
         for end, joint in enumerate((i - 1, i)):

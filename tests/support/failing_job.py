@@ -14,7 +14,7 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
-from processor.batch import child
+from processor.jobs import child
 
 
 def fake(source, out):
@@ -73,14 +73,14 @@ def main():
         __main__.main()
         return
     child.guard(int(sys.argv[1]))
-    source = Path(sys.argv[3])
+    source = Path(sys.argv[4])
     plant(source)
     if (source / "real").exists():
-        sys.argv[:] = ["processor", *sys.argv[2:]]
+        sys.argv[:] = sys.argv[2:]
         from processor.__main__ import main as processor
 
         processor()
-    fake(source, Path(sys.argv[5]))
+    fake(source, Path(sys.argv[6]))
 
 
 if __name__ == "__main__":

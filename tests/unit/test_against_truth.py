@@ -9,14 +9,15 @@ from processor.evaluation import preassembly
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
 from processor.model import ArchTruth, Scene, Truth
-from processor.preassembly.baselines import edge_features
 from processor.preassembly.chain import adjustment
 from processor.preassembly.ends import bottom_edges, joint_end
+from processor.preassembly.ends.joint_frame import joint_frame
+from processor.preassembly.parts.member import Member
 from processor.preassembly.result import Result
 from tests.support import arch_clouds
 
 DESIGN = arch_clouds.design()
-FRAMES = np.array([edge_features.joint_frame(points) for points in DESIGN.joint_points])
+FRAMES = np.array([joint_frame(points) for points in DESIGN.joint_points])
 WEIGHT = 0.1
 
 
@@ -44,20 +45,20 @@ def member(i, ends, edges, unseen, without):
     """
     part = DESIGN.parts[i]
     lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
-    stations = bottom_edges.unseen(*lines)
+    stations = bottom_edges.unknown(*lines)
     own = []
     for e, joint in enumerate((i - 1, i)):
         if not 0 <= joint < 4:
             own.append(None)
         elif (i, e) in unseen or i in without:
-            own.append(joint_end.nothing("too few points on the end face"))
+            own.append(joint_end.unknown("too few points on the end face"))
         else:
             moved = (ends[i, e] - DESIGN.joint_points[joint]) @ FRAMES[joint][:3, :3]
-            own.append(joint_end.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), 0.01, ""))
+            own.append(joint_end.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), ""))
     middle = part.vertices.mean(axis=0)
     if i in without:
-        return adjustment.Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))
-    count = len(stations.arc) // 2
+        return Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))
+    count = len(stations.chainage) // 2
     at = np.vstack([preassembly._at_stations(edges[i, k], lines[k]) for k in range(2)])
     departure = np.einsum("kai,ki->ka", stations.axes, at - stations.points)
     measured = dataclasses.replace(
@@ -66,7 +67,7 @@ def member(i, ends, edges, unseen, without):
         covariance=np.stack([1e-4 * np.eye(2 * count)] * 2),
         by_pose=np.zeros((2 * count, 2, 6)),
     )
-    return adjustment.Member((own[0], own[1]), measured, middle, np.zeros((6, 6)))
+    return Member((own[0], own[1]), measured, middle, np.zeros((6, 6)))
 
 
 def checked(unseen, without):

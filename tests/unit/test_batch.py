@@ -32,13 +32,13 @@ from processor import __main__
 from processor.batch import batch, finding, job, summary
 from processor.batch.figures import of_results
 from processor.cli import run as cli_run
-from processor.jobs import runner
+from processor.jobs import process, runner
 from processor.model import InputError, UsageError
 from processor.scan_folder import fingerprint
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
-REAL, FAILING = job.PROGRAM, (sys.executable, str(ROOT / "tests/support/failing_job.py"))
+REAL, FAILING = process.GUARDED, (sys.executable, str(ROOT / "tests/support/failing_job.py"))
 SPHERES = ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
 SUMMARY = ("index.html", "summary.csv", "summary.json")
 
@@ -737,7 +737,7 @@ def test_a_cluster_that_is_lost_is_said_and_the_next_run_goes_on(tmp_path, clust
 
 def test_a_cluster_that_does_not_answer_is_said(tmp_path, monkeypatch):
     pytest.importorskip("distributed")
-    monkeypatch.setattr(runner, "CONNECT_SECONDS", 1)
+    monkeypatch.setattr(runner, "CONNECT_S", 1)
     folder(tmp_path / "root/a")
     address = f"tcp://127.0.0.1:{free_port()}"
     done = run(tmp_path / "root", "-o", tmp_path / "out", "--cluster", address, code=2)

@@ -1,16 +1,17 @@
-"""Limits of the whole chain: guard bands by hand, extremes by draws, what is stated and not held, and unsure chains."""
+"""Limits of the whole chain: guard bands by hand, extremes by draws, unused limits, and doubtful chains."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+from processor.adjustment import extremes
 from processor.limits import standards
 from processor.model import ArchDesign, DesignPart, Tolerance
-from processor.preassembly import assemble
-from processor.preassembly.chain import adjustment as chain_adjustment
+from processor.preassembly import to_result
 from processor.preassembly.chain import span_and_closure
-from processor.preassembly.ends.bottom_edges import EdgeStations
+from processor.preassembly.ends.bottom_edges import EdgeDepartures
+from processor.preassembly.parts.member import Member
 from processor.preassembly.verdicts import chain, joints
 
 GB, JTG = standards.load("GB 50205-2020"), standards.load("JTG arch rib")
@@ -66,28 +67,33 @@ def test_edges_are_held_all_along_and_limits_hang_on_the_span():
     assert by_key == {"inner_arc_mm": "pass", "lateral_axis_mm": "pass", "elevation_mm": "pass"}
     np.testing.assert_allclose(found.high, [8.0, 5.0, 10.0])
     np.testing.assert_allclose(found.value, 4.5)
-    np.testing.assert_allclose(found.ci95, 1.96 * 0.1, rtol=1e-3)  # no other station may be the extreme
+    np.testing.assert_allclose(found.ci95, 1.96 * 0.1, rtol=1e-3)  # no other place can be the extreme
     values[17] = 4.9
     assert chain.judge(quantities, JTG, 30_000.0).each[1] == "indeterminate"
     values[17] = -5.4
     assert chain.judge(quantities, JTG, 30_000.0).each[1] == "fail"
-    # Where many may be it, the band holds all of them.
+    # Where many can be the extreme, the band covers all of them.
     low, high = [], []
     for _ in range(400):
-        _, bottom, top = chain.greatest(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
+        _, bottom, top = extremes.of_independent(rng.normal(0.0, 0.1, 50), np.full(50, 0.1))
         low.append(bottom)
         high.append(top)
     assert np.mean((np.array(low) <= 0.0) & (np.array(high) >= 0.0)) >= 0.95
 
 
-def test_what_the_stations_say():
-    """Both edges 3 mm to the left and 2 mm up from an arch as steep as 3 : 4; height over a place is 2.5 mm."""
+def test_quantities_of_the_edges_by_hand():
+    """Both edges 3 mm to the left and 2 mm up from an arch with slope 3 : 4: the elevation is 2.5 mm."""
     axes = np.tile(np.array([[0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]), (4, 1, 1))
-    edges = EdgeStations(
-        ("left", "left", "right", "right"), np.zeros(4), np.zeros((4, 3)), axes, np.zeros((4, 2)),
-        np.zeros((2, 4, 4)), np.zeros((4, 2, 6)),
-    )  # fmt: skip
-    member = chain_adjustment.Member((None, None), edges, np.zeros(3), np.zeros((6, 6)))
+    edges = EdgeDepartures(
+        side=("left", "left", "right", "right"),
+        chainage=np.zeros(4),
+        points=np.zeros((4, 3)),
+        axes=axes,
+        departure=np.zeros((4, 2)),
+        covariance=np.zeros((2, 4, 4)),
+        by_pose=np.zeros((4, 2, 6)),
+    )
+    member = Member((None, None), edges, np.zeros(3), np.zeros((6, 6)))
     adjusted = SimpleNamespace(
         departures=(np.tile([3.0, 2.0], (4, 1)),), departure_variance=(np.tile([0.04, 0.01], (4, 1)),)
     )
@@ -101,11 +107,14 @@ def test_what_the_stations_say():
 
 
 def test_a_limit_that_nothing_is_held_against_is_said():
-    assert chain.not_held(GB) == []
+    assert chain.unused_limits(GB) == []
     mixed = standards.with_own(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
-    assert [limit.key for limit in chain.not_held(mixed)] == ["bow_mm"]
+    assert [limit.key for limit in chain.unused_limits(mixed)] == ["bow_mm"]
     params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
-    assert "limits that nothing is held against: bow_mm" in assemble._message(params, mixed, 0.0, [])
+    assembly = SimpleNamespace(
+        params=params, limits=mixed, temperature_corrected=False, joints=[], chain=joints.Verdict()
+    )
+    assert "limits that nothing is held against: bow_mm" in to_result._message(assembly)
 
 
 def test_an_unsure_chain_is_left_open():
@@ -119,7 +128,7 @@ def test_an_unsure_chain_is_left_open():
 
 
 def test_the_span_is_not_known_where_a_joint_is_not():
-    """Nothing measured says how far apart the parts beside it are: they are held where their registration has them."""
+    """Without gaps the distance between the parts beside a joint is not measured."""
     line = np.array([[0.0, 0.0, 0.0], [1e3, 0.0, 0.0]])
     parts = tuple(DesignPart(str(i), bottom_edge_left=line, bottom_edge_right=line) for i in range(2))
     design = ArchDesign(parts, ("J1",), ("0",), ("1",), np.zeros((1, 8, 3)))
@@ -129,17 +138,30 @@ def test_the_span_is_not_known_where_a_joint_is_not():
 
 def test_a_joint_left_open_has_no_limit_that_is_sure():
     verdict = joints.Verdict(
-        "fail", 0.0, ("a",), ("b",), np.ones(1), np.ones(1), np.zeros(1), np.zeros(1), ("fail",), np.zeros(1),
-        ("c",), ("",), ("s",), np.zeros(1, np.uint8), "x",
-    )  # fmt: skip
-    told = assemble._if_told(verdict, "rib1 is ambiguous")
-    assert (told.verdict, told.each) == ("indeterminate", ("indeterminate",))
-    assert np.isnan([told.probability, told.each_probability[0]]).all()
-    assert assemble._if_told(verdict, "") is verdict
+        verdict="fail",
+        probability=0.0,
+        key=("a",),
+        what=("b",),
+        value=np.ones(1),
+        ci95=np.ones(1),
+        low=np.zeros(1),
+        high=np.zeros(1),
+        each=("fail",),
+        each_probability=np.zeros(1),
+        clause=("c",),
+        edition=("",),
+        source=("s",),
+        verified=np.zeros(1, np.uint8),
+        said="x",
+    )
+    opened = joints.left_open(verdict, "rib1 is ambiguous")
+    assert (opened.verdict, opened.each) == ("indeterminate", ("indeterminate",))
+    assert np.isnan([opened.probability, opened.each_probability[0]]).all()
+    assert joints.left_open(verdict, "") is verdict
 
 
 def test_mean_and_largest_of_many_alike_are_as_unsure_as_one():
-    """Of one number 1.96 sd; of a hundred that may err alike the mean still: 95 % or more holds."""
+    """1.96 sd for one value, and for the mean of a hundred values that may be fully correlated."""
     of = span_and_closure.mean_max_ci95
     np.testing.assert_allclose(of(np.array([[3.0]]), np.array([[0.04]])), 0.392, rtol=1e-3)
     assert of(np.zeros((100, 1)), np.full((100, 1), 0.04))[0] == pytest.approx(0.392, rel=1e-3)

@@ -22,13 +22,17 @@ import h5py
 import numpy as np
 import pytest
 
-from designgen import batch, recipes, spread
+from designgen import batch, recipes
+from processor.jobs import process as processes
+from processor.jobs import runner
+from processor.jobs.child import Loss, Lost
 from processor.model import UsageError
 from processor.store import store
 
 MAKE = (sys.executable, "-m", "designgen", "make", "frame-small", "--set", "scan.spacing_mm=60")
 COLUMNS = ["file", "recipe", "seed", "points", "scans", "scene_hash", "sha256", "status", "reason"]
 SCENES_OF_KILLED_RUNS = 16
+MARK = "STARTED_FOR"
 
 
 def run(*arguments, code=0, command=MAKE):
@@ -166,7 +170,7 @@ def test_other_software_is_made_again(made, tmp_path, monkeypatch):
     job = batch.plan(folder, name, recipes.overridden(recipe, ["scan.spacing_mm=60"]), {}, 7, 1)[0]
     outcome = batch.run_job(job)
     assert outcome.made
-    assert outcome.said == "was made with other software; made again"
+    assert outcome.replaced == "was made with other software; made again"
     assert store.read_provenance(folder / job.file)["software"]["designgen"] == "9.9"
 
 
@@ -231,7 +235,12 @@ def started(folder, *more):
     # A shell in the background hands down interrupts that are ignored; here they are to arrive.
     listening = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(
-        [*map(str, command)], stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=listening
+        [*map(str, command)],
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+        preexec_fn=listening,
+        env={**os.environ, MARK: str(folder)},
     )
 
 
@@ -249,21 +258,20 @@ def until_scenes(folder, number, process):
     assert len(scenes(folder)) < SCENES_OF_KILLED_RUNS, "too late to disturb it"
 
 
-def members(session):
-    """Processes of a session that are alive, from /proc."""
-    found = []
-    for stat in Path("/proc").glob("[0-9]*/stat"):
+def members(folder):
+    """Processes alive that were started for a folder, by their environment in /proc; zombies have none."""
+    mark, found = f"{MARK}={folder}\0".encode(), []
+    for environ in Path("/proc").glob("[0-9]*/environ"):
         try:
-            fields = stat.read_text().rpartition(")")[2].split()
+            if mark in environ.read_bytes():
+                found.append(int(environ.parent.name))
         except OSError:
             continue
-        if int(fields[3]) == session and fields[0] not in "ZX":
-            found.append(int(stat.parent.name))
     return found
 
 
-def until_gone(session):
-    until(lambda: not members(session), 10)
+def until_gone(folder):
+    until(lambda: not members(folder), 10)
 
 
 def test_killed_at_random_and_run_again(whole, tmp_path):
@@ -272,10 +280,11 @@ def test_killed_at_random_and_run_again(whole, tmp_path):
         process = started(folder, "--jobs", 2)
         until_scenes(folder, left, process)
         time.sleep(dice.uniform(0.0, 0.1))
+        assert len(members(folder)) == 3
         process.kill()
         process.communicate()
         assert process.returncode == -signal.SIGKILL, "killed too late"
-        until_gone(process.pid)  # what it started goes with it
+        until_gone(folder)  # what it started goes with it
         for name in scenes(folder):  # no half file under a final name
             assert (folder / name).read_bytes() == (whole / name).read_bytes()
         assert not (folder / "index.csv").exists()
@@ -299,7 +308,7 @@ def test_stops_cleanly(whole, tmp_path, sent, code, to_all):
     assert "Traceback" not in said
     assert re.search(r"stopped: \d+ of 16 scene\(s\) are done; run again to go on", said)
     assert sorted(os.listdir(folder)) == scenes(folder), "neither an index nor temporary files"
-    until_gone(process.pid)
+    until_gone(folder)
     for name in scenes(folder):
         assert (folder / name).read_bytes() == (whole / name).read_bytes()
 
@@ -317,9 +326,12 @@ def test_a_process_that_dies_costs_its_own_job_alone(tmp_path):
     names = ["a", "always", "b", "c", "d"]
     for name in "acd":
         (tmp_path / name).touch()
-    with spread.over_processes(2) as do:
-        found = {path.name: result for path, result in do(kill_own_process, [tmp_path / name for name in names])}
-    assert found.pop("always") == spread.Lost(spread.DIED)
+    do = functools.partial(processes.in_process, kill_own_process)
+    found = {path.name: result for path, result in runner.Local(2).run(do, [tmp_path / name for name in names])}
+    processes.POOL.close()
+    lost = found.pop("always")
+    assert lost == Lost(Loss.DIED)
+    assert batch.reason_of(lost).startswith("the process that made it died twice")
     assert {name: result[:2] for name, result in found.items()} == {name: (name, "1") for name in "abcd"}
     assert os.getpid() not in {result[2] for result in found.values()}
 
@@ -498,6 +510,6 @@ def test_without_dask_the_error_says_how_to_install_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "distributed", None)
     with (
         pytest.raises(UsageError, match=r"pip install 'steel-scan-check\[cluster\]'"),
-        spread.over_cluster("tcp://x:1"),
+        runner.executor("tcp://x:1", 1, print),
     ):
         pass

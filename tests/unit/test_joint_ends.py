@@ -1,18 +1,17 @@
-"""Ends of a straight box whose corners were built elsewhere, by points made with numpy: closed forms throughout."""
+"""Ends of a straight box with displaced corners, by points made with numpy, against closed forms."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from processor.adjustment import variance_components
-from processor.adjustment.model_averaging import Believed, by_the_others, either, no_surer, weigh
 from processor.geometry import mesh_distance, rigid
-from processor.preassembly.baselines import edge_features
 from processor.preassembly.chain import adjustment, span_and_closure
 from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import joint_end, plate_sides
-from processor.preassembly.ends.bottom_edges import EdgeStations
+from processor.preassembly.ends.bottom_edges import EdgeDepartures
+from processor.preassembly.ends.joint_frame import end_place
+from processor.preassembly.parts.member import Member
 
 LENGTH, B, H, T = 1600.0, 600.0, 800.0, 26.0  # the end at x = 0, the part towards -x; half width, height; plates
 
@@ -58,7 +57,7 @@ def cloud(rng, spacing, shares=(1.0, 1.0, 1.0, 1.0), inner=1.0):
 
 
 def built(points, corners):
-    """Move points by what the corners P1..P4 (4, 3) of the end moved, fading out within 1.5 m."""
+    """Move points by the movements of the end's corners P1..P4 (4, 3), fading out within 1.5 m."""
     a, c = points[:, 1] / B, 2.0 * points[:, 2] / H - 1.0
     shares = 0.25 * np.stack([(1 + a) * (1 - c), (1 - a) * (1 - c), (1 - a) * (1 + c), (1 + a) * (1 + c)])
     fade = np.clip(1.0 + points[:, 0] / 1500.0, 0.0, 1.0)
@@ -67,18 +66,25 @@ def built(points, corners):
 
 def fitted(points, rng, sigma=1.0):
     surface, joint = design()
-    outer = ends_faces.of_part(surface, [joint])
+    outer = ends_faces.outer_faces(surface, [joint])
     noisy = points + sigma * rng.standard_normal(points.shape)
-    station = np.zeros(len(points), np.int64)
-    frame = edge_features.joint_frame(joint)
-    assert np.allclose(frame[:3, :3], np.eye(3))
-    seen = joint_end.observe(noisy, surface, outer, frame, joint[:4], 1.0, 1e-12 * np.eye(6), station, 0.0)
-    return seen if isinstance(seen, joint_end.JointEnd) else joint_end.judged([seen])[0]
+    place = end_place(joint, 1.0)
+    assert np.allclose(place.T_bridge_joint[:3, :3], np.eye(3))
+    part = ends_faces.RegisteredPart(
+        points=noisy,
+        station=np.zeros(len(points), np.int64),
+        between_stations=0.0,
+        pose=1e-12 * np.eye(6),
+        surface=surface,
+        outer=outer,
+    )
+    end = joint_end.fit(part, place)
+    return end if isinstance(end, joint_end.JointEnd) else joint_end.estimate([end])[0]
 
 
 def test_the_outer_faces_are_those_that_the_corners_lie_on():
     surface, joint = design()
-    outer = ends_faces.of_part(surface, [joint])
+    outer = ends_faces.outer_faces(surface, [joint])
     assert len(outer.faces) == 8
     assert np.isin(np.abs(outer.vertices[outer.faces][:, :, 1]), [B]).all()
 
@@ -90,7 +96,7 @@ def test_corners_centimetres_off_are_found_within_their_intervals(seed):
     end = fitted(built(cloud(rng, 8.0), corners), rng)
     assert end.trouble == ""
     truth = np.vstack([corners, *(0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)))])
-    off = end.moved - truth
+    off = end.departure - truth
     sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
     assert sd.max() < 0.4
     assert (np.abs(off) < 4.0 * np.hypot(sd, 0.05)).all()
@@ -98,7 +104,7 @@ def test_corners_centimetres_off_are_found_within_their_intervals(seed):
 
 @pytest.mark.parametrize("side", range(4))
 def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
-    """The outer side then lies where the design has the inner one, and was seen in a fifth of the points."""
+    """The outer side then lies where the design has the inner one, and has a fifth of the points."""
     rng = np.random.default_rng(side)
     inward = np.array([[0.0, 0, 1], [0, 1, 0], [0, 0, -1], [0, -1, 0]])[side]
     on_side = ((0, 1), (1, 2), (2, 3), (3, 0))[side]
@@ -108,12 +114,14 @@ def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     shares[side] = 0.2
     end = fitted(built(cloud(rng, 8.0, shares), corners), rng)
     assert end.trouble == ""
-    assert np.abs(end.moved[list(on_side)] - corners[list(on_side)]).max() < 1.0
+    assert np.abs(end.departure[list(on_side)] - corners[list(on_side)]).max() < 1.0
 
 
 def test_a_face_of_which_one_side_alone_was_seen_may_be_the_inner_one():
     rng = np.random.default_rng(5)
-    end = fitted(built(cloud(rng, 8.0, (1.0, 1.0, 0.0, 1.0)), np.zeros((4, 3))), rng)  # of the top, the inside alone
+    end = fitted(
+        built(cloud(rng, 8.0, (1.0, 1.0, 0.0, 1.0)), np.zeros((4, 3))), rng
+    )  # no points on the outside of the top
     assert end.trouble == "the top face may be the plate's inner side"
 
 
@@ -121,7 +129,7 @@ def test_the_outermost_layer_of_a_tilted_plate():
     rng = np.random.default_rng(1)
     x, w = rng.uniform(size=4000), rng.uniform(-1.0, 1.0, 4000)
     basis = np.stack([np.ones(4000), x, w, x * w], axis=1)
-    level = basis @ np.array([3.0, -12.0, 18.0, 5.0])  # by more across the plate than it is thick
+    level = basis @ np.array([3.0, -12.0, 18.0, 5.0])  # across the plate it changes by more than the thickness
     inner = np.arange(4000) % 3 > 0
     out = level - 24.0 * inner + rng.standard_normal(4000)
     cell = (np.floor(5 * x) * 6 + np.floor(3.0 * (w + 1.0))).astype(np.int64)
@@ -130,47 +138,8 @@ def test_the_outermost_layer_of_a_tilted_plate():
     assert not kept[inner].any()
 
 
-def test_variance_of_form():
-    rng = np.random.default_rng(2)
-    cell = np.repeat(np.arange(40), 100)
-    found = [variance_components.lack_of_fit_variance([(rng.standard_normal(4000), cell)], 0) for _ in range(40)]
-    # By noise alone the sum of squares between 40 cells is chi-squared: its mean is 40, its sd sqrt(80).
-    assert max(found) < 5.0 * np.sqrt(80.0) / 4000.0
-    steps = 0.5 * rng.standard_normal(40)
-    assert variance_components.lack_of_fit_variance(
-        [(rng.standard_normal(4000) + steps[cell], cell)], 0
-    ) == pytest.approx(float(np.mean(steps**2)), abs=0.05)
-    assert variance_components.lack_of_fit_variance([(np.zeros(3), np.arange(3))], 0) == 0.0
-
-
-def faces_of(rng, bent, sigma, count=40, points=4_000):
-    """Rests of faces that depart at the joint by a cubic of so much, along the zone and from side to side."""
-    found = []
-    for _ in range(count):
-        x, w = rng.uniform(-ends_faces.ZONE_MM, 0.0, points), rng.uniform(-1.0, 1.0, points)
-        amid, across = bent * rng.standard_normal(2)
-        # On 0..1 from the far side of the zone: 20 t^3 - 30 t^2 + 12 t - 1 is what quadratics leave of 20 t^3.
-        out = (amid + across * w) * 20.0 * (1.0 + x / ends_faces.ZONE_MM) ** 3 + sigma * rng.standard_normal(points)
-        basis = ends_faces.basis(x, w)
-        found.append((basis, out - basis @ np.linalg.lstsq(basis, out, rcond=None)[0]))
-    return found
-
-
-def test_what_bends_a_face_beyond_its_numbers_is_found_at_the_joint():
-    rng = np.random.default_rng(4)
-    third = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.3, 1.0)])
-    # By hand: the mean square of the polynomial is 1/7, and 1/21 where it goes with w.
-    np.testing.assert_allclose(third[::2, 1], 7.0 / 4_000, rtol=0.1)
-    np.testing.assert_allclose(third[1::2, 1], 21.0 / 4_000, rtol=0.1)
-    # 80 squares of normal numbers: their mean is known to sqrt(2 / 80).
-    assert variance_components.excess(third) == pytest.approx(0.09, rel=3.0 * np.sqrt(2.0 / 80.0))
-    nothing = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.0, 1.0)])
-    assert variance_components.excess(nothing) < 5.0 * np.sqrt(2.0 / 80.0) * nothing[:, 1].max()
-    assert variance_components.excess(np.array([[0.1, 0.02], [0.1, 0.02]])) == 0.0
-
-
 def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
-    """The edges of a shallow arch hardly hold it along itself: noise of 0.02 mm would move it by decimetres."""
+    """The edges of a shallow arch hardly constrain it along its chord: noise of 0.02 mm would move it by decimetres."""
     rng = np.random.default_rng(3)
     arc = np.linspace(-6000.0, 6000.0, 60)
     angle = arc / 60_000.0
@@ -180,84 +149,28 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
         up = np.stack([np.sin(angle), np.zeros(60), np.cos(angle)], axis=1)
         axes.append(np.stack([np.broadcast_to([0.0, 1.0, 0.0], up.shape), up], axis=1))
     noise = 0.02 * rng.standard_normal((120, 2))
-    edges = EdgeStations(
-        ("left",) * 60 + ("right",) * 60, np.tile(arc, 2), np.vstack(points), np.vstack(axes), noise,
-        np.stack([0.02**2 * np.eye(120)] * 2), np.zeros((120, 2, 6)),
-    )  # fmt: skip
-    member = adjustment.Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]), np.zeros((6, 6)))
+    edges = EdgeDepartures(
+        side=("left",) * 60 + ("right",) * 60,
+        chainage=np.tile(arc, 2),
+        points=np.vstack(points),
+        axes=np.vstack(axes),
+        departure=noise,
+        covariance=np.stack([0.02**2 * np.eye(120)] * 2),
+        by_pose=np.zeros((120, 2, 6)),
+    )
+    member = Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]), np.zeros((6, 6)))
     adjusted = adjustment.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
     assert np.abs(adjusted.motions[0][:3, 3]).max() < 1.0 + 60_000.0 * 2e-5  # its turn is about the middle
     moved = adjusted.motions[0] @ np.array([0.0, 0.0, 60_000.0, 1.0])
     assert abs(moved[0]) < 1.0
 
 
-def test_a_belief_is_no_surer_than_the_values_in_any_direction():
-    rng = np.random.default_rng(4)
-    least, own = (a @ a.T + 0.1 * np.eye(5) for a in rng.normal(size=(2, 5, 5)))
-    raised = no_surer(Believed(np.arange(5.0), own, np.eye(5)), least)
-    for floor in (own, least):
-        assert np.linalg.eigvalsh(raised.covariance - floor).min() > -1e-9
-    np.testing.assert_array_equal(raised.mean, np.arange(5.0))
-    # Where it is less sure already, nothing changes.
-    same = no_surer(Believed(np.zeros(5), 2.0 * least, np.eye(5)), least)
-    np.testing.assert_allclose(same.covariance, 2.0 * least, rtol=1e-12)
-
-
-def test_what_is_surely_nothing_may_stay_so():
-    least = np.diag([0.5, 0.0])  # of a scan without noise bends are known not to be there
-    raised = no_surer(Believed(np.zeros(2), np.diag([0.1, 0.0]), np.eye(2)), least)
-    np.testing.assert_allclose(raised.covariance, least, atol=2e-8)
-
-
-def test_what_two_sets_of_hypotheses_say_is_what_all_of_them_say():
-    rng = np.random.default_rng(6)
-    noise, *priors = (a @ a.T + 0.1 * np.eye(3) for a in rng.normal(size=(5, 3, 3)))
-    every = [(before, prior) for before, prior in zip((0.4, 0.1, 2.0, 1.0), priors, strict=True)]
-    value = rng.normal(size=3)
-    whole = weigh(value, noise, every)
-    for parts in ((every[:1], every[1:]), (every[2:], every[:2])):
-        found = either(*(weigh(value, noise, part) for part in parts))
-        np.testing.assert_allclose(found.mean, whole.mean, rtol=1e-10)
-        np.testing.assert_allclose(found.covariance, whole.covariance, rtol=1e-10, atol=1e-14)
-        np.testing.assert_allclose(found.gain @ value, whole.mean, rtol=1e-10)
-        np.testing.assert_allclose(found.gain, whole.gain, rtol=1e-10, atol=1e-14)
-        assert found.evidence == pytest.approx(whole.evidence)
-
-
 def test_a_bridge_without_an_end_that_was_seen_has_none_to_judge():
-    assert joint_end.judged([]) == []
-
-
-def test_others_say_how_large_departures_are():
-    before = np.array([1.0, 1.0, 2.0])
-    logs = np.log(np.array([[0.9, 0.1, 1e-9], [0.8, 0.2, 1e-9], [1e-9, 1e-9, 1.0], [0.9, 0.1, 1e-9]]))
-    one_trait = np.arange(3)[None]
-    weights = by_the_others(logs, before, one_trait)
-    np.testing.assert_allclose(weights.sum(axis=1), 1.0)
-    # Three say the first: so it is for each of them, and less so by the others of these than by those of the third.
-    assert (weights.argmax(axis=1) == 0).all()
-    assert weights[2, 0] > weights[0, 0] > 0.45
-    # One by itself, and things that say nothing, leave all as it was.
-    np.testing.assert_allclose(by_the_others(logs[:1], before, one_trait), [[0.25, 0.25, 0.5]])
-    silent = by_the_others(np.zeros((3, 3)), before, one_trait)
-    np.testing.assert_allclose(silent, np.tile([0.25, 0.25, 0.5], (3, 1)))
-
-
-def test_how_ends_bend_is_learned_however_far_each_is_shifted():
-    """Hypotheses are two shifts by two bends: two ends of either shift are straight, the last one's bend is unknown."""
-    traits = np.array([[0, 0, 1, 1], [0, 1, 0, 1]])
-    near, far, far_alone = np.log([[1.0, 1e-6, 1e-6, 1e-6], [1e-6, 1e-6, 1.0, 1e-6], [1e-6, 1e-6, 1.0, 1.0]])
-    logs = np.stack([near, near, far, far, far_alone])
-    weights = by_the_others(logs, np.ones(4), traits)
-    # By all other four, with what is believed before as a fifth: nine of ten for straight, whatever the shift.
-    np.testing.assert_allclose(weights[4, 2] / weights[4, 2:].sum(), 0.9, rtol=1e-3)
-    np.testing.assert_allclose(weights[4, 0] / weights[4, :2].sum(), 0.9, rtol=1e-3)
-    whole = by_the_others(logs, np.ones(4), np.arange(4)[None])
-    assert whole[4, 2] / whole[4, 2:].sum() < 0.9
+    assert joint_end.estimate([]) == []
 
 
 def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
-    """Drawn 400 times: intervals of gaps and movements are those of what was drawn, registrations' errors included."""
+    """Intervals of gaps and movements against 400 draws, with the registrations' errors included."""
     rng = np.random.default_rng(8)
     corners = np.array([[0.0, y, z] for y, z in ((700, -900), (-700, -900), (-700, 900), (700, 900))], float)
     joints = np.array([np.vstack([corners, 0.5 * (corners + np.roll(corners, -1, axis=0))])])
@@ -269,19 +182,24 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
     for sense in (-1.0, 1.0):
         points = np.array([[sense * x, y, -900.0] for y in (700.0, -700.0) for x in along])
         moves = np.einsum("kai,kij->kaj", axes, rigid.motion(points))
-        edges = EdgeStations(
-            ("left",) * 12 + ("right",) * 12, np.tile(along, 2), points, axes, np.zeros((24, 2)),
-            np.stack([noise**2 * np.eye(24)] * 2), moves,
-        )  # fmt: skip
+        edges = EdgeDepartures(
+            side=("left",) * 12 + ("right",) * 12,
+            chainage=np.tile(along, 2),
+            points=points,
+            axes=axes,
+            departure=np.zeros((24, 2)),
+            covariance=np.stack([noise**2 * np.eye(24)] * 2),
+            by_pose=moves,
+        )
         at_joint = rigid.motion(joints[0]).reshape(24, 6)
         covariance = at_joint @ pose @ at_joint.T + noise**2 * np.eye(24)
-        end = joint_end.JointEnd(np.zeros((8, 3)), covariance, at_joint, 0.0, "")
+        end = joint_end.JointEnd(np.zeros((8, 3)), covariance, at_joint, "")
         middle = np.array([3000.0 * sense, 0.0, 0.0])
-        parts.append(adjustment.Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
+        parts.append(Member((None, end) if sense < 0.0 else (end, None), edges, middle, pose))
     stated = adjustment.adjust(parts, joints, np.eye(4)[None], 0.1)
     for end in (parts[0].ends[1], parts[1].ends[0]):
-        left = np.sqrt(np.diag(adjustment.of_itself(end, pose)))
-        np.testing.assert_allclose(left, noise, rtol=1e-3)  # what limits the gap: the rest cancels in it
+        left = np.sqrt(np.diag(adjustment.without_pose(end, pose)))
+        np.testing.assert_allclose(left, noise, rtol=1e-3)  # the error of the registration cancels in the gap
     gaps, moved, at_rest, largest = [], [], [], []
     for _ in range(400):
         wrong = np.sqrt(np.diag(pose)) * rng.standard_normal((2, 6))
@@ -289,30 +207,32 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
         for part, own in zip(parts, wrong, strict=True):
             departure = -part.edges.by_pose @ own + noise * rng.standard_normal((24, 2))
             ends = tuple(
-                one and replace(one, moved=(-one.by_pose @ own + noise * rng.standard_normal(24)).reshape(8, 3))
+                one and replace(one, departure=(-one.by_pose @ own + noise * rng.standard_normal(24)).reshape(8, 3))
                 for one in part.ends
             )
             drawn.append(replace(part, ends=ends, edges=replace(part.edges, departure=departure)))
         found = adjustment.adjust(drawn, joints, np.eye(4)[None], 0.1)
         gaps.append(found.gaps.ravel())
-        # With the first part back on its design, edges lie off by what it was registered wrong by.
+        # With the first part on its design, all edges have the error of its registration.
         back = rigid.invert(found.motions[0])
         for edges, departure in zip((one.edges for one in drawn), found.departures, strict=True):
             there = edges.points + np.einsum("ka,kai->ki", departure, edges.axes)
             at_rest.append(np.einsum("kai,ki->ka", edges.axes, rigid.apply(back, there) - edges.points))
         largest.append([np.abs(found.gaps).mean(), np.abs(found.gaps).max()])
-        # Where the outer end of the last part comes to lie: by its movement, and by what it was wrong.
+        # Error of the last part's outer end: by its movement and by its registration.
         at = np.array([[6000.0, 0.0, 0.0]])
         moved.append((rigid.apply(found.motions[1], at) - at)[0] - rigid.motion(at)[0] @ wrong[1])
-    assert np.sqrt(np.diag(stated.gap_covariance[0])).max() < 2.0 * noise  # of 0.14 mm that both ends are wrong by
+    assert (
+        np.sqrt(np.diag(stated.gap_covariance[0])).max() < 2.0 * noise
+    )  # of the 0.14 mm that both ends have in common
     pulls = np.array(gaps) / np.sqrt(np.diag(stated.gap_covariance[0]))
     np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)
     drawn_sd = np.std(np.array(at_rest).reshape(400, 48, 2), axis=0)
     np.testing.assert_allclose(drawn_sd, np.sqrt(np.vstack(stated.at_rest_variance)), rtol=0.2)
     halves = span_and_closure.mean_max_ci95(stated.gaps.reshape(-1, 1), np.diag(stated.gap_covariance[0])[:, None])
-    assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # true gaps are none
+    assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # the true gaps are zero
     assert (np.quantile(largest, 0.95, axis=0) > 0.3 * np.array(halves)).all()
-    J, own = rigid.motion(at - parts[1].middle)[0], rigid.motion(at)[0]
+    J, own = rigid.motion(at - parts[1].centre)[0], rigid.motion(at)[0]
     both = J @ stated.motion_with_pose[6:, 6:] @ own.T
     covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T
     np.testing.assert_allclose(np.std(moved, axis=0), np.sqrt(np.diag(covariance)), rtol=0.2)

@@ -1,4 +1,4 @@
-"""Measures and verdicts of a joint against closed forms, numbers by hand and draws of the errors themselves."""
+"""Measures and verdicts of a joint against closed forms, numbers by hand and draws of the errors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from processor.limits import standards
 from processor.model import Limit, Tolerance
-from processor.preassembly.baselines import edge_features
+from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.verdicts import joint_measures, joints
 from processor.preassembly.verdicts.joint_measures import measure
 from processor.preassembly.verdicts.joints import judge
@@ -49,7 +49,7 @@ def only(**limits):
 def test_the_joints_axes_are_those_of_its_frame():
     T = tilted()
     there = POINTS @ T[:3, :3].T + T[:3, 3]
-    np.testing.assert_allclose(edge_features.joint_frame(there), T, atol=1e-9)
+    np.testing.assert_allclose(joint_frame(there), T, atol=1e-9)
     gaps = np.random.default_rng(1).normal(size=(8, 3))
     covariance = some_covariance(2)
     local, spread = joint_measures.in_joint_axes(gaps, covariance, T)
@@ -88,7 +88,7 @@ def test_a_turn_about_y_by_hand():
 
 @pytest.mark.parametrize("seed", range(5))
 def test_any_small_motion_is_found_again(seed):
-    """The right part moved as scipy turns it; second order left out."""
+    """The right part moved by a rotation of scipy, to first order."""
     rng = np.random.default_rng(seed)
     turn, offset = rng.normal(size=3) * 1e-6, rng.normal(size=3)
     gaps = Rotation.from_rotvec(turn).apply(POINTS) + offset - POINTS
@@ -111,7 +111,7 @@ def test_misalignment_is_across_the_plates():
 def test_half_widths_against_draws():
     covariance = some_covariance(5)
     gaps = np.zeros((8, 3))
-    gaps[:, 0] = np.linspace(0.0, 28.0, 8)  # P1 and P8 stand clear: their extremes are theirs alone
+    gaps[:, 0] = np.linspace(0.0, 28.0, 8)  # P1 and P8 stand clear: no other point can be the extreme
     gaps[6, 2] = -9.0
     found = at_rest(gaps, covariance)
     drawn = np.random.default_rng(6).multivariate_normal(gaps.ravel(), covariance, 200_000).reshape(-1, 8, 3)
@@ -134,7 +134,7 @@ def test_half_widths_against_draws():
 
 @pytest.mark.parametrize("shape", ["level", "two alike", "wedge", pytest.param("zero", marks=pytest.mark.slow)])
 def test_intervals_of_extremes_hold(shape):
-    """True extremes lie within the stated intervals in 95 % of measurements or more, however many points are alike."""
+    """True extremes lie within the intervals in at least 95 % of measurements, however many points are alike."""
     true = np.zeros((8, 3))
     if shape == "two alike":
         true[:, 0], true[2:4, 0] = 0.0, 3.0
@@ -186,11 +186,11 @@ def test_a_lone_extreme_has_the_interval_of_a_single_value():
     ],
 )
 def test_guard_band(interval, verdict):
-    assert joints.guarded(interval, -1.0, 2.0) == verdict
+    assert joints.guard_band(interval, -1.0, 2.0) == verdict
 
 
 def lone(value, sd, point=5, axis=1):
-    """Gaps that are known but for one of them."""
+    """Gaps of which all but one are known exactly."""
     gaps, covariance = np.zeros((8, 3)), np.zeros((24, 24))
     gaps[point, axis] = value
     covariance[3 * point + axis, 3 * point + axis] = sd**2

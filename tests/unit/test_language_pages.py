@@ -18,7 +18,7 @@ from processor.defects.result import Result as Defects
 from processor.deviation.result import Registration
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
-from processor.language.messages import messages
+from processor.language.messages import label, messages
 from processor.model import reason
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import Held
@@ -58,7 +58,7 @@ STITCH_CHECKS = (
     "three-point: scans not placed",
 )  # fmt: skip
 DEFECT_CHECKS = (
-    *(f"missed: {kind}" for kind in DefectClass), "paper: missed: step", "false alarms", "surface examined",
+    *(f"missed: {kind}" for kind in DefectClass), "false alarms", "surface examined",
     "class wrong", "depths off by more than a tenth and 2 LOD95", "depth error, median", "depth error, max",
     "depths that are bounds alone",
 )  # fmt: skip
@@ -127,7 +127,8 @@ def searched():
     first = step_results.defects(reasons=(placed, *step_results.EXAMINED))
     paper = step_results.defects(3, PAPER, method="paper")
     made = step_results.execution(("defects", "default", "{}", first), ("defects", "paper", "{}", paper))
-    return made, ErrorReport(checks_of("defects", *DEFECT_CHECKS))
+    of_paper = metric("missed: step", 1.0, step="defects", method="paper")
+    return made, ErrorReport((*checks_of("defects", *DEFECT_CHECKS), of_paper))
 
 
 @pytest.mark.parametrize("made", [stitched, controlled, given, searched])
@@ -163,7 +164,7 @@ def test_a_word_of_two_senses_has_that_of_its_vocabulary_or_column():
     say = language.language("zh").say
     assert (say("step"), say(DefectClass.STEP), say("missed: step")) == ("步骤", "错台", "漏检：错台")
     assert (say("misalignment"), say(DefectClass.MISALIGNMENT)) == ("接口错边", "整体偏位")
-    assert (say("side"), say("side", "heading")) == ("立面", "边长")
+    assert (say("side"), say(label("side"))) == ("立面", "边长")
 
 
 # --- a batch --------------------------------------------------------------------------------------------------------

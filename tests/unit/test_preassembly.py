@@ -1,4 +1,4 @@
-"""The source paper's preassembly on a bridge made with numpy: attitudes, features, errors, and what must fail aloud."""
+"""The source paper's preassembly on a bridge made with numpy: attitudes, features, errors, and reported failures."""
 
 import dataclasses
 
@@ -12,7 +12,8 @@ from processor.model import InputError, Scene, UsageError
 from processor.preassembly import errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features, joint_alignment, methods
-from processor.preassembly.params import PAPER_METHODS
+from processor.preassembly.ends.joint_frame import joint_frame
+from processor.preassembly.params import PAPER_METHODS, BoxParams, MatchParams, SliceParams
 from processor.preassembly.parts import attitude
 from tests.support import arch_clouds
 
@@ -24,7 +25,7 @@ def bridge():
 
 @pytest.fixture(scope="module")
 def runs(bridge):
-    """Answers by all methods; what the paper's three have in common, the features of the parts, is extracted once."""
+    """Results of all methods; the features, common to the paper's three, are extracted once."""
     scene, _ = bridge
     scans = [own[0] for own in preassembly_step.scans_in_order(scene, scene.arch)]
     parts = methods.extract(scans, scene.arch, preassembly_step.Params())
@@ -93,10 +94,8 @@ def box_end(spacing=4.0, sigma=0.0, width=900.0, height=1100.0, plate=24.0):
 
 
 def test_reduced_boxes_find_the_inner_edges_of_the_plates():
-    # As published: the point nearest to P lies on the end's inner edge, a plate's thickness inside of the outer one.
-    edges = edge_features.reduced_boxes(
-        box_end(), 1.0, 4.0, edge_features.BoxParams(edge_box_mm=36.0), np.random.default_rng(0)
-    )
+    # As published: the point nearest to P lies on the end's inner edge, a plate's thickness inside the outer edge.
+    edges = edge_features.reduced_boxes(box_end(), 1.0, 4.0, BoxParams(edge_box_mm=36.0), np.random.default_rng(0))
     inner_b, inner_h = 450.0 - 24.0, 550.0 - 24.0
     expected = np.array(
         [[0, inner_b, -inner_h], [0, -inner_b, -inner_h], [0, -inner_b, inner_h], [0, inner_b, inner_h]]
@@ -109,13 +108,13 @@ def test_reduced_boxes_find_the_inner_edges_of_the_plates():
 def test_reduced_boxes_without_points_say_so():
     cut = box_end()
     rng = np.random.default_rng(0)
-    assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, edge_features.BoxParams(), rng) is None
-    assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, edge_features.BoxParams(), rng) is None
+    assert edge_features.reduced_boxes(cut[np.abs(cut[:, 1]) > 200.0], 1.0, 4.0, BoxParams(), rng) is None
+    assert edge_features.reduced_boxes(cut[:20], 1.0, 4.0, BoxParams(), rng) is None
 
 
 def test_the_joint_frame_looks_along_the_bridge():
     points = arch_clouds.key_points(0.4 * arch_clouds.ARC)
-    T = edge_features.joint_frame(points)
+    T = joint_frame(points)
     ahead = arch_clouds.position(np.array([0.4 * arch_clouds.ARC + 1.0]), np.zeros(1), np.zeros(1))
     here = arch_clouds.position(np.array([0.4 * arch_clouds.ARC]), np.zeros(1), np.zeros(1))
     np.testing.assert_allclose(T[:3, 0], (ahead - here)[0], atol=1e-4)
@@ -127,12 +126,12 @@ def test_slices_follow_the_bottom_edges():
     rng = np.random.default_rng(3)
     points = arch_clouds.scan_points(2, 8.0, 0.5, rng)
     part = arch_clouds.design().parts[2]
-    left, right = edge_features.slice_edges(points, np.eye(4), 8.0, 0.5, edge_features.SliceParams())
+    left, right = edge_features.slice_edges(points, np.eye(4), 8.0, 0.5, SliceParams())
     for found, design in ((left, part.bottom_edge_left), (right, part.bottom_edge_right)):
         offset = np.linalg.norm(Polyline.through(design).nearest(found)[1], axis=1)
         assert len(found) > 500
         assert np.median(offset) < 2.0 * 8.0
-        # nothing may remain of the ends, where the lowest point of a slice runs up the section
+        # no points of the end faces, along which the lowest point of a slice moves up
         assert np.quantile(offset, 0.99) < 8.0 * 8.0
 
 
@@ -146,7 +145,7 @@ def test_linear_error_of_a_lifted_edge_by_hand():
     left = np.array(found.edge) == "left"
     assert found.deviation[left].mean() == pytest.approx(5.0, abs=0.3)  # the noise does not add to it
     np.testing.assert_allclose(found.deviation[~left], 0.0, atol=1e-12)
-    assert np.diff(found.station[left]) == pytest.approx(200.0)
+    assert np.diff(found.chainage[left]) == pytest.approx(200.0)
 
 
 def test_splicing_error_by_hand():
@@ -168,7 +167,7 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
     checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
     assert checks["wrong poses called ok"].passed
     if method in PAPER_METHODS:
-        # The key points lie on the inner edges: off by the root of two plates squared, as the authors did not say.
+        # The key points lie on the inner edges: off by the root of the sum of two thicknesses squared.
         assert checks["key points in the scan, rms"].value == pytest.approx(np.hypot(24.0, 24.0) * 0.87, rel=0.2)
     else:
         assert checks["key points in the scan, rms"].value < 0.5
@@ -190,14 +189,14 @@ def test_the_adjustment_states_intervals_that_hold(bridge, runs):
     known = np.isfinite(result.key_points_sd)
     assert known.sum() == 8 * 8 * 3
     pull = (off / result.key_points_sd)[known]
-    # 19 numbers an end are independent, not its 24 coordinates: 8 ends leave a spread of a tenth.
+    # An end has 19 independent coordinates of 24: 8 ends determine the ratio to a tenth.
     assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
     for size in (off[known], result.key_points_sd[known]):
         assert np.sqrt((size**2).mean()) < 0.12
     np.testing.assert_array_less(np.abs(result.gaps), 2.0 * result.gap_ci95)  # perfect parts: no gap but noise
     assert result.splicing_mean < 0.1
     assert set(result.verdict) == {"pass"}
-    # The heavier the design, the nearer the line and the wider the gaps.
+    # A larger weight of the design moves the edges closer to it and widens the gaps.
     splicing, linear = result.trade_figures[:, 0], result.trade_figures[:, 2]
     assert (np.diff(result.trade_lambda) < 0.0).all()
     assert (np.diff(splicing) <= 1e-6).all()
@@ -220,7 +219,7 @@ def test_the_adjustment_measures_what_was_built_otherwise(bridge):
     result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params())
     moved = rigid.apply(T, result.key_points_scan[2, 0]) - truth.arch.key_points_bridge[2, 0]
     np.testing.assert_allclose(moved @ (ahead - here), 3.0, atol=0.35)
-    # Edges may slide along themselves: the bridge closes the gap and is shorter between its feet by as much.
+    # Edges do not constrain a part along its length: the gap closes, and the span is shorter by as much.
     assert np.abs(result.gaps[1] @ (ahead - here)).max() < 0.6
     shift = [
         rigid.apply(result.T_bridge_scan[i] @ rigid.invert(truth.arch.T_bridge_scan[i]), points.mean(axis=0))
@@ -258,23 +257,21 @@ def test_a_part_of_another_place_is_not_assembled(bridge):
 
 
 def test_the_design_keeps_the_line(runs):
-    # The source paper's finding, in kind: chained by joints alone the bridge turns with Foot 1's attitude.
+    # As found by the source paper: chained by joints alone, the bridge turns with Foot 1's attitude.
     assert runs["design-aided"].linear_mean < 0.5 * runs["line"].linear_mean
     assert runs["design-aided"].linear_mean < 0.5 * runs["corner"].linear_mean
 
 
 @pytest.mark.parametrize(("slide", "believed"), [(300.0, True), (1500.0, False)])
 def test_a_coarse_pose_slid_along_the_bridge_is_not_believed(slide, believed, monkeypatch):
-    # Histograms of straight lines are alike all along: a pose may be right in attitude and metres off along the line.
+    # Histograms do not change along a straight line: a pose may be right in attitude and metres off along it.
     def slid(*_, **__):
         return rigid.transform(np.eye(3), np.array([slide, 0.0, 0.0]))
 
     monkeypatch.setattr(pfh, "coarse_alignment", slid)
     x = np.linspace(0.0, 5000.0, 400)
     lines = np.vstack([np.column_stack([x, np.full_like(x, y), np.zeros_like(x)]) for y in (-450.0, 450.0)])
-    T, message = joint_alignment._coarse(
-        lines, lines, np.eye(4), joint_alignment.MatchParams(), np.random.default_rng(0)
-    )
+    T, message = joint_alignment._coarse(lines, lines, np.eye(4), MatchParams(), np.random.default_rng(0))
     assert (T[0, 3], message == "") == ((slide, True) if believed else (0.0, False))
     assert believed or "1500 mm from where the joint puts the part" in message
 

@@ -1,4 +1,4 @@
-"""Parts and scans as they come: square, half missing, steep, dirty, unmarked, cut, in two scans, of other plates."""
+"""Difficult parts and scans: square, half missing, steep, cluttered, unmarked, cut, in two scans, of other plates."""
 
 import dataclasses
 from itertools import product
@@ -14,9 +14,9 @@ from processor.geometry import principal, rigid
 from processor.geometry.neighbors import by_cell
 from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene
 from processor.preassembly import step as preassembly_step
-from processor.preassembly.baselines import edge_features
+from processor.preassembly.ends.joint_frame import joint_frame
+from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import attitude, identity, measure
-from processor.preassembly.parts.systematic_errors import SystematicParams
 from tests.support import arch_clouds
 from tests.support.arch_clouds import random_pose
 
@@ -56,7 +56,8 @@ def scanned(points, seed=1, name="scan", component=""):
 
 
 def measured(design, index, *scans):
-    return measure.measure(scans, index, design, 1.0, SystematicParams())
+    systematic = SystematicParams()
+    return measure.estimate([measure.fit(scans, index, design, 1.0, systematic)], systematic)[0]
 
 
 def pulls(design, index, part, found, T):
@@ -64,10 +65,10 @@ def pulls(design, index, part, found, T):
     result = {}
     for end, joint, s in (("start", index - 1, part.s0), ("end", index, part.s1)):
         own = found.member.ends[("start", "end").index(end)]
-        if own is None or not np.isfinite(own.moved).all():
+        if own is None or not np.isfinite(own.departure).all():
             continue
-        R = edge_features.joint_frame(design.joint_points[joint])[:3, :3]
-        there = design.joint_points[joint] + own.moved @ R.T
+        R = joint_frame(design.joint_points[joint])[:3, :3]
+        there = design.joint_points[joint] + own.departure @ R.T
         off = (rigid.apply(T @ rigid.invert(found.T_bridge_scan), there) - part.key_points(s)) @ R
         result[end] = off.ravel() / np.sqrt(np.diag(own.covariance))
     return result
@@ -79,13 +80,13 @@ def assert_right(found, design, index, part, T, ends=("start", "end")):
     every = pulls(design, index, part, found, T)
     assert tuple(every) == ends
     for pull in every.values():
-        # Of 24 coordinates that hang on 22 numbers.
+        # 24 coordinates with 22 degrees of freedom.
         assert np.sqrt((pull**2).mean()) < 2.0
         assert np.abs(pull).max() < 4.5
 
 
 def assert_found_right(parts, design, points):
-    """Scan the rib as points from somewhere: it is found, sure, and right at both ends."""
+    """Scan the rib in a random frame: its pose is unambiguous, and both ends are right."""
     scan, T = scanned(points)
     found = measured(design, RIB, scan)
     assert found.status == "ok"
@@ -130,7 +131,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
     part = parts[RIB]
     points = cloud(part)
     s, u = part.pad
-    # Neither the mark nor the place where it would be with the part turned round.
+    # Without the mark, and without its place on the part turned round.
     pads = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
     bare = points[(np.linalg.norm(points[:, None] - pads, axis=2) > 400.0).all(axis=1)]
     scan, T = scanned(bare)
@@ -144,7 +145,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
 
 
 def test_parts_of_one_shape_are_told_apart_by_their_mark():
-    """Rib 3 turned round is rib 1 but for its mark: laid as rib 1 it fits to the noise."""
+    """Rib 3 turned round equals rib 1 but for its mark: it fits rib 1 to the noise."""
     parts, design = bridge()
     for asked, came in ((1, 3), (0, 4)):
         found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
@@ -155,7 +156,7 @@ def test_parts_of_one_shape_are_told_apart_by_their_mark():
 
 
 def without_the_marks_places(part, points):
-    """Points of a part but for about its mark, and about where its twin has its own."""
+    """Points of a part without those near its mark, and near the mark of the part of the same shape."""
     s, u = part.pad
     places = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
     return points[(np.linalg.norm(points[:, None] - places, axis=2) > 400.0).all(axis=1)]
@@ -176,11 +177,11 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
     points = cloud(part, spacing_mm=14.0)
     s, u = part.pad
     turned = part.point(np.array([s, part.s0 + part.s1 - s]), np.array([u, -u]), np.full(2, SMALL.height_mm))
-    for place in turned:  # the mark, and where rib 3 has its own: 14 mm up over half a metre
+    for place in turned:  # the mark, and the place of rib 3's mark: 14 mm up over half a metre
         far = np.linalg.norm(points - place, axis=1)
         up = part.point(np.array([s]), np.array([u]), np.array([1.0])) - part.point(np.array([s]), np.array([u]), [0.0])
         points = points + np.where(far < 700.0, 14.0, 0.0)[:, None] * up
-    assert identity.tell(points, np.eye(4), shape, design.parts[1], design) == identity.Told()
+    assert identity.identify(points, np.eye(4), shape, design.parts[1], design) == identity.Identity()
 
 
 @pytest.mark.parametrize(
@@ -192,7 +193,7 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
     ],
 )
 def test_neighbours_swapped_are_named(asked, came, said):
-    """By its size: also of scans that fit the wrong part well enough to be weak only."""
+    """By its size, also where the scan fits the wrong part well enough to be weak only."""
     parts, design = bridge()
     found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=20.0))[0])
     assert found.status != "ok"
@@ -217,7 +218,7 @@ def on_foot():
 
 @pytest.mark.parametrize("strays", [0, 3])
 def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot, strays, monkeypatch):
-    """The upper half of this foot has the rib's section: the rest passed for clutter. With clutter no size tells."""
+    """The upper half of this foot has the rib's section, and the rest looks like clutter. Clutter hides the size."""
     design, scan = on_foot
     clutter = np.random.default_rng(1).normal(0.0, 100.0, (40 * strays, 3)) + 9e3
     scan = dataclasses.replace(scan, points=np.vstack([scan.points, clutter]))
@@ -225,10 +226,10 @@ def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot
     stated = attitude.Attitude(np.eye(4), np.eye(4), "ok", "")
     monkeypatch.setattr(attitude, "find", lambda *_: stated)
     found = measure._place(scan, design.parts[0], design, shape, 1.0)
-    assert 0.5 < found.fitted.used_share < 0.7
+    assert 0.5 < found.registration.used_share < 0.7
     if strays:
         assert found.doubt.endswith("of its sides; is this the right part, and whole?")
-        assert not found.rank[1]
+        assert not found.sure[1]
     else:
         assert found.trouble.endswith("of the points are away from the design's surface; by its size it is rather rib2")
 
@@ -241,8 +242,8 @@ def test_another_part_is_not_taken_for_a_foot(clutter, index):
     floor = np.random.default_rng(1).uniform([-9e3, -9e3, -5e3], [9e3, 9e3, -4.9e3], (int(clutter * len(points)), 3))
     every = np.vstack([points, floor + points.mean(axis=0)])
     wrong, right = placed(scene.arch, index, every), placed(scene.arch, 2, every)
-    assert wrong.trouble or wrong.doubt or wrong.found.status != "ok"
-    assert (right.found.status, right.trouble, right.doubt) == ("ok", "", "")
+    assert wrong.trouble or wrong.doubt or wrong.attitude.status != "ok"
+    assert (right.attitude.status, right.trouble, right.doubt) == ("ok", "", "")
 
 
 def test_how_much_of_a_part_its_points_lie_on():
@@ -260,7 +261,7 @@ def test_a_rival_farther_along_is_not_called_a_turn():
     _, design = bridge()
     surface = attitude.sample_surface(design.parts[1])
     along = rigid.transform(np.eye(3), 240.0 * surface.axes[:, 0])
-    assert attitude._said_of(np.eye(4), along, surface) == (
+    assert attitude._rival_message(np.eye(4), along, surface) == (
         "the part fits its design as well when shifted by 240 mm along itself; an end seen would tell"
     )
 
@@ -293,7 +294,7 @@ def test_a_scan_of_one_end_only_says_so():
 
 
 def test_two_scans_of_one_part_make_one():
-    """One scan sees the left side, the other the right: each holds the part, both ends are whole in the two only."""
+    """One scan shows the left side, the other the right: each constrains the part, only both show whole ends."""
     parts, design = bridge()
     part = parts[RIB]
     points = cloud(part, spacing_mm=12.0)
@@ -336,7 +337,7 @@ def with_a_floor(points, axes, share, rng):
     return np.vstack([points, floor @ axes.T])
 
 
-# By day a rib that was laid half a turn round: the right way was not tried.
+# The case that is not slow was once placed half a turn round: the right attitude had not been tried.
 @pytest.mark.parametrize(
     ("seed", "index", "share"),
     [
@@ -378,7 +379,7 @@ def test_no_random_pose_is_wrong_and_called_ok():
 
 @pytest.mark.slow
 def test_a_rib_of_even_curvature_is_not_laid_half_a_turn_round():
-    """The right attitude comes to rest 1.8 m along the arch here, and fits less well than the wrong one in place."""
+    """The right attitude converges 1.8 m off along the arch here, with a larger misfit than the wrong one."""
     recipe = recipes.overridden(recipes.load("arch-d3")[1], ["scan.sigma_mm=1.0", "scan.spacing_mm=5.0"])
     scene, truth = make("d3", recipe, 1)
     part = scene.arch.parts[2]

@@ -261,11 +261,11 @@ def test_stitching_finds_the_same_ends_in_files_as_in_the_scene(room, tmp_path):
     ours = room[0]
     formats.write_ptx(tmp_path / "a.ptx", ours, None)
     e57.write(tmp_path / "b.e57", [ours], spherical=False)
-    expected = scan_planes.prepared(ours, 200.0)
+    expected = scan_planes.extract(ours, 200.0)
     assert len(expected.ends.points) > 100
     for path in (tmp_path / "a.ptx", tmp_path / "b.e57"):
         (theirs,) = folder.read_input(path).scans
-        found = scan_planes.prepared(dataclasses.replace(theirs, sigma_mm=2.0), 200.0)
+        found = scan_planes.extract(dataclasses.replace(theirs, sigma_mm=2.0), 200.0)
         want, got = expected.ends.points, found.ends.points
         assert abs(len(want) - len(got)) <= 3  # PTX rounds, and some points lie at a limit
         np.testing.assert_allclose(got.mean(axis=0), want.mean(axis=0), atol=1.0)

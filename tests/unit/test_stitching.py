@@ -1,4 +1,4 @@
-"""Scans stitched by the structure itself, against poses that made them."""
+"""Method ``automatic`` on simulated scans of a room, compared with the true poses."""
 
 import dataclasses
 import json
@@ -22,13 +22,13 @@ from tests.support.stitch_clouds import four
 
 
 def errors(result, T):
-    """Shifts (k, 3) of the scanners, mm, and turns (k,), mrad, relative to the first scan."""
+    """Errors of positions (k, 3), mm, and of rotations (k,), mrad, relative to the first scan."""
     base = np.linalg.inv(T[0])
     shifts, turns = [], []
-    for found, true in zip(result.T_project_scan, T, strict=True):
+    for pose, true in zip(result.T_project_scan, T, strict=True):
         want = base @ true
-        shifts.append(found[:3, 3] - want[:3, 3])
-        turns.append(1e3 * Rotation.from_matrix(found[:3, :3] @ want[:3, :3].T).magnitude())
+        shifts.append(pose[:3, 3] - want[:3, 3])
+        turns.append(1e3 * Rotation.from_matrix(pose[:3, :3] @ want[:3, :3].T).magnitude())
     return np.array(shifts), np.array(turns)
 
 
@@ -38,13 +38,13 @@ def room():
     return T, scans, stitching_step.run(Scene("room", "structure", scans), stitching_step.Params())
 
 
-def test_four_scans_of_a_room_come_together(room):
+def test_four_scans_of_a_room_are_registered(room):
     T, _, result = room
     assert result.status == "ok"
     assert result.frame == "PRCS"
     assert set(result.scan_status) == {"ok"}
     shift, turn = errors(result, T)
-    # 78 thousand points of 2 mm a scan: the walls alone hold a scan to a few hundredths of a millimetre.
+    # With 78 thousand points of 2 mm in a scan the walls alone determine a pose to a few hundredths of a millimetre.
     assert np.abs(shift).max() < 0.2
     assert turn.max() < 0.05
     assert result.used.all()
@@ -53,8 +53,8 @@ def test_four_scans_of_a_room_come_together(room):
     assert result.closure_mm.max() < 0.5
 
 
-def test_what_is_said_of_the_pose_is_true_of_every_frame(room):
-    """Covariance: left perturbation in the project's frame, so a point's own follows; positions agree with poses."""
+def test_covariance_is_that_of_a_left_perturbation_in_the_project_frame(room):
+    """The covariance of a point follows from it, and agrees with the stated one of the scanner's position."""
     _, _, result = room
     for T, C, position, sd in zip(
         result.T_project_scan[1:], result.covariance[1:], result.position[1:], result.position_sd[1:], strict=True
@@ -66,7 +66,7 @@ def test_what_is_said_of_the_pose_is_true_of_every_frame(room):
     assert not result.covariance[0].any()
 
 
-def test_the_result_does_not_depend_on_how_a_scan_lies_in_its_frame(room):
+def test_result_is_independent_of_the_frames_of_the_scans(room):
     T, scans, first = room
     rng = np.random.default_rng(5)
     turned, back = [], []
@@ -81,13 +81,13 @@ def test_the_result_does_not_depend_on_how_a_scan_lies_in_its_frame(room):
         back.append(D)
     result = stitching_step.run(Scene("room", "structure", tuple(turned)), stitching_step.Params())
     assert result.status == "ok"
-    found = [np.linalg.inv(back[0]) @ one @ D for one, D in zip(result.T_project_scan, back, strict=True)]
-    shift, turn = errors(dataclasses.replace(first, T_project_scan=np.array(found)), T)
+    poses = [np.linalg.inv(back[0]) @ T_s @ D for T_s, D in zip(result.T_project_scan, back, strict=True)]
+    shift, turn = errors(dataclasses.replace(first, T_project_scan=np.array(poses)), T)
     assert np.abs(shift).max() < 0.2
     assert turn.max() < 0.05
 
 
-def test_order_of_points_and_threads_do_not_show(room):
+def test_result_is_independent_of_the_order_of_points(room):
     _, scans, first = room
     rng = np.random.default_rng(1)
     mixed = []
@@ -105,18 +105,18 @@ def test_order_of_points_and_threads_do_not_show(room):
     np.testing.assert_allclose(again.T_project_scan, first.T_project_scan, rtol=0.0, atol=1e-4)
 
 
-def test_a_room_that_looks_the_same_turned_round_is_ambiguous():
-    """An empty room with the scanner near the middle: half a turn fits as well, and nothing tells."""
+def test_a_room_with_a_symmetry_is_ambiguous():
+    """An empty room with the scanner near the middle: rotated by 180 degrees it fits as well."""
     room = (np.array([-5000.0, -3000.0, 0.0]), np.array([5000.0, 3000.0, 3000.0]))
     T = [stitch_clouds.pose([-1500.0, 300.0, 1500.0], 10.0), stitch_clouds.pose([1200.0, -400.0, 1500.0], 70.0)]
-    scans = tuple(stitch_clouds.scan(f"S{i}", one, i, room=room, things=(), step_mrad=20.0) for i, one in enumerate(T))
+    scans = tuple(stitch_clouds.scan(f"S{i}", T_i, i, room=room, things=(), step_mrad=20.0) for i, T_i in enumerate(T))
     # Levelled: upside down the room would fit as well.
     result = stitching_step.run(Scene("empty", "structure", scans), stitching_step.Params(levelled_mrad=20.0))
     assert result.status == "partial"
     assert result.scan_status[1] == "ambiguous"
-    # The rival is the other answer: one of the two is right.
+    # Either the pose or its rival is right.
     true = np.linalg.inv(T[0]) @ T[1]
-    off = [np.linalg.norm(one[1][:3, 3] - true[:3, 3]) for one in (result.T_project_scan, result.T_rival_scan)]
+    off = [np.linalg.norm(poses[1][:3, 3] - true[:3, 3]) for poses in (result.T_project_scan, result.T_rival_scan)]
     assert min(off) < 5.0
 
 
@@ -134,16 +134,16 @@ def test_scans_of_different_places_are_never_called_ok():
     assert result.status != "ok"
 
 
-def test_scans_without_a_grid_or_a_scanner_that_is_known():
+def test_scans_without_a_grid_are_registered():
     T, scans = four(grid=False)
     result = stitching_step.run(Scene("room", "structure", scans), stitching_step.Params(reference="S2"))
     assert result.reference == "S2"
     base = np.linalg.inv(T[1])
-    for found, true in zip(result.T_project_scan, T, strict=True):
-        np.testing.assert_allclose(found[:3, 3], (base @ true)[:3, 3], atol=0.3)
+    for pose, true in zip(result.T_project_scan, T, strict=True):
+        np.testing.assert_allclose(pose[:3, 3], (base @ true)[:3, 3], atol=0.3)
 
 
-def test_a_given_pose_of_the_reference_leads_to_the_project():
+def test_a_given_pose_of_the_reference_defines_the_project_frame():
     T, scans = four(step_mrad=20.0)
     given = stitch_clouds.pose([5e5, 4e6, 300.0], 33.0)
     scans = (dataclasses.replace(scans[0], T_project_scan=given), *scans[1:])
@@ -156,7 +156,7 @@ def test_a_given_pose_of_the_reference_leads_to_the_project():
     np.testing.assert_allclose(result.position[2], want[:3, 3], atol=0.5)
 
 
-def test_bad_input_is_said_plainly():
+def test_bad_input_is_rejected_with_a_message():
     few = Scan("few", np.zeros((20, 3)))
     many = Scan("many", np.random.default_rng(0).normal(size=(500, 3)))
     with pytest.raises(InputError, match="two scans or more, found 1"):
@@ -177,7 +177,7 @@ def test_bad_input_is_said_plainly():
 
 
 @pytest.mark.parametrize("kind", ["ball of noise", "one plane", "one place"])
-def test_scans_that_hold_nothing_to_go_by_fail_without_a_crash(kind):
+def test_scans_without_usable_structure_are_not_ok_and_do_not_crash(kind):
     rng = np.random.default_rng(3)
     made = {
         "ball of noise": lambda: rng.normal(0.0, 1000.0, (3000, 3)),
@@ -192,7 +192,7 @@ def test_scans_that_hold_nothing_to_go_by_fail_without_a_crash(kind):
 
 @pytest.mark.slow
 def test_intervals_cover_over_seeds():
-    """Errors by their standard deviations over seeds: what is called 95 % holds in most of few cases."""
+    """Errors by their standard deviations over four seeds: few cases, therefore a low limit for the 95 % intervals."""
     pulls = []
     for seed in range(1, 5):
         T, scans = four(seed, step_mrad=20.0)
@@ -203,25 +203,25 @@ def test_intervals_cover_over_seeds():
     assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5
 
 
-def test_a_run_is_reported_whole(room, tmp_path):
-    """Scene file to OUT: results.json as agreed, poses that read back exactly, both figures, every table."""
+def test_a_run_writes_all_reports(room, tmp_path):
+    """results.json as specified, poses that are read back exactly, both figures, all tables."""
     _, scans, result = room
     path = tmp_path / "room.h5"
     store.write_scene(path, Scene("room", "structure", scans, units="mm", units_reason="made so"), None, {})
     scene = pipeline.read(path, None)
     execution = pipeline.execute(path, scene, pipeline.plan(("stitch",), (), {}, None))
     results_folder.write(tmp_path / "out", execution, ErrorReport())
-    found = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
-    assert found["reference"] == "S1"
-    assert [one["status"] for one in found["scans"]] == ["ok"] * 4
-    assert set(found["pairs"][0]) >= {"a", "b", "overlap", "residual", "used"}
-    assert set(found["closures"][0]) >= {"loop", "mm", "mrad"}
-    assert np.array(found["scans"][1]["covariance"]).shape == (6, 6)
+    written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
+    assert written["reference"] == "S1"
+    assert [row["status"] for row in written["scans"]] == ["ok"] * 4
+    assert set(written["pairs"][0]) >= {"a", "b", "overlap", "residual", "used"}
+    assert set(written["closures"][0]) >= {"loop", "mm", "mrad"}
+    assert np.array(written["scans"][1]["covariance"]).shape == (6, 6)
     rows = (tmp_path / "out" / "stitch.csv").read_text().splitlines()
     poses = np.array([[float(x) for x in row.split(",")[2:18]] for row in rows[1:]]).reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, execution.runs[0].result.T_project_scan)
     np.testing.assert_allclose(poses, result.T_project_scan, atol=1e-2)  # a scene file rounds to 0.01 mm
-    names = {one.name for one in (tmp_path / "out").rglob("*")}
+    names = {path.name for path in (tmp_path / "out").rglob("*")}
     assert names >= {
         "stitch-scans.csv",
         "stitch-pairs.csv",
@@ -234,8 +234,8 @@ def test_a_run_is_reported_whole(room, tmp_path):
     assert "GLCS" in page
 
 
-def held_against(T, true, status, **more):
-    """Checks of made-up poses (k, 4, 4) against true ones."""
+def checks_of(T, true, status, **more):
+    """Checks of given poses (k, 4, 4) against true ones, by name."""
     k = len(T)
     names = tuple(f"S{i + 1}" for i in range(k))
     made = stitching_step.Result(
@@ -244,56 +244,56 @@ def held_against(T, true, status, **more):
         covariance=np.zeros((k, 6, 6)), rivalry=np.zeros(k), T_rival_scan=np.full((k, 4, 4), np.nan), **more,
     )  # fmt: skip
     truth = Truth(stations=StationTruth(names, true))
-    return {one.name: one.value for one in stitching_evaluation.check(Scene("s", "structure"), made, truth)}
+    return {metric.name: metric.value for metric in stitching_evaluation.check(Scene("s", "structure"), made, truth)}
 
 
-def test_a_scan_rightly_called_weak_does_not_make_the_good_ones_wrong():
+def test_a_weak_scan_does_not_affect_the_checks_of_the_others():
     true = np.array([stitch_clouds.pose([8000.0 * i, 3000.0 * i**2, 0.0], 50.0 * i) for i in range(5)])
     T = true.copy()
     T[4, :3, 3] += [0.0, 0.0, 400.0]
-    found = held_against(T, true, ("ok",) * 4 + ("weak",))
-    assert found["scans called ok, over 50 mm off"] == 0.0
-    assert found["station positions after datum fit, max"] == pytest.approx(400.0)
-    assert held_against(T, true, ("ok",) * 5)["scans called ok, over 50 mm off"] > 0.0
+    checks = checks_of(T, true, ("ok",) * 4 + ("weak",))
+    assert checks["scans called ok, over 50 mm off"] == 0.0
+    assert checks["station positions after datum fit, max"] == pytest.approx(400.0)
+    assert checks_of(T, true, ("ok",) * 5)["scans called ok, over 50 mm off"] > 0.0
 
 
-def test_what_control_points_hold_is_checked_in_their_frame():
+def test_poses_by_control_points_are_checked_in_the_control_frame():
     true = np.array([stitch_clouds.pose([8000.0 * i, 3000.0 * i**2, 0.0], 50.0 * i) for i in range(4)])
     T = true.copy()
-    T[:, 0, 3] += 3.0  # all alike, which a datum fit would take up
-    free = held_against(T, true, ("ok",) * 4)
-    held = held_against(T, true, ("ok",) * 4, control=Held(holds=1))
+    T[:, 0, 3] += 3.0  # common to all, which a datum fit would absorb
+    free = checks_of(T, true, ("ok",) * 4)
+    controlled = checks_of(T, true, ("ok",) * 4, control=Held(holds=1))
     assert "station positions by control points, max" not in free
-    assert held["station positions by control points, max"] == pytest.approx(3.0)
-    assert held["station positions after datum fit, max"] == pytest.approx(0.0, abs=1e-6)
+    assert controlled["station positions by control points, max"] == pytest.approx(3.0)
+    assert controlled["station positions after datum fit, max"] == pytest.approx(0.0, abs=1e-6)
     assert free["pose components within their 95 % intervals"] == pytest.approx(100.0)
-    assert held["pose components within their 95 % intervals"] == pytest.approx(100.0 * 5 / 6)
+    assert controlled["pose components within their 95 % intervals"] == pytest.approx(100.0 * 5 / 6)
 
 
 ROOMS = Path(__file__).resolve().parents[2] / "../shared/data/pcd"
 
 
 @pytest.mark.skipif(not ROOMS.is_dir(), reason="the real room scans are not there")
-def test_two_real_scans_of_a_room_come_together():
-    """By another library: point-to-plane ICP of Open3D, started at the answer, stays there."""
+def test_two_real_scans_of_a_room_are_registered():
+    """Point-to-plane ICP of Open3D, started at the result, stays there."""
     scans = tuple(folder.read_input(ROOMS / f"room_scan{i}.pcd").scans[0] for i in (1, 2))
     result = stitching_step.run(Scene("rooms", "structure", scans), stitching_step.Params())
-    # A sensor's errors, alike over whole walls, and rough normals: an adjustment that takes them as independent would
-    # say 0.6 mm. Plain ICP on halves of the room scatters by 5 to 15 mm and several mrad.
+    # The sensor's errors are common to whole walls: an adjustment that takes them as independent would state 0.6 mm.
+    # Plain ICP on halves of the room scatters by 5 to 15 mm and several mrad.
     assert result.scan_status[1] == "weak"
     assert "sure to" in result.scan_message[1]
     assert 3.0 < 1.96 * result.position_sd[1].max() < 30.0
     assert 1.0 < 1960.0 * result.rotation_sd[1].max() < 15.0
     T = result.T_project_scan[1].copy()
-    # The robot's own odometry, published with the data, says 0.69 rad about the vertical.
+    # The robot's odometry, published with the data, gives 0.69 rad about the vertical.
     assert np.arctan2(T[1, 0], T[0, 0]) == pytest.approx(0.69, abs=0.05)
     o3d = pytest.importorskip("open3d")
     clouds = [o3d.geometry.PointCloud(o3d.utility.Vector3dVector(1e-3 * (scan.points + scan.origin))) for scan in scans]
     clouds[0].estimate_normals(o3d.geometry.KDTreeSearchParamHybrid(0.15, 30))
     T[:3, 3] *= 1e-3
     method = o3d.pipelines.registration.TransformationEstimationPointToPlane()
-    found = o3d.pipelines.registration.registration_icp(clouds[1], clouds[0], 0.1, T, method)
-    D = found.transformation @ np.linalg.inv(T)
-    assert found.fitness > 0.5
+    icp = o3d.pipelines.registration.registration_icp(clouds[1], clouds[0], 0.1, T, method)
+    D = icp.transformation @ np.linalg.inv(T)
+    assert icp.fitness > 0.5
     assert np.linalg.norm(D[:3, 3]) < 0.03  # spacing of the points: 0.04 m
     assert Rotation.from_matrix(D[:3, :3].copy()).magnitude() < 0.015

@@ -1,11 +1,11 @@
-"""Compiled gathering and near faces, held against plain numpy."""
+"""Compiled hashing and nearest patches compared with plain numpy."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from processor.stitching.coarse import face_index
 from processor.stitching.planes import hashing
-from processor.stitching.planes.samples import Elements
+from processor.stitching.planes.samples import Patches
 
 
 def test_keys_are_numbered_as_numpy_does():
@@ -35,39 +35,37 @@ def test_sums_by_group_are_those_of_a_matrix():
     np.testing.assert_allclose(hashing.sums_of_points(points, group, 9), want)
 
 
-def faces(rng, n, spread):
+def random_patches(rng, n, spread):
     normals = rng.normal(size=(n, 3))
-    return Elements(rng.uniform(-spread, spread, (n, 3)), normals / np.linalg.norm(normals, axis=1)[:, None])
+    return Patches(rng.uniform(-spread, spread, (n, 3)), normals / np.linalg.norm(normals, axis=1)[:, None])
 
 
-def test_near_faces_are_those_of_all_distances():
+def test_nearest_patches_are_those_by_all_distances():
     rng = np.random.default_rng(3)
-    there, asked = faces(rng, 400, 5.0), faces(rng, 600, 6.0)
+    there, patches = random_patches(rng, 400, 5.0), random_patches(rng, 600, 6.0)
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = Rotation.random(random_state=rng).as_matrix(), [0.3, -0.2, 0.1]
-    x, n = asked.points @ T[:3, :3].T + T[:3, 3], asked.normals @ T[:3, :3].T
+    x, n = patches.points @ T[:3, :3].T + T[:3, 3], patches.normals @ T[:3, :3].T
     d = np.linalg.norm(x[:, None] - there.points, axis=2)
     off = np.abs(np.einsum("kni,ni->kn", x[:, None] - there.points, there.normals))
     like = n @ there.normals.T
-    nearest = np.argsort(d, axis=1)[:, : face_index.KEPT]
+    nearest = np.argsort(d, axis=1)[:, : face_index.NEAREST]
     fits = (d < 1.4) & (off < 0.6) & (like > 0.2)
     want = np.take_along_axis(fits, nearest, axis=1).any(axis=1)
     got = np.empty(600, np.bool_)
-    face_index.agreeing(face_index.of_faces(there, 1.5), T, asked.points, asked.normals, 1.4, 0.6, 0.2, got)
+    face_index.mark_matches(face_index.build(there, 1.5), T, patches, 1.4, 0.6, 0.2, got)
     np.testing.assert_array_equal(got, want)
     assert 20 < want.sum() < 580
 
     weight = rng.uniform(0.5, 2.0, 600)
-    small, large = face_index.of_faces(there, 0.5), face_index.of_faces(there, 1.5)
-    H, g, centre, reach, count = face_index.equations(
-        small, large, T, asked.points, asked.normals, weight, 1.2, 0.5, 0.1
-    )
-    one = nearest[:, 0]
+    small, large = face_index.build(there, 0.5), face_index.build(there, 1.5)
+    H, g, centre, reach, count = face_index.normal_equations(small, large, T, patches, weight, 1.2, 0.5, 0.1)
+    first = nearest[:, 0]
     rows = np.arange(600)
-    kept = (d[rows, one] < 1.2) & (off[rows, one] < 0.5) & (like[rows, one] > 0.1)
-    assert count == kept.sum() > 50
-    p, m, w = x[kept], there.normals[one[kept]], weight[kept]
-    r = np.einsum("ni,ni->n", p - there.points[one[kept]], m)
+    matched = (d[rows, first] < 1.2) & (off[rows, first] < 0.5) & (like[rows, first] > 0.1)
+    assert count == matched.sum() > 50
+    p, m, w = x[matched], there.normals[first[matched]], weight[matched]
+    r = np.einsum("ni,ni->n", p - there.points[first[matched]], m)
     np.testing.assert_allclose(centre, p.mean(axis=0))
     assert np.isclose(reach, np.sqrt(((p - centre) ** 2).sum(axis=1).mean()))
     J = np.hstack([np.cross((p - centre) / reach, m), m])

@@ -1,4 +1,4 @@
-"""Picked common points: the paper's method, six parameters and seven, and the file they come in."""
+"""Method ``three-point``: six parameters and seven, pooled standard deviations, and the file of picks."""
 
 import dataclasses
 
@@ -10,35 +10,35 @@ from processor.model import InputError, Picks, Scan, Scene
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
 from processor.stitching import three_point
-from tests.support.stitch_clouds import pose
+from tests.support.stitch_clouds import four, pose
 
 CORNERS = np.array([[0.0, 0.0, 0.0], [9000.0, 0.0, 500.0], [2000.0, 7000.0, 4000.0], [8000.0, 6000.0, 100.0]])
 
 
 def test_three_points_worked_by_hand():
-    """b is a turned a quarter about z and moved: x_a = (-y_b + 10, x_b + 20, z_b)."""
+    """b rotated by 90 degrees about z and shifted: x_a = (-y_b + 10, x_b + 20, z_b)."""
     b = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0], [0.0, 50.0, 0.0]])
     a = np.array([[10.0, 20.0, 0.0], [10.0, 120.0, 0.0], [-40.0, 20.0, 0.0]])
-    found = three_point.tie(a, b, scale_free=False)
-    np.testing.assert_allclose(found.T_a_b, [[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12)
-    assert found.scale == pytest.approx(1.0)
-    assert np.abs(found.residuals).max() < 1e-12
+    fit = three_point.fit_pair(a, b, scale_free=False)
+    np.testing.assert_allclose(fit.T_a_b, [[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 0], [0, 0, 0, 1]], atol=1e-12)
+    assert fit.scale == pytest.approx(1.0)
+    assert np.abs(fit.residuals).max() < 1e-12
 
 
-def test_seven_parameters_take_up_a_scale_six_show_it():
+def test_seven_parameters_absorb_a_scale_that_six_show():
     R = Rotation.from_rotvec([0.3, -0.2, 0.9]).as_matrix()
     a = 1.0005 * CORNERS @ R.T + [100.0, 200.0, 300.0]
-    free = three_point.tie(a, CORNERS, scale_free=True)
+    free = three_point.fit_pair(a, CORNERS, scale_free=True)
     assert free.scale == pytest.approx(1.0005, abs=1e-12)
     assert np.abs(free.residuals).max() < 1e-9
     np.testing.assert_allclose(free.T_a_b[:3, :3], R, atol=1e-12)
     np.testing.assert_allclose(free.T_a_b[:3, 3], [100.0, 200.0, 300.0], atol=1e-6)
-    held = three_point.tie(a, CORNERS, scale_free=False)
-    assert held.scale == pytest.approx(1.0005, abs=1e-9)
-    assert np.abs(held.residuals).max() > 1.0
+    fixed = three_point.fit_pair(a, CORNERS, scale_free=False)
+    assert fixed.scale == pytest.approx(1.0005, abs=1e-9)
+    assert np.abs(fixed.residuals).max() > 1.0
 
 
-def test_a_scale_is_named_for_what_it_may_be():
+def test_likely_cause_of_a_scale():
     assert "m and mm" in three_point.verdict(1000.3, 1e-4, 1000.0)
     assert "inches" in three_point.verdict(1.0 / 25.4, 1e-6, 1000.0)
     assert "blunder" in three_point.verdict(1.02, 1e-4, 1000.0)
@@ -49,22 +49,22 @@ def test_a_scale_is_named_for_what_it_may_be():
 @pytest.mark.parametrize(
     "points", [CORNERS[:2], np.outer(np.arange(4.0), [1.0, 2.0, 3.0]), np.zeros((3, 3))], ids=["two", "line", "place"]
 )
-def test_too_few_points_tell_no_pose(points):
+def test_too_few_points_are_rejected(points):
     with pytest.raises(three_point.TooFewError):
-        three_point.tie(points, points, scale_free=False)
+        three_point.fit_pair(points, points, scale_free=False)
 
 
-def test_a_pairs_covariance_is_what_noisy_picks_scatter_by():
-    """2000 draws of 5 mm: the scatter of the poses against the mean of the stated covariances."""
+def test_covariance_of_a_pair_is_the_scatter_of_noisy_picks():
+    """2000 draws of 5 mm: the scatter of the poses compared with the mean of the stated covariances."""
     rng = np.random.default_rng(7)
     T = pose([4000.0, -3000.0, 200.0], 70.0, 10.0)
     a = CORNERS @ T[:3, :3].T + T[:3, 3]
     drawn, stated = [], []
     for _ in range(2000):
-        found = three_point.tie(a + rng.normal(0, 5.0, a.shape), CORNERS + rng.normal(0, 5.0, a.shape), False)
-        turn = Rotation.from_matrix(found.T_a_b[:3, :3] @ T[:3, :3].T).as_rotvec()
-        drawn.append([*turn, *(found.T_a_b[:3, 3] - T[:3, 3])])
-        stated.append(found.covariance)
+        fit = three_point.fit_pair(a + rng.normal(0, 5.0, a.shape), CORNERS + rng.normal(0, 5.0, a.shape), False)
+        turn = Rotation.from_matrix(fit.T_a_b[:3, :3] @ T[:3, :3].T).as_rotvec()
+        drawn.append([*turn, *(fit.T_a_b[:3, 3] - T[:3, 3])])
+        stated.append(fit.covariance)
     np.testing.assert_allclose(np.std(drawn, axis=0), np.sqrt(np.diag(np.mean(stated, axis=0))), rtol=0.06)
 
 
@@ -77,8 +77,8 @@ def network(seed, noise, scale=1.0, count=5, points=6):
     for a, b in [*((i, i + 1) for i in range(count - 1)), (0, count - 1)]:
         world = rng.uniform([0, -8e3, 0], [3e4, 8e3, 8e3], (points, 3))
         for k, x in enumerate(world):
-            own = [np.linalg.inv(T[s]) @ [*x, 1.0] for s in (a, b)]
-            rows.append((f"S{a + 1}", f"S{b + 1}", f"P{k}", *(one[:3] + rng.normal(0, noise, 3) for one in own)))
+            local = [np.linalg.inv(T[s]) @ [*x, 1.0] for s in (a, b)]
+            rows.append((f"S{a + 1}", f"S{b + 1}", f"P{k}", *(p[:3] + rng.normal(0, noise, 3) for p in local)))
     names_a, names_b, names, in_a, in_b = zip(*rows, strict=True)
     picks = Picks(names_a, names_b, names, np.array(in_a), scale * np.array(in_b))
     return np.array(T), Scene("network", "structure", scans, picks=picks)
@@ -89,13 +89,13 @@ def test_a_chain_of_all_scans_with_picks_of_5_mm():
     for seed in range(20):
         T, scene = network(seed, 5.0)
         result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
-        assert result.status in ("ok", "partial")  # partial where luck leaves a scan weak
+        assert result.status in ("ok", "partial")  # partial if a scan is weak by chance
         assert "failed" not in result.scan_status
         want = np.linalg.inv(T[0]) @ T
         off = result.T_project_scan[1:, :3, 3] - want[1:, :3, 3]
         errors.append(np.abs(off).max())
-        at = np.array([(one @ [*p, 1.0])[:3] for one, p in zip(result.T_project_scan, _places(scene), strict=True)])
-        true = np.array([(one @ [*p, 1.0])[:3] for one, p in zip(want, _places(scene), strict=True)])
+        at = np.array([(T_s @ [*p, 1.0])[:3] for T_s, p in zip(result.T_project_scan, _places(scene), strict=True)])
+        true = np.array([(T_s @ [*p, 1.0])[:3] for T_s, p in zip(want, _places(scene), strict=True)])
         pulls.append((at - true)[1:] / result.position_sd[1:])
     assert np.median(errors) < 30.0
     assert 0.85 < (np.abs(pulls) < 1.96).mean() <= 0.99
@@ -114,7 +114,7 @@ def test_exact_picks_give_exact_poses_and_close_the_loop():
     assert sorted(result.loops[0].split(" > ")[1:]) == ["S1", "S2", "S3", "S4", "S5"]
 
 
-def test_a_scan_in_other_units_is_told():
+def test_a_scan_in_other_units_is_reported():
     _, scene = network(2, 1.0, scale=0.001)
     result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
     assert "units mixed up (m and mm)" in result.message
@@ -135,7 +135,7 @@ def test_picks_are_read_in_the_scans_units(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("text", "said"),
+    ("text", "message"),
     [
         ("a,b,c\n", "expected columns scan_a,scan_b"),
         ("HEAD\nA,C,P,1,2,3,4,5,6\n", "line 2: there is no scan 'C'; there are A, B"),
@@ -146,18 +146,16 @@ def test_picks_are_read_in_the_scans_units(tmp_path):
         ("HEAD\n\n", "holds no points"),
     ],
 )
-def test_bad_picks_are_named(tmp_path, text, said):
+def test_bad_picks_are_rejected_with_a_message(tmp_path, text, message):
     for name in ("A", "B"):
         np.savetxt(tmp_path / f"{name}.xyz", np.random.default_rng(0).normal(0.0, 3.0, (300, 3)))
     (tmp_path / "picks.csv").write_text(text.replace("HEAD", "scan_a,scan_b,point,xa,ya,za,xb,yb,zb"))
-    with pytest.raises(InputError, match=said):
+    with pytest.raises(InputError, match=message):
         folder.read_input(tmp_path)
 
 
-def test_picks_start_a_pair_that_nothing_else_brings_together():
-    """Automatic on scans whose picks name the pose: it is among those tried, and held against the scans."""
-    from tests.support.stitch_clouds import four
-
+def test_automatic_accepts_a_pose_by_picks():
+    """The pose by picks is one of the candidates, and is refined on the scans."""
     T, scans = four(step_mrad=20.0)
     want = np.linalg.inv(T[0]) @ T[1]
     in_b = np.array([[1000.0, 0, 0], [0, 2000.0, 0], [0, 0, 1500.0]])
@@ -169,8 +167,8 @@ def test_picks_start_a_pair_that_nothing_else_brings_together():
 
 
 @pytest.mark.parametrize("scale", ["fixed", "free"])
-def test_three_points_a_pair_state_what_they_scatter_by(scale):
-    """Two or three freedoms a pair: by each one's own standard deviation intervals would hold 78 % and 53 %."""
+def test_intervals_with_three_points_a_pair_cover(scale):
+    """Two or three freedoms a pair: with unpooled standard deviations intervals would cover 78 % and 53 %."""
     inside = []
     for seed in range(40):
         T, scene = network(seed, 5.0, points=3)
@@ -183,7 +181,7 @@ def test_three_points_a_pair_state_what_they_scatter_by(scale):
     assert 0.9 <= np.mean(inside) <= 0.99
 
 
-def test_a_pair_with_a_blunder_does_not_make_the_others_unsure():
+def test_a_blunder_in_one_pair_does_not_widen_the_intervals_of_others():
     T, scene = network(3, 2.0)
     in_a = scene.picks.in_a.copy()
     in_a[0] += 4000.0
@@ -197,38 +195,38 @@ def test_a_pair_with_a_blunder_does_not_make_the_others_unsure():
 
 
 @pytest.mark.parametrize("points", [3, 6])
-def test_a_scale_of_one_is_not_called_another(points):
-    """Picks of 5 mm without a scale: of 200 pairs few are named, for all that two freedoms a pair know little."""
-    said = [
+def test_a_scale_of_one_is_rarely_reported(points):
+    """Picks of 5 mm without a scale: 2 % of 200 pairs at most are reported, also with two freedoms a pair."""
+    messages = [
         message
         for seed in range(40)
         for message in stitching_step.run(
             network(seed, 5.0, points=points)[1], stitching_step.Params(method="three-point")
         ).pair_message
     ]
-    assert sum("scale" in one for one in said) <= 0.02 * len(said)
+    assert sum("scale" in message for message in messages) <= 0.02 * len(messages)
 
 
-def test_one_pair_alone_needs_more_to_doubt_its_scale():
-    """By two freedoms a scale 5 standard deviations off is chance (Student: 19 of them), by many it is not."""
+def test_a_single_pair_needs_a_larger_scale_to_be_reported():
+    """With two freedoms a scale 5 standard deviations off may be chance (19 in Student's t), with many it is not."""
     assert three_point.verdict(1.0005, 1e-4, 1000.0, 2) == ""
     assert "temperature" in three_point.verdict(1.0005, 1e-4, 1000.0, 60)
     assert "± 430 ppm" in three_point.verdict(1.003, 1e-4, 5000.0, 2)
 
 
-def test_a_scale_that_is_one_is_found_and_its_interval_holds():
-    inside, named = [], []
+def test_a_true_scale_is_reported_and_its_interval_covers():
+    inside, reported = [], []
     for seed in range(30):
         result = stitching_step.run(
             network(seed, 2.0, scale=1.0 / 1.004)[1], stitching_step.Params(method="three-point")
         )
         inside += (np.abs(result.scale - 1.004) < 1.96 * result.scale_sd).tolist()
-        named += ["scale 1.004" in one or "scale 1.003" in one for one in result.pair_message]
+        reported += ["scale 1.004" in text or "scale 1.003" in text for text in result.pair_message]
     assert 0.88 < np.mean(inside) < 0.99
-    assert np.mean(named) > 0.9
+    assert np.mean(reported) > 0.9
 
 
-def test_a_scan_that_cannot_be_placed_says_what_it_lacks():
+def test_a_scan_that_cannot_be_placed_has_a_reason():
     _, scene = network(1, 2.0)
     picks = scene.picks
     pairs = list(zip(picks.scan_a, picks.scan_b, strict=True))

@@ -1,4 +1,4 @@
-"""Poses by regions, and pieces that lie: what an adjustment alone would be too sure of."""
+"""Systematic errors and moved objects, for which the covariance of an adjustment alone is too small."""
 
 import dataclasses
 
@@ -10,18 +10,18 @@ from tests.support.stitch_clouds import four
 
 
 def bent(scan, mm):
-    """Ranges off by a wave of the direction: alike over a wall, and no pose takes it up."""
+    """Range errors that vary with the direction: common to a wall, and not absorbed by a pose."""
     R = np.linalg.norm(scan.points, axis=1)
     turn = np.arctan2(scan.points[:, 1], scan.points[:, 0])
     return dataclasses.replace(scan, points=scan.points * (1.0 + mm * np.sin(3.0 * turn) / R)[:, None])
 
 
-def test_scans_that_are_bent_are_not_called_sure():
+def test_systematic_range_errors_raise_the_standard_deviations():
     T, scans = four(3, step_mrad=20.0)
     want = np.linalg.inv(T[0]) @ T
     crooked = (scans[0], *(bent(scan, 8.0) for scan in scans[1:]))
     good, bad = (
-        stitching_step.run(Scene("room", "structure", one), stitching_step.Params()) for one in (scans, crooked)
+        stitching_step.run(Scene("room", "structure", some), stitching_step.Params()) for some in (scans, crooked)
     )
     off = np.linalg.norm(bad.T_project_scan[1:, :3, 3] - want[1:, :3, 3], axis=1)
     assert off.max() > 0.5  # far more than the noise makes
@@ -29,29 +29,29 @@ def test_scans_that_are_bent_are_not_called_sure():
     assert (off < 4.0 * np.linalg.norm(bad.position_sd[1:], axis=1)).all()
 
 
-def test_a_board_that_stood_elsewhere_during_one_scan_does_not_pull_it():
-    """A board on the nearest wall, 3 mm off while one scan was made: its pieces hold the most points of all."""
+def test_a_board_that_moved_during_one_scan_does_not_bias_its_pose():
+    """A board on the nearest wall, 3 mm off during one scan: its pieces have the most points of all."""
     T, scans = four(4, step_mrad=20.0)
     inside = scans[2].points @ T[2][:3, :3].T + T[2][:3, 3]
     board = (inside[:, 0] > 6900.0) & (np.abs(inside[:, 1:] - [-2000.0, 1500.0]) < 750.0).all(axis=1)
     assert board.sum() > 400
     points = (inside + np.where(board, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0] - T[2][:3, 3]) @ T[2][:3, :3]
-    moved = (*scans[:2], dataclasses.replace(scans[2], points=points), scans[3])
-    result = stitching_step.run(Scene("room", "structure", moved), stitching_step.Params())
+    changed = (*scans[:2], dataclasses.replace(scans[2], points=points), scans[3])
+    result = stitching_step.run(Scene("room", "structure", changed), stitching_step.Params())
     want = np.linalg.inv(T[0]) @ T
     off = np.abs(result.T_project_scan[1:, :3, 3] - want[1:, :3, 3])
     assert (off < 4.0 * result.position_sd[1:]).all()
     assert off.max() < 0.25
 
 
-def test_a_near_wall_that_moved_during_one_scan_is_told_by_the_faces_that_it_overrules():
-    """Its points outweigh all that holds the scan the other way, so the pose follows it: other faces know better."""
+def test_a_wall_that_moved_during_one_scan_is_contradicted_by_the_rejected_faces():
+    """The points of the near wall outweigh all others in its direction, so that the pose follows it."""
     T, scans = four(6, step_mrad=20.0)
     inside = scans[2].points @ T[2][:3, :3].T + T[2][:3, 3]
-    moved = inside + np.where(inside[:, 0] > 6900.0, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
-    wrong = dataclasses.replace(scans[2], points=(moved - T[2][:3, 3]) @ T[2][:3, :3])
+    shifted = inside + np.where(inside[:, 0] > 6900.0, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
+    wrong = dataclasses.replace(scans[2], points=(shifted - T[2][:3, 3]) @ T[2][:3, :3])
     result = stitching_step.run(Scene("room", "structure", (*scans[:2], wrong, scans[3])), stitching_step.Params())
     off = np.linalg.inv(T[0]) @ T - result.T_project_scan
-    assert np.abs(off[2, :3, 3]).max() > 1.0  # or there would be nothing to say
+    assert np.abs(off[2, :3, 3]).max() > 1.0  # else the test would be void
     assert result.scan_status == ("ok", "ok", "weak", "ok")
     assert "faces agree that it stands" in result.scan_message[2]

@@ -1,6 +1,5 @@
 """Cells in processes: they end with the one that started them, and on a cluster each cell's outcome comes back."""
 
-import json
 import os
 import subprocess
 import sys
@@ -8,39 +7,40 @@ import time
 
 import pytest
 
+from processor.jobs import runner
 from processor.model import UsageError
-from processor.validation import child, running
-from processor.validation.cells import Cell, Outcome
+from processor.validation import running
+from processor.validation.cells import Case, Cell, Outcome
 from tests.support import validation_nights
 
-
-def spec(**more):
-    return {"recipe": "frame-small", "recipe_text": "", "settings": [], "steps": ["spheres"], "methods": [],
-            "params": {}, "seed": 1, **more}  # fmt: skip
+CELL = Cell(Case("frame", "frame-small", "", False, (), ("spheres",), ()), 1, True)
+PARENT = """
+import sys
+from processor.validation import running
+from tests.unit.test_validation_running import CELL
+running.do(CELL, scratch=sys.argv[1])
+"""
 
 
 def test_a_cell_ends_with_the_process_that_started_it(tmp_path):
-    (tmp_path / child.SPEC).write_text(json.dumps(spec()), "utf-8")
-    process = subprocess.Popen(
-        [sys.executable, "-m", "processor.validation.child", str(tmp_path)],
-        stdin=subprocess.PIPE,
-        start_new_session=True,
-    )
+    process = subprocess.Popen([sys.executable, "-c", PARENT, str(tmp_path)])
     deadline = time.monotonic() + 30.0
     while not (below := children(process.pid)) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert below
-    process.stdin.close()  # as the system does after any death of the one that started it
+    process.kill()
     assert process.wait(10.0) == -9
     while any(alive(one) for one in below) and time.monotonic() < deadline:
         time.sleep(0.01)
     assert not any(alive(one) for one in below)
-    assert not (tmp_path / child.DONE).exists()
 
 
 def children(pid):
-    with open(f"/proc/{pid}/task/{pid}/children", encoding="ascii") as file:
-        return [int(one) for one in file.read().split()]
+    found = []
+    for task in os.listdir(f"/proc/{pid}/task"):
+        with open(f"/proc/{pid}/task/{task}/children", encoding="ascii") as file:
+            found += [int(one) for one in file.read().split()]
+    return found
 
 
 def alive(pid):
@@ -52,7 +52,7 @@ def alive(pid):
 
 
 def test_a_cell_that_takes_too_long_fails(tmp_path):
-    found = running.do(spec(), 1, str(tmp_path), timeout_s=0.05)
+    found = running.do(CELL, scratch=str(tmp_path), timeout_s=0.05)
     assert found.failed == "took longer than 0.05 s"
     assert list(tmp_path.iterdir()) == []
 
@@ -61,13 +61,13 @@ def test_parameters_are_written_as_toml():
     tomllib = pytest.importorskip("tomllib")
 
     table = {"spheres": {"radius_mm": 50.0, "catalogue": 'a "b"', "deep": {"list": [1.0, 2.0], "on": True}}}
-    assert tomllib.loads(child._toml(table)) == table
+    assert tomllib.loads(running._toml(table)) == table
 
 
 def test_stopping_ends_what_is_under_way(tmp_path):
     cell = Cell(validation_nights.case(), 1, True)
     started = time.monotonic()
-    with running.over_processes(1, tmp_path) as run:
+    with running.opened(None, 1, tmp_path, print) as run:
         coming = run([cell, cell])
         next(coming)  # fails soon: its recipe is no recipe
         coming.close()
@@ -76,29 +76,29 @@ def test_stopping_ends_what_is_under_way(tmp_path):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_cells_on_a_cluster(monkeypatch):
+def test_cells_on_a_cluster(tmp_path, monkeypatch):
     distributed = pytest.importorskip("distributed")
 
-    def do(given, threads):
-        if given["seed"] == 2:
+    def do(cell):
+        if cell.seed == 2:
             raise MemoryError("none left")
-        return Outcome("", {"seed": given["seed"], "pid": os.getpid()}, 1.0, 1.0)
+        return Outcome("", {"seed": cell.seed, "pid": os.getpid()}, 1.0, 1.0)
 
     monkeypatch.setattr(running, "do", do)
     cells = [Cell(validation_nights.case(), seed, True) for seed in (1, 2, 3)]
     with (
         distributed.LocalCluster(1, processes=False, threads_per_worker=2, dashboard_address=None) as cluster,
-        running.over_cluster(cluster.scheduler_address) as run,
+        running.opened(cluster.scheduler_address, 1, tmp_path, print) as run,
     ):
         found = {cell.seed: outcome for cell, outcome in run(cells)}
     assert {seed: outcome.results.get("seed") for seed, outcome in found.items()} == {1: 1, 2: None, 3: 3}
     assert found[2].failed == "a worker could not run it (MemoryError: none left)"
 
 
-def test_a_cluster_that_does_not_answer(monkeypatch):
-    monkeypatch.setattr(running, "CONNECT_S", 1)
+def test_a_cluster_that_does_not_answer(tmp_path, monkeypatch):
+    monkeypatch.setattr(runner, "CONNECT_S", 1)
     with (
         pytest.raises(UsageError, match="expected the address of a Dask scheduler that answers"),
-        running.over_cluster("tcp://127.0.0.1:1"),
+        running.opened("tcp://127.0.0.1:1", 1, tmp_path, print),
     ):
         pass

@@ -1,10 +1,10 @@
-"""What the source paper's methods make of parts that are exactly as designed: the band of their own error.
+"""Bands of the source paper's methods by the parametric bootstrap: their results for parts exactly as designed.
 
-The methods state no uncertainty, and noise is the least of their errors: principal axes tilt, boxes miss edges, and
-every joint hands its error on. So each scan is repeated with its part as designed: the points are laid on the design's
-surface and given new noise as large as theirs; density, shadows, and what lies beside the part stay. Of a bridge of
-such scans all gaps and departures are nothing, and what a method finds is its own doing (the parametric bootstrap:
-Efron and Tibshirani, An Introduction to the Bootstrap, 1993, section 6.5).
+The methods state no uncertainty, and noise is the smallest of their errors: principal axes tilt, boxes miss edges, and
+every joint passes its error on. So each scan is repeated with its part as designed: the points are projected onto the
+design's surface and get new noise of the same size; density, occlusion and clutter stay. All gaps and departures of
+such a bridge are zero, so the method's result is its own error (Efron and Tibshirani, An Introduction to the Bootstrap,
+1993, section 6.5).
 """
 
 from __future__ import annotations
@@ -22,69 +22,71 @@ from processor.geometry.parallel import each
 from processor.model import ArchDesign, DesignPart, Floats, Ints
 from processor.preassembly import errors
 from processor.preassembly.baselines import methods
+from processor.preassembly.baselines.methods import PartFeatures
 from processor.preassembly.params import Params
 from processor.preassembly.parts import attitude
 from processor.preassembly.result import Result
 
 Bools = npt.NDArray[np.bool_]
 
-CELL_MM = 40.0  # within which a part's form does not show
-NEAR_MM = 30.0  # of the design: so far a part as built may lie off it
-LEAST = 3  # repetitions that must have an answer, for a band
+CELL_MM = 40.0  # a part's form does not change within a cell
+NEAR_MM = 30.0  # largest distance of a part as built from its design
+LEAST = 3  # repetitions with an answer, for a band
 QUARTILE = 0.6745  # of the normal distribution
 
 
 @dataclass(frozen=True)
 class _AsDesigned:
-    """A part's scan: points (n, 3), in its frame, laid on the design where they are ``near`` (n,), and their noise."""
+    """A part's scan: points (n, 3), in its frame, projected on the design where they are ``near`` (n,), their noise."""
 
-    part: methods.Part
+    part: PartFeatures
     points: Floats
     near: Bools
     sigma_mm: float
     T_bridge_scan: Floats
 
 
-def scanned_again(parts: list[methods.Part], design: ArchDesign, params: Params) -> list[list[methods.Part]]:
-    """Scan parts as designed, ``params.repetitions`` times, as the given ones were scanned; their features each time.
+def repeat_scans(parts: list[PartFeatures], design: ArchDesign, params: Params) -> list[list[PartFeatures]]:
+    """Repeat the scans ``params.repetitions`` times with the parts as designed; return the features of each repetition.
 
     They are the same for every method.
     """
     if params.repetitions < LEAST:
         return []
-    exact = [_as_designed(part, own) for part, own in zip(parts, design.parts, strict=True)]
+    as_designed = [_as_designed(part, design_part) for part, design_part in zip(parts, design.parts, strict=True)]
 
-    def again(turn: int) -> list[methods.Part]:
-        return [_repeated(one, i, turn, design, params) for i, one in enumerate(exact)]
+    def repeat(turn: int) -> list[PartFeatures]:
+        return [_repeated(part, i, turn, design, params) for i, part in enumerate(as_designed)]
 
-    return each(again, range(params.repetitions))
+    return each(repeat, range(params.repetitions))
 
 
-def with_bands(result: Result, repeated: list[list[methods.Part]], design: ArchDesign, params: Params) -> Result:
-    """Add to what a method says how far it errs by itself: what it says of parts as designed, ``repeated``.
+def with_bands(result: Result, repeated: list[list[PartFeatures]], design: ArchDesign, params: Params) -> Result:
+    """Add bands to the result of a method: its errors in the ``repeated`` scans of parts as designed.
 
-    NaN where too few of the repetitions have an answer; unchanged without any.
+    NaN where too few of the repetitions have an answer; unchanged without repetitions.
     """
     if not repeated:
         return result
-    found = [methods.place(parts, design, params) for parts in repeated]
+    assemblies = [methods.place(parts, design, params) for parts in repeated]
     figures = [
-        (*errors.splicing_error(one.gaps), one.linear.mean, one.linear.max, one.best_fit.mean, one.best_fit.max)
-        for one in found
+        (*errors.splicing_error(a.gaps), a.linear.mean, a.linear.max, a.best_fit.mean, a.best_fit.max)
+        for a in assemblies
     ]
     return replace(
         result,
         message=f"bands are what this method makes of parts as designed; {methods.INNER_EDGES}",
-        linear_ci95=bound(np.array([one.linear.vector for one in found])),
-        best_fit_linear_ci95=bound(np.array([one.best_fit.vector for one in found])),
+        linear_ci95=bound(np.array([assembly.linear.vector for assembly in assemblies])),
+        best_fit_linear_ci95=bound(np.array([assembly.best_fit.vector for assembly in assemblies])),
         errors_ci95=bound(np.array(figures)[:, :, None]),
     )
 
 
 def bound(vectors: Floats) -> Floats:
-    """Return what one more of vectors (k, n, m), each of n by itself, exceeds in length in 5 % of cases at most: (n,).
+    """Bound (n,) on the length of one further vector, with 95 %, by k draws of n vectors: (k, n, m).
 
-    It is the length of their mean, and how far from it one may lie by Student's distribution.
+    It is the length of the mean of the draws plus the prediction interval by Student's distribution. NaN with too few
+    draws.
     """
     known: Bools = np.logical_and.reduce(np.isfinite(vectors), axis=2)
     given = np.where(known[:, :, None], vectors, 0.0)
@@ -92,37 +94,37 @@ def bound(vectors: Floats) -> Floats:
     mean = given.sum(axis=0) / count[:, None]
     square = (given**2).sum(axis=(0, 2)) - count * (mean**2).sum(axis=1)
     sd = np.sqrt(np.maximum(square, 0.0) / (count - 1) * (1.0 + 1.0 / count))
-    found: Floats = np.linalg.norm(mean, axis=1) + student.ppf(0.975, count - 1) * sd
-    found[known.sum(axis=0) < LEAST] = np.nan
-    return found
+    length: Floats = np.linalg.norm(mean, axis=1) + student.ppf(0.975, count - 1) * sd
+    length[known.sum(axis=0) < LEAST] = np.nan
+    return length
 
 
-def _as_designed(part: methods.Part, design: DesignPart) -> _AsDesigned:
-    """Lay what is near the design on it; where the part was not found, all stays as it is."""
+def _as_designed(part: PartFeatures, design: DesignPart) -> _AsDesigned:
+    """Project the points near the design onto it; unchanged where the part's pose is not known."""
     points = part.scan.points[by_cell(part.scan.points, CELL_MM)]
-    as_is = _AsDesigned(part, points, np.zeros(len(points), bool), 0.0, part.attitude.T_surface)
+    unchanged = _AsDesigned(part, points, np.zeros(len(points), bool), 0.0, part.attitude.T_surface)
     if part.attitude.status == "failed":
-        return as_is
+        return unchanged
     shape = attitude.sample_surface(design)
     fitted = surface_registration.fine(points, shape.mesh, shape.axes, part.attitude.T_surface)
     if not surface_registration.fits(fitted):
-        return as_is
-    moved = rigid.apply(fitted.T_bridge_scan, points)
-    face, residual, _ = shape.mesh.distances(moved, NEAR_MM + surface_registration.GATES_MM[0])
-    some = np.flatnonzero((face >= 0) & (np.abs(residual) < NEAR_MM))
-    foot = _nearest(shape.mesh, moved[some], face[some])
-    on_it: Bools = np.linalg.norm(foot - moved[some], axis=1) < NEAR_MM
-    laid = moved.copy()
-    laid[some[on_it]] = foot[on_it]
+        return unchanged
+    on_design = rigid.apply(fitted.T_bridge_scan, points)
+    face, residual, _ = shape.mesh.distances(on_design, NEAR_MM + surface_registration.GATES_MM[0])
+    rows = np.flatnonzero((face >= 0) & (np.abs(residual) < NEAR_MM))
+    foot = _nearest(shape.mesh, on_design[rows], face[rows])
+    projected: Bools = np.linalg.norm(foot - on_design[rows], axis=1) < NEAR_MM
+    on_design[rows[projected]] = foot[projected]
     near = np.zeros(len(points), bool)
-    near[some[on_it]] = True
-    # Neighbours share the part's form; what is left between them is noise.
+    near[rows[projected]] = True
+    # Neighbours share the part's form; their differences are noise.
     sigma = float(np.median(np.abs(np.diff(residual[near])))) / (QUARTILE * np.sqrt(2.0)) if near.sum() > 1 else 0.0
-    return _AsDesigned(part, rigid.apply(rigid.invert(fitted.T_bridge_scan), laid), near, sigma, fitted.T_bridge_scan)
+    in_scan = rigid.apply(rigid.invert(fitted.T_bridge_scan), on_design)
+    return _AsDesigned(part, in_scan, near, sigma, fitted.T_bridge_scan)
 
 
 def _nearest(mesh: MeshSurface, points: Floats, face: Ints) -> Floats:
-    """Return the nearest (n, 3) of each point's facet: a part longer than designed ends where the design does."""
+    """Nearest point (n, 3) of each point's facet: a part longer than designed ends where the design does."""
     corners = mesh.vertices[mesh.faces[face]]
     share = mesh.barycentric(points, face)
     foot: Floats = np.einsum("nk,nki->ni", share, corners)
@@ -139,17 +141,14 @@ def _nearest(mesh: MeshSurface, points: Floats, face: Ints) -> Floats:
     return foot
 
 
-def _repeated(one: _AsDesigned, index: int, turn: int, design: ArchDesign, params: Params) -> methods.Part:
-    """Scan the part once more, its attitude by principal axes found anew, and take its features."""
-    points = one.points.copy()
-    rng = methods.generator(params, f"repetition {turn} of {one.part.name}")
-    points[one.near] += one.sigma_mm * rng.normal(size=(int(one.near.sum()), 3))
-    T_before = one.part.attitude.T_principal
+def _repeated(scanned: _AsDesigned, index: int, turn: int, design: ArchDesign, params: Params) -> PartFeatures:
+    """Extract the features of one repetition, with a new attitude by principal axes."""
+    points = scanned.points.copy()
+    rng = methods.generator(params, f"repetition {turn} of {scanned.part.name}")
+    points[scanned.near] += scanned.sigma_mm * rng.normal(size=(int(scanned.near.sum()), 3))
+    before = rigid.apply(scanned.part.attitude.T_principal, points[::100])
     hypotheses = attitude.principal_hypotheses(points, design.parts[index])
-    T = min(
-        hypotheses,
-        key=lambda T: float(np.linalg.norm(rigid.apply(T, points[::100]) - rigid.apply(T_before, points[::100]))),
-    )
-    found = replace(one.part.attitude, T_principal=T, T_surface=one.T_bridge_scan)
-    features = methods.features_of(replace(one.part.scan, points=points), index, found, design, params)
-    return replace(features, scan=one.part.scan)  # the points are not needed any more
+    T = min(hypotheses, key=lambda T: float(np.linalg.norm(rigid.apply(T, points[::100]) - before)))
+    pose = replace(scanned.part.attitude, T_principal=T, T_surface=scanned.T_bridge_scan)
+    features = methods.features_of(replace(scanned.part.scan, points=points), index, pose, design, params)
+    return replace(features, scan=scanned.part.scan)  # without the new points, which are not needed any more

@@ -1,135 +1,152 @@
-"""Figures of the whole chain: its span, how it closes by the joints alone, and what limits the accuracy of its gaps."""
+"""Figures of the whole chain: its span, its closure by the joints alone, and what limits the accuracy of its gaps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
 
+from processor.adjustment import extremes
 from processor.geometry import rigid
 from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats
 from processor.preassembly.chain import adjustment
 from processor.preassembly.chain.adjustment import Adjusted
-from processor.preassembly.parts.measure import Measured
-from processor.preassembly.verdicts.chain import greatest
+from processor.preassembly.parts.measure import MeasuredPart
 
-JOINTS_ALONE = 1e-9  # lambda with which the design's curve only says which way the bridge lies
-AXES = ("end face", "webs", "bottom and top")  # what places a joint end along its x, y and z
+JOINTS_ALONE = 1e-9  # lambda with which the design's curve only fixes the position of the bridge
+AXES = ("end face", "webs", "bottom and top")  # the surfaces that place a joint end along its x, y and z
 
 
-def span(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> tuple[float, float]:
-    """How much farther apart the bridge's outer ends are than designed, mm, and the half-width of its interval.
+class Figures(NamedTuple):
+    """Figures of the chain, named as in the result: see :func:`span`, :func:`closure` and :func:`limiting`."""
 
-    Nothing in the adjustment holds the span: parts that are too short bring the feet nearer to each other. NaN where
-    a joint has no answer: then nothing says how far apart the parts beside it are.
+    span_departure: float
+    span_ci95: float
+    closure: Floats
+    closure_ci95: Floats
+    limiting: str
+    advice: str
+
+
+def measure(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> Figures:
+    """Measure all figures of a chain; ``frames`` (j, 4, 4) are T_bridge_joint."""
+    return Figures(
+        *span(parts, adjusted, design), *closure(parts, design, frames), *limiting(parts, adjusted, design, frames)
+    )
+
+
+def span(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign) -> tuple[float, float]:
+    """Departure of the distance between the bridge's outer ends from the design's, mm, and its 95 % half-width.
+
+    The adjustment does not constrain the span: parts that are too short bring the feet closer together. NaN where a
+    joint has no answer, since the distance of the parts beside it is not measured.
     """
     if not np.isfinite(adjusted.gaps).all():
         return float("nan"), float("nan")
     ends = _outer_ends(design)
     chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    found, D, own = 0.0, *np.zeros((2, 1, len(adjusted.motion_covariance)))
+    departure, by_motion, by_pose = 0.0, *np.zeros((2, 1, len(adjusted.motion_covariance)))
     for i, at, sign in ((0, ends[0], -1.0), (len(parts) - 1, ends[1], 1.0)):
-        found += sign * float(chord @ (rigid.apply(adjusted.motions[i], at[None])[0] - at))
-        D[0] += sign * chord @ _to_point(parts, i, at)
-        own[0, 6 * i : 6 * i + 6] += sign * chord @ rigid.motion(at[None])[0]
-    return found, NORMAL_95 * float(np.sqrt(_covariance(parts, adjusted, D, own)[0, 0]))
-
-
-def closure(
-    parts: Sequence[Measured], members: Sequence[adjustment.Member], design: ArchDesign, frames: Floats
-) -> tuple[Floats, Floats]:
-    """Where the last part's outer end comes to lie when the joints alone place all parts after the first.
-
-    Departure (6,) from the design, mm along the bridge's axes and mrad about them, with half-widths (6,); NaN where a
-    joint has no answer. The first part rests on its design.
-    """
-    alone = adjustment.adjust(members, design.joint_points, frames, JOINTS_ALONE)
-    if not np.isfinite(alone.gaps).all():
-        return np.full(6, np.nan), np.full(6, np.nan)
-    at = _outer_ends(design)[1]
-    T = rigid.invert(alone.motions[0]) @ alone.motions[-1]
-    shift, turn = rigid.apply(T, at[None])[0] - at, rigid.vector_from_rotation(T[:3, :3])
-    D, own = np.zeros((2, 6, len(alone.motion_covariance)))
-    for i, sign in ((0, -1.0), (len(parts) - 1, 1.0)):
-        D[:3] += sign * _to_point(parts, i, at)
-        own[:3, 6 * i : 6 * i + 6] += sign * rigid.motion(at[None])[0]
-        for one in (D, own):
-            one[3:, 6 * i : 6 * i + 3] += sign * np.eye(3)
-    covariance = _covariance(parts, alone, D, own)
-    unit = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
-    return np.concatenate([shift, turn]) * unit, NORMAL_95 * np.sqrt(np.diag(covariance)) * unit
-
-
-def limiting(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> tuple[str, str]:
-    """Say which joint and which measured face limit the gaps' accuracy, and which further scan would help."""
-    worst, where = 0.0, (0, 0, 0)
-    for j, (covariance, frame) in enumerate(zip(adjusted.gap_covariance, frames, strict=True)):
-        turn = np.kron(np.eye(8), frame[:3, :3].T)
-        spread = np.sqrt(np.maximum(np.diag(turn @ covariance @ turn.T), 0.0))
-        if np.isfinite(spread).all() and spread.max() > worst:
-            k = int(np.argmax(spread))
-            worst, where = float(spread[k]), (j, k // 3, k % 3)
-    missing = _missing(parts, adjusted, design)
-    if worst == 0.0:
-        return missing, missing
-    j, point, axis = where
-    ends = {"end": parts[j].member.ends[1], "start": parts[j + 1].member.ends[0]}
-    # What an end follows of its part's registration is the same at the other end: it cancels, so it limits nothing.
-    poses = {"end": parts[j].member.pose, "start": parts[j + 1].member.pose}
-    own = {
-        side: float(np.diag(adjustment.of_itself(end, poses[side]))[3 * point + axis])
-        for side, end in ends.items()
-        if end is not None
-    }
-    side = max(own, key=lambda one: own[one])
-    part = parts[j].name if side == "end" else parts[j + 1].name
-    share = own[side] / sum(own.values())
-    limit = f"{design.joint_names[j]} {KEY_POINTS[point]}: +-{NORMAL_95 * worst:.3f} mm (95 %), {share:.0%} of the "
-    limit += f"variance from the {AXES[axis]} at the {side} of {part}"
-    advice = f"a scan of {part} that shows more of the {AXES[axis]} at its {side}: four times the points halve its part"
-    return limit, "; ".join(filter(None, (missing, advice)))
-
-
-def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
-    """Half-widths that hold the mean and the largest size of vectors (n, d) with 95 % or more.
-
-    ``variance`` (n, d) is of their coordinates; what goes together among them need not be known. A size is off by no
-    more than its vector, the mean by no more than the root mean square of all: of squares of normal numbers none
-    leaves 1.96**2 times its mean more often than a single one does (Szekely and Bakirov, Probab. Theory Relat. Fields
-    126 (2003)). The largest may be any that is near it, each widened as if all were independent.
-    """
-    known = np.isfinite(vectors).all(axis=1) & np.isfinite(variance).all(axis=1)
-    if not known.any():
-        return float("nan"), float("nan")
-    variance = np.maximum(variance[known], 0.0)
-    size, sd = np.linalg.norm(vectors[known], axis=1), np.sqrt(variance.max(axis=1))
-    largest, low, high = greatest(size, sd, vectors.shape[1])
-    return NORMAL_95 * float(np.sqrt(variance.sum(axis=1).mean())), max(high - largest, largest - low)
-
-
-def _missing(parts: Sequence[Measured], adjusted: Adjusted, design: ArchDesign) -> str:
-    """Say what to scan where joints have no answer."""
-    said: dict[str, list[str]] = {}
-    for name, gaps, *beside in zip(design.joint_names, adjusted.gaps, parts, parts[1:], strict=False):
-        if not np.isfinite(gaps).all():
-            failed = " and ".join(part.name for part in beside if part.status == "failed")
-            said.setdefault(f"{failed} has no scan that fits" if failed else "scan both ends there", []).append(name)
-    return "; ".join(f"no answer at {', '.join(joints)}: {what}" for what, joints in said.items())
-
-
-def _covariance(parts: Sequence[Measured], adjusted: Adjusted, by_motion: Floats, by_pose: Floats) -> Floats:
-    """Covariance (k, k) of what follows the motions (k, 6 c) and, where nothing was measured, the registrations."""
-    both = by_motion @ adjusted.motion_with_pose @ by_pose.T
-    registered = by_pose @ block_diag(*(part.member.pose for part in parts)) @ by_pose.T
-    found: Floats = by_motion @ adjusted.motion_covariance @ by_motion.T + both + both.T + registered
-    return found
+        departure += sign * float(chord @ (rigid.apply(adjusted.motions[i], at[None])[0] - at))
+        by_motion[0] += sign * chord @ _point_motion(parts, i, at)
+        by_pose[0, 6 * i : 6 * i + 6] += sign * chord @ rigid.motion(at[None])[0]
+    return departure, NORMAL_95 * float(np.sqrt(_covariance(parts, adjusted, by_motion, by_pose)[0, 0]))
 
 
 def design_span(design: ArchDesign) -> float:
     """Distance of the bridge's outer ends as designed, mm."""
     ends = _outer_ends(design)
     return float(np.linalg.norm(ends[1] - ends[0]))
+
+
+def closure(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats) -> tuple[Floats, Floats]:
+    """Closure of the chain: departure of its outer end when the joints alone place all parts after the first.
+
+    Departure (6,) from the design, mm along the bridge's axes and mrad about them, with 95 % half-widths (6,); NaN
+    where a joint has no answer. The first part rests on its design.
+    """
+    alone = adjustment.adjust([part.member for part in parts], design.joint_points, frames, JOINTS_ALONE)
+    if not np.isfinite(alone.gaps).all():
+        return np.full(6, np.nan), np.full(6, np.nan)
+    at = _outer_ends(design)[1]
+    T = rigid.invert(alone.motions[0]) @ alone.motions[-1]
+    shift, turn = rigid.apply(T, at[None])[0] - at, rigid.vector_from_rotation(T[:3, :3])
+    by_motion, by_pose = np.zeros((2, 6, len(alone.motion_covariance)))
+    for i, sign in ((0, -1.0), (len(parts) - 1, 1.0)):
+        by_motion[:3] += sign * _point_motion(parts, i, at)
+        by_pose[:3, 6 * i : 6 * i + 6] += sign * rigid.motion(at[None])[0]
+        for derivative in (by_motion, by_pose):
+            derivative[3:, 6 * i : 6 * i + 3] += sign * np.eye(3)
+    covariance = _covariance(parts, alone, by_motion, by_pose)
+    unit = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
+    return np.concatenate([shift, turn]) * unit, NORMAL_95 * np.sqrt(np.diag(covariance)) * unit
+
+
+def limiting(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> tuple[str, str]:
+    """Return the joint and the measured face that limit the gaps' accuracy, and the further scan that would help."""
+    worst, where = 0.0, (0, 0, 0)
+    for j, (covariance, frame) in enumerate(zip(adjusted.gap_covariance, frames, strict=True)):
+        turn = np.kron(np.eye(8), frame[:3, :3].T)
+        sd = np.sqrt(np.maximum(np.diag(turn @ covariance @ turn.T), 0.0))
+        if np.isfinite(sd).all() and sd.max() > worst:
+            k = int(np.argmax(sd))
+            worst, where = float(sd[k]), (j, k // 3, k % 3)
+    missing = _missing(parts, adjusted, design)
+    if worst == 0.0:
+        return missing, missing
+    j, point, axis = where
+    variance = {}
+    for side, part, end in (("end", parts[j], 1), ("start", parts[j + 1], 0)):
+        joint_end = part.member.ends[end]
+        if joint_end is not None:
+            # An end's error by its part's registration is common to both ends: it cancels, so it limits nothing.
+            covariance = adjustment.without_pose(joint_end, part.member.pose)
+            variance[side] = float(np.diag(covariance)[3 * point + axis])
+    side = max(variance, key=lambda side: variance[side])
+    name = parts[j].name if side == "end" else parts[j + 1].name
+    share = variance[side] / sum(variance.values())
+    limit = f"{design.joint_names[j]} {KEY_POINTS[point]}: +-{NORMAL_95 * worst:.3f} mm (95 %), {share:.0%} of the "
+    limit += f"variance from the {AXES[axis]} at the {side} of {name}"
+    advice = f"a scan of {name} that shows more of the {AXES[axis]} at its {side}: four times the points halve its part"
+    return limit, "; ".join(filter(None, (missing, advice)))
+
+
+def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
+    """Half-widths that cover the mean and the largest length of vectors (n, d) with 95 % or more.
+
+    ``variance`` (n, d) is of their coordinates; their correlation need not be known. A length is off by no more than
+    its vector, the mean by no more than the root mean square of all: a mean of squares of normal variables exceeds
+    1.96**2 times its expectation no more often than a single one does (Szekely and Bakirov, Probab. Theory Relat.
+    Fields 126 (2003)). The largest has the simultaneous band of all that may be it.
+    """
+    known = np.isfinite(vectors).all(axis=1) & np.isfinite(variance).all(axis=1)
+    if not known.any():
+        return float("nan"), float("nan")
+    variance = np.maximum(variance[known], 0.0)
+    size, sd = np.linalg.norm(vectors[known], axis=1), np.sqrt(variance.max(axis=1))
+    largest, low, high = extremes.of_independent(size, sd, vectors.shape[1])
+    return NORMAL_95 * float(np.sqrt(variance.sum(axis=1).mean())), max(high - largest, largest - low)
+
+
+def _missing(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign) -> str:
+    """Return what to scan where joints have no answer."""
+    joints: dict[str, list[str]] = {}
+    for name, gaps, *beside in zip(design.joint_names, adjusted.gaps, parts, parts[1:], strict=False):
+        if not np.isfinite(gaps).all():
+            failed = " and ".join(part.name for part in beside if part.status == "failed")
+            what = f"{failed} has no scan that fits" if failed else "scan both ends there"
+            joints.setdefault(what, []).append(name)
+    return "; ".join(f"no answer at {', '.join(names)}: {what}" for what, names in joints.items())
+
+
+def _covariance(parts: Sequence[MeasuredPart], adjusted: Adjusted, by_motion: Floats, by_pose: Floats) -> Floats:
+    """Covariance (k, k) of quantities with derivatives (k, 6 c) by the motions and by the registrations."""
+    both = by_motion @ adjusted.motion_with_pose @ by_pose.T
+    registered = by_pose @ block_diag(*(part.member.pose for part in parts)) @ by_pose.T
+    covariance: Floats = by_motion @ adjusted.motion_covariance @ by_motion.T + both + both.T + registered
+    return covariance
 
 
 def _outer_ends(design: ArchDesign) -> Floats:
@@ -143,8 +160,8 @@ def _outer_ends(design: ArchDesign) -> Floats:
     )
 
 
-def _to_point(parts: Sequence[Measured], index: int, at: Floats) -> Floats:
+def _point_motion(parts: Sequence[MeasuredPart], index: int, at: Floats) -> Floats:
     """Return the derivative (3, 6 c) of a point of a part by all motions."""
-    found = np.zeros((3, 6 * len(parts)))
-    found[:, 6 * index : 6 * index + 6] = rigid.motion((at - parts[index].member.middle)[None])[0]
-    return found
+    derivative = np.zeros((3, 6 * len(parts)))
+    derivative[:, 6 * index : 6 * index + 6] = rigid.motion((at - parts[index].member.centre)[None])[0]
+    return derivative

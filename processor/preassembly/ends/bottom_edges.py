@@ -1,13 +1,14 @@
-"""Where the bottom edges of a part really run: departures from the design's, station by station, with their spread.
+"""Departures of a part's bottom edges from the design, at regular chainages, with their covariance.
 
-An edge is where the bottom and a web meet. Near a station both faces' residuals against the design are fitted with a
-plane in the distance along and from the edge; at the edge itself they say how far it lies sideways and up. The stations
-of an edge are then smoothed along it.
+An edge is where the bottom and a web meet. In every interval of chainage the residuals of both faces against the design
+are fitted with a plane in the distances along and from the edge. Its value at the edge is the departure, of the web
+sideways and of the bottom up. The departures of an edge are then smoothed along it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import block_diag
@@ -15,149 +16,171 @@ from scipy.spatial import cKDTree
 
 from processor.adjustment.model_averaging import smooth
 from processor.geometry import mesh_distance, rigid
-from processor.geometry.mesh_distance import MeshSurface, on_face
+from processor.geometry.mesh_distance import on_face
 from processor.geometry.polyline import Polyline
 from processor.model import Floats, Ints
 from processor.preassembly.ends import plate_sides
-from processor.preassembly.ends.faces import ALONG
+from processor.preassembly.ends.faces import ALONG, RegisteredPart
 from processor.preassembly.ends.plate_sides import Bools
+from processor.preassembly.errors import INTERVAL_MM
 
-STATION_MM = 200.0
 REACH_MM = 200.0  # across each face
 LEAST_POINTS = 30
 FLOOR_MM = 0.004
 
 
 @dataclass(frozen=True)
-class EdgeStations:
-    """Stations of both edges of a part, a row each: design point (k, 3), unit vectors sideways and up (k, 2, 3)."""
+class EdgeDepartures:
+    """Departures of both bottom edges of a part from the design, a row per chainage and edge; mm, bridge frame.
+
+    ``covariance`` leaves out the error of the part's registration; ``by_pose`` is the derivative of the departures'
+    errors by it.
+    """
 
     side: tuple[str, ...]  # left | right
-    arc: Floats  # (k,) from the part's start
-    points: Floats
-    axes: Floats
-    departure: Floats  # (k, 2) sideways (to the left) and up; NaN where nothing is known
-    covariance: Floats  # (2, k, k) of departures sideways, and of those up, but for what by_pose brings
-    by_pose: Floats  # (k, 2, 6) how their errors follow that of the part's registration
+    chainage: Floats  # (k,) from the part's start
+    points: Floats  # (k, 3) on the design's edge
+    axes: Floats  # (k, 2, 3) unit vectors sideways (to the left) and up
+    departure: Floats  # (k, 2) sideways and up; NaN = unknown
+    covariance: Floats  # (2, k, k) sideways, and up
+    by_pose: Floats  # (k, 2, 6)
 
 
-def measure(
-    points: Floats,
-    surface: MeshSurface,
-    outer: MeshSurface,
-    left: Polyline,
-    right: Polyline,
-    sigma_mm: float,
-    pose: Floats,
-) -> EdgeStations:
-    """Measure both edges on points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
+class _FacePoints(NamedTuple):
+    """Points of one face near an edge: interval (n,), distances (n,) along and from the edge, residual (n,)."""
 
-    ``outer`` are the outer faces of ``surface``.
-    """
-    sides: list[str] = []
-    arcs, places, axes, departures, own_noise, by_pose = [], [], [], [], [], []
-    for side, line, other, sense in (("left", left, right, 1.0), ("right", right, left, -1.0)):
-        count = max(1, int(line.length / STATION_MM))
-        arc = STATION_MM * (np.arange(count, dtype=np.float64) + 0.5)
-        fine = np.arange(0.0, line.length, 10.0, dtype=np.float64)
-        frame = _frame(line, other, fine, sense)
-        near, index = cKDTree(line.at(fine)).query(points, distance_upper_bound=1.2 * REACH_MM, workers=-1)
-        rows = np.flatnonzero(np.isfinite(near))
-        own, at = points[rows], index[rows]
-        offset = own - line.at(fine[at])
-        along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
-        nearest = surface.distances(own, REACH_MM)[0]
-        face, residual, beyond = outer.distances(own, REACH_MM)
-        seen = (nearest >= 0) & on_face(face, beyond) & (np.abs(residual) < plate_sides.REACH_MM)
-        # Not by the sense of the normals: meshes come with either.
-        normal, on = outer.normals[face], surface.normals[nearest]
-        facing, nearly = ([np.einsum("ni,ni->n", n, frame[k][at]) for k in (1, 2)] for n in (normal, on))
-        lies = [(np.abs(facing[k]) > ALONG) & (np.abs(nearly[k]) > ALONG) for k in range(2)]
-        margin = 3.0 * sigma_mm + 2.0
-        station = np.floor((fine[at] + along) / STATION_MM).astype(np.int64)
-        x = fine[at] + along - arc[np.clip(station, 0, count - 1)]
-        inside = seen & (station >= 0) & (station < count)
-        web = inside & lies[0] & (np.abs(level) < plate_sides.REACH_MM) & (up > margin) & (up < REACH_MM)
-        bottom = inside & lies[1] & (np.abs(up) < plate_sides.REACH_MM) & (-sense * level > margin)
-        bottom &= -sense * level < REACH_MM
-        for own, out in ((web, sense * np.sign(facing[0])), (bottom, -np.sign(facing[1]))):
-            own[own] = _outer(station[own], (out * residual)[own])
-        found = [
-            _at_edge(station[web], x[web], up[web], np.sign(facing[0][web]) * residual[web], count),
-            _at_edge(
-                station[bottom], x[bottom], -sense * level[bottom], np.sign(facing[1][bottom]) * residual[bottom], count
-            ),
-        ]
-        sides += [side] * count
-        arcs.append(arc)
-        places.append(line.at(arc))
-        frame = _frame(line, other, arc, sense)
-        axes.append(np.stack([frame[1], frame[2]], axis=1))
-        moves = [np.einsum("ki,kij->kj", frame[k], rigid.motion(line.at(arc))) for k in (1, 2)]
-        both = [smooth(arc, *one, moved @ pose @ moved.T) for one, moved in zip(found, moves, strict=True)]
-        left_over = [one.left_of(moved) for one, moved in zip(both, moves, strict=True)]
-        departures.append(np.stack([one.mean for one in both], axis=1))
-        own_noise.append([one.covariance - F @ pose @ F.T for one, F in zip(both, left_over, strict=True)])
-        by_pose.append(np.stack(left_over, axis=1))
-    return EdgeStations(
-        tuple(sides),
-        np.concatenate(arcs),
-        np.concatenate(places),
-        np.concatenate(axes),
-        np.concatenate(departures),
-        np.array([block_diag(*sides_of_axis) for sides_of_axis in zip(*own_noise, strict=True)]),
-        np.concatenate(by_pose),
+    interval: Ints
+    x: Floats
+    w: Floats
+    residual: Floats
+
+
+def measure(part: RegisteredPart, left: Polyline, right: Polyline, sigma_mm: float) -> EdgeDepartures:
+    """Measure both edges of a part; ``left`` and ``right`` are the design's, ``sigma_mm`` the noise of the points."""
+    edges = (_measure_edge("left", part, left, right, sigma_mm), _measure_edge("right", part, right, left, sigma_mm))
+    return EdgeDepartures(
+        side=edges[0].side + edges[1].side,
+        chainage=np.concatenate([edge.chainage for edge in edges]),
+        points=np.concatenate([edge.points for edge in edges]),
+        axes=np.concatenate([edge.axes for edge in edges]),
+        departure=np.concatenate([edge.departure for edge in edges]),
+        covariance=np.array([block_diag(*(edge.covariance[axis] for edge in edges)) for axis in range(2)]),
+        by_pose=np.concatenate([edge.by_pose for edge in edges]),
     )
 
 
-def unseen(left: Polyline, right: Polyline) -> EdgeStations:
-    """Return the stations of a part of which nothing is known."""
-    nothing = np.empty((0, 3))
+def unknown(left: Polyline, right: Polyline) -> EdgeDepartures:
+    """Return the departures, all NaN, of a part without points."""
     mesh = mesh_distance.of_mesh(np.eye(3), np.array([[0, 1, 2]]))
-    return measure(nothing, mesh, mesh, left, right, 0.0, np.zeros((6, 6)))
+    part = RegisteredPart(
+        points=np.empty((0, 3)),
+        station=np.empty(0, np.int64),
+        between_stations=0.0,
+        pose=np.zeros((6, 6)),
+        surface=mesh,
+        outer=mesh,
+    )
+    return measure(part, left, right, 0.0)
 
 
-def _frame(line: Polyline, other: Polyline, arc: Floats, sense: float) -> tuple[Floats, Floats, Floats]:
-    """Return unit vectors (k, 3) along the edge, to the left, and up, at arc lengths (k,)."""
-    along = line.at(arc + 5.0) - line.at(arc - 5.0)
+def _measure_edge(side: str, part: RegisteredPart, line: Polyline, other: Polyline, sigma_mm: float) -> EdgeDepartures:
+    sense = 1.0 if side == "left" else -1.0
+    count = max(1, int(line.length / INTERVAL_MM))
+    chainage = INTERVAL_MM * (np.arange(count, dtype=np.float64) + 0.5)
+    at_edge = [_at_edge(face, count) for face in _faces(part, line, other, sense, sigma_mm, chainage)]
+    points = line.at(chainage)
+    _, *axes = _frame(line, other, chainage, sense)
+    motions = [np.einsum("ki,kij->kj", axis, rigid.motion(points)) for axis in axes]
+    smoothed = [
+        smooth(chainage, value, variance, motion @ part.pose @ motion.T)
+        for (value, variance), motion in zip(at_edge, motions, strict=True)
+    ]
+    by_pose = [estimate.not_followed(motion) for estimate, motion in zip(smoothed, motions, strict=True)]
+    return EdgeDepartures(
+        side=(side,) * count,
+        chainage=chainage,
+        points=points,
+        axes=np.stack(axes, axis=1),
+        departure=np.stack([estimate.mean for estimate in smoothed], axis=1),
+        covariance=np.array([e.covariance - F @ part.pose @ F.T for e, F in zip(smoothed, by_pose, strict=True)]),
+        by_pose=np.stack(by_pose, axis=1),
+    )
+
+
+def _faces(
+    part: RegisteredPart, line: Polyline, other: Polyline, sense: float, sigma_mm: float, chainage: Floats
+) -> tuple[_FacePoints, _FacePoints]:
+    """Points of the web and of the bottom along an edge, those of the plates' inner sides left out."""
+    fine = np.arange(0.0, line.length, 10.0, dtype=np.float64)
+    frame = _frame(line, other, fine, sense)
+    near, index = cKDTree(line.at(fine)).query(part.points, distance_upper_bound=1.2 * REACH_MM, workers=-1)
+    rows = np.flatnonzero(np.isfinite(near))
+    points, at = part.points[rows], index[rows]
+    offset = points - line.at(fine[at])
+    along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
+    nearest = part.surface.distances(points, REACH_MM)[0]
+    face, residual, beyond = part.outer.distances(points, REACH_MM)
+    measured = (nearest >= 0) & on_face(face, beyond) & (np.abs(residual) < plate_sides.REACH_MM)
+    # The sense of the normals is not used: meshes come with either.
+    normals = part.outer.normals[face], part.surface.normals[nearest]
+    facing, nearest_facing = ([np.einsum("ni,ni->n", n, frame[k][at]) for k in (1, 2)] for n in normals)
+    looks = [(np.abs(facing[k]) > ALONG) & (np.abs(nearest_facing[k]) > ALONG) for k in range(2)]
+    margin = 3.0 * sigma_mm + 2.0
+    interval = np.floor((fine[at] + along) / INTERVAL_MM).astype(np.int64)
+    x = fine[at] + along - chainage[np.clip(interval, 0, len(chainage) - 1)]
+    inside = measured & (interval >= 0) & (interval < len(chainage))
+    inward = -sense * level
+    web = inside & looks[0] & (np.abs(level) < plate_sides.REACH_MM) & (up > margin) & (up < REACH_MM)
+    bottom = inside & looks[1] & (np.abs(up) < plate_sides.REACH_MM) & (inward > margin) & (inward < REACH_MM)
+    for used, out in ((web, sense * np.sign(facing[0])), (bottom, -np.sign(facing[1]))):
+        used[used] = _outer(interval[used], (out * residual)[used])
+    return (
+        _FacePoints(interval[web], x[web], up[web], np.sign(facing[0][web]) * residual[web]),
+        _FacePoints(interval[bottom], x[bottom], inward[bottom], np.sign(facing[1][bottom]) * residual[bottom]),
+    )
+
+
+def _frame(line: Polyline, other: Polyline, chainage: Floats, sense: float) -> tuple[Floats, Floats, Floats]:
+    """Return unit vectors (k, 3) along the edge, to the left, and up, at chainages (k,)."""
+    along = line.at(chainage + 5.0) - line.at(chainage - 5.0)
     along = along / np.linalg.norm(along, axis=1)[:, None]
-    left = sense * (line.at(arc) - other.at(arc * other.length / line.length))
+    left = sense * (line.at(chainage) - other.at(chainage * other.length / line.length))
     left = left - np.einsum("ni,ni->n", left, along)[:, None] * along
     left = left / np.linalg.norm(left, axis=1)[:, None]
     return along, left, np.cross(along, left)
 
 
-def _outer(station: Ints, out: Floats) -> Bools:
-    """Mark points (n,) that are not of a plate's inner side, station by station."""
-    kept = np.ones(len(out), bool)
-    for one in np.unique(station[out < -plate_sides.LAYER_MM]):
-        at = np.flatnonzero(station == one)
-        kept[at] = plate_sides.outer(out[at])
-    return kept
+def _outer(interval: Ints, out: Floats) -> Bools:
+    """Mark points (n,) that are not of a plate's inner side, interval by interval."""
+    outer = np.ones(len(out), bool)
+    for number in np.unique(interval[out < -plate_sides.LAYER_MM]):
+        rows = np.flatnonzero(interval == number)
+        outer[rows] = plate_sides.outer_layer(out[rows])
+    return outer
 
 
-def _at_edge(station: np.ndarray, x: Floats, w: Floats, residual: Floats, count: int) -> tuple[Floats, Floats]:
-    """Residual (count,) at the edge, of planes in x and w fitted station by station, and its variance."""
-    basis = np.stack([np.ones_like(x), x / STATION_MM, w / REACH_MM], axis=1)
-    used = np.ones(len(x), bool)
+def _at_edge(face: _FacePoints, count: int) -> tuple[Floats, Floats]:
+    """Value (count,) at the edge of planes in x and w, fitted to each interval's residuals, and its variance."""
+    basis = np.stack([np.ones_like(face.x), face.x / INTERVAL_MM, face.w / REACH_MM], axis=1)
+    used = np.ones(len(face.x), bool)
     value, variance = np.full(count, np.nan), np.full(count, np.nan)
     for _ in range(3):
-        s, B, r = station[used], basis[used], residual[used]
-        number = np.bincount(s, minlength=count)
-        normal = np.stack([np.bincount(s, B[:, i] * B[:, j], count) for i in range(3) for j in range(3)], axis=1)
-        right = np.stack([np.bincount(s, B[:, i] * r, count) for i in range(3)], axis=1)
-        whole = np.flatnonzero(number >= LEAST_POINTS)
-        N = normal[whole].reshape(-1, 3, 3)
-        well = np.linalg.cond(N) < 1e6
-        whole, N = whole[well], N[well]
+        interval, B, r = face.interval[used], basis[used], face.residual[used]
+        number = np.bincount(interval, minlength=count)
+        sums = [np.bincount(interval, B[:, i] * B[:, j], count) for i in range(3) for j in range(3)]
+        right = np.stack([np.bincount(interval, B[:, i] * r, count) for i in range(3)], axis=1)
+        fitted = np.flatnonzero(number >= LEAST_POINTS)
+        N = np.stack(sums, axis=1)[fitted].reshape(-1, 3, 3)
+        well_posed = np.linalg.cond(N) < 1e6
+        fitted, N = fitted[well_posed], N[well_posed]
         solution = np.zeros((count, 3))
         inverse = np.linalg.inv(N)
-        solution[whole] = np.einsum("nij,nj->ni", inverse, right[whole])
-        rest = residual - np.einsum("ni,ni->n", basis, solution[station])
-        known = np.isin(station, whole)
+        solution[fitted] = np.einsum("nij,nj->ni", inverse, right[fitted])
+        rest = face.residual - np.einsum("ni,ni->n", basis, solution[face.interval])
+        known = np.isin(face.interval, fitted)
         spread = 1.4826 * float(np.median(np.abs(rest[known & used]))) if (known & used).any() else 0.0
         value, variance = np.full(count, np.nan), np.full(count, np.nan)
-        value[whole], variance[whole] = solution[whole, 0], spread**2 * inverse[:, 0, 0] + FLOOR_MM**2
+        value[fitted], variance[fitted] = solution[fitted, 0], spread**2 * inverse[:, 0, 0] + FLOOR_MM**2
         now = known & (np.abs(rest) < 4.5 * max(spread, FLOOR_MM))
         if (now == used).all():
             break

@@ -1,358 +1,340 @@
-"""A joint end from its surfaces: faces and end ring fitted to their residuals against the design.
+"""A part's end at a joint: its outer faces and its end ring fitted to their residuals against the design.
 
 In the joint's zone each outer face departs from the design by a plane in x (along the bridge from the joint) and w
-(across the face), a warp x w, and what bends it: x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
-and v and what bends it, see :mod:`processor.preassembly.ends.ring`. A corner is where its two faces and the ring meet,
-as built; the covariance is that of these 40 numbers, so points of one corner are as dependent as they are. What bends a
-face beyond them (x^3 and on) is not followed; how large it is at the joint is learned from all ends, and is added.
+(across the face), a warp x w, and bending terms x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
+and v and bending terms, see :mod:`processor.preassembly.ends.ring`. A corner is where its two faces and the ring meet,
+as built; its covariance is that of these 40 coefficients, so points of one corner are correlated. Terms of third order
+are not fitted; their variance at the joint is estimated from all ends and added.
 
-Whether numbers are departures or noise is judged for all ends of a bridge together, see
-:mod:`processor.adjustment.model_averaging`: how far the others depart says what one's numbers mean.
+Departure and noise are separated for all ends of a bridge together, see :mod:`processor.adjustment.model_averaging`:
+the sizes of the other ends' departures set the weights of the hypotheses for each end.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import block_diag
 
-from processor.adjustment import variance_components
-from processor.adjustment.model_averaging import (
-    SIZES_MM,
-    Believed,
-    averaged,
-    by_the_others,
-    either,
-    explained,
-    no_surer,
-)
+from processor.adjustment import model_averaging, variance_components
+from processor.adjustment.model_averaging import SIZES_MM, Bools, Estimate
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Floats, Ints
 from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends import ring as ends_ring
-from processor.preassembly.ends.faces import FACE, FACES, FLOOR_MM, LEAST_POINTS, REACH_MM, ZONE_MM
+from processor.preassembly.ends.faces import (
+    FACE,
+    FACES,
+    FLOOR_MM,
+    LEAST_POINTS,
+    REACH_MM,
+    ZONE_MM,
+    FaceFit,
+    RegisteredPart,
+    UsedPoints,
+)
+from processor.preassembly.ends.joint_frame import EndPlace
 
-# Sizes of bends, the finest for scans without noise, and their weights beforehand: ends are cut by a plane.
+# Sizes of bending terms, the finest for scans without noise, and their prior weights: ends are cut by a plane.
 BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
-STRAIGHT = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))
-RING = 8  # numbers of the ring
-TURNS = 4
-# Of a movement: shapes are held against the design where they are, not where they came from. A corner 20 mm off, on
-# faces tilted by as much over their width, is 0.5 mm off in ways of which the numbers follow most, but not all: the
-# rest is within 0.005 of the movement, anywhere within.
+BEND_WEIGHTS = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))
+RING = 8  # coefficients of the ring
+ITERATIONS = 4  # of a corner's place on its faces
+# Share of a departure, one standard deviation. Terms are taken where the design has the surface, not where the surface
+# is. For a corner 20 mm off, on faces tilted by as much over their width, the difference is 0.5 mm. The coefficients
+# follow most of it; the rest lies, uniformly distributed, within 0.005 of the departure.
 SECOND_ORDER = 0.005 / np.sqrt(3.0)
 COUNT = len(FACES) * FACE + RING
-THERE = [FACE * face + number for face in range(len(FACES)) for number in (0, 2)]  # where a face is at the joint
+AT_JOINT = [FACE * face + term for face in range(len(FACES)) for term in (0, 2)]  # a face's level and tilt at the joint
+OF_FACES, OF_RING = slice(0, COUNT - RING), slice(COUNT - RING, COUNT)
+# P1..P4, bottom left, bottom right, top right, top left: u, v, and the numbers of their upright and their level face.
+CORNERS = ((1.0, -1.0, 3, 0), (-1.0, -1.0, 1, 0), (-1.0, 1.0, 1, 2), (1.0, 1.0, 3, 2))
 
 
 @dataclass(frozen=True)
 class JointEnd:
-    """What was built at one end: movements (8, 3) of P1..P8 from the design, joint axes; covariance (24, 24).
+    """Departures (8, 3) of P1..P8 from the design in the joint's axes, mm, with covariance (24, 24); NaN = unknown.
 
-    ``by_pose`` (24, 6) is how their errors follow that of the part's registration: it is the same at both ends.
+    ``by_pose`` (24, 6) is the derivative of their errors by that of the part's registration, common to both ends.
     """
 
-    moved: Floats
+    departure: Floats
     covariance: Floats
     by_pose: Floats
-    sigma_mm: float  # noise of the points about the fitted faces
     trouble: str
 
 
 @dataclass(frozen=True)
-class _OnRing:
-    """Points of the ring: their basis (n, 8), rests (n,), and from where and where on the ring they were seen."""
+class FittedEnd:
+    """The 40 coefficients of faces and ring as fitted, before model averaging, with their covariance.
 
-    basis: Floats
-    rest: Floats
-    station: Ints
-    sector: Ints
-
-
-@dataclass(frozen=True)
-class Observed:
-    """What the points of one end say before it is weighed: 40 numbers and their covariance.
-
-    ``moves`` (40, 6) is how the part's registration moves them, ``pose`` (6, 6) the covariance of that; ``half`` (3,)
-    is half of the joint's size, ``outward`` +1 where the part ends at the joint.
+    ``motion`` (40, 6) is their derivative by a motion of the part, ``pose`` (6, 6) the covariance of its registration.
     """
 
-    number: Floats
+    coefficients: Floats
     covariance: Floats
-    moves: Floats
+    motion: Floats
     pose: Floats
-    half: Floats
-    outward: float
-    sigma_mm: float
-    third_order: Floats  # (8, 2): see form.third_order, of the four faces
+    place: EndPlace
+    third_order: Floats  # (8, 2) of the four faces, see variance_components.third_order
     trouble: str
 
 
-def nothing(trouble: str) -> JointEnd:
-    """Return the end of which nothing is known."""
-    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), np.full((24, 6), np.nan), float("nan"), trouble)
+class _Block(NamedTuple):
+    """Some coefficients (n,) of an end, their noise (n, n), and the covariances (n, n) of departures by hypothesis."""
+
+    coefficients: Floats
+    noise: Floats
+    priors: list[Floats]
 
 
-def observe(
-    points: Floats,
-    surface: MeshSurface,
-    outer: MeshSurface,
-    T_bridge_joint: Floats,
-    corners: Floats,
-    outward: float,
-    pose: Floats,
-    station: Ints,
-    apart: float,
-) -> Observed | JointEnd:
-    """Fit one joint end to points (n, 3), bridge frame, registered to the design with a covariance ``pose`` (6, 6).
+def unknown(trouble: str) -> JointEnd:
+    """Return an end without an answer, and the reason."""
+    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), np.full((24, 6), np.nan), trouble)
 
-    What comes back is still to be :func:`judged`, but for an end of which too little was seen: that is final.
-    ``outer`` are the outer faces of ``surface``, ``corners`` (4, 3) the design's P1..P4; ``outward`` is +1 where the
-    part ends at the joint, -1 where it starts. ``station`` (n,) says from where each point was seen, ``apart`` is the
-    variance between stations, mm^2.
+
+def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
+    """Fit the faces and the ring of one end.
+
+    The fit is completed by :func:`estimate`; a JointEnd without an answer is final.
     """
-    T_joint_bridge = rigid.invert(T_bridge_joint)
-    size = np.ptp(rigid.apply(T_joint_bridge, corners), axis=0)
-    local = rigid.apply(T_joint_bridge, points)
-    depth = -outward * local[:, 0]
-    zone = (depth < ZONE_MM) & (depth > -REACH_MM) & (np.abs(local[:, 1:]) < 0.5 * size[1:] + REACH_MM).all(axis=1)
+    local = rigid.apply(rigid.invert(place.T_bridge_joint), part.points)
+    depth = -place.outward * local[:, 0]
+    beside = np.abs(local[:, 1:]) < place.half[1:] + REACH_MM
+    zone = (depth < ZONE_MM) & (depth > -REACH_MM) & beside.all(axis=1)
     if zone.sum() < 5 * LEAST_POINTS:
-        return nothing("too few points near the joint")
-    local = local[zone]
-    half = 0.5 * size
-    station = station[zone]
-    faces = ends_faces.fit(points[zone], local, station, surface, outer, T_bridge_joint, half, outward)
+        return unknown("too few points near the joint")
+    part, local = part.only(zone), local[zone]
+    faces = ends_faces.fit(part, local, place)
     if isinstance(faces, str):
-        return nothing(faces)
-    rest = np.concatenate([face.rest for face in faces])
-    sigma = float(np.sqrt(rest @ rest / max(len(rest) - FACE * len(faces), 1)))
-    unfollowed = variance_components.lack_of_fit_variance([(face.rest, face.cell) for face in faces], FACE)
-    fits = [
-        (
-            face.coefficients,
-            face.covariance
-            + variance_components.added(face.basis, face.station, apart)
-            + variance_components.added(face.basis, face.cell, unfollowed),
-        )
-        for face in faces
-    ]
-    thickness = _thickness(surface, T_joint_bridge, half)
-    ring, about = _ring(local, station, [face.coefficients for face in faces], half, thickness, outward, sigma)
+        return unknown(faces)
+    residual = np.concatenate([face.used.residual for face in faces])
+    sigma = float(np.sqrt(residual @ residual / max(len(residual) - FACE * len(faces), 1)))
+    thickness = _design_thickness(part.surface, place)
+    ring, on_ring = _fit_ring(local, part.station, faces, place, thickness, sigma)
     if not len(ring.coefficients):
-        return nothing("too few points on the end face")
-    unfollowed = variance_components.lack_of_fit_variance([(about.rest, about.sector)], RING)
-    fits.append(
-        (
-            ring.coefficients,
-            ring.covariance
-            + variance_components.added(about.basis, about.station, apart)
-            + variance_components.added(about.basis, about.sector, unfollowed),
-        )
+        return unknown("too few points on the end face")
+    blocks = _full_covariances([(f.covariance, f.used) for f in faces], part.between_stations)
+    blocks += _full_covariances([(ring.covariance, on_ring)], part.between_stations)
+    return FittedEnd(
+        coefficients=np.concatenate([*(face.coefficients for face in faces), ring.coefficients]),
+        covariance=block_diag(*blocks),
+        motion=_motion(place),
+        pose=part.pose,
+        place=place,
+        third_order=np.vstack([variance_components.third_order(f.used.basis, f.used.residual) for f in faces]),
+        trouble=_inner_side(faces, thickness),
     )
-    number = np.concatenate([coefficients for coefficients, _ in fits])
+
+
+def estimate(ends: Sequence[FittedEnd]) -> list[JointEnd]:
+    """Estimate the corners of all ends of one bridge by model averaging, in which each end learns from the others."""
+    if not ends:
+        return []
+    bending = variance_components.excess_variance(np.vstack([end.third_order for end in ends]))
+    return [_corners_of(end, averaged, bending) for end, averaged in zip(ends, _averaged(ends), strict=True)]
+
+
+def _inner_side(faces: Sequence[FaceFit], thickness: Floats) -> str:
+    """Reason for doubt where a face lies further in than half its plate and no second layer was found."""
     doubtful = [
         name
         for (name, axis, _), face in zip(FACES, faces, strict=True)
-        if face.alone and face.coefficients[0] < -0.5 * thickness[axis - 1] < 0.0
+        if face.single_layer and face.coefficients[0] < -0.5 * thickness[axis - 1] < 0.0
     ]
-    trouble = f"the {' and the '.join(doubtful)} face may be the plate's inner side" if doubtful else ""
-    covariance = block_diag(*(block for _, block in fits))
-    third = np.vstack([variance_components.third_order(face.basis, face.rest) for face in faces])
-    moves = _moves(T_bridge_joint, half, outward)
-    return Observed(number, covariance, moves, pose, half, outward, sigma, third, trouble)
+    return f"the {' and the '.join(doubtful)} face may be the plate's inner side" if doubtful else ""
 
 
-def judged(ends: Sequence[Observed]) -> list[JointEnd]:
-    """Weigh the ends of one bridge against the design: by how far each departs, and by how far the others do."""
-    if not ends:
-        return []
-    bent = variance_components.excess(np.vstack([end.third_order for end in ends]))
-    return [_corners_of(end, own, bent) for end, own in zip(ends, _weighed(ends), strict=True)]
+def _full_covariances(fits: Sequence[tuple[Floats, UsedPoints]], between_stations: float) -> list[Floats]:
+    """Add to each fit's covariance the errors shared within stations, and within cells by lack of fit."""
+    coefficients = len(fits[0][0])
+    cells = [(used.residual, used.cell) for _, used in fits]
+    lack_of_fit = variance_components.lack_of_fit_variance(cells, coefficients)
+    return [
+        covariance
+        + variance_components.group_covariance(used.basis, used.station, between_stations)
+        + variance_components.group_covariance(used.basis, used.cell, lack_of_fit)
+        for covariance, used in fits
+    ]
 
 
-def _corners_of(end: Observed, believed: Believed, bent: float) -> JointEnd:
-    """Return the corners of an end; ``bent`` is the variance at the joint of what faces' numbers do not follow."""
-    moved, derivative = _corners(end.half, end.outward, believed.mean)
-    second_order = np.repeat(SECOND_ORDER * np.linalg.norm(moved.reshape(8, 3), axis=1), 3)
-    covariance = derivative @ believed.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
-    there = derivative[:, THERE]
-    covariance += bent * there @ there.T
-    by_pose = derivative @ believed.left_of(end.moves)
-    return JointEnd(moved.reshape(8, 3), covariance, by_pose, end.sigma_mm, end.trouble)
+def _corners_of(end: FittedEnd, averaged: Estimate, bending: float) -> JointEnd:
+    """Key points of an end; ``bending`` is the variance at the joint of terms that are not fitted."""
+    departure, derivative = _key_points(end.place, averaged.mean)
+    second_order = np.repeat(SECOND_ORDER * np.linalg.norm(departure.reshape(8, 3), axis=1), 3)
+    covariance = derivative @ averaged.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
+    at_joint = derivative[:, AT_JOINT]
+    covariance += bending * at_joint @ at_joint.T
+    by_pose = derivative @ averaged.not_followed(end.motion)
+    return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.trouble)
 
 
-def _thickness(surface: MeshSurface, T_joint_bridge: Floats, half: Floats) -> Floats:
-    """Return the thickness (2,) of webs and flanges at the joint: how deep the facets of the design's end reach."""
+def _design_thickness(surface: MeshSurface, place: EndPlace) -> Floats:
+    """Thickness (2,) of webs and flanges at the joint: the depth of the facets of the design's end face."""
+    T_joint_bridge = rigid.invert(place.T_bridge_joint)
     upright = np.flatnonzero(np.abs(surface.normals @ T_joint_bridge[0, :3]) > 0.9)
     corners = rigid.apply(T_joint_bridge, surface.vertices[surface.faces[upright]])
     corners = corners[(np.abs(corners[:, :, 0]) < 0.5).all(axis=1)]
-    depth = half[1:] - np.abs(corners[:, :, 1:])
+    depth = place.half[1:] - np.abs(corners[:, :, 1:])
     middle = depth.mean(axis=1)
     on_web = middle[:, 0] < middle[:, 1]
     return np.array([depth[on_web, :, 0].max(initial=0.0), depth[~on_web, :, 1].max(initial=0.0)])
 
 
-def _ring(
-    local: Floats,
-    station: Ints,
-    faces: list[Floats],
-    half: Floats,
-    thickness: Floats,
-    outward: float,
-    sigma: float,
-) -> tuple[ends_ring.Ring, _OnRing]:
+def _fit_ring(
+    local: Floats, station: Ints, faces: Sequence[FaceFit], place: EndPlace, thickness: Floats, sigma: float
+) -> tuple[ends_ring.Ring, UsedPoints]:
     """Fit the end ring to points (n, 3) of the joint's frame, plate by plate between the corners.
 
-    ``faces`` are the coefficients of the outer faces. Also what is known of the points that are surely of the ring.
+    Also return the points that are surely of the ring.
     """
-    columns = []
-    depth, plates, x = [], [], outward * local[:, 0]
-    for (_, axis, sense), coefficients in zip(FACES, faces, strict=True):
+    half = place.half
+    depth, plates, x = [], [], place.outward * local[:, 0]
+    for (_, axis, sense), face in zip(FACES, faces, strict=True):
         across = 1 if axis == 2 else 2
         w = local[:, across] / half[across]
-        e = half[axis] + ends_faces.basis(local[:, 0], w) @ coefficients - sense * local[:, axis]
+        e = half[axis] + ends_faces.basis(local[:, 0], w) @ face.coefficients - sense * local[:, axis]
         wide = np.abs(local[:, across]) < half[across] - np.minimum(plate_sides.REACH_MM, 0.5 * half[across])
-        plates.append(plate_sides.plate_mm(x[wide], e[wide], sigma, float(thickness[axis - 1])))
+        plates.append(plate_sides.plate_thickness(x[wide], e[wide], sigma, float(thickness[axis - 1])))
         depth.append(e)
     clear = np.array([max(plates[1], plates[3]), max(plates[0], plates[2])]) + ends_ring.REACH * sigma + 1.0
+    columns = []
     for (_, axis, _), e, plate in zip(FACES, depth, plates, strict=True):
         across = 1 if axis == 2 else 2
-        near = np.abs(local[:, across]) < half[across] - clear[across - 1]  # of the corners, where two walls meet
+        near = np.abs(local[:, across]) < half[across] - clear[across - 1]  # off the corners, where two walls meet
         near &= (e < plate + 60.0) & (e > -60.0) & (np.abs(x) < 80.0)
         basis = _ring_basis(local[near, 1] / half[1], local[near, 2] / half[2])
         columns.append((x[near], e[near], np.full(near.sum(), plate), basis, station[near]))
-    at, inward, thick, basis, seen_from = (np.concatenate(column) for column in zip(*columns, strict=True))
-    found = ends_ring.fit(at, inward, thick, basis, sigma)
-    rest = at - basis @ found.coefficients if len(found.coefficients) else np.full(len(at), np.inf)
-    margin = np.minimum(2.0 * sigma, 0.35 * thick)
-    surely = (np.abs(rest) < ends_ring.REACH * max(sigma, FLOOR_MM)) & (inward > margin) & (inward < thick - margin)
-    return found, _OnRing(basis[surely], rest[surely], seen_from[surely], ends_ring.sectors(basis[surely]))
+    at, inward, plate_mm, basis, at_station = (np.concatenate(column) for column in zip(*columns, strict=True))
+    ring = ends_ring.fit(at, inward, plate_mm, basis, sigma)
+    residual = at - basis @ ring.coefficients if len(ring.coefficients) else np.full(len(at), np.inf)
+    margin = np.minimum(2.0 * sigma, 0.35 * plate_mm)
+    surely = (inward > margin) & (inward < plate_mm - margin)
+    surely &= np.abs(residual) < ends_ring.REACH * max(sigma, FLOOR_MM)
+    sector = ends_ring.sectors(basis[surely])
+    return ring, UsedPoints(basis[surely], residual[surely], at_station[surely], sector)
 
 
 def _ring_basis(u: Floats, v: Floats) -> Floats:
-    one = np.ones_like(u)
-    bent_u, bent_v = u * u - one, v * v - one
-    return np.stack([one, u, v, u * v, bent_u, bent_v, v * bent_u, u * bent_v], axis=1)
+    constant = np.ones_like(u)
+    bent_u, bent_v = u * u - constant, v * v - constant
+    return np.stack([constant, u, v, u * v, bent_u, bent_v, v * bent_u, u * bent_v], axis=1)
 
 
-def _weighed(ends: Sequence[Observed]) -> list[Believed]:
-    """Weigh the numbers (40,) of ends against ends as designed, which the registration alone moves.
+def _averaged(ends: Sequence[FittedEnd]) -> list[Estimate]:
+    """Average the coefficients (40,) of ends over hypotheses of their departures' sizes.
 
-    The faces' shifts are of one unknown size, how they lie of another, how they bend of a third; so are the ring's
-    plane and its bends. Faces and ring have in common what the registration is wrong by.
+    The levels of the faces have one unknown size, their tilts another, their bends a third; likewise the ring's plane
+    and its bends. Faces and ring share the error of the registration.
     """
-    found = [Believed(np.zeros(COUNT), *np.zeros((2, COUNT, COUNT))) for _ in ends]
+    averaged = [Estimate(np.zeros(COUNT), *np.zeros((2, COUNT, COUNT))) for _ in ends]
+    bends = list(zip(BENDS_MM, BEND_WEIGHTS, strict=True))
     faces = [
-        (before, np.tile(np.repeat([shift, tilt, bend], (1, 3, 4)), 4))
-        for shift in SIZES_MM
+        (weight, np.tile(np.repeat([level, tilt, bend], (1, 3, 4)), 4))
+        for level in SIZES_MM
         for tilt in SIZES_MM
-        for bend, before in zip(BENDS_MM, STRAIGHT, strict=True)
+        for bend, weight in bends
     ]
-    ring = [
-        (before, np.repeat([plane, bend], (3, RING - 3)))
-        for plane in SIZES_MM
-        for bend, before in zip(BENDS_MM, STRAIGHT, strict=True)
-    ]
-    of_faces, of_ring = slice(0, COUNT - RING), slice(COUNT - RING, COUNT)
-    for rows, hypotheses in ((of_faces, faces), (of_ring, ring)):
-        before = np.array([weight for weight, _ in hypotheses])
+    ring = [(weight, np.repeat([plane, bend], (3, RING - 3))) for plane in SIZES_MM for bend, weight in bends]
+    for rows, hypotheses in ((OF_FACES, faces), (OF_RING, ring)):
+        prior = np.array([weight for weight, _ in hypotheses])
         sizes = np.array([size for _, size in hypotheses])
-        seen = [_rows(end, rows, sizes) for end in ends]
-        logs = np.array([explained(*one) for one in seen])
-        by_others = by_the_others(logs, before, _traits(sizes))
-        for one, log, weights, into in zip(seen, logs, by_others, found, strict=True):
-            own = _of_rows(one, log, sizes, before, weights)
-            into.mean[rows], into.covariance[rows, rows], into.gain[rows, rows] = own.mean, own.covariance, own.gain
-    for end, into in zip(ends, found, strict=True):
-        left = into.left_of(end.moves)
-        both = left[of_faces] @ end.pose @ left[of_ring].T
-        into.covariance[of_faces, of_ring], into.covariance[of_ring, of_faces] = both, both.T
-    return found
+        blocks = [_block(end, rows, sizes) for end in ends]
+        logs = np.array([model_averaging.log_likelihoods(*block) for block in blocks])
+        weights = model_averaging.weights_by_others(logs, prior, _traits(sizes))
+        for whole, block, log, weight in zip(averaged, blocks, logs, weights, strict=True):
+            part = _average_block(block, log, sizes, prior, weight)
+            whole.mean[rows], whole.covariance[rows, rows] = part.mean, part.covariance
+            whole.gain[rows, rows] = part.gain
+    for end, whole in zip(ends, averaged, strict=True):
+        by_pose = whole.not_followed(end.motion)
+        common = by_pose[OF_FACES] @ end.pose @ by_pose[OF_RING].T
+        whole.covariance[OF_FACES, OF_RING], whole.covariance[OF_RING, OF_FACES] = common, common.T
+    return averaged
 
 
 def _traits(sizes: Floats) -> Ints:
-    """Return numbers (2, h) of what hypotheses have in common: where an end lies, and how it bends."""
+    """Numbers (2, h) of the hypotheses' common sizes: of level and tilt, and of bends."""
     return np.stack([np.unique(of, axis=0, return_inverse=True)[1].ravel() for of in (sizes[:, :2], sizes[:, -1:])])
 
 
-def _rows(end: Observed, rows: slice, sizes: Floats) -> tuple[Floats, Floats, list[Floats]]:
-    """Return some numbers of an end, their noise, and the covariance of departures by each of ``sizes`` (h, n)."""
+def _block(end: FittedEnd, rows: slice, sizes: Floats) -> _Block:
+    """Coefficients of an end under hypotheses of their ``sizes`` (h, n)."""
     noise = end.covariance[rows, rows] + FLOOR_MM**2 * np.eye(sizes.shape[1])
-    by_pose = end.moves[rows] @ end.pose @ end.moves[rows].T
-    return end.number[rows], noise, [by_pose + np.diag(size**2) for size in sizes]
+    by_pose = end.motion[rows] @ end.pose @ end.motion[rows].T
+    return _Block(end.coefficients[rows], noise, [by_pose + np.diag(size**2) for size in sizes])
 
 
-def _of_rows(
-    seen: tuple[Floats, Floats, list[Floats]], logs: Floats, sizes: Floats, before: Floats, weights: Floats
-) -> Believed:
-    """Weigh some numbers of an end: ``logs`` (h,) is how well hypotheses explain them.
+def _average_block(block: _Block, logs: Floats, sizes: Floats, prior: Floats, weights: Floats) -> Estimate:
+    """Average some coefficients of an end over hypotheses with log likelihoods ``logs`` (h,).
 
-    ``weights`` (h,) are those of the hypotheses by the other ends, ``before`` (h,) those without.
+    ``weights`` (h,) are learned from the other ends, ``prior`` (h,) holds without them.
     """
-    number, noise, priors = seen
-    lies = sizes[:, :2]  # shift and tilt, or the plane twice
-    designed, largest = (lies == 0.0).all(axis=1), (lies == SIZES_MM[-1]).all(axis=1)
+    plane = sizes[:, :2]  # level and tilt, or the ring's plane twice
+    as_designed, largest = (plane == 0.0).all(axis=1), (plane == SIZES_MM[-1]).all(axis=1)
 
-    def weighed(of: npt.NDArray[np.bool_], by: Floats) -> Believed:
-        return averaged(number, noise, [priors[h] for h in np.flatnonzero(of)], logs[of] + np.log(by[of]))
+    def over(hypotheses: Bools, weight: Floats) -> Estimate:
+        priors = [block.priors[h] for h in np.flatnonzero(hypotheses)]
+        log_weights = logs[hypotheses] + np.log(weight[hypotheses])
+        return model_averaging.average(block.coefficients, block.noise, priors, log_weights)
 
-    # That ends are cut by planes is known beforehand; where these lie that depart, no better than the points say.
-    departing = no_surer(weighed(~designed, weights), weighed(largest, before).covariance)
-    return either(weighed(designed, weights), departing)
+    # It is prior knowledge that ends are cut by planes. Where a departing plane lies is known no better than measured.
+    departing = model_averaging.with_least_covariance(over(~as_designed, weights), over(largest, prior).covariance)
+    return model_averaging.mixture(over(as_designed, weights), departing)
 
 
-def _moves(T_bridge_joint: Floats, half: Floats, outward: float) -> Floats:
-    """Return how an end's numbers follow a motion of the part about the bridge's origin, (40, 6)."""
+def _motion(place: EndPlace) -> Floats:
+    """Return the derivative (40, 6) of an end's coefficients by a motion of the part about the bridge's origin."""
+    T, half = place.T_bridge_joint, place.half
     rows = []
-    x, w = (a.ravel() for a in np.meshgrid([0.0, -outward * ZONE_MM], [-1.0, 1.0]))
+    x, w = (a.ravel() for a in np.meshgrid([0.0, -place.outward * ZONE_MM], [-1.0, 1.0]))
     for _, axis, sense in FACES:
         local = np.zeros((4, 3))
         local[:, 0], local[:, axis], local[:, 3 - axis] = x, sense * half[axis], w * half[3 - axis]
-        field = sense * np.einsum(
-            "i,nij->nj", T_bridge_joint[:3, axis], rigid.motion(rigid.apply(T_bridge_joint, local))
-        )
+        field = sense * np.einsum("i,nij->nj", T[:3, axis], rigid.motion(rigid.apply(T, local)))
         rows += [np.linalg.solve(ends_faces.basis(x, w)[:, :4], field), np.zeros((FACE - 4, 6))]
     u, v = np.array([1.0, -1.0, 0.0]), np.array([0.0, 0.0, 1.0])
     local = np.stack([np.zeros(3), u * half[1], v * half[2]], axis=1)
-    field = outward * np.einsum("i,nij->nj", T_bridge_joint[:3, 0], rigid.motion(rigid.apply(T_bridge_joint, local)))
+    field = place.outward * np.einsum("i,nij->nj", T[:3, 0], rigid.motion(rigid.apply(T, local)))
     rows.append(np.linalg.solve(_ring_basis(u, v)[:, :3], field))
     return np.vstack([*rows, np.zeros((RING - 3, 6))])
 
 
-def _corners(half: Floats, outward: float, number: Floats) -> tuple[Floats, Floats]:
-    """Return the movements (24,) of P1..P8 by the numbers (40,) of faces and ring, and their derivative (24, 40).
+def _key_points(place: EndPlace, coefficients: Floats) -> tuple[Floats, Floats]:
+    """Departures (24,) of P1..P8 by the coefficients (40,) of faces and ring, and their derivative (24, 40).
 
-    A corner is where its faces and the ring meet: each of them is taken where the others have it, so it is found by
-    turns.
+    A corner is where its faces and the ring meet. Each surface is evaluated at the corner as the others place it, by
+    fixed-point iteration.
     """
-    # P1..P4: bottom left, bottom right, top right, top left, with their upright and their level face.
-    places = [(1.0, -1.0, 3, 0), (-1.0, -1.0, 1, 0), (-1.0, 1.0, 1, 2), (1.0, 1.0, 3, 2)]
-    moved, derivative = np.zeros((8, 3)), np.zeros((8, 3, COUNT))
-    for k, (u, v, upright, level) in enumerate(places):
-        for _ in range(TURNS):
-            at_u, at_v = u + moved[k, 1] / half[1], v + moved[k, 2] / half[2]
-            derivative[k, 0, -RING:] = outward * _ring_basis(np.array([at_u]), np.array([at_v]))[0]
+    half = place.half
+    departure, derivative = np.zeros((8, 3)), np.zeros((8, 3, COUNT))
+    for k, (u, v, upright, level) in enumerate(CORNERS):
+        for _ in range(ITERATIONS):
+            at_u, at_v = u + departure[k, 1] / half[1], v + departure[k, 2] / half[2]
+            derivative[k, 0, -RING:] = place.outward * _ring_basis(np.array([at_u]), np.array([at_v]))[0]
             for axis, face, w in ((1, upright, at_v), (2, level, at_u)):
-                derivative[k, axis, FACE * face : FACE * (face + 1)] = _of_face(face, moved[k, 0], w)
-            moved[k] = derivative[k] @ number
+                derivative[k, axis, FACE * face : FACE * (face + 1)] = _on_face(face, departure[k, 0], w)
+            departure[k] = derivative[k] @ coefficients
     for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 3), (3, 0))):  # the middles of the edges
         derivative[4 + k] = 0.5 * (derivative[a] + derivative[b])
-        moved[4 + k] = 0.5 * (moved[a] + moved[b])
-        u, v = (0.5 * (places[a][i] + places[b][i]) + moved[4 + k, axis] / half[axis] for i, axis in ((0, 1), (1, 2)))
-        derivative[4 + k, 0, -RING:] = outward * _ring_basis(np.array([u]), np.array([v]))[0]
+        departure[4 + k] = 0.5 * (departure[a] + departure[b])
+        u, v = (
+            0.5 * (CORNERS[a][i] + CORNERS[b][i]) + departure[4 + k, axis] / half[axis] for i, axis in ((0, 1), (1, 2))
+        )
+        derivative[4 + k, 0, -RING:] = place.outward * _ring_basis(np.array([u]), np.array([v]))[0]
         axis, w = (2, u) if k % 2 == 0 else (1, v)
         derivative[4 + k, axis] = 0.0
-        derivative[4 + k, axis, FACE * k : FACE * (k + 1)] = _of_face(k, moved[4 + k, 0], w)
-        moved[4 + k] = derivative[4 + k] @ number
-    return moved.ravel(), derivative.reshape(24, COUNT)
+        derivative[4 + k, axis, FACE * k : FACE * (k + 1)] = _on_face(k, departure[4 + k, 0], w)
+        departure[4 + k] = derivative[4 + k] @ coefficients
+    return departure.ravel(), derivative.reshape(24, COUNT)
 
 
-def _of_face(face: int, x: float, w: float) -> Floats:
-    """Return the derivative (8,) of a coordinate of a face, at x and w, by the face's numbers."""
-    found: Floats = FACES[face][2] * ends_faces.basis(np.array([x]), np.array([w]))[0]
-    return found
+def _on_face(face: int, x: float, w: float) -> Floats:
+    """Return the derivative (8,) of a coordinate on a face, at x and w, by the face's coefficients."""
+    derivative: Floats = FACES[face][2] * ends_faces.basis(np.array([x]), np.array([w]))[0]
+    return derivative

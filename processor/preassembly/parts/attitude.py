@@ -1,7 +1,7 @@
-"""The attitude of a part: principal axes laid on the design's, and which of the possible ways is right.
+"""The coarse pose of a part: its principal axes aligned with the design's, and the right one of the possible ways.
 
 Principal axes leave four proper rotations, eight where the section is nearly square. The source paper (000, section
-2.2) resolves them by levelling the parts by hand; here every one is tried against the design's surface.
+2.2) resolves them by levelling the parts by hand; here every one is aligned with the design's surface.
 """
 
 from __future__ import annotations
@@ -19,30 +19,30 @@ from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.parallel import each
 from processor.model import DesignPart, Floats
 
-SAMPLE_SPACING_MM = 30.0  # of the design's surface: a mark of 0.1 m shows in ten samples
+SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
-FINE_GATES_MM = (50.0, 25.0, 12.0)  # for those that can still win
+FINE_GATES_MM = (50.0, 25.0, 12.0)  # for the promising ones
 COARSE_POINTS, FINE_POINTS = 600, 20_000
-# Where no hypothesis of a whole part comes as near, the scan may be of a piece of it: noise and form of parts are less.
+# Least misfit by noise and form of parts: where no hypothesis of a whole part is better, the scan may be of a piece.
 PIECE_MM = 5.0
 PIECE_POINTS, PIECE_ITERATIONS, PIECES_KEPT = 200, 6, 24
-SAME_SIZE = 0.05  # of the size along an axis, by which a piece may differ and yet be as large as the part along it
-# After the coarse gates a hypothesis this many times worse than the best, and by so much, is dropped: the right one may
-# have come to rest some millimetres off.
+SAME_SIZE = 0.05  # relative difference of sizes along an axis that a piece of full size may have
+# A hypothesis whose misfit after the coarse gates exceeds PROMISING times the best plus PROMISING_MM is dropped; the
+# right one may have converged some millimetres off.
 PROMISING, PROMISING_MM = 4.0, 10.0
-SHORT_SHARE = 0.1  # of its length, by which a scan may be shorter than the part and still be of all of it
-NO_FIT_MM = 25.0  # typical distance to the design, about a plate's thickness, beyond which no pose explains the scan
-SAME_POSE_MM = 5.0  # poses that move no corner of the part by more are one and the same
-TELLING_MM = 10.0  # design surface this far from the rival's design can tell two poses apart
+SHORT_SHARE = 0.1  # of its length, by which a scan of a whole part may be shorter
+NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose explains the scan
+SAME_POSE_MM = 5.0  # poses are equal where no corner of the part differs by more
+TELLING_MM = 10.0  # distance between two poses' surfaces beyond which the scan can distinguish the poses
 CORNER_SAMPLES = 12  # nearest of the rival's design: some of them on each face that meets at a corner
-LEAST_EVIDENCE = 10  # samples of telling surface that the scan shows
+LEAST_EVIDENCE = 10  # samples of distinguishing surface that the scan shows
 SLIDE_RAD = np.radians(45.0)  # a rival turned by less has slid along the part: along an arch it turns a little
 RIVAL_RATIO = 1.5  # a pose whose misfit is within this factor of the best is a rival
 
 
 @dataclass(frozen=True)
 class Attitude:
-    """The pose of a part by its principal axes and by its surface (``T_bridge_scan``, 4x4 each), and how sure it is."""
+    """The pose of a part by its principal axes and by its surface (``T_bridge_scan``, 4x4 each), with its status."""
 
     T_principal: Floats
     T_surface: Floats
@@ -74,7 +74,7 @@ class _Candidate:
 
 
 def samples_of(part: DesignPart) -> tuple[Floats, Floats]:
-    """Spread samples (n, 3), with unit normals, over the part's triangles, on a fixed low-discrepancy pattern."""
+    """Sample the part's surface on a fixed low-discrepancy pattern: points (n, 3) with unit normals (n, 3)."""
     a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
     cross = np.cross(b - a, c - a)
     double_area = np.linalg.norm(cross, axis=1)
@@ -98,14 +98,22 @@ def sample_surface(part: DesignPart) -> Surface:
     points, normals = samples_of(part)
     size = float(np.linalg.norm(np.ptp(part.vertices, axis=0)))
     mesh = mesh_distance.of_mesh(part.vertices, part.faces)
-    own = principal.of_mesh(part.vertices, part.faces)
-    return Surface(points, normals, cKDTree(points, balanced_tree=False), mesh, own.centre, own.axes, size)
+    axes = principal.of_mesh(part.vertices, part.faces)
+    return Surface(
+        points=points,
+        normals=normals,
+        tree=cKDTree(points, balanced_tree=False),
+        mesh=mesh,
+        centre=axes.centre,
+        axes=axes.axes,
+        size=size,
+    )
 
 
 def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
-    """T_bridge_scan that lay the scan's principal axes on the design's: eight proper rotations about the long axis.
+    """T_bridge_scan that align the scan's principal axes with the design's: eight proper rotations about the long axis.
 
-    A scan that is shorter than the part is also laid to either end of it.
+    A scan that is shorter than the part is also placed at either end of it.
     """
     scan = principal.of_points(points)
     design = principal.of_mesh(part.vertices, part.faces)
@@ -114,18 +122,18 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
     whole = (part.vertices - design.centre) @ design.axes[:, 0]
     short = np.ptp(whole) - (high - low)
     shifts = [0.0] if short < SHORT_SHARE * np.ptp(whole) else [0.0, -1.0, 1.0]
-    found = []
+    hypotheses = []
     for R in rotations:
         for shift in shifts:
-            ahead = R @ scan.axes[:, 0] @ design.axes[:, 0]  # 1 or -1: which way the scan lies on the design
-            own = (low, high) if ahead > 0.0 else (-high, -low)
-            move = 0.0 if shift == 0.0 else whole.min() - own[0] if shift < 0.0 else whole.max() - own[1]
-            found.append(rigid.transform(R, design.centre + move * design.axes[:, 0] - R @ scan.centre))
-    return found
+            ahead = R @ scan.axes[:, 0] @ design.axes[:, 0]  # 1 or -1: direction of the scan along the design
+            start, end = (low, high) if ahead > 0.0 else (-high, -low)
+            move = 0.0 if shift == 0.0 else whole.min() - start if shift < 0.0 else whole.max() - end
+            hypotheses.append(rigid.transform(R, design.centre + move * design.axes[:, 0] - R @ scan.centre))
+    return hypotheses
 
 
 def _rotations(scan_axes: Floats, design_axes: Floats) -> list[Floats]:
-    """Return the eight proper rotations (3, 3) that lay one long axis on the other and either cross axis on either."""
+    """Return the eight proper rotations (3, 3) that align the long axes, and the cross axes in either order."""
     quarter_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
     return [
         design_axes @ np.diag(signs) @ turn @ scan_axes.T
@@ -135,133 +143,134 @@ def _rotations(scan_axes: Floats, design_axes: Floats) -> list[Floats]:
 
 
 def piece_hypotheses(seeds: Floats, part: DesignPart) -> list[Floats]:
-    """T_bridge_scan that lay a piece of the part, as evenly seen in seeds (n, 3), to either side and amid it.
+    """T_bridge_scan that place a piece of the part, evenly sampled by seeds (n, 3), at either side and in the middle.
 
-    Of a half seen from above the middle is not the part's: along every axis along which it is smaller than the part it
-    is tried at the low side, in the middle and at the high side.
+    The middle of a half seen from above is not the part's. Along every axis along which the piece is smaller than the
+    part, it is placed at the low side, in the middle and at the high side.
     """
     design_axes = principal.of_mesh(part.vertices, part.faces).axes
     whole = part.vertices @ design_axes
     low, high = whole.min(axis=0), whole.max(axis=0)
-    found = []
+    hypotheses = []
     for R in _rotations(principal.of_points(seeds).axes, design_axes):
-        own = seeds @ R.T @ design_axes
-        own_low, own_high = np.quantile(own, [0.002, 0.998], axis=0)  # the odd stray point does not count
-        middle = 0.5 * (low + high - own_low - own_high)
-        moves = [
-            (m,) if abs((b - a) - (d - c)) < SAME_SIZE * (b - a) else (c_low, m, c_high)
-            for a, b, c, d, m, c_low, c_high in zip(
-                low, high, own_low, own_high, middle, low - own_low, high - own_high, strict=True
-            )
-        ]
-        found += [rigid.transform(R, design_axes @ np.array(move)) for move in product(*moves)]
-    return found
+        turned = seeds @ R.T @ design_axes
+        piece_low, piece_high = np.quantile(turned, [0.002, 0.998], axis=0)  # without single outliers
+        moves = np.stack([low - piece_low, 0.5 * (low + high - piece_low - piece_high), high - piece_high], axis=1)
+        same_size = np.abs((high - low) - (piece_high - piece_low)) < SAME_SIZE * (high - low)
+        tried = [move[1:2] if same else move for move, same in zip(moves, same_size, strict=True)]
+        hypotheses += [rigid.transform(R, design_axes @ np.array(move)) for move in product(*tried)]
+    return hypotheses
 
 
 def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> Attitude:
-    """Attitude of the part scanned as points (n, 3), against its design, whose samples may be there already.
+    """Find the attitude of a part from points (n, 3) and its design; ``surface`` is its sampled surface, if at hand.
 
-    Symmetric parts are told apart by what the designs in the two poses do not share (a pad, a taper); where there is
-    nothing of the kind, or the scan does not show it, the answer is ``ambiguous``.
+    The poses of a symmetric part are distinguished by surface that only one of them has (a pad, a taper). Where there
+    is none, or the scan does not show it, the status is ``ambiguous``.
     """
     surface = sample_surface(part) if surface is None else surface
     seeds = voxel_means(points, surface.size / 150.0, least=2)
     if len(seeds) < 50:
         seeds = points
     few = thinned(seeds, COARSE_POINTS)
-    begun = [_Candidate(T, T) for T in principal_hypotheses(points, part)]
-    coarse = each(partial(_tried, few, surface, COARSE_GATES_MM), begun)
+    starts = [_Candidate(T, T) for T in principal_hypotheses(points, part)]
+    coarse = each(partial(_align, few, surface, COARSE_GATES_MM), starts)
     box = _corners(points)
     if min(c.misfit for c in coarse) > PIECE_MM:
         coarse += _of_pieces(seeds, few, surface, part)
     coarse = _promising(coarse, box)
-    # Single points now: means of voxels blend the end faces, which alone hold the part along its length.
+    # Single points: voxel means blur the end faces, which alone constrain the part along its length.
     seeds = thinned(points, FINE_POINTS)
-    tried = partial(_tried, seeds, surface, FINE_GATES_MM)
-    candidates = _distinct(each(tried, coarse), box)
-    # Few points hold a part of even curvature along itself, and it may have come to rest metres off; and what lies
-    # beside the part turns its principal axes, from which the right attitude may not be reached. Every attitude is
-    # tried from where the best one lies, too: turned as their beginnings are, and as the part may lie on itself.
+    align = partial(_align, seeds, surface, FINE_GATES_MM)
+    candidates = _distinct(each(align, coarse), box)
+    # Few points constrain a part of even curvature along its length, so it may have converged metres off. Clutter
+    # turns the principal axes, from which the right attitude may not be reached. So every attitude is also tried from
+    # the best pose: turned by the rotations between the starts, and by those of the part onto itself.
     best = candidates[0]
     turns = [c.start @ rigid.invert(best.start) for c in coarse]
     turns += [_about(surface.centre, R) for R in _rotations(surface.axes, surface.axes)]
     turned = [_Candidate(S @ best.T, S @ best.start) for S in turns]
-    screened = each(partial(_tried, few, surface, COARSE_GATES_MM[1:]), turned)
+    screened = each(partial(_align, few, surface, COARSE_GATES_MM[1:]), turned)
     turned = _promising([replace(c, misfit=s.misfit) for c, s in zip(turned, screened, strict=True)], box)
-    candidates = _distinct(candidates + each(tried, turned), box)
+    candidates = _distinct(candidates + each(align, turned), box)
     best = candidates[0]
     if best.misfit > NO_FIT_MM:
-        said = f"no attitude fits the design (typical distance {best.misfit:.0f} mm)"
-        return Attitude(best.start, best.T, "failed", said)
+        message = f"no attitude fits the design (typical distance {best.misfit:.0f} mm)"
+        return Attitude(best.start, best.T, "failed", message)
     rivals = [c for c in candidates if c.misfit <= RIVAL_RATIO * best.misfit + 0.5]
-    return _settled(points, box, seeds, surface, rivals)
+    return _decide(points, box, seeds, surface, rivals)
 
 
 def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -> list[_Candidate]:
-    """Try the part's pieces: what stands best after a few quick steps goes through the coarse gates."""
+    """Align pieces of the part: the best after a few quick iterations go through the coarse gates."""
     quick = thinned(few, PIECE_POINTS)
 
-    def stepped(T: Floats) -> _Candidate:
-        given = (quick, surface.points, surface.normals, T)
-        gate = COARSE_GATES_MM[:1]
+    def iterate(T: Floats) -> _Candidate:
         fitted = icp.point_to_plane(
-            *given, gates_mm=gate, tree=surface.tree, axes=surface.axes, max_iterations=PIECE_ITERATIONS
+            quick,
+            surface.points,
+            surface.normals,
+            T,
+            gates_mm=COARSE_GATES_MM[:1],
+            tree=surface.tree,
+            axes=surface.axes,
+            max_iterations=PIECE_ITERATIONS,
         ).T_target_source
         return _Candidate(fitted, fitted, _misfit(quick, surface, fitted))
 
-    best = sorted(each(stepped, piece_hypotheses(seeds, part)), key=lambda c: c.misfit)[:PIECES_KEPT]
-    return each(partial(_tried, few, surface, COARSE_GATES_MM), [_Candidate(c.T, c.T) for c in best])
+    best = sorted(each(iterate, piece_hypotheses(seeds, part)), key=lambda c: c.misfit)[:PIECES_KEPT]
+    return each(partial(_align, few, surface, COARSE_GATES_MM), [_Candidate(c.T, c.T) for c in best])
 
 
 def _about(centre: Floats, R: Floats) -> Floats:
-    """Turn (4, 4) by R (3, 3) about a centre (3,)."""
+    """Rotation R (3, 3) about a centre (3,), as (4, 4)."""
     return rigid.transform(R, centre - R @ centre)
 
 
 def _distinct(candidates: list[_Candidate], box: Floats) -> list[_Candidate]:
-    """Sort candidates by their misfit; of those that take the corners of the scan's box (8, 3) alike, keep one."""
-    kept: list[_Candidate] = []
-    for one in sorted(candidates, key=lambda c: c.misfit):
-        moved = rigid.apply(one.T, box)
-        if all(np.linalg.norm(moved - rigid.apply(c.T, box), axis=1).max() >= SAME_POSE_MM for c in kept):
-            kept.append(one)
-    return kept
+    """Sort candidates by their misfit, and drop equal poses by the corners (8, 3) of the scan's box."""
+    distinct: list[_Candidate] = []
+    for candidate in sorted(candidates, key=lambda c: c.misfit):
+        corners = rigid.apply(candidate.T, box)
+        if all(np.linalg.norm(corners - rigid.apply(c.T, box), axis=1).max() >= SAME_POSE_MM for c in distinct):
+            distinct.append(candidate)
+    return distinct
 
 
 def _promising(candidates: list[_Candidate], box: Floats) -> list[_Candidate]:
-    """Drop candidates that come so much less near than the best that they cannot win, and twins."""
+    """Drop candidates with a misfit so much larger than the best that they cannot win, and equal ones."""
     least = min(c.misfit for c in candidates)
     return _distinct([c for c in candidates if c.misfit <= PROMISING * least + PROMISING_MM], box)
 
 
-def _settled(points: Floats, box: Floats, seeds: Floats, surface: Surface, candidates: list[_Candidate]) -> Attitude:
-    """Choose, of candidates that fit, the one that no other beats by what the scan shows."""
+def _decide(points: Floats, box: Floats, seeds: Floats, surface: Surface, candidates: list[_Candidate]) -> Attitude:
+    """Choose, of candidates that fit, the one that no other beats by the surface that the scan shows."""
     if len(candidates) > 1:
-        # Evidence counts tens of millimetres: no pose may be off by such along the part.
+        # Evidence is counted at a scale of tens of millimetres: poses must be more accurate than that.
         fine = [surface_registration.fine(seeds, surface.mesh, surface.axes, c.T).T_bridge_scan for c in candidates]
         candidates = _distinct([replace(c, T=T) for c, T in zip(candidates, fine, strict=True)], box)
 
     @cache
-    def tells(i: int, j: int) -> int:
-        """Whether the scan speaks for the one (1), for the other (-1), or for neither (0)."""
-        ours, theirs = _evidence(points, surface, candidates[i].T, candidates[j].T)
-        more, fewer = max(ours, theirs), min(ours, theirs)
+    def compare(i: int, j: int) -> int:
+        """Whether the scan supports the first candidate (1), the second (-1), or neither (0)."""
+        for_i, for_j = _evidence(points, surface, candidates[i].T, candidates[j].T)
+        more, fewer = max(for_i, for_j), min(for_i, for_j)
         clear = more >= LEAST_EVIDENCE and more >= 2 * fewer
-        return int(np.sign(ours - theirs)) if clear else 0
+        return int(np.sign(for_i - for_j)) if clear else 0
 
     best = 0
     for other in range(1, len(candidates)):
-        best = other if tells(best, other) < 0 else best
-    rivals = [other for other in range(len(candidates)) if other != best and tells(best, other) <= 0]
+        best = other if compare(best, other) < 0 else best
+    rivals = [other for other in range(len(candidates)) if other != best and compare(best, other) <= 0]
     T, start = candidates[best].T, candidates[best].start
     if not rivals:
         return Attitude(start, T, "ok", "")
     T_rival = candidates[rivals[0]].T
-    return Attitude(start, T, "ambiguous", _said_of(T, T_rival, surface), T_rival)
+    return Attitude(start, T, "ambiguous", _rival_message(T, T_rival, surface), T_rival)
 
 
-def _said_of(best: Floats, rival: Floats, surface: Surface) -> str:
-    """Say what a rival's pose is against the best, T_bridge_scan (4, 4) each, and what would tell them apart."""
+def _rival_message(best: Floats, rival: Floats, surface: Surface) -> str:
+    """Describe a rival pose relative to the best, T_bridge_scan (4, 4) each, and what would distinguish them."""
     between = rival @ rigid.invert(best)
     middle = surface.points.mean(axis=0)
     turn = rigid.rotation_angle(between[:3, :3])
@@ -271,25 +280,20 @@ def _said_of(best: Floats, rival: Floats, surface: Surface) -> str:
     return f"the part fits its design as well when shifted by {shift:.0f} mm along itself; an end seen would tell"
 
 
-def _tried(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:
-    """Align from where a candidate lies."""
-    T = _aligned(points, surface, candidate.T, gates_mm)
+def _align(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:
+    """Align from the pose of a candidate."""
+    T = icp.point_to_plane(
+        points, surface.points, surface.normals, candidate.T, gates_mm=gates_mm, tree=surface.tree, axes=surface.axes
+    ).T_target_source
     return _Candidate(T, candidate.start, _misfit(points, surface, T))
-
-
-def _aligned(points: Floats, surface: Surface, T: Floats, gates_mm: tuple[float, ...]) -> Floats:
-    found = icp.point_to_plane(
-        points, surface.points, surface.normals, T, gates_mm=gates_mm, tree=surface.tree, axes=surface.axes
-    )
-    return found.T_target_source
 
 
 def _misfit(points: Floats, surface: Surface, T: Floats) -> float:
     """Median distance in mm of the points to the nearest design sample's plane."""
-    moved = rigid.apply(T, points)
-    distance, index = surface.tree.query(moved)
-    normal_part = np.abs(np.einsum("ni,ni->n", moved - surface.points[index], surface.normals[index]))
-    # Beyond the surface's edge a point lies in the plane of its nearest sample and is far all the same.
+    placed = rigid.apply(T, points)
+    distance, index = surface.tree.query(placed)
+    normal_part = np.abs(np.einsum("ni,ni->n", placed - surface.points[index], surface.normals[index]))
+    # A point beyond the surface's edge may lie in the plane of its nearest sample and still be far from it.
     spacing = 3.0 * float(np.median(distance))
     return float(np.median(np.where(distance > 100.0 + spacing, distance, normal_part)))
 
@@ -300,7 +304,7 @@ def _corners(points: Floats) -> Floats:
 
 
 def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> tuple[int, int]:
-    """Count the shown samples of surface that only one of the poses has, for the best and for the rival."""
+    """Count the samples that the scan shows of surface that only one pose has, for the best and for the rival."""
     return (
         shown(points, best, only_in(surface, best, surface, rival)[0]),
         shown(points, rival, only_in(surface, rival, surface, best)[0]),
@@ -308,32 +312,32 @@ def _evidence(points: Floats, surface: Surface, best: Floats, rival: Floats) -> 
 
 
 def only_in(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> tuple[Floats, Floats]:
-    """Give the samples (k, 3) of a design that, placed in the scan by T, are far from the other design as placed there.
+    """Return samples and normals (k, 3) of a design that, placed in the scan, are far from the other design there.
 
-    With their normals (k, 3). ``T`` and ``T_other`` are T_bridge_scan (4, 4); the designs may be one and the same.
+    ``T`` and ``T_other`` are T_bridge_scan (4, 4) of the two designs, which may be the same.
     """
-    there = rigid.apply(T_other, rigid.apply(rigid.invert(T), surface.points))
-    _, distance, beyond = other.mesh.distances(there, 5.0 * TELLING_MM)
-    near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # not so where nothing is in reach: NaN
+    samples = rigid.apply(T_other, rigid.apply(rigid.invert(T), surface.points))
+    _, distance, beyond = other.mesh.distances(samples, 5.0 * TELLING_MM)
+    near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # False where nothing is in reach: NaN
     far = np.flatnonzero(~near)
-    # Near a corner the nearest sample may be on the other face, from which the walk does not come round.
-    around = other.mesh.tree.query(there[far], k=CORNER_SAMPLES, workers=-1)
+    # Near a corner the nearest sample may be on the other face, from which the search over facets does not get round.
+    around = other.mesh.tree.query(samples[far], k=CORNER_SAMPLES, workers=-1)
     beside = around[0][:, 0] <= 1.4 * TELLING_MM
     for k in range(CORNER_SAMPLES):
         face = other.mesh.sample_face[around[1][:, k]]
-        _, distance, beyond = other.mesh.distances(there[far], np.inf, face)
+        _, distance, beyond = other.mesh.distances(samples[far], np.inf, face)
         beside |= (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)
     far = far[~beside]
     return surface.points[far], surface.normals[far]
 
 
 def shown(points: Floats, T: Floats, samples: Floats) -> int:
-    """Count the samples that have a point within TELLING_MM, the points taken by T."""
+    """Count the samples that have a point within TELLING_MM, the points placed by T (4, 4)."""
     if len(samples) == 0:
         return 0
-    moved = rigid.apply(T, points)
-    near = ((moved > samples.min(axis=0) - TELLING_MM) & (moved < samples.max(axis=0) + TELLING_MM)).all(axis=1)
+    placed = rigid.apply(T, points)
+    near = ((placed > samples.min(axis=0) - TELLING_MM) & (placed < samples.max(axis=0) + TELLING_MM)).all(axis=1)
     if not near.any():
         return 0
-    distance = cKDTree(moved[near], balanced_tree=False).query(samples, distance_upper_bound=TELLING_MM, workers=-1)[0]
+    distance = cKDTree(placed[near], balanced_tree=False).query(samples, distance_upper_bound=TELLING_MM, workers=-1)[0]
     return int(np.isfinite(distance).sum())

@@ -1,13 +1,14 @@
-"""Parts of one shape: whether a scan is of the part whose name it bears, told by what marks show.
+"""Parts of one shape: whether a scan is of the part it is named after.
 
-The ribs, or the feet, of one arch are often each other's mirror images and, their sections being symmetric, the same
-after half a turn: scans of either fit the other's design to the noise, and a chain of swapped parts closes. Only where
-the designs differ, at the marks that tell a part's ends apart, do the scans.
+The ribs, or the feet, of one arch are often mirror images of each other and, their sections being symmetric, equal
+after half a turn. A scan of one then fits the design of the other to the noise, and a chain of swapped parts closes.
+Scans differ only where the designs do: at the marks that distinguish a part's ends.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,18 +20,19 @@ from processor.model import ArchDesign, DesignPart, Floats
 from processor.preassembly.parts import attitude
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, SAMPLE_SPACING_MM
 
-AROUND = 30_000  # points by which the surface's own departure about a mark is known: one in 50 mm on a long part
-NEIGHBOURS = 64  # of them about a place: a circle of some 0.2 m radius
+AROUND = 30_000  # points that show the surface's departure near a mark: one in 50 mm on a long part
+NEIGHBOURS = 64  # of them near a sample: a circle of some 0.2 m radius
 LEAST_NEIGHBOURS = 8
 REACH_MM = 60.0
 SAME_FACE_COS = 0.9
 
 
 @dataclass(frozen=True)
-class Told:
-    """Names of parts of the same shape: of which the scan is rather, with which it may be confused still.
+class Identity:
+    """Other parts of the same shape, by what the scan shows.
 
-    ``unseen``: their marks differ, but nothing of them was seen. ``same``: the designs differ in nothing at all.
+    ``rather``: the scan shows their mark. ``unseen``: their marks differ, but the scan shows none. ``same``: the
+    designs do not differ.
     """
 
     rather: tuple[str, ...] = ()
@@ -38,77 +40,89 @@ class Told:
     same: tuple[str, ...] = ()
 
     @property
-    def wrong(self) -> str:
-        """Why the scan is of another part, or nothing."""
+    def contradiction(self) -> str:
+        """Why the scan is of another part; empty where it is not."""
         return f"by its mark it is rather {' or '.join(self.rather)}" if self.rather else ""
 
     @property
-    def open(self) -> list[str]:
-        """What the scan leaves open."""
-        found = []
+    def open_questions(self) -> list[str]:
+        """Parts that the scan may be of as well."""
+        questions = []
         if self.unseen:
-            found.append(f"of the same shape as {' and '.join(self.unseen)}: no mark was seen that tells them apart")
+            questions.append(
+                f"of the same shape as {' and '.join(self.unseen)}: no mark was seen that tells them apart"
+            )
         if self.same:
-            found.append(f"of the same shape as {' and '.join(self.same)}: the scan may be of either")
-        return found
+            questions.append(f"of the same shape as {' and '.join(self.same)}: the scan may be of either")
+        return questions
 
 
-def tell(points: Floats, T: Floats, surface: attitude.Surface, part: DesignPart, design: ArchDesign) -> Told:
-    """Hold points (n, 3), placed on the part's surface by T_bridge_scan (4, 4), against the parts of the same shape."""
+class _Surroundings(NamedTuple):
+    """Points (k, 3) on the design away from the marks, its normals (k, 3) there, and departures (k,) outward."""
+
+    points: Floats
+    normals: Floats
+    departure: Floats
+
+
+def identify(points: Floats, T: Floats, surface: attitude.Surface, part: DesignPart, design: ArchDesign) -> Identity:
+    """Compare points (n, 3), placed on the part's surface by T_bridge_scan (4, 4), with the parts of the same shape."""
     rather, unseen, same = [], [], []
     for other in design.parts:
-        ways = box_girder.motions(part, other) if other.name != part.name else []
-        if not ways:
+        motions = box_girder.motions(part, other) if other.name != part.name else []
+        if not motions:
             continue
-        theirs = attitude.sample_surface(other)
-        # A part that is symmetric but for its mark lies on the other in two ways; where the marks agree in one of them
-        # the two are the same, and a mark that agrees in the other is the part's own, laid the other way round.
-        found = {_of_one(points, T, surface, theirs, way) for way in ways}
-        if "same" in found:
+        other_surface = attitude.sample_surface(other)
+        # A part that is symmetric but for its mark lies on the other in two ways. Where the marks agree in one of them
+        # the two parts are the same; a mark that agrees in the other way is the part's own, turned round.
+        answers = {_compare(points, T, surface, other_surface, motion) for motion in motions}
+        if "same" in answers:
             same.append(other.name)
-        elif "other" in found:
+        elif "other" in answers:
             rather.append(other.name)
-        elif "unseen" in found:
+        elif "unseen" in answers:
             unseen.append(other.name)
-    return Told(tuple(rather), tuple(unseen), tuple(same))
+    return Identity(tuple(rather), tuple(unseen), tuple(same))
 
 
-def _of_one(points: Floats, T: Floats, surface: attitude.Surface, theirs: attitude.Surface, way: Floats) -> str:
-    """Tell by one T_part_other: own | other | unseen | same."""
-    T_other = rigid.invert(way) @ T
-    own = attitude.only_in(surface, T, theirs, T_other)
-    other = attitude.only_in(theirs, T_other, surface, T)
-    if len(own[0]) + len(other[0]) < LEAST_EVIDENCE:
+def _compare(
+    points: Floats, T: Floats, surface: attitude.Surface, other_surface: attitude.Surface, T_part_other: Floats
+) -> str:
+    """Compare with another part laid on this one in one way: part | other | unseen | same."""
+    T_other = rigid.invert(T_part_other) @ T
+    of_part = attitude.only_in(surface, T, other_surface, T_other)
+    of_other = attitude.only_in(other_surface, T_other, surface, T)
+    if len(of_part[0]) + len(of_other[0]) < LEAST_EVIDENCE:
         return "same"
-    other = rigid.apply(way, other[0]), other[1] @ way[:3, :3].T  # both in the frame of the part's design now
-    telling = np.vstack([own[0], other[0]])
-    around = _around(rigid.apply(T, thinned(points, AROUND)), surface, telling)
-    ours, others = (attitude.shown(points, T, _where_the_part_is(*samples, *around)) for samples in (own, other))
-    more, fewer = max(ours, others), min(ours, others)
+    of_other = rigid.apply(T_part_other, of_other[0]), of_other[1] @ T_part_other[:3, :3].T
+    marks = np.vstack([of_part[0], of_other[0]])  # both in the frame of the part's design
+    around = _around(rigid.apply(T, thinned(points, AROUND)), surface, marks)
+    part_count, other_count = (
+        attitude.shown(points, T, _as_built(samples, normals, around)) for samples, normals in (of_part, of_other)
+    )
+    more, fewer = max(part_count, other_count), min(part_count, other_count)
     if more < LEAST_EVIDENCE or more < 2 * fewer:
         return "unseen"
-    return "own" if ours > others else "other"
+    return "part" if part_count > other_count else "other"
 
 
-def _around(moved: Floats, surface: attitude.Surface, telling: Floats) -> tuple[Floats, Floats, Floats]:
-    """Points (k, 3) on the design off its telling places, normals (k, 3) there, departures (k,) outward."""
-    face, distance, beyond = surface.mesh.distances(moved, REACH_MM)
-    used = on_face(face, beyond) & (cKDTree(telling).query(moved)[0] > 1.5 * SAMPLE_SPACING_MM)
-    return moved[used], surface.mesh.normals[face[used]], distance[used]
+def _around(points: Floats, surface: attitude.Surface, marks: Floats) -> _Surroundings:
+    """Points on the design that are away from samples (m, 3) of the marks."""
+    face, distance, beyond = surface.mesh.distances(points, REACH_MM)
+    used = on_face(face, beyond) & (cKDTree(marks).query(points)[0] > 1.5 * SAMPLE_SPACING_MM)
+    return _Surroundings(points[used], surface.mesh.normals[face[used]], distance[used])
 
 
-def _where_the_part_is(
-    samples: Floats, normals: Floats, around: Floats, around_normals: Floats, departure: Floats
-) -> Floats:
-    """Move samples (k, 3) along their normals by what the part's face departs from its design about them.
+def _as_built(samples: Floats, normals: Floats, around: _Surroundings) -> Floats:
+    """Move samples (k, 3) along their normals by the departure of the part's face from its design around them.
 
-    A mark stands on its plate: where a plate is bowed or dented by as much as marks are high, so is the mark.
+    A mark stands on its plate. Where the plate is bowed or dented by as much as marks are high, the mark moves with it.
     """
-    if len(samples) == 0 or len(around) < NEIGHBOURS:
+    if len(samples) == 0 or len(around.points) < NEIGHBOURS:
         return samples
-    near = cKDTree(around).query(samples, k=NEIGHBOURS)[1]
-    same = np.einsum("kni,ki->kn", around_normals[near], normals) > SAME_FACE_COS
-    known = same.sum(axis=1) >= LEAST_NEIGHBOURS
+    near = cKDTree(around.points).query(samples, k=NEIGHBOURS)[1]
+    same_face = np.einsum("kni,ki->kn", around.normals[near], normals) > SAME_FACE_COS
+    known = same_face.sum(axis=1) >= LEAST_NEIGHBOURS
     shift = np.zeros(len(samples))
-    shift[known] = np.nanmedian(np.where(same, departure[near], np.nan)[known], axis=1)
+    shift[known] = np.nanmedian(np.where(same_face, around.departure[near], np.nan)[known], axis=1)
     return samples + shift[:, None] * normals

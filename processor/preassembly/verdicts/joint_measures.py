@@ -1,31 +1,24 @@
-"""What the eight gaps of a joint mean: groove gap, misalignment, rotation and offset, each with its 95 % interval.
+"""Measures of a joint by its eight gaps: groove gap, misalignment, rotation and offset, each with its 95 % interval.
 
-All is said in the joint's axes, x along the bridge, y left, z up. A gap is right part minus left part: along x
-positive is open and negative an overlap. Plates meet across their faces: bottom and top (P5, P7) along z, the webs
-(P6, P8) along y, the corners (P1..P4) along both; a shift along a plate is no misalignment of it.
-
-The least and the greatest of several values with errors are biased, and the interval of whichever point came out
-extreme is too short: of eight it may miss in one case of five. So extremes take a band over all points at once, its
-factor k from draws of their joint errors: with 95 % all errors stay within k sd, and then the true extreme lies between
-the extremes of the band's two sides, whichever point has it. Points that cannot be the extreme are left out, so where
-one stands clear of the others k is 1.96, as for any single value.
+All are in the joint's axes, x along the bridge, y left, z up. A gap is right part minus left part: along x positive is
+open and negative an overlap. Plates meet across their faces: bottom and top (P5, P7) along z, the webs (P6, P8) along
+y, the corners (P1..P4) along both. A shift along a plate is no misalignment of it. Least and greatest of several gaps
+have intervals by :mod:`processor.adjustment.extremes`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from processor.adjustment import extremes
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Checked, Floats, Ints, column, names
 
-RAYLEIGH_95 = 2.447747  # radius that holds 95 % of a round normal distribution in the plane, in sd
-DRAWS = 4000
-SEED = 20
-CLEAR_SD = 4.0  # a point this many sd of their difference from the extreme one is not it
-EXACT_MM = 1e-9
+RAYLEIGH_95 = 2.447747  # radius that holds 95 % of a round normal distribution in the plane, in standard deviations
 
 # What counts as misalignment: rows of (point, axis), corners along both.
 ACROSS = ((0, 1), (0, 2), (1, 1), (1, 2), (2, 1), (2, 2), (3, 1), (3, 2), (4, 2), (5, 1), (6, 2), (7, 1))
@@ -56,15 +49,30 @@ class Measures(Checked):
     misalignment_at: Floats = column(8)
     misalignment_at_ci95: Floats = column(8)
 
+    @property
+    def known(self) -> bool:
+        """Whether all gaps and their covariance are known."""
+        return bool(np.isfinite(self.gaps).all() and np.isfinite(self.covariance).all())
+
     def of(self, name: str) -> tuple[float, float]:
-        """Value and 95 % half-width of a row. Raises ValueError for a name there is none of."""
+        """Value and 95 % half-width of a row. Raises ValueError for an unknown name."""
         row = self.name.index(name)
         return float(self.value[row]), float(self.ci95[row])
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a row. Raises ValueError for a name there is none of."""
+        """95 % interval of a row. Raises ValueError for an unknown name."""
         row = self.name.index(name)
         return float(self.low[row]), float(self.high[row])
+
+
+class _Row(NamedTuple):
+    """One measure with its 95 % interval."""
+
+    name: str
+    value: float
+    unit: str
+    low: float
+    high: float
 
 
 def in_joint_axes(gaps: Floats, covariance: Floats, T_bridge_joint: Floats) -> tuple[Floats, Floats]:
@@ -79,85 +87,22 @@ def measure(gaps: Floats, covariance: Floats, T_bridge_joint: Floats, points: Fl
     local, spread = in_joint_axes(gaps, covariance, T_bridge_joint)
     at = rigid.apply(rigid.invert(T_bridge_joint), points)
     rows = [*_groove_rows(local, spread), _misalignment_row(local, spread), *_motion_rows(local, spread, at)]
-    low, high = (np.array([row[k] for row in rows]) for k in (3, 4))
-    value = np.array([row[1] for row in rows])
-    misaligned, half = _misalignment_at(local, spread)
+    low, high = np.array([row.low for row in rows]), np.array([row.high for row in rows])
+    value = np.array([row.value for row in rows])
+    misalignment, half_width = _misalignment_at(local, spread)
     return Measures(
-        tuple(row[0] for row in rows),
-        value,
-        np.maximum(high - value, value - low),
-        low,
-        high,
-        tuple(row[2] for row in rows),
-        at,
-        local,
-        spread,
-        misaligned,
-        half,
+        name=tuple(row.name for row in rows),
+        value=value,
+        ci95=np.maximum(high - value, value - low),
+        low=low,
+        high=high,
+        unit=tuple(row.unit for row in rows),
+        points=at,
+        gaps=local,
+        covariance=spread,
+        misalignment_at=misalignment,
+        misalignment_at_ci95=half_width,
     )
-
-
-_Row = tuple[str, float, str, float, float]
-
-
-def _row(name: str, value: float, unit: str, half: float) -> _Row:
-    return name, value, unit, value - half, value + half
-
-
-def _groove_rows(gaps: Floats, covariance: Floats) -> list[_Row]:
-    x, spread = gaps[:, 0], covariance[np.ix_(_ALONG, _ALONG)]
-    found = [_row("groove_gap_mean", float(x.mean()), "mm", NORMAL_95 * float(np.sqrt(max(spread.mean(), 0.0))))]
-    for name, sign in (("least", -1.0), ("greatest", 1.0)):
-        value, low, high = _greatest(sign * x, spread)
-        if sign < 0.0:
-            low, high = -high, -low
-        found.append((f"groove_gap_{name}", sign * value, "mm", low, high))
-    return found
-
-
-def _misalignment_row(gaps: Floats, covariance: Floats) -> _Row:
-    across, spread = gaps.ravel()[_ROWS], covariance[np.ix_(_ROWS, _ROWS)]
-    sign = np.where(across < 0.0, -1.0, 1.0)
-    value, low, high = _greatest(sign * across, spread * np.outer(sign, sign), folded=True)
-    return "misalignment", value, "mm", low, high
-
-
-def _greatest(values: Floats, covariance: Floats, folded: bool = False) -> tuple[float, float, float]:
-    """Greatest of values (n,) with errors of covariance (n, n), and its 95 % interval; ``folded``: of magnitudes."""
-    if not (np.isfinite(values).all() and np.isfinite(covariance).all()):
-        return float(values.max()), float("nan"), float("nan")
-    top = int(np.argmax(values))
-    var = np.maximum(np.diag(covariance), 0.0)
-    apart = np.sqrt(np.maximum(var + var[top] - 2.0 * covariance[top], 0.0))
-    if folded:  # the other sign of a value can be the greatest magnitude as well
-        apart = np.maximum(apart, np.sqrt(np.maximum(var + var[top] + 2.0 * covariance[top], 0.0)))
-    near = values >= values[top] - CLEAR_SD * apart - EXACT_MM
-    sd = np.sqrt(var[near])
-    reach = _factor(covariance[np.ix_(near, near)]) * sd
-    low, high = float((values[near] - reach).max()), float((values[near] + reach).max())
-    return float(values[top]), max(low, 0.0) if folded else low, high
-
-
-def _factor(covariance: Floats) -> float:
-    """Sd (k) within which 95 % of joint draws have all their errors."""
-    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    noisy = sd > 0.0
-    if noisy.sum() < 2:
-        return NORMAL_95
-    errors = draws(np.zeros(int(noisy.sum())), covariance[np.ix_(noisy, noisy)], count=20_000)[:10_000]
-    return max(NORMAL_95, float(np.quantile(np.abs(errors / sd[noisy]).max(axis=1), 0.95)))
-
-
-def draws(mean: Floats, covariance: Floats, count: int = DRAWS, seed: int = SEED) -> Floats:
-    """Draw (count, n) from a normal distribution, the same ones every time; each comes with its mirror image.
-
-    The mirror images make what is linear in the draws exact: a value on its limit is within it in just half of them.
-    """
-    rng = np.random.default_rng(seed)
-    scale, axes = np.linalg.eigh(0.5 * (covariance + covariance.T))
-    errors = (rng.standard_normal((count // 2, len(mean))) * np.sqrt(np.maximum(scale, 0.0))) @ axes.T
-    found: Floats = mean + np.concatenate([errors, -errors])
-    return found
 
 
 def motion_of(points: Floats) -> Floats:
@@ -167,23 +112,47 @@ def motion_of(points: Floats) -> Floats:
     """
     flat = rigid.motion(points).reshape(24, 6)
     size = np.linalg.norm(flat, axis=0)
-    found: Floats = np.linalg.pinv(flat / size) / size[:, None]
-    return found
+    solve: Floats = np.linalg.pinv(flat / size) / size[:, None]
+    return solve
+
+
+def _row(name: str, value: float, unit: str, half_width: float) -> _Row:
+    return _Row(name, value, unit, value - half_width, value + half_width)
+
+
+def _groove_rows(gaps: Floats, covariance: Floats) -> list[_Row]:
+    x, spread = gaps[:, 0], covariance[np.ix_(_ALONG, _ALONG)]
+    mean_sd = float(np.sqrt(max(spread.mean(), 0.0)))
+    negative, below, above = extremes.of_correlated(-x, spread)
+    greatest, low, high = extremes.of_correlated(x, spread)
+    return [
+        _row("groove_gap_mean", float(x.mean()), "mm", NORMAL_95 * mean_sd),
+        _Row("groove_gap_least", -negative, "mm", -above, -below),
+        _Row("groove_gap_greatest", greatest, "mm", low, high),
+    ]
+
+
+def _misalignment_row(gaps: Floats, covariance: Floats) -> _Row:
+    across, spread = gaps.ravel()[_ROWS], covariance[np.ix_(_ROWS, _ROWS)]
+    sign = np.where(across < 0.0, -1.0, 1.0)
+    greatest, low, high = extremes.of_correlated(sign * across, spread * np.outer(sign, sign), folded=True)
+    return _Row("misalignment", greatest, "mm", low, high)
 
 
 def _motion_rows(gaps: Floats, covariance: Floats, points: Floats) -> list[_Row]:
     solve = motion_of(points)
     motion, spread = solve @ gaps.ravel(), solve @ covariance @ solve.T
-    half = NORMAL_95 * np.sqrt(np.maximum(np.diag(spread), 0.0))
-    # Reaching no farther than the error of the offset does, the size of the offset is within it.
-    off = float(np.hypot(motion[4], motion[5]))
+    half_width = NORMAL_95 * np.sqrt(np.maximum(np.diag(spread), 0.0))
+    # The length of the offset is off by no more than the length of the offset's error.
+    offset = float(np.hypot(motion[4], motion[5]))
     reach = RAYLEIGH_95 * _largest_sd(spread[4:, 4:])
-    found: list[_Row] = [("eccentricity", off, "mm", max(off - reach, 0.0) if np.isfinite(off) else off, off + reach)]
+    low = max(offset - reach, 0.0) if np.isfinite(offset) else offset
+    rows = [_Row("eccentricity", offset, "mm", low, offset + reach)]
     for k, axis in enumerate("xyz"):
-        found.append(_row(f"rotation_{axis}", 1e3 * float(motion[k]), "mrad", 1e3 * float(half[k])))
+        rows.append(_row(f"rotation_{axis}", 1e3 * float(motion[k]), "mrad", 1e3 * float(half_width[k])))
     for k, axis in enumerate("xyz"):
-        found.append(_row(f"offset_{axis}", float(motion[3 + k]), "mm", float(half[3 + k])))
-    return found
+        rows.append(_row(f"offset_{axis}", float(motion[3 + k]), "mm", float(half_width[3 + k])))
+    return rows
 
 
 def _largest_sd(covariance: Floats) -> float:
@@ -193,12 +162,12 @@ def _largest_sd(covariance: Floats) -> float:
 
 
 def _misalignment_at(gaps: Floats, covariance: Floats) -> tuple[Floats, Floats]:
-    """Root-sum of what is misaligned at each point (8,), with a half-width that holds in 95 % or more."""
-    value, half = np.zeros(8), np.zeros(8)
+    """Root of the sum of squares of the misalignment at each point (8,), with a half-width (8,) of 95 % or more."""
+    value, half_width = np.zeros(8), np.zeros(8)
     for point in range(8):
         axes: Sequence[int] = [axis for at, axis in ACROSS if at == point]
         rows = [3 * point + axis for axis in axes]
         value[point] = np.linalg.norm(gaps[point, axes])
         factor = RAYLEIGH_95 if len(axes) == 2 else NORMAL_95
-        half[point] = factor * _largest_sd(covariance[np.ix_(rows, rows)])
-    return value, half
+        half_width[point] = factor * _largest_sd(covariance[np.ix_(rows, rows)])
+    return value, half_width

@@ -1,18 +1,19 @@
-"""What to do at a joint: nothing, cut the right part's end, or build it up, and how likely it then keeps its limits.
+"""Proposal for a joint: nothing, cut the right part's end, or build it up, and the probability of conformity after it.
 
-A cut is a plane, an offset and a tilt about two axes, or goes straight along each plate from corner to corner. It opens
-the gap by its depth and takes nothing on, so its least depth is 0 or more. The assembled pose stays as it is. Tried are
+A cut is a plane, an offset and a tilt about two axes, or straight along each plate from corner to corner. It opens the
+gap by its depth, which is 0 or more everywhere. The assembled pose does not change. Candidates are
 
 * the even plane: the ends are parallel after it, the gap as near to the wanted one as a cut can bring it;
-* the nearest plane: the squared differences from the wanted gap are least;
-* the least plane with which the gap is nowhere narrower than wanted;
+* the nearest plane: least squares of the differences from the wanted gap;
+* the least plane after which the gap is nowhere narrower than wanted;
 * what each corner lacks by itself.
 
 Planes that would cut a corner wider than the groove's limit are left out: nothing is cut to be filled again. The last
-two also with shims or weld build-up where the gap is wider than wanted, and these without a cut. Proposed is what keeps
-the groove gap most probably, if it does with HOLDS at all; of works alike the lesser. A cut must be worth its while,
-build-up more so. No cut mends what is misaligned across the joint: that is said with it. Where a part may lie the other
-way round, or the end may be another one, nothing is proposed.
+two are also tried with shims or weld build-up where the gap is wider than wanted, and these without a cut. Proposed is
+the candidate that most probably keeps the groove gap, if its probability is at least LEAST_PROBABILITY; of equal
+candidates the smaller. A cut must raise the probability by CUT_GAIN, build-up by BUILD_UP_GAIN. No cut changes the
+misalignment across the joint, which the sentence states. Nothing is proposed where a part's pose is ambiguous or an end
+may be that of another plate side.
 """
 
 from __future__ import annotations
@@ -25,32 +26,20 @@ from itertools import combinations
 import numpy as np
 from scipy.optimize import linprog
 
+from processor.adjustment.extremes import SEED, draws
 from processor.limits import standards as limits_of
-from processor.model import KEY_POINTS, Checked, Floats, Limit, Tolerance, UsageError, column
-from processor.preassembly.verdicts.joint_measures import ACROSS, SEED, Measures, draws
-from processor.preassembly.verdicts.joints import NO_SIZES, Marks, held, judge, keeps
+from processor.model import KEY_POINTS, Checked, Floats, Limit, Tolerance, column
+from processor.preassembly.params import TrimParams
+from processor.preassembly.verdicts.joint_measures import ACROSS, Measures
+from processor.preassembly.verdicts.joints import NO_SIZES, Bools, allowed, conforms, joint_limits, judge
 
 PLACES = ("bottom left", "bottom right", "top right", "top left", "bottom", "right", "top", "left")
-SHOWN_MM = 0.1  # amounts are said to this
-ALIKE = 0.01  # probabilities that differ by less are alike
-CUT_GAIN, BUILD_UP_GAIN = 0.05, 0.1  # of probability, for which a cut, and for which build-up is worth its while
-HOLDS = 0.1  # probability of the groove gap below which a work is no proposal
-SURELY_NOT = 0.005  # less is said to be no proposal: it would print as 0 %
+SHOWN_MM = 0.1  # resolution of amounts in the sentence
+ALIKE = 0.01  # difference of probabilities that does not count
+CUT_GAIN, BUILD_UP_GAIN = 0.05, 0.1
+LEAST_PROBABILITY = 0.1  # of the groove gap
+SURELY_NOT = 0.005  # a probability that would print as 0 %
 SIDES = {(1, False): "to the left", (1, True): "to the right", (2, False): "up", (2, True): "down"}
-
-
-@dataclass(frozen=True)
-class TrimParams:
-    """Parameters of the proposals (mm)."""
-
-    cut_sd_mm: float = 1.0  # of a cut or build-up, at the corners of the section
-    aim_mm: float = 0.0  # wanted gap after it, less the design's root gap
-    least_mm: float = 0.5  # less, at its deepest, is not worth a cut or build-up
-
-    def __post_init__(self) -> None:
-        amounts = self.cut_sd_mm, self.least_mm
-        if not (all(0.0 <= one < math.inf for one in amounts) and math.isfinite(self.aim_mm)):
-            raise UsageError(f"preassemble.trim: expected numbers, cut_sd_mm and least_mm of 0 or more, got {self}")
 
 
 @dataclass(frozen=True)
@@ -78,28 +67,33 @@ class Proposal(Checked):
 
 @dataclass(frozen=True)
 class _Work:
+    """A candidate: plane (3,) of the cut, amounts (8,) cut and built up at P1..P8."""
+
     plane: Floats
     cut: Floats
     build_up: Floats
 
     def on(self, gaps: Floats, error: Floats) -> Floats:
-        """Gaps (n, 8, 3) after it, with the error (n, 8) of doing it."""
+        """Gaps (n, 8, 3) after the work, with its errors (n, 8)."""
         if self.amount == 0.0:
             return gaps
-        done: Floats = gaps.copy()
-        done[:, :, 0] += self.cut - self.build_up + error
-        return done
+        worked: Floats = gaps.copy()
+        worked[:, :, 0] += self.cut - self.build_up + error
+        return worked
 
     @property
     def amount(self) -> float:
-        """Sum of what is taken off and what is put on."""
+        """Sum of what is cut off and built up."""
         return float(self.cut.sum() + self.build_up.sum())
 
     @property
     def action(self) -> str:
-        """The name of what is done."""
-        done = [name for name, by in (("trim", self.cut), ("build up", self.build_up)) if by.max() > 0.0]
-        return " and ".join(done) or "nothing"
+        """Name of the work."""
+        names = [name for name, by in (("trim", self.cut), ("build up", self.build_up)) if by.max() > 0.0]
+        return " and ".join(names) or "nothing"
+
+
+NO_WORK = _Work(np.zeros(3), np.zeros(8), np.zeros(8))
 
 
 def propose(
@@ -111,82 +105,92 @@ def propose(
     unsure: str = "",
     rests_on: str = "",
 ) -> Proposal:
-    """Propose what to do at a joint so that it keeps the limits of ``tolerance``; ``joint`` is its name.
+    """Propose work on a joint, by its name, after which it keeps the limits of ``tolerance``.
 
-    ``unsure`` says why the gaps may be wrong altogether: then nothing is proposed. ``rests_on`` says which part beside
-    the joint is weak: that is said with what is proposed. The probabilities are shares of draws of the gaps and of the
-    cut's errors, NaN where a limit hangs on a size that is not among ``sizes_mm``. Limits without a groove gap leave
-    nothing to cut for.
+    ``unsure`` is a reason why the gaps may be wrong altogether: then nothing is proposed. ``rests_on`` names a weak
+    part beside the joint, for the sentence. Probabilities are shares of draws of the gaps and of the cut's errors, NaN
+    where a limit depends on a size that is not among ``sizes_mm``. Without a limit of the groove gap nothing is cut.
     """
     params = params or TrimParams()
-    known = bool(np.isfinite(measures.gaps).all() and np.isfinite(measures.covariance).all())
-    if unsure or not known:
-        no, said = np.full(8, np.nan), "the gaps are not known, so nothing is proposed: scan both ends of the joint"
-        if known:
-            said = f"nothing proposed until this is settled: {unsure}"
-        return Proposal("unknown", no, no, no[:3], no, no, misaligned_by=no, sentence=f"{joint}: {said}.")
-    limits = {limit.measure: limit for limit in reversed(held(tolerance))}
+    if unsure or not measures.known:
+        return _nothing_known(joint, unsure if measures.known else "")
+    limits = {limit.measure: limit for limit in reversed(joint_limits(tolerance))}
     drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
 
-    def kept(limit: Limit, gaps: Floats) -> Marks | None:
-        low, high = limits_of.bounds(limit, sizes_mm)
-        if math.isnan(low) or math.isnan(high):
-            return None
-        return keeps(gaps, measures.points, limit, low, high, tolerance.root_gap_mm)
+    def conforming(limit: Limit, gaps: Floats) -> Bools | None:
+        bounds = allowed(limit, tolerance, sizes_mm)
+        return conforms(gaps, measures.points, bounds) if bounds.known else None
 
-    across = [kept(limit, drawn) for limit in held(tolerance) if limit.measure != "groove_gap"]
-    nothing = _Work(np.zeros(3), np.zeros(8), np.zeros(8))
-    groove, best = limits.get("groove_gap"), nothing
-    before: list[Marks | None] = []
-    after: list[Marks | None] = []
+    across = [conforming(limit, drawn) for limit in joint_limits(tolerance) if limit.measure != "groove_gap"]
+    groove, best = limits.get("groove_gap"), NO_WORK
+    before: list[Bools | None] = []
+    after: list[Bools | None] = []
     wanted = tolerance.root_gap_mm + params.aim_mm
     if groove is not None:
         error = _cut_errors(measures.points, params.cut_sd_mm, len(drawn))
-        works = [nothing]
-        if _verdict(measures, tolerance, groove, sizes_mm) != "pass":
+        works = [NO_WORK]
+        if judge(measures, replace(tolerance, limits=(groove,)), sizes_mm).verdict != "pass":
             room = limits_of.bounds(groove, sizes_mm)[1] - params.aim_mm
             works += _works(measures, wanted, max(params.least_mm, SHOWN_MM), room)
-        marks = [kept(groove, work.on(drawn, error)) for work in works]
-        chosen = _chosen(works, [_share([one]) for one in marks])
+        marks = [conforming(groove, work.on(drawn, error)) for work in works]
+        chosen = _choice(works, [_share([mark]) for mark in marks])
         best, before, after = works[chosen], marks[:1], [marks[chosen]]
-    found = Proposal(
-        best.action,
-        best.cut,
-        best.build_up,
-        best.plane * [1.0, 1e3, 1e3],
-        measures.gaps[:, 0],
-        measures.gaps[:, 0] + best.cut - best.build_up,
-        wanted,
-        _share([*across, *after]),
-        _share([*across, *before]),
-        _share(after),
-        _share(across),
-        _misaligned_by(measures, limits.get("misalignment"), sizes_mm).max(axis=1),
+    proposal = Proposal(
+        action=best.action,
+        cut=best.cut,
+        build_up=best.build_up,
+        plane=best.plane * [1.0, 1e3, 1e3],
+        gap_before=measures.gaps[:, 0],
+        gap_after=measures.gaps[:, 0] + best.cut - best.build_up,
+        wanted_gap=wanted,
+        probability=_share([*across, *after]),
+        probability_as_is=_share([*across, *before]),
+        groove_probability=_share(after),
+        misalignment_probability=_share(across),
+        misaligned_by=_misaligned_by(measures, limits.get("misalignment"), sizes_mm).max(axis=1),
     )
-    return replace(found, sentence=_sentence(joint, found, measures, limits, sizes_mm, params.cut_sd_mm, rests_on))
+    return replace(
+        proposal, sentence=_sentence(joint, proposal, measures, limits, sizes_mm, params.cut_sd_mm, rests_on)
+    )
 
 
-def _verdict(measures: Measures, tolerance: Tolerance, limit: Limit, sizes_mm: Mapping[str, float]) -> str:
-    return judge(measures, replace(tolerance, limits=(limit,)), sizes_mm).verdict
+def _nothing_known(joint: str, unsure: str) -> Proposal:
+    """Return no proposal, with the reason: gaps that may be wrong, or are not known."""
+    nan = np.full(8, np.nan)
+    reason = "the gaps are not known, so nothing is proposed: scan both ends of the joint"
+    if unsure:
+        reason = f"nothing proposed until this is settled: {unsure}"
+    return Proposal(
+        cut=nan,
+        build_up=nan,
+        plane=nan[:3],
+        gap_before=nan,
+        gap_after=nan,
+        misaligned_by=nan,
+        sentence=f"{joint}: {reason}.",
+    )
 
 
-def _share(marks: Sequence[Marks | None]) -> float:
-    """Share of draws that keep all; NaN where there is nothing to keep or a limit is not known."""
-    known = [one for one in marks if one is not None]
+def _share(marks: Sequence[Bools | None]) -> float:
+    """Share of draws that keep all limits; NaN without a limit or with an unknown one."""
+    known = [mark for mark in marks if mark is not None]
     return float(np.all(known, axis=0).mean()) if known and len(known) == len(marks) else float("nan")
 
 
 def _cut_errors(points: Floats, sd_mm: float, count: int) -> Floats:
-    """Errors (count, 8) of cuts: planes off in depth and both tilts, alike in size, by sd_mm in all at a corner."""
+    """Errors (count, 8) of cuts: planes with equal errors of depth and both tilts, together sd_mm at a corner."""
     half = np.abs(points).max(axis=0)
     shape = np.column_stack([np.ones(8), points[:, 1] / half[1], points[:, 2] / half[2]]) / np.sqrt(3.0)
-    plain = np.random.default_rng([SEED, 1]).standard_normal((count // 2, 3))
-    found: Floats = sd_mm * np.concatenate([plain, -plain]) @ shape.T
-    return found
+    normal = np.random.default_rng([SEED, 1]).standard_normal((count // 2, 3))
+    errors: Floats = sd_mm * np.concatenate([normal, -normal]) @ shape.T
+    return errors
 
 
-def _chosen(works: Sequence[_Work], shares: Sequence[float]) -> int:
-    """Row of the work to propose; the first is to do nothing, and stays where a share is not known."""
+def _choice(works: Sequence[_Work], shares: Sequence[float]) -> int:
+    """Row of the work to propose, by the shares of draws that keep the groove gap.
+
+    The first work is to do nothing; it is chosen where a share is not known.
+    """
     best = 0
     cuts = [k for k, work in enumerate(works) if k and not work.build_up.any()]
     fills = [k for k, work in enumerate(works) if work.build_up.any()]
@@ -194,18 +198,18 @@ def _chosen(works: Sequence[_Work], shares: Sequence[float]) -> int:
         top = max((shares[k] for k in rows), default=0.0)
         if top >= shares[best] + gain:
             best = min((k for k in rows if shares[k] >= top - ALIKE), key=lambda k: works[k].amount)
-    return best if shares[best] >= HOLDS else 0
+    return best if shares[best] >= LEAST_PROBABILITY else 0
 
 
 def _works(measures: Measures, wanted: float, least_mm: float, room: float) -> Iterator[_Work]:
-    """Yield what could be done: the cuts, build-up after the last two, and build-up alone.
+    """Yield the candidates: cuts, build-up after the last two of them, and build-up alone.
 
     ``room`` is by how much a gap may be wider than wanted.
     """
     A = np.column_stack([np.ones(8), measures.points[:, 1:]])
     lacking = wanted - measures.gaps[:, 0]
-    nothing, no_plane = np.zeros(3), np.full(3, np.nan)
-    corners = _from_corner_to_corner(np.maximum(lacking[:4], 0.0))
+    no_plane = np.full(3, np.nan)
+    corners = _between_corners(np.maximum(lacking[:4], 0.0))
     for plane, fill in (
         (_even(A, lacking), False),
         (_nearest(A, lacking), False),
@@ -213,49 +217,44 @@ def _works(measures: Measures, wanted: float, least_mm: float, room: float) -> I
         (no_plane, False),
         (_covering(A, lacking), True),
         (no_plane, True),
-        (nothing, True),
+        (NO_WORK.plane, True),
     ):
         cut = corners if np.isnan(plane).any() else np.maximum(A @ plane, 0.0)
         if cut.max() < least_mm:
-            plane, cut = nothing, np.zeros(8)
-        at_corner = cut[:4]
-        put = np.maximum(cut - lacking, 0.0) if fill else np.zeros(8)
-        if ((at_corner > np.maximum(lacking[:4] + room, 0.0) + SHOWN_MM) | _both(at_corner, put[:4])).any():
+            plane, cut = NO_WORK.plane, NO_WORK.cut
+        build_up = np.maximum(cut - lacking, 0.0) if fill else np.zeros(8)
+        too_deep = cut[:4] > np.maximum(lacking[:4] + room, 0.0) + SHOWN_MM
+        refilled = np.minimum(cut[:4], build_up[:4]) > SHOWN_MM
+        if (too_deep | refilled).any():
             continue
-        if put.max() >= least_mm or (cut.any() and not fill):
-            yield _Work(plane, cut, put)
+        if build_up.max() >= least_mm or (cut.any() and not fill):
+            yield _Work(plane, cut, build_up)
 
 
-def _both(cut: Floats, put: Floats) -> Marks:
-    """Mark where something would be cut in order to be filled again."""
-    found: Marks = np.minimum(cut, put) > SHOWN_MM
-    return found
-
-
-def _from_corner_to_corner(corners: Floats) -> Floats:
-    """Amounts (8,) at P1..P8 of what is straight between P1..P4."""
+def _between_corners(corners: Floats) -> Floats:
+    """Amounts (8,) at P1..P8, linear between those at P1..P4."""
     return np.concatenate([corners, 0.5 * (corners + np.roll(corners, -1))])
 
 
 def _even(A: Floats, lacking: Floats) -> Floats:
-    """Plane (3,) that leaves an even gap, its mean the wanted one or, where that would add material, more."""
+    """Plane (3,) after which the gap is even: the wanted gap in the mean or, where that would add material, wider."""
     plane: Floats = np.asarray(np.linalg.lstsq(A, lacking, rcond=None)[0], np.float64)
     plane[0] -= min(0.0, float((A @ plane).min()))
     return plane
 
 
 def _covering(A: Floats, lacking: Floats) -> Floats:
-    """Plane (3,) of least depth in all that takes off what the gap lacks everywhere, and nowhere below 0."""
+    """Plane (3,) with the least sum of depths that removes what the gap lacks everywhere, nowhere below 0."""
     scale = np.abs(A).max(axis=0)
-    found = linprog((A / scale).sum(axis=0), -A / scale, -np.maximum(lacking, 0.0), bounds=(None, None))
-    plane: Floats = np.asarray(found.x / scale, np.float64)
+    solution = linprog((A / scale).sum(axis=0), -A / scale, -np.maximum(lacking, 0.0), bounds=(None, None))
+    plane: Floats = np.asarray(solution.x / scale, np.float64)
     return plane
 
 
 def _nearest(A: Floats, lacking: Floats) -> Floats:
     """Plane p (3,) nearest to what the gap lacks (8,), nowhere below 0: least |A p - lacking| with A p >= 0.
 
-    The least lies where some of the points, three at most, are just not cut: all such sets are tried.
+    At the minimum up to three points have depth 0: all such sets are tried.
     """
     best, least = np.zeros(3), float(np.linalg.norm(lacking))
     scaled = A / np.abs(A).max(axis=0)
@@ -266,45 +265,45 @@ def _nearest(A: Floats, lacking: Floats) -> Floats:
             misfit = float(np.linalg.norm(scaled @ plane - lacking))
             if (scaled @ plane).min() > -1e-9 and misfit < least:
                 best, least = plane, misfit
-    found: Floats = best / np.abs(A).max(axis=0)
-    return found
+    unscaled: Floats = best / np.abs(A).max(axis=0)
+    return unscaled
 
 
 def _misaligned_by(measures: Measures, limit: Limit | None, sizes_mm: Mapping[str, float]) -> Floats:
-    """How far (8, 3) each point is beyond the limit along each axis that counts there."""
-    found = np.full((8, 3), np.nan if limit is None else 0.0)
+    """Excess (8, 3) over the limit of misalignment at each point along each axis that counts there."""
+    excess = np.full((8, 3), np.nan if limit is None else 0.0)
     if limit is not None:
         high = limits_of.bounds(limit, sizes_mm)[1]
         for point, axis in ACROSS:
-            found[point, axis] = max(abs(measures.gaps[point, axis]) - high, 0.0) if not math.isnan(high) else np.nan
-    return found
+            excess[point, axis] = max(abs(measures.gaps[point, axis]) - high, 0.0) if not math.isnan(high) else np.nan
+    return excess
 
 
 def _sentence(
     joint: str,
-    found: Proposal,
+    proposal: Proposal,
     measures: Measures,
     limits: Mapping[str, Limit],
     sizes_mm: Mapping[str, float],
     cut_sd_mm: float,
     rests_on: str,
 ) -> str:
-    said = [f"rests on a weak part: {rests_on}"] if rests_on else []
+    parts = [f"rests on a weak part: {rests_on}"] if rests_on else []
     if "groove_gap" not in limits:
-        said.append("nothing proposed, for the limits name no groove gap (groove_gap_mm)")
-    elif found.action == "nothing":
-        fits = "nothing to cut" if found.misalignment_probability < 0.95 else "nothing to do"
+        parts.append("nothing proposed, for the limits name no groove gap (groove_gap_mm)")
+    elif proposal.action == "nothing":
+        fits = "nothing to cut" if proposal.misalignment_probability < 0.95 else "nothing to do"
         unsure = "nothing proposed, for no cut or build-up makes the groove gap much surer"
-        if found.groove_probability < HOLDS:
+        if proposal.groove_probability < LEAST_PROBABILITY:
             unsure = "nothing proposed, for no cut or build-up makes the groove gap hold"
-        said.append(unsure if found.groove_probability < 0.95 else fits)
+        parts.append(unsure if proposal.groove_probability < 0.95 else fits)
     else:
-        works = " and ".join(_works_in_words(found))
-        if found.probability < SURELY_NOT:
-            said.append("no cut or build-up makes all limits hold")
+        works = " and ".join(_works_in_words(proposal))
+        if proposal.probability < SURELY_NOT:
+            parts.append("no cut or build-up makes all limits hold")
             works = f"for the groove gap alone, {works}"
-        said.append(works)
-    said.append(_chances(found, cut_sd_mm))
+        parts.append(works)
+    parts.append(_chances(proposal, cut_sd_mm))
     high = limits_of.bounds(limits["misalignment"], sizes_mm)[1] if "misalignment" in limits else math.nan
     off = _misaligned_by(measures, limits.get("misalignment"), sizes_mm)
     beyond = sorted(((off[p, a], p, a) for p, a in ACROSS if off[p, a] > 0.0), reverse=True)
@@ -314,14 +313,17 @@ def _sentence(
             f" ({by:.1f} too much)"
             for by, p, a in beyond
         )
-        said.append(f"no trim mends the misalignment, {high:g} mm at most, of the right part at {edges}")
-    elif found.misalignment_probability < 0.95:
-        said.append("no trim changes the misalignment, which is near its limit")
-    return f"{joint}: {'; '.join(said)}."
+        parts.append(f"no trim mends the misalignment, {high:g} mm at most, of the right part at {edges}")
+    elif proposal.misalignment_probability < 0.95:
+        parts.append("no trim changes the misalignment, which is near its limit")
+    return f"{joint}: {'; '.join(parts)}."
 
 
-def _works_in_words(found: Proposal) -> Iterator[str]:
-    for what, by in (("cut the right part's end by", found.cut), ("fill by shims or weld build-up", found.build_up)):
+def _works_in_words(proposal: Proposal) -> Iterator[str]:
+    for what, by in (
+        ("cut the right part's end by", proposal.cut),
+        ("fill by shims or weld build-up", proposal.build_up),
+    ):
         if by.max() <= 0.0:
             continue
         least, most = int(np.argmin(by)), int(np.argmax(by))
@@ -333,20 +335,20 @@ def _works_in_words(found: Proposal) -> Iterator[str]:
                 f"{KEY_POINTS[least]} {PLACES[least]}"
             )
         else:
-            amounts = " / ".join(f"{one:.1f}" for one in by[:4])
+            amounts = " / ".join(f"{amount:.1f}" for amount in by[:4])
             yield f"{what} {amounts} mm at P1 / P2 / P3 / P4, straight between them"
 
 
-def _chances(found: Proposal, cut_sd_mm: float) -> str:
-    if math.isnan(found.probability):
+def _chances(proposal: Proposal, cut_sd_mm: float) -> str:
+    if math.isnan(proposal.probability):
         return "the probability that all limits hold is not known, for a limit is missing or hangs on an unknown size"
-    if found.action == "nothing":
-        known = f"all limits hold with {found.probability:.0%}"
-        return known if found.probability >= SURELY_NOT else "as it is not all limits hold"
-    if found.probability < SURELY_NOT:
-        return f"done to {cut_sd_mm:g} mm (one sd), the groove gap then holds with {found.groove_probability:.0%}"
+    if proposal.action == "nothing":
+        known = f"all limits hold with {proposal.probability:.0%}"
+        return known if proposal.probability >= SURELY_NOT else "as it is not all limits hold"
+    if proposal.probability < SURELY_NOT:
+        return f"done to {cut_sd_mm:g} mm (one sd), the groove gap then holds with {proposal.groove_probability:.0%}"
     return (
-        f"done to {cut_sd_mm:g} mm (one sd), all limits then hold with {found.probability:.0%} "
-        f"(groove gap {found.groove_probability:.0%}), "
-        f"as it is with {found.probability_as_is:.0%}"
+        f"done to {cut_sd_mm:g} mm (one sd), all limits then hold with {proposal.probability:.0%} "
+        f"(groove gap {proposal.groove_probability:.0%}), "
+        f"as it is with {proposal.probability_as_is:.0%}"
     )

@@ -1,29 +1,29 @@
-"""Scans placed one after another, each where all that stand already speak for it; rivals are remembered."""
+"""Coarse registration of all scans, one after another by the scans placed before; competing poses are recorded."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from processor.geometry import rigid
 from processor.model import Floats
 from processor.stitching.coarse import pairwise
-from processor.stitching.coarse.pairwise import Placing, View
+from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 
 MOST_TRIED = 5
-AMBIGUOUS = 0.75  # of the best pose's score: a rival that reaches it cannot be told from it
+AMBIGUOUS = 0.75  # of the best pose's score: a competing pose that reaches it is as likely
 LEAST_OVERLAP = 0.08
 
-Candidates = dict[tuple[int, int], list[Placing]]
-Asked = dict[tuple[int, int, bytes], Placing]  # poses of scan j beside scan i that have been looked at
+Pairs = dict[tuple[int, int], list[ScoredPose]]
+RankedPoses = list[tuple[float, Floats]]  # (score, pose), the best first
 
 
 @dataclass(frozen=True)
-class Placed:
-    """Poses T_ref_scan (k, 4, 4), NaN of scans without one; a rival's share of the best score (k,) and pose.
+class CoarsePoses:
+    """Poses T_ref_scan (k, 4, 4), NaN of scans without one; score of the best competing pose by theirs (k,), its pose.
 
-    ``contrary`` (k,) is what speaks against a scan's pose by what speaks for it, ``overlap`` (k,) its largest.
+    ``contrary`` (k,) is the contradiction of a scan's pose by its support, ``overlap`` (k,) the largest with another.
     """
 
     T: Floats
@@ -33,123 +33,136 @@ class Placed:
     overlap: Floats
 
 
-def towards(candidates: Candidates, i: int, j: int) -> list[tuple[Floats, float]]:
-    """Poses of j in i with their scores, whichever of the two was the first of the pair."""
-    if (i, j) in candidates:
-        return [(one.T_a_b, one.score) for one in candidates[i, j]]
-    return [(rigid.invert(one.T_a_b), one.score) for one in candidates.get((j, i), [])]
+@dataclass(frozen=True)
+class Network:
+    """All scans with the candidate poses of their pairs, and the poses T (k, 4, 4) of those placed so far.
+
+    The pose of a placed scan does not change any more: scores beside it are cached.
+    """
+
+    scans: list[ScanPatches]
+    candidates: Pairs
+    T: Floats
+    placed: list[int]
+    cache: dict[tuple[int, int, bytes], ScoredPose] = field(default_factory=dict)
+
+    def poses_beside(self, i: int, j: int) -> list[tuple[Floats, float]]:
+        """Return the candidate poses of scan j in scan i with their scores, in either order of the pair."""
+        if (i, j) in self.candidates:
+            return [(pose.T_a_b, pose.score) for pose in self.candidates[i, j]]
+        return [(rigid.invert(pose.T_a_b), pose.score) for pose in self.candidates.get((j, i), [])]
+
+    def score_beside(self, i: int, j: int, pose: Floats) -> ScoredPose:
+        """Score a pose (4, 4) of scan j beside the placed scan i."""
+        key = (i, j, pose.tobytes())
+        if key not in self.cache:
+            self.cache[key] = pairwise.score_pose(self.scans[i], self.scans[j], rigid.invert(self.T[i]) @ pose)
+        return self.cache[key]
+
+    def same(self, T: Floats, S: Floats, j: int) -> bool:
+        """Return whether two poses of scan j are the same."""
+        return pairwise.same(T, S, self.scans[0].side_mm, self.scans[j])
 
 
-def place(views: list[View], candidates: Candidates, reference: int) -> Placed:
-    """Place all scans that can be, the surest first."""
-    k = len(views)
+def place(scans: list[ScanPatches], candidates: Pairs, reference: int) -> CoarsePoses:
+    """Place all scans that have candidate poses, the most certain first; the reference at the identity."""
+    k = len(scans)
     T = np.full((k, 4, 4), np.nan)
     T[reference] = np.eye(4)
+    network = Network(scans=scans, candidates=candidates, T=T, placed=[reference])
+    while (best := _most_certain(network)) is not None:
+        j, pose = best
+        T[j] = pose
+        network.placed.append(j)
+    return _rated(network, reference)
+
+
+def _most_certain(network: Network) -> tuple[int, Floats] | None:
+    """Return the scan whose best pose leads the next best one by the largest score, and this pose."""
+    best: tuple[int, Floats] | None = None
+    best_lead = 0.0
+    for j in sorted(set(range(len(network.scans))) - set(network.placed)):
+        ranked = rank_poses(network, j, network.placed)
+        if not ranked:
+            continue
+        lead = ranked[0][0] - (ranked[1][0] if len(ranked) > 1 else 0.0)
+        if best is None or lead > best_lead:
+            best, best_lead = (j, ranked[0][1]), lead
+    return best
+
+
+def _rated(network: Network, reference: int) -> CoarsePoses:
+    """Compare each placed scan's pose with its competitors, beside all other placed scans."""
+    T, k = network.T, len(network.scans)
     rivalry, T_rival = np.zeros(k), np.full((k, 4, 4), np.nan)
     contrary, overlap = np.zeros(k), np.ones(k)
-    done = [reference]
-    asked: Asked = {}
-    while len(done) < k:
-        best: tuple[float, int, list[tuple[float, Floats]]] | None = None
-        for j in sorted(set(range(k)) - set(done)):
-            ranked = ranking(views, candidates, T, done, j, asked)
-            if not ranked:
-                continue
-            sure = ranked[0][0] - (ranked[1][0] if len(ranked) > 1 else 0.0)
-            if best is None or sure > best[0]:
-                best = (sure, j, ranked)
-        if best is None:
-            break
-        _, j, ranked = best
-        T[j] = ranked[0][1]
-        done.append(j)
-    for j in done:
-        others = [i for i in done if i != j]
+    for j in network.placed:
+        others = [i for i in network.placed if i != j]
         if j == reference or not others:
             continue
-        ranked = ranking(views, candidates, T, others, j, asked, T[j])
-        own = next(s for s, pose in ranked if pairwise.same(pose, T[j], views[0].side_mm, views[j]))
-        rivals = [(s, p) for s, p in ranked if not pairwise.same(p, T[j], views[0].side_mm, views[j])]
+        ranked = rank_poses(network, j, others, T[j])
+        best = next(score for score, pose in ranked if network.same(pose, T[j], j))
+        rivals = [(score, pose) for score, pose in ranked if not network.same(pose, T[j], j)]
         if rivals:
-            rivalry[j] = rivals[0][0] / max(own, 1e-12)
+            rivalry[j] = rivals[0][0] / max(best, 1e-12)
             T_rival[j] = rivals[0][1]
-        all_held = [held(views, T, i, j, T[j], asked) for i in others]
-        agree = sum(one.agree for one in all_held if one.overlap > LEAST_OVERLAP)
-        contrary[j] = sum(one.against for one in all_held) / max(agree, 1e-12)
-        overlap[j] = max(one.overlap for one in all_held)
-    return Placed(T, rivalry, T_rival, contrary, overlap)
+        scored = [network.score_beside(i, j, T[j]) for i in others]
+        agree = sum(pose.agree for pose in scored if pose.overlap > LEAST_OVERLAP)
+        contrary[j] = sum(pose.against for pose in scored) / max(agree, 1e-12)
+        overlap[j] = max(pose.overlap for pose in scored)
+    return CoarsePoses(T=T, rivalry=rivalry, T_rival=T_rival, contrary=contrary, overlap=overlap)
 
 
-def refuted(held: dict[tuple[int, int], Placing], count: int, reference: int) -> Floats:
-    """Return what speaks against poses as found (count,), of what speaks for them; 0 where they are sure enough.
+def rank_poses(network: Network, j: int, others: list[int], current: Floats | None = None) -> RankedPoses:
+    """Rank poses of scan j by their joint scores beside placed scans ``others``; ``current`` is one more candidate.
 
-    ``held`` is what each pair has to say. Asked only of scans that rest on one other alone: a structure that repeats
-    itself looks so, one bay on or turned round. Where several tell the same, they would all have to be wrong.
+    Candidates from different scans differ slightly. One that is a decimetre off may be contradicted by the other scans
+    although it is right: a group of candidates that are the same pose has the score of its best member.
     """
-    found = np.zeros(count)
-    for j in set(range(count)) - {reference}:
-        own = [one for pair, one in held.items() if j in pair]
-        supporting = [one for one in own if one.overlap > LEAST_OVERLAP]
-        against = sum(one.against for one in own)
-        if len(supporting) == 1 and against > pairwise.LITTLE_AGAINST * supporting[0].agree:
-            found[j] = against / supporting[0].agree
-    return found
-
-
-def held(views: list[View], T: Floats, i: int, j: int, pose: Floats, asked: Asked) -> Placing:
-    """Count what speaks for and against a pose (4, 4) of scan j, beside scan i at its pose in T (k, 4, 4).
-
-    T of a scan does not change once it has one: what was asked before is remembered.
-    """
-    key = (i, j, pose.tobytes())
-    if key not in asked:
-        side, T_i_j = views[i].side_mm, rigid.invert(T[i]) @ pose
-        asked[key] = pairwise.held(views[i], views[j], T_i_j, pairwise.NEAR * side, pairwise.MARGIN * side)
-    return asked[key]
-
-
-def ranking(
-    views: list[View],
-    candidates: Candidates,
-    T: Floats,
-    done: list[int],
-    j: int,
-    asked: Asked,
-    own: Floats | None = None,
-) -> list[tuple[float, Floats]]:
-    """Poses of scan j with the score that all of ``done`` give them together, the best first.
-
-    Each scan has a pose a little elsewhere: by that from one alone, a decimetre off, the right one may look wrong to
-    the others. A pose is worth what the best of them is.
-    """
-    poses: list[tuple[list[Floats], float]] = [] if own is None else [([own], np.inf)]
-    for i in done:
-        for T_i_j, score in towards(candidates, i, j):
-            pose = T[i] @ T_i_j
-            for row, (alike, sum_) in enumerate(poses):
-                if pairwise.same(alike[0], pose, views[0].side_mm, views[j]):
-                    poses[row] = ([*alike, pose], sum_ + score)
+    groups: list[tuple[list[Floats], float]] = [] if current is None else [([current], np.inf)]
+    for i in others:
+        for T_i_j, score in network.poses_beside(i, j):
+            pose = network.T[i] @ T_i_j
+            for row, (members, total) in enumerate(groups):
+                if network.same(members[0], pose, j):
+                    groups[row] = ([*members, pose], total + score)
                     break
             else:
-                poses.append(([pose], score))
-    poses.sort(key=lambda one: -one[1])
-    found = []
-    for alike, _ in poses[:MOST_TRIED]:
-        scores = [together(views, T, done, j, one, asked) for one in alike]
+                groups.append(([pose], score))
+    groups.sort(key=lambda group: -group[1])
+    ranked = []
+    for members, _ in groups[:MOST_TRIED]:
+        scores = [joint_score(network, j, others, pose) for pose in members]
         best = int(np.argmax(scores))
         if scores[best] > 0.0:
-            found.append((scores[best], alike[best]))
-    found.sort(key=lambda one: -one[0])
-    return found
+            ranked.append((scores[best], members[best]))
+    ranked.sort(key=lambda pair: -pair[0])
+    return ranked
 
 
-def together(views: list[View], T: Floats, done: list[int], j: int, pose: Floats, asked: Asked) -> float:
-    """Return the score that all of ``done`` give a pose (4, 4) of scan j together; 0 where none agrees."""
+def joint_score(network: Network, j: int, others: list[int], pose: Floats) -> float:
+    """Return the score of a pose (4, 4) of scan j beside placed scans together; 0 if it overlaps with none of them."""
     agree, against, total = 0.0, 0.0, 0.0
-    for i in done:
-        one = held(views, T, i, j, pose, asked)
-        against += one.against
-        if one.overlap > LEAST_OVERLAP:
-            agree += one.agree
-            total += one.agree / one.overlap
+    for i in others:
+        scored = network.score_beside(i, j, pose)
+        against += scored.against
+        if scored.overlap > LEAST_OVERLAP:
+            agree += scored.agree
+            total += scored.agree / scored.overlap
     return pairwise.score(agree, against, total)
+
+
+def refuted(poses: dict[tuple[int, int], ScoredPose], count: int, reference: int) -> Floats:
+    """Return the contradiction by free space of each scan's pose by its support (count,), 0 where it is negligible.
+
+    ``poses`` are the adjusted relative poses of all pairs. Only scans that overlap with a single other one are checked:
+    there a repetitive structure may be matched one bay off or turned round. Several overlaps are not all wrong.
+    """
+    ratio = np.zeros(count)
+    for j in set(range(count)) - {reference}:
+        of_scan = [pose for pair, pose in poses.items() if j in pair]
+        supporting = [pose for pose in of_scan if pose.overlap > LEAST_OVERLAP]
+        against = sum(pose.against for pose in of_scan)
+        if len(supporting) == 1 and against > pairwise.LITTLE_AGAINST * supporting[0].agree:
+            ratio[j] = against / supporting[0].agree
+    return ratio

@@ -1,4 +1,4 @@
-"""Poses that two scans may have to each other, each with what speaks for it and against it."""
+"""Candidate poses of two scans relative to each other, scored by matching patches and by free space."""
 
 from __future__ import annotations
 
@@ -10,74 +10,65 @@ import numpy as np
 from processor.geometry import rigid
 from processor.model import Floats
 from processor.stitching.coarse import face_index, rotations, translations
-from processor.stitching.coarse.free_space import Sight
-from processor.stitching.planes.samples import Elements, elements
+from processor.stitching.coarse.face_index import FaceIndex
+from processor.stitching.coarse.translations import WeightedPatches
+from processor.stitching.planes.samples import sample
 from processor.stitching.planes.scan_planes import Cloud
-
-SIDES = 48.0  # a view's coarse cubes: so many along the reach of the points
-LIKE_COS = float(np.cos(np.radians(15.0)))
-FEWEST = 6  # faces
-FINE = 0.3  # of the cubes' side
 
 
 @dataclass(frozen=True)
-class Search:
-    """How far to look: shifts of a turn, least votes by the most, poses held against the rays, and poses refined."""
+class Effort:
+    """Size of a search: translations for each rotation, their least votes by the best, poses scored, poses refined."""
 
     peaks: int
     least_of_best: float
-    checked: int
+    scored: int
     refined: int
 
 
-QUICK, WIDE = Search(translations.PEAKS, translations.LEAST_OF_BEST, 60, 8), Search(15, 0.3, 150, 20)
-GATES = (0.7, 0.35, 0.2, 0.12)  # of the cubes' side
-FEW_ABOVE = 0.3  # of the cubes' side: wider gates ask the faces that vote alone
-STEPS = 4
-NEAR, MARGIN = 0.15, 0.4  # of the cubes' side: faces closer than that are the same; seen this far beyond is through
-FOUND = 0.45  # of the cubes' side: as far as faces are asked for what is near
-BEYOND = 0.35  # of the cubes' side: as far beyond a gate as a face may have its middle
-SMALL, LARGE = GATES[2] + BEYOND, GATES[0] + BEYOND
-SLID, SLIDES = 3, (-1.2, -0.9, -0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.9, 1.2)  # poses tried so, by shares of the side
-LOOSE = 0.01  # of the strength of the strongest direction
+# Lengths are in sides of the coarse cubes unless stated.
+SIDES = 48.0  # along the reach of the points
+LIKE_COS = float(np.cos(np.radians(15.0)))
+FEWEST = 6  # patches
+FINE = 0.3  # side of the cubes of indexed patches
+QUICK = Effort(peaks=6, least_of_best=0.5, scored=60, refined=8)
+WIDE = Effort(peaks=15, least_of_best=0.3, scored=150, refined=20)
+GATES = (0.7, 0.35, 0.2, 0.12)  # distance across of matches, from refinement to refinement
+FEW_ABOVE = 0.3  # wider gates use the voters only
+STEPS = 4  # Gauss-Newton steps for each gate
+NEAR, MARGIN = 0.15, 0.4  # distance across of matching patches; margin of free space
+ROUGH_NEAR, ROUGH_MARGIN = 0.7, 1.0  # the same before a pose is refined
+MATCH_RADIUS = 0.45  # distance of the centres of matching patches
+BEYOND = 0.35  # by which the centre of a patch may be farther away than the gate
+SMALL, LARGE = GATES[2] + BEYOND, GATES[0] + BEYOND  # cells of the indexes
+SLID, SLIDES = 3, (-1.2, -0.9, -0.6, -0.4, -0.2, 0.2, 0.4, 0.6, 0.9, 1.2)  # poses that are slid, and how far
+LOOSE = 0.01  # eigenvalue of an undetermined direction by the largest one
 ENOUGH = 0.08  # overlap that two scans should have; less is a weak sign
-AGAINST_SHARE = 0.007
-SURE = 0.5  # score of a pose that rays do not speak against; right ones have over 0.7, a truss turned round under 0.3
+AGAINST_SHARE = 0.007  # contradiction by support that lowers a score by 1 / e
+SURE = 0.5  # a score not lowered by free space: right poses have over 0.7, a truss turned end for end under 0.3
 LITTLE_AGAINST = AGAINST_SHARE * math.log(1.0 / SURE)
-SAME_MM, SAME_RAD = 0.7, 0.03  # of the cubes' side; poses closer than that are one
-
-
-def score(agree: float, against: float, total: float) -> float:
-    """Weigh agreement and what speaks against it, 0 to 1.
-
-    Beyond an overlap that is enough, more says nothing: a bridge turned end for end may overlap more. What tells is
-    the share of faces that speak against a pose, as a right one has next to none.
-    """
-    if not agree > 0.0:
-        return 0.0
-    return (1.0 - math.exp(-agree / (ENOUGH * total))) * math.exp(-against / (AGAINST_SHARE * agree))
+SAME_SHIFT, SAME_RAD = 0.7, 0.03  # poses closer than that are the same
 
 
 @dataclass(frozen=True)
-class View:
-    """A cloud made ready for being placed: coarse and finer elements, their weights, what was looked through."""
+class ScanPatches:
+    """A cloud with its patches on coarse cubes of side ``side_mm``, and its finer patches indexed."""
 
     cloud: Cloud
     side_mm: float
-    coarse: Elements
-    weight: Floats
-    voters: tuple[Elements, Floats]
-    small: face_index.Near  # of the finer faces, by cells of SMALL and of LARGE
-    large: face_index.Near
+    patches: WeightedPatches
+    voters: WeightedPatches  # fewer of them, for voting and rough scores
+    small: FaceIndex  # of the finer patches, in cells of SMALL and of LARGE
+    large: FaceIndex
     modes: tuple[Floats, Floats]
-    sight: Sight | None
 
 
 @dataclass(frozen=True)
-class Placing:
-    """One pose of scan b in the frame of scan a: the share of b's faces (of those that a could see) that a sees too.
+class ScoredPose:
+    """A pose of scan b in the frame of scan a with its support (``agree``) and contradiction (``against``).
 
-    ``agree`` and ``against`` are weighted counts of both scans' faces: found in the other, and looked through by it.
+    These are weighted counts of both scans' patches: matching one of the other, and lying in its free space.
+    ``overlap`` is the matching share of all patches' weight.
     """
 
     T_a_b: Floats
@@ -91,116 +82,129 @@ class Placing:
         return score(self.agree, self.against, self.agree / max(self.overlap, 1e-12))
 
 
-def side_of(clouds: list[Cloud]) -> float:
-    """Side of coarse cubes, mm, for clouds that are to be placed together."""
+def score(agree: float, against: float, total: float) -> float:
+    """Combine support, contradiction and the total weight of the patches to a score of 0 to 1.
+
+    Overlap beyond ENOUGH adds nothing: a bridge turned end for end may overlap more than in its right pose. Decisive is
+    the ratio of contradiction to support, which is almost 0 for a right pose.
+    """
+    if not agree > 0.0:
+        return 0.0
+    return (1.0 - math.exp(-agree / (ENOUGH * total))) * math.exp(-against / (AGAINST_SHARE * agree))
+
+
+def cube_side(clouds: list[Cloud]) -> float:
+    """Return the side of coarse cubes, mm, common to clouds that are registered together."""
     reach = [
-        float(np.quantile(np.linalg.norm(c.cells.mean - np.median(c.cells.mean, axis=0), axis=1), 0.8))
-        for c in clouds
-        if len(c.sums)
+        float(np.quantile(np.linalg.norm(cloud.mean - np.median(cloud.mean, axis=0), axis=1), 0.8))
+        for cloud in clouds
+        if len(cloud.sums)
     ]
     return float(np.median(reach)) / SIDES * 2.0 if reach else 1.0
 
 
-def view(cloud: Cloud, side_mm: float) -> View:
-    """Make a cloud ready."""
-    coarse = elements(cloud, side_mm)
-    fine = elements(cloud, FINE * side_mm)
-    weight = translations.weights(coarse.normals)
-    voters = translations.voters(coarse, weight) if len(weight) else (coarse, weight)
-    axes = rotations.modes(coarse.normals)
-    small, large = (face_index.of_faces(fine, share * side_mm) for share in (SMALL, LARGE))
-    return View(cloud, side_mm, coarse, weight, voters, small, large, axes, cloud.sight)
+def prepare(cloud: Cloud, side_mm: float) -> ScanPatches:
+    """Sample and index the patches of a cloud."""
+    patches = translations.weighted(sample(cloud, side_mm))
+    fine = sample(cloud, FINE * side_mm)
+    return ScanPatches(
+        cloud=cloud,
+        side_mm=side_mm,
+        patches=patches,
+        voters=translations.thinned(patches),
+        small=face_index.build(fine, SMALL * side_mm),
+        large=face_index.build(fine, LARGE * side_mm),
+        modes=rotations.normal_modes(patches.patches.normals),
+    )
 
 
-def placings(a: View, b: View, most_tilt_rad: float, most: int = 4) -> list[Placing]:
-    """Poses of b to a, the best first; none where nothing is alike.
+def candidate_poses(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, most: int = 4) -> list[ScoredPose]:
+    """Return at most ``most`` poses of b in a, the best first; none if the scans have nothing alike.
 
-    Where rays speak against all that a quick look finds, as on a structure that repeats itself, a wider one follows.
+    If free space contradicts all poses of a quick search, as on a repetitive structure, a wider search follows.
     """
-    if min(len(a.coarse.points), len(b.coarse.points)) < FEWEST:
+    if min(len(a.patches.weight), len(b.patches.weight)) < FEWEST:
         return []
-    found = _searched(a, b, most_tilt_rad, most, QUICK)
-    return found if found and found[0].score > SURE else _searched(a, b, most_tilt_rad, most, WIDE)
+    poses = _search(a, b, most_tilt_rad, QUICK)[:most]
+    return poses if poses and poses[0].score > SURE else _search(a, b, most_tilt_rad, WIDE)[:most]
 
 
-def _searched(a: View, b: View, most_tilt_rad: float, most: int, search: Search) -> list[Placing]:
-    tried: list[tuple[float, Floats]] = []
-    for R in rotations.turns(a.modes, b.modes, most_tilt_rad):
-        found_of_turn = translations.shifts(*a.voters, *b.voters, R, a.side_mm, search.peaks, search.least_of_best)
-        for t, score in zip(*found_of_turn, strict=True):
-            tried.append((float(score), rigid.transform(R, t)))
-    tried = sorted(tried, key=lambda one: -one[0])[: search.checked]
-    checked = [held(a, b, T, 0.7 * a.side_mm, a.side_mm, few=True) for _, T in tried]
-    checked.sort(key=lambda one: -one.score)
-    refined = [
-        held(a, b, refine(a, b, one.T_a_b)[0], NEAR * a.side_mm, MARGIN * a.side_mm)
-        for one in checked[: search.refined]
-    ]
-    refined.sort(key=lambda one: (-one.score, -one.agree))
-    refined = [slid(a, b, one) for one in refined[:SLID]] + refined[SLID:]
-    refined.sort(key=lambda one: (-one.score, -one.agree))
-    found: list[Placing] = []
-    for one in refined:
-        if not any(same(one.T_a_b, other.T_a_b, a.side_mm, b) for other in found):
-            found.append(one)
-    return found[:most]
+def _search(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, effort: Effort) -> list[ScoredPose]:
+    """Vote, score roughly, refine, slide; returns the distinct poses, the best first."""
+    voted: list[tuple[float, Floats]] = []
+    for R in rotations.candidate_rotations(a.modes, b.modes, most_tilt_rad):
+        shifts, votes = translations.candidate_translations(
+            a.voters, b.voters, R, a.side_mm, effort.peaks, effort.least_of_best
+        )
+        voted += [(float(v), rigid.transform(R, t)) for t, v in zip(shifts, votes, strict=True)]
+    voted = sorted(voted, key=lambda pair: -pair[0])[: effort.scored]
+    scored = [score_pose(a, b, T, rough=True) for _, T in voted]
+    scored.sort(key=lambda pose: -pose.score)
+    refined = [score_pose(a, b, refine(a, b, pose.T_a_b)[0]) for pose in scored[: effort.refined]]
+    refined.sort(key=lambda pose: (-pose.score, -pose.agree))
+    refined = [slide(a, b, pose) for pose in refined[:SLID]] + refined[SLID:]
+    refined.sort(key=lambda pose: (-pose.score, -pose.agree))
+    distinct: list[ScoredPose] = []
+    for pose in refined:
+        if not any(same(pose.T_a_b, other.T_a_b, a.side_mm, b) for other in distinct):
+            distinct.append(pose)
+    return distinct
 
 
-def same(T: Floats, S: Floats, side_mm: float, b: View) -> bool:
-    """Whether two poses of b differ by less than what tells poses apart."""
+def same(T: Floats, S: Floats, side_mm: float, b: ScanPatches) -> bool:
+    """Return whether two poses of b are the same within SAME_RAD and SAME_SHIFT cubes at the centre of its patches."""
     D = rigid.invert(T) @ S
-    middle = b.coarse.points.mean(axis=0)
-    apart = np.linalg.norm(rigid.apply(D, middle) - middle)
-    return bool(rigid.rotation_angle(D[:3, :3]) < SAME_RAD and apart < SAME_MM * side_mm)
+    centre = b.patches.patches.points.mean(axis=0)
+    shift = np.linalg.norm(rigid.apply(D, centre) - centre)
+    return bool(rigid.rotation_angle(D[:3, :3]) < SAME_RAD and shift < SAME_SHIFT * side_mm)
 
 
-def held(a: View, b: View, T_a_b: Floats, near_mm: float, margin_mm: float, few: bool = False) -> Placing:
-    """Count what speaks for and against a pose: faces of each in the other, and faces the other looked through.
+def score_pose(a: ScanPatches, b: ScanPatches, T_a_b: Floats, rough: bool = False) -> ScoredPose:
+    """Score a relative pose: weighted counts of matching patches and of patches lying in the other scan's free space.
 
-    ``few`` asks the faces that vote alone.
+    ``rough`` uses the voters only, with wider tolerances.
     """
+    near_mm, margin_mm = (x * a.side_mm for x in ((ROUGH_NEAR, ROUGH_MARGIN) if rough else (NEAR, MARGIN)))
     agree, against, total = 0.0, 0.0, 0.0
-    for one, other, T in ((a, b, rigid.invert(T_a_b)), (b, a, T_a_b)):
-        # faces of `one`, in the frame of `other`
-        faces, w = one.voters if few else (one.coarse, one.weight)
-        found = np.empty(len(w), np.bool_)
-        face_index.agreeing(other.small, T, faces.points, faces.normals, FOUND * a.side_mm, near_mm, LIKE_COS, found)
-        agree += float(w[found].sum())
-        total += float(w.sum())
-        if other.sight is not None:
-            rest = rigid.apply(T, faces.points[~found])
-            against += float(w[~found] @ other.sight.through(rest, margin_mm))
-    return Placing(T_a_b, agree, against, agree / max(total, 1e-12))
+    for scan, other, T in ((a, b, rigid.invert(T_a_b)), (b, a, T_a_b)):  # T = T_other_scan
+        patches, weight = scan.voters if rough else scan.patches
+        match = np.empty(len(weight), np.bool_)
+        face_index.mark_matches(other.small, T, patches, MATCH_RADIUS * a.side_mm, near_mm, LIKE_COS, match)
+        agree += float(weight[match].sum())
+        total += float(weight.sum())
+        if other.cloud.free_space is not None:
+            rest = rigid.apply(T, patches.points[~match])
+            against += float(weight[~match] @ other.cloud.free_space.contains(rest, margin_mm))
+    return ScoredPose(T_a_b, agree, against, agree / max(total, 1e-12))
 
 
-def slid(a: View, b: View, one: Placing) -> Placing:
-    """Move a pose along what the shared faces do not tell, to where most speaks for it."""
-    _, loose = refine(a, b, one.T_a_b, GATES[-1:])
+def slide(a: ScanPatches, b: ScanPatches, pose: ScoredPose) -> ScoredPose:
+    """Shift a pose along the direction that the matches do not determine, to the best score."""
+    _, loose = refine(a, b, pose.T_a_b, GATES[-1:])
     if loose is None:
-        return one
-    best = one
-    for k in SLIDES:
-        T = one.T_a_b.copy()
-        T[:3, 3] += k * a.side_mm * loose
-        other = held(a, b, T, NEAR * a.side_mm, MARGIN * a.side_mm)
-        if (other.score, other.agree) > (best.score, best.agree):
-            best = other
+        return pose
+    best = pose
+    for step in SLIDES:
+        T = pose.T_a_b.copy()
+        T[:3, 3] += step * a.side_mm * loose
+        candidate = score_pose(a, b, T)
+        if (candidate.score, candidate.agree) > (best.score, best.agree):
+            best = candidate
     return best
 
 
-def refine(a: View, b: View, T: Floats, gates: tuple[float, ...] = GATES) -> tuple[Floats, Floats | None]:
-    """Move b's faces onto a's, gate by gate; along what the faces do not tell, a pose stays as it is.
+def refine(a: ScanPatches, b: ScanPatches, T: Floats, gates: tuple[float, ...] = GATES) -> tuple[Floats, Floats | None]:
+    """Refine a pose by point-to-plane ICP with decreasing gates; damping keeps undetermined components as they are.
 
-    Returns the pose, and the unit vector (3,) along which it is loose, if there is one.
+    Returns the pose, and the unit vector (3,) of a direction that the matches do not determine, if there is one.
     """
     loose = None
     for gate in gates:
-        faces, weight = b.voters if gate > FEW_ABOVE else (b.coarse, b.weight)
+        patches, weight = b.voters if gate > FEW_ABOVE else b.patches
         for _ in range(STEPS):
-            H, g, centre, reach, count = face_index.equations(
-                a.small, a.large, T, faces.points, faces.normals, weight,
-                (gate + BEYOND) * a.side_mm, gate * a.side_mm, LIKE_COS,
-            )  # fmt: skip
+            H, g, centre, reach, count = face_index.normal_equations(
+                a.small, a.large, T, patches, weight, (gate + BEYOND) * a.side_mm, gate * a.side_mm, LIKE_COS
+            )
             if count < FEWEST:
                 return T, None
             step = -np.linalg.solve(H + 1e-3 * np.trace(H) / 6.0 * np.eye(6), g)

@@ -1,13 +1,15 @@
-"""Adjustment of all scans' poses at once on the flat pieces they share; every piece's plane is an unknown too.
+"""Adjustment of all scans' poses at once on the planar pieces that they share; the planes are unknowns too.
 
-The points enter by their sums alone: distances from a plane are linear in [p; 1], so that 4 x 4 sums give the normal
-equations exactly. A piece's plane is eliminated, and so is one offset a scan and piece, of a standard deviation tau
-that the misfits between scans tell: what errors of neighbouring points have in common does not average out.
+The points enter by their moments alone: distances from a plane are linear in [p; 1], so that 4 x 4 moments give the
+normal equations exactly. The plane of each piece is eliminated, and so is one offset for each scan and piece, with a
+standard deviation tau estimated from the misfits. It models errors common to neighbouring points, which do not average
+out.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -17,33 +19,34 @@ from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching.fine.correspondences import Blocks
 from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes.extraction import Planes
 
 HUBER = 2.5
 DROPPED = 6.0  # standard deviations of a scan's misfit on a piece
-ASIDE, SETTLED = 1e-3, 8  # a weight below which a piece is left aside; rounds until weights have settled
-PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # keep what nothing tells where it is
+OUTLIER_WEIGHT = 1e-6
+ASIDE, ROUNDS = 1e-3, 8  # a weight below which a block counts as an outlier; rounds of reweighting at fixed poses
+PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # weak priors on the poses: undetermined components stay as they are
 MEDIAN = 0.6745  # of |z|, z normal
 KINDS = 2
-EVEN, WIDE_SIGMAS = 3, 0.3  # adjustments at first with pieces of much the same weight, by the noise of a point
-LEAST_REAL = 0.01  # share of a direction's strength that is taken as real
+EVEN, WIDE_SIGMAS = 3, 0.3  # first iterations with almost equal weights of all pieces: tau by the noise of a point
+LEAST_REAL = 0.01  # least share of the information in a direction that is taken as real
+LEAST_BLOCKS = 10  # to estimate tau from
+STILL_MM = 1e-4  # largest shift of a pose at convergence
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Poses T_ref_scan (k, 4, 4), their joint covariance (6k, 6k; rad, mm; turns about the scan's own origin).
+    """Poses T_ref_scan (k, 4, 4) and their joint covariance (6k, 6k; rad, mm; rotations about each scan's own origin).
 
-    ``misfit`` (b,) of each block in standard deviations, ``offset`` (b,) in mm; ``tau`` of each kind: mm, of ends in
-    standard deviations of a single one.
+    ``offset`` (b,) is the mean distance of a block from its plane, mm; ``weight`` (b,) its robust weight. ``tau`` of
+    each kind: mm, for ends in standard deviations of a single one.
     """
 
     T: Floats
     covariance: Floats
-    misfit: Floats
     offset: Floats
     tau: tuple[float, ...]
     weight: Floats
-    chi2: float
-    free: float
 
 
 def solve(
@@ -54,123 +57,104 @@ def solve(
     iterations: int = 10,
     robust: bool = True,
     tau: tuple[float, ...] | None = None,
-    tolerance_mm: float = 1e-4,
     slack_mm: float = 0.0,
 ) -> Solution:
-    """Adjust poses from a start T (k, 4, 4), the reference held; scans without blocks stay, without covariance.
+    """Adjust poses from initial ones T (k, 4, 4), the reference fixed; scans without blocks keep theirs.
 
-    ``tau`` given is held, else it is found. ``slack_mm`` is how far off the start may be: no piece is dropped for that.
+    The covariance of scans without blocks is NaN. ``tau`` is estimated unless given. ``slack_mm`` is the error of the
+    initial poses: no piece is rejected for a misfit of this size.
     """
     common = np.zeros(KINDS) if tau is None else np.array(tau)
-    if not len(_free(blocks, T, reference)):
-        covariance = np.full((6 * len(T), 6 * len(T)), np.nan)
-        covariance[6 * reference : 6 * reference + 6] = covariance[:, 6 * reference : 6 * reference + 6] = 0.0
+    if not len(_unknowns(blocks, T, reference)):
+        covariance = _fixed_reference(np.full((6 * len(T), 6 * len(T)), np.nan), reference)
         none = np.empty(0)
-        return Solution(T, covariance, none, none, tuple(common.tolist()), none, 0.0, 0.0)
+        return Solution(T=T, covariance=covariance, offset=none, tau=tuple(common.tolist()), weight=none)
     weight = np.ones(len(blocks.piece))
-    wide = _wide(blocks) if robust and tau is None else np.zeros(KINDS)
+    initial = _initial_tau(blocks) if robust and tau is None else np.zeros(KINDS)
     for iteration in range(iterations):
-        loose = wide if iteration < EVEN else np.zeros(KINDS)
-        N, _, g, z, offset, spread = _normal(blocks, T, np.maximum(common, loose), weight)
-        common = _tau(blocks, offset, spread, common) if iteration and tau is None else common
-        if iteration == EVEN and wide.any():
-            weight = _robust(blocks, _forgiving(z, offset, slack_mm))
+        least = initial if iteration < EVEN else np.zeros(KINDS)
+        equations = _linearize(blocks, T, np.maximum(common, least), weight)
+        if iteration and tau is None:
+            common = _estimate_tau(blocks, equations.offset, equations.variance, common)
+        if iteration == EVEN and initial.any():
+            weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
             continue
-        free = _free(blocks, T, reference)
-        step = np.zeros(len(g))
-        step[free] = -np.linalg.solve(N[np.ix_(free, free)], g[free])
-        T = _stepped(T, step.reshape(-1, 6))
+        step = _newton_step(equations, _unknowns(blocks, T, reference)).reshape(-1, 6)
+        T = _moved_by(T, step)
         if robust:
-            weight = _robust(blocks, _forgiving(z, offset, slack_mm))
-        if iteration > EVEN and np.abs(step.reshape(-1, 6)[:, 3:]).max(initial=0.0) < tolerance_mm:
+            weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
+        if iteration > EVEN and np.abs(step[:, 3:]).max(initial=0.0) < STILL_MM:
             break
-    N, spurious, _, z, offset, spread = _normal(blocks, T, common, weight)
-    covariance = np.full(N.shape, np.nan)
-    free = _free(blocks, T, reference)
-    covariance[np.ix_(free, free)] = _sandwich(N[np.ix_(free, free)], spurious[np.ix_(free, free)])
-    own = slice(6 * reference, 6 * reference + 6)
-    covariance[own], covariance[:, own] = 0.0, 0.0
-    inside = weight > 0.5
-    return Solution(
-        T, covariance, z, offset, tuple(common.tolist()), weight, float((z[inside] ** 2).sum()), float(inside.sum())
-    )
+    equations = _linearize(blocks, T, common, weight)
+    unknowns = _unknowns(blocks, T, reference)
+    at = np.ix_(unknowns, unknowns)
+    covariance = np.full(equations.N.shape, np.nan)
+    covariance[at] = _sandwich(equations.N[at], equations.spurious[at])
+    covariance = _fixed_reference(covariance, reference)
+    return Solution(T=T, covariance=covariance, offset=equations.offset, tau=tuple(common.tolist()), weight=weight)
 
 
 def weights_at(blocks: Blocks, T: Floats, tau: tuple[float, ...]) -> Floats:
-    """Return the weights (b,) that blocks have where poses T (k, 4, 4) are held."""
+    """Return the robust weights (b,) of blocks at fixed poses T (k, 4, 4)."""
     weight = np.ones(len(blocks.piece))
-    for _ in range(SETTLED):
-        weight = _robust(blocks, _normal(blocks, T, np.array(tau), weight)[3])
+    for _ in range(ROUNDS):
+        weight = _robust_weights(blocks, _linearize(blocks, T, np.array(tau), weight).z)
     return weight
 
 
 def step_without(
     blocks: Blocks, solution: Solution, reference: int, out: npt.NDArray[np.bool_], almost_none: float
 ) -> Floats:
-    """Return how poses would move (6k,) from a solution if blocks ``out`` (b,) counted for ``almost_none``."""
+    """Return the step (6k,) of the poses from a solution if blocks ``out`` (b,) had the weight ``almost_none``."""
     weight = np.where(out, almost_none, solution.weight)
-    N, _, g, _, _, _ = _normal(blocks, solution.T, np.array(solution.tau), weight)
-    free = _free(blocks, solution.T, reference)
-    step = np.zeros(len(g))
-    step[free] = -np.linalg.solve(N[np.ix_(free, free)], g[free])
-    return step
+    equations = _linearize(blocks, solution.T, np.array(solution.tau), weight)
+    return _newton_step(equations, _unknowns(blocks, solution.T, reference))
 
 
-def _wide(blocks: Blocks) -> Floats:
-    """Return common offsets (KINDS,) that adjustments begin with: no piece says more than a few of its points do.
+# Normal equations.
 
-    A wall of thousands of points with something leant against it would else be believed before all others.
+
+@dataclass(frozen=True)
+class _Equations:
+    """Reduced normal equations N (6k, 6k), g (6k,) of the poses, and the misfits (b,) of the blocks.
+
+    ``spurious`` (6k, 6k) is the part of N that is due to the uncertainty of the planes' normals. ``z`` are misfits in
+    standard deviations, ``offset`` in mm, ``variance`` of the latter without tau.
     """
-    points = blocks.kind == 0
-    if not points.any():
-        return np.zeros(KINDS)
-    noise = float(np.median(np.sqrt(blocks.count[points] / np.maximum(blocks.sums[points, 9], 1e-300))))
-    return np.array([WIDE_SIGMAS * noise, 0.0])
+
+    N: Floats
+    spurious: Floats
+    g: Floats
+    z: Floats
+    offset: Floats
+    variance: Floats
 
 
-def _forgiving(z: Floats, offset: Floats, slack_mm: float) -> Floats:
-    """Misfits by their standard deviations and a slack: what poses have not yet had the chance to take up is none."""
-    found: Floats = offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm)
-    return found
+class _Coupling(NamedTuple):
+    """Rows (b,) of poses and planes to be eliminated, sorted by piece, and their blocks of the normal matrix.
 
-
-def _robust(blocks: Blocks, z: Floats) -> Floats:
-    """Weights (b,) by misfits; where fewer than two scans of a piece are left, all share the least of the weights.
-
-    One of two scans cannot be told to be the wrong one, and alone it would seem to fit without a misfit.
+    ``Hsp`` (b, 6, 3) couples a scan's pose and the plane of its piece; ``inverse`` (p, 3, 3) is that of the planes'
+    block, ``gp`` (p, 3) their gradient. ``tilt`` (p, 3, 3) is the covariance of the ``normal`` (p, 3), ``along`` (b,)
+    the information of a row on the shift of its scan along the normal.
     """
-    weight = np.where(np.abs(z) > DROPPED, 1e-6, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)))
-    left = np.bincount(blocks.piece, weight > ASIDE, blocks.pieces)
-    least = np.ones(blocks.pieces)
-    np.minimum.at(least, blocks.piece, weight)
-    found: Floats = np.where(left[blocks.piece] < 2, least[blocks.piece], weight)
-    return found
+
+    piece: Ints
+    scan: Ints
+    Hsp: Floats
+    inverse: Floats
+    gp: Floats
+    normal: Floats
+    tilt: Floats
+    along: Floats
 
 
-def _free(blocks: Blocks, T: Floats, reference: int) -> Ints:
-    """Rows (6m,) of the unknowns: six for every scan with blocks but the reference."""
-    scans = [s for s in range(len(T)) if s != reference and (blocks.scan == s).any()]
-    return (6 * np.array(scans, np.int64)[:, None] + np.arange(6)).ravel()
+def _linearize(blocks: Blocks, T: Floats, tau: Floats, weight: Floats) -> _Equations:
+    """Build the normal equations at poses T (k, 4, 4), with planes and common offsets eliminated.
 
-
-def _stepped(T: Floats, step: Floats) -> Floats:
-    found: Floats = T.copy()
-    for s in np.flatnonzero(np.abs(step).sum(axis=1) > 0.0):
-        R = rigid.rotation_from_vector(step[s, :3])
-        found[s, :3, :3] = R @ T[s, :3, :3]
-        found[s, :3, 3] = T[s, :3, 3] + step[s, 3:]
-    return found
-
-
-def _normal(
-    blocks: Blocks, T: Floats, tau: Floats, weight: Floats
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Return normal matrix, what of it is none, gradient, misfits in sd (b,), in mm, and their variances without tau.
-
-    A plane's normal is not known exactly: where it is off, a piece seems to hold scans along itself as well. How much
-    of the normal matrix is made up of that follows from the planes' own uncertainty.
+    The normal of a plane is not known exactly: if it is off, a piece seems to determine shifts along itself as well.
+    The part of the normal matrix due to this follows from the uncertainty of the planes.
     """
-    k = len(T)
+    k, b = len(T), len(blocks.piece)
     world = T[blocks.scan]
     W = world @ extraction.square(blocks.sums) @ world.transpose(0, 2, 1)
     total = hashing.summed(extraction.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
@@ -178,22 +162,11 @@ def _normal(
     n, c = planes.normal[blocks.piece], planes.mean[blocks.piece]
     W = _shifted(W, c)
     mass = W[:, 3, 3]
-    t2 = tau[blocks.kind] ** 2 * _unit2(blocks)
+    t2 = tau[blocks.kind] ** 2 * _unit_variance(blocks)
     # A common offset of the block's points is eliminated.
     e = W[:, :, 3]
     W = (W - (t2 / (1.0 + t2 * mass))[:, None, None] * e[:, :, None] * e[:, None, :]) * weight[:, None, None]
-    axes = planes.axes[blocks.piece]
-    b = len(mass)
-    Lp = np.zeros((b, 3, 4))
-    Lp[:, 0, :3], Lp[:, 1, :3], Lp[:, 2, 3] = axes[:, :, 1], axes[:, :, 2], -1.0
-    # Turns about the scan's own origin: q = p - o, and n . (w x q) = w . (q x n).
-    arm = c - T[blocks.scan, :3, 3]
-    Ls = np.zeros((b, 6, 4))
-    Ls[:, 0, 1], Ls[:, 0, 2] = n[:, 2], -n[:, 1]
-    Ls[:, 1, 0], Ls[:, 1, 2] = -n[:, 2], n[:, 0]
-    Ls[:, 2, 0], Ls[:, 2, 1] = n[:, 1], -n[:, 0]
-    Ls[:, :3, 3] = np.cross(arm, n)
-    Ls[:, 3:, 3] = n
+    Ls, Lp = _design_matrices(blocks, T, planes)
     rho = np.concatenate([n, np.zeros((b, 1))], axis=1)
     LsW, Wr = Ls @ W, np.einsum("bij,bj->bi", W, rho)
     Hss = LsW @ Ls.transpose(0, 2, 1)
@@ -202,93 +175,59 @@ def _normal(
     gs = np.einsum("bij,bj->bi", Ls, Wr)
     gp = hashing.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
     scale = np.einsum("nii->ni", Hpp)
-    Hpp = Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3)
-    inverse = np.linalg.inv(Hpp)
-    own = np.zeros((k, k, 6, 6))
-    np.add.at(own, (blocks.scan, blocks.scan), Hss)
-    N: Floats = np.ascontiguousarray(own.transpose(0, 2, 1, 3)).reshape(6 * k, 6 * k)
+    inverse = np.linalg.inv(Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3))
+    of_scans = np.zeros((k, k, 6, 6))
+    np.add.at(of_scans, (blocks.scan, blocks.scan), Hss)
+    N: Floats = np.ascontiguousarray(of_scans.transpose(0, 2, 1, 3)).reshape(6 * k, 6 * k)
     gradient = np.zeros((k, 6))
     np.add.at(gradient, blocks.scan, gs)
     g, spurious = gradient.ravel(), np.zeros((6 * k, 6 * k))
     along = np.einsum("bi,bij,bj->b", n, Hss[:, 3:, 3:], n)
     tilt = planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1)
-    eliminate(blocks.piece, blocks.scan, Hsp, inverse, gp, planes.normal, tilt, along, N, g, spurious)
+    coupling = _Coupling(
+        piece=blocks.piece, scan=blocks.scan, Hsp=Hsp, inverse=inverse, gp=gp, normal=planes.normal, tilt=tilt,
+        along=along,
+    )  # fmt: skip
+    eliminate(coupling, N, g, spurious)
     N += np.diag(np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k))
-    # Misfits: a block's mean distance from the plane, and how sure that is beside the plane's own uncertainty.
+    # Misfit: the mean distance of a block from the plane; its variance is reduced by the block's leverage on the plane.
     mean = e[:, :3] / mass[:, None]
     offset = np.einsum("bi,bi->b", mean, n)
-    v = np.einsum("bij,bj->bi", Lp, _one(mean))
+    v = np.einsum("bij,bj->bi", Lp, np.concatenate([mean, np.ones((b, 1))], axis=1))
     leverage = np.einsum("bi,bij,bj->b", v, inverse[blocks.piece], v) * weight / (1.0 / mass + t2)
     share = np.maximum(1.0 - leverage, 0.02)
     z = offset / np.sqrt((1.0 / mass + t2) * share)
-    return N, spurious, g, z, offset / np.sqrt(share), 1.0 / mass
+    return _Equations(N=N, spurious=spurious, g=g, z=z, offset=offset / np.sqrt(share), variance=1.0 / mass)
 
 
-def _sandwich(N: Floats, spurious: Floats) -> Floats:
-    """Covariance of an estimate whose normal matrix N is in part spurious: more, the more of it is."""
-    L = np.linalg.cholesky(N)
-    S = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
-    share, V = np.linalg.eigh(0.5 * (S + S.T))
-    half = np.linalg.solve(L.T, V) / np.maximum(1.0 - share, LEAST_REAL)
-    found: Floats = half @ half.T
-    return found
+def _design_matrices(blocks: Blocks, T: Floats, planes: Planes) -> tuple[Floats, Floats]:
+    """Return the derivatives of a point's distance from its plane by the pose (b, 6, 4) and by the plane (b, 3, 4).
 
-
-def _unit2(blocks: Blocks) -> Floats:
-    """Return what the squares (b,) of common offsets are counted in: mm^2, of ends the variance of a single one.
-
-    Where an edge runs along the scanner's rows or columns, all its ends err by the same part of a step.
+    They are linear in [p; 1], p relative to the mean of the plane.
     """
-    found: Floats = np.where(blocks.kind == 1, blocks.count / np.maximum(blocks.sums[:, 9], 1e-300), 1.0)
-    return found
-
-
-def _one(points: Floats) -> Floats:
-    return np.concatenate([points, np.ones((len(points), 1))], axis=1)
-
-
-def _shifted(W: Floats, c: Floats) -> Floats:
-    """Move the origin of sums (b, 4, 4) to c (b, 3)."""
-    S = np.tile(np.eye(4), (len(c), 1, 1))
-    S[:, :3, 3] = -c
-    found: Floats = S @ W @ S.transpose(0, 2, 1)
-    return found
-
-
-def _tau(blocks: Blocks, offset: Floats, spread: Floats, before: Floats) -> Floats:
-    """Find the standard deviation of offsets, mm, of each kind beyond what single points' noise explains."""
-    found: Floats = before.copy()
-    unit2 = _unit2(blocks)
-    for kind in range(KINDS):
-        rows = blocks.kind == kind
-        if rows.sum() < 10:
-            continue
-        r2, v, u = offset[rows] ** 2, spread[rows], unit2[rows]
-        low, high = 0.0, float(np.sqrt(np.max(r2 / u)))
-        if np.median(r2 / v) <= MEDIAN**2:
-            found[kind] = 0.0
-            continue
-        for _ in range(40):
-            middle = 0.5 * (low + high)
-            if np.median(r2 / (v + middle**2 * u)) > MEDIAN**2:
-                low = middle
-            else:
-                high = middle
-        found[kind] = high
-    return found
-
-
-# --- Planes eliminated from the normal equations of all scans' poses: compiled sums over the few scans of each piece.
+    b = len(blocks.piece)
+    n, c, axes = planes.normal[blocks.piece], planes.mean[blocks.piece], planes.axes[blocks.piece]
+    Lp = np.zeros((b, 3, 4))
+    Lp[:, 0, :3], Lp[:, 1, :3], Lp[:, 2, 3] = axes[:, :, 1], axes[:, :, 2], -1.0
+    # Rotations w about the scan's own origin o: q = p - o, and n . (w x q) = w . (q x n).
+    arm = c - T[blocks.scan, :3, 3]
+    Ls = np.zeros((b, 6, 4))
+    Ls[:, 0, 1], Ls[:, 0, 2] = n[:, 2], -n[:, 1]
+    Ls[:, 1, 0], Ls[:, 1, 2] = -n[:, 2], n[:, 0]
+    Ls[:, 2, 0], Ls[:, 2, 1] = n[:, 1], -n[:, 0]
+    Ls[:, :3, 3] = np.cross(arm, n)
+    Ls[:, 3:, 3] = n
+    return Ls, Lp
 
 
 @njit(cache=True, nogil=True)
-def eliminate(piece, scan, Hsp, inverse, gp, normal, tilt, along, N, g, spurious):  # type: ignore[no-untyped-def]
-    """Take Hsp Hpp^-1 Hps off N (6k, 6k) and Hsp Hpp^-1 gp off g (6k,); add what of N is seeming to ``spurious``.
+def eliminate(coupling, N, g, spurious):  # type: ignore[no-untyped-def]
+    """Subtract Hsp Hpp^-1 Hps from N (6k, 6k) and Hsp Hpp^-1 gp from g (6k,); add the spurious part of N.
 
-    Rows are sorted by ``piece`` (b,): Hsp (b, 6, 3) of a scan's pose and its piece's plane. ``inverse`` (p, 3, 3) of
-    Hpp, gp (p, 3), the planes' ``normal`` (p, 3) and the ``tilt`` (p, 3, 3) of these that is not known; ``along`` (b,)
-    is how much a row holds its scan along the normal.
+    Sums run over the few scans of each piece; see :class:`_Coupling`.
     """
+    piece, scan, Hsp, inverse = coupling.piece, coupling.scan, coupling.Hsp, coupling.inverse
+    normal, tilt = coupling.normal, coupling.tilt
     b = len(piece)
     W, pull = np.empty((6, 3)), np.empty(3)
     start = 0
@@ -305,17 +244,17 @@ def eliminate(piece, scan, Hsp, inverse, gp, normal, tilt, along, N, g, spurious
                     for m in range(3):
                         W[i, j] += Hsp[x, i, m] * inverse[p, m, j]
                 for j in range(3):
-                    g[s + i] -= W[i, j] * gp[p, j]
+                    g[s + i] -= W[i, j] * coupling.gp[p, j]
             for j in range(3):
                 pull[j] = normal[p, 0] * W[3, j] + normal[p, 1] * W[4, j] + normal[p, 2] * W[5, j]
             for i in range(3):
                 for j in range(3):
-                    spurious[s + 3 + i, s + 3 + j] += along[x] * tilt[p, i, j]
+                    spurious[s + 3 + i, s + 3 + j] += coupling.along[x] * tilt[p, i, j]
             for y in range(start, end):
                 t = 6 * scan[y]
-                held = 0.0
+                shared = 0.0
                 for m in range(3):
-                    held += pull[m] * (
+                    shared += pull[m] * (
                         normal[p, 0] * Hsp[y, 3, m] + normal[p, 1] * Hsp[y, 4, m] + normal[p, 2] * Hsp[y, 5, m]
                     )
                 for i in range(6):
@@ -326,5 +265,119 @@ def eliminate(piece, scan, Hsp, inverse, gp, normal, tilt, along, N, g, spurious
                         N[s + i, t + j] -= total
                 for i in range(3):
                     for j in range(3):
-                        spurious[s + 3 + i, t + 3 + j] -= held * tilt[p, i, j]
+                        spurious[s + 3 + i, t + 3 + j] -= shared * tilt[p, i, j]
         start = end
+
+
+def _shifted(W: Floats, c: Floats) -> Floats:
+    """Move the origin of moments (b, 4, 4) to c (b, 3)."""
+    S = np.tile(np.eye(4), (len(c), 1, 1))
+    S[:, :3, 3] = -c
+    shifted: Floats = S @ W @ S.transpose(0, 2, 1)
+    return shifted
+
+
+def _newton_step(equations: _Equations, unknowns: Ints) -> Floats:
+    step = np.zeros(len(equations.g))
+    step[unknowns] = -np.linalg.solve(equations.N[np.ix_(unknowns, unknowns)], equations.g[unknowns])
+    return step
+
+
+def _unknowns(blocks: Blocks, T: Floats, reference: int) -> Ints:
+    """Return the rows (6m,) of the unknowns: six for every scan with blocks but the reference."""
+    scans = [s for s in range(len(T)) if s != reference and (blocks.scan == s).any()]
+    return (6 * np.array(scans, np.int64)[:, None] + np.arange(6)).ravel()
+
+
+def _moved_by(T: Floats, step: Floats) -> Floats:
+    """Rotate poses about their own origins and shift them by ``step`` (k, 6)."""
+    poses: Floats = T.copy()
+    for s in np.flatnonzero(np.abs(step).sum(axis=1) > 0.0):
+        R = rigid.rotation_from_vector(step[s, :3])
+        poses[s, :3, :3] = R @ T[s, :3, :3]
+        poses[s, :3, 3] = T[s, :3, 3] + step[s, 3:]
+    return poses
+
+
+def _sandwich(N: Floats, spurious: Floats) -> Floats:
+    """Return the covariance of an estimate whose normal matrix N is spurious in part: the larger, the more of it is."""
+    L = np.linalg.cholesky(N)
+    S = np.linalg.solve(L, np.linalg.solve(L, spurious).T)
+    share, V = np.linalg.eigh(0.5 * (S + S.T))
+    half = np.linalg.solve(L.T, V) / np.maximum(1.0 - share, LEAST_REAL)
+    covariance: Floats = half @ half.T
+    return covariance
+
+
+def _fixed_reference(covariance: Floats, reference: int) -> Floats:
+    """Set the rows and columns of the reference scan to 0, in place."""
+    rows = slice(6 * reference, 6 * reference + 6)
+    covariance[rows], covariance[:, rows] = 0.0, 0.0
+    return covariance
+
+
+# Weights: robust ones of blocks, and the variance of the offsets common to a block's points.
+
+
+def _robust_weights(blocks: Blocks, z: Floats) -> Floats:
+    """Return weights (b,) by misfits; if fewer than two scans of a piece remain, all get the least of its weights.
+
+    Of two scans it cannot be decided which one is wrong, and a single one would seem to fit without any misfit.
+    """
+    weight = np.where(np.abs(z) > DROPPED, OUTLIER_WEIGHT, np.minimum(1.0, HUBER / np.maximum(np.abs(z), 1e-9)))
+    left = np.bincount(blocks.piece, weight > ASIDE, blocks.pieces)
+    least = np.ones(blocks.pieces)
+    np.minimum.at(least, blocks.piece, weight)
+    weights: Floats = np.where(left[blocks.piece] < 2, least[blocks.piece], weight)
+    return weights
+
+
+def _with_slack(equations: _Equations, slack_mm: float) -> Floats:
+    """Return misfits (b,) by their standard deviations combined with the error of poses not yet adjusted."""
+    z, offset = equations.z, equations.offset
+    reduced: Floats = offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm)
+    return reduced
+
+
+def _initial_tau(blocks: Blocks) -> Floats:
+    """Return the tau (KINDS,) of the first iterations, so large that no piece weighs more than a few of its points do.
+
+    Else a wall of thousands of points with an object leaning on it would outweigh everything else.
+    """
+    points = blocks.kind == 0
+    if not points.any():
+        return np.zeros(KINDS)
+    sigma = float(np.median(np.sqrt(blocks.count[points] / np.maximum(blocks.sums[points, 9], 1e-300))))
+    return np.array([WIDE_SIGMAS * sigma, 0.0])
+
+
+def _unit_variance(blocks: Blocks) -> Floats:
+    """Return the unit (b,) of tau squared: 1 mm^2 for points, the variance of a single end for ends.
+
+    If an edge runs along the scanner's rows or columns, all its ends have the same error, in shares of a step.
+    """
+    unit: Floats = np.where(blocks.kind == 1, blocks.count / np.maximum(blocks.sums[:, 9], 1e-300), 1.0)
+    return unit
+
+
+def _estimate_tau(blocks: Blocks, offset: Floats, variance: Floats, before: Floats) -> Floats:
+    """Estimate tau of each kind: the variance of offsets beyond that of the point noise, by the median of squares."""
+    tau: Floats = before.copy()
+    unit = _unit_variance(blocks)
+    for kind in range(KINDS):
+        rows = blocks.kind == kind
+        if rows.sum() < LEAST_BLOCKS:
+            continue
+        r2, v, u = offset[rows] ** 2, variance[rows], unit[rows]
+        low, high = 0.0, float(np.sqrt(np.max(r2 / u)))
+        if np.median(r2 / v) <= MEDIAN**2:
+            tau[kind] = 0.0
+            continue
+        for _ in range(40):
+            middle = 0.5 * (low + high)
+            if np.median(r2 / (v + middle**2 * u)) > MEDIAN**2:
+                low = middle
+            else:
+                high = middle
+        tau[kind] = high
+    return tau

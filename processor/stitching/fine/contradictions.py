@@ -1,9 +1,9 @@
-"""Whether faces that an adjustment left aside agree on another pose of a scan.
+"""Contradictions of a scan's pose: faces that the adjustment rejected as outliers, but that agree on another pose.
 
-Errors of single faces are outliers, and rightly left aside. But where a near wall of many points moved during one scan,
-it may hold the scan by itself, and the others, which are right, are the ones left aside: the answer then fits well and
-is wrong. So each face left aside says by which motion of the scan it would fit; those that others left aside share are
-counted against the faces that such a motion would make misfits of.
+Errors of single faces are outliers and are rightly rejected. But if a near wall with many points moved during one scan,
+it may determine the pose by itself, and the faces that are right are rejected: the result fits well and is wrong.
+For each rejected face the motion of the scan that would make it fit is tried. The rejected faces that fit after this
+motion are compared in number with the accepted faces that no longer do.
 """
 
 from __future__ import annotations
@@ -11,21 +11,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from processor.model import Floats, Ints
 from processor.stitching.fine import bundle_adjustment, correspondences
 from processor.stitching.fine.bundle_adjustment import DROPPED, Solution
-from processor.stitching.fine.correspondences import FLAT_SIGMAS, Blocks, Gathered
+from processor.stitching.fine.correspondences import FLAT_SIGMAS, Blocks, CellTable
 from processor.stitching.planes import extraction, hashing
 
-AGREES = 4.0  # standard deviations of a face's misfit once the scan has moved
-LEAST_FACES = 4  # three of a hundred agree on something by chance: one of 90 scans of a truss
-LEAST_SHARE = 0.14  # of the faces that hold the scan where it is
+AGREES = 4.0  # standard deviations of a face's misfit after the motion
+LEAST_FACES = 4  # three of a hundred agree by chance in one of 90 scans of a truss
+LEAST_SHARE = 0.14  # of the accepted faces that contradict the motion
 
 
 @dataclass(frozen=True)
-class Dissent:
-    """Of a scan: faces left aside that agree on a motion, faces that speak against it, and how far it goes."""
+class Contradiction:
+    """Rejected faces of a scan that agree on a motion, accepted faces that contradict it, and the motion's size."""
 
     agree: int = 0
     hold: int = 0
@@ -34,76 +35,78 @@ class Dissent:
 
     @property
     def counts(self) -> bool:
-        """Whether it is more than the faces that things moved between scans leave aside."""
+        """Whether more faces agree than objects moved between the scans would explain."""
         return self.agree > LEAST_SHARE * self.hold
 
 
 @dataclass(frozen=True)
-class _Witnesses:
-    """Faces of all scans: whose, distance from the plane that the other scans give, its variance, how poses move it."""
+class _Misfits:
+    """Faces of all scans: distance from the plane of the other scans, its variance, and its derivative by the pose."""
 
     scan: Ints
     offset: Floats
     variance: Floats
-    follows: Floats  # (n, 6): turns about the scan's origin, shift
+    by_pose: Floats  # (n, 6): rotation about the scan's origin, shift
+
+    def of_scan(self, s: int) -> _Misfits:
+        rows = self.scan == s
+        return _Misfits(self.scan[rows], self.offset[rows], self.variance[rows], self.by_pose[rows])
 
 
-def of_scans(cells: Gathered, solution: Solution, gate_mm: float) -> list[Dissent]:
-    """Return the strongest dissent about each scan's pose; faces up to ``gate_mm`` apart count as one."""
+def of_scans(cells: CellTable, solution: Solution, gate_mm: float) -> list[Contradiction]:
+    """Return the strongest contradiction of each scan's pose; faces up to ``gate_mm`` apart are taken as one."""
     count = len(solution.T)
-    blocks = correspondences.shared(correspondences.pieces(cells, solution.T, gate_mm)) if len(cells.sums) else None
+    blocks = correspondences.segment(cells, solution.T, gate_mm).shared() if len(cells.sums) else None
     if blocks is None or not blocks.pieces:
-        return [Dissent()] * count
-    every = _witnesses(blocks, solution)
-    return [_strongest(every, every.scan == s) for s in range(count)]
+        return [Contradiction()] * count
+    misfits = _misfits(blocks, solution)
+    return [_strongest(misfits.of_scan(s)) for s in range(count)]
 
 
-def _witnesses(blocks: Blocks, solution: Solution) -> _Witnesses:
-    """Hold each face against the plane of the other scans' points on it; only where both are as flat as the noise."""
+def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:
+    """Compare each face with the plane of the other scans' points; only where both are planar within the noise."""
     weight = bundle_adjustment.weights_at(blocks, solution.T, solution.tau)
-    # Where all but one are left aside, nobody knows which is wrong: each is held against all others.
+    # Where all faces of a piece but one are outliers, any may be wrong: each is compared with all others.
     left = np.bincount(blocks.piece, weight > bundle_adjustment.ASIDE, blocks.pieces)
     weight = np.where(left[blocks.piece] < 2, 1.0, weight)
-    world = extraction.moved(blocks.sums, solution.T[blocks.scan])
-    own = extraction.planes_of(world)
+    world = extraction.transformed(blocks.sums, solution.T[blocks.scan])
+    faces = extraction.planes_of(world)
     weighted = world * weight[:, None]
     rest = hashing.summed(weighted, blocks.piece, blocks.pieces)[blocks.piece] - weighted
     others = extraction.planes_of(rest)
     counts = np.bincount(blocks.piece, blocks.count, blocks.pieces)[blocks.piece] - blocks.count
     limit = FLAT_SIGMAS**2
-    flat = (own.variance[:, 0] * own.count <= limit * blocks.count) & (
+    flat = (faces.variance[:, 0] * faces.count <= limit * blocks.count) & (
         others.variance[:, 0] * others.count <= limit * counts
     )
-    apart = own.mean - others.mean
-    along = np.einsum("bi,bij->bj", apart, others.axes[:, :, 1:])
+    shift = faces.mean - others.mean
+    along = np.einsum("bi,bij->bj", shift, others.axes[:, :, 1:])
     lean = (along**2 / np.maximum(others.variance[:, 1:], 1e-12)).sum(axis=1)
-    variance = 1.0 / own.count + (1.0 + lean) / np.maximum(others.count, 1e-12) + 2.0 * solution.tau[0] ** 2
-    arm = own.mean - solution.T[blocks.scan, :3, 3]
+    variance = 1.0 / faces.count + (1.0 + lean) / np.maximum(others.count, 1e-12) + 2.0 * solution.tau[0] ** 2
+    arm = faces.mean - solution.T[blocks.scan, :3, 3]
     n = others.normal
-    return _Witnesses(
-        blocks.scan[flat],
-        np.einsum("bi,bi->b", apart, n)[flat],
-        variance[flat],
-        np.concatenate([np.cross(arm, n), n], axis=1)[flat],
+    return _Misfits(
+        scan=blocks.scan[flat],
+        offset=np.einsum("bi,bi->b", shift, n)[flat],
+        variance=variance[flat],
+        by_pose=np.concatenate([np.cross(arm, n), n], axis=1)[flat],
     )
 
 
-def _strongest(every: _Witnesses, rows: np.ndarray) -> Dissent:
-    """Try the motion that each face left aside asks for, and count who agrees."""
-    offset, variance, follows = every.offset[rows], every.variance[rows], every.follows[rows]
-    z = np.abs(offset) / np.sqrt(variance)
-    aside = z > DROPPED
-    held = ~aside
-    information = np.einsum("b,bi,bj->ij", held / variance, follows, follows)
+def _strongest(misfits: _Misfits) -> Contradiction:
+    """Try the motion that each rejected face of a scan suggests, and count the faces that agree."""
+    offset, variance, by_pose = misfits.offset, misfits.variance, misfits.by_pose
+    rejected: npt.NDArray[np.bool_] = np.abs(offset) / np.sqrt(variance) > DROPPED
+    information = np.einsum("b,bi,bj->ij", ~rejected / variance, by_pose, by_pose)
     information += np.diag([bundle_adjustment.PRIOR_RAD**-2] * 3 + [bundle_adjustment.PRIOR_MM**-2] * 3)
-    best = Dissent()
-    for i in np.flatnonzero(aside):
-        # Of all motions that bring this face back, the one that the faces which hold the scan mind least.
-        easiest = np.linalg.solve(information, follows[i])
-        motion = -offset[i] / (follows[i] @ easiest) * easiest
-        after = np.abs(offset + follows @ motion) / np.sqrt(variance)
-        agree, hold = int((aside & (after < AGREES)).sum()), int((held & (after > DROPPED)).sum())
+    best = Contradiction()
+    for i in np.flatnonzero(rejected):
+        # Of all motions that make this face fit, the one that changes the fit of the accepted faces least.
+        easiest = np.linalg.solve(information, by_pose[i])
+        motion = -offset[i] / (by_pose[i] @ easiest) * easiest
+        after = np.abs(offset + by_pose @ motion) / np.sqrt(variance)
+        agree, hold = int((rejected & (after < AGREES)).sum()), int((~rejected & (after > DROPPED)).sum())
         if agree >= LEAST_FACES and agree * max(best.hold, 1) > best.agree * max(hold, 1):
-            size = float(np.linalg.norm(motion[3:])), float(1e3 * np.linalg.norm(motion[:3]))
-            best = Dissent(agree, hold, *size)
+            shift_mm, turn_mrad = float(np.linalg.norm(motion[3:])), float(1e3 * np.linalg.norm(motion[:3]))
+            best = Contradiction(agree=agree, hold=hold, shift_mm=shift_mm, turn_mrad=turn_mrad)
     return best

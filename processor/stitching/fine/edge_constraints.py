@@ -1,8 +1,8 @@
-"""Ends of one scan's faces held against the faces of others that bound them."""
+"""Edge constraints: ends of one scan's faces on the pieces of other scans that bound these faces."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 import numpy.typing as npt
@@ -13,113 +13,148 @@ from processor.model import Floats, Ints
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import Blocks
 from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.scan_planes import Cloud
 
-BEHIND_COS = -0.03  # a face looks away from the scanner
-ACROSS_COS = 0.5  # of the way from ray to ray, to the face's normal
+BEHIND_COS = -0.03  # a piece faces away from the scanner
+ACROSS_COS = 0.5  # between the step from ray to ray and the piece's normal
 SQUARE_COS = 0.85  # the two faces meet at an angle
 NEIGHBOURS = 12
-ONE_FACE_MM = 10.0  # planes of pieces of one face differ by less where an end is
-REACH = 1.9  # of a piece: its half width by its standard deviation, with a little to spare
+ONE_FACE_MM = 10.0  # planes of two pieces of one face differ by less at an end
+REACH = 1.9  # half width of a piece by its standard deviation, with a margin
 LEAST_MM = 1.0  # standard deviation of an end, however close the rays
-INSIDE = 0.75  # of the width between two rays, half of it to either side and half as much again
-MOST_NODES_MM = 4000.0
-UNIFORM = 1.0 / 12.0  # variance of a place anywhere in a gap, in gaps
-RUN_JUMP = 0.1  # gaps: ends of one run are no farther apart
+INSIDE = 0.75  # of the width between two rays: half of it on either side, and half as much again
+MOST_DISTANCE_MM = 4000.0  # of a piece's centre from an end
+UNIFORM = 1.0 / 12.0  # variance of a uniform position in a gap, in gaps squared
+RUN_JUMP = 0.1  # gaps: consecutive ends of one run are no farther apart
 HARMONICS = 16  # of the pattern that an edge makes with the scanner's rows and columns
 
-LOOSE_MM = 1.0  # standard deviation of a motion that faces alone do not tell
-LEVER_MM = 1e4  # a turn counts by what it moves so far off
+LOOSE_MM = 1.0  # standard deviation of a motion that faces alone do not determine
+LEVER_MM = 1e4  # a rotation counts as the shift at this distance
 SHIFT_STEP_MM = 2.0
 SLACK_MM = 3.0
 MOST_LOOSE = 12
+LEAST_RATE = 0.1  # shift of an end across its piece, by the size of the motion
 
 
 @dataclass(frozen=True)
 class Matches:
     """Ends (n, 3) of scans (n,), in their clouds' frames, on pieces (n,) that bound them.
 
-    ``off`` (n,) is how far beyond the piece each lies, ``width`` (n,) the room between its two rays, both across the
-    piece; ``normal`` (n, 3) the piece's; ``gap`` and ``edge`` (n,) as of :class:`Ends`.
+    ``off`` (n,) is how far beyond the piece each lies, ``width`` (n,) the distance between its two rays, both across
+    the piece; ``normal`` (n, 3) is that of the piece; ``gap`` and ``edge`` (n,) are those of :class:`Ends`.
     """
 
-    piece: Ints
-    scan: Ints
-    points: Floats
-    off: Floats
-    width: Floats
-    normal: Floats
-    gap: Ints
-    edge: Ints
+    piece: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    scan: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    points: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    off: Floats = field(default_factory=lambda: np.empty(0))
+    width: Floats = field(default_factory=lambda: np.empty(0))
+    normal: Floats = field(default_factory=lambda: np.empty((0, 3)))
+    gap: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    edge: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
-def matched(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear: bool = False) -> Matches:
+def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
+    """Add the ends of faces to the pieces that bound them, as blocks of kind 1; see :func:`match`."""
+    if not blocks.pieces:
+        return blocks
+    ends = match(clouds, blocks, T, gate_mm, clear=True)
+    if not len(ends.piece):
+        return blocks
+    weight = 1.0 / (variance(ends) + LEAST_MM**2)
+    key, inverse = np.unique(ends.piece * len(T) + ends.scan, return_inverse=True)
+    inverse = inverse.ravel()
+    sums = hashing.summed(extraction.sums_of(ends.points) * weight[:, None], inverse, len(key))
+    piece = np.concatenate([blocks.piece, key // len(T)])
+    order = np.argsort(piece, kind="stable")
+    return Blocks(
+        piece=piece[order],
+        scan=np.concatenate([blocks.scan, key % len(T)])[order],
+        sums=np.vstack([blocks.sums, sums])[order],
+        count=np.concatenate([blocks.count, np.bincount(inverse).astype(float)])[order],
+        kind=np.concatenate([blocks.kind, np.ones(len(key), np.int64)])[order],
+        pieces=blocks.pieces,
+    )
+
+
+def match(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float, clear: bool = False) -> Matches:
     """Find the pieces that bound ends of faces.
 
-    A piece bounds an end where it looks away from the end's scanner, stands across, and passes within ``gate_mm`` of
-    where the two rays leave room. ``clear`` leaves out ends that two faces, one behind the other as a flange's and the
-    web's, may bound: the nearer one taken, the ends of a flange would seem to lie outside of it. Whether two are within
-    a gap's width of each other does not depend on where the rays happened to pass, so that what is left is not biased.
+    A piece bounds an end if it faces away from the end's scanner, stands across the face, and passes within ``gate_mm``
+    of the interval between the two rays. ``clear`` rejects ends that two faces one behind the other may bound, such as
+    those of a flange and the web: with the nearer one taken, ends of a flange would seem to lie outside of it. Whether
+    two faces are within a gap's width of each other does not depend on where the rays passed, so that this selection
+    introduces no bias.
     """
-    world = extraction.moved(blocks.sums, T[blocks.scan])
+    world = extraction.transformed(blocks.sums, T[blocks.scan])
     planes = extraction.planes_of(hashing.summed(world, blocks.piece, blocks.pieces))
-    # A piece looks at the scanners that saw it; all of a piece see the same side.
+    # A piece faces the scanners that saw it; all of them see the same side.
     first = np.unique(blocks.piece, return_index=True)[1]
     towards = np.einsum("ni,ni->n", planes.normal, T[blocks.scan[first], :3, 3] - planes.mean)
     normal = planes.normal * np.where(towards < 0.0, -1.0, 1.0)[:, None]
     half = REACH * np.sqrt(planes.variance[:, 1:]) + 2.0 * clouds[0].cell_mm
-    found: list[tuple[Ints, Ints, Floats, Floats, Floats, Floats, Ints, Ints]] = []
+    parts = [Matches()]
     for s, cloud in enumerate(clouds):
         if not len(cloud.ends.points) or not np.isfinite(T[s]).all():
             continue
         look = T[s, :3, 3] - planes.mean
         away = np.flatnonzero(np.einsum("ni,ni->n", look, normal) < BEHIND_COS * np.linalg.norm(look, axis=1))
-        if not len(away):
-            continue
-        points = cloud.ends.points @ T[s, :3, :3].T + T[s, :3, 3]
-        across = cloud.ends.across @ T[s, :3, :3].T
-        faces = cloud.ends.normals @ T[s, :3, :3].T
-        k = min(NEIGHBOURS, len(away))
-        distance, index = cKDTree(planes.mean[away]).query(points, k=k, distance_upper_bound=MOST_NODES_MM)
-        distance, index = distance.reshape(len(points), k), index.reshape(len(points), k)
-        q = away[np.minimum(index, len(away) - 1)]
-        y = points[:, None] - planes.mean[q]
-        off = np.einsum("nki,nki->nk", y, normal[q])
-        width = np.einsum("ni,nki->nk", across, normal[q])
-        length = np.linalg.norm(across, axis=1)[:, None]
-        fits = (
-            np.isfinite(distance)
-            & (width > ACROSS_COS * length)
-            & (np.abs(np.einsum("ni,nki->nk", faces, normal[q])) < SQUARE_COS)
-            & (np.abs(np.einsum("nki,nki->nk", y, planes.axes[q, :, 1])) < half[q, 0])
-            & (np.abs(np.einsum("nki,nki->nk", y, planes.axes[q, :, 2])) < half[q, 1])
-        )
-        cost = np.where(fits & (np.abs(off) < INSIDE * width + gate_mm), np.abs(off), np.inf)
-        best = np.argmin(cost, axis=1)[:, None]
-        good = np.isfinite(np.take_along_axis(cost, best, axis=1)[:, 0])
-        if clear:
-            apart = np.abs(off - np.take_along_axis(off, best, axis=1))
-            room = np.take_along_axis(width, best, axis=1) + 2.0 * gate_mm
-            good &= ~(fits & (apart > ONE_FACE_MM) & (apart < room)).any(axis=1)
-        rows, best = np.flatnonzero(good), best[:, 0]
-        piece = q[rows, best[rows]]
-        found.append(
-            (piece, np.full(len(rows), s), cloud.ends.points[rows], off[rows, best[rows]], width[rows, best[rows]],
-             normal[piece], cloud.ends.gap[rows], cloud.ends.edge[rows])
-        )  # fmt: skip
-    if not found:
-        none = np.empty(0, np.int64)
-        return Matches(none, none, np.empty((0, 3)), np.empty(0), np.empty(0), np.empty((0, 3)), none, none)
-    return Matches(*(np.concatenate([one[m] for one in found]) for m in range(8)))
+        if len(away):
+            rows, piece, off, width = _match_scan(cloud, T[s], planes, normal, half, away, gate_mm, clear)
+            parts.append(
+                Matches(
+                    piece=piece, scan=np.full(len(rows), s), points=cloud.ends.points[rows], off=off, width=width,
+                    normal=normal[piece], gap=cloud.ends.gap[rows], edge=cloud.ends.edge[rows],
+                )
+            )  # fmt: skip
+    return Matches(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Matches)})
+
+
+def _match_scan(
+    cloud: Cloud, T: Floats, planes: Planes, normal: Floats, half: Floats, away: Ints, gate_mm: float, clear: bool
+) -> tuple[Ints, Ints, Floats, Floats]:
+    """Match the ends of one scan at its pose T (4, 4) to the pieces ``away``, which face away from it.
+
+    Returns rows of ends (m,), pieces (m,), and the distances and widths (m,) across these.
+    """
+    points = cloud.ends.points @ T[:3, :3].T + T[:3, 3]
+    across = cloud.ends.across @ T[:3, :3].T
+    faces = cloud.ends.normals @ T[:3, :3].T
+    k = min(NEIGHBOURS, len(away))
+    distance, index = cKDTree(planes.mean[away]).query(points, k=k, distance_upper_bound=MOST_DISTANCE_MM)
+    distance, index = distance.reshape(len(points), k), index.reshape(len(points), k)
+    q = away[np.minimum(index, len(away) - 1)]
+    y = points[:, None] - planes.mean[q]
+    off = np.einsum("nki,nki->nk", y, normal[q])
+    width = np.einsum("ni,nki->nk", across, normal[q])
+    length = np.linalg.norm(across, axis=1)[:, None]
+    fits = (
+        np.isfinite(distance)
+        & (width > ACROSS_COS * length)
+        & (np.abs(np.einsum("ni,nki->nk", faces, normal[q])) < SQUARE_COS)
+        & (np.abs(np.einsum("nki,nki->nk", y, planes.axes[q, :, 1])) < half[q, 0])
+        & (np.abs(np.einsum("nki,nki->nk", y, planes.axes[q, :, 2])) < half[q, 1])
+    )
+    cost = np.where(fits & (np.abs(off) < INSIDE * width + gate_mm), np.abs(off), np.inf)
+    best = np.argmin(cost, axis=1)[:, None]
+    good = np.isfinite(np.take_along_axis(cost, best, axis=1)[:, 0])
+    if clear:
+        spacing = np.abs(off - np.take_along_axis(off, best, axis=1))
+        room = np.take_along_axis(width, best, axis=1) + 2.0 * gate_mm
+        good &= ~(fits & (spacing > ONE_FACE_MM) & (spacing < room)).any(axis=1)
+    rows, best = np.flatnonzero(good), best[:, 0]
+    return rows, q[rows, best[rows]], off[rows, best[rows]], width[rows, best[rows]]
 
 
 def variance(ends: Matches) -> Floats:
-    """Variance (n,), mm^2, that each end is weighed by: that of its run's mean, times the ends of the run.
+    """Return the variance (n,), mm^2, by which each end is weighted: that of its run's mean, times the run's length.
 
-    An end is anywhere in its gap, of variance 1/12 in gaps. But an edge along the scanner's rows or columns, as a post
-    is, lies at the same part of one gap all its way: its many ends tell no more than one. What the ends of a run do not
-    scatter by within the gap, of the 1/12, they have in common. One that crosses rows and columns in step, as at 45
-    degrees, lies at the same part of each gap: see :func:`in_step`. What says more is taken.
+    The position of an end in its gap is uniform, with variance 1/12 in gaps squared. But an edge along the scanner's
+    rows or columns, such as a post's, lies at the same position in one gap all the way: its many ends carry the
+    information of one. The part of the 1/12 that is missing in the scatter of a run is common to its ends. An edge that
+    crosses rows and columns in step, as at 45 degrees, lies at the same position in each gap: see :func:`in_step`. The
+    larger of the two is used.
     """
     share = ends.off / np.maximum(ends.width, 1e-9)
     order = np.lexsort([share, ends.gap, ends.scan])
@@ -134,93 +169,80 @@ def variance(ends: Matches) -> Floats:
     of_mean = np.maximum(UNIFORM - scatter, UNIFORM / count)
     key = np.stack([ends.scan, ends.piece, ends.edge])
     _, edge = np.unique(key, axis=1, return_inverse=True)
-    found: Floats = ends.width**2 * np.maximum((count * of_mean)[run], in_step(share, edge.ravel()))
-    return found
+    weighted: Floats = ends.width**2 * np.maximum((count * of_mean)[run], in_step(share, edge.ravel()))
+    return weighted
 
 
 def in_step(share: Floats, edge: Ints) -> Floats:
-    """Variance (n,), in gaps^2, of the mean of an edge's ends, times their number: those at shares (n,) of their gaps.
+    """Return the variance (n,), in gaps squared, of the mean of an edge's ends, times their number.
 
-    Were the edge moved, all shares would move alike and begin anew at the gap's other end. Over all such moves, two
-    ends whose shares differ by d have the covariance 1/12 - d (1 - d) / 2, which is the sum over k of
-    cos(2 pi k d) / (2 pi^2 k^2). Ends anywhere in their gaps come to 1/12 each, all at one place to 1/12 together.
+    ``share`` (n,) is the position of each end in its gap. If the edge moved, all positions would change alike and
+    wrap around at the end of the gap. Over all such motions two ends at positions that differ by d have the covariance
+    1/12 - d (1 - d) / 2, the sum over k of cos(2 pi k d) / (2 pi^2 k^2). For ends at uniform positions this gives 1/12
+    each, for ends all at one position 1/12 together.
     """
     count = np.bincount(edge).astype(float)
     total = np.zeros(len(count))
     for k in range(1, HARMONICS + 1):
         turn = 2.0 * np.pi * k * share
         total += (np.bincount(edge, np.cos(turn)) ** 2 + np.bincount(edge, np.sin(turn)) ** 2) / (k * k)
-    found: Floats = np.maximum(total / (2.0 * np.pi**2 * count), UNIFORM)[edge]
-    return found
+    scaled: Floats = np.maximum(total / (2.0 * np.pi**2 * count), UNIFORM)[edge]
+    return scaled
 
 
-def bounded(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) -> Blocks:
-    """Add the ends of faces to the pieces that bound them, as blocks of kind 1; see :func:`matched`."""
-    if not blocks.pieces:
-        return blocks
-    ends = matched(clouds, blocks, T, gate_mm, clear=True)
-    if not len(ends.piece):
-        return blocks
-    weight = 1.0 / (variance(ends) + LEAST_MM**2)
-    key, inverse = np.unique(ends.piece * len(T) + ends.scan, return_inverse=True)
-    inverse = inverse.ravel()
-    sums = hashing.summed(extraction.sums_of(ends.points) * weight[:, None], inverse, len(key))
-    piece = np.concatenate([blocks.piece, key // len(T)])
-    order = np.argsort(piece, kind="stable")
-    return Blocks(
-        piece[order],
-        np.concatenate([blocks.scan, key % len(T)])[order],
-        np.vstack([blocks.sums, sums])[order],
-        np.concatenate([blocks.count, np.bincount(inverse).astype(float)])[order],
-        np.concatenate([blocks.kind, np.ones(len(key), np.int64)])[order],
-        blocks.pieces,
-    )
+def resolve_loose_motions(clouds: list[Cloud], blocks: Blocks, faces: Solution, reach_mm: float) -> Floats:
+    """Shift poses along motions that faces alone do not determine, to where most ends agree; returns T (k, 4, 4).
 
-
-def settled(clouds: list[Cloud], blocks: Blocks, faces: Solution, reach_mm: float) -> Floats:
-    """Move poses along what faces alone do not tell, to where most ends agree; returns T (k, 4, 4).
-
-    ``faces`` is an adjustment without ends. Along each of its loose motions all shifts up to ``reach_mm`` are tried:
-    the right one has every true end between its two rays, while ends that are matched wrongly agree on nothing.
+    ``faces`` is an adjustment without ends. Along each of its loose motions all shifts up to ``reach_mm`` are tried.
+    At the right one every correctly matched end lies between its two rays; wrongly matched ends agree on no shift.
     """
     T: Floats = faces.T.copy()
     k = len(T)
-    scale = np.tile([LEVER_MM] * 3 + [1.0] * 3, k)
-    known: npt.NDArray[np.bool_] = np.asarray(np.isfinite(faces.covariance).all(axis=1))
-    C = np.where(known[:, None] & known[None], faces.covariance, 0.0) * scale[:, None] * scale[None]
-    value, vector = np.linalg.eigh(C)
-    loose = [m for m in range(6 * k - 1, -1, -1) if value[m] > LOOSE_MM**2][:MOST_LOOSE]
-    first = np.full(blocks.pieces, -1, np.int64)
-    heaviest = np.argsort(blocks.sums[:, 9], kind="stable")
-    first[blocks.piece[heaviest]] = blocks.scan[heaviest]  # the last written counts: the heaviest
-    for m in loose:
-        ends = matched(clouds, blocks, T, reach_mm)
+    heaviest = np.full(blocks.pieces, -1, np.int64)  # scan with the largest weight on each piece
+    order = np.argsort(blocks.sums[:, 9], kind="stable")
+    heaviest[blocks.piece[order]] = blocks.scan[order]  # the last one written remains
+    for motion in _loose_motions(faces):
+        ends = match(clouds, blocks, T, reach_mm)
         if not len(ends.piece):
             return T
-        motion = (vector[:, m] / scale).reshape(k, 6)
-        largest = np.abs(vector[:, m].reshape(k, 6)[:, 3:]).max()
-        if largest < 1e-6:
-            continue
-        motion = motion / largest  # mm of the scan that moves most
         at = np.einsum("nij,nj->ni", T[ends.scan, :3, :3], ends.points) + T[ends.scan, :3, 3]
-        rate = np.einsum(
-            "ni,ni->n", ends.normal, _moved(motion, T, ends.scan, at) - _moved(motion, T, first[ends.piece], at)
-        )
-        tell = np.abs(rate) > 0.1
-        if tell.sum() < NEIGHBOURS:
+        relative = _velocity(motion, T, ends.scan, at) - _velocity(motion, T, heaviest[ends.piece], at)
+        rate = np.einsum("ni,ni->n", ends.normal, relative)
+        sensitive = np.abs(rate) > LEAST_RATE
+        if sensitive.sum() < NEIGHBOURS:
             continue
-        off, rate, room = ends.off[tell], rate[tell], 0.5 * ends.width[tell] + SLACK_MM
-        shifts = np.arange(-reach_mm, reach_mm + SHIFT_STEP_MM, SHIFT_STEP_MM)
-        held = np.array([((np.abs(off + rate * shift) < room) / room).sum() for shift in shifts])
-        good = np.flatnonzero(held > 0.98 * held.max())
-        step = float(shifts[good].mean()) if np.ptp(good) < len(shifts) // 10 else float(shifts[np.argmax(held)])
+        step = _best_shift(ends.off[sensitive], rate[sensitive], 0.5 * ends.width[sensitive] + SLACK_MM, reach_mm)
         for s in range(k):
             T[s, :3, :3] = rigid.rotation_from_vector(step * motion[s, :3]) @ T[s, :3, :3]
             T[s, :3, 3] += step * motion[s, 3:]
     return T
 
 
-def _moved(motion: Floats, T: Floats, scan: Ints, at: Floats) -> Floats:
-    """Return how points ``at`` (n, 3) of scans (n,) move with a motion (k, 6) of the scans about their own origins."""
-    found: Floats = np.cross(motion[scan, :3], at - T[scan, :3, 3]) + motion[scan, 3:]
-    return found
+def _loose_motions(faces: Solution) -> list[Floats]:
+    """Return motions (k, 6) with a standard deviation over LOOSE_MM, the largest first; their largest shift is 1."""
+    k = len(faces.T)
+    scale = np.tile([LEVER_MM] * 3 + [1.0] * 3, k)
+    known: npt.NDArray[np.bool_] = np.asarray(np.isfinite(faces.covariance).all(axis=1))
+    C = np.where(known[:, None] & known[None], faces.covariance, 0.0) * scale[:, None] * scale[None]
+    value, vector = np.linalg.eigh(C)
+    loose = [m for m in range(6 * k - 1, -1, -1) if value[m] > LOOSE_MM**2][:MOST_LOOSE]
+    motions = []
+    for m in loose:
+        largest = np.abs(vector[:, m].reshape(k, 6)[:, 3:]).max()
+        if largest >= 1e-6:
+            motions.append((vector[:, m] / scale).reshape(k, 6) / largest)
+    return motions
+
+
+def _best_shift(off: Floats, rate: Floats, room: Floats, reach_mm: float) -> float:
+    """Return the shift with the most ends between their rays; the middle of the shifts that are almost as good."""
+    shifts = np.arange(-reach_mm, reach_mm + SHIFT_STEP_MM, SHIFT_STEP_MM)
+    support = np.array([((np.abs(off + rate * shift) < room) / room).sum() for shift in shifts])
+    good = np.flatnonzero(support > 0.98 * support.max())
+    return float(shifts[good].mean()) if np.ptp(good) < len(shifts) // 10 else float(shifts[np.argmax(support)])
+
+
+def _velocity(motion: Floats, T: Floats, scan: Ints, at: Floats) -> Floats:
+    """Return the velocity (n, 3) of points ``at`` (n, 3) of scans (n,) under a motion (k, 6) about scans' origins."""
+    velocity: Floats = np.cross(motion[scan, :3], at - T[scan, :3, 3]) + motion[scan, 3:]
+    return velocity

@@ -1,9 +1,9 @@
-"""How far poses scatter by regions of the structure: what neighbouring faces have in common shows here.
+"""Covariances of poses raised to their scatter between regions of the structure.
 
-An adjustment takes the errors of pieces as independent. A scanner whose ranges or angles are bent, or a structure that
-moved in between, makes them alike over whole walls, and the poses are far less sure than the adjustment says. So each
-region is left out in turn (delete-a-group jackknife, one step of Newton each), and where a pose answers by more than
-its covariance lets expect by chance, that is raised.
+An adjustment takes the errors of pieces as independent. A scanner with systematic range or angle errors, or a structure
+that moved in between, makes them alike over whole walls, and the covariance is then far too small. Each region is left
+out in turn (delete-a-group jackknife, one Newton step each). Where a pose reacts by more than its covariance explains,
+beyond chance, the covariance is raised.
 """
 
 from __future__ import annotations
@@ -19,57 +19,56 @@ from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import Blocks
 from processor.stitching.planes import extraction, hashing
 
-HALVINGS = 3  # 8 regions
+HALVINGS = 3
+REGIONS = 2**HALVINGS
 LEAST_PIECES = 4  # of a region
-ALMOST_NONE = 1e-9
+ALMOST_NONE = 1e-9  # weight of the pieces left out
 BY_CHANCE = 1e-3
 
 
-def honest(blocks: Blocks, solution: Solution, reference: int) -> Solution:
-    """Return the solution with each scan's covariance raised to what the regions tell, never lowered."""
-    factor = factors(blocks, solution, reference)
-    by_row = np.repeat(factor, 6)
+def with_raised_covariance(blocks: Blocks, solution: Solution, reference: int) -> Solution:
+    """Return the solution with each scan's covariance raised to its scatter between regions, never lowered."""
+    by_row = np.repeat(factors(blocks, solution, reference), 6)
     return replace(solution, covariance=solution.covariance * by_row[:, None] * by_row[None])
 
 
 def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
-    """Return the ratio (k,) of the standard deviations by regions to those of the adjustment; 1 where chance may be it.
+    """Return the ratio (k,) of the standard deviations by regions to those of the adjustment; 1 if it may be chance.
 
-    The mean square of as many motions as there are regions, less one, by their covariance: chi-square by its freedoms.
+    The mean square of the motions without a region each, by their covariance, is chi-square by its freedoms.
     """
-    k, free = len(solution.T), 2**HALVINGS - 1
-    found = np.ones(k)
-    groups = 2**HALVINGS
-    if blocks.pieces < groups * LEAST_PIECES:
-        return found
-    world = extraction.moved(blocks.sums, solution.T[blocks.scan])
+    k, freedoms = len(solution.T), REGIONS - 1
+    factor = np.ones(k)
+    if blocks.pieces < REGIONS * LEAST_PIECES:
+        return factor
+    world = extraction.transformed(blocks.sums, solution.T[blocks.scan])
     mean = extraction.scatter(hashing.summed(world, blocks.piece, blocks.pieces))[0]
     region = regions(mean)
-    moved = np.stack(
+    steps = np.stack(
         [
             bundle_adjustment.step_without(blocks, solution, reference, region[blocks.piece] == g, ALMOST_NONE)
-            for g in range(groups)
+            for g in range(REGIONS)
         ]
     )
-    moved = (moved - moved.mean(axis=0)).reshape(groups, k, 6)
+    steps = (steps - steps.mean(axis=0)).reshape(REGIONS, k, 6)
     for s in range(k):
-        own = solution.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
-        if s == reference or not np.isfinite(own).all():
+        C = solution.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
+        if s == reference or not np.isfinite(C).all():
             continue
-        ratio = np.einsum("gi,gi->", moved[:, s], np.linalg.solve(own, moved[:, s].T).T) * (groups - 1) / groups / 6.0
-        found[s] = np.sqrt(ratio) if ratio > chi2.isf(BY_CHANCE, free) / free else 1.0
-    return found
+        ratio = np.einsum("gi,gi->", steps[:, s], np.linalg.solve(C, steps[:, s].T).T) * freedoms / REGIONS / 6.0
+        factor[s] = np.sqrt(ratio) if ratio > chi2.isf(BY_CHANCE, freedoms) / freedoms else 1.0
+    return factor
 
 
 def regions(places: Floats) -> Ints:
-    """Cut places (n, 3) in 2^HALVINGS regions (n,) of as many each, across their longest side in turn."""
-    found = np.zeros(len(places), np.int64)
+    """Divide points (n, 3) into REGIONS (n,) of equal numbers by repeated bisection across the longest side."""
+    region = np.zeros(len(places), np.int64)
     for _ in range(HALVINGS):
-        halves = 2 * found
-        for g in np.unique(found):
-            rows = np.flatnonzero(found == g)
+        halves = 2 * region
+        for g in np.unique(region):
+            rows = np.flatnonzero(region == g)
             axis = int(np.argmax(np.ptp(places[rows], axis=0)))
             order = np.argsort(places[rows, axis], kind="stable")
             halves[rows[order[len(rows) // 2 :]]] += 1
-        found = halves
-    return found
+        region = halves
+    return region

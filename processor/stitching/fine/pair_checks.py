@@ -1,4 +1,4 @@
-"""Pairs of scans by themselves: their own pose and covariance, held against the network, and around loops."""
+"""Single pairs of scans: pose and covariance from the pair alone, compared with the network and around loops."""
 
 from __future__ import annotations
 
@@ -20,46 +20,25 @@ GROSS_PROBABILITY = 1e-6
 
 @dataclass(frozen=True)
 class Pair:
-    """Two scans (rows a < b) as registered by what they share; frames are the clouds' own."""
+    """Two scans (rows a < b) registered by what they share; the frames are those of the clouds."""
 
     a: int
     b: int
     pieces: int
     T_a_b: Floats
-    covariance: Floats  # along a's axes, turns about b's origin
+    covariance: Floats  # along the axes of a, rotation about the origin of b
     residual: float
     chi2: float  # of its difference from the network's pose
 
-
-def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
-    """Register a pair by the pieces it shares alone; None where these are too few.
-
-    What the network found to be off keeps the weight it has there: two scans alone cannot tell.
-    """
-    T = network.T
-    weighed = replace(blocks, sums=blocks.sums * network.weight[:, None])
-    own = weighed.only((a, b))
-    if own.pieces < LEAST_PIECES:
-        return None
-    local = Blocks(own.piece, (own.scan == b).astype(np.int64), own.sums, own.count, own.kind, own.pieces)
-    start = np.stack([np.eye(4), rigid.invert(T[a]) @ T[b]])
-    found = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
-    own_covariance = found.covariance[6:, 6:]
-    d = frames.difference(found.T[1], start[1])
-    points = local.kind == 0
-    weight = local.sums[points, 9]
-    residual = float(np.sqrt((weight * found.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
-    return Pair(a, b, own.pieces, found.T[1], own_covariance, residual, float(d @ np.linalg.solve(own_covariance, d)))
-
-
-def is_gross(pair: Pair) -> bool:
-    """Whether a pair's own pose contradicts the network's beyond chance."""
-    return bool(pair.chi2 > chi2.isf(GROSS_PROBABILITY, 6))
+    @property
+    def is_gross(self) -> bool:
+        """Whether the pair's pose differs from the network's beyond chance."""
+        return bool(self.chi2 > chi2.isf(GROSS_PROBABILITY, 6))
 
 
 @dataclass(frozen=True)
 class Loop:
-    """Scans around a loop, its misclosure, and that by what the covariances let expect."""
+    """Scans around a loop (the first again at the end), its misclosure, and chi2 of this by its 6 freedoms."""
 
     rows: tuple[int, ...]
     mm: float
@@ -67,8 +46,31 @@ class Loop:
     ratio: float
 
 
+def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
+    """Register a pair by its shared pieces alone; None if these are too few.
+
+    Outliers keep their weights from the network, since two scans alone cannot decide which of them is wrong.
+    """
+    weighted = replace(blocks, sums=blocks.sums * network.weight[:, None])
+    of_pair = weighted.take(np.isin(blocks.scan, (a, b))).shared()
+    if of_pair.pieces < LEAST_PIECES:
+        return None
+    local = replace(of_pair, scan=(of_pair.scan == b).astype(np.int64))
+    start = np.stack([np.eye(4), rigid.invert(network.T[a]) @ network.T[b]])
+    solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
+    covariance = solution.covariance[6:, 6:]
+    d = frames.difference(solution.T[1], start[1])
+    points = local.kind == 0
+    weight = local.sums[points, 9]
+    residual = float(np.sqrt((weight * solution.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
+    return Pair(
+        a=a, b=b, pieces=local.pieces, T_a_b=solution.T[1], covariance=covariance, residual=residual,
+        chi2=float(d @ np.linalg.solve(covariance, d)),
+    )  # fmt: skip
+
+
 def loops(pairs: list[Pair], weights: Floats, reference: int, count: int) -> list[Loop]:
-    """Misclosures of the loops that pairs close over the tree of the heaviest pairs, at the first scan of each."""
+    """Return the loops that pairs close over the maximum spanning tree by weight, with their misclosures."""
     order = np.argsort(-weights, kind="stable")
     group = list(range(count))
     tree: dict[int, list[tuple[int, Pair]]] = {i: [] for i in range(count)}
@@ -86,7 +88,7 @@ def loops(pairs: list[Pair], weights: Floats, reference: int, count: int) -> lis
 
 
 def _path(tree: dict[int, list[tuple[int, Pair]]], start: int, end: int) -> list[Pair]:
-    """Pairs along the tree from end to start, so that a loop can go on from there."""
+    """Return the pairs along the tree from ``end`` to ``start``."""
     todo: list[tuple[int, list[Pair]]] = [(end, [])]
     seen = {end}
     while todo:
@@ -101,17 +103,18 @@ def _path(tree: dict[int, list[tuple[int, Pair]]], start: int, end: int) -> list
 
 
 def _loop(path: list[Pair], start: int) -> Loop:
+    """Chain the poses and covariances of pairs around a loop, in the frame of scan ``start``."""
     T, C, at, rows = np.eye(4), np.zeros((6, 6)), start, [start]
     for pair in path:
         forward = pair.a == at
-        # Covariance as turns about a's origin, which is the frame's: then it is carried along by the adjoint.
-        own = frames.about_origin(pair.covariance, pair.T_a_b[:3, 3])
+        # With rotations about the origin of a's frame the adjoint transforms the covariance.
+        covariance = frames.about_origin(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
-            C = C + _carried(T, own)
+            C = C + _transformed(covariance, T)
             T = T @ pair.T_a_b
         else:
             T = T @ rigid.invert(pair.T_a_b)
-            C = C + _carried(T, own)
+            C = C + _transformed(covariance, T)
         at = pair.b if forward else pair.a
         rows.append(at)
     xi = np.concatenate([rigid.vector_from_rotation(T[:3, :3]), T[:3, 3]])
@@ -119,10 +122,10 @@ def _loop(path: list[Pair], start: int) -> Loop:
     return Loop(tuple(rows), float(np.linalg.norm(xi[3:])), float(1e3 * np.linalg.norm(xi[:3])), ratio)
 
 
-def _carried(T: Floats, covariance: Floats) -> Floats:
-    """Covariance (6, 6) of a small motion in a frame, as one in the frame that T (4, 4) leads to."""
+def _transformed(covariance: Floats, T: Floats) -> Floats:
+    """Transform the covariance (6, 6) of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = T[:3, :3]
     J[3:, :3] = frames.cross_matrix(T[:3, 3]) @ T[:3, :3]
-    found: Floats = J @ covariance @ J.T
-    return found
+    transformed: Floats = J @ covariance @ J.T
+    return transformed

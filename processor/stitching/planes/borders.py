@@ -1,9 +1,9 @@
-"""Points where a face ends and the next one begins: they may lie on either.
+"""Points next to the border of a face, which may lie on this face or on the adjacent one.
 
-A cube that holds a face's border holds the first millimetres of the next face too, and these lie behind: the bars of
-a truss would look 0.02 mm thinner than they are, ten times what the points' noise makes of a face. So where a
-neighbour on the scanner's grid lies off the face, a point of it is left out: it alone cannot be told from the next
-face's. Whether that is so depends on the neighbour's place, not on the point's own noise, and so nothing is preferred.
+A cube at the border of a face also holds the first millimetres of the adjacent face, which lie behind it. They bias the
+plane: bars of a truss come out 0.02 mm too thin, ten times the effect of the point noise. A point is therefore left out
+if a neighbour on the scanner's grid lies off the face. This criterion depends on the neighbour's position and not on
+the point's own noise, so that it introduces no bias.
 """
 
 from __future__ import annotations
@@ -15,14 +15,31 @@ from numba import njit
 from processor.model import Floats, Ints
 from processor.stitching.planes.extraction import Planes
 
-ON_SIGMAS = 3.0
-LEAST_SHARE = 0.5  # of a piece's points
-BEYOND = 0.05  # of the range: what lies so far behind is no side of the same bar
+ON_SIGMAS = 3.0  # a point this close to a plane lies on it
+LEAST_SHARE = 0.5  # of a piece's points that must remain
+BEYOND = 0.05  # of the range: a point this far behind the plane is not on a side face of the same bar
+
+
+def inside(points: Floats, grid: Ints, piece: Ints, planes: Planes) -> npt.NDArray[np.bool_]:
+    """Return which points (n,) lie clear of the borders of their planar piece.
+
+    ``points`` (n, 3) are in the scanner's frame, ``grid`` is their scan grid, ``piece`` (n,) a row of ``planes`` or -1.
+    A piece that would lose most of its points, such as a bar hit by few rays, keeps them all.
+    """
+    limit = ON_SIGMAS * np.sqrt(planes.variance[:, 0])
+    clear = np.zeros(len(points), np.bool_)
+    clear_of_borders(grid, np.ascontiguousarray(points), piece, planes.mean, planes.normal, limit, clear)
+    count = len(planes.count)
+    on_piece = piece >= 0
+    whole = np.bincount(piece[on_piece], minlength=count)
+    few = np.bincount(piece[clear], minlength=count) < LEAST_SHARE * whole
+    selected: npt.NDArray[np.bool_] = clear | (on_piece & few[piece])
+    return selected
 
 
 @njit(cache=True, nogil=True)
 def clear_of_borders(grid, points, piece, mean, normal, limit, clear):  # type: ignore[no-untyped-def]
-    """Mark points on their piece's plane, mean and normal (k, 3), whose neighbours on the grid lie on it or far off."""
+    """Mark points on the plane of their piece whose grid neighbours lie on the plane too, or far behind it."""
     rows, columns = grid.shape
     for r in range(rows):
         for c in range(columns):
@@ -49,19 +66,3 @@ def clear_of_borders(grid, points, piece, mean, normal, limit, clear):  # type: 
                     off += normal[f, m] * (points[j, m] - mean[f, m])
                 good &= abs(off) < limit[f] or abs(off) > reach
             clear[i] = good
-
-
-def inside(points: Floats, grid: Ints, piece: Ints, planes: Planes) -> npt.NDArray[np.bool_]:
-    """Whether points (n, 3), seen from the origin on a ``grid`` of rows, are to stand for their ``piece`` (n,) or -1.
-
-    A piece that would lose most of its points, as a bar that few rays met, keeps them all.
-    """
-    limit = ON_SIGMAS * np.sqrt(planes.variance[:, 0])
-    clear = np.zeros(len(points), np.bool_)
-    clear_of_borders(grid, np.ascontiguousarray(points), piece, planes.mean, planes.normal, limit, clear)
-    count = len(planes.count)
-    held = piece >= 0
-    whole = np.bincount(piece[held], minlength=count)
-    few = np.bincount(piece[clear], minlength=count) < LEAST_SHARE * whole
-    found: npt.NDArray[np.bool_] = clear | (held & few[piece])
-    return found

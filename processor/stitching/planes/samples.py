@@ -1,8 +1,8 @@
-"""The places of a scan that votes and checks are taken at: one a coarse cube and direction."""
+"""Patches: a scan's faces sampled on coarse cubes, as the coarse registration votes with and checks."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -10,41 +10,38 @@ from processor.model import Floats, Ints
 from processor.stitching.planes import extraction, hashing
 from processor.stitching.planes.scan_planes import Cloud
 
-MOST_NORMALS = 1500
 
-
-@dataclass(frozen=True)
-class Elements:
-    """Places (n, 3) with the unit normal (n, 3) of the face there, in the cloud's frame."""
+class Patches(NamedTuple):
+    """Centres (n, 3) of patches and their unit normals (n, 3), in the cloud's frame."""
 
     points: Floats
     normals: Floats
 
 
-def elements(cloud: Cloud, side_mm: float) -> Elements:
-    """Gather a cloud's cells in cubes of a side, faces that look different ways apart."""
-    where = extraction.cells_of(cloud.cells.mean, side_mm)
-    # A face's side of the cube by its normal, in axes that no structure is built along.
-    group = facing(cloud.normal)
-    _, first, inverse = np.unique(extraction.packed(where, group), return_index=True, return_inverse=True)
+def sample(cloud: Cloud, side_mm: float) -> Patches:
+    """Average a cloud's cells over cubes of side ``side_mm``, one patch for each cube and facing direction."""
+    where = extraction.cells_of(cloud.mean, side_mm)
+    _, first, inverse = np.unique(
+        extraction.packed(where, facing(cloud.normal)), return_index=True, return_inverse=True
+    )
     inverse = inverse.ravel()
-    one = np.ones(len(inverse))
-    count = np.bincount(inverse, one, len(first))
-    points = hashing.summed(cloud.cells.mean, inverse, len(first)) / count[:, None]
+    count = np.bincount(inverse, np.ones(len(inverse)), len(first))
+    points = hashing.summed(cloud.mean, inverse, len(first)) / count[:, None]
     normals = hashing.summed(cloud.normal, inverse, len(first))
-    return Elements(points, normals / np.linalg.norm(normals, axis=1)[:, None])
+    return Patches(points, normals / np.linalg.norm(normals, axis=1)[:, None])
 
 
 def facing(normals: Floats) -> Ints:
-    """Return which of six ways (n,) each of normals (n, 3) looks most, in axes that no structure is built along."""
-    turned = normals @ OBLIQUE
-    axis = np.argmax(np.abs(turned), axis=1)
-    sign = np.take_along_axis(turned, axis[:, None], axis=1)[:, 0] < 0.0
-    found: Ints = 2 * axis + sign
-    return found
+    """Return which of the six directions of oblique axes (n,) is nearest to each of normals (n, 3)."""
+    components = normals @ OBLIQUE
+    axis = np.argmax(np.abs(components), axis=1)
+    negative = np.take_along_axis(components, axis[:, None], axis=1)[:, 0] < 0.0
+    direction: Ints = 2 * axis + negative
+    return direction
 
 
 def _oblique() -> Floats:
+    """Return axes (3, 3) oblique to those of any built structure: no class border runs through a main direction."""
     a, b, c = 0.61, 0.37, 0.83
     X = np.array([[1, 0, 0], [0, np.cos(a), -np.sin(a)], [0, np.sin(a), np.cos(a)]])
     Y = np.array([[np.cos(b), 0, np.sin(b)], [0, 1, 0], [-np.sin(b), 0, np.cos(b)]])

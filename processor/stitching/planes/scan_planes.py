@@ -1,66 +1,48 @@
-"""A scan as stitching sees it: sums of its points in small cells, and the flat pieces they make up."""
+"""A scan as cells with moments and the planar pieces that these form."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from processor.geometry import scanner_rays as grid_rays
+from processor.geometry import scanner_rays
 from processor.model import Floats, Ints, Scan
-from processor.stitching.coarse.free_space import Sight
 from processor.stitching.planes import borders, extraction, hashing
 from processor.stitching.planes.edges import Ends, ends_of, grid_of
 from processor.stitching.planes.extraction import Planes
+from processor.stitching.planes.free_space import FreeSpace
 
 POINTS_A_CELL = 5.0
 LEVELS = 6
 KEPT_BELOW = 2  # cells are kept this many levels finer than the piece they belong to
 LIMIT_SIGMAS = 2.5
-NARROW = ((0.004, 0.1), (0.01, 0.15), (0.03, 0.25))  # widths of directions, and how many may hold two depths
-APART = 0.05  # of the range
+NARROW = ((0.004, 0.1), (0.01, 0.15), (0.03, 0.25))  # widths of directions, and share of these that may hold two depths
+DEPTH_STEP = 0.05  # of the range
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """A scan in its own frame less ``origin``: the scanner where it is known, else the middle of the points.
+    """A scan in its file's frame less ``origin``: the scanner's position if known, else the centroid of the points.
 
-    The cells' ``sums`` (m, 10) are relative to the origin. ``piece`` (m,) is the row of
-    ``planes`` that a cell lies on; cells of none are left out. Normals look at the scanner.
+    The cells' moments ``sums`` (m, 10) are relative to the origin; cells on no planar piece are left out. Normals point
+    towards the scanner, if its position is known.
     """
 
-    name: str
     origin: Floats
     has_position: bool
     cell_mm: float
-    sigma_mm: float  # scatter of flat pieces, as found
+    sigma_mm: float  # estimated scatter across planar pieces
     sums: Floats
-    cells: Planes
-    piece: Ints
-    level: Ints  # (k,) of each piece
-    planes: Planes
-    normal: Floats  # (m, 3) of the cells: their pieces'
-    ends: Ends  # of the pieces; none where the scanner's grid is not known
-    sight: Sight | None  # None where the scanner's place is not known
+    mean: Floats  # (m, 3) of the cells' points
+    normal: Floats  # (m, 3) of the pieces that the cells lie on
+    planes: Planes  # of the pieces
+    ends: Ends  # of the pieces; none without the scan grid
+    free_space: FreeSpace | None  # None where the scanner's position is not known
 
 
-def cell_size(points: Floats) -> float:
-    """Side of a cube, mm, such that those with points hold POINTS_A_CELL on average."""
-    some = points[:: max(1, len(points) // 400_000)]
-    share = len(some) / len(points)
-    spread = float(np.quantile(np.linalg.norm(some - np.median(some, axis=0), axis=1), 0.9))
-    size = max(spread, 1e-6) / 1024.0
-    while size < spread:
-        # A thinned cloud fills fewer cells; what counts is the mean number in an occupied cell of the whole.
-        held = len(some) / hashing.distinct_count(extraction.packed(extraction.cells_of(some, size)))
-        if 1.0 + (held - 1.0) / share >= POINTS_A_CELL:
-            break
-        size *= 2.0**0.5
-    return size
-
-
-def prepared(scan: Scan, cell_mm: float = 0.0) -> Cloud:
-    """Take a scan apart into cells and flat pieces; ``cell_mm`` 0 = by the scan's density."""
+def extract(scan: Scan, cell_mm: float = 0.0) -> Cloud:
+    """Segment a scan into cells and planar pieces; ``cell_mm`` 0 = from the density of its points."""
     known = bool(scan.position.size) or _seen_from_origin(scan)
     position = scan.position if scan.position.size else np.zeros(3)
     origin = position if known else scan.origin + scan.points.mean(axis=0)
@@ -71,71 +53,90 @@ def prepared(scan: Scan, cell_mm: float = 0.0) -> Cloud:
     size = cell_mm or cell_size(points)
     cells = extraction.cells_of(points, size)
     first, of_point = hashing.numbered(extraction.packed(cells))
-    sums = hashing.sums_of_points(points, of_point, len(first))
-    cells = cells[first]
+    cells, sums = cells[first], hashing.sums_of_points(points, of_point, len(first))
     sigma = _scatter(cells, sums, size, scan.sigma_mm)
     piece, level = extraction.flat_pieces(cells, sums, size, LIMIT_SIGMAS * sigma, LEVELS)
     on_grid = known and len(scan.grid_row) > 0
     if on_grid:
         row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
-        held = np.flatnonzero(piece >= 0)
-        rough = extraction.planes_of(hashing.summed(sums[held], piece[held], len(level)))
-        sure = borders.inside(points, grid_of(row, column), piece[of_point], rough)
-        sums = hashing.sums_of_points(points[sure], of_point[sure], len(first))
+        on_piece = np.flatnonzero(piece >= 0)
+        rough = extraction.planes_of(hashing.summed(sums[on_piece], piece[on_piece], len(level)))
+        clear = borders.inside(points, grid_of(row, column), piece[of_point], rough)
+        sums = hashing.sums_of_points(points[clear], of_point[clear], len(first))
+    merged, piece_of_merged = _merged(cells, sums, piece, level)
+    planes = extraction.planes_of(hashing.summed(merged, piece_of_merged, len(level)))
+    if known:
+        planes = _facing_scanner(planes)
+    ends, unanswered = Ends(), np.empty((0, 3))
+    rays = scanner_rays.fitted(points, row, column) if on_grid else None
+    if rays is not None:
+        ends = ends_of(points, row, column, piece[of_point], planes, sigma, rays)
+        unanswered = scanner_rays.unanswered(rays, row, column)
+    return Cloud(
+        origin=origin, has_position=known, cell_mm=size, sigma_mm=sigma, sums=merged,
+        mean=extraction.scatter(merged)[0], normal=planes.normal[piece_of_merged], planes=planes, ends=ends,
+        free_space=FreeSpace.from_rays(points, unanswered) if known else None,
+    )  # fmt: skip
+
+
+def cell_size(points: Floats) -> float:
+    """Return the side, mm, of cubes that hold POINTS_A_CELL points on average, empty ones not counted."""
+    some = points[:: max(1, len(points) // 400_000)]
+    share = len(some) / len(points)
+    spread = float(np.quantile(np.linalg.norm(some - np.median(some, axis=0), axis=1), 0.9))
+    size = max(spread, 1e-6) / 1024.0
+    while size < spread:
+        # The subsample occupies fewer cells than the whole cloud: its mean count is scaled to that of all points.
+        mean_count = len(some) / hashing.distinct_count(extraction.packed(extraction.cells_of(some, size)))
+        if 1.0 + (mean_count - 1.0) / share >= POINTS_A_CELL:
+            break
+        size *= 2.0**0.5
+    return size
+
+
+def _scatter(cells: Ints, sums: Floats, size: float, sigma_mm: float) -> float:
+    """Estimate the scatter of planar places across their planes, mm; at least the scanner's ``sigma_mm``, if known."""
+    first, inverse = hashing.numbered(extraction.packed(cells >> 1))
+    total = hashing.summed(sums, inverse, len(first))
+    variance = np.linalg.eigvalsh(extraction.scatter(total[total[:, 9] >= 12.0])[1])
+    flat = variance[(variance[:, 0] < 0.02 * variance[:, 1]) & (variance[:, 1] > (0.1 * size) ** 2), 0]
+    estimate = float(np.sqrt(np.quantile(np.maximum(flat, 0.0), 0.75))) if len(flat) else 0.02 * size
+    least = sigma_mm if np.isfinite(sigma_mm) else 0.0
+    return min(max(estimate, least, 1e-3 * size), 0.15 * size)
+
+
+def _merged(cells: Ints, sums: Floats, piece: Ints, level: Ints) -> tuple[Floats, Ints]:
+    """Merge the cells of large pieces, which are many and redundant; returns moments (m, 10) and pieces (m,)."""
     on = np.flatnonzero((piece >= 0) & (sums[:, 9] > 0.0))
-    # Cells of large pieces are put together: there are many, and they say little that a coarser one does not.
     down = np.maximum(level[piece[on]] - KEPT_BELOW, 0)
     key = extraction.packed(cells[on] >> down[:, None])
     _, inverse = np.unique(np.stack([key, piece[on]], axis=1), axis=0, return_inverse=True)
     inverse = inverse.ravel()
     count = int(inverse.max()) + 1 if len(inverse) else 0
-    kept = hashing.summed(sums[on], inverse, count)
-    of = np.zeros(count, np.int64)
-    of[inverse] = piece[on]
-    planes = extraction.planes_of(hashing.summed(kept, of, len(level)))
-    if known:
-        turn = np.where(np.einsum("ni,ni->n", planes.normal, planes.mean) > 0.0, -1.0, 1.0)
-    else:
-        turn = np.ones(len(planes.normal))
-    planes = Planes(planes.count, planes.mean, planes.normal * turn[:, None], planes.variance, planes.axes)
-    ends, lost = Ends(), np.empty((0, 3))
-    if on_grid:
-        rays = grid_rays.fitted(points, row, column)
-        if rays is not None:
-            ends = ends_of(points, row, column, piece[of_point], planes, sigma, rays)
-            lost = grid_rays.unanswered(rays, row, column)
-    return Cloud(
-        scan.name, origin, known, size, sigma, kept, extraction.planes_of(kept), of, level, planes,
-        planes.normal[of], ends,
-        Sight.of(points, lost) if known else None,
-    )  # fmt: skip
+    piece_of_merged = np.zeros(count, np.int64)
+    piece_of_merged[inverse] = piece[on]
+    return hashing.summed(sums[on], inverse, count), piece_of_merged
 
 
-def _scatter(cells: Ints, sums: Floats, size: float, said: float) -> float:
-    """Scatter of flat places across their planes, mm: what is said of the scanner, or more where more is found."""
-    first, inverse = hashing.numbered(extraction.packed(cells >> 1))
-    total = hashing.summed(sums, inverse, len(first))
-    variance = np.linalg.eigvalsh(extraction.scatter(total[total[:, 9] >= 12.0])[1])
-    flat = variance[(variance[:, 0] < 0.02 * variance[:, 1]) & (variance[:, 1] > (0.1 * size) ** 2), 0]
-    found = float(np.sqrt(np.quantile(np.maximum(flat, 0.0), 0.75))) if len(flat) else 0.02 * size
-    least = said if np.isfinite(said) else 0.0
-    return min(max(found, least, 1e-3 * size), 0.15 * size)
+def _facing_scanner(planes: Planes) -> Planes:
+    sign = np.where(np.einsum("ni,ni->n", planes.normal, planes.mean) > 0.0, -1.0, 1.0)
+    return replace(planes, normal=planes.normal * sign[:, None])
 
 
 def _seen_from_origin(scan: Scan) -> bool:
-    """Whether the points can have been seen from the frame's origin: then that is where the scanner was (SOCS)."""
+    """Return whether the points are consistent with a scanner at the frame's origin (SOCS)."""
     points = scan.points[:: max(1, len(scan.points) // 200_000)] + scan.origin
     R = np.linalg.norm(points, axis=1)
     points, R = points[R > 1e-9], R[R > 1e-9]
     if len(R) < 100:
         return False
-    # What lies behind something in the same narrow direction was not seen from there.
+    # From its own position a scanner sees a single depth in each narrow direction.
     u = points / R[:, None]
     for width, most in NARROW:
         key = extraction.packed(extraction.cells_of(u, width))
         order = np.lexsort([R, key])
         same = key[order][1:] == key[order][:-1]
         if same.sum() > 0.2 * len(R):
-            apart = np.log(R[order][1:] / R[order][:-1]) > APART
-            return float((same & apart).sum()) < most * float(same.sum())
+            steps = np.log(R[order][1:] / R[order][:-1]) > DEPTH_STEP
+            return float((same & steps).sum()) < most * float(same.sum())
     return False

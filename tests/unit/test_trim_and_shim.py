@@ -1,4 +1,4 @@
-"""Trim and build-up of a joint: amounts by hand, optima by another solver, probabilities by draws of their own."""
+"""Trim and build-up of a joint: amounts by hand, optima by another solver, probabilities by independent draws."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from scipy.stats import norm
 
 from processor.limits import standards
 from processor.model import Checked, StepRun, Tolerance, UsageError
+from processor.preassembly.params import TrimParams
 from processor.preassembly.verdicts import joint_measures, joints, trim_and_shim
-from processor.preassembly.verdicts.trim_and_shim import TrimParams, propose
+from processor.preassembly.verdicts.trim_and_shim import propose
 from processor.store import store
 
 B, H = 700.0, 900.0  # half the width and the height of the section; y left, z up
@@ -72,14 +73,14 @@ def test_a_tilted_end_is_cut_parallel():
     np.testing.assert_allclose(found.plane, [4.0, 0.0, -2.0], atol=1e-9)
     np.testing.assert_allclose(found.gap_after, 0.0, atol=1e-9)
     assert "5.8 mm at P1 bottom left down to 2.2 mm at P3 top right" in found.sentence
-    # And about z: what is 1 mm per m more to the right (y < 0).
+    # And about z: 1 mm per m more to the right (y < 0).
     turned = proposed(along(-4.0 + 1e-3 * POINTS[:, 1]))
     np.testing.assert_allclose(turned.plane, [4.0, -1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(turned.cut[[5, 7]], [4.7, 3.3], atol=1e-9)
 
 
 def test_a_wedge_is_cut_where_it_is_narrow_and_filled_where_it_is_wide():
-    """From -1.5 at the bottom to 5.5 at the top: cutting 1.5 mm to nothing leaves 0 to 5.5, and that is filled."""
+    """From -1.5 at the bottom to 5.5 at the top: a cut of 1.5 mm, tapering to 0, leaves 0 to 5.5, which is filled."""
     found = proposed(along(2.0 + 3.5 * POINTS[:, 2] / H))
     assert found.action == "trim and build up"
     np.testing.assert_allclose(found.cut, [1.5, 1.5, 0, 0, 1.5, 0.75, 0, 0.75], atol=1e-9)
@@ -105,7 +106,7 @@ def test_cuts_are_planes_that_take_nothing_on(seed):
     even = A @ trim_and_shim._even(A, lacking)
     assert even.min() > -1e-9
     rest = even - lacking
-    np.testing.assert_allclose(A[:, 1:].T @ rest, 0.0, atol=1e-9)  # nothing is left to tilt
+    np.testing.assert_allclose(A[:, 1:].T @ rest, 0.0, atol=1e-9)  # the residual has no tilt
     covering = A @ trim_and_shim._covering(A, lacking)
     assert (covering - np.maximum(lacking, 0.0)).min() > -1e-9
     assert covering.sum() <= 8.0 * max(lacking.max(), 0.0) + 1e-9  # no more than a straight cut of that depth
@@ -121,7 +122,7 @@ def test_cuts_are_planes_that_take_nothing_on(seed):
 
 
 def test_the_probability_after_a_cut_against_draws():
-    """What is left: the gaps' own errors and a plane's, off by 0.6 mm at a corner in depth and both tilts together."""
+    """Errors after the work: those of the gaps, and 0.6 mm at a corner by a plane's depth and tilts."""
     covariance = 0.09 * np.eye(24)
     found = proposed(along(-3.0), covariance, params=TrimParams(cut_sd_mm=0.6))
     rng = np.random.default_rng(77)
@@ -131,7 +132,7 @@ def test_the_probability_after_a_cut_against_draws():
     gap += rng.normal(0.0, 0.3, gap.shape)
     expected = ((gap >= -1.0) & (gap <= 2.0)).all(axis=1).mean()
     assert found.groove_probability == pytest.approx(expected, abs=0.03)
-    # Twelve misalignments of sd 0.3 against 2: 6.7 sd, all but sure.
+    # Twelve misalignments of sd 0.3 against 2: 6.7 sd, all but certain.
     assert found.misalignment_probability == 1.0
     assert found.probability == found.groove_probability
     better = proposed(along(-3.0), covariance, params=TrimParams(cut_sd_mm=0.6, aim_mm=0.5))
@@ -155,7 +156,7 @@ def test_as_it_is_half_of_the_draws_keep_a_limit_that_a_value_is_on():
 
 
 def test_nothing_is_cut_in_order_to_be_filled_again():
-    """One corner overlaps by 45.9 mm, its neighbours are open: a plane through it would cut these too."""
+    """One corner overlaps by 45.9 mm, its neighbours are open: a plane through it would cut these as well."""
     x = _between([13.0, 10.3, -45.9, 16.0])
     found = proposed(along(x))
     assert found.action == "trim and build up"
@@ -208,14 +209,14 @@ def test_no_trim_mends_what_is_misaligned():
         "no trim mends the misalignment, 2 mm at most, of the right part at P7 top 3.1 mm up (1.1 too much), "
         "P6 right 2.4 mm to the right (0.4 too much)."
     )
-    # Nothing that holds with 0 % is called a proposal.
+    # A work that holds with 0 % is not proposed.
     assert "no cut or build-up makes all limits hold; for the groove gap alone, cut" in found.sentence
     assert "the groove gap then holds with 100%" in found.sentence
     assert " 0%" not in found.sentence
 
 
 def test_a_cut_that_gains_too_little_is_not_proposed():
-    # A gap of -0.8 with errors of 0.2: 0.84 of it alone keep -1; cut by a saw of 2 mm that would fall.
+    # A gap of -0.8 with errors of 0.2 keeps -1 with 0.84; a cut with errors of 2 mm would lower it.
     covariance = np.zeros((24, 24))
     covariance[0, 0] = 0.04
     gaps = along(0.0)

@@ -1,4 +1,4 @@
-"""Parts without a mesh: their outer box against the generator's closed form, and what comes of it."""
+"""Parts without a mesh: their outer box against the generator's closed form, and the measurement with it."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from processor.geometry import box_girder, rigid
 from processor.model import InputError, UsageError
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.ends import plate_sides
+from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import measure
-from processor.preassembly.parts.systematic_errors import SystematicParams
 from processor.scan_folder import folder
 from processor.store import store
 
@@ -39,7 +39,7 @@ def surrogate_of(parts_, i, **options):
 
 
 def sections(part, count=400):
-    """Arc lengths (n,), half widths, heights and a number in 0..1 each."""
+    """Chainages (n,), half widths, heights and a number in 0..1 each."""
     rng = np.random.default_rng(5)
     s = rng.uniform(part.s0, part.s1, count)
     return s, part.b(s), part.h(s), rng.uniform(0.0, 1.0, count)
@@ -59,7 +59,7 @@ def test_a_rib_is_its_outer_faces(bridge):
     s, b, h, w = sections(part)
     for u, v in (((2 * w - 1) * b, 0 * h), ((2 * w - 1) * b, h), (b, w * h), (-b, w * h)):
         assert off(mesh, part.point(s, u, v)).max() < 0.01
-    # Nothing besides: all of the box is within the outer faces' bounds.
+    # And nothing else: all of the box is within the outer faces' bounds.
     assert mesh.area < 1.02 * (2 * (part.s1 - part.s0) * (b[0] * 2 + h[0]) * 1.06 + 4 * 20 * (b[0] * 2 + h[0]))
 
 
@@ -186,7 +186,7 @@ def test_only_an_arch_bridge_goes_without_meshes(tmp_path):
         export_folder.export(tmp_path / "f.h5", tmp_path / "out", "ply", with_truth=True, with_meshes=False)
 
 
-# --- what comes of it ------------------------------------------------------------------------------------------------
+# --- measurement -----------------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -224,12 +224,17 @@ def test_parts_of_one_shape_are_named():
     assert [box_girder.alike(part, scene.arch) for part in scene.arch.parts] == [()] * 5
 
 
+def measured(scan, index, design):
+    systematic = SystematicParams()
+    return measure.estimate([measure.fit([scan], index, design, 1.0, systematic)], systematic)[0]
+
+
 @pytest.mark.slow
 def test_a_wrong_part_is_not_called_ok(without_meshes):
     scene, _ = without_meshes
     scans = {scan.component: scan for scan in scene.scans}
     for asked, came in ((1, "rib2"), (2, "rib1"), (0, "rib3")):
-        found = measure.measure([scans[came]], asked, scene.arch, 1.0, SystematicParams())
+        found = measured(scans[came], asked, scene.arch)
         assert found.status != "ok", (asked, came, found.message)
 
 
@@ -241,7 +246,7 @@ def test_poses_of_any_kind_are_right_or_not_called_ok(without_meshes):
         R = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         turn = rigid.transform(R * np.linalg.det(R), rng.uniform(-1e4, 1e4, 3))
         scan = dataclasses.replace(scene.scans[i], points=rigid.apply(turn, scene.scans[i].points))
-        found = measure.measure([scan], i, scene.arch, 1.0, SystematicParams())
+        found = measured(scan, i, scene.arch)
         back = found.T_bridge_scan @ turn @ rigid.invert(truth.arch.T_bridge_scan[i])
         assert found.status == "ambiguous" or rigid.rotation_angle(back[:3, :3]) < 0.002
 
@@ -253,14 +258,14 @@ def test_the_outer_layer():
     rng = np.random.default_rng(2)
     outside, inside = rng.normal(1.5, 1.0, 3000), rng.normal(-22.0, 1.0, 2800)
     out = np.concatenate([outside, inside, rng.uniform(-50.0, 50.0, 60)])
-    kept = plate_sides.outer(out)
+    kept = plate_sides.outer_layer(out)
     assert kept[:3000].all()
     assert not kept[3000:5800].any()
-    assert plate_sides.outer(outside).all()
-    assert plate_sides.outer(
+    assert plate_sides.outer_layer(outside).all()
+    assert plate_sides.outer_layer(
         np.concatenate([outside, rng.uniform(-50.0, 50.0, 60)])
     ).all()  # strays are left to the fit
-    assert plate_sides.outer(np.empty(0)).shape == (0,)
+    assert plate_sides.outer_layer(np.empty(0)).shape == (0,)
 
 
 @pytest.mark.parametrize("walls", [True, False])
@@ -270,5 +275,5 @@ def test_a_plates_thickness(true_mm, walls):
     ring = np.stack([np.zeros(2000), rng.uniform(0.0, true_mm, 2000)], axis=1)
     deep = np.stack([rng.uniform(-80.0, 0.0, 4000), np.repeat([0.0, true_mm], 2000)], axis=1)[: 4000 if walls else 2000]
     x, e = (np.vstack([ring, deep]) + rng.normal(0.0, 0.8, (2000 + len(deep), 2))).T
-    assert abs(plate_sides.plate_mm(x, e, 0.8, 20.0) - true_mm) < (0.2 if walls else 1.0)
-    assert plate_sides.plate_mm(x[:5], e[:5], 0.8, 20.0) == 20.0  # too few to say
+    assert abs(plate_sides.plate_thickness(x, e, 0.8, 20.0) - true_mm) < (0.2 if walls else 1.0)
+    assert plate_sides.plate_thickness(x[:5], e[:5], 0.8, 20.0) == 20.0  # too few to say

@@ -1,4 +1,4 @@
-"""Bands of the source paper's methods: what they make of parts as designed, against bridges whose errors are known."""
+"""Bands of the source paper's methods by parts as designed, against bridges with known errors."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ from tests.support import arch_clouds
 
 
 def extracted(scene, truth):
-    """Features of a bridge's parts; attitudes are as they would be found."""
+    """Features of a bridge's parts, with the attitudes that the search would find."""
     parts = []
     for i, (scan, part, T) in enumerate(zip(scene.scans, scene.arch.parts, truth.arch.T_bridge_scan, strict=True)):
         hypotheses = attitude.principal_hypotheses(scan.points, part)
@@ -36,7 +36,7 @@ def bridge():
 
 def banded(design, parts, method, **given):
     params = preassembly_step.Params(method=method, **given)
-    repeated = bootstrap_bands.scanned_again(parts, design, params)
+    repeated = bootstrap_bands.repeat_scans(parts, design, params)
     return bootstrap_bands.with_bands(methods.assemble(parts, design, params), repeated, design, params)
 
 
@@ -68,7 +68,9 @@ def test_a_part_as_built_is_laid_on_its_design():
     T = arch_clouds.random_pose(rng)
     scan = Scan("rib2", rigid.apply(T, np.vstack([built, strays])), component="rib2")
     found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok", "")
-    part = methods.Part("rib2", scan, found, (None, None), np.empty((0, 3)), None, "")
+    part = methods.PartFeatures(
+        name="rib2", scan=scan, attitude=found, ends=(None, None), lines=np.empty((0, 3)), edges=None, trouble=""
+    )
     laid = bootstrap_bands._as_designed(part, design)
     assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)
     assert (~laid.near).sum() == 50
@@ -84,7 +86,7 @@ def test_a_part_as_built_is_laid_on_its_design():
     "method", ["design-aided", *(pytest.param(one, marks=pytest.mark.slow) for one in ("corner", "line"))]
 )
 def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
-    """All that a method says of this bridge is wrong: its parts are exactly as designed."""
+    """All deviations of this bridge are errors of the method: its parts are exactly as designed."""
     result = banded(*bridge, method)
     joints = np.cumsum([part.edges.design_left.length for part in bridge[1]])[:-1]
     assert result.bands_as_designed
@@ -92,10 +94,10 @@ def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
         (result.linear_deviation, result.linear_ci95),
         (result.best_fit_linear_deviation, result.best_fit_linear_ci95),
     ):
-        # The last points of a part may fall beside its last station in some repetitions, and not in others.
+        # The last interval of a part may have points in some repetitions only.
         apart = np.isfinite(band) != np.isfinite(said)
         assert apart.sum() <= 1
-        assert (np.abs(joints[:, None] - result.linear_station[apart]) < errors.STATION_MM).any(axis=0).all()
+        assert (np.abs(joints[:, None] - result.linear_station[apart]) < errors.INTERVAL_MM).any(axis=0).all()
         known = np.isfinite(said) & np.isfinite(band)
         assert (said <= band)[known].mean() > 0.9
     figures = [result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max]
@@ -113,7 +115,7 @@ def test_over_bridges_the_bands_hold_what_they_say():
             result = banded(scene.arch, parts, method, seed=seed)
             known = np.isfinite(result.linear_ci95) & np.isfinite(result.linear_deviation)
             own.append((result.linear_deviation <= result.linear_ci95)[known].mean())
-    # Errors of one bridge's stations go together: with 8 bridges the mean share is known to some per cent.
+    # Errors along one bridge are correlated: 8 bridges determine the mean share to some per cent.
     for own in held.values():
         assert np.mean(own) > 0.9
 

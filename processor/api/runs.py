@@ -1,0 +1,181 @@
+"""Whole inputs: read, run and check, as the commands do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from processor import pipeline
+from processor.evaluation import evaluate
+from processor.evaluation.evaluate import ErrorReport
+from processor.model import InputError, Metric, Scene, Truth, Verdict, worst
+from processor.pipeline import Execution
+from processor.progress import stage
+from processor.report import results_folder
+from processor.scan_folder import fingerprint
+
+Names = str | Sequence[str] | None
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a run found.
+
+    ``steps`` holds each step's result record by the step's name, e.g. ``results.steps["spheres"].balls``;
+    ``comparison`` those of further methods, by step and method. ``checks`` are empty without a truth.
+    """
+
+    execution: Execution
+    report: ErrorReport = field(default_factory=ErrorReport)
+
+    @property
+    def scene(self) -> Scene:
+        """The scene that was processed."""
+        return self.execution.scene
+
+    @property
+    def steps(self) -> dict[str, Any]:
+        """Result records by step."""
+        return {run.step: run.result for run in reversed(self.execution.runs)}
+
+    @property
+    def comparison(self) -> dict[str, dict[str, Any]]:
+        """Result records of further methods, by step and method."""
+        found: dict[str, dict[str, Any]] = {}
+        for run in self.execution.runs:
+            if self.steps[run.step] is not run.result:
+                found.setdefault(run.step, {})[run.method] = run.result
+        return found
+
+    @property
+    def checks(self) -> tuple[Metric, ...]:
+        """Figures compared with the truth."""
+        return self.report.metrics
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst verdict of the steps."""
+        return worst(getattr(result, "overall", Verdict.NONE) for result in self.steps.values())
+
+
+def read(path: str | Path, units: str | None = None) -> Scene:
+    """Read a scan folder, a scene file (.h5) or one scan file.
+
+    Parameters
+    ----------
+    path : a scan folder, a scene file or a scan file (E57, LAS, LAZ, PLY, PCD, PTX, PTS, text).
+    units : of the coordinates, "m", "mm", "cm", "inch" or "ft", whatever the format states; None = as the project or
+        the format has it, else metres.
+
+    Returns
+    -------
+    The scene, in mm. ``scene.units`` and ``scene.units_reason`` state how the coordinates were read.
+
+    Raises
+    ------
+    InputError : the input cannot be used.
+    UsageError : ``units`` is given for a scene file, which states its own.
+    """
+    source = Path(path)
+    if not source.exists():
+        raise InputError(f"{source}: there is no such file or folder")
+    return pipeline.read(source, units)
+
+
+def run(
+    input_: str | Path | Scene,
+    output: str | Path | None = None,
+    steps: Names = None,
+    method: Names = None,
+    params: str | Path | Mapping[str, Any] | None = None,
+    units: str | None = None,
+    seed: int | None = 0,
+    *,
+    lang: str = "en",
+    log: Callable[[str], None] = lambda _: None,
+) -> Results:
+    """Process an input as ``processor run`` does.
+
+    Parameters
+    ----------
+    input_ : a scan folder, a scene file or a scan file; or a scene.
+    output : folder for results.h5, results.json, report.html and tables; None = nothing is written.
+    steps : names of the steps, in a list or one text with commas; None = those of the input's kind.
+    method : one method or several; the first of a step gives its result, further ones are run for comparison.
+    params : a TOML file, or a table a step as the file has it.
+    units : of the scans' coordinates, see :func:`read`.
+    seed : of all randomness; None = that of the parameters.
+    lang : of the page, "en" or "zh".
+    log : receives a line of progress at a time.
+
+    Returns
+    -------
+    The results, with checks where the input holds a truth.
+
+    Raises
+    ------
+    InputError : the input cannot be used, or the output cannot be written.
+    UsageError : a name or parameter is unknown.
+    """
+    wanted, methods = _names(steps), _names(method)
+    parameters = (
+        params if isinstance(params, Mapping) else pipeline.read_params(None if params is None else Path(params))
+    )
+    out = None if output is None else Path(output)
+    if isinstance(input_, Scene):
+        return _run_scene(input_, out, pipeline.jobs_for(input_, wanted, methods, parameters, seed), lang, log)
+    path = Path(input_)
+    if not path.exists():
+        raise InputError(f"{path}: there is no such file or folder")
+    if out is not None:
+        results_folder.check_output(out, path)
+    if wanted:
+        pipeline.plan(wanted, methods, parameters, seed)  # wrong names are reported before a long reading
+    place = None if out is None else out.resolve()
+    before = fingerprint.signature(path.resolve(), place)
+    with stage(f"reading {path.name}"):
+        scene, jobs, piecewise = pipeline.prepare(path, units, wanted, methods, parameters, seed)
+    log(f"{path.name}: read as {scene.units} ({scene.units_reason})")
+    execution = pipeline.execute(path, scene, jobs, log, piecewise)
+    report = evaluate.evaluate(path, execution)
+    fingerprint.check_unchanged(path.resolve(), before, place)
+    return write(Results(execution, report), out, lang)
+
+
+def _run_scene(
+    scene: Scene, out: Path | None, jobs: Sequence[pipeline.Job], lang: str, log: Callable[[str], None]
+) -> Results:
+    if out is not None:
+        results_folder.check_output(out, None)
+    return write(Results(pipeline.execute(Path(scene.name), scene, jobs, log)), out, lang)
+
+
+def write(results: Results, out: Path | None, lang: str = "en") -> Results:
+    """Write the folder of results, in place of an earlier one; returns the results."""
+    if out is not None:
+        with stage("drawing and writing the report"):
+            results_folder.write(out, results.execution, results.report, lang)
+    return results
+
+
+def check(results: Results, truth: Truth) -> tuple[Metric, ...]:
+    """Compare results with a truth, e.g. that of :func:`designgen.make`.
+
+    Returns
+    -------
+    The figures: step, quantity, statistic, value, unit, limit and whether the limit is kept.
+
+    Raises
+    ------
+    InputError : the truth is that of another scene.
+    """
+    return evaluate.against(truth, results.execution, results.scene.name).metrics
+
+
+def _names(value: Names) -> tuple[str, ...]:
+    if value is None:
+        return ()
+    parts = value.split(",") if isinstance(value, str) else value
+    return tuple(part.strip() for part in parts if part.strip())

@@ -1,0 +1,39 @@
+"""Command ``processor init``: a first project.toml for a folder of scans."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import click
+
+from processor.model import UsageError
+
+
+@click.command()
+@click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
+@click.option("--force", is_flag=True, help="replace the project.toml that is there")
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+def init(folder: Path, force: bool, as_json: bool) -> None:
+    """Write FOLDER/project.toml as its files suggest: kind, units, design, and which scan is which component.
+
+    Components are told by their names and by their shape against the design. What was unsure is said, and marked in
+    the file: look at it before the first run.
+    """
+    from processor.scan_folder import guess
+    from processor.store import store
+
+    path = folder / guess.PROJECT
+    if path.exists() and not force:
+        raise UsageError(f"{path}: is there already; --force replaces it")
+    found = guess.guess(folder)
+    text = guess.written(found)
+    with store.replacing(path) as temporary:
+        temporary.write_text(text, "utf-8")
+    if as_json:
+        click.echo(json.dumps(guess.as_json(found), ensure_ascii=False))
+        return
+    click.echo(f"{path}: kind {found.kind}, {len(found.scans)} file(s) of scans")
+    for one in found.unsure:
+        click.echo(f"? {one}")

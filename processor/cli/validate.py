@@ -1,0 +1,70 @@
+"""Command ``processor validate``: a matrix of simulated scenes, night by night."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+
+from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED
+
+
+@dataclass(frozen=True)
+class ValidateOptions:
+    """The options of the command, as click has them."""
+
+    output: Path
+    jobs: int | None
+    cluster: str | None
+    full: bool
+    history: Path | None
+    night: str | None
+    again: bool
+    accept: bool
+    lang: str
+    as_json: bool
+
+
+@click.command()
+@click.argument("matrix", metavar="[MATRIX.toml]", required=False, type=click.Path(path_type=Path, dir_okay=False))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path), help="folder of all nights")
+@click.option("--jobs", type=click.IntRange(min=1), help="cells at a time  [default: 1]")
+@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers do them, e.g. tcp://10.0.0.1:8786")
+@click.option("--full", is_flag=True, help="the cells that are marked full as well")
+@click.option("--history", type=click.Path(path_type=Path, dir_okay=False), help="[default: history.sqlite in OUT]")
+@click.option("--night", metavar="YYYY-MM-DD", help="whose seeds are used  [default: today, UTC]")
+@click.option("--again", is_flag=True, help="do all of a night again that other software began")
+@click.option("--accept", is_flag=True, help="do nothing but accept what got worse in the night as the new level")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the pages")
+@click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
+@click.pass_context
+def validate(context: click.Context, /, matrix: Path | None, **options: Any) -> None:
+    """Make, run and check a matrix of scenes, and say what changed since the nights before.
+
+    Without MATRIX.toml the default one, which covers every step. Run again, it goes on where it was.
+    Exit codes: 0 done, 1 some cells failed, 4 a limit was missed or a figure got worse.
+    """
+    from processor.validation import command
+
+    chosen = ValidateOptions(**options)
+    if chosen.jobs is not None and chosen.cluster is not None:
+        raise click.UsageError("--jobs and --cluster exclude each other: a cluster has as many processes as workers")
+    if chosen.accept:
+        click.echo(command.accept(chosen.output, chosen.history, chosen.night))
+        return
+    summary = command.run(
+        matrix,
+        chosen.output,
+        chosen.jobs or 1,
+        chosen.cluster,
+        full=chosen.full,
+        history=chosen.history,
+        night=chosen.night,
+        again=chosen.again,
+        lang=chosen.lang,
+    )
+    click.echo(json.dumps(summary.as_object(), ensure_ascii=False) if chosen.as_json else summary.line)
+    context.exit(LIMIT_MISSED if not summary.passed else IN_PART if summary.failed else DONE)

@@ -1,0 +1,90 @@
+"""The parts as assembled: poses, key points as scanned, and gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.geometry import rigid, surface_registration
+from processor.model import ArchDesign, Floats
+from processor.preassembly.chain.adjustment import Adjusted
+from processor.preassembly.parts.measure import MeasuredPart
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Poses T_bridge_scan (c, 4, 4) with covariance (c, 6, 6), rival poses, key points (c, 2, 8, 3) and gaps (j, 8, 3).
+
+    Poses and key points are of the scan's frame with its origin, lengths of poses at the reference temperature and of
+    key points as scanned; mm, NaN = unknown.
+    """
+
+    T_bridge_scan: Floats
+    covariance: Floats
+    T_rival_scan: Floats
+    key_points_scan: Floats
+    key_points_sd: Floats
+    gaps: Floats
+
+
+def place(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> Placement:
+    """Place the measured parts by their adjusted motions; ``frames`` (j, 4, 4) are T_bridge_joint."""
+    poses = np.array([T @ part.T_bridge_scan for T, part in zip(adjusted.motions, parts, strict=True)])
+    T_bridge_scan = _with_origins(parts, poses)
+    key_points, key_points_sd = _key_points(parts, design, frames)
+    ends = np.array(
+        [
+            [rigid.apply(T, end * part.shrink) for end in ends]
+            for T, ends, part in zip(T_bridge_scan, key_points, parts, strict=True)
+        ]
+    )
+    return Placement(
+        T_bridge_scan=T_bridge_scan,
+        covariance=_covariances(parts, adjusted, T_bridge_scan),
+        T_rival_scan=_with_origins(parts, [part.T_rival for part in parts]),
+        key_points_scan=key_points,
+        key_points_sd=key_points_sd,
+        gaps=ends[1:, 0] - ends[:-1, 1],  # equal to the linear ones of the adjustment, to second order
+    )
+
+
+def _with_origins(parts: Sequence[MeasuredPart], poses: Sequence[Floats] | Floats) -> Floats:
+    """Poses (c, 4, 4) of scans whose origins were taken off, as poses of the scans' own frames."""
+    return np.array(
+        [rigid.with_origin(T, part.scans[0].origin * part.shrink) for T, part in zip(poses, parts, strict=True)]
+    )
+
+
+def _covariances(parts: Sequence[MeasuredPart], adjusted: Adjusted, poses: Floats) -> Floats:
+    """Covariances (c, 6, 6) of the assembled poses, NaN of parts without a pose.
+
+    The error of the registration cancels: ends and edges are measured from the registered pose.
+    """
+    covariances = np.full((len(parts), 6, 6), np.nan)
+    for i, part in enumerate(parts):
+        if np.isfinite(poses[i]).all():
+            rows = slice(6 * i, 6 * i + 6)
+            of_motion = adjusted.motion_covariance[rows, rows]
+            covariances[i] = surface_registration.about_origin(of_motion, part.member.centre)
+    return covariances
+
+
+def _key_points(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats) -> tuple[Floats, Floats]:
+    """Key points (c, 2, 8, 3) as scanned, and the standard deviation of each coordinate."""
+    points, sd = np.full((len(parts), 2, 8, 3), np.nan), np.full((len(parts), 2, 8, 3), np.nan)
+    for i, part in enumerate(parts):
+        for e, joint in enumerate((i - 1, i)):
+            end = part.member.ends[e]
+            if end is None or not np.isfinite(end.departure).all():
+                continue
+            R = frames[joint][:3, :3]
+            in_bridge = design.joint_points[joint] + end.departure @ R.T
+            in_scan = rigid.apply(rigid.invert(part.T_bridge_scan), in_bridge)
+            points[i, e] = in_scan / part.shrink + part.scans[0].origin
+            turn = part.T_bridge_scan[:3, :3].T @ R
+            for k in range(8):
+                block = end.covariance[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+                sd[i, e, k] = np.sqrt(np.diag(turn @ block @ turn.T)) / part.shrink
+    return points, sd

@@ -1,0 +1,40 @@
+"""The frame of a joint, and the place of a part's end in it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.geometry import rigid
+from processor.model import Floats
+
+
+@dataclass(frozen=True)
+class EndPlace:
+    """A part's end as designed: T_bridge_joint (4, 4), half the section's size (3,), and the direction of the part.
+
+    ``outward`` is +1 where the part ends at the joint and -1 where it starts.
+    """
+
+    T_bridge_joint: Floats
+    half: Floats
+    outward: float
+
+
+def joint_frame(key_points: Floats) -> Floats:
+    """T_bridge_joint (4, 4) of a joint from its P1..P8: origin in the middle, x along the bridge, y left, z up."""
+    p1, p2, p3, p4 = key_points[:4]
+    y = (p1 - p2) + (p4 - p3)
+    z = (p4 - p1) + (p3 - p2)
+    x = np.cross(y, z)
+    x /= np.linalg.norm(x)
+    z = np.cross(x, y)
+    z /= np.linalg.norm(z)
+    return rigid.transform(np.stack([x, np.cross(z, x), z], axis=1), key_points[:4].mean(axis=0))
+
+
+def end_place(key_points: Floats, outward: float) -> EndPlace:
+    """Place of the end of a part at a joint with the design's P1..P8 (8, 3)."""
+    frame = joint_frame(key_points)
+    return EndPlace(frame, 0.5 * np.ptp(rigid.apply(rigid.invert(frame), key_points[:4]), axis=0), outward)

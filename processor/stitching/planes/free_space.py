@@ -1,0 +1,126 @@
+"""Free space of a scan: the directions and ranges in which its rays met nothing, as a range image on a cube."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from processor.model import Floats
+
+PIXELS = 320  # at most along each side of the six faces of the cube: 0.28 degrees
+FEWEST_PIXELS = 40
+SEEN_NEIGHBOURS = 5  # of 3 x 3 pixels, that must hold rays for a point to count as lying in free space
+FILLED = 0.85  # share of the pixels with points that must have so many neighbours: else pixels are too small
+UNANSWERED = 0.3  # weight of a point in a direction of rays without a return: bare steel may return none as well
+
+
+@dataclass(frozen=True)
+class FreeSpace:
+    """Range image (6, n, n) of the least range seen in each direction, mm; infinite = no return, negative = no ray."""
+
+    near: Floats
+
+    @classmethod
+    def from_rays(cls, points: Floats, unanswered: Floats) -> FreeSpace:
+        """Build the range image of points (n, 3) in the scanner's frame and of rays (m, 3) without a return."""
+        n = PIXELS
+        while True:
+            near = np.full((6, n, n), np.inf)
+            write_ranges(points, near, n)
+            near[np.isinf(near)] = -1.0
+            if n <= FEWEST_PIXELS or filled_share(near, SEEN_NEIGHBOURS) >= FILLED:
+                break
+            n = int(n / 1.3)
+        write_unanswered(unanswered, near, n)
+        return cls(near)
+
+    def contains(self, points: Floats, tolerance_mm: float, slope: float = 0.02) -> Floats:
+        """Return the weight (n,) with which points (n, 3) lie in free space by more than a margin: 1, or 0 outside.
+
+        The margin is ``tolerance_mm`` plus ``slope`` times the range. Among rays without a return the weight is
+        UNANSWERED.
+        """
+        weight = np.zeros(len(points))
+        weigh_free(np.ascontiguousarray(points), self.near, tolerance_mm, slope, SEEN_NEIGHBOURS, UNANSWERED, weight)
+        return weight
+
+
+@njit(cache=True, nogil=True)
+def pixel(x, y, z, n):  # type: ignore[no-untyped-def]
+    """Return the face, row and column of the cube's pixel in a direction."""
+    ax, ay, az = abs(x), abs(y), abs(z)
+    if ax >= ay and ax >= az:
+        face = 0 if x > 0 else 1
+        u, v, w = y, z, ax
+    elif ay >= az:
+        face = 2 if y > 0 else 3
+        u, v, w = x, z, ay
+    else:
+        face = 4 if z > 0 else 5
+        u, v, w = x, y, az
+    if w == 0.0:
+        return 0, 0, 0
+    # Pixels of equal angles rather than of equal widths.
+    i = min(n - 1, int((np.arctan(u / w) / (np.pi / 2.0) + 0.5) * n))
+    j = min(n - 1, int((np.arctan(v / w) / (np.pi / 2.0) + 0.5) * n))
+    return face, i, j
+
+
+@njit(cache=True, nogil=True)
+def write_ranges(points, near, n):  # type: ignore[no-untyped-def]
+    """Write the least range of the points in each pixel of ``near`` (6, n, n)."""
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        f, i, j = pixel(x, y, z, n)
+        r = np.sqrt(x * x + y * y + z * z)
+        if r < near[f, i, j]:
+            near[f, i, j] = r
+
+
+@njit(cache=True, nogil=True)
+def write_unanswered(rays, near, n):  # type: ignore[no-untyped-def]
+    """Set pixels without points to infinity where rays without a return passed."""
+    for k in range(len(rays)):
+        f, i, j = pixel(rays[k, 0], rays[k, 1], rays[k, 2], n)
+        if near[f, i, j] < 0.0:
+            near[f, i, j] = np.inf
+
+
+@njit(cache=True, nogil=True)
+def weigh_free(points, near, tolerance, slope, least, unanswered, weight):  # type: ignore[no-untyped-def]
+    """Write the weight (n,) of points nearer than the ranges of all pixels around them; others are left as they are."""
+    n = near.shape[1]
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        f, i, j = pixel(x, y, z, n)
+        r = np.sqrt(x * x + y * y + z * z)
+        seen, nearest = 0, np.inf
+        for di in range(-1, 2):
+            for dj in range(-1, 2):
+                a, b = i + di, j + dj
+                if 0 <= a < n and 0 <= b < n and near[f, a, b] >= 0.0:
+                    seen += 1
+                    nearest = min(nearest, near[f, a, b])
+        if seen >= least and r < nearest - tolerance - slope * r:
+            weight[k] = 1.0 if nearest < np.inf else unanswered
+
+
+@njit(cache=True, nogil=True)
+def filled_share(near, least):  # type: ignore[no-untyped-def]
+    """Return the share of the pixels with points that have ``least`` of them or more in their 3 x 3 neighbourhood."""
+    n = near.shape[1]
+    filled, good = 0, 0
+    for f in range(6):
+        for i in range(1, n - 1):
+            for j in range(1, n - 1):
+                if 0.0 <= near[f, i, j] < np.inf:
+                    filled += 1
+                    count = 0
+                    for a in range(i - 1, i + 2):
+                        for b in range(j - 1, j + 2):
+                            count += 0.0 <= near[f, a, b] < np.inf
+                    good += count >= least
+    return good / max(filled, 1)

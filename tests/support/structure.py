@@ -1,0 +1,174 @@
+"""The structure of the sources, read with ast: modules, imports, circles, sizes."""
+
+import ast
+from collections import Counter, defaultdict
+from functools import cache
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PACKAGES = ("processor", "designgen")
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+MOST_FILES, MOST_LINES, MOST_KERNEL_LINES, MOST_ARGUMENTS = 20, 60, 100, 10
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+MODULES = {module_name(path): path for path in SOURCES}
+
+
+@cache
+def tree(path):
+    return ast.parse(path.read_text("utf-8"))
+
+
+@cache
+def imports(path):
+    """Every module that a file imports, those inside functions too; of `from a import b` both a and a.b.
+
+    Imports for type checkers alone do not count, and neither do names in strings.
+    """
+    found = set()
+    only_types = {
+        id(inner)
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.If) and getattr(node.test, "id", "") == "TYPE_CHECKING"
+        for inner in ast.walk(node)
+    }
+    for node in ast.walk(tree(path)):
+        if id(node) in only_types:
+            continue
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return frozenset(found)
+
+
+def within(names, *packages):
+    return {n for n in names if any(n == p or n.startswith(p + ".") for p in packages)}
+
+
+def used_modules(name):
+    """The modules of the project that a module imports; packages without code of their own are passed over."""
+    own = {n for n in imports(MODULES[name]) if n in MODULES and n != name}
+    return {n for n in own if MODULES[n].name != "__init__.py" or len(tree(MODULES[n]).body) > 1}
+
+
+def circles():
+    """Groups of modules that import each other, directly or through others (Tarjan)."""
+    graph = {name: sorted(used_modules(name)) for name in MODULES}
+    index, low, on, stack, found = {}, {}, set(), [], []
+
+    def visit(node):
+        index[node] = low[node] = len(index)
+        stack.append(node)
+        on.add(node)
+        for other in graph[node]:
+            if other not in index:
+                visit(other)
+                low[node] = min(low[node], low[other])
+            elif other in on:
+                low[node] = min(low[node], index[other])
+        if low[node] == index[node]:
+            group = []
+            while not group or group[-1] != node:
+                group.append(stack.pop())
+                on.discard(group[-1])
+            if len(group) > 1:
+                found.append(sorted(group))
+
+    for name in graph:
+        if name not in index:
+            visit(name)
+    return found
+
+
+def crowded_folders():
+    counts = Counter(str(path.parent.relative_to(ROOT)) for path in SOURCES if path.name != "__init__.py")
+    return {folder: count for folder, count in counts.items() if count > MOST_FILES}
+
+
+def long_functions():
+    """Functions with too many lines or arguments; compiled kernels may have more lines."""
+    found = []
+    for path in SOURCES:
+        for node in ast.walk(tree(path)):
+            if not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+                continue
+            lines = node.end_lineno - min([node.lineno, *(one.lineno for one in node.decorator_list)]) + 1
+            arguments = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs)
+            kernel = any("njit" in ast.dump(one) for one in node.decorator_list)
+            if lines > (MOST_KERNEL_LINES if kernel else MOST_LINES) or arguments > MOST_ARGUMENTS:
+                found.append(
+                    f"{path.relative_to(ROOT)}:{node.lineno} {node.name}: {lines} lines, {arguments} arguments"
+                )
+    return found
+
+
+def positional_records(most=5):
+    """Calls of dataclasses of the project with more than ``most`` positional arguments."""
+    records = {
+        node.name
+        for path in SOURCES
+        for node in ast.walk(tree(path))
+        if isinstance(node, ast.ClassDef) and any("dataclass" in ast.dump(one) for one in node.decorator_list)
+    }
+    found = []
+    for path in SOURCES:
+        for node in ast.walk(tree(path)):
+            name = getattr(node.func, "id", getattr(node.func, "attr", "")) if isinstance(node, ast.Call) else ""
+            if name in records and len(node.args) > most:
+                found.append(f"{path.relative_to(ROOT)}:{node.lineno} {name}: {len(node.args)} positional arguments")
+    return found
+
+
+def layer_groups():
+    """The first folder or file of each module below its package."""
+    groups = defaultdict(set)
+    for name in MODULES:
+        groups[".".join(name.split(".")[:2])].add(name)
+    return groups
+
+
+STEPS = ("defects", "deviation", "preassembly", "space_frame", "stitching")
+LAYERS = (
+    ("version",),
+    ("model",),
+    ("progress", "language", "jobs"),
+    ("geometry",),
+    ("adjustment",),
+    ("limits", "store"),
+    ("readers",),
+    ("scan_folder",),
+    STEPS,
+    ("pipeline",),
+    ("compare", "evaluation"),
+    ("report",),
+    ("api",),
+    ("batch", "validation"),
+    ("cli",),
+    ("__main__",),
+)
+FOR_STEPS = ("version", "model", "progress", "geometry", "adjustment", "limits")
+
+
+def wrong_arrows():
+    """Imports that do not lead to a lower layer of processor, or from one step to another or to files."""
+    rank = {name: i for i, names in enumerate(LAYERS) for name in names}
+    found = []
+    for name in MODULES:
+        if not name.startswith("processor."):
+            continue
+        room = name.split(".")[1]
+        assert room in rank, f"{name}: not in a layer"
+        for other in sorted(used_modules(name)):
+            target = other.split(".")[1] if other.count(".") else ""
+            if other.split(".")[0] != "processor" or target in ("", room):
+                continue
+            if rank[target] >= rank[room] or (room in STEPS and target not in FOR_STEPS):
+                found.append(f"{name} -> {other}")
+    return found

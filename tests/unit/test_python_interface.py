@@ -1,0 +1,120 @@
+"""The Python interface, called as a user calls it."""
+
+import dataclasses
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import processor
+from processor.model import InputError, Scene, Status, UsageError, Verdict
+
+SCAN_FOLDER = Path(__file__).resolve().parents[2] / "fixtures" / "scan-folder"
+CENTRE, RADIUS = np.array([1.0e6, 2.0e6, 100.0]), 75.0
+
+
+def test_import_is_quick():
+    code = "import time; start = time.perf_counter(); import processor; print(time.perf_counter() - start)"
+    took = [
+        float(subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout) for _ in range(3)
+    ]
+    assert min(took) < 0.5
+
+
+def test_every_name_of_the_interface_is_there():
+    for name in processor.__all__:
+        assert getattr(processor, name)
+    with pytest.raises(AttributeError, match="no attribute 'magic'"):
+        processor.magic  # noqa: B018
+
+
+def test_both_packages_are_typed():
+    assert (Path(processor.__file__).parent / "py.typed").exists()
+
+
+def test_a_sphere_of_a_target():
+    rng = np.random.default_rng(1)
+    direction = rng.normal(size=(3000, 3))
+    direction /= np.linalg.norm(direction, axis=1)[:, None]
+    direction = direction[direction[:, 0] > 0.1]
+    points = CENTRE + (RADIUS + rng.normal(0.0, 0.5, (len(direction), 1))) * direction
+    clutter = CENTRE + rng.uniform(-300.0, 300.0, (150, 3))
+    fit = processor.fit_sphere(np.vstack([points, clutter]))
+    sd = np.sqrt(np.diag(fit.covariance))
+    assert fit.status is Status.OK
+    assert (np.abs(fit.centre - CENTRE) < 4.0 * sd[:3] + 0.1).all()
+    assert abs(fit.radius - RADIUS) < 4.0 * sd[3] + 0.1
+    held = processor.fit_sphere(points, radius=RADIUS)
+    assert held.radius == RADIUS
+    assert held.covariance[3, 3] == 0.0
+
+
+def test_points_of_no_sphere_fail_and_are_no_error():
+    fit = processor.fit_sphere(np.random.default_rng(0).uniform(-500.0, 500.0, (300, 3)))
+    assert fit.status in (Status.FAILED, Status.WEAK)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda p: p / 1000.0, "in metres"),
+        (lambda p: p[:5], "10 points or more, got 5"),
+        (lambda p: p[:, :2], r"array \(n, 3\).*got shape"),
+        (lambda p: np.where(p > p.mean(), np.nan, p), "NaN or infinite"),
+        (lambda _: "points", "expected numbers"),
+    ],
+)
+def test_arrays_that_cannot_be_used(change, message):
+    rng = np.random.default_rng(0)
+    points = CENTRE + RADIUS * np.array([d / np.linalg.norm(d) for d in rng.normal(size=(200, 3))])
+    with pytest.raises(ValueError, match=message):
+        processor.fit_sphere(change(points))
+    with pytest.raises(ValueError, match="expected"):
+        processor.m3c2(change(points)[:0], points, normal_diameter=50.0, projection_diameter=20.0, max_depth=10.0)
+
+
+def test_a_shift_of_a_plane_by_m3c2():
+    rng = np.random.default_rng(2)
+    first = np.column_stack([rng.uniform(-1000.0, 1000.0, (20_000, 2)), rng.normal(0.0, 1.0, 20_000)]) + CENTRE
+    second = first + np.array([0.0, 0.0, 5.0])
+    scales = {"normal_diameter": 200.0, "projection_diameter": 100.0, "max_depth": 50.0}
+    table = processor.m3c2(first, second, core=first[:300], **scales)
+    np.testing.assert_allclose(np.median(table.distance), 5.0, atol=1e-3)
+    assert table.significant.all()
+    assert table.core.shape == table.normals.shape == (300, 3)
+    given = processor.m3c2(first, second, core=first[:10], normals=np.tile([0.0, 0.0, -1.0], (10, 1)), **scales)
+    np.testing.assert_allclose(given.distance, -5.0, atol=0.5)
+    with pytest.raises(ValueError, match="one unit"):
+        processor.m3c2(first / 100.0, second / 100.0, **scales)
+    with pytest.raises(ValueError, match="positive"):
+        processor.m3c2(first, second, **{**scales, "max_depth": 0.0})
+
+
+def test_a_folder_is_read_and_run(tmp_path):
+    scene = processor.read(SCAN_FOLDER)
+    assert isinstance(scene, Scene)
+    results = processor.run(SCAN_FOLDER, tmp_path / "out", steps="spheres")
+    assert (tmp_path / "out" / "results.json").exists()
+    assert results.steps["spheres"].status in tuple(Status)
+    assert isinstance(results.verdict, Verdict)
+    assert results.checks  # the folder holds a truth
+    with pytest.raises(InputError, match="no such file"):
+        processor.run(tmp_path / "nothing")
+    with pytest.raises(UsageError, match="no step 'magic'"):
+        processor.run(SCAN_FOLDER, steps=["magic"])
+
+
+def test_a_scene_is_run_and_compared_with_its_truth():
+    designgen = pytest.importorskip("designgen")
+    if not hasattr(designgen, "make"):
+        pytest.skip("designgen.make is not there")
+    scene, truth = designgen.make("frame-small", seed=1)
+    results = processor.run(scene, method=("ray", "ransac"))
+    assert results.checks == ()
+    assert set(results.comparison["spheres"]) == {"ransac"}
+    checks = processor.check(results, truth)
+    assert {check.method for check in checks} == {"", "ransac"}
+    with pytest.raises(InputError, match="another scene"):
+        processor.check(results, dataclasses.replace(truth, frame=dataclasses.replace(truth.frame, radii=np.ones(3))))

@@ -1,0 +1,85 @@
+"""Variance between stations and lack of fit, against draws of known size."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from processor.adjustment import variance_components
+from processor.preassembly.ends import faces as ends_faces
+
+
+def drawn(rng, stations, apart, cells=40, points=60):
+    """Residuals of cells with points of four stations each, shifted by station."""
+    shift = apart * rng.normal(size=stations)
+    station = np.concatenate([np.repeat(rng.permutation(stations)[:4], points) for _ in range(cells)])
+    cell = np.repeat(np.arange(cells), 4 * points)
+    return shift[station] + 0.5 * rng.normal(size=len(station)), station, cell
+
+
+@pytest.mark.parametrize("apart", [0.0, 0.1, 1.0])
+def test_the_variance_between_stations_is_estimated(apart):
+    rng = np.random.default_rng(0)
+    found = np.array([variance_components.between_stations(*drawn(rng, 9, apart)) for _ in range(300)])
+    widened = (stats.t.ppf(0.975, 8) / 1.959964) ** 2
+    # The mean over 300 sets of 9 stations; without any, half of the estimates are negative and count as none.
+    assert found.mean() == pytest.approx(widened * apart**2, rel=0.1, abs=1e-3)
+
+
+def test_one_station_has_no_variance_between_stations():
+    rng = np.random.default_rng(1)
+    assert (
+        variance_components.between_stations(rng.normal(size=500), np.zeros(500, np.int64), np.arange(500) // 100)
+        == 0.0
+    )
+
+
+def test_covariance_of_a_line_by_stations_against_draws():
+    rng = np.random.default_rng(2)
+    x = rng.uniform(-1.0, 1.0, 400)
+    station = np.digitize(x + 0.3 * rng.normal(size=400), [-0.5, 0.0, 0.6])
+    basis = np.stack([np.ones(400), x], axis=1)
+    solve = np.linalg.pinv(basis)
+    moved = np.array([solve @ (0.7 * rng.normal(size=4))[station] for _ in range(20_000)])
+    np.testing.assert_allclose(
+        variance_components.group_covariance(basis, station, 0.49), np.cov(moved.T), rtol=0.05, atol=5e-3
+    )
+    assert variance_components.share_in_mean(np.array([0, 0, 1, 1])) == 0.5
+
+
+def test_lack_of_fit_variance():
+    rng = np.random.default_rng(2)
+    cell = np.repeat(np.arange(40), 100)
+    found = [variance_components.lack_of_fit_variance([(rng.standard_normal(4000), cell)], 0) for _ in range(40)]
+    # By noise alone the sum of squares between 40 cells is chi-squared: its mean is 40, its sd sqrt(80).
+    assert max(found) < 5.0 * np.sqrt(80.0) / 4000.0
+    steps = 0.5 * rng.standard_normal(40)
+    assert variance_components.lack_of_fit_variance(
+        [(rng.standard_normal(4000) + steps[cell], cell)], 0
+    ) == pytest.approx(float(np.mean(steps**2)), abs=0.05)
+    assert variance_components.lack_of_fit_variance([(np.zeros(3), np.arange(3))], 0) == 0.0
+
+
+def faces_of(rng, bent, sigma, count=40, points=4_000):
+    """Residuals of faces that depart by a cubic along the zone, with amplitude ``bent`` at the joint."""
+    found = []
+    for _ in range(count):
+        x, w = rng.uniform(-ends_faces.ZONE_MM, 0.0, points), rng.uniform(-1.0, 1.0, points)
+        amid, across = bent * rng.standard_normal(2)
+        # On 0..1 from the far side of the zone: 20 t^3 - 30 t^2 + 12 t - 1 is what quadratics leave of 20 t^3.
+        out = (amid + across * w) * 20.0 * (1.0 + x / ends_faces.ZONE_MM) ** 3 + sigma * rng.standard_normal(points)
+        basis = ends_faces.basis(x, w)
+        found.append((basis, out - basis @ np.linalg.lstsq(basis, out, rcond=None)[0]))
+    return found
+
+
+def test_third_order_terms_at_the_joint():
+    rng = np.random.default_rng(4)
+    third = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.3, 1.0)])
+    # By hand: the mean square of the polynomial is 1/7, and 1/21 where it goes with w.
+    np.testing.assert_allclose(third[::2, 1], 7.0 / 4_000, rtol=0.1)
+    np.testing.assert_allclose(third[1::2, 1], 21.0 / 4_000, rtol=0.1)
+    # 80 squares of normal numbers: their mean is known to sqrt(2 / 80).
+    assert variance_components.excess_variance(third) == pytest.approx(0.09, rel=3.0 * np.sqrt(2.0 / 80.0))
+    nothing = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.0, 1.0)])
+    assert variance_components.excess_variance(nothing) < 5.0 * np.sqrt(2.0 / 80.0) * nothing[:, 1].max()
+    assert variance_components.excess_variance(np.array([[0.1, 0.02], [0.1, 0.02]])) == 0.0
