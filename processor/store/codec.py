@@ -37,7 +37,8 @@ class DecodeError(ValueError):
 
 
 def write_array(group: Any, name: str, array: np.typing.NDArray[np.generic]) -> None:
-    """Write an array; a large one in chunks of rows, shuffled and compressed."""
+    """Write an array, booleans as uint8; a large one in chunks of rows, shuffled and compressed."""
+    array = array.astype(np.uint8) if array.dtype == np.bool_ else array
     if array.size <= PLAIN_ITEMS:
         _create(group, name, array)
         return
@@ -245,11 +246,12 @@ def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[An
 
 
 def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
-    """Read an array of float64 or int64 of ``ndim`` axes (an absent one is empty, of any number of axes)."""
-    stored = np.dtype(dtype).str[1:]
+    """Read an array of ``dtype`` with ``ndim`` axes (an absent one is empty, of any number of axes)."""
+    stored = "u1" if dtype is np.bool_ else np.dtype(dtype).str[1:]
     if name in group and isinstance(group[name], h5py.Dataset) and group[name].size == 0:
         ndim = group[name].ndim
-    return _dataset(group, name, stored, ndim)[()]
+    array = _dataset(group, name, stored, ndim)[()]
+    return array.astype(dtype) if dtype is np.bool_ else array
 
 
 def column(group: Any, name: str, dtype: type) -> Any:

@@ -11,8 +11,12 @@ from processor.defects import pictures, surface_charts
 from processor.defects.deviation_field import Field
 from processor.defects.result import Result
 from processor.evaluation.evaluate import ErrorReport
+from processor.model import StepRun
 from processor.report import page, surface_view
 from processor.report.defects import figures, view
+from processor.report.record_json import as_object
+from processor.report.results_json import plain
+from processor.store import store
 from tests.support import step_results
 from tests.unit.test_report_adjusted import Page
 
@@ -104,6 +108,20 @@ def test_small_defects_are_drawn_whole_and_lie_on_large_ones(plates):
     assert 300 < count[1] < 500
     unseen = dataclasses.replace(field, count=np.where(away < 60.0, 0, 1))
     assert (pictures.of_surface([small], unseen, found, np.zeros(3), 500).defect == -1).all()
+
+
+def test_results_are_stored_and_read_again(tmp_path):
+    result = step_results.defects()
+    result = dataclasses.replace(
+        result, defects=dataclasses.replace(result.defects, doubtful=np.arange(len(result.defects)) % 2 == 0)
+    )
+    store.write_results(tmp_path / "r.h5", [StepRun("defects", "default", "{}", result)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", {"defects": Result})
+    assert plain(as_object(back.result)) == plain(as_object(result))
+    for name in ("pictures", "surface"):
+        np.testing.assert_equal(dataclasses.asdict(back.result)[name], dataclasses.asdict(result)[name])
+    first, second, *_ = as_object(result)["defects"]
+    assert (first["doubtful"], first["deflection"]["along"][0], second["deflection"]) == (True, -200.0, None)
 
 
 def test_every_defect_has_a_page():
