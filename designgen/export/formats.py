@@ -82,20 +82,21 @@ def write_las(path: Path, scan: Scan) -> None:
 
 def write_pcd(path: Path, scan: Scan) -> None:
     """Write binary PCD in metres, coordinates as doubles."""
-    from pypcd4.pypcd4 import Encoding, PointCloud
-
-    columns: list[Any] = [(scan.points[:, i] + scan.origin[i]) * METRES for i in range(3)]
-    names: list[str] = ["x", "y", "z"]
-    types: list[Any] = [np.float64] * 3
+    columns: dict[str, Any] = {axis: (scan.points[:, i] + scan.origin[i]) * METRES for i, axis in enumerate("xyz")}
     if len(scan.intensity):
-        columns.append(scan.intensity.astype(np.float32))
-        names.append("intensity")
-        types.append(np.float32)
+        columns["intensity"] = scan.intensity.astype(np.float32)
     if len(scan.point_station):
-        columns.append(station_numbers(scan).astype(np.int32))
-        names.append("station")
-        types.append(np.int32)
-    PointCloud.from_points(columns, names, types).save(path, Encoding.BINARY)
+        columns["station"] = station_numbers(scan).astype(np.int32)
+    rows = np.empty(len(scan.points), [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    types = [column.dtype for column in columns.values()]
+    header = (
+        f"VERSION 0.7\nFIELDS {' '.join(columns)}\nSIZE {' '.join(str(t.itemsize) for t in types)}\n"
+        f"TYPE {' '.join(t.kind.upper() for t in types)}\nCOUNT {' '.join('1' for _ in types)}\nWIDTH {len(rows)}\n"
+        f"HEIGHT 1\nVIEWPOINT 0.0 0.0 0.0 1.0 0.0 0.0 0.0\nPOINTS {len(rows)}\nDATA binary\n"
+    )
+    path.write_bytes(header.encode() + rows.tobytes())
 
 
 def write_xyz(path: Path, scan: Scan) -> None:
