@@ -18,15 +18,13 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.defects import design_pose, pictures
+from processor.defects import pictures
 from processor.defects.params import Paper, Params
 from processor.defects.pictures import MOST_PLACES
 from processor.defects.result import DefectClass, Result, SurfacePlaces
 from processor.defects.surface_charts import of_mesh
 from processor.defects.to_result import table
-from processor.deviation import cloud as deviation_cloud
-from processor.geometry import icp, pfh, rigid, visible_facets
-from processor.geometry.merging import merged
+from processor.geometry import icp, merging, mesh_distance, pfh, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import NORMAL_95, Floats, Ints, Scene, Status, reason
 
@@ -63,8 +61,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     """Find the defects of a structure as in paper 004."""
     paper = params.paper
     assert scene.structure is not None
-    vertices, origin = deviation_cloud.local_design(scene.structure)
-    cloud = merged(design_pose.stitched(scene, earlier), with_scanner=False)
+    vertices, origin = merging.local_design(scene.structure)
+    cloud = merging.merged(merging.stitched(scene, earlier.get("stitch")), with_scanner=False)
     size, points = _thinned(cloud.points + (cloud.origin - origin), paper)
     radius = paper.cluster_radius_mm or RADIUS_VOXELS * size
     label = density_clusters(points, radius, paper.cluster_points)
@@ -72,7 +70,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     points = points[(label >= 0) & (counts[np.maximum(label, 0)] >= paper.smallest_cluster_share * counts.max())]
     if len(points) < paper.feature_points:
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.paper-too-few-points"),))
-    design = deviation_cloud.sampled(vertices, scene.structure.faces, size)
+    design = mesh_distance.sampled(vertices, scene.structure.faces, size)
     rng = np.random.default_rng([params.seed, 4])
     T = _first_pose(points, design.points, design.normals, size, paper, rng)
     rms, paired_share = np.inf, 0.0
@@ -114,8 +112,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
 def _deviations(points: Floats, vertices: Floats, faces: Ints, radius: float, params: Params) -> Deviations:
     """Measure distances of points (n, 3), and cluster those beyond the threshold."""
     surface = of_mesh(vertices, faces, 1000.0)
-    grid = visible_facets.grid_of(surface.vertices, surface.faces, surface.normals, params.reach_mm)
-    facet, distance = visible_facets.nearest(grid, points, np.zeros((1, 3)), np.full(len(points), -1, np.int64))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, params.reach_mm)
+    facet, distance = mesh_distance.nearest_visible(grid, points, np.zeros((1, 3)), np.full(len(points), -1, np.int64))
     near = facet >= 0
     points, facet, distance = points[near], facet[near], distance[near]
     sigma = 1.4826 * float(np.median(np.abs(distance - np.median(distance)))) if len(distance) else 0.0

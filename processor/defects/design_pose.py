@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -10,11 +9,9 @@ from typing import Any
 import numpy as np
 
 from processor.defects.params import Params
-from processor.deviation import cloud as deviation_cloud
-from processor.deviation import design_pose, measure
-from processor.deviation.attitude import AMBIGUOUS
-from processor.geometry import rigid
-from processor.geometry.merging import merged
+from processor.geometry import merging, mesh_distance, rigid, surface_registration
+from processor.geometry.principal import AMBIGUOUS
+from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Reason, Scene, Status, reason
 
 DEFAULT_ERROR_MM = 1.0  # registration error of scans in the design's frame, where none is known
@@ -31,12 +28,6 @@ class DesignPose:
     status: Status = Status.OK
 
 
-def stitched(scene: Scene, earlier: dict[str, Any]) -> Scene:
-    """Return the scene with the poses of step stitch, where it ran."""
-    result = earlier.get("stitch")
-    return scene if result is None else dataclasses.replace(scene, scans=deviation_cloud.posed(scene, result))
-
-
 def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
     """Return the pose of step deviation where it ran, else a pose by the same rule.
 
@@ -51,17 +42,15 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
         return DesignPose(before.T_design_scan, error, (source,), status)
     error = params.registration_error_mm if math.isfinite(params.registration_error_mm) else DEFAULT_ERROR_MM
     assert scene.structure is not None
-    cloud = merged(scene, with_scanner=False)
-    if len(cloud.points) < deviation_cloud.FEWEST_POINTS:
+    cloud = merging.merged(scene, with_scanner=False)
+    if len(cloud.points) < merging.FEWEST_POINTS:
         return DesignPose(None, error, (reason("defects.too-few-points"),))
-    vertices, origin = deviation_cloud.local_design(scene.structure)
+    vertices, origin = merging.local_design(scene.structure)
     few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
-    thin = deviation_cloud.ScanCloud(
-        points=few, origin=cloud.origin, scanner=None, spacing_mm=1.0, read=len(cloud.points), kept=len(few)
-    )
     given = rigid.transform(np.eye(3), cloud.origin - origin)
-    placed = design_pose.place(thin, measure.surface_of(vertices, scene.structure.faces), given, "auto")
-    if placed.registration == "as given":
+    surface = mesh_distance.of_design(vertices, scene.structure.faces)
+    placed = surface_registration.place(few, surface, given, "auto")
+    if placed.registration is Registration.AS_GIVEN:
         return DesignPose(np.eye(4), error)
     if not np.isfinite(placed.T_best_fit).all():
         return DesignPose(None, error, (reason("defects.not-placed"),))

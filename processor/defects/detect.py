@@ -28,8 +28,7 @@ from processor.defects.observations import Observed, Pairs
 from processor.defects.params import Params
 from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
-from processor.deviation import cloud
-from processor.geometry import rigid
+from processor.geometry import merging, mesh_distance, rigid
 from processor.model import Floats, InputError, Ints, Scene, Status, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
@@ -58,8 +57,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     design = scene.structure
     if design is None or not len(design.faces):
         raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP in project.toml)")
-    vertices, origin = cloud.local_design(design)
-    scene = design_pose.stitched(scene, earlier)
+    vertices, origin = merging.local_design(design)
+    scene = merging.stitched(scene, earlier.get("stitch"))
     pose = design_pose.pose(scene, earlier, params)
     if pose.T_design_project is None:
         return Result(status=Status.FAILED, method=params.method, reasons=pose.reasons)
@@ -157,9 +156,7 @@ def _fitted_shapes(
 
 def _coarse_cell(vertices: Floats, faces: Ints) -> float:
     """Return a first size of cells that keeps their number within MOST_CELLS."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    return max(FIRST_CELL_MM, float(np.sqrt(area / (0.25 * MOST_CELLS))))
+    return max(FIRST_CELL_MM, float(np.sqrt(mesh_distance.area(vertices, faces) / (0.25 * MOST_CELLS))))
 
 
 def _median_sd(aligned: Alignment, surface: DesignSurface) -> float:

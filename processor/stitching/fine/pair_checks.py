@@ -69,7 +69,7 @@ def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
     )  # fmt: skip
 
 
-def loops(pairs: list[Pair], weights: Floats, reference: int, count: int) -> list[Loop]:
+def loops(pairs: list[Pair], weights: Floats, count: int) -> list[Loop]:
     """Return the loops that pairs close over the maximum spanning tree by weight, with their misclosures."""
     order = np.argsort(-weights, kind="stable")
     group = list(range(count))
@@ -108,7 +108,7 @@ def _loop(path: list[Pair], start: int) -> Loop:
     for pair in path:
         forward = pair.a == at
         # With rotations about the origin of a's frame the adjoint transforms the covariance.
-        covariance = frames.about_origin(pair.covariance, pair.T_a_b[:3, 3])
+        covariance = rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
             C = C + _transformed(covariance, T)
             T = T @ pair.T_a_b
@@ -126,6 +126,6 @@ def _transformed(covariance: Floats, T: Floats) -> Floats:
     """Transform the covariance (6, 6) of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = T[:3, :3]
-    J[3:, :3] = frames.cross_matrix(T[:3, 3]) @ T[:3, :3]
+    J[3:, :3] = rigid.cross_matrix(T[:3, 3]) @ T[:3, :3]
     transformed: Floats = J @ covariance @ J.T
     return transformed
