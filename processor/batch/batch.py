@@ -20,16 +20,16 @@ from processor.batch import job as batch_job
 from processor.batch import record, summary
 from processor.batch.finding import STATE, Input, Inputs, find
 from processor.batch.job import Job, OutputGoneError
-from processor.batch.record import FAILED, Record
+from processor.batch.record import JobStatus, Record
 from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.runner import StoppedError
-from processor.model import InputError, UsageError
+from processor.language.messages import messages
+from processor.model import InputError, UsageError, reason
 
 LOGS = "logs"
 LONGEST_NAME = 240  # bytes of a file's name, with room for prefix and suffix
 MEMORY_SHARE, LEAST_MEMORY_MB = 0.8, 1024  # of the machine, for all jobs together; for a job
-DIED = "every worker that did it died (out of memory?); run again, with fewer jobs at a time"
 
 
 @dataclass(frozen=True)
@@ -69,10 +69,10 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
         raise UsageError(f"{settings.out}: holds the inputs; name another folder for the results")
     inputs = find(root, out)
     for name in [each.name for each in inputs.inputs if each.name.split("/", 1)[0] in (*summary.FILES, LOGS)]:
-        inputs.left_out[name] = "has the name of one of the batch's own files; rename it"
+        inputs.left_out[name] = reason("batch.reserved-name")
     inputs.inputs = [each for each in inputs.inputs if each.name not in inputs.left_out]
-    for name, reason in sorted(inputs.left_out.items()):
-        say(f"{name}: left out: {reason}")
+    for name, why in sorted(inputs.left_out.items()):
+        say(f"{name}: left out: {messages('en').text(why)}")
     if not inputs.inputs:
         raise InputError(f"{settings.root}: expected scan folders, scenes or scans in it, found none")
     with (
@@ -120,12 +120,12 @@ def _checked(job: Job, result: Record | Lost) -> Record:
     """Return a job's record; a failure if no worker could run it, or if its worker wrote to a disk of its own."""
     if isinstance(result, Lost):
         died = result.loss is Loss.DIED
-        reason = DIED if died else f"a worker of the cluster could not run it ({result.error})"
-    elif result.status == FAILED or (job.place / record.RECORD).is_file():
+        why = reason("batch.workers-died") if died else reason("batch.worker-failed", error=str(result.error))
+    elif result.status == JobStatus.FAILED or (job.place / record.RECORD).is_file():
         return result
     else:
-        reason = "done, but not in this folder: all workers must share it, and the inputs, under the same path"
-    return Record(input=job.name, identity="", status=FAILED, reason=reason, lasting=False)
+        why = reason("batch.not-shared")
+    return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why, lasting=False)
 
 
 def _token_file(state: Path) -> Path:

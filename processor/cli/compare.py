@@ -16,7 +16,7 @@ RADIUS = ("rad", "scale")  # in the names of options that other software has in 
 
 
 class _Diameters(click.Command):
-    """A command whose lengths across are diameters: who gives a radius is told, and is not led to give it as one."""
+    """A command whose lengths across are diameters; options of other software for radii end in an explanation."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         try:
@@ -24,8 +24,8 @@ class _Diameters(click.Command):
         except click.NoSuchOption as error:
             if any(part in error.option_name.lower() for part in RADIUS):
                 raise click.UsageError(
-                    f"No such option: {error.option_name}. What is measured across is given as a diameter, twice the "
-                    "radius: --projection-diameter of the cylinder, --normal-diameter of the sphere for normals.",
+                    f"No such option: {error.option_name}. Widths are given as diameters, twice the radius: "
+                    "--projection-diameter of the cylinder, --normal-diameter of the sphere for normals.",
                     ctx,
                 ) from error
             raise
@@ -47,18 +47,20 @@ class _Diameters(click.Command):
 def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: bool, **options: Any) -> None:
     """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
 
-    All lengths are in the clouds' own unit; what is not given is made from their density.
+    All lengths are in the clouds' own unit; those not given are derived from their density.
     """
     from processor.compare import compare as comparing
+    from processor.language.messages import messages
     from processor.report import comparison
 
     lengths = ("normal_diameter", "projection_diameter", "max_depth")
     request = comparing.Request(reference, compared, **options | {name: options[name] or 0.0 for name in lengths})
     comparison.check_output(output, (reference, compared, request.core, request.normals))
-    record = comparison.write(output, comparing.compare(request, say), lang)
+    result = comparing.compare(request, say)
+    record = comparison.write(output, result, lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))
         return
-    for line in comparison.lines(record):
-        click.echo(line)
+    for line in comparison.lines(result):
+        click.echo(messages("en").text(line))
     click.echo(f"report: {output / comparison.PAGE}")

@@ -1,4 +1,4 @@
-"""Why a comparison has no answer at all, as far as the clouds themselves tell."""
+"""Why a comparison has no distances, from extents, spacings and positions of the clouds."""
 
 from __future__ import annotations
 
@@ -9,30 +9,30 @@ from processor.model import Floats
 
 # What lengths in one unit are of those in another: mm and cm, inch, ft, m; cm and inch, ft, m; m and inch.
 UNIT_RATIOS = (10.0, 25.4, 304.8, 1000.0, 30.48, 100.0, 39.37)
-NAMED = 0.05  # logarithm of how far from such a ratio extents are that differ by the unit
-ALIKE = 0.3  # and of how far from it the spacings may be
+EXTENT_TOLERANCE = 0.05  # logarithmic, of the ratio of extents from one of UNIT_RATIOS
+SPACING_TOLERANCE = 0.3  # logarithmic, of the ratio of spacings from that of the extents
 
 
 def other_unit(reference: Floats, compared: Floats, used: Scales) -> str:
-    """Say that a cloud (n, 3) has another unit than the other (m, 3): larger by a unit's ratio, and as much coarser.
+    """Return a message where the clouds (n, 3) and (m, 3) seem to differ in unit, else nothing.
 
-    Nothing where that is not so. Such clouds may well have answers, where they share an origin: cylinders as wide as
-    the coarser cloud asks for hold all of the other.
+    One is then larger than the other by a ratio of units, and coarser by the same ratio. With a common origin such
+    clouds can still have distances: cylinders as wide as the coarser cloud needs contain all of the other.
     """
     ratio = _extent(compared) / _extent(reference) if _extent(reference) > 0.0 else 0.0
     spacing = used.compared_spacing_mm / used.reference_spacing_mm
-    if ratio > 0.0 and spacing > 0.0 and abs(np.log(spacing / ratio)) < ALIKE:
-        return _unit_said(reference, compared)
+    if ratio > 0.0 and spacing > 0.0 and abs(np.log(spacing / ratio)) < SPACING_TOLERANCE:
+        return _unit_message(reference, compared)
     return ""
 
 
-def _unit_said(reference: Floats, compared: Floats) -> str:
+def _unit_message(reference: Floats, compared: Floats) -> str:
     sizes = _extent(reference), _extent(compared)
     if not min(sizes) > 0.0:
         return ""
     ratio = max(sizes) / min(sizes)
-    near = min(UNIT_RATIOS, key=lambda one: abs(np.log(ratio / one)))
-    if abs(np.log(ratio / near)) >= NAMED:
+    near = min(UNIT_RATIOS, key=lambda known: abs(np.log(ratio / known)))
+    if abs(np.log(ratio / near)) >= EXTENT_TOLERANCE:
         return ""
     larger, other = ("compared", "reference") if sizes[1] > sizes[0] else ("reference", "compared")
     return (
@@ -46,11 +46,11 @@ def _extent(cloud: Floats) -> float:
 
 
 def no_answer(reference: Floats, compared: Floats, core: Floats, without_normal: int, used: Scales) -> str:
-    """Say why no core point (k, 3) has a distance between two clouds (n, 3), (m, 3), in one unit and frame or not."""
-    if said := _unit_said(reference, compared):
-        return said
-    for name, one in (("core points", core), ("compared cloud", compared)):
-        gap = apart(reference, one)
+    """Return a message why no core point (k, 3) has a distance between two clouds (n, 3) and (m, 3)."""
+    if message := _unit_message(reference, compared):
+        return message
+    for name, cloud in (("core points", core), ("compared cloud", compared)):
+        gap = _box_distance(reference, cloud)
         if gap > used.max_depth_mm:
             return (
                 f"the {name} and the reference cloud lie {gap:.6g} apart (their boxes), farther than the max depth of "
@@ -67,7 +67,7 @@ def no_answer(reference: Floats, compared: Floats, core: Floats, without_normal:
     )
 
 
-def apart(one: Floats, other: Floats) -> float:
+def _box_distance(first: Floats, second: Floats) -> float:
     """Distance between the boxes about two clouds (n, 3) and (m, 3), 0 where they overlap."""
-    gap = np.maximum(one.min(axis=0) - other.max(axis=0), other.min(axis=0) - one.max(axis=0))
+    gap = np.maximum(first.min(axis=0) - second.max(axis=0), second.min(axis=0) - first.max(axis=0))
     return float(np.linalg.norm(np.maximum(gap, 0.0)))

@@ -180,8 +180,8 @@ def test_what_is_left_out_is_said(tmp_path):
     names, left_out = found_in(tmp_path)
     assert names == ["bridge", "points.txt"]
     assert sorted(left_out) == ["README.txt", "bridge/inner", "link", "older", "own link", "run"]
-    assert "follows none" in left_out["link"]
-    assert "results of an earlier run" in left_out["run"]
+    assert left_out["link"].code == "batch.link"
+    assert left_out["run"].code == "batch.holds-results"
 
 
 # --- the hash of an input -------------------------------------------------------------------------------------------

@@ -11,12 +11,13 @@ from processor import language
 from processor.batch import figures as batch_figures
 from processor.batch import summary
 from processor.batch.job import Job
-from processor.batch.record import Record
+from processor.batch.record import JobStatus, Record
 from processor.compare import compare
 from processor.defects.result import CLASSES
 from processor.defects.result import Result as Defects
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
+from processor.model import Status, reason
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import Held
 from processor.validation import changes, night
@@ -174,25 +175,26 @@ def test_a_word_of_two_senses_has_that_of_its_column():
 # --- a batch --------------------------------------------------------------------------------------------------------
 
 REASONS = (
-    "stopped before it ended",
-    "took longer than 3.5 s (--timeout-s)",
-    "needs more memory than 200 MB (--memory-mb)",
-    "crashed: SIGSEGV (signal 11)",
-    "crashed: signal 70",
-    "ended with exit code 9 and without results",
-    "ended with exit code 9 and without results: 坏",
-    "the input changed while it was processed, so nothing is kept; run again when it is complete",
-    "done, but not in this folder: all workers must share it, and the inputs, under the same path",
-    "every worker that did it died (out of memory?); run again, with fewer jobs at a time",
-    "a worker has other software: numpy 1.0, not 2.0; install the same everywhere",
+    reason("batch.stopped"),
+    reason("batch.timeout", limit=3.5),
+    reason("batch.memory", limit=200),
+    reason("batch.crashed", signal="SIGSEGV", number=11),
+    reason("batch.crashed-unnamed", number=70),
+    reason("batch.no-results", exit_code=9),
+    reason("batch.no-results-but", exit_code=9, last="坏"),
+    reason("batch.input-changed"),
+    reason("batch.not-shared"),
+    reason("batch.workers-died"),
+    reason("batch.worker-failed", error="坏"),
+    reason("batch.other-software", difference="numpy 1.0, not 2.0"),
 )
 LEFT_OUT = (
-    "cannot be read (Permission denied)",
-    "holds results of an earlier run",
-    "a link; the batch follows none",
-    "holds no rows of coordinates, so it is taken for no scan",
-    "lies within the scan folder 桥",
-    "has the name of one of the batch's own files; rename it",
+    reason("batch.unreadable", error="Permission denied"),
+    reason("batch.holds-results"),
+    reason("batch.link"),
+    reason("batch.no-coordinates"),
+    reason("batch.in-scan-folder", folder="桥"),
+    reason("batch.reserved-name"),
 )
 
 
@@ -206,14 +208,14 @@ def job(out, name):
 
 def indexed(out, lang, reasons=REASONS):
     everything = dict.fromkeys(batch_figures.COLUMNS, 3)
-    everything |= {"steps": "preassemble, spheres (partial), stitch (failed), deviation (ambiguous), defects (weak)"}
+    steps = dict(zip(("preassemble", "spheres", "stitch", "deviation", "defects"), map(str, Status), strict=True))
     done = [
-        Record(f"扫描 {i}", "", status, figures={**everything, "verdict": verdict})
+        Record(f"扫描 {i}", "", JobStatus(status), figures={**everything, "verdict": verdict}, steps=steps)
         for i, (status, verdict) in enumerate(
             [("done", "pass"), ("in-part", "indeterminate"), ("limit-missed", "fail"), ("done", None)]
         )
     ]
-    done += [Record(f"坏 {i}", "", "failed", reason) for i, reason in enumerate(reasons)]
+    done += [Record(f"坏 {i}", "", JobStatus.FAILED, why) for i, why in enumerate(reasons)]
     found = summary.write(out, [(job(out, one.input), one) for one in done], LEFT, lang)
     return found.page.read_text("utf-8")
 
@@ -225,7 +227,7 @@ def test_the_index_of_a_batch_in_chinese(tmp_path):
 
 def test_errors_of_inputs_are_marked_as_english(tmp_path):
     error = "scan.ply: expected 1000 points, found 50; export it again"
-    text = indexed(tmp_path, "zh", (error, *REASONS))
+    text = indexed(tmp_path, "zh", (reason("batch.error", message=error), *REASONS))
     assert f'lang="en">{error}</td>' in text
     assert "错误信息与命令行一致" in text
     assert text.count('lang="en"') == 1
@@ -235,23 +237,24 @@ def test_errors_of_inputs_are_marked_as_english(tmp_path):
 # --- a comparison ---------------------------------------------------------------------------------------------------
 
 
-def test_a_comparison_in_chinese():
-    share = {"core_points": 10, "without_lod": 2, "significant": 3, "significant_share": 0.375, "mean": -0.1,
-             "significant_share_ci95": [0.1, 0.6], "median": 1e-5, "sd": 0.2, "min": None, "max": 1.0,
-             "lod95_median": 0.01}  # fmt: skip
-    inputs = {name: {"file": f"{file}.ply"} for name, file in (("reference", "前"), ("compared", "后"))}
-    for unit in ("mm", "that of the files, which do not say it"):
-        for known in (2, 10):
-            record = {"summary": {**share, "without_lod": known}, "unit": unit, "inputs": inputs}
-            record["normals_note"] = compare.turned_note(Turned(np.empty((0, 3)), 1, 2, 3, 4, 2))
-            record["unit_note"] = compare.unit_note(
-                {"reference": "m", "compared": "", "core": ""}, dict.fromkeys(compare.CLOUDS, "a.ply")
-            )
-            drawn = [("Deviations; the outermost bars hold all beyond", b"")]
-            seen = Visible(comparison._page(record, drawn, "zh"))
+def test_a_comparison_in_chinese(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("前", "后"):
+        np.savetxt(tmp_path / f"{name}.xyz", rng.uniform(0.0, [3.0, 3.0, 0.01], (2000, 3)))
+    first = compare.compare(compare.Request(tmp_path / "前.xyz", tmp_path / "后.xyz", tmp_path / "前.xyz"))
+    found = dataclasses.replace(
+        first,
+        turned=Turned(np.empty((0, 3)), 1, 2, 3, 4, 2),
+        units={"reference": "m", "compared": "", "core": ""},
+    )
+    without = dataclasses.replace(first.summary, without_lod=first.summary.core_points)
+    for unit in ("mm", ""):
+        for summary_ in (first.summary, without):
+            comparison.write(tmp_path / "out", dataclasses.replace(found, summary=summary_, unit=unit), "zh")
+            seen = Visible((tmp_path / "out" / "report.html").read_text("utf-8"))
             assert seen.lang == "zh"
-            assert "由 前.ply 至 后.ply" in seen.texts
-            assert [one for one in latin(seen.texts) if "ply" not in one] == []
+            assert "由 前.xyz 至 后.xyz" in seen.texts
+            assert latin(seen.texts, STAYS | {"xyz", "LOD95"}) == []
 
 
 # --- nights ---------------------------------------------------------------------------------------------------------
