@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, text
-from processor.model import METRIC_NAMES, Metric, StepRun
+from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
 from processor.report import section
 from processor.report.table import Table
@@ -31,9 +31,14 @@ def of_checks(report: ErrorReport) -> Table:
 
 def metric_name(metric: Metric) -> Text:
     """Return the name of a figure as a text."""
-    template = METRIC_NAMES.get(metric.statistic, "{quantity}, {statistic}")
-    name = text(template, quantity=label(metric.quantity), statistic=metric.statistic)
+    name = figure_name(metric.quantity, metric.statistic)
     return text("{method}: {figure}", method=metric.method, figure=name) if metric.method else name
+
+
+def figure_name(quantity: str, statistic: Statistic) -> Text:
+    """Return the name of a figure without its method."""
+    template = METRIC_NAMES.get(statistic, "{quantity}, {statistic}")
+    return text(template, quantity=label(quantity), statistic=statistic)
 
 
 def _outcome(limit: float, passed: bool) -> Text:

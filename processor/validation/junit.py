@@ -1,4 +1,4 @@
-"""JUnit XML of a night, for CI servers: a test case for every cell, and one for every figure that changed."""
+"""JUnit XML of a night, for CI servers: a test case for every cell, and one for every figure that got worse."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def xml(night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Seq
     for change in alarms:
         step, method, name = change.name
         case = _case(suite, f"changes.{step}.{method}", name, 0.0)
-        text = f"{change.kind}: {change.said} ({change.test} test, p {change.p:.2g}, {change.cases} cases)"
+        text = f"{change.kind}: {change.message} ({change.test} test, p {change.p:.2g}, {change.cases} cases)"
         ET.SubElement(case, "failure", message=_clean(text))
     if not alarms:
         _case(suite, "changes", f"{found.figures} figures, none worse", 0.0)

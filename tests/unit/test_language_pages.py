@@ -17,6 +17,7 @@ from processor.defects.result import CLASSES
 from processor.defects.result import Result as Defects
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
+from processor.language.messages import messages
 from processor.model import Status, reason
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import Held
@@ -261,7 +262,9 @@ def test_a_comparison_in_chinese(tmp_path):
 
 
 def change(kind, size, is_ratio=True, unit="mm", cases=3, name=("spheres", "ray", "radii, bias")):
-    return changes.Change(name, kind, "paired", size, is_ratio, unit, 0.001, cases)
+    return changes.Change(
+        name, changes.ChangeKind(kind), "paired", size, is_ratio, unit, 0.001, cases, quantity="radii", statistic="bias"
+    )
 
 
 CHANGES = (
@@ -282,7 +285,7 @@ def a_night(failed=1, missed=2, found=CHANGES, **more):
 
 
 @pytest.mark.parametrize(
-    "told",
+    "found",
     [
         *(a_night(found=(one,)) for one in CHANGES),
         a_night(),
@@ -291,9 +294,9 @@ def a_night(failed=1, missed=2, found=CHANGES, **more):
         a_night(2, 0, CHANGES[:1]),
     ],
 )
-def test_the_line_of_a_night_in_chinese(told):
-    said = language.language("zh").say(told.line)
-    assert latin([said.replace("ray", "").replace("c0ffeec0", "")]) == []
+def test_the_line_of_a_night_in_chinese(found):
+    line = messages("zh").text(found.line)
+    assert latin([line.replace("ray", "").replace("c0ffeec0", "")]) == []
 
 
 def two_nights(out, lang):
