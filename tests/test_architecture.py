@@ -10,6 +10,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 STORE = {
+    "processor.store",
     "processor.store.store",
     "processor.store.codec",
     "processor.store.tiles",

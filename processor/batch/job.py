@@ -30,7 +30,19 @@ from processor.scan_folder import fingerprint
 from processor.store.store import sync
 from processor.version import __version__
 
-PACKAGES = ("ezdxf", "h5py", "laspy", "lazrs", "numba", "numpy", "plyfile", "pye57", "pypcd4", "scipy", "trimesh")
+PACKAGES = (
+    "ezdxf",
+    "h5py",
+    "laspy",
+    "lazrs",
+    "numba",
+    "numpy",
+    "plyfile",
+    "pye57",
+    "python-neo-lzf",
+    "scipy",
+    "trimesh",
+)
 # By the exit code of `processor run`.
 STATUS = {0: JobStatus.DONE, 1: JobStatus.IN_PART, 4: JobStatus.LIMIT_MISSED}
 WITH_RESULTS = tuple(STATUS.values())

@@ -151,13 +151,17 @@ def _html(
     columns = [
         (label(name.replace("_", " ")), any(row["cells"][i]["number"] for row in shown)) for i, name in enumerate(names)
     ]
-    page: str = templates.environment("batch", lang).get_template("summary.html").render(
-        lang=lang,
-        title=text("{count} {count:?input|inputs}", count=len(rows)),
-        counted=text("{counts}.", counts=counted),
-        columns=columns,
-        rows=shown,
-        left_out=[(readable(name), _written(why, lang)) for name, why in sorted(left_out.items())],
+    page: str = (
+        templates.environment("batch", lang)
+        .get_template("summary.html")
+        .render(
+            lang=lang,
+            title=text("{count} {count:?input|inputs}", count=len(rows)),
+            counted=text("{counts}.", counts=counted),
+            columns=columns,
+            rows=shown,
+            left_out=[(readable(name), _written(why, lang)) for name, why in sorted(left_out.items())],
+        )
     )
     return page
 

@@ -17,9 +17,9 @@ from processor.geometry.m3c2 import FEWEST_FOR_LOD
 from processor.geometry.normal_orientation import CONVENTION, Turned
 from processor.language.messages import NO_NUMBER, Message, messages, text
 from processor.report import results_folder, templates
-from processor.report.record_json import reason_json
 from processor.report.deviation import csv
 from processor.report.deviation import figures as deviation_figures
+from processor.report.record_json import reason_json
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
 OWN_NAMES = (TABLE, *FIGURES, RECORD, PAGE)
@@ -52,7 +52,7 @@ def as_json(found: Comparison) -> dict[str, Any]:
                     name: {"file": path.name, "sha256": found.hashes[name], "points": found.points.get(name)}
                     for name, path in files.items()
                 },
-                "unit": found.unit or "that of the files, which do not state it",
+                "unit": found.unit or "that of the files, which do not give it",
                 "unit_note": found.unit_note and english.text(found.unit_note),
                 "definition": DEFINITION,
                 "normals": english.text(found.normals_from),
@@ -161,11 +161,17 @@ def lines(found: Comparison) -> list[Message]:
 
 def _page(found: Comparison, record: dict[str, Any], drawn: list[tuple[Message, bytes]], lang: str) -> str:
     request = found.request
-    page: str = templates.environment("report", lang).get_template("comparison.html").render(
-        lang=lang,
-        title=text("From {reference} to {compared}", reference=request.reference.name, compared=request.compared.name),
-        lines=lines(found),
-        figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
-        provenance=json.dumps(record, indent=2, ensure_ascii=False),
+    page: str = (
+        templates.environment("report", lang)
+        .get_template("comparison.html")
+        .render(
+            lang=lang,
+            title=text(
+                "From {reference} to {compared}", reference=request.reference.name, compared=request.compared.name
+            ),
+            lines=lines(found),
+            figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
+            provenance=json.dumps(record, indent=2, ensure_ascii=False),
+        )
     )
     return page

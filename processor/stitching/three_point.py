@@ -13,7 +13,7 @@ import numpy as np
 from scipy.stats import f
 from scipy.stats import t as student
 
-from processor.geometry import rigid
+from processor.geometry import rigid, unit_ratio
 from processor.model import NORMAL_95, Floats, Picks, Scan
 from processor.stitching import frames
 from processor.stitching.fine.pair_checks import Pair
@@ -175,9 +175,9 @@ def widened(sd: float, freedoms: float) -> float:
 
 def units_slip(scale: float) -> str:
     """Return the two units whose ratio a scale is, within 2 %, or nothing."""
-    return next(
-        (units for ratio, units in UNIT_SLIPS if min(abs(scale / ratio - 1.0), abs(scale * ratio - 1.0)) < 0.02), ""
-    )
+    names = {ratio: units for factor, units in UNIT_SLIPS for ratio in (factor, 1.0 / factor)}
+    factor = unit_ratio.nearest_factor(scale, names, 0.02)
+    return names[factor] if factor else ""
 
 
 def as_pair(a: int, b: int, fit: PairFit) -> Pair:

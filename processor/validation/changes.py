@@ -214,9 +214,7 @@ def find(
 _Present = set[tuple[str, int, tuple[str, str]]]  # case, seed, and step with method
 
 
-def _by_figure(
-    rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]]
-) -> tuple[dict[Name, _Series], _Present]:
+def _by_figure(rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]]) -> tuple[dict[Name, _Series], _Present]:
     """Sort rows by figure, without later nights and those that are no level; also what was measured this night."""
     series: dict[Name, _Series] = defaultdict(_Series)
     present: _Present = set()

@@ -16,7 +16,7 @@ from processor.report import templates
 from processor.report.all_tables import figure_name
 from processor.validation import changes
 from processor.validation.cells import Figure
-from processor.validation.changes import ALARMS, Change, Direction, Found, ChangeKind
+from processor.validation.changes import ALARMS, Change, ChangeKind, Direction, Found
 from processor.validation.history import Name, Night, Row
 from processor.validation.software import Software
 
@@ -194,14 +194,18 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], 
                 "change": change.message if change else "",
             }
         )
-    page: str = templates.environment("validation", lang).get_template("nights.html").render(
-        lang=lang,
-        summary=summary,
-        nights=list(reversed(nights)),
-        figures=figures,
-        test=TEST,
-        width=SPARK_WIDTH,
-        height=SPARK_HEIGHT,
+    page: str = (
+        templates.environment("validation", lang)
+        .get_template("nights.html")
+        .render(
+            lang=lang,
+            summary=summary,
+            nights=list(reversed(nights)),
+            figures=figures,
+            test=TEST,
+            width=SPARK_WIDTH,
+            height=SPARK_HEIGHT,
+        )
     )
     return page + "\n"
 

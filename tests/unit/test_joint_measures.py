@@ -43,7 +43,7 @@ def some_covariance(seed, scale=0.3):
 
 def only(**limits):
     base = Tolerance("by hand")
-    return standards.with_own(base, {key: np.atleast_1d(np.float64(value)) for key, value in limits.items()}, "test")
+    return standards.override(base, {key: np.atleast_1d(np.float64(value)) for key, value in limits.items()}, "test")
 
 
 def test_the_joints_axes_are_those_of_its_frame():

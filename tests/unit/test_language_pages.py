@@ -323,4 +323,5 @@ def test_pages_of_nights_in_chinese(tmp_path):
         text = (tmp_path / name).read_text("utf-8")
         text = re.sub(r"<code>[0-9a-f]+</code>|c0ffee\w*", "", text)
         assert left_in_english(text, *more) == []
+    assert "2026-11-20 异常" in (tmp_path / "nights.html").read_text("utf-8")  # the line of an earlier night
     assert 'lang="zh"' in (tmp_path / "nights/2026-11-20/certificate.html").read_text("utf-8")

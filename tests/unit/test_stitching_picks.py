@@ -139,7 +139,7 @@ def test_picks_are_read_in_the_scans_units(tmp_path):
     [
         ("a,b,c\n", "expected columns scan_a,scan_b"),
         ("HEAD\nA,C,P,1,2,3,4,5,6\n", "line 2: there is no scan 'C'; there are A, B"),
-        ("HEAD\nA,A,P,1,2,3,4,5,6\n", "with itself"),
+        ("HEAD\nA,A,P,1,2,3,4,5,6\n", "expected two scans, found 'A' twice"),
         ("HEAD\nA,B,P,1,2,3,4,5\n", "expected 9 cells, found 8"),
         ("HEAD\nA,B,P,1,2,x,4,5,6\n", "expected six numbers"),
         ("HEAD\nA,B,P,1,2,nan,4,5,6\n", "expected finite numbers"),
