@@ -6,6 +6,8 @@ import dataclasses
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from processor.language.messages import messages
 from processor.model import Checked, Reason, Rows
 from processor.store.codec import reason_object
@@ -31,7 +33,8 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
         keys = field.metadata.get("keys", ())
         for row, value in zip(rows, column, strict=True):
             for name, item in zip(keys, value, strict=True) if keys else [("", value)]:
-                _put(row, key.replace("*", name), _value(item))
+                null = field.metadata.get("nullable") and np.isnan(item).all()
+                _put(row, key.replace("*", name), None if null else _value(item))
     return rows
 
 

@@ -124,7 +124,9 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
     if value is None:
         return
     if "shape" in metadata:
-        write_array(group, name, value)
+        write_array(group, name, value.view(np.uint8) if value.dtype == np.bool_ else value)
+    elif "lists" in metadata:
+        write_texts(group, name, [json.dumps(row, ensure_ascii=False) for row in value])
     elif "reasons" in metadata:
         rows = (
             [[reason_object(item) for item in row] for row in value]
@@ -199,8 +201,11 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     kind = allowed[0] if union else hint
     if "shape" in metadata:
         return read_array(group, name, metadata["dtype"], len(metadata["shape"]))
+    if "lists" in metadata:
+        return _read_json(group, name, lambda row: tuple(map(str, row)))
     if "reasons" in metadata:
-        return _read_reasons(group, name, bool(metadata["reasons"]))
+        by_row = bool(metadata["reasons"])
+        return _read_json(group, name, lambda row: tuple(map(_reason, row)) if by_row else _reason(row))
     if kind is str or ("words" in metadata and "axis" not in metadata):
         return read_text(group, name)
     if kind in (bool, int, float):
@@ -217,13 +222,13 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     return _read_member(group[name], kind, hooks)
 
 
-def _read_reasons(group: Any, name: str, by_row: bool) -> Any:
+def _read_json(group: Any, name: str, made: Callable[[Any], Any]) -> tuple[Any, ...]:
+    """Read texts of JSON, and what ``made`` makes of each."""
     where = f"{group.name}/{name}"
     try:
-        rows = [json.loads(_decoded(item, where)) for item in _dataset(group, name, "S", 1)[()].tolist()]
-        return tuple(tuple(map(_reason, row)) if by_row else _reason(row) for row in rows)
+        return tuple(made(json.loads(_decoded(item, where))) for item in _dataset(group, name, "S", 1)[()].tolist())
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise DecodeError([f"{where}: expected reasons as JSON ({error})"]) from None
+        raise DecodeError([f"{where}: expected JSON ({error})"]) from None
 
 
 def _read_member(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:
@@ -248,8 +253,8 @@ def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[An
 
 
 def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
-    """Read an array with ``ndim`` axes; an absent optional array is empty, with any number of axes."""
-    stored = np.dtype(dtype).str[1:]
+    """Read an array with ``ndim`` axes, bool from uint8; an absent optional array is empty, with any number of axes."""
+    stored = np.dtype(np.uint8 if dtype is np.bool_ else dtype).str[1:]
     if name in group and isinstance(group[name], h5py.Dataset) and group[name].size == 0:
         ndim = group[name].ndim
     return _dataset(group, name, stored, ndim)[()]
