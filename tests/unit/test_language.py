@@ -9,6 +9,9 @@ import pytest
 
 from processor import language
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import messages
+from processor.language.messages import text as message
+from processor.model import Status
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, view
 from tests.support.metrics import metric
@@ -85,7 +88,7 @@ def test_all_that_the_scripts_say_is_known(code):
     script, _ = view.script()
     said = set(re.findall(r'say\("([^"]+)"\)', script))
     assert len(said) > 20
-    assert said - set(language.language(code).of_scripts(script)) == set()
+    assert said - set(messages(code).of_scripts(script)) == set()
 
 
 def test_names_from_files_are_left_alone():
@@ -96,14 +99,10 @@ def test_names_from_files_are_left_alone():
 
 
 def test_live_figures_are_translated_but_for_names():
-    found = language.language("zh").in_figures(
-        {"title": "Balls in space", "parts": [{"name": "top", "text": "balls: wrong-size"}], "stops": ["left", 1.0]}
+    found = messages("zh").rendered(
+        {"title": message("Balls in space"), "parts": [{"name": "top", "text": Status.OK}], "stops": ("left", 1.0)}
     )
-    assert found == {
-        "title": "螺栓球的三维视图",
-        "parts": [{"name": "top", "text": "螺栓球：规格不符"}],
-        "stops": ["left", 1.0],
-    }
+    assert found == {"title": "螺栓球的三维视图", "parts": [{"name": "top", "text": "正常"}], "stops": ["left", 1.0]}
 
 
 # --- Chinese -------------------------------------------------------------------------------------------------------
