@@ -16,14 +16,12 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
-from processor.defects import design_pose, pictures
+from processor.defects import pictures
 from processor.defects.params import Paper, Params
 from processor.defects.pictures import MOST_PLACES
 from processor.defects.result import Result
 from processor.defects.surface_charts import of_mesh
-from processor.deviation import cloud as deviation_cloud
-from processor.geometry import icp, pfh, rigid, visible_facets
-from processor.geometry.merging import merged
+from processor.geometry import icp, merging, mesh_distance, pfh, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
 from processor.model import NORMAL_95, Floats, Ints, Scene
 
@@ -42,8 +40,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     """Find the defects of a structure as in paper 004."""
     paper = params.paper
     assert scene.structure is not None
-    vertices, origin = deviation_cloud.local_design(scene.structure)
-    cloud = merged(design_pose.stitched(scene, earlier), with_scanner=False)
+    vertices, origin = merging.local_design(scene.structure)
+    cloud = merging.merged(merging.stitched(scene, earlier.get("stitch")), with_scanner=False)
     local = cloud.points + (cloud.origin - origin)
     size, points = _thinned(local, paper)
     radius = paper.cluster_radius_mm or RADIUS_VOXELS * size
@@ -53,7 +51,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     points = points[kept]
     if len(points) < paper.feature_points:
         return Result("failed", params.method, "too few points are left after the removal of noise")
-    design = deviation_cloud.sampled(vertices, scene.structure.faces, size)
+    design = mesh_distance.sampled(vertices, scene.structure.faces, size)
     rng = np.random.default_rng([params.seed, 4])
     start = _first_pose(points, design.points, design.normals, size, paper, rng)
     T, rms = start, np.inf
@@ -66,8 +64,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         return Result("failed", params.method, "the scan could not be laid on the design")
     surface = of_mesh(vertices, scene.structure.faces, 1000.0)
     placed = rigid.apply(T, points)
-    grid = visible_facets.grid_of(surface.vertices, surface.faces, surface.normals, params.reach_mm)
-    facet, distance = visible_facets.nearest(grid, placed, np.zeros((1, 3)), np.full(len(placed), -1, np.int64))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, params.reach_mm)
+    facet, distance = mesh_distance.nearest_visible(grid, placed, np.zeros((1, 3)), np.full(len(placed), -1, np.int64))
     on = facet >= 0
     placed, facet, distance = placed[on], facet[on], distance[on]
     sigma = 1.4826 * float(np.median(np.abs(distance - np.median(distance)))) if len(distance) else 0.0

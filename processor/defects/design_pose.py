@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -10,11 +9,9 @@ from typing import Any
 import numpy as np
 
 from processor.defects.params import Params
-from processor.deviation import cloud as deviation_cloud
-from processor.deviation import design_pose, measure
-from processor.deviation.attitude import AMBIGUOUS
-from processor.geometry import rigid
-from processor.geometry.merging import merged
+from processor.geometry import merging, mesh_distance, rigid, surface_registration
+from processor.geometry.principal import AMBIGUOUS
+from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Scene
 
 ADVICE = "run the steps stitch and deviation first, or give the scans poses in the design's frame"
@@ -32,14 +29,6 @@ class Placing:
     status: str = "ok"
 
 
-def stitched(scene: Scene, earlier: dict[str, Any]) -> Scene:
-    """Return the scene with the poses that step stitch found, where it ran."""
-    found = earlier.get("stitch")
-    if found is None:
-        return scene
-    return dataclasses.replace(scene, scans=deviation_cloud.posed(scene, found))
-
-
 def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> Placing:
     """Place the scans at the design: as step deviation did where that ran, else by the same rule.
 
@@ -53,15 +42,15 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> Placing:
         return Placing(before.T_design_scan, error, f"placed by step deviation ({before.registration})", status)
     error = params.registration_error_mm if math.isfinite(params.registration_error_mm) else UNKNOWN_ERROR_MM
     assert scene.structure is not None
-    cloud = merged(scene, with_scanner=False)
-    if len(cloud.points) < deviation_cloud.FEWEST_POINTS:
+    cloud = merging.merged(scene, with_scanner=False)
+    if len(cloud.points) < merging.FEWEST_POINTS:
         return Placing(None, error, "too few points to place the scans at the design")
-    vertices, origin = deviation_cloud.local_design(scene.structure)
+    vertices, origin = merging.local_design(scene.structure)
     few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
-    thin = deviation_cloud.ScanCloud(few, cloud.origin, None, 1.0, len(cloud.points), len(few))
     given = rigid.transform(np.eye(3), cloud.origin - origin)
-    placed = design_pose.place(thin, measure.surface_of(vertices, scene.structure.faces), given, "auto")
-    if placed.registration == "as given":
+    surface = mesh_distance.of_design(vertices, scene.structure.faces)
+    placed = surface_registration.place(few, surface, given, "auto")
+    if placed.registration is Registration.AS_GIVEN:
         return Placing(np.eye(4), error)
     if not np.isfinite(placed.T_best_fit).all():
         return Placing(None, error, f"the scans are not in the design's frame and could not be placed there; {ADVICE}")

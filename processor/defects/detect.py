@@ -22,8 +22,7 @@ from processor.defects import (
 )
 from processor.defects.params import Params
 from processor.defects.result import Result
-from processor.deviation import cloud
-from processor.geometry import rigid
+from processor.geometry import merging, rigid
 from processor.model import Floats, InputError, Scene
 
 CELL_POINTS = 12.0  # in a cell, on the median
@@ -39,8 +38,8 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     design = scene.structure
     if design is None or not len(design.faces):
         raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP in project.toml)")
-    vertices, origin = cloud.local_design(design)
-    scene = design_pose.stitched(scene, earlier)
+    vertices, origin = merging.local_design(design)
+    scene = merging.stitched(scene, earlier.get("stitch"))
     placed = design_pose.pose(scene, earlier, params)
     if placed.T_design_project is None:
         return Result("failed", params.method, placed.said)

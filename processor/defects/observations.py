@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from processor.defects.surface_charts import DesignSurface, layout
-from processor.geometry import rigid, visible_facets
+from processor.geometry import mesh_distance, rigid
 from processor.model import Floats, InputError, Ints, Scene
 
 CHUNK = 500_000
@@ -57,7 +57,7 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
     """
     if not scene.scans or not any(len(scan.points) for scan in scene.scans):
         raise InputError(f"{scene.name}: expected scans of the structure, found no points")
-    grid = visible_facets.grid_of(surface.vertices, surface.faces, surface.normals, reach_mm)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach_mm)
     names: list[str] = []
     positions: list[Floats] = []
     parts: list[tuple[Ints, Floats, Ints, Floats]] = []
@@ -80,7 +80,7 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
             rows = slice(start, start + CHUNK)
             points = rigid.apply(T, scan.points[rows])
             station = np.where(known[own[rows]], own[rows], -1)
-            facet, deviation = visible_facets.nearest(grid, points, np.nan_to_num(np.array(positions)), station)
+            facet, deviation = mesh_distance.nearest_visible(grid, points, np.nan_to_num(np.array(positions)), station)
             near = np.flatnonzero(facet >= 0)
             arm = np.nan_to_num(np.array(positions))[own[rows][near]] - points[near]
             cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[near]]) / np.linalg.norm(arm, axis=1)

@@ -14,7 +14,7 @@ from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from processor.geometry import mesh_distance, visible_facets
+from processor.geometry import mesh_distance
 from processor.model import Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
@@ -128,7 +128,7 @@ def _components(vertices: Floats, faces: Ints) -> Ints:
     links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())),
                       (len(vertices),) * 2)  # fmt: skip
     body = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
-    one, two = visible_facets.touching(vertices, faces, TOUCH_MM)
+    one, two = mesh_distance.touching(vertices, faces, TOUCH_MM)
     own = np.full(len(vertices), -1, np.int64)
     own[faces.ravel()] = np.repeat(body, 3)
     count = int(body.max(initial=-1)) + 1

@@ -10,7 +10,7 @@ import trimesh
 from processor.defects import baseline, deviation_field, pictures, regions, scan_statistic, shape_models, surface_charts
 from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
-from processor.geometry import visible_facets
+from processor.geometry import mesh_distance
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.pipeline import as_json
 from processor.report.defects import section
@@ -281,8 +281,8 @@ def test_facets_are_the_nearest_that_a_scanner_can_see():
     normals = trimesh.Trimesh(vertices, faces, process=False).face_normals
     rng = np.random.default_rng(3)
     points = rng.uniform([-30.0, -30.0, -30.0], [330.0, 42.0, 230.0], (2000, 3))
-    grid = visible_facets.grid_of(vertices, faces, normals, 60.0)
-    facet, distance = visible_facets.nearest(grid, points, np.zeros((1, 3)), np.full(2000, -1))
+    grid = mesh_distance.facet_grid(vertices, faces, normals, 60.0)
+    facet, distance = mesh_distance.nearest_visible(grid, points, np.zeros((1, 3)), np.full(2000, -1))
     _, true, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(vertices, faces, process=False), points)
     corner = vertices[faces[facet, 0]]
     np.testing.assert_allclose(distance, np.einsum("ni,ni->n", points - corner, normals[facet]), atol=1e-9)
@@ -291,7 +291,9 @@ def test_facets_are_the_nearest_that_a_scanner_can_see():
     np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), true, atol=1e-9)
     # Deep in the plate, nearer to its back, but seen from the front.
     deep = np.array([[150.0, 9.0, 100.0]])
-    facet, distance = visible_facets.nearest(grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64))
+    facet, distance = mesh_distance.nearest_visible(
+        grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64)
+    )
     assert distance[0] == pytest.approx(-9.0)
     np.testing.assert_allclose(normals[facet[0]], [0.0, -1.0, 0.0])
 

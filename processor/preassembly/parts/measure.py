@@ -71,7 +71,7 @@ class _PlacedScan:
     points: Floats
     station: Ints
     attitude: attitude.Attitude
-    registration: surface_registration.Registration = surface_registration.NOWHERE
+    registration: surface_registration.SurfaceFit = surface_registration.NOWHERE
     trouble: str = ""
     identity: identity.Identity = field(default_factory=identity.Identity)
     doubt: str = ""  # why it may be of another part
@@ -126,7 +126,7 @@ def fit(
         scans=tuple(scan.scan for scan in used),
         status=status,
         message="; ".join(filter(None, (*_messages(placed, used, part, troubles), resemblance))),
-        T_bridge_scan=first.registration.T_bridge_scan,
+        T_bridge_scan=first.registration.T_design_scan,
         member=Member((None, None), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
         T_rival=first.attitude.T_rival,
@@ -169,7 +169,7 @@ def _messages(
 
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
-    points = np.vstack([rigid.apply(scan.registration.T_bridge_scan, scan.points) for scan in used])
+    points = np.vstack([rigid.apply(scan.registration.T_design_scan, scan.points) for scan in used])
     station = _station_numbers([scan.station for scan in used])
     return RegisteredPart(
         points=points,
@@ -236,17 +236,17 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
         resemblance = _resemblance(points, design, part)
         if resemblance:
             return replace(placed, trouble=f"{away}; {resemblance}")
-        covered = _covered(points, registration.T_bridge_scan, shape)
+        covered = _covered(points, registration.T_design_scan, shape)
         if covered < LEAST_COVERED:
             doubt = f"{away} and the others cover {covered:.0%} of its sides; {WHICH}"
             placed = replace(placed, doubt=doubt)
-    others = identity.identify(points, registration.T_bridge_scan, shape, part, design)
+    others = identity.identify(points, registration.T_design_scan, shape, part, design)
     # A part of another size may by chance have its mark where the other part of this shape has its own.
     wrong = others.contradiction and (_resemblance(points, design, part) or others.contradiction)
     return replace(placed, identity=others, trouble=wrong)
 
 
-def _misfit(registration: surface_registration.Registration) -> str:
+def _misfit(registration: surface_registration.SurfaceFit) -> str:
     """Why a registered scan is not of its design; empty where it is."""
     share = registration.used_share
     if not (share > surface_registration.LEAST_SHARE and np.isfinite(registration.covariance).all()):
