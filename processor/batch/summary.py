@@ -136,17 +136,18 @@ def _html(
     counted = [
         text("{count} {status}", count=statuses[status], status=status) for status in JobStatus if statuses[status]
     ]
+    verdicts = [Verdict(row["verdict"] or "none") for row in rows]
     shown = [
         {
             **{name: row[name] for name in ("input", "status", "report", "log")},
             "tone": TONES[row["status"]],
-            "verdict": Verdict(row["verdict"]) if row["verdict"] else "",
-            "verdict_tone": TONES.get(row["verdict"] or "", ""),
+            "verdict": verdict if row["verdict"] else "",
+            "verdict_tone": TONES.get(verdict, ""),
             "reason": _written(ending.reason, lang),
             "english": row["reason_code"] == ERROR and lang != "en",
             "cells": [_cell_shown(_steps(ending) if name == "steps" else row.get(name), lang) for name in names],
         }
-        for row, ending in zip(rows, records, strict=True)
+        for row, ending, verdict in zip(rows, records, verdicts, strict=True)
     ]
     columns = [
         (label(name.replace("_", " ")), any(row["cells"][i]["number"] for row in shown)) for i, name in enumerate(names)
