@@ -318,7 +318,7 @@ def find_input(results: Path) -> Path:
     """
     from processor import store
 
-    name = store.read_provenance(results).get("input", "")
+    name = str(store.read_provenance(results).get("input", ""))
     folders = (results.absolute().parent.parent, Path.cwd())
     found = next((folder / name for folder in folders if name and (folder / name).exists()), None)
     if found is None:

@@ -1,6 +1,6 @@
-"""All inputs below a folder: found, processed, and summarised; run again, it takes up where it was.
+"""Finds, processes and summarises all inputs below a folder; run again, it continues where it stopped.
 
-The state is files alone, each put in place by one renaming, so that it is whole whenever the batch is killed.
+The state is in files only, each moved into place by one renaming, so that it is whole whenever the batch is killed.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MEMORY_SHARE, LEAST_MEMORY_MB = 0.8, 1024  # of the machine, for all jobs togeth
 
 @dataclass(frozen=True)
 class Settings:
-    """What a batch does; ``arguments`` go to every ``processor run``, ``units`` to those of scans."""
+    """Settings of a batch; ``arguments`` are passed to every ``processor run``, ``units`` to those of scans."""
 
     root: Path
     out: Path
@@ -117,7 +117,7 @@ def _records(
 
 
 def _checked(job: Job, result: Record | Lost) -> Record:
-    """Return a job's record; a failure if no worker could run it, or if its worker wrote to a disk of its own."""
+    """Return a job's record; a failure if no worker could run it, or if its worker wrote to another disk."""
     if isinstance(result, Lost):
         died = result.loss is Loss.DIED
         why = reason("batch.workers-died") if died else reason("batch.worker-failed", error=str(result.error))
@@ -191,9 +191,9 @@ def _memory_mb(at_once: int) -> int:
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[Path]:
-    """Make and lock the folder of results; gives that of the batch's state."""
+    """Make and lock the folder of results; yield the folder of the batch's state."""
     state = out / STATE
-    busy = f"{out}: another batch is at work here; wait for it or stop it"
+    busy = f"{out}: another batch is running here; wait for it or stop it"
     with ExitStack() as stack:
         try:
             state.mkdir(parents=True, exist_ok=True)

@@ -86,7 +86,7 @@ def _search(folder: Path, name: str, out: Path, left_out: dict[str, Reason]) -> 
             scans.append(Input(inner, path))
         elif path.suffix.lower() in readers.SUFFIXES and entry.name not in NOT_INPUTS:
             left_out[inner] = reason("batch.no-coordinates")
-    # scans/ belongs to this folder unless something else in it would be an input of its own.
+    # scans/ belongs to this folder unless something else in it would be a separate input.
     only_scans = in_scans and [each.name for each in below] == [f"{name}/{SCANS}".lstrip("/")]
     if not scenes and ((only_scans and (name or not scans)) or (name and scans and not below)):
         return [Input(name or ".", folder)]

@@ -1,4 +1,4 @@
-"""Tables of a run, for the page, for CSV files and for the terminal."""
+"""Tables of a run for the page, CSV files and the terminal."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ __all__ = ["Table", "all_of", "grouped", "of_checks", "of_step"]
 
 
 def of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
-    """Tables of a step's answer, beside other methods on the same scene."""
+    """Tables of a step's result, with those of other methods on the same scene."""
     return section.of(run.step).tables((run, *others), report)
 
 
@@ -56,11 +56,10 @@ def all_of(execution: Execution, report: ErrorReport) -> list[Table]:
 
 
 def grouped(runs: Sequence[StepRun]) -> list[tuple[StepRun, list[StepRun]]]:
-    """Pair each step's answer with the runs of other methods made for comparison."""
-    answers: dict[str, tuple[StepRun, list[StepRun]]] = {}
+    """Pair the first run of each step, its result, with the runs of other methods for comparison."""
+    by_step: dict[str, tuple[StepRun, list[StepRun]]] = {}
     for run in runs:
-        if run.step in answers:
-            answers[run.step][1].append(run)
-        else:
-            answers[run.step] = (run, [])
-    return list(answers.values())
+        by_step.setdefault(run.step, (run, []))
+        if by_step[run.step][0] is not run:
+            by_step[run.step][1].append(run)
+    return list(by_step.values())

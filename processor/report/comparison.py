@@ -37,9 +37,9 @@ def check_output(out: Path, inputs: tuple[Path | None, ...]) -> None:
             results_folder.check_output(out, path, RECORD, OWN_NAMES)
 
 
-def as_json(found: Comparison) -> dict[str, Any]:
+def as_json(result: Comparison) -> dict[str, Any]:
     """Build the object of compare.json; lengths in the clouds' unit."""
-    request, scales, notes = found.request, found.scales, found.normals_notes
+    request, scales, notes = result.request, result.scales, result.normals_notes
     names = ("reference", "compared", "core", "normals")
     files = {name: path for name in names if (path := getattr(request, name)) is not None}
     english = messages("en")
@@ -49,16 +49,16 @@ def as_json(found: Comparison) -> dict[str, Any]:
                 "format": "processor-comparison",
                 "format_version": "1.0",
                 "inputs": {
-                    name: {"file": path.name, "sha256": found.hashes[name], "points": found.points.get(name)}
+                    name: {"file": path.name, "sha256": result.hashes[name], "points": result.points.get(name)}
                     for name, path in files.items()
                 },
-                "unit": found.unit or "that of the files, which do not give it",
-                "unit_note": found.unit_note and english.text(found.unit_note),
+                "unit": result.unit or "that of the files, which do not give it",
+                "unit_note": result.unit_note and english.text(result.unit_note),
                 "definition": DEFINITION,
-                "normals": english.text(found.normals_from),
+                "normals": english.text(result.normals_from),
                 "normals_note": english.sentences(notes) if notes else None,
-                "notes": [reason_json(note) for note in found.notes],
-                "normals_turned": None if found.turned is None else _turned(found.turned),
+                "notes": [reason_json(note) for note in result.notes],
+                "normals_turned": None if result.turned is None else _turned(result.turned),
                 "parameters": {
                     "normal_diameter": None if request.normals else scales.normal_diameter_mm,
                     "projection_diameter": scales.projection_diameter_mm,
@@ -71,7 +71,7 @@ def as_json(found: Comparison) -> dict[str, Any]:
                     ],
                 },
                 "spacing": {"reference": scales.reference_spacing_mm, "compared": scales.compared_spacing_mm},
-                "summary": _summary(found),
+                "summary": _summary(result),
                 "software": pipeline.software(),
             }
         )
@@ -79,8 +79,8 @@ def as_json(found: Comparison) -> dict[str, Any]:
     return written
 
 
-def _summary(found: Comparison) -> dict[str, Any]:
-    summary = found.summary
+def _summary(result: Comparison) -> dict[str, Any]:
+    summary = result.summary
     share = summary.significant_share
     figures = {
         field.name: getattr(summary, field.name)
@@ -103,31 +103,31 @@ def _turned(turned: Turned) -> dict[str, Any]:
     }
 
 
-def write(out: Path, found: Comparison, lang: str = "en") -> dict[str, Any]:
+def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
     """Write the folder in place of an earlier one, its page in ``lang``; returns the object of compare.json."""
-    record = as_json(found)
+    record = as_json(result)
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams["text.parse_math"] = False
         drawn = [
-            deviation_figures.deviation_map(found.core + found.origin, found.normals, found.distances, found.unit),
-            deviation_figures.histogram(found.distances, found.unit),
+            deviation_figures.deviation_map(result.core + result.origin, result.normals, result.distances, result.unit),
+            deviation_figures.histogram(result.distances, result.unit),
         ]
     with results_folder.whole(out) as making:
-        table = csv.csv_text(found.origin, found.core, found.distances, found.normals)
+        table = csv.csv_text(result.origin, result.core, result.distances, result.normals)
         results_folder.write_text(making / TABLE, table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
         results_folder.write_text(making / RECORD, record_text + "\n")
         for name, (_, data) in zip(FIGURES, drawn, strict=True):
             results_folder.write_bytes(making / name, data)
-        results_folder.write_text(making / PAGE, _page(found, record, drawn, lang))
+        results_folder.write_text(making / PAGE, _page(result, record, drawn, lang))
     return record
 
 
-def lines(found: Comparison) -> list[Message]:
+def lines(result: Comparison) -> list[Message]:
     """Summarise the outcome, for the terminal and the page."""
-    summary = found.summary
-    unit = f" {found.unit}" if found.unit else ""
+    summary = result.summary
+    unit = f" {result.unit}" if result.unit else ""
 
     def number(value: float, half: float = math.nan) -> str:
         if not math.isfinite(value):
@@ -138,7 +138,7 @@ def lines(found: Comparison) -> list[Message]:
     known = summary.core_points - summary.without_lod
     total = text("{count} core points, {known} with a level of detection", count=summary.core_points, known=known)
     if not known:
-        return [total, *found.notes]
+        return [total, *result.notes]
     share = summary.significant_share
     beyond = text(
         "beyond it: {count}, {share:.1f} % (95 %: {low:.1f}-{high:.1f})",
@@ -156,11 +156,11 @@ def lines(found: Comparison) -> list[Message]:
         greatest=number(summary.max, summary.max_lod95),
     )
     lod95 = text("median level of detection {lod95}", lod95=number(summary.lod95_median))
-    return [total, beyond, distance, lod95, *found.notes]
+    return [total, beyond, distance, lod95, *result.notes]
 
 
-def _page(found: Comparison, record: dict[str, Any], drawn: list[tuple[Message, bytes]], lang: str) -> str:
-    request = found.request
+def _page(result: Comparison, record: dict[str, Any], drawn: list[tuple[Message, bytes]], lang: str) -> str:
+    request = result.request
     page: str = (
         templates.environment("report", lang)
         .get_template("comparison.html")
@@ -169,7 +169,7 @@ def _page(found: Comparison, record: dict[str, Any], drawn: list[tuple[Message, 
             title=text(
                 "From {reference} to {compared}", reference=request.reference.name, compared=request.compared.name
             ),
-            lines=lines(found),
+            lines=lines(result),
             figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
             provenance=json.dumps(record, indent=2, ensure_ascii=False),
         )

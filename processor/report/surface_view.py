@@ -77,7 +77,7 @@ def of_points(
         for mark in marks
     ]
     lines, spots, places = _outlined(regions, origin, len(drawn))
-    found = {
+    data = {
         "title": title,
         "arrows": "",
         "values": text("deviations"),
@@ -92,7 +92,7 @@ def of_points(
         "regions": [f"{region.name}: {region.brief}" for region in regions] if region_of is not None else [],
         "places": places,
     }
-    made: dict[str, Any] = plain(found)
+    made: dict[str, Any] = plain(data)
     return made
 
 

@@ -97,7 +97,7 @@ class Change:
 
 
 @dataclass(frozen=True)
-class Found:
+class Detected:
     """Outcome of the tests: changes, and what they rest on."""
 
     changes: tuple[Change, ...] = ()
@@ -153,7 +153,7 @@ class _Series:
 
 def find(
     rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]], aims: Mapping[str, str | float] | None = None
-) -> Found:
+) -> Detected:
     """Find what changed in ``night``; ``rows`` hold it and earlier nights.
 
     ``worse`` names the nights in which a figure was worse and not accepted: these are no level to compare with. So an
@@ -201,7 +201,7 @@ def find(
     known_names = {known.name for known in changes}
     changes += [change(ChangeKind.CHANGED, test, 1.0) for name, test in moved.items() if name not in known_names]
     paired = sum(test.test == "paired" for test in tests)
-    return Found(
+    return Detected(
         changes=tuple(changes),
         figures=sum(bool(figure.mine or figure.fresh) for figure in series.values()),
         paired=paired,
@@ -264,7 +264,7 @@ def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Badnes
     size = float(np.median([difference for _, difference, _ in pairs if difference != 0.0]))
     count = len(means)
     if count < LEAST_PAIRS:
-        return _Test(name, "paired", size, math.nan, math.nan, count)
+        return _Test(name, "paired", size, math.nan, cases=count)
     margin = measure.margin + measure.share * float(np.sqrt(np.mean([before**2 for *_, before in pairs])))
     spread = max(float(np.std(means, ddof=1)), LEAST_SPREAD)
     scales = [(spread, count - 1)]
@@ -276,7 +276,7 @@ def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Badnes
         min(1.0, 2.0 * min(float(stats.t.sf((sign * mean - margin) * root / scale, dof)) for scale, dof in scales))
         for sign in (1.0, -1.0)
     )
-    return _Test(name, "paired", size, worse, better, count)
+    return _Test(name, "paired", size, worse, p_better=better, cases=count)
 
 
 def _between_seeds(figure: _Series, measure: Badness) -> tuple[float, int]:
@@ -305,11 +305,11 @@ def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Badness) -> _Test
     sizes = []
     for case, tonight in now.items():
         ((_, values),) = tonight.items()
-        same_size = ((night, found) for night, found in before.get(case, {}).items() if len(found) == len(values))
+        same_size = (each for each in before.get(case, {}).items() if len(each[1]) == len(values))
         earlier = sorted(same_size)[-MOST_NIGHTS:]
         if len(earlier) < LEAST_NIGHTS:
             continue
-        levels = np.array([_mean(measure, found) for found in [values, *(found for _, found in earlier)]])
+        levels = np.array([_mean(measure, seeds) for seeds in [values, *(seeds for _, seeds in earlier)]])
         scores = np.rint(GRID * special.ndtri(stats.rankdata(levels) / (len(levels) + 1))).astype(np.int64)
         if (scores == scores[0]).all():
             continue
@@ -325,7 +325,7 @@ def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Badness) -> _Test
     at = total - offset
     enough = abs(size) > measure.margin
     worse, better = (float(part.sum()) if enough else 1.0 for part in (null[at:], null[: at + 1]))
-    return _Test(name, "fresh", size, worse, better, len(sizes))
+    return _Test(name, "fresh", size, worse, p_better=better, cases=len(sizes))
 
 
 def _mean(measure: Badness, values: Sequence[float]) -> float:

@@ -16,7 +16,7 @@ from processor.report import templates
 from processor.report.all_tables import figure_name
 from processor.validation import changes
 from processor.validation.cells import Figure
-from processor.validation.changes import ALARMS, Change, ChangeKind, Direction, Found
+from processor.validation.changes import ALARMS, Change, ChangeKind, Detected, Direction
 from processor.validation.history import Name, Night, Row
 from processor.validation.software import Software
 
@@ -37,13 +37,13 @@ TEST = text(
 
 @dataclass(frozen=True)
 class Summary:
-    """Cells of a night, figures beyond their limits by cell (``missed``), and changes (``found``)."""
+    """Cells of a night, figures beyond their limits by cell (``missed``), and changes (``detected``)."""
 
     night: str
     software: Software
     cells: tuple[Mapping[str, Any], ...]
     missed: Mapping[str, Sequence[Figure]]
-    found: Found
+    detected: Detected
 
     @property
     def failed(self) -> list[Mapping[str, Any]]:
@@ -53,13 +53,13 @@ class Summary:
     @property
     def passed(self) -> bool:
         """Whether no limit was missed and nothing got worse."""
-        return not self.missed and not self.found.of(*ALARMS)
+        return not self.missed and not self.detected.of(*ALARMS)
 
     @property
     def line(self) -> Text:
         """The night on one line, for a chat channel."""
         misses = sum(map(len, self.missed.values()))
-        failed, detected = len(self.failed), self.found
+        failed, detected = len(self.failed), self.detected
         verdict = text("ok") if self.passed and not failed else text("NOT OK")
         parts = [text("{night} {verdict}", night=self.night, verdict=verdict), self._version()]
         counts = {"cells": len(self.cells) - failed, "figures": detected.figures}
@@ -106,13 +106,13 @@ class Summary:
                 for cell, figures in self.missed.items()
                 for f in figures
             ],
-            "changes": [change_object(change) for change in self.found.of(*ChangeKind)],
+            "changes": [change_object(change) for change in self.detected.of(*ChangeKind)],
             "test": {
                 "about": str(TEST),
                 "alarm_rate": changes.ALARM_RATE,
-                "figures": self.found.figures,
-                "paired": self.found.paired,
-                "fresh": self.found.fresh,
+                "figures": self.detected.figures,
+                "paired": self.detected.paired,
+                "fresh": self.detected.fresh,
             },
         }
 
@@ -175,7 +175,7 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], 
     for row in rows:
         course[row.name][row.night].append(row.value)
         last[row.name] = row
-    change_of = {change.name: change for change in summary.found.changes}
+    change_of = {change.name: change for change in summary.detected.changes}
     figures = []
     for name in sorted(course):
         if summary.night not in course[name]:
