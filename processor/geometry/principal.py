@@ -30,11 +30,15 @@ class PrincipalAxes:
 
 @dataclass(frozen=True)
 class CoarsePose:
-    """``T_target_source`` (4, 4), the rms in mm that it leaves, and the ratio of the next best pose's rms to it."""
+    """``T_target_source`` (4, 4), the rms in mm that it leaves, and the ratio of the next best pose's rms to it.
+
+    ``T_rival`` (4, 4) is the next best pose, NaN where there is none.
+    """
 
     T_target_source: Floats
     rms_mm: float
     ambiguity: float
+    T_rival: Floats
 
 
 def of_points(points: Floats) -> PrincipalAxes:
@@ -107,8 +111,9 @@ def coarse(
         fits.append(refined(rigid.transform(R, target.centre - R @ source.centre)))
     order = sorted(range(len(fits)), key=lambda k: (fits[k][0], k))
     error, best = fits[order[0]]
-    rivals = (fits[k][0] for k in order[1:] if differ(fits[k][1], best, source.centre, size))
-    return CoarsePose(best, error, next(rivals, float("nan")) / max(error, 1e-9))
+    rivals = (fits[k] for k in order[1:] if differ(fits[k][1], best, source.centre, size))
+    rival_error, rival = next(rivals, (float("nan"), np.full((4, 4), np.nan)))
+    return CoarsePose(best, error, rival_error / max(error, 1e-9), rival)
 
 
 def differ(T: Floats, other: Floats, centre: Floats, size: float) -> bool:

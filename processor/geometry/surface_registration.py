@@ -206,6 +206,7 @@ class Placed:
     turn: float
     weak: tuple[Motion, ...]
     sigma_mm: float
+    T_rival: Floats  # (4, 4) of the next best coarse pose; NaN without one
 
 
 def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Placed:
@@ -219,10 +220,12 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Plac
     near, _ = surface.tree.query(rigid.apply(given, few), distance_upper_bound=NEAR_MM, workers=-1)
     near_share = float(np.isfinite(near).mean())
     start, ambiguity, registration = given, NAN, Registration.AS_GIVEN
+    rival = np.full((4, 4), NAN)
     if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
         spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
         pose = coarse(even(points), mesh_distance.sampled(surface.vertices, surface.faces, spacing), axes)
         start, ambiguity, registration = pose.T_target_source, pose.ambiguity, Registration.COARSE
+        rival = pose.T_rival
     elif how == "fine":
         registration = Registration.FINE
     fitted = fine(few, surface, axes.axes, start)
@@ -242,6 +245,7 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Plac
         turn=rigid.rotation_angle(between[:3, :3]),
         weak=fitted.weak,
         sigma_mm=fitted.sigma_mm,
+        T_rival=rival,
     )
 
 
