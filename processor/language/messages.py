@@ -98,8 +98,8 @@ class Messages(string.Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         """Write one value of a template."""
         if format_spec.startswith("?"):
-            singular, _, plural = format_spec[1:].partition("|")
-            return singular if value == 1 else plural
+            one, _, many = format_spec[1:].partition("|")
+            return one if value == 1 else many
         if isinstance(value, float) and not math.isfinite(value):
             return NO_NUMBER
         if isinstance(value, Text | Reason | Word | list | tuple):
@@ -111,11 +111,11 @@ class Messages(string.Formatter):
     def sentences(self, reasons: tuple[Reason, ...]) -> str:
         """Write reasons one after the other, as sentences."""
         stop, space = ("。", "") if self.code == "zh" else (".", " ")
-        texts = (self.text(reason) for reason in reasons)
-        return space.join(text[:1].upper() + text[1:] + ("" if text.endswith((stop, "?")) else stop) for text in texts)
+        written = (self.text(one) for one in reasons)
+        return space.join(one[:1].upper() + one[1:] + ("" if one.endswith((stop, "?")) else stop) for one in written)
 
     def of_scripts(self, scripts: str) -> dict[str, str]:
-        """Return the texts that the page's scripts show, which are there between quotation marks."""
+        """Return the texts that the page's own scripts show: those that stand there between quotation marks."""
         return {key: value for key, value in self.texts.items() if f'"{key}"' in scripts}
 
     def rendered(self, data: Any) -> Any:
@@ -135,7 +135,7 @@ def catalogue(code: str) -> dict[str, dict[str, dict[str, str]]]:
 def _files(code: str) -> Iterator[Any]:
     folder = importlib.resources.files("processor.language")
     return iter(
-        sorted((file for file in folder.iterdir() if file.name.startswith(f"{code}-")), key=lambda file: file.name)
+        sorted((file for file in folder.iterdir() if file.name.startswith(f"{code}-")), key=lambda one: one.name)
     )
 
 
