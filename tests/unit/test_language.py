@@ -2,7 +2,6 @@
 
 import dataclasses
 import re
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
@@ -15,6 +14,7 @@ from processor.model import Status
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, view
 from tests.support.metrics import metric
+from tests.support.pages import Visible, latin
 from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
 from tests.unit.test_report_balls import of_frame, whole, with_truth
 
@@ -106,53 +106,6 @@ def test_live_figures_are_translated_but_for_names():
 
 
 # --- Chinese -------------------------------------------------------------------------------------------------------
-
-UNITS = {"mm", "mrad", "ci", "ci95"}
-METHODS = {"adjustment", "corner", "line", "design", "aided", "ray", "ransac", "least", "squares"}
-STANDARDS = {"GB", "Cram", "rao"}  # Cramér-Rao, the name of a bound
-IN_FILES = {
-    "foot1",
-    "rib1",
-    "foot2",
-    "bridge",
-    "frame",
-    "project",
-    "toml",
-    "balls",
-    "results",
-    "csv",
-    "json",
-    "plausible",
-    "candidates",
-}
-SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm"}
-STAYS = UNITS | METHODS | STANDARDS | IN_FILES | SYMBOLS
-
-
-class Visible(HTMLParser):
-    """Text of a page that a reader sees: no scripts, no style, no provenance; what stands for a picture too."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.texts, self.lang, self._hidden = [], "", 0
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self._hidden += tag in ("script", "style", "pre")
-        self.texts += [value for name, value in attrs if name in ("alt", "title")]
-        self.lang = dict(attrs).get("lang", self.lang)
-
-    def handle_endtag(self, tag):
-        self._hidden -= tag in ("script", "style", "pre")
-
-    def handle_data(self, data):
-        if not self._hidden:
-            self.texts.append(data)
-
-
-def latin(texts, stays=STAYS):
-    """Texts with words that are not Chinese and are no names."""
-    return [one for one in texts if set(re.findall(r"[A-Za-z]{2}[A-Za-z0-9_]*", one)) - stays]
 
 
 def chinese_page(execution, report):

@@ -8,10 +8,6 @@ import numpy as np
 import pytest
 
 from processor import language
-from processor.batch import figures as batch_figures
-from processor.batch import summary
-from processor.batch.job import Job
-from processor.batch.record import JobStatus, Record
 from processor.compare import compare
 from processor.defects.result import DefectClass
 from processor.defects.result import Result as Defects
@@ -19,48 +15,30 @@ from processor.deviation.result import Registration
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
 from processor.language.messages import label, messages
-from processor.model import Status, reason
+from processor.model import reason
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import ControlPoints, ControlSightings
-from processor.validation import changes, night
+from processor.validation import changes
 from processor.validation import summary as nights_summary
 from tests.support import step_results, validation_nights
 from tests.support.metrics import metric
-from tests.unit.test_language import STAYS, Visible, latin
+from tests.support.pages import (
+    NAMES,
+    PAPER,
+    REASONS,
+    STAYS,
+    STITCH_CHECKS,
+    Visible,
+    checks_of,
+    indexed,
+    latin,
+    left_in_english,
+    searched,
+    two_nights,
+)
 
 SOURCES = Path(language.__file__).parents[1]
-NAMES = {
-    *(f"S{i}" for i in range(9)),
-    *("site", "scan", "made", "component", "ply", "summary", "timings"),
-    *("automatic", "default", "paper", "three", "point", "stitch", "deviation", "spheres", "defects", "pdf"),
-    *("PRCS", "SOCS", "GLCS", "T_PRCS_SOCS", "GLCS_PRCS", "LOD95", "lod95", "ppm", "rms"),
-}
-
-
-def left_in_english(text, *more):
-    seen = Visible(re.sub(r"T_(PR|GL)CS_SOCS\(.*?\)", "", text))
-    assert seen.lang == "zh"
-    assert len(seen.texts) > 20
-    return latin(seen.texts, STAYS | NAMES | set(more))
-
-
 # --- steps ----------------------------------------------------------------------------------------------------------
-
-
-def checks_of(step, *names):
-    return tuple(metric(name, 1.0, 0.0 if i % 2 else float("nan"), step=step) for i, name in enumerate(names))
-
-
-STITCH_CHECKS = (
-    "scans not placed", "station positions after datum fit, max", "station positions after datum fit, rms",
-    "rotations after datum fit, max", "scans called ok, over 50 mm off", "pose components within their 95 % intervals",
-    "station positions by control points, max",
-)  # fmt: skip
-DEFECT_CHECKS = (
-    *(f"missed: {kind}" for kind in DefectClass), "false alarms", "surface examined",
-    "class wrong", "depths off by more than a tenth and 2 LOD95", "depth error, median", "depth error, max",
-    "depths that are bounds alone",
-)  # fmt: skip
 
 
 def stitched():
@@ -123,22 +101,6 @@ def given():
     return step_results.execution(("stitch", "automatic", "{}", result), names=scans.name), ErrorReport()
 
 
-PAPER = (
-    reason("defects.paper-clusters", points=2000, spacing=4.5),
-    reason("defects.paper-fit", rms=1.2, share=87.0),
-    reason("defects.paper-threshold", threshold=3.1),
-)
-
-
-def searched():
-    placed = reason("defects.placed-by-deviation", registration=Registration.AS_GIVEN)
-    first = step_results.defects(reasons=(placed, *step_results.EXAMINED))
-    paper = step_results.defects(3, PAPER, method="paper")
-    made = step_results.execution(("defects", "default", "{}", first), ("defects", "paper", "{}", paper))
-    of_paper = metric("missed: step", 1.0, step="defects", method="paper")
-    return made, ErrorReport((*checks_of("defects", *DEFECT_CHECKS), of_paper))
-
-
 @pytest.mark.parametrize("made", [stitched, controlled, given, searched])
 def test_nothing_but_names_and_units_is_left_in_english(made):
     execution, report = made()
@@ -176,51 +138,6 @@ def test_a_word_of_two_senses_has_that_of_its_vocabulary_or_column():
 
 
 # --- a batch --------------------------------------------------------------------------------------------------------
-
-REASONS = (
-    reason("batch.stopped"),
-    reason("batch.timeout", limit=3.5),
-    reason("batch.memory", limit=200),
-    reason("batch.crashed", signal="SIGSEGV", number=11),
-    reason("batch.crashed-unnamed", number=70),
-    reason("batch.no-results", exit_code=9),
-    reason("batch.no-results-but", exit_code=9, last="坏"),
-    reason("batch.input-changed"),
-    reason("batch.not-shared"),
-    reason("batch.workers-died"),
-    reason("batch.worker-failed", error="坏"),
-    reason("batch.other-software", difference="numpy 1.0, not 2.0"),
-)
-LEFT_OUT = (
-    reason("batch.unreadable", error="Permission denied"),
-    reason("batch.holds-results"),
-    reason("batch.link"),
-    reason("batch.no-coordinates"),
-    reason("batch.in-scan-folder", folder="桥"),
-    reason("batch.reserved-name"),
-)
-
-
-LEFT = dict(zip("一二三四五六", LEFT_OUT, strict=True))
-
-
-def job(out, name):
-    (out / f"{name}.log").touch()
-    return Job(name, out, out, out, out / name, out / f"{name}.log", out, out, out, "", (), {}, {}, 1.0, 1, 1)
-
-
-def indexed(out, lang, reasons=REASONS):
-    everything = dict.fromkeys(batch_figures.COLUMNS, 3)
-    steps = dict(zip(("preassemble", "spheres", "stitch", "deviation", "defects"), map(str, Status), strict=True))
-    done = [
-        Record(f"扫描 {i}", "", JobStatus(status), figures={**everything, "verdict": verdict}, steps=steps)
-        for i, (status, verdict) in enumerate(
-            [("done", "pass"), ("in-part", "indeterminate"), ("limit-missed", "fail"), ("done", None)]
-        )
-    ]
-    done += [Record(f"坏 {i}", "", JobStatus.FAILED, why) for i, why in enumerate(reasons)]
-    found = summary.write(out, [(job(out, one.input), one) for one in done], LEFT, lang)
-    return found.page.read_text("utf-8")
 
 
 def test_the_index_of_a_batch_in_chinese(tmp_path):
@@ -299,22 +216,6 @@ def a_night(failed=1, missed=2, found=CHANGES, **more):
 def test_the_line_of_a_night_in_chinese(found):
     line = messages("zh").text(found.line)
     assert latin([line.replace("ray", "").replace("c0ffeec0", "")]) == []
-
-
-def two_nights(out, lang):
-    stored = {figure["name"] for case in validation_nights.Simulated(1).cases for figure in case["figures"]}
-    figures_of = {name: (0.5, 0.2 if "bias" in name else None, "mm") for name in stored}
-    figures_of |= dict.fromkeys((*STITCH_CHECKS, *DEFECT_CHECKS), (1.0, None, "mm"))
-    rays = '[scan]\nmode = "rays"\nscanner = "phase"\nstep_mrad = 1.5\n'
-    cases = (
-        validation_nights.case(),
-        validation_nights.case("scan", text=rays),
-        validation_nights.case(steps=("defects",), methods=("default",)),
-    )
-    asked = validation_nights.matrix(*cases)
-    for day in ("2026-11-20", "2026-11-21"):
-        runner = validation_nights.runner(lambda cell: dict(figures_of))
-        night.run(asked, out, day, runner, made_by=validation_nights.SOFTWARE, lang=lang)
 
 
 def test_pages_of_nights_in_chinese(tmp_path):
