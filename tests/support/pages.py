@@ -35,7 +35,7 @@ IN_FILES = {
     "plausible",
     "candidates",
 }
-SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm"}
+SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm", "max_balls"}
 STAYS = UNITS | METHODS | STANDARDS | IN_FILES | SYMBOLS
 
 
