@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from processor.evaluation.error_statistics import signed
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
-from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Truth
+from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Status, Truth
 from processor.preassembly import errors
 from processor.preassembly.chain.adjustment import HOLD
 from processor.preassembly.result import Result
@@ -34,23 +34,23 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     if truth.arch is None or scene.arch is None:
         return []
     true = {name: i for i, name in enumerate(truth.arch.names)}
-    true_poses = [truth.arch.T_bridge_scan[true[name]] for name in result.components]
+    true_poses = [truth.arch.T_bridge_scan[true[name]] for name in result.components.name]
     key_error, turns, wrong = [], [], 0
-    for i, name in enumerate(result.components):
-        points = result.key_points_scan[i] - truth.arch.key_points_scan[true[name]]
+    for i, name in enumerate(result.components.name):
+        points = result.components.key_points_scan[i] - truth.arch.key_points_scan[true[name]]
         key_error.append(points[np.isfinite(points).all(axis=2)])
-        if np.isfinite(result.T_bridge_scan[i]).all():
-            turn = rigid.rotation_angle(result.T_bridge_scan[i][:3, :3] @ true_poses[i][:3, :3].T)
+        if np.isfinite(result.components.T_bridge_scan[i]).all():
+            turn = rigid.rotation_angle(result.components.T_bridge_scan[i][:3, :3] @ true_poses[i][:3, :3].T)
             turns.append(turn)
-            wrong += turn > WRONG_POSE_RAD and result.component_status[i] == "ok"
+            wrong += turn > WRONG_POSE_RAD and result.components.status[i] == Status.OK
     errors_at_points = np.vstack(key_error)
     mean, largest = _true_linear_error(scene.arch, result, truth.arch, true, true_poses)
     limit = 5.0 if truth.spacing_mm <= 5.0 else float("nan")
     own = np.abs(_gaps_of_truth(result, truth.arch, true, true_poses))
     return [
         Metric("preassemble", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
-        Metric("preassemble", "splicing error", result.splicing_mean, Statistic.MEAN, unit="mm", limit=limit),
-        Metric("preassemble", "splicing error", result.splicing_max, Statistic.MAX, unit="mm"),
+        Metric("preassemble", "splicing error", result.splicing.mean, Statistic.MEAN, unit="mm", limit=limit),
+        Metric("preassemble", "splicing error", result.splicing.max, Statistic.MAX, unit="mm"),
         Metric("preassemble", TRUE_SPLICING, _over(np.mean, own), Statistic.MEAN, unit="mm"),
         Metric("preassemble", TRUE_SPLICING, _over(np.max, own), Statistic.MAX, unit="mm"),
         Metric("preassemble", TRUE_LINEAR, mean, Statistic.MEAN, unit="mm"),
@@ -65,11 +65,11 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
 
 def _coverage(result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
     """How many of the key points' coordinates lie within their 95 % intervals, where a method states any."""
-    off = result.key_points_scan - truth.key_points_scan[[true[name] for name in result.components]]
-    known = np.isfinite(off) & np.isfinite(result.key_points_sd)
+    off = result.components.key_points_scan - truth.key_points_scan[[true[name] for name in result.components.name]]
+    known = np.isfinite(off) & np.isfinite(result.components.key_points_sd)
     if not known.any():
         return []
-    share = float((np.abs(off[known]) <= NORMAL_95 * result.key_points_sd[known]).mean())
+    share = float((np.abs(off[known]) <= NORMAL_95 * result.components.key_points_sd[known]).mean())
     return [Metric("preassemble", "key points", 100.0 * share, Statistic.COVERAGE, unit="%")]
 
 
@@ -85,7 +85,7 @@ def _over(what: Callable[[Floats], Floats], values: Floats) -> float:
 def _gaps_of_truth(result: Result, truth: ArchTruth, true: dict[str, int], true_poses: list[Floats]) -> Floats:
     """Gaps (j, 8, 3) of the true key points at the poses found: the poses' own error where parts are perfect."""
     moved = []
-    for name, pose, true_pose in zip(result.components, result.T_bridge_scan, true_poses, strict=True):
+    for name, pose, true_pose in zip(result.components.name, result.components.T_bridge_scan, true_poses, strict=True):
         moved.append(rigid.apply(pose @ rigid.invert(true_pose), truth.key_points_bridge[true[name]]))
     ends = np.array(moved)
     found: Floats = ends[1:, 0] - ends[:-1, 1]
@@ -94,20 +94,20 @@ def _gaps_of_truth(result: Result, truth: ArchTruth, true: dict[str, int], true_
 
 def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
     """Hold the gaps of an adjustment against those of the truth under its objective."""
-    if not np.isfinite(result.weight):
+    if result.adjustment is None:
         return []
-    known = np.isfinite(result.gaps) & np.isfinite(result.gap_ci95)
+    known = np.isfinite(result.joints.gaps) & np.isfinite(result.joints.gap_ci95)
     if not known.any():
         return []
-    rows = [true[name] for name in result.components]
+    rows = [true[name] for name in result.components.name]
     edges, ends = truth.edges_bridge[rows], truth.key_points_bridge[rows]
-    edges[~np.isfinite(result.T_bridge_scan[:, 0, 0])] = np.nan
+    edges[~np.isfinite(result.components.T_bridge_scan[:, 0, 0])] = np.nan
     for j, there in enumerate(known):
         if not there.all():
             ends[j, 1] = ends[j + 1, 0] = np.nan
-    gaps, linear = by_objective(design, ends, edges, result.weight)
-    off = (result.gaps - gaps)[known]
-    share = 100.0 * float((np.abs(off) <= result.gap_ci95[known]).mean())
+    gaps, linear = by_objective(design, ends, edges, result.adjustment.weight)
+    off = (result.joints.gaps - gaps)[known]
+    share = 100.0 * float((np.abs(off) <= result.joints.gap_ci95[known]).mean())
     return [
         Metric("preassemble", "gaps against the truth's", float(np.sqrt(np.mean(off**2))), Statistic.RMS, unit="mm"),
         Metric("preassemble", "gaps", share, Statistic.COVERAGE, unit="%"),
@@ -120,7 +120,8 @@ def _errors_held(result: Result, gaps: Floats, linear: Floats) -> list[Metric]:
     """How many of the mean and largest errors lie within their intervals; the truth has gaps (g,), departures (s,)."""
     if not len(result.errors_ci95):
         return []
-    stated = np.array([result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max])
+    linear_error = result.linear.assembled.error
+    stated = np.array([result.splicing.mean, result.splicing.max, linear_error.mean, linear_error.max])
     size = np.abs(gaps)
     true = np.array([size.mean(), size.max(), _over(np.mean, linear), _over(np.max, linear)])
     share = float((np.abs(stated - true) <= result.errors_ci95[:4]).mean())
@@ -179,7 +180,7 @@ def _true_linear_error(
 ) -> tuple[float, float]:
     """Mean and maximum distance to the design of the bottom edges as built, at the poses found, at all stations."""
     distances = []
-    for part, pose, true_pose in zip(design.parts, result.T_bridge_scan, true_poses, strict=True):
+    for part, pose, true_pose in zip(design.parts, result.components.T_bridge_scan, true_poses, strict=True):
         lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
         for line, edge in zip(lines, truth.edges_bridge[true[part.name]], strict=True):
             moved = rigid.apply(pose @ rigid.invert(true_pose), _at_stations(edge, line))

@@ -8,7 +8,7 @@ The catalogue of a language is the TOML files CODE-PART.toml beside this file, i
 
 Templates have the syntax of :meth:`str.format` with named fields. Fields without a format have three decimals where
 they are numbers. ``{n:?scan|scans}`` is the first word for n = 1 and the second otherwise. Values that are messages or
-words are translated; lists are joined.
+words are translated; lists are joined by commas, as ``{list:;}`` by semicolons, as ``{list:.}`` written as sentences.
 """
 
 from __future__ import annotations
@@ -31,6 +31,7 @@ else:
 
 CODES = ("en", "zh")
 LIST = {"en": ", ", "zh": "、"}
+SEMICOLON = {"en": "; ", "zh": "；"}
 NO_NUMBER = "–"
 
 
@@ -102,6 +103,10 @@ class Messages(string.Formatter):
             return one if value == 1 else many
         if isinstance(value, float) and not math.isfinite(value):
             return NO_NUMBER
+        if format_spec == ".":
+            return self.sentences(value)
+        if format_spec == ";":
+            return SEMICOLON[self.code].join(map(self.text, value))
         if isinstance(value, Text | Reason | Word | list | tuple):
             return self.text(value)
         if isinstance(value, float) and not format_spec:

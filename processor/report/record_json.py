@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
 
 from processor.language.messages import messages
 from processor.model import Checked, Reason, Rows
@@ -15,9 +17,11 @@ def as_object(record: Checked) -> dict[str, Any]:
     """Write a record as the metadata of its fields have it; see :func:`processor.model.described`."""
     found: dict[str, Any] = {}
     for field in dataclasses.fields(record):  # type: ignore[arg-type]
-        key, value = field.metadata.get("json", field.name), getattr(record, field.name)
-        if key and not _absent(value, field.metadata):
-            _put(found, key, _value(value))
+        value = getattr(record, field.name)
+        if not _absent(value, field.metadata):
+            _put_field(found, field, value)
+        if "sentence" in field.metadata:
+            _put(found, field.metadata["sentence"], messages("en").sentences(value))
     return found
 
 
@@ -25,14 +29,34 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
     """Write a table as a list of its rows; a column without values is left out."""
     rows: list[dict[str, Any]] = [{} for _ in range(len(table))]
     for field in dataclasses.fields(table):  # type: ignore[arg-type]
-        key, column = field.metadata.get("json", field.name), getattr(table, field.name)
-        if not key or not len(column):
-            continue
-        keys = field.metadata.get("keys", ())
-        for row, value in zip(rows, column, strict=True):
-            for name, item in zip(keys, value, strict=True) if keys else [("", value)]:
-                _put(row, key.replace("*", name), _value(item))
+        column = getattr(table, field.name)
+        if len(column):
+            for row, value in zip(rows, column, strict=True):
+                _put_field(row, field, value)
     return rows
+
+
+def _put_field(target: dict[str, Any], field: dataclasses.Field[Any], value: Any) -> None:
+    """Set the value of a field, or its value in one row, by the metadata of the field."""
+    key, metadata = field.metadata.get("json", field.name), field.metadata
+    if not key:
+        return
+    if "keys" in metadata:
+        for name, item in zip(metadata["keys"], value, strict=True):
+            _put(target, key.replace("*", str(name)), _value(item))
+    elif "axes" in metadata:
+        _put(target, key, _by_name(value, *metadata["axes"]))
+    elif "by" in metadata:
+        _put(target, key, {str(row.pop(metadata["by"])): row for row in as_rows(value)})
+    else:
+        _put(target, key, _value(value))
+
+
+def _by_name(values: Any, names: Sequence[str], *further: Sequence[str]) -> dict[str, Any]:
+    """Name the items along each axis of an array; a part of it without any number is an empty object."""
+    if not np.isfinite(values).any():
+        return {}
+    return {name: _by_name(item, *further) if further else item for name, item in zip(names, values, strict=True)}
 
 
 def _absent(value: Any, metadata: Mapping[str, Any]) -> bool:
