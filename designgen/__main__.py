@@ -1,4 +1,4 @@
-"""Entry point of ``designgen``: runs the command line and turns errors into one line and an exit code."""
+"""Entry point of ``designgen``: runs the command line and reports errors as one line and an exit code."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ WRONG_USAGE, BAD_INPUT = 2, 3
 
 
 def main() -> None:
-    """Run the command line; exits 0 when done, 2 on wrong usage, 3 on bad input or where nothing can be written."""
+    """Run the command line; exit with 0 when done, 2 on wrong usage, 3 on bad input or an error of the file system."""
     try:
         sys.exit(commands(standalone_mode=False))
     except click.exceptions.Exit as end:

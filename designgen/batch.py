@@ -32,7 +32,7 @@ from processor.model import InputError, UsageError
 INDEX = "index.csv"
 MOST_SCENES = 99_999  # in one folder: file names number them by five digits
 MOST_SEED = 2**63
-SOFTWARE = ("cadquery", "cadquery-ocp", "h5py", "numba", "numpy", "scipy")  # what a scene's bytes depend on
+SOFTWARE = ("h5py", "numba", "numpy", "scipy")  # packages that a scene's bytes depend on; CAD solids are no part of it
 SCENE_FILE = re.compile(r".+-\d{5}-seed\d+\.h5")
 LEFTOVER = re.compile(rf"\.({SCENE_FILE.pattern}|{re.escape(INDEX)})\.\d+-[0-9a-f]{{8}}\.tmp")
 LOSSES = {

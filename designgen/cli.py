@@ -1,4 +1,4 @@
-"""Command line of ``designgen``. What is heavy is imported where it is used, so that help comes at once."""
+"""Command line of ``designgen``. Slow imports are inside the functions, so that help appears at once."""
 
 from __future__ import annotations
 
@@ -10,46 +10,49 @@ from pathlib import Path
 import click
 
 from designgen import __version__, designs
+from designgen.export import FORMATS
 from processor.progress import stage
 
 DONE, IN_PART, ALL_FAILED = 0, 1, 2
-FORMATS = ("ply", "las", "laz", "e57", "ptx", "pcd", "xyz")
 
 
 @click.group(context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__, prog_name="designgen")
 def commands() -> None:
-    """Make steel designs and synthetic scans of them, with the truth beside them."""
+    """Make designs of steel structures, and synthetic laser scans of them with their truth."""
 
 
 @commands.command("list")
 def list_() -> None:
-    """List component types and recipes, a line each."""
+    """List the types of components and the recipes, a line each."""
     from designgen import recipes
 
-    click.echo("component types")
-    for module in pkgutil.iter_modules(designs.__path__):
-        about = getattr(importlib.import_module(f"designgen.designs.{module.name}"), "ABOUT", "")
-        if about:
-            click.echo(f"  {module.name:<14} {about}")
-    click.echo("recipes")
-    for name, recipe in recipes.named().items():
-        click.echo(f"  {name:<14} {recipe['about']}")
+    names = [module.name for module in pkgutil.iter_modules(designs.__path__)]
+    modules = {name: importlib.import_module(f"designgen.designs.{name}") for name in names}
+    types = {name: module.ABOUT for name, module in modules.items() if hasattr(module, "ABOUT")}
+    named = {name: recipe["about"] for name, recipe in recipes.named().items()}
+    width = max(map(len, [*types, *named]))
+    for heading, lines in (("component types", types), ("recipes", named)):
+        click.echo(heading)
+        for name, about in lines.items():
+            click.echo(f"  {name:<{width}}  {about}")
 
 
 @commands.command()
 @click.argument("recipe")
 @click.option(
-    "-o", "--output", required=True, type=click.Path(path_type=Path), help="scene to write; of many, the folder"
+    "-o", "--output", required=True, type=click.Path(path_type=Path), help="scene file; folder for several scenes"
 )
-@click.option("--seed", type=click.IntRange(min=0), help="instead of the recipe's own; of many scenes, the first")
-@click.option("--set", "settings", multiple=True, metavar="KEY=VALUE", help="e.g. scan.sigma_mm=2; may be repeated")
-@click.option("--count", type=click.IntRange(min=1), help="make a folder of scenes: so many seeds, one after another")
+@click.option("--seed", type=click.IntRange(min=0), help="first seed  [default: the recipe's]")
 @click.option(
-    "--vary", multiple=True, metavar="KEY=V1,V2,...", help="... and every combination of values; may be repeated"
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="change the recipe, e.g. scan.sigma_mm=2; repeatable"
 )
-@click.option("--jobs", type=click.IntRange(min=1), help="processes that make the folder's scenes  [default: 1]")
-@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler whose workers make them, e.g. tcp://10.0.0.1:8786")
+@click.option("--count", type=click.IntRange(min=1), help="make scenes for this number of consecutive seeds")
+@click.option(
+    "--vary", multiple=True, metavar="KEY=V1,V2,...", help="make scenes for every combination of values; repeatable"
+)
+@click.option("--jobs", type=click.IntRange(min=1), help="number of processes for several scenes  [default: 1]")
+@click.option("--cluster", metavar="ADDRESS", help="Dask scheduler for several scenes, e.g. tcp://10.0.0.1:8786")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @click.pass_context
 def make(
@@ -66,8 +69,8 @@ def make(
 ) -> None:
     """Make the scene of RECIPE (a name or a TOML file) with its truth.
 
-    With --count or --vary many, in a folder with an index.csv. Run again, what is there and whole is kept.
-    Exit codes: 0 done, 1 some scenes failed (the index says why), 2 all failed, or wrong usage, 3 bad input.
+    With --count or --vary, make several scenes in a folder with an index.csv. A second run keeps complete scenes.
+    Exit codes: 0 done, 1 some scenes failed (reasons are in the index), 2 all failed or wrong usage, 3 bad input.
     """
     from designgen import batch, recipes
 
@@ -78,13 +81,12 @@ def make(
     if many:
         varied = batch.parse_varied(vary)
         planned = batch.plan(output, name, loaded, varied, seed, count or 1)
-        said = batch.make_many(output, planned, list(varied), jobs or 1, cluster)
-        for failure in said["failed"]:
+        report = batch.make_many(output, planned, list(varied), jobs or 1, cluster)
+        for failure in report["failed"]:
             click.echo(f"{failure['file']}: failed: {failure['reason']}", err=True)
-        click.echo(
-            json.dumps(said) if as_json else "{index}: {done} of {scenes} scene(s), {made} made now".format(**said)
-        )
-        context.exit(DONE if not said["failed"] else IN_PART if said["done"] else ALL_FAILED)
+        text = "{index}: {done} of {scenes} scene(s), {made} made now".format(**report)
+        click.echo(json.dumps(report) if as_json else text)
+        context.exit(DONE if not report["failed"] else IN_PART if report["done"] else ALL_FAILED)
     with stage(f"making {name}"):
         used, scans, points = batch.make_scene(output, name, loaded, seed)
     if as_json:
@@ -95,12 +97,12 @@ def make(
 
 @commands.command()
 @click.argument("scene", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="folder to make")
-@click.option("--format", "format_", required=True, type=click.Choice(FORMATS), help="of the scans")
-@click.option("--without-truth", is_flag=True, help="leave the truth out")
-@click.option("--spherical", is_flag=True, help="E57 with ranges and angles, as scanners write it")
-@click.option("--step", is_flag=True, help="write the design's solids as STEP, too")
-@click.option("--without-meshes", is_flag=True, help="leave the meshes of an arch bridge's parts out of its design")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="new folder")
+@click.option("--format", "format_", required=True, type=click.Choice(FORMATS), help="format of the scans")
+@click.option("--without-truth", is_flag=True, help="do not write the truth")
+@click.option("--spherical", is_flag=True, help="E57 with ranges and angles instead of x, y, z")
+@click.option("--step", is_flag=True, help="also write the solids of the design as STEP")
+@click.option("--without-meshes", is_flag=True, help="design of an arch bridge without meshes of its parts")
 def export(
     scene: Path, output: Path, format_: str, without_truth: bool, spherical: bool, step: bool, without_meshes: bool
 ) -> None:
@@ -120,28 +122,25 @@ def export(
             with_meshes=not without_meshes,
         )
     for name in written.left_out:
-        click.echo(f"{output}: scan {name!r} is left out: it saw next to nothing", err=True)
+        click.echo(f"{output}: scan {name!r} is left out: it has almost no points", err=True)
     click.echo(f"{output}: {written.scans} scan(s) as {format_}")
 
 
 @commands.command("import")
 @click.argument("file", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="folder to make")
-@click.option("--units", default="", help="of the file's numbers, whatever the file says: mm, m, inch, ...")
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="new folder")
+@click.option("--units", default="", help="unit of the numbers, instead of that in the file: mm, m, inch, ...")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @click.pass_context
 def import_(context: click.Context, file: Path, output: Path, units: str, as_json: bool) -> None:
-    """Turn a STEP or IFC FILE into meshes in mm, one a body, with their sizes in import.json.
+    """Convert a STEP or IFC FILE to meshes in mm, one for each body, with their sizes in import.json.
 
-    Exit codes: 0 done, 1 some bodies could not be taken (they are listed), 2 wrong usage, 3 bad input.
+    Exit codes: 0 done, 1 some bodies could not be read (they are listed), 2 wrong usage, 3 bad input.
     """
     from designgen.cad import files
 
-    said = files.import_file(file, output, units)
-    if as_json:
-        click.echo(json.dumps(said, ensure_ascii=False))
-    else:
-        click.echo("\n".join(files.summary(said)))
-    for problem in said["problems"]:
+    report = files.import_file(file, output, units)
+    click.echo(json.dumps(report, ensure_ascii=False) if as_json else "\n".join(files.summary(report)))
+    for problem in report["problems"]:
         click.echo(f"{file}: {problem}", err=True)
-    context.exit(IN_PART if said["problems"] else DONE)
+    context.exit(IN_PART if report["problems"] else DONE)

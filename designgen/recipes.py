@@ -1,10 +1,12 @@
-"""Recipes: TOML files that name a scene's kind, sizes and scan. The named ones lie beside this file in ``recipes/``."""
+"""Recipes: TOML files with a scene's kind, sizes and scan. The named ones are in the folder ``recipes``."""
 
 from __future__ import annotations
 
+import copy
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
+from os import PathLike
 from pathlib import Path
 from typing import Any
 
@@ -19,44 +21,61 @@ Recipe = dict[str, Any]
 
 
 def named() -> dict[str, Recipe]:
-    """All named recipes, by name."""
+    """Return all named recipes, by name."""
     folder = resources.files("designgen") / "recipes"
     files = sorted((f for f in folder.iterdir() if f.name.endswith(".toml")), key=lambda f: f.name)
     return {f.name[: -len(".toml")]: tomllib.loads(f.read_text("utf-8")) for f in files}
 
 
-def load(name_or_path: str) -> tuple[str, Recipe]:
-    """Load a recipe by name, or from a TOML file: its name and content.
+def load(name_or_path: str | PathLike[str]) -> tuple[str, Recipe]:
+    """Return name and content of a recipe, by its name or from a TOML file.
 
-    Raises UsageError for a name that does not exist, InputError for a file that cannot be read.
+    Raises UsageError for an unknown name, InputError for a file that cannot be read.
     """
     known = named()
-    if name_or_path in known:
-        return name_or_path, known[name_or_path]
-    path = Path(name_or_path)
+    name = str(name_or_path)
+    if name in known:
+        return name, known[name]
+    path = Path(name)
     if path.suffix != ".toml":
-        raise UsageError(f"no recipe {name_or_path!r}; there are {', '.join(known)}, or give a .toml file")
+        raise UsageError(f"no recipe {name!r}; there are {', '.join(known)}, or give a .toml file")
     try:
         return path.stem, tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: not a readable recipe: {error}") from error
 
 
-def overridden(recipe: Mapping[str, Any], settings: Sequence[str]) -> Recipe:
-    """Copy a recipe with ``section.key=value`` settings; values are read as TOML, bare words as text."""
-    result = {key: dict(value) if isinstance(value, dict) else value for key, value in recipe.items()}
-    for setting in settings:
-        path, equals, text = setting.partition("=")
-        if not equals:
-            raise UsageError(f"--set {setting}: expected section.key=value")
-        *sections, key = path.strip().split(".")
+def overridden(recipe: Mapping[str, Any], settings: Sequence[str] | Mapping[str, Any]) -> Recipe:
+    """Return a copy of a recipe with settings: values by ``section.key``, or texts ``section.key=value``.
+
+    The values of texts are read as TOML, or taken as text where they are not TOML. Raises UsageError for a text without
+    a value, and for a section that is a value in the recipe.
+    """
+    pairs: Iterable[tuple[str, Any]]
+    pairs = settings.items() if isinstance(settings, Mapping) else [_parsed(setting) for setting in settings]
+    result = copy.deepcopy(dict(recipe))
+    for path, value in pairs:
+        *sections, key = path.split(".")
         table = result
         for section in sections:
             table = table.setdefault(section, {})
             if not isinstance(table, dict):
-                raise UsageError(f"--set {setting}: {section} is not a section")
-        try:
-            table[key] = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            table[key] = text
+                raise UsageError(f"setting {path}: {section} is not a section")
+        table[key] = _as_toml(value)
     return result
+
+
+def _parsed(setting: str) -> tuple[str, Any]:
+    path, equals, text = setting.partition("=")
+    if not equals:
+        raise UsageError(f"--set {setting}: expected section.key=value")
+    try:
+        return path.strip(), tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return path.strip(), text
+
+
+def _as_toml(value: Any) -> Any:
+    """Return a value with the types of TOML: lists for tuples and arrays, Python's numbers for NumPy's."""
+    value = value.tolist() if hasattr(value, "tolist") else value
+    return [_as_toml(item) for item in value] if isinstance(value, list | tuple) else value

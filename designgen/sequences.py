@@ -1,37 +1,37 @@
-"""Sequences of numbers that fill a range evenly, however many are taken: the first k stay what they are."""
+"""Low-discrepancy sequences: any number of leading terms fills the range evenly."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from processor.model import Floats
+from processor.model import Floats, Ints
 
 PLASTIC = 1.324717957244746  # the real root of x^3 = x + 1
 
 
 def van_der_corput(number: int) -> float:
-    """Return the share 0..1 of a number from 0, its binary digits mirrored at the point: 0, 1/2, 1/4, 3/4, 1/8, ..."""
-    share, place = 0.0, 0.5
+    """Return term ``number`` (from 0) of the van der Corput sequence in base 2: 0, 1/2, 1/4, 3/4, 1/8, ..."""
+    value, digit = 0.0, 0.5
     while number:
-        share += place * (number & 1)
+        value += digit * (number & 1)
         number >>= 1
-        place *= 0.5
-    return share
+        digit *= 0.5
+    return value
 
 
-def in_square(number: int) -> Floats:
-    """Return the place (2,) of a number from 0 in the unit square, by the R2 sequence; the first is its middle."""
-    found: Floats = (0.5 + number * np.array([1.0 / PLASTIC, 1.0 / PLASTIC**2])) % 1.0
-    return found
+def in_square(number: int | Ints) -> Floats:
+    """Return terms ``number`` (from 0) of the R2 sequence in the unit square, (2,) or (n, 2), from its middle."""
+    points: Floats = (0.5 + np.multiply.outer(number, [1.0 / PLASTIC, 1.0 / PLASTIC**2])) % 1.0
+    return points
 
 
 def on_sphere(number: int) -> Floats:
-    """Return the unit vector (3,) of a number from 0: pairs on opposite sides, the first near the ends of axis 0.
+    """Return direction ``number`` (from 0), a unit vector (3,): opposite pairs, the first pair near the ends of axis 0.
 
-    A pair's height goes by the van der Corput sequence, and each stands three eighths of a turn on from the last.
+    The heights of the pairs follow the van der Corput sequence; each pair is turned by 3/8 from the one before.
     """
     pair, second = divmod(number, 2)
-    # From 3/16, and by 3/8: of such numbers the ones that see most of the sides and ends of long boxes.
+    # The start 3/16 and the turn 3/8 were chosen by a search: they cover most of the sides and ends of long boxes.
     height = 1.0 - (van_der_corput(pair) + 0.1875) % 1.0
     level, turn = np.sqrt(1.0 - height**2), 0.75 * np.pi * pair
     unit = np.array([height, level * np.cos(turn), level * np.sin(turn)])

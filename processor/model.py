@@ -25,6 +25,7 @@ Ints = npt.NDArray[np.int64]
 Labels = npt.NDArray[np.int32]
 Codes = npt.NDArray[np.uint8]
 Shorts = npt.NDArray[np.float32]
+Flags = npt.NDArray[np.bool_]
 
 
 class RecordError(ValueError):
@@ -90,6 +91,11 @@ def names(axis: str, **shown: Any) -> Any:
     return dataclasses.field(default=(), metadata={"axis": axis, **shown})
 
 
+def name_lists(axis: str, **shown: Any) -> Any:
+    """Declare a tuple of lists of strings, as long as the axis of that name in the record's arrays."""
+    return dataclasses.field(default=(), metadata={"axis": axis, "lists": True, **shown})
+
+
 def words(axis: str, vocabulary: type[Word], **shown: Any) -> Any:
     """Declare a tuple of words of a vocabulary, as long as the axis of that name in the record's arrays."""
     return dataclasses.field(default=(), metadata={"axis": axis, "words": vocabulary, **shown})
@@ -130,7 +136,8 @@ class Checked:
                 object.__setattr__(self, field.name, _word(metadata["words"], value, where))
             elif "axis" in metadata:
                 kind = metadata.get("words", str)
-                value = tuple(_word(kind, item, where) for item in value)
+                lists = metadata.get("lists", False)
+                value = tuple(tuple(map(str, item)) if lists else _word(kind, item, where) for item in value)
                 _same_length(lengths, metadata["axis"], len(value), where)
                 object.__setattr__(self, field.name, value)
             elif "reasons" in metadata:

@@ -1,7 +1,7 @@
-"""What is built otherwise than designed: each imperfection a function of the design's numbers, with its truth.
+"""Imperfections of arch parts and space frames: each a function of the design's numbers, with its truth.
 
-Nothing here looks at a mesh: a part as built is its design's closed form with its coordinates moved, a frame its
-design's table of nodes and members with other numbers.
+No mesh is involved. A part as built is the closed form of its design with displaced coordinates; a frame as built is
+the design's table of nodes and members with other numbers.
 """
 
 from __future__ import annotations
@@ -11,35 +11,37 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from designgen.checks import expect
 from designgen.designs.arch_part import ArchPart, Hole, Plates
 from designgen.designs.space_frame import Frame
 from processor.model import AsBuilt, Floats, UsageError
 
 EXPANSION_PER_K = 12e-6
-CORNER_REACH_MM = 1500.0  # from an end, how far the errors of its corners reach
+CORNER_REACH_MM = 1500.0  # distance from an end over which the errors of its corners fade out
 REFERENCE_C = 20.0
-MOST_DRAWS = 200  # of a place for a dent or a missing piece
+MOST_DRAWS = 200  # attempts to find a place for a dent or a missing piece
 LEAST_PLATE_MM = 2.0
-LEAST_SHARE = 0.5  # of a section's size as designed; a tenth of its size is hollow
+LEAST_SHARE = 0.5  # least size of a section as a fraction of its design
+MOST_FILLED = 0.9  # largest fraction of a section's size that plates may take
 
 
 @dataclass(frozen=True)
 class ArchParams:
-    """How far arch parts depart from their design: standard deviations, but counts and sizes of damage as given."""
+    """Deviations of arch parts from their design: standard deviations; counts and sizes of damage are used as given."""
 
-    length_mm: float = 0.0  # each end's, along the part
-    skew_mrad: float = 0.0  # each end's, about both axes of its section
+    length_mm: float = 0.0  # of each end, along the part
+    skew_mrad: float = 0.0  # of each end, about both axes of its section
     twist_mrad: float = 0.0  # between the ends
     bow_mm: float = 0.0  # sideways and upward, at the middle
     section_mm: float = 0.0  # width and height
-    plate_mm: float = 0.0  # thickness of each plate, which is LEAST_PLATE_MM at least
-    corner_mm: float = 0.0  # each corner of each end, along all axes: as ends look that were cut and welded in a yard
+    plate_mm: float = 0.0  # thickness of each plate; at least LEAST_PLATE_MM is left
+    corner_mm: float = 0.0  # of each corner of each end along all axes, as from cutting and welding
     waviness_mm: float = 0.0  # amplitude on each wall
     waviness_length_mm: float = 1500.0
-    dents: int = 0  # on all parts together
+    dents: int = 0  # total of all parts
     dent_depth_mm: float = 8.0
     dent_radius_mm: float = 150.0
-    missing_pieces: int = 0  # rectangles cut from webs, on all parts together
+    missing_pieces: int = 0  # rectangles cut from webs, total of all parts
     missing_size_mm: float = 250.0
     temperature_C: float = REFERENCE_C
 
@@ -49,14 +51,14 @@ class ArchParams:
 
 @dataclass(frozen=True)
 class FrameParams:
-    """How far a frame departs from its design."""
+    """Deviations of a frame from its design."""
 
-    node_movement_mm: float = 0.0  # standard deviation of each axis
-    wrong_sizes: int = 0  # balls of another size than designed
+    node_movement_mm: float = 0.0  # standard deviation along each axis
+    wrong_sizes: int = 0  # number of balls of another size than designed
     radius_mm: float = 0.0  # standard deviation of a ball's radius
-    eccentricity_mm: float = 0.0  # of each member's ends off the nodes, standard deviation across the axis
-    bow_share: float = 0.0  # of tubes, uniform up to this share of their own length (1/1000 is common)
-    missing_bolts: int = 0  # ends of members whose sleeve is not there
+    eccentricity_mm: float = 0.0  # of each member's ends from the nodes, standard deviation across the axis
+    bow_share: float = 0.0  # of tubes, uniform up to this fraction of their length (1/1000 is common)
+    missing_bolts: int = 0  # number of members' ends without sleeve
     temperature_C: float = REFERENCE_C
 
     def __post_init__(self) -> None:
@@ -67,35 +69,34 @@ def _check(params: ArchParams | FrameParams) -> None:
     for key in params.__dataclass_fields__:
         value = getattr(params, key)
         if key == "temperature_C":
-            if not -60.0 <= value <= 200.0:
-                raise UsageError(f"asbuilt.{key}: expected -60 to 200, got {value!r}")
-        elif value < 0:
-            raise UsageError(f"asbuilt.{key}: expected 0 or more, got {value!r}")
+            expect(-60.0 <= value <= 200.0, f"asbuilt.{key}", value, "-60 to 200")
+        else:
+            expect(value >= 0, f"asbuilt.{key}", value, "0 or more")
 
 
 def expansion(temperature_C: float) -> float:
-    """Factor of all lengths of steel at a temperature against those at the reference."""
+    """Return the ratio of the lengths of steel at a temperature to those at REFERENCE_C."""
     return 1.0 + EXPANSION_PER_K * (temperature_C - REFERENCE_C)
 
 
 def stated(temperature_C: float) -> float:
-    """Return the temperature as a project states it: not at all (NaN) where it is the reference."""
+    """Return the temperature to store in a scene: NaN (not given) for the reference temperature."""
     return temperature_C if temperature_C != REFERENCE_C else float("nan")
 
 
 @dataclass
 class Ledger:
-    """Collects what was built otherwise, a row a number."""
+    """Collects the imperfections, a row each."""
 
     rows: list[tuple[str, str, float, str]] = field(default_factory=list)
 
     def note(self, what: str, where: str, value: float, unit: str) -> float:
-        """Write a number down and return it."""
+        """Add a row and return its value."""
         self.rows.append((what, where, float(value), unit))
         return float(value)
 
     def record(self) -> AsBuilt:
-        """Return the truth's record."""
+        """Return the rows as the truth's record."""
         what, where, value, unit = zip(*self.rows, strict=True) if self.rows else ((), (), (), ())
         return AsBuilt(what, where, np.array(value, np.float64), unit)
 
@@ -114,20 +115,20 @@ class _Dent:
 
 @dataclass(frozen=True)
 class _Spot:
-    """Where a web is damaged: a square of half a side ``half`` about (s, v)."""
+    """A damaged square on a web: middle (s, v), side 2 ``half``, mm."""
 
     wall: str
     s: float
     v: float
     half: float
 
-    def apart(self, other: _Spot) -> bool:
-        """Whether the squares of two spots do not meet."""
+    def disjoint(self, other: _Spot) -> bool:
+        """Return whether two squares do not overlap."""
         reach = self.half + other.half
         return self.wall != other.wall or abs(self.s - other.s) >= reach or abs(self.v - other.v) >= reach
 
     def where(self, part: ArchPart) -> str:
-        """Say where it is, for the ledger."""
+        """Return the place as text for the ledger."""
         return f"{part.name} {self.wall} web, {self.s - part.s0:.0f} mm from the start, {self.v:.0f} mm up"
 
 
@@ -140,24 +141,24 @@ class _Wave:
 
 @dataclass(frozen=True)
 class ArchErrors:
-    """One part's errors; ``q`` runs from 0 at its start to 1 at its end, ``vc`` is the height above the middle."""
+    """The errors of one part, mm and rad."""
 
     ends: Floats  # (2, 3): length, skew about the vertical and about the horizontal axis of the section
     twist: float
-    bow: tuple[float, float]
-    section: tuple[float, float]
-    waves: dict[str, _Wave]
+    bow: tuple[float, float]  # sideways, upward
+    section: tuple[float, float]  # width, height
+    waves: dict[str, _Wave]  # by wall
     dents: tuple[_Dent, ...] = ()
-    corners: Floats = field(default_factory=lambda: np.zeros((2, 4, 3)))  # of P1 to P4 at each end, along, left, up
+    corners: Floats = field(default_factory=lambda: np.zeros((2, 4, 3)))  # of P1 to P4 at each end: along, left, up
 
 
 def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[Hole, ...] = ()) -> ArchPart:
-    """Return the part with its errors: lengths and skews of its ends, twist, bow, section, waves and dents."""
+    """Return the part as built: errors of ends, twist, bow, section and corners, waves and dents."""
     s0, span = part.s0, part.s1 - part.s0
 
     def built(s: Floats, u: Floats, v: Floats, wall: str) -> tuple[Floats, Floats, Floats]:
-        q, b, h = (s - s0) / span, part.b(s), part.h(s)
-        # Waves and dents move a wall along its normal; they vanish at its edges, where walls meet.
+        q, b, h = (s - s0) / span, part.b(s), part.h(s)  # q runs from 0 at the start to 1 at the end
+        # Waves and dents displace a wall along its normal; they vanish at its edges, where walls join.
         if wall:
             flat = wall in ("bottom", "top")
             c, across = (u, u / b) if flat else (v, 2.0 * v / h - 1.0)
@@ -172,12 +173,12 @@ def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[H
             outward = {"bottom": -1.0, "top": 1.0, "left": 1.0, "right": -1.0}[wall] * move
             u, v = (u, v + outward) if flat else (u + outward, v)
         width, height = errors.section
-        vc = v - 0.5 * h
+        vc = v - 0.5 * h  # height above the middle of the section
         u, vc = u * (1.0 + 0.5 * width / b), vc * (1.0 + height / h)
         first, last = errors.ends
         s = s + (1.0 - q) * (first[0] + first[1] * u + first[2] * vc) + q * (last[0] + last[1] * u + last[2] * vc)
-        moved = _off_corners(errors.corners, u / b, 2.0 * vc / h, q * span, (1.0 - q) * span)
-        s, u, vc = s + moved[0], u + moved[1], vc + moved[2]
+        along, left, up = _corner_displacement(errors.corners, u / b, 2.0 * vc / h, q * span, (1.0 - q) * span)
+        s, u, vc = s + along, u + left, vc + up
         turn = errors.twist * (q - 0.5)
         u, vc = u * np.cos(turn) - vc * np.sin(turn), u * np.sin(turn) + vc * np.cos(turn)
         bend = np.sin(np.pi * q)
@@ -186,69 +187,82 @@ def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[H
     return dataclasses.replace(part, plates=plates, built=built, holes=holes)
 
 
-def _off_corners(corners: Floats, a: Floats, c: Floats, from_start: Floats, from_end: Floats) -> Floats:
-    """Movements (3, n) by those of the ends' corners: bilinear over the section, fading out along the part.
+def _corner_displacement(corners: Floats, a: Floats, c: Floats, from_start: Floats, from_end: Floats) -> Floats:
+    """Return displacements (3, n) due to the corners' (2, 4, 3): bilinear over the section, fading out along the part.
 
     ``a`` and ``c`` (n,) run from -1 to 1 across the section, to the left and upward.
     """
     left, up = 0.5 * (1.0 + a), 0.5 * (1.0 + c)
     shares = np.stack([left * (1.0 - up), (1.0 - left) * (1.0 - up), (1.0 - left) * up, left * up])
-    moved = np.zeros((3, len(a)))
+    result = np.zeros((3, len(a)))
     for end, away in enumerate((from_start, from_end)):
         x = np.clip(away / CORNER_REACH_MM, 0.0, 1.0)
-        moved += (1.0 - x) ** 2 * (1.0 + 2.0 * x) * (corners[end].T @ shares)
-    return moved
+        result += (1.0 - x) ** 2 * (1.0 + 2.0 * x) * (corners[end].T @ shares)
+    return result
 
 
 def arch(
     parts: tuple[ArchPart, ...], params: ArchParams, rngs: list[np.random.Generator], ledger: Ledger
 ) -> list[ArchPart]:
-    """Draw every part's errors from its own generator, write them down, and return the parts as built."""
-    found = []
+    """Draw the errors of every part from its generator, add them to the ledger, and return the parts as built.
+
+    Raises UsageError for drawn plates or sections that cannot be built, and for damage that does not fit on the webs.
+    """
+    built = []
     for number, (part, rng) in enumerate(zip(parts, rngs, strict=True)):
-        scale = np.array([params.length_mm, 1e-3 * params.skew_mrad, 1e-3 * params.skew_mrad])
-        ends = rng.standard_normal((2, 3)) * scale
-        twist = 1e-3 * params.twist_mrad * rng.standard_normal()
-        bow, section = params.bow_mm * rng.standard_normal(2), params.section_mm * rng.standard_normal(2)
-        thick = params.plate_mm * rng.standard_normal(3)
-        phases = rng.uniform(0.0, 2.0 * np.pi, 4)
-        waves = params.waviness_mm * rng.standard_normal(4)
-        corners = params.corner_mm * rng.standard_normal((2, 4, 3)) if params.corner_mm else np.zeros((2, 4, 3))
-        for i, end in enumerate(("start", "end")):
-            ledger.note("length error", f"{part.name} {end}", ends[i, 0], "mm")
-            ledger.note("skew about the vertical", f"{part.name} {end}", ends[i, 1], "rad")
-            ledger.note("skew about the horizontal", f"{part.name} {end}", ends[i, 2], "rad")
-            for k, axis in np.ndindex(4, 3) if params.corner_mm else ():
-                what = f"corner P{k + 1}, {('along', 'left', 'up')[axis]}"
-                ledger.note(what, f"{part.name} {end}", corners[i, k, axis], "mm")
-        for what, value in zip(("bow sideways", "bow upward", "width", "height"), (*bow, *section), strict=True):
-            ledger.note(what, part.name, value, "mm")
-        ledger.note("twist", part.name, twist, "rad")
-        plates = Plates(*(np.array([part.plates.bottom, part.plates.top, part.plates.web]) + thick).tolist())
-        if params.plate_mm:
-            _check_plates(part, plates)
-        _check_section(part, section)
-        for what, value in zip(("bottom plate", "top plate", "web plate"), thick, strict=True):
-            ledger.note(what, part.name, value, "mm")
-        walls = ("bottom", "top", "left", "right")
-        taken: list[_Spot] = []
-        errors = ArchErrors(
-            ends,
-            twist,
-            (float(bow[0]), float(bow[1])),
-            (float(section[0]), float(section[1])),
-            {
-                w: _Wave(float(a), float(p), params.waviness_length_mm)
-                for w, a, p in zip(walls, waves, phases, strict=True)
-            },
-            tuple(_dent(part, params, rng, ledger, taken) for _ in range(_share(params.dents, number, len(parts)))),
-            corners,
+        errors, plates = _draw_errors(part, params, rng, ledger)
+        damaged: list[_Spot] = []
+        dents = _share(params.dents, number, len(parts))
+        errors = dataclasses.replace(
+            errors, dents=tuple(_dent(part, params, rng, ledger, damaged) for _ in range(dents))
         )
-        holes = tuple(
-            _hole(part, params, rng, ledger, taken) for _ in range(_share(params.missing_pieces, number, len(parts)))
-        )
-        found.append(fabricate(part, errors, plates, holes))
-    return found
+        pieces = _share(params.missing_pieces, number, len(parts))
+        holes = tuple(_hole(part, params, rng, ledger, damaged) for _ in range(pieces))
+        built.append(fabricate(part, errors, plates, holes))
+    return built
+
+
+def _draw_errors(
+    part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger
+) -> tuple[ArchErrors, Plates]:
+    """Draw one part's errors but its damage, and its plates, and add them to the ledger."""
+    scale = np.array([params.length_mm, 1e-3 * params.skew_mrad, 1e-3 * params.skew_mrad])
+    ends = rng.standard_normal((2, 3)) * scale
+    twist = 1e-3 * params.twist_mrad * rng.standard_normal()
+    bow, section = params.bow_mm * rng.standard_normal(2), params.section_mm * rng.standard_normal(2)
+    thickness = params.plate_mm * rng.standard_normal(3)
+    phases = rng.uniform(0.0, 2.0 * np.pi, 4)
+    amplitudes = params.waviness_mm * rng.standard_normal(4)
+    corners = params.corner_mm * rng.standard_normal((2, 4, 3)) if params.corner_mm else np.zeros((2, 4, 3))
+    for i, end in enumerate(("start", "end")):
+        ledger.note("length error", f"{part.name} {end}", ends[i, 0], "mm")
+        ledger.note("skew about the vertical", f"{part.name} {end}", ends[i, 1], "rad")
+        ledger.note("skew about the horizontal", f"{part.name} {end}", ends[i, 2], "rad")
+        for k, axis in np.ndindex(4, 3) if params.corner_mm else ():
+            what = f"corner P{k + 1}, {('along', 'left', 'up')[axis]}"
+            ledger.note(what, f"{part.name} {end}", corners[i, k, axis], "mm")
+    for what, value in zip(("bow sideways", "bow upward", "width", "height"), (*bow, *section), strict=True):
+        ledger.note(what, part.name, value, "mm")
+    ledger.note("twist", part.name, twist, "rad")
+    plates = Plates(*(np.array(dataclasses.astuple(part.plates)) + thickness).tolist())
+    if params.plate_mm:
+        _check_plates(part, plates)
+    _check_section(part, section)
+    for what, value in zip(("bottom plate", "top plate", "web plate"), thickness, strict=True):
+        ledger.note(what, part.name, value, "mm")
+    waves = {
+        wall: _Wave(float(amplitude), float(phase), params.waviness_length_mm)
+        for wall, amplitude, phase in zip(("bottom", "top", "left", "right"), amplitudes, phases, strict=True)
+    }
+    errors = ArchErrors(
+        ends=ends,
+        twist=twist,
+        bow=(float(bow[0]), float(bow[1])),
+        section=(float(section[0]), float(section[1])),
+        waves=waves,
+        corners=corners,
+    )
+    return errors, plates
 
 
 def _sizes(part: ArchPart) -> tuple[float, float]:
@@ -259,20 +273,20 @@ def _sizes(part: ArchPart) -> tuple[float, float]:
 def _check_plates(part: ArchPart, plates: Plates) -> None:
     """Raise UsageError for drawn plates that are too thin or fill the part."""
     width, height = _sizes(part)
-    for what, thick in zip(("bottom", "top", "web"), dataclasses.astuple(plates), strict=True):
-        if thick < LEAST_PLATE_MM:
+    for what, thickness in zip(("bottom", "top", "web"), dataclasses.astuple(plates), strict=True):
+        if thickness < LEAST_PLATE_MM:
             raise UsageError(
                 f"asbuilt.plate_mm: expected plates of {LEAST_PLATE_MM:g} mm at least, drew a {what} plate of "
-                f"{thick:.1f} mm for {part.name}; ask for smaller errors of plates"
+                f"{thickness:.1f} mm for {part.name}; give smaller errors of plates"
             )
     for what, both, size in (
         ("bottom and top", plates.bottom + plates.top, height),
         ("two web", 2.0 * plates.web, width),
     ):
-        if both > 0.9 * size:
+        if both > MOST_FILLED * size:
             raise UsageError(
                 f"asbuilt.plate_mm: expected plates that leave {part.name} hollow, drew {what} plates of {both:.1f} mm "
-                f"together where the section measures {size:g} mm; ask for smaller errors of plates"
+                f"together where the section measures {size:g} mm; give smaller errors of plates"
             )
 
 
@@ -282,18 +296,18 @@ def _check_section(part: ArchPart, section: Floats) -> None:
         if size + error < LEAST_SHARE * size:
             raise UsageError(
                 f"asbuilt.section_mm: expected at least half of {part.name}'s section, drew an error of its {what} "
-                f"of {error:.1f} mm where it measures {size:g} mm; ask for smaller errors of sections"
+                f"of {error:.1f} mm where it measures {size:g} mm; give smaller errors of sections"
             )
 
 
 def _share(count: int, number: int, of: int) -> int:
-    """How many of ``count`` things fall to a part: the middle parts first."""
+    """Return how many of ``count`` things are on part ``number`` of ``of``; the middle part is served first."""
     order = [of // 2, *(i for i in range(of) if i != of // 2)]
     return count // of + (order.index(number) < count % of)
 
 
-def _on_web(part: ArchPart, size: float, rng: np.random.Generator, taken: list[_Spot]) -> _Spot:
-    """Draw a place on a web's constant section, ``size`` away from every edge and apart from those taken; take it."""
+def _on_web(part: ArchPart, size: float, rng: np.random.Generator, damaged: list[_Spot]) -> _Spot:
+    """Draw a spot on a web's constant section, ``size`` from every edge and disjoint from ``damaged``; add it there."""
     s0, s1 = part.constant_section()
     h = float(part.h(np.array(s0)))
     low, high = part.plates.bottom + 1.2 * size, h - part.plates.top - 1.2 * size
@@ -302,25 +316,25 @@ def _on_web(part: ArchPart, size: float, rng: np.random.Generator, taken: list[_
     for _ in range(MOST_DRAWS):
         wall = ("left", "right")[int(rng.integers(2))]
         spot = _Spot(wall, rng.uniform(s0 + 1.5 * size, s1 - 1.5 * size), rng.uniform(low, high), size)
-        if all(spot.apart(other) for other in taken):
-            taken.append(spot)
+        if all(spot.disjoint(other) for other in damaged):
+            damaged.append(spot)
             return spot
     raise UsageError(
-        f"asbuilt.dents, missing_pieces: {len(taken) + 1} of them do not fit on the webs of {part.name} apart from "
-        "each other; ask for fewer or smaller ones"
+        f"asbuilt.dents, missing_pieces: {len(damaged) + 1} of them do not fit on the webs of {part.name} apart from "
+        "each other; give fewer or smaller ones"
     )
 
 
-def _dent(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, taken: list[_Spot]) -> _Dent:
-    spot = _on_web(part, params.dent_radius_mm, rng, taken)
+def _dent(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, damaged: list[_Spot]) -> _Dent:
+    spot = _on_web(part, params.dent_radius_mm, rng, damaged)
     where = spot.where(part)
     depth = ledger.note("dent, depth", where, params.dent_depth_mm, "mm")
     return _Dent(spot.wall, spot.s, spot.v, depth, ledger.note("dent, radius", where, params.dent_radius_mm, "mm"))
 
 
-def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, taken: list[_Spot]) -> Hole:
+def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, damaged: list[_Spot]) -> Hole:
     half = 0.5 * params.missing_size_mm
-    spot = _on_web(part, half, rng, taken)
+    spot = _on_web(part, half, rng, damaged)
     ledger.note("missing piece, side", spot.where(part), params.missing_size_mm, "mm")
     return Hole(spot.wall, spot.s - half, spot.s + half, spot.v - half, spot.v + half)
 
@@ -329,9 +343,9 @@ def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: 
 
 
 def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger: Ledger) -> Frame:
-    """Draw a frame's errors, write them down, and return the frame as built, at its temperature.
+    """Draw a frame's errors, add them to the ledger, and return the frame as built, at its temperature.
 
-    Raises UsageError for more wrong balls or missing bolts than there are, and for errors that leave no room to build.
+    Raises UsageError for more wrong balls or missing bolts than there are, and for errors too large to build the frame.
     """
     count, members = len(nominal.centres), len(nominal.members)
     for key, most, of in (("wrong_sizes", count, "balls"), ("missing_bolts", 2 * members, "bolts")):
@@ -354,14 +368,11 @@ def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger:
     side /= np.linalg.norm(side, axis=1)[:, None]
     other = np.cross(unit, side)
 
-    def across(draws: Floats) -> Floats:
-        moved: Floats = draws[..., 0, None] * side[:, None] + draws[..., 1, None] * other[:, None]
-        return moved
-
-    offsets = across(params.eccentricity_mm * rng.standard_normal((members, 2, 2)))
+    draws = params.eccentricity_mm * rng.standard_normal((members, 2, 2))
+    offsets = draws[..., 0, None] * side[:, None] + draws[..., 1, None] * other[:, None]
     angle = rng.uniform(0.0, 2.0 * np.pi, members)
-    joined = nominal.connection.scaled(grown)
-    built = dataclasses.replace(nominal, centres=centres, radii=radii, offsets=offsets, connection=joined)
+    connection = nominal.connection.scaled(grown)
+    built = dataclasses.replace(nominal, centres=centres, radii=radii, offsets=offsets, connection=connection)
     try:
         tubes = built.tube_lengths()
     except UsageError as error:

@@ -1,4 +1,4 @@
-"""Bodies of STEP and IFC files: triangle meshes in mm, refined until they keep a deviation from the CAD surface."""
+"""Bodies of STEP and IFC files: triangle meshes in mm, refined to a deviation from the CAD surface."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ import numpy as np
 
 from processor.model import Floats, InputError, Ints
 
-TESSELLATION_MM = 0.05
-COARSE_SHARE = 1e-3  # of a body's size: where meshing starts
-COARSER = 10.0  # a mesh than the next
+TESSELLATION_MM = 0.05  # deviation aimed at
+ANGLE_RAD = 0.1  # largest angle between adjacent facets of a curved face
+COARSE_SHARE = 1e-3  # deviation of the first mesh as a fraction of the body's size
+COARSER = 10.0  # largest ratio of the deviations of a mesh and the next
 LARGEST_MM = 1e9
 NO_UNIT = "says no unit of length that is known; name it with --units"
 UNITS_MM = {
@@ -25,8 +26,8 @@ UNITS_MM = {
 class Body:
     """A solid of a CAD file, or a surface without a volume: vertices (v, 3) in mm and triangles (f, 3).
 
-    ``closed`` says whether the mesh has no open edge; ``deviation_mm`` how far it may be from the body, by the kernel's
-    own figure; ``volume_mm3`` is NaN for a surface.
+    ``closed``: the mesh has no open edge. ``deviation_mm`` is the kernel's figure of the largest distance between mesh
+    and body. ``volume_mm3`` is NaN for a surface.
     """
 
     name: str
@@ -40,16 +41,17 @@ class Body:
 
     @property
     def size_mm(self) -> Floats:
-        """Sizes (3,) of the box around it."""
-        found: Floats = np.ptp(self.vertices, axis=0)
-        return found
+        """Sizes (3,) of the axis-aligned bounding box, mm."""
+        sizes: Floats = np.ptp(self.vertices, axis=0)
+        return sizes
 
 
 @dataclass(frozen=True)
 class CadFile:
-    """The unit of a file's numbers and its size, the unit that the file says ("" if none), its bodies, what was lost.
+    """The bodies of a CAD file, and as ``problems`` what could not be read.
 
-    ``unit`` and ``unit_said`` differ where another unit was asked for.
+    ``unit`` and its size ``unit_mm`` are those of the file's numbers; ``unit_said`` is the unit named in the file, ""
+    for none. The two differ where another unit was requested.
     """
 
     unit: str
@@ -59,37 +61,28 @@ class CadFile:
     problems: tuple[str, ...]
 
 
-# --- from process to process -----------------------------------------------------------------------------------------
+def unit_name(path: str, given: str, size_mm: float) -> tuple[str, list[str]]:
+    """Return the name of a unit by its size, and a problem where the name ``given`` in the file contradicts the size.
 
-
-# --- the text --------------------------------------------------------------------------------------------------------
-
-
-# --- units and meshes ------------------------------------------------------------------------------------------------
-
-
-def unit_name(path: str, said: str, size_mm: float) -> tuple[str, list[str]]:
-    """Name a unit by its size, which is what counts, and say where the file's own name for it is another.
-
-    Raises InputError for a size that is none.
+    Raises InputError for a size that is not positive and finite.
     """
     if not 0.0 < size_mm < float("inf"):
         raise InputError(f"{path}: says a unit of length of {size_mm:.10g} mm; name it with --units")
-    said = said.strip().lower()
+    given = given.strip().lower()
     fitting = [name for name, size in UNITS_MM.items() if abs(size / size_mm - 1.0) < 1e-6]
-    if said in UNITS_MM and said not in fitting:
-        return f"{size_mm:.10g} mm", [f"the file calls {size_mm:.10g} mm {said}; name the unit with --units if wrong"]
+    if given in UNITS_MM and given not in fitting:
+        return f"{size_mm:.10g} mm", [f"the file calls {size_mm:.10g} mm {given}; name the unit with --units if wrong"]
     if fitting:
-        return (said if said in fitting else fitting[0]), []
-    return (said if re.fullmatch(r"[\w. -]{1,40}", said) else f"{size_mm:.10g} mm"), []
+        return (given if given in fitting else fitting[0]), []
+    return (given if re.fullmatch(r"[\w. -]{1,40}", given) else f"{size_mm:.10g} mm"), []
 
 
 def finest_mm(path: str, name: str, size_mm: float, most: int, triangles: Callable[[float], int]) -> float:
-    """Return the deviation of the last mesh made by ``triangles``: the aimed at, or what keeps near ``most`` triangles.
+    """Refine a mesh to TESSELLATION_MM, or to about ``most`` triangles; return the deviation of the last mesh, mm.
 
-    ``triangles`` makes the mesh of a deviation in mm and counts it. The number of a doubly curved body goes with one
-    over the deviation, that of any other slower, so that a coarse mesh tells before much time and memory are taken.
-    Raises InputError for a body that is too large to be one.
+    ``triangles`` makes the mesh of a deviation in mm and returns the number of its triangles. That number is inversely
+    proportional to the deviation on doubly curved bodies and grows more slowly on others. So a coarse mesh predicts the
+    time and memory of a finer one. Raises InputError for a body too large to be real.
     """
     if not size_mm < LARGEST_MM:
         raise InputError(f"{path}: {name!r} is {size_mm:.3g} mm large; is its unit right? name it with --units")
@@ -103,7 +96,7 @@ def finest_mm(path: str, name: str, size_mm: float, most: int, triangles: Callab
 
 
 def is_closed(faces: Ints) -> bool:
-    """Tell whether the triangles along every edge run one way as often as the other, so that they hold a volume."""
+    """Return whether every edge is used equally often in both directions, so that the triangles enclose a volume."""
     edges = faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     low, high = edges.min(axis=1), edges.max(axis=1)
     _, which = np.unique(low * (int(high.max(initial=0)) + 1) + high, return_inverse=True)

@@ -1,4 +1,4 @@
-"""IFC texts to bodies; runs in the process of :mod:`designgen.cad.bodies`."""
+"""IFC texts to bodies; runs in the child process of :mod:`designgen.cad.process`."""
 
 from __future__ import annotations
 
@@ -6,18 +6,17 @@ from typing import Any
 
 import numpy as np
 
-from designgen.cad.bodies import NO_UNIT, UNITS_MM, Body, CadFile, finest_mm, is_closed, unit_name
-from designgen.mesh import ANGLE_RAD
+from designgen.cad.bodies import ANGLE_RAD, NO_UNIT, UNITS_MM, Body, CadFile, finest_mm, is_closed, unit_name
 from processor.model import Floats, InputError, Ints, UsageError
 
-MOST_TRIANGLES = 100_000  # of a body; the library's time grows with their square
-BEYOND = 1.5  # times the deflection asked for; on spheres the library departs by 1.37 times
+MOST_TRIANGLES = 100_000  # of a body; the library's time grows with the square of the number
+BEYOND = 1.5  # largest deviation in units of the requested one; measured on spheres: 1.37
 NO_BODIES = ("IfcFeatureElementSubtraction", "IfcSpace", "IfcVirtualElement", "IfcAnnotation", "IfcGrid")
-FLAT = ("Axis", "FootPrint", "Annotation", "Box", "CoG", "Reference")  # representations that have no surface
+FLAT = ("Axis", "FootPrint", "Annotation", "Box", "CoG", "Reference")  # representations without a surface
 
 
 def parse(path: str, content: bytes, units: str) -> CadFile:
-    """Read the text of an IFC file; its numbers are in ``units`` where given. Raises as cad_reading.parse."""
+    """Read the text of an IFC file; its numbers are in ``units`` if given. Raises as :func:`process.parse`."""
     try:
         import ifcopenshell
         import ifcopenshell.util.unit
@@ -32,10 +31,10 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     if not projects:
         raise InputError(damaged)
     problems: list[str] = []
-    declared, size, said = ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT"), 1000.0, ""
+    declared, size, name = ifcopenshell.util.unit.get_project_unit(model, "LENGTHUNIT"), 1000.0, ""
     if declared is not None:
         size = 1000.0 * float(ifcopenshell.util.unit.calculate_unit_scale(model))
-        said, problems = unit_name(path, ifcopenshell.util.unit.get_full_unit_name(declared), size)
+        name, problems = unit_name(path, ifcopenshell.util.unit.get_full_unit_name(declared), size)
     elif not units:
         raise InputError(f"{path}: {NO_UNIT}")
     taken = UNITS_MM[units] if units else size
@@ -46,9 +45,9 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
         body = _body(path, product, 1000.0 * taken / size)
         if body is not None:
             bodies.append(body)
-        elif any(one.RepresentationIdentifier not in FLAT for one in product.Representation.Representations):
+        elif any(r.RepresentationIdentifier not in FLAT for r in product.Representation.Representations):
             problems.append(f"{_name(product)!r} ({product.is_a()}) cannot be meshed and is left out")
-    return CadFile(units or said, taken, said, tuple(bodies), tuple(problems))
+    return CadFile(units or name, taken, name, tuple(bodies), tuple(problems))
 
 
 def _name(product: Any) -> str:
@@ -56,7 +55,7 @@ def _name(product: Any) -> str:
 
 
 def _body(path: str, product: Any, to_mm: float) -> Body | None:
-    """Return a product's body, ``to_mm`` the size of the library's metre in it; None if the library makes none."""
+    """Return a product's body, None if the library makes none; ``to_mm`` is the length of the library's metre in mm."""
     import ifcopenshell.geom
 
     made: dict[str, Any] = {}
@@ -71,7 +70,7 @@ def _body(path: str, product: Any, to_mm: float) -> Body | None:
         return len(made["shape"].faces) // 3
 
     try:
-        triangles(1e3 * to_mm)  # a first look, for its size
+        triangles(1e3 * to_mm)  # a coarse mesh, for its size
         first = np.array(made["shape"].verts, np.float64).reshape(-1, 3) * to_mm
         if not len(made["shape"].faces) or not np.isfinite(first).all():
             return None
@@ -92,4 +91,13 @@ def _measured(name: str, vertices: Floats, faces: Ints, deviation_mm: float) -> 
     across = np.cross(b - a, c - a)
     area, volume = 0.5 * float(np.linalg.norm(across, axis=1).sum()), float(np.sum(a * across)) / 6.0
     closed = is_closed(triangles)
-    return Body(name, closed, closed, points, triangles, abs(volume) if closed else float("nan"), area, deviation_mm)
+    return Body(
+        name=name,
+        solid=closed,
+        closed=closed,
+        vertices=points,
+        faces=triangles,
+        volume_mm3=abs(volume) if closed else float("nan"),
+        area_mm2=area,
+        deviation_mm=deviation_mm,
+    )

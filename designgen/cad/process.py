@@ -1,11 +1,12 @@
 """STEP and IFC files read by the CAD kernel in a child process.
 
-The kernel can end the process on a damaged file. The child reads one file; the parent receives the bodies, an error,
-or the end of the process. The answer of a child that read a damaged file is not trusted: it is JSON and plain arrays.
+A damaged file can end the process of the kernel. The child reads one file and sends the bodies, an error, or nothing.
+The parent does not trust a child that read a damaged file: the answer is JSON and plain arrays, which are checked.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import os
@@ -35,31 +36,31 @@ def serve() -> None:
     for stream in (1, 2):
         os.dup2(nowhere, stream)
     _limit(job["limit_s"], job["memory_bytes"])
-    path, found = job["path"], None
+    path, cad = job["path"], None
     try:
-        found = parse(path, job["suffix"], content, job["units"])
-        header = _header(found)
+        cad = parse(path, job["suffix"], content, job["units"])
+        header = _header(cad)
     except (InputError, UsageError) as error:
         header = {"error": type(error).__name__, "message": str(error)}
     except ImportError as error:
-        said = f"{path}: cannot be read: the CAD kernel cannot be loaded ({error}); install the extra 'designgen'"
-        header = {"error": "InputError", "message": said}
+        message = f"{path}: cannot be read: the CAD kernel cannot be loaded ({error}); install the extra 'designgen'"
+        header = {"error": "InputError", "message": message}
     except MemoryError:
-        said = f"{path}: reading it takes more than {job['memory_bytes'] / 1e9:g} GB of memory; export it in parts"
-        header = {"error": "InputError", "message": said}
-    except Exception as error:  # the kernel's own kinds, which say little
+        message = f"{path}: reading it takes more than {job['memory_bytes'] / 1e9:g} GB of memory; export it in parts"
+        header = {"error": "InputError", "message": message}
+    except Exception as error:  # of types that the kernel defines
         why = " ".join(f"{type(error).__name__}: {error}".split())[:200]
-        said = f"{path}: the CAD kernel cannot read it ({why}); it may be damaged: copy or export it again"
-        header = {"error": "InputError", "message": said}
+        message = f"{path}: the CAD kernel cannot read it ({why}); it may be damaged: copy or export it again"
+        header = {"error": "InputError", "message": message}
     answers.write(json.dumps(header).encode("ascii") + b"\n")
-    for body in found.bodies if found is not None and "bodies" in header else ():
+    for body in cad.bodies if cad is not None and "bodies" in header else ():
         for array in (body.vertices, body.faces):
             np.lib.format.write_array(answers, np.ascontiguousarray(array), allow_pickle=False)
     answers.flush()
 
 
 def _limit(limit_s: float, memory_bytes: int) -> None:
-    """Limit memory where the platform can; end on its own even if the caller is gone."""
+    """Limit the time, even if the parent has ended, and the memory, where the platform can."""
     if hasattr(signal, "alarm"):
         signal.alarm(math.ceil(limit_s) + 5)
     try:
@@ -72,7 +73,7 @@ def _limit(limit_s: float, memory_bytes: int) -> None:
         pass
 
 
-def _header(found: CadFile) -> dict[str, Any]:
+def _header(cad: CadFile) -> dict[str, Any]:
     bodies = [
         {
             "name": body.name,
@@ -82,22 +83,22 @@ def _header(found: CadFile) -> dict[str, Any]:
             "area_mm2": body.area_mm2,
             "deviation_mm": body.deviation_mm,
         }
-        for body in found.bodies
+        for body in cad.bodies
     ]
-    header = {"unit": found.unit, "unit_mm": found.unit_mm, "unit_said": found.unit_said, "bodies": bodies}
-    return {**header, "problems": list(found.problems)}
+    header = {"unit": cad.unit, "unit_mm": cad.unit_mm, "unit_said": cad.unit_said, "bodies": bodies}
+    return {**header, "problems": list(cad.problems)}
 
 
 def received(answer: IO[bytes]) -> CadFile:
-    """Return what :func:`serve` answered.
+    """Return the content of an answer of :func:`serve`.
 
-    Raises the InputError or UsageError that it answered, ValueError, KeyError, TypeError or EOFError for no answer.
+    Raises the InputError or UsageError in the answer; ValueError, KeyError, TypeError or EOFError for an invalid one.
     """
     header = json.loads(answer.readline())
     if "error" in header:
         raise (UsageError if header["error"] == "UsageError" else InputError)(str(header["message"]))
     bodies = []
-    for said in header["bodies"]:
+    for entry in header["bodies"]:
         vertices = np.lib.format.read_array(answer, allow_pickle=False)
         faces = np.lib.format.read_array(answer, allow_pickle=False)
         fits = (
@@ -105,37 +106,51 @@ def received(answer: IO[bytes]) -> CadFile:
         )
         if not fits or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
             raise ValueError("no mesh")
-        volume = float(said["volume_mm3"]) if said["solid"] else float("nan")
-        sizes = (volume, float(said["area_mm2"]), float(said["deviation_mm"]))
-        if not np.isfinite(vertices).all() or not np.isfinite(sizes[0 if said["solid"] else 1 :]).all():
+        body = Body(
+            name=str(entry["name"]),
+            solid=bool(entry["solid"]),
+            closed=bool(entry["closed"]),
+            vertices=vertices,
+            faces=faces,
+            volume_mm3=float(entry["volume_mm3"]) if entry["solid"] else float("nan"),
+            area_mm2=float(entry["area_mm2"]),
+            deviation_mm=float(entry["deviation_mm"]),
+        )
+        sizes = [body.area_mm2, body.deviation_mm, *([body.volume_mm3] if body.solid else [])]
+        if not np.isfinite(vertices).all() or not np.isfinite(sizes).all():
             raise ValueError("no number")
-        bodies.append(Body(str(said["name"]), bool(said["solid"]), bool(said["closed"]), vertices, faces, *sizes))
-    problems = tuple(str(one) for one in header["problems"])
+        bodies.append(body)
+    problems = tuple(str(problem) for problem in header["problems"])
     return CadFile(str(header["unit"]), float(header["unit_mm"]), str(header["unit_said"]), tuple(bodies), problems)
 
 
 def parse(path: str, suffix: str, content: bytes, units: str) -> CadFile:
-    """Read the text of a STEP file (``suffix`` .step, .stp) or an IFC file; its numbers are in ``units`` where given.
+    """Read the text of a STEP file (``suffix`` .step, .stp) or an IFC file; its numbers are in ``units`` if given.
 
-    Raises InputError for what cannot be read or has no unit, UsageError where IFC's library is missing and where a unit
-    is asked for but the file has several.
+    Raises InputError for a text that cannot be read or has no unit, UsageError where the library for IFC is missing and
+    where ``units`` are given but the file has several units.
     """
-    from designgen.cad import ifc
-    from designgen.cad import step as cad_step
-
+    # The kernels are loaded in the child process only: that takes seconds, and may fail.
     text = escaped(content)
-    found = ifc.parse(path, text, units) if suffix == ".ifc" else cad_step.parse(path, text, units)
+    if suffix == ".ifc":
+        from designgen.cad import ifc
+
+        cad = ifc.parse(path, text, units)
+    else:
+        from designgen.cad import step
+
+        cad = step.parse(path, text, units)
     lost = missing_lines(text)
     if not lost:
-        return found
-    said = f"{len(lost)} line(s) that others refer to are missing, first #{lost[0]}: bodies may be missing or wrong"
-    return CadFile(found.unit, found.unit_mm, found.unit_said, found.bodies, (said, *found.problems))
+        return cad
+    problem = f"{len(lost)} line(s) that others refer to are missing, first #{lost[0]}: bodies may be missing or wrong"
+    return dataclasses.replace(cad, problems=(problem, *cad.problems))
 
 
 def escaped(content: bytes) -> bytes:
-    """Return a file's text in ASCII, other characters as ISO 10303-21 writes them, from UTF-8 or else GB 18030.
+    """Return a file's text in ASCII with all other characters escaped by ISO 10303-21, from UTF-8 or else GB 18030.
 
-    Names are often written as they are, against the standard, which the kernels take for Latin or drop.
+    Many programs write names unescaped, against the standard; the kernels take them for Latin letters or drop them.
     """
     if content.isascii():
         return content
@@ -147,13 +162,13 @@ def escaped(content: bytes) -> bytes:
 
 
 def escape(text: str) -> str:
-    r"""Write what is not ASCII as ISO 10303-21 does: ``\X2\6881\X0\``, beyond 16 bits ``\X4\00020000\X0\``."""
+    r"""Escape characters beyond ASCII as in ISO 10303-21: ``\X2\6881\X0\``, beyond 16 bits ``\X4\00020000\X0\``."""
     text = re.sub("[\x80-\uffff]+", lambda m: rf"\X2\{m[0].encode('utf-16-be', 'replace').hex().upper()}\X0" "\\", text)
     return re.sub("[\U00010000-\U0010ffff]+", lambda m: rf"\X4\{m[0].encode('utf-32-be').hex().upper()}\X0" "\\", text)
 
 
 def missing_lines(text: bytes) -> list[int]:
-    """Return the numbers of entities that a file refers to but does not hold, in order."""
+    """Return the numbers of entities that a file refers to but does not contain, in order."""
     plain = re.sub(rb"'[^']*'|/\*.*?\*/", b"", text, flags=re.S)
     defined = {int(number) for number in re.findall(rb"#(\d{1,18})\s*=", plain)}
     return sorted({int(number) for number in re.findall(rb"#(\d{1,18})(?!\d)", plain)} - defined)

@@ -1,4 +1,4 @@
-"""STEP texts to bodies; runs in the process of :mod:`designgen.cad.bodies`."""
+"""STEP texts to bodies; runs in the child process of :mod:`designgen.cad.process`."""
 
 from __future__ import annotations
 
@@ -9,32 +9,51 @@ from io import BytesIO
 from typing import Any
 
 import numpy as np
+from OCP.Bnd import Bnd_Box
+from OCP.BRep import BRep_Builder
+from OCP.BRepBndLib import BRepBndLib
+from OCP.BRepGProp import BRepGProp
+from OCP.GProp import GProp_GProps
+from OCP.IFSelect import IFSelect_RetDone
+from OCP.StepBasic import StepBasic_SiUnitAndLengthUnit, StepBasic_SiUnitName
+from OCP.STEPConstruct import STEPConstruct_UnitContext
+from OCP.STEPControl import STEPControl_Reader
+from OCP.StepRepr import (
+    StepRepr_NextAssemblyUsageOccurrence,
+    StepRepr_RepresentationItem,
+    StepRepr_ShapeRepresentationRelationship,
+    StepRepr_ShapeRepresentationRelationshipWithTransformation,
+)
+from OCP.StepShape import StepShape_FaceSurface, StepShape_ManifoldSolidBrep, StepShape_ShapeDefinitionRepresentation
+from OCP.TColStd import TColStd_SequenceOfAsciiString
+from OCP.TopAbs import TopAbs_FACE, TopAbs_SHELL, TopAbs_SOLID
+from OCP.TopExp import TopExp_Explorer
+from OCP.TopLoc import TopLoc_Location
+from OCP.TopoDS import TopoDS_Compound
+from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from designgen import mesh
+from designgen.cad import tessellation
 from designgen.cad.bodies import NO_UNIT, UNITS_MM, Body, CadFile, finest_mm, is_closed, unit_name
 from processor.model import InputError, UsageError
 
 MOST_TRIANGLES = 700_000  # of a body: about ten seconds
-LARGE_MM = 1000.0  # bodies from here on are meshed by the algorithm for many triangles
+LARGE_MM = 1000.0  # larger bodies are meshed by the algorithm for many triangles
 
 
 def parse(path: str, content: bytes, units: str) -> CadFile:
-    """Read the text of a STEP file; its numbers are in ``units`` where given. Raises as cad_reading.parse."""
-    from OCP.IFSelect import IFSelect_RetDone
-    from OCP.STEPControl import STEPControl_Reader
-
+    """Read the text of a STEP file; its numbers are in ``units`` if given. Raises as :func:`process.parse`."""
     reader = STEPControl_Reader()
     if reader.ReadStream("file.step", BytesIO(content)) != IFSelect_RetDone:
         raise InputError(f"{path}: not a readable STEP file: it is damaged; copy or export it again")
     model = reader.StepModel()
-    # Kept together: an entity is the same object only as long as somebody holds it.
+    # Referenced throughout: Python creates a new object for an entity that is no longer referenced.
     entities = [model.Value(i) for i in range(1, model.NbEntities() + 1)]
-    said, sizes = _units(reader, entities)
+    unit_given, sizes = _units(reader, entities)
     damaged = _damaged(reader, entities)
     known = bool(sizes) and not any(re.match("StepBasic_.*(Length|Conversion)", kind) for kind in damaged)
-    if not known and not units and any("SHAPE" in type(one).__name__.upper() for one in entities):
+    if not known and not units and any("SHAPE" in type(entity).__name__.upper() for entity in entities):
         raise InputError(f"{path}: {NO_UNIT}")
-    unit, problems = unit_name(path, said, sizes[0]) if known else ("", [])
+    unit, problems = unit_name(path, unit_given, sizes[0]) if known else ("", [])
     geometry = [kind.split("_", 1)[1] for kind in damaged if kind.startswith(("StepShape_", "StepGeom_"))]
     if geometry:
         problems.append(f"{len(geometry)} damaged entities, first {geometry[0]}: bodies may be missing")
@@ -46,7 +65,7 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     taken = UNITS_MM[units] if units else declared
     if sizes:
         reader.SetSystemLengthUnit(declared / taken)
-    scale = 1.0 if sizes else taken  # without a unit, the kernel takes the numbers as they are
+    scale = 1.0 if sizes else taken  # without a unit, the kernel does not scale the numbers
     reader.TransferRoots()
     names = _Names(reader, entities)
     problems += _lost(reader, entities, names)
@@ -63,10 +82,7 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
 
 
 def _units(reader: Any, entities: list[Any]) -> tuple[str, list[float]]:
-    """Return what the file calls its unit of length, and the different sizes in mm by which the kernel will go."""
-    from OCP.STEPConstruct import STEPConstruct_UnitContext
-    from OCP.TColStd import TColStd_SequenceOfAsciiString
-
+    """Return the name of the file's unit of length, and the distinct sizes in mm that the kernel uses."""
     lengths, angles, solid_angles = (TColStd_SequenceOfAsciiString() for _ in range(3))
     reader.FileUnits(lengths, angles, solid_angles)
     sizes: list[float] = []
@@ -81,33 +97,25 @@ def _units(reader: Any, entities: list[Any]) -> tuple[str, list[float]]:
 
 
 def _damaged(reader: Any, entities: list[Any]) -> list[str]:
-    """Return the kinds of the entities that the kernel cannot make sense of.
+    """Return the types of the entities that the kernel cannot interpret.
 
-    It leaves geometry out, with the whole solid around it, and takes a damaged unit for another.
+    It leaves out such geometry, with the whole solid around it, and mistakes a damaged unit for another.
     """
-    from OCP.StepBasic import StepBasic_SiUnitAndLengthUnit, StepBasic_SiUnitName
-
     metre = StepBasic_SiUnitName.StepBasic_sunMetre
-    lengths = [one for one in entities if isinstance(one, StepBasic_SiUnitAndLengthUnit)]
-    found = ["StepBasic_SiUnitAndLengthUnit" for one in lengths if one.Name() != metre]
+    lengths = [entity for entity in entities if isinstance(entity, StepBasic_SiUnitAndLengthUnit)]
+    damaged = ["StepBasic_SiUnitAndLengthUnit" for unit in lengths if unit.Name() != metre]
     checks = reader.WS().ModelCheckList(False)
     checks.Start()
     while checks.More():
         number = checks.Number()
         if checks.Value().NbFails() and 0 < number <= len(entities):
-            found.append(type(entities[number - 1]).__name__)
+            damaged.append(type(entities[number - 1]).__name__)
         checks.Next()
-    return found
+    return damaged
 
 
 def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
-    """Say which solids and how many faces of the file did not become any."""
-    from OCP.StepShape import StepShape_FaceSurface, StepShape_ManifoldSolidBrep
-    from OCP.TopAbs import TopAbs_FACE, TopAbs_SOLID
-    from OCP.TopExp import TopExp_Explorer
-    from OCP.TopLoc import TopLoc_Location
-    from OCP.TopTools import TopTools_IndexedMapOfShape
-
+    """Return as problems the solids, and the number of faces, that the kernel did not convert."""
     shape, nowhere = reader.OneShape() if reader.NbShapes() else None, TopLoc_Location()
     made, faces = set[Any](), TopTools_IndexedMapOfShape()
     for kind in (TopAbs_SOLID, TopAbs_FACE) if shape is not None else ():
@@ -118,21 +126,16 @@ def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
             else:
                 made.add(names.item(explorer.Current()))
             explorer.Next()
-    solids = [one for one in entities if isinstance(one, StepShape_ManifoldSolidBrep)]
-    found = [f"solid {_text(one)!r} is damaged, so that it did not become one" for one in solids if one not in made]
-    wanted = sum(isinstance(one, StepShape_FaceSurface) for one in entities)
-    if faces.Extent() < wanted:
-        found.append(f"{wanted - faces.Extent()} of {wanted} faces are damaged and are left out")
-    return found
+    solids = [entity for entity in entities if isinstance(entity, StepShape_ManifoldSolidBrep)]
+    problems = [f"solid {_text(s)!r} is damaged, so that it did not become one" for s in solids if s not in made]
+    expected = sum(isinstance(entity, StepShape_FaceSurface) for entity in entities)
+    if faces.Extent() < expected:
+        problems.append(f"{expected - faces.Extent()} of {expected} faces are damaged and are left out")
+    return problems
 
 
 def _pieces(shape: Any) -> Iterator[tuple[Any, bool]]:
-    """Give every solid (True), then every shell and the loose faces outside of solids (False)."""
-    from OCP.BRep import BRep_Builder
-    from OCP.TopAbs import TopAbs_FACE, TopAbs_SHELL, TopAbs_SOLID
-    from OCP.TopExp import TopExp_Explorer
-    from OCP.TopoDS import TopoDS_Compound
-
+    """Yield every solid (True), then every shell and the loose faces outside of solids (False)."""
     for kind, avoided in ((TopAbs_SOLID, None), (TopAbs_SHELL, TopAbs_SOLID)):
         explorer = TopExp_Explorer(shape, kind, *([avoided] if avoided is not None else []))
         while explorer.More():
@@ -148,12 +151,7 @@ def _pieces(shape: Any) -> Iterator[tuple[Any, bool]]:
 
 
 def _body(path: str, name: str, shape: Any, scale: float, *, solid: bool) -> Body | str:
-    """Return a shape, ``scale`` mm its unit, as a body, or what is wrong with it."""
-    from OCP.Bnd import Bnd_Box
-    from OCP.BRepBndLib import BRepBndLib
-    from OCP.BRepGProp import BRepGProp
-    from OCP.GProp import GProp_GProps
-
+    """Return a shape, whose unit is ``scale`` mm, as a body, or the problem with it."""
     box = Bnd_Box()
     BRepBndLib.Add_s(shape, box, False)
     if box.IsVoid():
@@ -162,35 +160,35 @@ def _body(path: str, name: str, shape: Any, scale: float, *, solid: bool) -> Bod
         return f"{name!r} has a face without bounds and is left out"
     size = scale * float(np.sqrt(box.SquareExtent()))
     deviation = finest_mm(
-        path, name, size, MOST_TRIANGLES, lambda mm: mesh.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
+        path, name, size, MOST_TRIANGLES, lambda mm: tessellation.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
     )
     volumes, areas = GProp_GProps(), GProp_GProps()
     BRepGProp.VolumeProperties_s(shape, volumes)
     BRepGProp.SurfaceProperties_s(shape, areas)
     try:
-        vertices, faces, measured = mesh.facets(shape)
+        vertices, faces, measured = tessellation.facets(shape)
     except ValueError:
         return f"{name!r} has faces that cannot be meshed and is left out"
     vertices = scale * vertices
     numbers = np.array([volumes.Mass(), areas.Mass(), measured]) * [scale**3, scale**2, scale]
     if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(numbers).all():
         return f"{name!r} has no extent and is left out"
-    volume = float(numbers[0]) if solid else float("nan")
     return Body(
-        name, solid, is_closed(faces), vertices, faces, volume, float(numbers[1]), max(deviation, float(numbers[2]))
+        name=name,
+        solid=solid,
+        closed=is_closed(faces),
+        vertices=vertices,
+        faces=faces,
+        volume_mm3=float(numbers[0]) if solid else float("nan"),
+        area_mm2=float(numbers[1]),
+        deviation_mm=max(deviation, float(numbers[2])),
     )
 
 
 class _Names:
-    """Names of shapes: a solid's own, else that of its place in an assembly, else that of its product."""
+    """Names of shapes: of the solid, else of its occurrence in an assembly, else of its product."""
 
     def __init__(self, reader: Any, entities: list[Any]) -> None:
-        from OCP.StepRepr import (
-            StepRepr_ShapeRepresentationRelationship,
-            StepRepr_ShapeRepresentationRelationshipWithTransformation,
-        )
-        from OCP.StepShape import StepShape_ShapeDefinitionRepresentation
-        from OCP.TopTools import TopTools_IndexedMapOfShape
 
         self._transfers = reader.WS().TransferReader()
         self._known, self._items = TopTools_IndexedMapOfShape(), list[Any]()
@@ -203,10 +201,10 @@ class _Names:
                 entity, StepRepr_ShapeRepresentationRelationshipWithTransformation
             ):
                 pairs.append((entity.Rep1(), entity.Rep2()))
-        for one, other in pairs:
-            for of, known in ((one, other), (other, one)):
-                if of not in products and known in products:
-                    products[of] = products[known]
+        for pair in pairs:
+            for unnamed, named in (pair, pair[::-1]):
+                if unnamed not in products and named in products:
+                    products[unnamed] = products[named]
         self._products: dict[Any, str] = {}  # of items
         for representation, name in products.items():
             items = representation.Items() if representation is not None else None
@@ -215,40 +213,36 @@ class _Names:
                     self._products.setdefault(items.Value(i), name)
 
     def of(self, shape: Any) -> str:
-        """Return the name of a shape as it lies in the file, or nothing."""
-        from OCP.StepRepr import StepRepr_NextAssemblyUsageOccurrence, StepRepr_RepresentationItem
-
+        """Return the name of a shape in the file, "" for none."""
         item = self.item(shape)
-        own = _text(item) if isinstance(item, StepRepr_RepresentationItem) else ""
-        if own:
-            return own
-        place = None if shape.Location().IsIdentity() else self._transfers.EntityFromShapeResult(shape, 1)
-        placed = _text(place) if isinstance(place, StepRepr_NextAssemblyUsageOccurrence) else ""
-        return placed or (self._products.get(item, "") if item is not None else "")
+        name = _text(item) if isinstance(item, StepRepr_RepresentationItem) else ""
+        if name:
+            return name
+        occurrence = None if shape.Location().IsIdentity() else self._transfers.EntityFromShapeResult(shape, 1)
+        name = _text(occurrence) if isinstance(occurrence, StepRepr_NextAssemblyUsageOccurrence) else ""
+        return name or (self._products.get(item, "") if item is not None else "")
 
     def item(self, shape: Any) -> Any:
-        """Return the entity that a shape was made of, wherever it lies; None where the kernel does not know."""
-        from OCP.TopLoc import TopLoc_Location
-
+        """Return the entity from which a shape was made, regardless of its location; None where it is unknown."""
         bare = shape.Located(TopLoc_Location())
-        if not self._known.Contains(bare):  # the kernel looks through everything, so it is asked once
+        if not self._known.Contains(bare):  # the kernel searches all entities, so each result is stored
             self._known.Add(bare)
             self._items.append(self._transfers.EntityFromShapeResult(bare, 1))
         return self._items[self._known.FindIndex(bare) - 1]
 
 
 def _product(representation: Any) -> str:
-    """Return the name of the product that a representation shows; damaged files lack any link of the chain."""
-    found = representation
+    """Return the name of a representation's product, "" where a damaged file lacks a link of the chain to it."""
+    entity = representation
     for link in ("Definition", "PropertyDefinition", "Definition", "ProductDefinition", "Formation", "OfProduct"):
-        found = getattr(found, link)() if hasattr(found, link) else None
-    return _text(found)
+        entity = getattr(entity, link)() if hasattr(entity, link) else None
+    return _text(entity)
 
 
 def _text(entity: Any) -> str:
-    """Return the name of an entity, nothing where it has none or it is no text."""
+    """Return the name of an entity, "" where it has none or one that is not text."""
     try:
-        found = str(entity.Name().ToCString()).strip()
+        name = str(entity.Name().ToCString()).strip()
     except (AttributeError, UnicodeDecodeError):
         return ""
-    return "" if found.upper() == "NONE" else found.encode("utf-8", "replace").decode()
+    return "" if name.upper() == "NONE" else name.encode("utf-8", "replace").decode()

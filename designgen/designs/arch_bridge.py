@@ -5,10 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from designgen import curves
+from designgen.checks import expect, expect_positive
+from designgen.curves import NAMES as CURVES
+from designgen.curves import make as make_curve
 from designgen.designs import arch_foot, arch_rib
 from designgen.designs.arch_part import ArchPart, Plates
-from processor.model import UsageError
 
 ABOUT = "arch bridge: two feet and three ribs along a parabola, catenary or circle"
 NAMES = ("foot1", "rib1", "rib2", "rib3", "foot2")
@@ -16,7 +17,7 @@ NAMES = ("foot1", "rib1", "rib2", "rib3", "foot2")
 
 @dataclass(frozen=True)
 class Params:
-    """Size of the bridge in mm; ``joints`` are fractions of the soffit's arc length."""
+    """Sizes of the bridge in mm; ``joints`` are fractions of the soffit's arc length."""
 
     curve: str = "parabola"
     span_mm: float = 24_000.0
@@ -32,31 +33,26 @@ class Params:
     taper: float = 0.6
 
     def __post_init__(self) -> None:
-        for key in ("span_mm", "rise_mm", "width_mm", "height_mm", "plate_bottom_mm", "plate_top_mm", "plate_web_mm"):
-            _expect(getattr(self, key) > 0.0, key, getattr(self, key), "a length above 0")
-        _expect(self.curve in curves.NAMES, "curve", self.curve, f"one of {', '.join(curves.NAMES)}")
-        _expect(self.rise_mm < 0.5 * self.span_mm, "rise_mm", self.rise_mm, "less than half of span_mm")
-        _expect(
-            self.plate_web_mm < 0.5 * self.width_mm, "plate_web_mm", self.plate_web_mm, "less than half of width_mm"
-        )
+        lengths = ("span_mm", "rise_mm", "width_mm", "height_mm", "plate_bottom_mm", "plate_top_mm", "plate_web_mm")
+        expect_positive(self, "bridge", *lengths)
         plates = self.plate_bottom_mm + self.plate_top_mm
-        _expect(plates < self.height_mm, "plate_bottom_mm + plate_top_mm", plates, "less than height_mm")
-        _expect(self.base_width_mm >= self.width_mm, "base_width_mm", self.base_width_mm, "at least width_mm")
-        _expect(self.base_height_mm >= self.height_mm, "base_height_mm", self.base_height_mm, "at least height_mm")
-        _expect(0.0 < self.taper < 1.0, "taper", self.taper, "between 0 and 1")
-        cuts = (0.0, *self.joints, 1.0)
-        rising = len(self.joints) == 4 and all(a < z for a, z in pairwise(cuts))
-        _expect(rising, "joints", list(self.joints), "four rising fractions between 0 and 1")
-
-
-def _expect(fits: bool, key: str, came: object, expected: str) -> None:
-    if not fits:
-        raise UsageError(f"bridge.{key}: expected {expected}, got {came!r}")
+        rising = len(self.joints) == 4 and all(a < z for a, z in pairwise((0.0, *self.joints, 1.0)))
+        for fits, key, value, expected in (
+            (self.curve in CURVES, "curve", self.curve, f"one of {', '.join(CURVES)}"),
+            (self.rise_mm < 0.5 * self.span_mm, "rise_mm", self.rise_mm, "less than half of span_mm"),
+            (self.plate_web_mm < 0.5 * self.width_mm, "plate_web_mm", self.plate_web_mm, "less than half of width_mm"),
+            (plates < self.height_mm, "plate_bottom_mm + plate_top_mm", plates, "less than height_mm"),
+            (self.base_width_mm >= self.width_mm, "base_width_mm", self.base_width_mm, "at least width_mm"),
+            (self.base_height_mm >= self.height_mm, "base_height_mm", self.base_height_mm, "at least height_mm"),
+            (0.0 < self.taper < 1.0, "taper", self.taper, "between 0 and 1"),
+            (rising, "joints", list(self.joints), "four rising fractions between 0 and 1"),
+        ):
+            expect(fits, f"bridge.{key}", value, expected)
 
 
 def build(params: Params) -> tuple[ArchPart, ...]:
     """Build the five parts, in order."""
-    curve = curves.make(params.curve, params.span_mm, params.rise_mm)
+    curve = make_curve(params.curve, params.span_mm, params.rise_mm)
     plates = Plates(params.plate_bottom_mm, params.plate_top_mm, params.plate_web_mm)
     cuts = [curve.length * c for c in (0.0, *params.joints, 1.0)]
     parts = []

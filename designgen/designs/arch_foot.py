@@ -14,7 +14,7 @@ ABOUT = "arch foot: box section widening to a closed base, open at the joint"
 
 @dataclass(frozen=True)
 class Params:
-    """A foot between arc lengths s0 and s1 (mm). ``taper`` is the share of its length over which it widens."""
+    """A foot between arc lengths s0 and s1, mm. ``taper`` is the fraction of its length over which it widens."""
 
     s0_mm: float
     s1_mm: float
@@ -28,7 +28,7 @@ class Params:
 
 
 def build(name: str, curve: Curve, params: Params) -> ArchPart:
-    """Build the foot on a curve."""
+    """Return the foot on a curve."""
     length = params.taper * (params.s1_mm - params.s0_mm)
     kink = params.s0_mm + length if params.base_at == "start" else params.s1_mm - length
     b, h = 0.5 * params.width_mm, params.height_mm
@@ -36,5 +36,12 @@ def build(name: str, curve: Curve, params: Params) -> ArchPart:
     if params.base_at == "end":
         widths.reverse()
         heights.reverse()
-    knots = np.array([params.s0_mm, kink, params.s1_mm])
-    return ArchPart(name, curve, params.plates, knots, np.array(widths), np.array(heights), closed=params.base_at)
+    return ArchPart(
+        name=name,
+        curve=curve,
+        plates=params.plates,
+        knots=np.array([params.s0_mm, kink, params.s1_mm]),
+        half_widths=np.array(widths),
+        heights=np.array(heights),
+        closed=params.base_at,
+    )

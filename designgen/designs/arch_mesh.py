@@ -1,7 +1,7 @@
-"""An arch part's mesh from its closed form: closed, every vertex on the surface, every facet within microns of it.
+"""The mesh of an arch part from its closed form: watertight, vertices on the surface, facets within microns of it.
 
-The CAD kernel's mesher keeps its tolerance on most faces but not on long ruled ones; a design that residuals of
-hundredths of a millimetre are taken against cannot be left to it.
+The CAD kernel's mesher exceeds its tolerance on long ruled faces. The design mesh is the reference for residuals of
+hundredths of a millimetre, so it is made here instead.
 """
 
 from __future__ import annotations
@@ -15,20 +15,20 @@ from designgen.designs.arch_part import PAD_HEIGHT_MM, PAD_SIZE_MM, ArchPart, pa
 from processor.model import Floats, Ints
 
 MESH_ERROR_MM = 0.002  # along the curve; the twisted webs of a widening foot are up to twice as far off
-# Corners of a section in order: bottom left and right, top right, the pad's two lines, top left.
+# Corners of a section in order: bottom left and right, top right, two on the edges of the pad, top left.
 OUTER, INNER = 6, 4
 
 
 def triangulate(part: ArchPart) -> tuple[Floats, Ints]:
-    """Vertices (v, 3) and triangles (f, 3) of a part as designed; normals look outward."""
+    """Return vertices (v, 3), mm, and triangles (f, 3) of a part as designed; normals point outward."""
     s, u = part.pad
     half = 0.5 * PAD_SIZE_MM
     lines = np.array([u - half, u + half])
     step = _step(part)
     first_s, last_s = (_under_pad(part, s, x) for x in (-half, half))
     cuts = [part.s0, first_s, last_s, part.s1]
-    outer = np.unique(np.concatenate([part.stations(a, z, step) for a, z in pairwise(cuts)]))
-    inner = part.stations(*part.cavity, step)
+    outer = np.unique(np.concatenate([part.chainages(a, z, step) for a, z in pairwise(cuts)]))
+    inner = part.chainages(*part.cavity, step)
     out = _sections(part, outer, lines)
     ins = _sections(part, inner, None)
     vertices, faces = [out.reshape(-1, 3), ins.reshape(-1, 3)], []
@@ -38,7 +38,7 @@ def triangulate(part: ArchPart) -> tuple[Floats, Ints]:
     n = first_inner + np.arange(len(inner) * INNER).reshape(-1, INNER)
     for k in range(OUTER):
         rows = np.arange(len(outer) - 1)
-        if k == 3:  # between the pad's lines; the pad stands there
+        if k == 3:  # the strip that carries the pad
             rows = np.setdiff1d(rows, padded[:-1])
         after = (k + 1) % OUTER
         corners = (o[rows, k], o[rows, after], o[rows + 1, after], o[rows + 1, k])
@@ -49,35 +49,34 @@ def triangulate(part: ArchPart) -> tuple[Floats, Ints]:
         faces.append(_quads(*corners) if k not in (1, 3) else _twisted(corners, vertices))
     for end, a, b, forward in (("start", o[0], n[0], False), ("end", o[-1], n[-1], True)):
         if part.closed == end:
-            faces += [_turned(_fan(a), forward), _turned(_fan(b), not forward)]
+            faces += [_oriented(_fan(a), forward), _oriented(_fan(b), not forward)]
         else:
-            faces.append(_turned(_ring(a, b), forward))
+            faces.append(_oriented(_ring(a, b), forward))
     top, pad_faces = _pad(part, out[padded][:, 3:5], o[padded][:, 3:5], sum(map(len, vertices)))
-    # Walked as above, all normals look inward.
+    # In the order above all normals point inward.
     return np.vstack([*vertices, top]), np.vstack([*faces, pad_faces]).astype(np.int64)[:, ::-1]
 
 
 def _step(part: ArchPart) -> float:
-    """Longest step along the soffit whose chord stays within MESH_ERROR_MM of the curve, on the top face too."""
+    """Return the longest step along the soffit whose chord is within MESH_ERROR_MM of soffit and top face."""
     s = np.linspace(part.s0, part.s1, 200)
     bend = part.curve.curvature(s) * (1.0 + part.curve.curvature(s) * part.h(s))
     return float(np.sqrt(8.0 * MESH_ERROR_MM / bend.max()))
 
 
 def _under_pad(part: ArchPart, s: float, x: float) -> float:
-    """Return the arc length at which the top face lies ``x`` along the pad from its middle at ``s``."""
+    """Return the arc length at which the top face is ``x`` along the pad from its middle at ``s``, mm."""
     origin, along, _, _ = pad_frame(part)
 
-    def off(at: float) -> float:
+    def error(at: float) -> float:
         top = part.curve.point(np.array([at]), np.zeros(1), part.h(np.array([at])))[0]
         return float((top - origin) @ along) - x
 
-    found: float = brentq(off, s + 2.0 * min(x, 0.0), s + 2.0 * max(x, 0.0), xtol=1e-10)
-    return found
+    return float(brentq(error, s + 2.0 * min(x, 0.0), s + 2.0 * max(x, 0.0), xtol=1e-10))
 
 
 def _sections(part: ArchPart, s: Floats, lines: Floats | None) -> Floats:
-    """Corners (n, 6 or 4, 3) of the outer sections, with the pad's lines, or of the inner ones without."""
+    """Return the corners (n, 6, 3) of outer sections, with ``lines`` at the pad's edges, or (n, 4, 3) of inner ones."""
     b, h = part.b(s), part.h(s)
     low = np.zeros_like(s)
     if lines is not None:
@@ -87,7 +86,7 @@ def _sections(part: ArchPart, s: Floats, lines: Floats | None) -> Floats:
         t = part.plates
         b, low, h = b - t.web, low + t.bottom, h - t.top
         u, v = [b, -b, -b, b], [low, low, h, h]
-    return np.stack([part.curve.point(s, one, two) for one, two in zip(u, v, strict=True)], axis=1)
+    return np.stack([part.curve.point(s, u_k, v_k) for u_k, v_k in zip(u, v, strict=True)], axis=1)
 
 
 def _quads(a: Ints, b: Ints, c: Ints, d: Ints) -> Ints:
@@ -97,10 +96,10 @@ def _quads(a: Ints, b: Ints, c: Ints, d: Ints) -> Ints:
 
 
 def _twisted(corners: tuple[Ints, Ints, Ints, Ints], vertices: list[Floats]) -> Ints:
-    """Triangles of quads that may be twisted, four each about a middle, which is added to the vertices."""
-    known = np.vstack(vertices)
+    """Return four triangles a quad, about its mean, which is added to the vertices: a twisted quad is not plane."""
+    points = np.vstack(vertices)
     centre = sum(map(len, vertices)) + np.arange(len(corners[0]))
-    vertices.append(np.mean([known[corner] for corner in corners], axis=0))
+    vertices.append(np.mean([points[corner] for corner in corners], axis=0))
     around = [(corners[i], corners[(i + 1) % 4]) for i in range(4)]
     triangles: Ints = np.stack([np.stack([a, b, centre], axis=-1) for a, b in around], axis=1).reshape(-1, 3)
     return triangles
@@ -110,19 +109,19 @@ def _fan(loop: Ints) -> Ints:
     return np.array([[loop[0], loop[k], loop[k + 1]] for k in range(1, len(loop) - 1)])
 
 
-def _turned(triangles: Ints, forward: bool) -> Ints:
+def _oriented(triangles: Ints, forward: bool) -> Ints:
     return triangles if forward else triangles[:, ::-1]
 
 
 def _ring(o: Ints, n: Ints) -> Ints:
-    """Triangles between an outer and an inner loop, in the outer loop's sense."""
+    """Return the triangles between an outer and an inner loop, oriented as the outer loop."""
     bottom, right, left = ([o[0], o[1], n[1], n[0]], [o[1], o[2], n[2], n[1]], [o[5], o[0], n[0], n[3]])
     plain = [_quads(*(np.array([i]) for i in quad)) for quad in (bottom, right, left)]
     return np.vstack([*plain, _fan(np.array([n[2], o[2], o[3], o[4], o[5], n[3]]))])
 
 
 def _pad(part: ArchPart, foot: Floats, index: Ints, first: int) -> tuple[Floats, Ints]:
-    """Top vertices (2 m, 3) and triangles of the pad on the top face's points ``foot`` (m, 2, 3), of rows ``index``."""
+    """Return the top vertices (2 m, 3) and triangles of the pad above points ``foot`` (m, 2, 3) with rows ``index``."""
     origin, along, left, up = pad_frame(part)
     x, y = (foot - origin) @ along, (foot - origin) @ left
     top = origin + x[..., None] * along + y[..., None] * left + PAD_HEIGHT_MM * up

@@ -1,4 +1,4 @@
-"""What feet and ribs share: a box section carried along a curve, its faces in closed form and its CadQuery solid."""
+"""A part of an arch bridge: a box section along a curve, its faces in closed form and its CadQuery solid."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from designgen.curves import Curve
-from designgen.scanning.surfaces import Patch
+from designgen.designs.patch import Bools, Patch, Surface
 from processor.model import Floats
 
 if TYPE_CHECKING:
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SECTION_STEP_MM = 250.0
 EDGE_STEP_MM = 20.0
-NET_STEP_MM, NET_ACROSS = 250.0, 6  # of the nets that rays hit first, before the surface itself
+NET_STEP_MM, NET_ACROSS = 250.0, 6  # cells of the nets that rays meet before the surface itself
 PAD_SIZE_MM, PAD_HEIGHT_MM = 200.0, 20.0
 
 
@@ -32,16 +32,16 @@ class Plates:
     web: float
 
 
-# From s, u, v on a wall ("" = on none) to what was built: s, u, v.
+# Maps s, u, v of the design on a wall ("": on none) to s, u, v as built.
 Fabrication = Callable[[Floats, Floats, Floats, str], tuple[Floats, Floats, Floats]]
 
 
 @dataclass(frozen=True)
 class ArchPart:
-    """One part of the bridge between arc lengths s0 and s1.
+    """One part of the bridge between arc lengths s0 and s1, mm.
 
-    Half width ``b`` and height ``h`` of the outer section are linear between the arc lengths ``knots`` (one at every
-    kink). ``closed`` names the end with a base plate ("start", "end" or ""); every other end is open.
+    Half width ``b`` and height ``h`` of the outer section are linear between the arc lengths ``knots``. ``closed`` is
+    the end with a base plate ("start", "end" or ""); any other end is open.
     """
 
     name: str
@@ -56,24 +56,24 @@ class ArchPart:
 
     @property
     def s0(self) -> float:
-        """Arc length of the start."""
+        """Arc length of the start, mm."""
         return float(self.knots[0])
 
     @property
     def s1(self) -> float:
-        """Arc length of the end."""
+        """Arc length of the end, mm."""
         return float(self.knots[-1])
 
     def b(self, s: Floats) -> Floats:
-        """Outer half width (n,) at s (n,)."""
+        """Return the outer half width (n,) at s (n,), mm."""
         return np.interp(s, self.knots, self.half_widths)
 
     def h(self, s: Floats) -> Floats:
-        """Outer height (n,) at s (n,)."""
+        """Return the outer height (n,) at s (n,), mm."""
         return np.interp(s, self.knots, self.heights)
 
     def slope(self, values: Floats, s: Floats) -> Floats:
-        """Take the derivative (n,) of half_widths or heights at s (n,)."""
+        """Return the derivative (n,) of half_widths or heights with respect to s at s (n,)."""
         piece = np.clip(np.searchsorted(self.knots, s, side="right") - 1, 0, len(self.knots) - 2)
         slopes: Floats = (np.diff(values) / np.diff(self.knots))[piece]
         return slopes
@@ -88,37 +88,38 @@ class ArchPart:
 
     @property
     def pad(self) -> tuple[float, float]:
-        """Middle of the orientation pad: arc length and u. Off the middle of the part both ways."""
-        # On the constant section, so that the pad stands on a face that is curved one way only.
+        """Middle of the orientation pad, arc length and u: off the part's middle along and across."""
+        # On the constant section the top face is curved in one direction only.
         s0, s1 = self.constant_section()
-        return s0 + 0.3 * (s1 - s0), 0.5 * float(self.b(np.array(s0 + 0.3 * (s1 - s0))))
+        s = s0 + 0.3 * (s1 - s0)
+        return s, 0.5 * float(self.b(np.array(s)))
 
     def constant_section(self) -> tuple[float, float]:
-        """Return the arc lengths between which the section stays the same."""
+        """Return the arc lengths between which the section is constant."""
         flat = np.flatnonzero(np.diff(self.heights) == 0.0)
         return float(self.knots[flat[0]]), float(self.knots[flat[-1] + 1])
 
     def key_points(self, s: float) -> Floats:
-        """P1..P8 (8, 3) of the outer section at s: corners bottom-left, bottom-right, top-right, top-left, middles."""
+        """Return P1..P8 (8, 3) of the outer section at s: corners from bottom-left to top-left, then edge middles."""
         b, h = float(self.b(np.array(s))), float(self.h(np.array(s)))
         u, v = np.array([b, -b, -b, b, 0.0, -b, 0.0, b]), np.array([0.0, 0.0, h, h, 0.0, 0.5 * h, h, 0.5 * h])
         return self.point(np.full(8, s), u, v)
 
     def bottom_edges(self) -> tuple[Floats, Floats]:
-        """Outer bottom edges, left and right, (n, 3) each, from start to end, a vertex at most every 20 mm."""
-        s = self.stations(self.s0, self.s1, EDGE_STEP_MM)
+        """Return the outer bottom edges, left and right, (n, 3) each, with vertices at most EDGE_STEP_MM apart."""
+        s = self.chainages(self.s0, self.s1, EDGE_STEP_MM)
         b = self.b(s)
         zero = np.zeros_like(s)
         return self.point(s, b, zero), self.point(s, -b, zero)
 
     def point(self, s: Floats, u: Floats, v: Floats, wall: str = "") -> Floats:
-        """Points (n, 3) of the part as built at the design's s, u, v (n,)."""
+        """Return points (n, 3) of the part as built, for s, u, v (n,) of the design."""
         if self.built is not None:
             s, u, v = self.built(s, u, v, wall)
         return self.curve.point(s, u, v)
 
-    def stations(self, start: float, end: float, step: float) -> Floats:
-        """Arc lengths from start to end, at most ``step`` apart, one at every knot between."""
+    def chainages(self, start: float, end: float, step: float) -> Floats:
+        """Return arc lengths from start to end, at most ``step`` apart, with every knot in between."""
         inner = self.knots[(self.knots > start) & (self.knots < end)]
         ends = np.concatenate([[start], inner, [end]])
         pieces = [np.linspace(a, z, max(2, int(np.ceil((z - a) / step)) + 1))[:-1] for a, z in pairwise(ends)]
@@ -127,7 +128,7 @@ class ArchPart:
 
 @dataclass(frozen=True)
 class Hole:
-    """A rectangle missing from a wall: arc lengths and, across it, u (bottom, top) or v (left, right)."""
+    """A rectangle missing from a wall: arc lengths s0, s1 and, across, u (bottom, top) or v (left, right), c0, c1."""
 
     wall: str
     s0: float
@@ -140,69 +141,74 @@ class Hole:
 class Face:
     """A face of a part: ``at(p, q)`` maps (n,) in 0..1 to points (n, 3); ``element`` is the design's area per dp dq.
 
-    ``along`` are the knots of its net in p; ``holes`` (k, 4) are p0, p1, q0, q1 of what is missing.
+    ``along`` are the knots of its net in p; ``holes`` (k, 4) are the missing rectangles as p0, p1, q0, q1.
     """
 
     name: str
-    at: Callable[[Floats, Floats], Floats]
+    at: Surface
     element: Callable[[Floats, Floats], Floats]
     along: Floats = dataclasses.field(default_factory=lambda: np.linspace(0.0, 1.0, 2))
     holes: Floats = dataclasses.field(default_factory=lambda: np.empty((0, 4)))
 
-    def kept(self, p: Floats, q: Floats) -> np.ndarray:
-        """Mark the places (n,) that no hole has taken."""
-        left = np.ones(len(p), bool)
+    def present(self, p: Floats, q: Floats) -> Bools:
+        """Mark the parameters (n,) that lie outside of all holes."""
+        result = np.ones(len(p), bool)
         for p0, p1, q0, q1 in self.holes:
-            left &= ~((p > p0) & (p < p1) & (q > q0) & (q < q1))
-        return left
+            result &= ~((p > p0) & (p < p1) & (q > q0) & (q < q1))
+        return result
 
     def patch(self, across: int = 1) -> Patch:
-        """Return the face as rays see it, with ``across`` cells of its net in q."""
+        """Return the face as a patch whose net has ``across`` cells in q."""
         p = np.unique([*self.along, *self.holes[:, :2].ravel()])
         q = np.unique([*np.linspace(0.0, 1.0, across + 1), *self.holes[:, 2:].ravel()])
         at_p, at_q = np.meshgrid(0.5 * (p[1:] + p[:-1]), 0.5 * (q[1:] + q[:-1]), indexing="ij")
-        return Patch(self.name, self.at, p, q, self.kept(at_p.ravel(), at_q.ravel()).reshape(at_p.shape))
+        return Patch(self.name, self.at, p, q, self.present(at_p.ravel(), at_q.ravel()).reshape(at_p.shape))
 
 
 def faces(part: ArchPart, inner_depth_mm: float) -> list[Face]:
-    """All faces of a part; the inner ones only within ``inner_depth_mm`` of an open end, where a scanner sees them."""
-    found = [_wall(part, side, inner=False, start=part.s0, end=part.s1) for side in ("bottom", "top", "left", "right")]
+    """Return all faces of a part; inner ones only within ``inner_depth_mm`` of an open end, where they are visible."""
+    sides = ("bottom", "top", "left", "right")
+    result = [_wall(part, side, inner=False, start=part.s0, end=part.s1) for side in sides]
     c0, c1 = part.cavity
     for s, end in ((part.s0, "start"), (part.s1, "end")):
         if part.closed == end:
-            found.append(_plate(part, f"base-{end}", s, 0.0, 1.0, 0.0, 1.0))
+            result.append(_plate(part, f"base-{end}", s, (0.0, 1.0), (0.0, 1.0)))
             continue
         lo, hi = (c0, min(c1, c0 + inner_depth_mm)) if end == "start" else (max(c0, c1 - inner_depth_mm), c1)
-        found += [_wall(part, side, inner=True, start=lo, end=hi) for side in ("bottom", "top", "left", "right")]
-        b, h = float(part.b(np.array(s))), float(part.h(np.array(s)))
-        t, w = part.plates, part.plates.web / (2.0 * b)
-        found += [
-            _plate(part, f"ring-{end}", s, 0.0, 1.0, 0.0, t.bottom / h),
-            _plate(part, f"ring-{end}", s, 0.0, 1.0, 1.0 - t.top / h, 1.0),
-            _plate(part, f"ring-{end}", s, 0.0, w, t.bottom / h, 1.0 - t.top / h),
-            _plate(part, f"ring-{end}", s, 1.0 - w, 1.0, t.bottom / h, 1.0 - t.top / h),
+        result += [_wall(part, side, inner=True, start=lo, end=hi) for side in sides]
+        w, low, high = _plate_fractions(part, s)
+        result += [
+            _plate(part, f"ring-{end}", s, (0.0, 1.0), (0.0, low)),
+            _plate(part, f"ring-{end}", s, (0.0, 1.0), (high, 1.0)),
+            _plate(part, f"ring-{end}", s, (0.0, w), (low, high)),
+            _plate(part, f"ring-{end}", s, (1.0 - w, 1.0), (low, high)),
         ]
         if inner_depth_mm >= c1 - c0:
             for closed, c in (("start", c0), ("end", c1)):
                 if part.closed == closed:
-                    b, h = float(part.b(np.array(c))), float(part.h(np.array(c)))
-                    w, low, high = t.web / (2.0 * b), t.bottom / h, 1.0 - t.top / h
-                    found.append(_plate(part, f"inner-base-{closed}", c, w, 1.0 - w, low, high))
+                    w, low, high = _plate_fractions(part, c)
+                    result.append(_plate(part, f"inner-base-{closed}", c, (w, 1.0 - w), (low, high)))
     for hole in part.holes:
-        found += _cut_faces(part, hole)
-    return found + _pad_faces(part)
+        result += _cut_faces(part, hole)
+    return result + _pad_faces(part)
+
+
+def _plate_fractions(part: ArchPart, s: float) -> tuple[float, float, float]:
+    """Return the web's fraction of the width at s, and the fractions of the height that bound the cavity."""
+    b, h, t = float(part.b(np.array(s))), float(part.h(np.array(s))), part.plates
+    return t.web / (2.0 * b), t.bottom / h, 1.0 - t.top / h
 
 
 def ray_patches(part: ArchPart) -> list[Patch]:
-    """Every face of a part, inside and outside, as rays see it."""
+    """Return every face of a part, inside and outside, as patches for rays."""
     c0, c1 = part.cavity
-    depth = (c1 - c0) * (1.0 if part.closed else 0.5)  # both ends reach to the middle
-    # Waves and dents need a fine net on the walls for the rays' first hit; the hit itself is exact.
+    depth = (c1 - c0) * (1.0 if part.closed else 0.5)  # the faces of two open ends meet in the middle
+    # Walls with waves and dents need a fine net to start the search for a hit; the hit itself is exact.
     return [face.patch(NET_ACROSS if len(face.along) > 2 else 1) for face in faces(part, depth)]
 
 
 def _cut_faces(part: ArchPart, hole: Hole) -> list[Face]:
-    """Return the four faces through the plate around a hole."""
+    """Return the four faces through the plate thickness around a hole."""
     t = part.plates
     flat = hole.wall in ("bottom", "top")
     thick = {"bottom": t.bottom, "top": t.top}.get(hole.wall, t.web)
@@ -225,12 +231,12 @@ def _cut_faces(part: ArchPart, hole: Hole) -> list[Face]:
 
 
 def _wall(part: ArchPart, side: str, *, inner: bool, start: float, end: float) -> Face:
-    """Make a face along the part; by the curve's curvature k the area element has dP/ds = (1 + k v) t."""
+    """Return a wall along the part. At height v above a soffit of curvature k, |dP/ds| = 1 + k v."""
     t = part.plates
     web, low, high = (t.web, t.bottom, t.top) if inner else (0.0, 0.0, 0.0)
     length = end - start
 
-    def place(p: Floats, q: Floats) -> tuple[Floats, Floats, Floats]:
+    def coordinates(p: Floats, q: Floats) -> tuple[Floats, Floats, Floats]:
         s = start + p * length
         b, h = part.b(s) - web, part.h(s)
         if side in ("bottom", "top"):
@@ -238,7 +244,7 @@ def _wall(part: ArchPart, side: str, *, inner: bool, start: float, end: float) -
         return s, b if side == "left" else -b, low + q * (h - low - high)
 
     def element(p: Floats, q: Floats) -> Floats:
-        s, _, v = place(p, q)
+        s, _, v = coordinates(p, q)
         along = 1.0 + part.curve.curvature(s) * v
         if side in ("bottom", "top"):
             rise = part.slope(part.heights, s) if side == "top" else np.zeros_like(s)
@@ -248,16 +254,25 @@ def _wall(part: ArchPart, side: str, *, inner: bool, start: float, end: float) -
         return area
 
     name = f"{'inner' if inner else 'outer'}-{side}"
-    along = (part.stations(start, end, NET_STEP_MM) - start) / length
+    along = (part.chainages(start, end, NET_STEP_MM) - start) / length
     missing = [hole for hole in part.holes if hole.wall == side]
     if side == "top" and not inner:
         missing.append(_under_pad(part))
-    holes = [_in_wall(hole, part, start, length, low, high, web) for hole in missing]
-    return Face(name, lambda p, q: part.point(*place(p, q), wall=side), element, along, np.array(holes).reshape(-1, 4))
+
+    def parameters(hole: Hole) -> tuple[float, float, float, float]:
+        """Return p0, p1, q0, q1 of a hole in a wall of constant section, cut off at the wall's ends."""
+        p0, p1 = (min(1.0, max(0.0, (s - start) / length)) for s in (hole.s0, hole.s1))
+        b, h = float(part.b(np.array(hole.s0))) - web, float(part.h(np.array(hole.s0)))
+        if side in ("bottom", "top"):
+            return p0, p1, 0.5 * (hole.c0 / b + 1.0), 0.5 * (hole.c1 / b + 1.0)
+        return p0, p1, (hole.c0 - low) / (h - low - high), (hole.c1 - low) / (h - low - high)
+
+    holes = np.array([parameters(hole) for hole in missing]).reshape(-1, 4)
+    return Face(name, lambda p, q: part.point(*coordinates(p, q), wall=side), element, along, holes)
 
 
 def _under_pad(part: ArchPart) -> Hole:
-    """Return what the pad hides of the top face, which is longer than the soffit by its height over the curve."""
+    """Return the area of the top face under the pad; the top face is longer than the soffit."""
     s, u = part.pad
     half = 0.5 * PAD_SIZE_MM
     at = np.array(s)
@@ -265,19 +280,9 @@ def _under_pad(part: ArchPart) -> Hole:
     return Hole("top", s - reach, s + reach, u - half, u + half)
 
 
-def _in_wall(
-    hole: Hole, part: ArchPart, start: float, length: float, low: float, high: float, web: float
-) -> tuple[float, float, float, float]:
-    """Return a hole's p0, p1, q0, q1 on a wall of constant section, cut at the wall's ends."""
-    p0, p1 = (min(1.0, max(0.0, (s - start) / length)) for s in (hole.s0, hole.s1))
-    b, h = float(part.b(np.array(hole.s0))) - web, float(part.h(np.array(hole.s0)))
-    if hole.wall in ("bottom", "top"):
-        return p0, p1, 0.5 * (hole.c0 / b + 1.0), 0.5 * (hole.c1 / b + 1.0)
-    return p0, p1, (hole.c0 - low) / (h - low - high), (hole.c1 - low) / (h - low - high)
-
-
-def _plate(part: ArchPart, name: str, s: float, p0: float, p1: float, q0: float, q1: float) -> Face:
-    """Make a rectangle in the section at s, in fractions of the outer width (from -b) and height."""
+def _plate(part: ArchPart, name: str, s: float, across: tuple[float, float], upward: tuple[float, float]) -> Face:
+    """Return a rectangle in the section at s, from and to these fractions of the outer width (from -b) and height."""
+    (p0, p1), (q0, q1) = across, upward
     b, h = float(part.b(np.array(s))), float(part.h(np.array(s)))
 
     def at(p: Floats, q: Floats) -> Floats:
@@ -289,7 +294,7 @@ def _plate(part: ArchPart, name: str, s: float, p0: float, p1: float, q0: float,
 
 
 def pad_frame(part: ArchPart) -> tuple[Floats, Floats, Floats, Floats]:
-    """Return the origin on the top face and the axes along, left and up of the pad, (3,) each."""
+    """Return the pad's origin on the top face and its unit axes along, left and up, (3,) each."""
     s, u = part.pad
     _, tangent, normal = part.curve.frame(np.array([s]))
     origin = part.point(np.array([s]), np.array([u]), part.h(np.array([s])), wall="top")[0]
@@ -300,48 +305,45 @@ def _pad_faces(part: ArchPart) -> list[Face]:
     origin, along, left, up = pad_frame(part)
     half = 0.5 * PAD_SIZE_MM
 
-    def rectangle(name: str, centre: Floats, one: Floats, two: Floats, length: float, width: float) -> Face:
+    def rectangle(name: str, centre: Floats, across: Floats, upward: Floats, height: float) -> Face:
         def at(p: Floats, q: Floats) -> Floats:
-            points: Floats = centre + np.outer((p - 0.5) * length, one) + np.outer((q - 0.5) * width, two)
+            points: Floats = centre + np.outer((p - 0.5) * PAD_SIZE_MM, across) + np.outer((q - 0.5) * height, upward)
             return points
 
-        return Face(name, at, lambda p, q: np.full_like(p, length * width))
+        return Face(name, at, lambda p, q: np.full_like(p, PAD_SIZE_MM * height))
 
+    result = [rectangle("pad", origin + PAD_HEIGHT_MM * up, along, left, PAD_SIZE_MM)]
     sides = [(sign, axis, other) for axis, other in ((along, left), (left, along)) for sign in (1.0, -1.0)]
-    return [rectangle("pad", origin + PAD_HEIGHT_MM * up, along, left, PAD_SIZE_MM, PAD_SIZE_MM)] + [
-        rectangle(
-            f"pad-side-{i}",
-            origin + sign * half * axis + 0.5 * PAD_HEIGHT_MM * up,
-            other,
-            up,
-            PAD_SIZE_MM,
-            PAD_HEIGHT_MM,
-        )
-        for i, (sign, axis, other) in enumerate(sides)
-    ]
+    for i, (sign, axis, other) in enumerate(sides):
+        centre = origin + sign * half * axis + 0.5 * PAD_HEIGHT_MM * up
+        result.append(rectangle(f"pad-side-{i}", centre, other, up, PAD_HEIGHT_MM))
+    return result
 
 
 def solid(part: ArchPart) -> cq.Solid:
-    """CadQuery solid of a part: ruled faces between splines through the section corners, capped and sewn."""
+    """Return the CadQuery solid of a part: ruled faces between splines through the section corners, capped and sewn.
+
+    Raises RuntimeError where the kernel does not make one solid of it.
+    """
     import cadquery as cq
 
     t = part.plates
-    found: list[cq.Face] = []
+    shell: list[cq.Face] = []
     sides = ((1.0, False), (-1.0, False), (-1.0, True), (1.0, True))
 
     def edge(start: float, end: float, side: float, top: bool, inner: bool) -> cq.Edge:
-        s = part.stations(start, end, SECTION_STEP_MM)
+        s = part.chainages(start, end, SECTION_STEP_MM)
         b, h = part.b(s) - (t.web if inner else 0.0), part.h(s)
         v = (h - (t.top if inner else 0.0)) if top else np.full_like(s, t.bottom if inner else 0.0)
         points = part.curve.point(s, side * b, v)
-        # The arc length is every spline's parameter, so that a ruling joins points of one section.
+        # All splines have the arc length as parameter, so that a ruling joins points of the same section.
         return cq.Edge.makeSpline([cq.Vector(*p) for p in points], parameters=s.tolist())
 
     for inner, (lo, hi) in ((False, (part.s0, part.s1)), (True, part.cavity)):
         ends = np.concatenate([[lo], part.knots[(part.knots > lo) & (part.knots < hi)], [hi]])
         for start, end in pairwise(ends):
             corners = [edge(start, end, side, top, inner) for side, top in sides]
-            found += [cq.Face.makeRuledSurface(corners[i], corners[(i + 1) % 4]) for i in range(4)]
+            shell += [cq.Face.makeRuledSurface(corners[i], corners[(i + 1) % 4]) for i in range(4)]
 
     def rectangle(s: float, inner: bool) -> cq.Wire:
         b = float(part.b(np.array(s))) - (t.web if inner else 0.0)
@@ -352,19 +354,18 @@ def solid(part: ArchPart) -> cq.Solid:
 
     for s, c, end in ((part.s0, part.cavity[0], "start"), (part.s1, part.cavity[1], "end")):
         if part.closed == end:
-            found += [cq.Face.makeFromWires(rectangle(s, False)), cq.Face.makeFromWires(rectangle(c, True))]
+            shell += [cq.Face.makeFromWires(rectangle(s, False)), cq.Face.makeFromWires(rectangle(c, True))]
         else:
-            found.append(cq.Face.makeFromWires(rectangle(s, False), [rectangle(s, True)]))
-    box = cq.Solid.makeSolid(cq.Shell.makeShell(found))
-    if box.Volume() < 0.0:  # sewing leaves the faces' sense to chance
+            shell.append(cq.Face.makeFromWires(rectangle(s, False), [rectangle(s, True)]))
+    box = cq.Solid.makeSolid(cq.Shell.makeShell(shell))
+    if box.Volume() < 0.0:  # sewing does not define the orientation of the shell
         box = cq.Solid(box.wrapped.Reversed())
     origin, along, _, up = pad_frame(part)
-    sunk = 0.5 * t.top  # into the plate, so that the pad meets a curved face without a sliver
+    sunk = 0.5 * t.top  # into the plate, so that no sliver remains between the pad and the curved face
     corner = origin - 0.5 * PAD_SIZE_MM * along - np.array([0.0, 0.5 * PAD_SIZE_MM, 0.0]) - sunk * up
     plane = cq.Plane(origin=tuple(corner), xDir=tuple(along), normal=tuple(up))
     pad = cq.Solid.makeBox(PAD_SIZE_MM, PAD_SIZE_MM, PAD_HEIGHT_MM + sunk).moved(cq.Location(plane))
-    joined = box.fuse(pad)
-    solids = joined.Solids()
+    solids = box.fuse(pad).Solids()
     if len(solids) != 1:
         raise RuntimeError(f"{part.name}: the CAD kernel made {len(solids)} solids of one part")
     return solids[0]

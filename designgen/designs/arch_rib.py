@@ -14,7 +14,7 @@ ABOUT = "arch rib: hollow box section of four plates, open at both ends"
 
 @dataclass(frozen=True)
 class Params:
-    """A rib between arc lengths s0 and s1 (mm)."""
+    """A rib between arc lengths s0 and s1, mm."""
 
     s0_mm: float
     s1_mm: float
@@ -24,8 +24,12 @@ class Params:
 
 
 def build(name: str, curve: Curve, params: Params) -> ArchPart:
-    """Build the rib on a curve."""
-    b, h = 0.5 * params.width_mm, params.height_mm
+    """Return the rib on a curve."""
     return ArchPart(
-        name, curve, params.plates, np.array([params.s0_mm, params.s1_mm]), np.array([b, b]), np.array([h, h])
+        name=name,
+        curve=curve,
+        plates=params.plates,
+        knots=np.array([params.s0_mm, params.s1_mm]),
+        half_widths=np.full(2, 0.5 * params.width_mm),
+        heights=np.full(2, params.height_mm),
     )

@@ -1,6 +1,6 @@
-"""Bolt ball: a sphere with a milled flat and a threaded hole a member, and a process hole at its lowest point.
+"""Bolt ball: a sphere with a milled flat and a threaded hole for each member, and a process hole at its lowest point.
 
-Sizes follow the pattern of catalogues and are plausible, not those of a standard.
+The sizes are plausible and follow the pattern of catalogues, but not a standard.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ PROCESS_HOLE_RADIUS_MM, PROCESS_HOLE_DEPTH_MM = 10.0, 35.0
 
 @dataclass(frozen=True)
 class Connection:
-    """How a tube is joined to a ball (mm): bolt, hexagonal sleeve and cone."""
+    """How a tube is joined to a ball, mm: bolt, hexagonal sleeve and cone."""
 
     tube_diameter: float
     bolt: float
@@ -56,10 +56,10 @@ CONNECTIONS = (
 
 
 def connection(tube_diameter: float) -> Connection:
-    """Return the connection for a tube; UsageError names the tubes there are."""
-    for found in CONNECTIONS:
-        if found.tube_diameter == tube_diameter:
-            return found
+    """Return the connection of a tube; UsageError for a diameter without one."""
+    for candidate in CONNECTIONS:
+        if candidate.tube_diameter == tube_diameter:
+            return candidate
     known = ", ".join(f"{c.tube_diameter:g}" for c in CONNECTIONS)
     raise UsageError(f"frame.tube_diameter_mm: expected one of {known}, got {tube_diameter:g}")
 
@@ -92,7 +92,7 @@ class Params:
 
 
 def least_radius(directions: Floats, joined: Connection) -> float:
-    """Smallest ball on which sleeves along unit directions (m, 3) do not meet: rc / sin(least angle / 2)."""
+    """Return the least radius of a ball whose sleeves along directions (m, 3) do not touch: rc / sin(angle / 2)."""
     if len(directions) < 2:
         return 0.0
     cosines = directions @ directions.T - 2.0 * np.eye(len(directions))
@@ -101,7 +101,7 @@ def least_radius(directions: Floats, joined: Connection) -> float:
 
 
 def build(params: Params) -> cq.Shape:
-    """Build the CadQuery solid, centred at the origin."""
+    """Return the CadQuery solid, centred at the origin."""
     import cadquery as cq
 
     R, joined = params.radius_mm, params.connection
@@ -120,11 +120,11 @@ def build(params: Params) -> cq.Shape:
 
 
 def exposed(params: Params, directions: Floats) -> np.ndarray:
-    """Mark the unit directions (n, 3) in which the sphere's own surface is left by the flats and the process hole."""
-    kept = np.ones(len(directions), bool)
+    """Mark the unit directions (n, 3) in which the sphere is not cut by a flat or the process hole."""
+    result = np.ones(len(directions), bool)
     for flat in params.directions:
-        kept &= params.radius_mm * (directions @ flat) < params.flat_distance
+        result &= params.radius_mm * (directions @ flat) < params.flat_distance
     if params.process_hole:
         off_axis = params.radius_mm * np.hypot(directions[:, 0], directions[:, 1])
-        kept &= (off_axis > PROCESS_HOLE_RADIUS_MM) | (directions[:, 2] > 0.0)
-    return kept
+        result &= (off_axis > PROCESS_HOLE_RADIUS_MM) | (directions[:, 2] > 0.0)
+    return result

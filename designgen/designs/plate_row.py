@@ -1,4 +1,4 @@
-"""Plates or girders in a row, each of which can carry one defect."""
+"""Plates or girders in a row, each with at most one defect."""
 
 from __future__ import annotations
 
@@ -6,19 +6,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from designgen.checks import expect, expect_positive
 from designgen.designs.structure import Box, Component, component
-from processor.model import Floats, UsageError
+from processor.model import Floats
 
-ABOUT = "plates or girders in a row, each with one defect: of every class"
+ABOUT = "row of plates or girders, one defect of any class each"
 FORMS = ("plate", "girder")
 
 
 @dataclass(frozen=True)
 class Params:
-    """Sizes in mm. A component stands upright with its front, the face with the defect, towards -Y."""
+    """Sizes in mm. A component stands upright; its front, the face with the defect, looks towards -Y."""
 
     form: str = "plate"
-    components: tuple[str, ...] = ("dent",)  # the classes of defects, a component each; "none" is an undamaged one
+    components: tuple[str, ...] = ("dent",)  # class of defect of each component, or "none"
     length_mm: float = 1_000.0
     height_mm: float = 1_000.0
     plate_mm: float = 12.0  # a plate, or a girder's web
@@ -28,13 +29,11 @@ class Params:
     lift_mm: float = 800.0  # above the ground
 
     def __post_init__(self) -> None:
-        if self.form not in FORMS:
-            raise UsageError(f"structure.form: expected one of {', '.join(FORMS)}, got {self.form!r}")
-        for key in ("length_mm", "height_mm", "plate_mm", "flange_width_mm", "flange_mm", "gap_mm"):
-            if not getattr(self, key) > 0.0:
-                raise UsageError(f"structure.{key}: expected a length above 0, got {getattr(self, key)!r}")
-        if not 2.0 * self.flange_mm < self.height_mm:
-            raise UsageError(f"structure.flange_mm: expected less than half of height_mm, got {self.flange_mm!r}")
+        expect(self.form in FORMS, "structure.form", self.form, f"one of {', '.join(FORMS)}")
+        lengths = ("length_mm", "height_mm", "plate_mm", "flange_width_mm", "flange_mm", "gap_mm")
+        expect_positive(self, "structure", *lengths)
+        thin = 2.0 * self.flange_mm < self.height_mm
+        expect(thin, "structure.flange_mm", self.flange_mm, "less than half of height_mm")
 
 
 AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # along, up, out of the front
@@ -42,7 +41,7 @@ AXES = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])  # along, 
 
 @dataclass(frozen=True)
 class Place:
-    """Where a component stands: ``origin`` (3,) is the middle of its front; its axes are AXES."""
+    """Where a component stands: ``origin`` (3,), mm, is the middle of its front; its axes are AXES."""
 
     name: str
     defect: str
@@ -50,9 +49,9 @@ class Place:
     halves: bool  # built of two halves that meet in the middle
 
     def local(self, points: Floats) -> Floats:
-        """Coordinates (n, 3) along, up and out of the front."""
-        found: Floats = (points - self.origin) @ AXES.T
-        return found
+        """Return coordinates (n, 3) along, up and out of the front."""
+        result: Floats = (points - self.origin) @ AXES.T
+        return result
 
 
 def places(params: Params) -> tuple[Place, ...]:
@@ -70,23 +69,19 @@ def places(params: Params) -> tuple[Place, ...]:
 
 
 def bodies(params: Params, place: Place) -> list[Box]:
-    """Return the boxes of a component: a plate, or the web and flanges of a girder; halves where it is built so."""
+    """Return the boxes of a component: a plate, or the web and flanges of a girder; two of each for halves."""
     pieces = [(-0.5, 0.5)] if not place.halves else [(-0.5, 0.0), (0.0, 0.5)]
-    found = []
+    boxes = []
     for start, end in pieces:
         length, middle = (end - start) * params.length_mm, 0.5 * (start + end) * params.length_mm
-        if params.form == "plate":
-            found.append(
-                _box(place, (middle, 0.0, -0.5 * params.plate_mm), (length, params.height_mm, params.plate_mm))
-            )
-            continue
-        web = params.height_mm - 2.0 * params.flange_mm
-        found.append(_box(place, (middle, 0.0, -0.5 * params.plate_mm), (length, web, params.plate_mm)))
-        for sign in (-1.0, 1.0):
+        depth = -0.5 * params.plate_mm
+        web = params.height_mm - (2.0 * params.flange_mm if params.form == "girder" else 0.0)
+        boxes.append(_box(place, (middle, 0.0, depth), (length, web, params.plate_mm)))
+        for sign in (-1.0, 1.0) if params.form == "girder" else ():
             up = sign * 0.5 * (params.height_mm - params.flange_mm)
             size = (length, params.flange_mm, params.flange_width_mm)
-            found.append(_box(place, (middle, up, -0.5 * params.plate_mm), size))
-    return found
+            boxes.append(_box(place, (middle, up, depth), size))
+    return boxes
 
 
 def _box(place: Place, middle: tuple[float, float, float], size: tuple[float, float, float]) -> Box:
@@ -94,5 +89,5 @@ def _box(place: Place, middle: tuple[float, float, float], size: tuple[float, fl
 
 
 def build(params: Params) -> tuple[Component, ...]:
-    """Build all components as designed."""
+    """Return all components as designed."""
     return tuple(component(place.name, bodies(params, place)) for place in places(params))

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from designgen.checks import expect
 from designgen.designs import bolt_ball
 from processor.model import Floats, Ints, UsageError
 
@@ -22,9 +23,9 @@ HEXAGON = np.array([[np.cos(a), np.sin(a), 0.0] for a in np.arange(6) * np.pi / 
 
 @dataclass(frozen=True)
 class Params:
-    """A grid of ``nodes_x`` by ``nodes_y`` balls, and with two layers one less each way above it, mm.
+    """A grid of ``nodes_x`` by ``nodes_y`` balls, mm; a second layer above it has one less in both directions.
 
-    ``shape`` flat; free-form: the roof rises and falls by ``rise_mm``; dome: a cap of a sphere of that rise.
+    ``shape``: flat; free-form, which rises and falls by ``rise_mm``; dome, a spherical cap of that rise.
     """
 
     nodes_x: int = 4
@@ -33,45 +34,39 @@ class Params:
     spacing_mm: float = 3000.0
     depth_mm: float = 2100.0
     height_mm: float = 6000.0  # of the lowest layer
-    radii_mm: tuple[float, ...] = (45.0,)  # taken in turn along the grid
+    radii_mm: tuple[float, ...] = (45.0,)  # assigned to the balls in rotation
     tube_diameter_mm: float = 60.0
     process_hole: bool = True
     shape: str = "flat"
     rise_mm: float = 0.0
-    diagonals: bool = False  # of one layer, a diagonal a cell
+    diagonals: bool = False  # with one layer: a diagonal in each cell
 
     def __post_init__(self) -> None:
-        _expect(self.nodes_x >= 2 and self.nodes_y >= 2, "nodes_x, nodes_y", (self.nodes_x, self.nodes_y), "2 or more")
-        _expect(
-            self.nodes_x * self.nodes_y <= 1_000_000,
-            "nodes_x * nodes_y",
-            self.nodes_x * self.nodes_y,
-            "a million at most",
-        )
-        _expect(self.layers in (1, 2), "layers", self.layers, "1 or 2")
-        _expect(self.shape in SHAPES, "shape", self.shape, f"one of {', '.join(SHAPES)}")
-        _expect(self.rise_mm >= 0.0, "rise_mm", self.rise_mm, "0 or a length")
-        reach = 0.5 * self.spacing_mm * max(self.nodes_x - 1, self.nodes_y - 1)
-        _expect(self.shape != "dome" or self.rise_mm < 0.7 * reach, "rise_mm", self.rise_mm, "a flatter dome")
-        _expect(len(self.radii_mm) > 0, "radii_mm", list(self.radii_mm), "one radius or more")
+        nodes, count = (self.nodes_x, self.nodes_y), self.nodes_x * self.nodes_y
+        reach = 0.5 * self.spacing_mm * (max(nodes) - 1)
+        flat = self.shape != "dome" or self.rise_mm < 0.7 * reach
         least = 4.0 * max(self.radii_mm, default=0.0)
-        _expect(self.spacing_mm > least, "spacing_mm", self.spacing_mm, f"more than four radii ({least:g})")
-        _expect(self.depth_mm > 0.0, "depth_mm", self.depth_mm, "a length above 0")
-        for radius in self.radii_mm:
-            _expect(radius > 0.0, "radii_mm", radius, "radii above 0")
-
-
-def _expect(fits: bool, key: str, came: object, expected: str) -> None:
-    if not fits:
-        raise UsageError(f"frame.{key}: expected {expected}, got {came!r}")
+        for fits, key, value, expected in (
+            (min(nodes) >= 2, "nodes_x, nodes_y", nodes, "2 or more"),
+            (count <= 1_000_000, "nodes_x * nodes_y", count, "a million at most"),
+            (self.layers in (1, 2), "layers", self.layers, "1 or 2"),
+            (self.shape in SHAPES, "shape", self.shape, f"one of {', '.join(SHAPES)}"),
+            (self.rise_mm >= 0.0, "rise_mm", self.rise_mm, "0 or a length"),
+            (flat, "rise_mm", self.rise_mm, "a flatter dome"),
+            (len(self.radii_mm) > 0, "radii_mm", list(self.radii_mm), "one radius or more"),
+            (self.spacing_mm > least, "spacing_mm", self.spacing_mm, f"more than four radii ({least:g})"),
+            (self.depth_mm > 0.0, "depth_mm", self.depth_mm, "a length above 0"),
+            *((radius > 0.0, "radii_mm", radius, "radii above 0") for radius in self.radii_mm),
+        ):
+            expect(fits, f"frame.{key}", value, expected)
 
 
 @dataclass(frozen=True)
 class Frame:
-    """The frame's nodes and members, as designed or as built.
+    """The frame's nodes and members, as designed or as built, mm.
 
-    A member runs from its nodes' centres moved by ``offsets`` (m, 2, 3); its tube is bowed by ``bows`` (m, 3) at the
-    middle; ``missing`` (m, 2) marks ends without sleeve and bolt. Empty arrays: none of it.
+    A member's axis ends at its nodes' centres displaced by ``offsets`` (m, 2, 3). Its tube is bowed by ``bows`` (m, 3)
+    at the middle; ``missing`` (m, 2) marks ends without sleeve and bolt. Empty arrays: as designed.
     """
 
     centres: Floats  # (k, 3)
@@ -86,27 +81,27 @@ class Frame:
     @cached_property
     def directions(self) -> tuple[Floats, ...]:
         """Unit vectors (m, 3) from each node along its members."""
-        found: list[list[Floats]] = [[] for _ in self.centres]
+        of_nodes: list[list[Floats]] = [[] for _ in self.centres]
         for m, (i, j) in enumerate(self.members):
             a, b = self.ends(m)
             unit = (b - a) / np.linalg.norm(b - a)
-            found[i].append(unit)
-            found[j].append(-unit)
-        return tuple(np.array(units).reshape(-1, 3) for units in found)
+            of_nodes[i].append(unit)
+            of_nodes[j].append(-unit)
+        return tuple(np.array(units).reshape(-1, 3) for units in of_nodes)
 
     def ends(self, member: int) -> tuple[Floats, Floats]:
-        """Where a member's axis begins and ends, (3,) each."""
+        """Return where a member's axis starts and ends, (3,) each."""
         i, j = self.members[member]
         a, b = self.centres[i], self.centres[j]
         return (a + self.offsets[member, 0], b + self.offsets[member, 1]) if len(self.offsets) else (a, b)
 
     def bow(self, member: int) -> Floats:
-        """Bow (3,) of a member's tube."""
-        found: Floats = self.bows[member] if len(self.bows) else np.zeros(3)
-        return found
+        """Return the bow (3,) of a member's tube."""
+        result: Floats = self.bows[member] if len(self.bows) else np.zeros(3)
+        return result
 
     def tube_lengths(self) -> Floats:
-        """Lengths (m,) of the members' tubes between their cones.
+        """Return the lengths (m,) of the tubes between their cones, mm.
 
         Raises UsageError for a ball that cannot be built, and for a tube without length.
         """
@@ -115,17 +110,17 @@ class Frame:
         if len(self.offsets):
             axes = axes + self.offsets[:, 1] - self.offsets[:, 0]
         joints = flats[self.members] + self.connection.sleeve_length + self.connection.cone_length
-        found: Floats = np.linalg.norm(axes, axis=1) - joints.sum(axis=1)
-        if not (found > 0.0).all():
-            worst = int(np.argmin(found))
+        lengths: Floats = np.linalg.norm(axes, axis=1) - joints.sum(axis=1)
+        if not (lengths > 0.0).all():
+            worst = int(np.argmin(lengths))
             raise UsageError(
                 f"frame.spacing_mm, depth_mm: expected balls so far apart that tubes fit between, got member {worst} "
-                f"with {-found[worst]:.1f} mm too little for its sleeves and cones"
+                f"with {-lengths[worst]:.1f} mm too little for its sleeves and cones"
             )
-        return found
+        return lengths
 
     def has_sleeve(self, member: int, end: int) -> bool:
-        """Whether a member's end has its sleeve and bolt."""
+        """Return whether a member's end has its sleeve and bolt."""
         return not (len(self.missing) and self.missing[member, end])
 
     def ball(self, node: int) -> bolt_ball.Params:
@@ -134,7 +129,7 @@ class Frame:
 
 
 def build(params: Params) -> Frame:
-    """Lay out the frame; every ball is checked for sleeves that would meet."""
+    """Return the frame as designed; UsageError where sleeves would touch or a tube has no length."""
     nx, ny, a = params.nodes_x, params.nodes_y, params.spacing_mm
     index = np.arange(nx * ny).reshape(nx, ny)
     x, y = np.meshgrid(np.arange(nx) * a, np.arange(ny) * a, indexing="ij")
@@ -157,21 +152,19 @@ def build(params: Params) -> Frame:
     elif params.diagonals:
         members.append(np.stack([index[:-1, :-1].ravel(), index[1:, 1:].ravel()], axis=1))
     nodes = _shaped(np.vstack(centres), params)
-    ends = np.vstack(members).astype(np.int64)
-    radii = np.resize(np.array(params.radii_mm), len(nodes))
     frame = Frame(
-        nodes,
-        radii,
-        ends,
-        bolt_ball.connection(params.tube_diameter_mm),
-        params.process_hole,
+        centres=nodes,
+        radii=np.resize(np.array(params.radii_mm), len(nodes)),
+        members=np.vstack(members).astype(np.int64),
+        connection=bolt_ball.connection(params.tube_diameter_mm),
+        process_hole=params.process_hole,
     )
-    frame.tube_lengths()
+    frame.tube_lengths()  # for its checks
     return frame
 
 
 def _shaped(nodes: Floats, params: Params) -> Floats:
-    """Give a flat grid its shape: nodes (k, 3), moved upward by how high the roof is above them."""
+    """Return the nodes (k, 3) of a flat grid raised to the roof's shape."""
     span = params.spacing_mm * np.array([params.nodes_x - 1, params.nodes_y - 1])
     x, y = (nodes[:, :2] - 0.5 * span).T
     if params.shape == "free-form":
@@ -188,7 +181,7 @@ def _shaped(nodes: Floats, params: Params) -> Floats:
 
 
 def solid(frame: Frame) -> cq.Compound:
-    """CadQuery compound of all balls, sleeves, cones and tubes."""
+    """Return the CadQuery compound of all balls, sleeves, cones and tubes."""
     import cadquery as cq
 
     shapes: list[cq.Shape] = [

@@ -1,20 +1,22 @@
-"""What whole structures are built of: boxes and tubes as patches in closed form, and as CadQuery solids."""
+"""The bodies of whole structures, boxes and tubes: patches in closed form and CadQuery solids."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.scanning.surfaces import Bools, Patch
+from designgen.designs.patch import Bools, Patch, Surface
+from designgen.frames import perpendicular
 from processor.model import Floats
 
 if TYPE_CHECKING:
     import cadquery as cq
 
-CONTACT_MM = 1e-7  # what lies no deeper in a body is on its surface
+CONTACT_MM = 1e-7  # a point no deeper inside of a body is on its surface
 
 
 @dataclass(frozen=True)
@@ -26,46 +28,41 @@ class Box:
     size: Floats
 
     def patches(self, knots: tuple[Floats, Floats, Floats] | None = None) -> list[Patch]:
-        """Six faces, their nets outward; ``knots`` are those along each axis, 0..1."""
+        """Return the six faces, their nets oriented outward; ``knots`` are those along each axis, 0..1."""
         along = knots or tuple(np.array([0.0, 1.0]) for _ in range(3))
         hand = np.sign(np.linalg.det(self.axes))
-        found = []
+        faces = []
         for axis in range(3):
             for sign, side in ((-1.0, "-"), (1.0, "+")):
-                # p along i and q along j, so that i x j points out.
+                # p runs along i and q along j, so that i x j points outward.
                 i, j = (axis + 1) % 3, (axis + 2) % 3
                 if sign * hand < 0.0:
                     i, j = j, i
                 corner = self.centre + 0.5 * sign * self.size[axis] * self.axes[axis]
-                found.append(Patch(f"{side}{'abn'[axis]}", self._face(corner, i, j), along[i], along[j]))
-        return found
+                faces.append(Patch(f"{side}{'abn'[axis]}", self._face(corner, i, j), along[i], along[j]))
+        return faces
 
-    def _face(self, middle: Floats, i: int, j: int) -> Callable[[Floats, Floats], Floats]:
-        one, two = self.size[i] * self.axes[i], self.size[j] * self.axes[j]
+    def _face(self, middle: Floats, i: int, j: int) -> Surface:
+        edge_i, edge_j = self.size[i] * self.axes[i], self.size[j] * self.axes[j]
 
         def at(p: Floats, q: Floats) -> Floats:
-            points: Floats = middle + np.outer(p - 0.5, one) + np.outer(q - 0.5, two)
+            points: Floats = middle + np.outer(p - 0.5, edge_i) + np.outer(q - 0.5, edge_j)
             return points
 
         return at
 
     def solid(self) -> cq.Solid:
-        """CadQuery solid."""
+        """Return the CadQuery solid."""
         import cadquery as cq
 
         low = self.centre - 0.5 * self.size @ self.axes
         plane = cq.Plane(origin=tuple(low), xDir=tuple(self.axes[0]), normal=tuple(self.axes[2]))
         return cq.Solid.makeBox(*self.size.tolist()).moved(cq.Location(plane))
 
-    @property
-    def volume(self) -> float:
-        """Volume, mm3."""
-        return float(np.prod(self.size))
-
     def depth(self, points: Floats) -> Floats:
-        """Return how far inside (n,) points (n, 3) lie, mm; negative outside."""
-        found: Floats = (0.5 * self.size - np.abs((points - self.centre) @ self.axes.T)).min(axis=1)
-        return found
+        """Return the depth (n,) of points (n, 3) below the surface, mm; negative outside."""
+        result: Floats = (0.5 * self.size - np.abs((points - self.centre) @ self.axes.T)).min(axis=1)
+        return result
 
     def bounds(self) -> tuple[Floats, Floats]:
         """Return the lowest and highest coordinates (3,)."""
@@ -82,12 +79,11 @@ class Tube:
     radius: float
 
     def patches(self, step_mm: float = 500.0, around: int = 48) -> list[Patch]:
-        """Return the tube's mantle, its net outward; its ends lie inside of other tubes."""
+        """Return the lateral surface, its net oriented outward; the ends lie inside of other tubes."""
         axis = self.end - self.start
         length = float(np.linalg.norm(axis))
         unit = axis / length
-        side = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
-        side = side / np.linalg.norm(side)
+        side = perpendicular(unit)
         other = np.cross(side, unit)
 
         def at(p: Floats, q: Floats) -> Floats:
@@ -100,27 +96,22 @@ class Tube:
         ]
 
     def solid(self) -> cq.Solid:
-        """CadQuery solid."""
+        """Return the CadQuery solid."""
         import cadquery as cq
 
         axis = self.end - self.start
         length = float(np.linalg.norm(axis))
         return cq.Solid.makeCylinder(self.radius, length, cq.Vector(*self.start), cq.Vector(*(axis / length)))
 
-    @property
-    def volume(self) -> float:
-        """Volume, mm3."""
-        return float(np.pi * self.radius**2 * np.linalg.norm(self.end - self.start))
-
     def depth(self, points: Floats) -> Floats:
-        """Return how far inside (n,) points (n, 3) lie, mm; negative outside."""
+        """Return the depth (n,) of points (n, 3) below the surface, mm; negative outside."""
         axis = self.end - self.start
         length = float(np.linalg.norm(axis))
         arm = points - self.start
         along = arm @ (axis / length)
         away = np.linalg.norm(arm - np.outer(along, axis / length), axis=1)
-        found: Floats = np.minimum(self.radius - away, np.minimum(along, length - along))
-        return found
+        result: Floats = np.minimum(self.radius - away, np.minimum(along, length - along))
+        return result
 
     def bounds(self) -> tuple[Floats, Floats]:
         """Return the lowest and highest coordinates (3,)."""
@@ -138,36 +129,36 @@ class Component:
 
 
 def component(name: str, bodies: Sequence[Box | Tube]) -> Component:
-    """Make a component of bodies with their plain faces; a body's faces are named by its number."""
-    found = [
-        Patch(f"{i} {patch.name}", patch.at, patch.p, patch.q, patch.kept)
+    """Return the component of these bodies as designed; the names of a body's faces start with its number."""
+    patches = [
+        dataclasses.replace(patch, name=f"{i} {patch.name}")
         for i, body in enumerate(bodies)
         for patch in body.patches()
     ]
-    return Component(name, tuple(bodies), tuple(found))
+    return Component(name, tuple(bodies), tuple(patches))
 
 
 def covered(components: Sequence[Component]) -> Callable[[Floats], Bools]:
-    """Return a function that says which of points (n, 3) lie inside of a body; those on its surface do not."""
-    bodies = [body for one in components for body in one.bodies]
+    """Return a function that marks the points (n, 3) inside of a body; points on a surface are not inside."""
+    bodies = [body for component in components for body in component.bodies]
     low, high = (np.array(corner) for corner in zip(*(body.bounds() for body in bodies), strict=True))
 
     def inside(points: Floats) -> Bools:
-        found = np.zeros(len(points), bool)
+        result = np.zeros(len(points), bool)
         if len(points):
             near = ((low < points.max(axis=0)) & (high > points.min(axis=0))).all(axis=1)
             for k in np.flatnonzero(near):
-                found |= bodies[k].depth(points) > CONTACT_MM
-        return found
+                result |= bodies[k].depth(points) > CONTACT_MM
+        return result
 
     return inside
 
 
 def mesh_of(components: Sequence[Component]) -> tuple[Floats, np.ndarray]:
-    """Vertices (v, 3) and triangles (f, 3) of all faces, outward; exact if flat, on tubes inside by radius / 470."""
+    """Return vertices (v, 3), mm, and outward triangles (f, 3) of all faces; on tubes up to radius / 470 too far in."""
     vertices, faces, count = [], [], 0
-    for one in components:
-        for patch in one.patches:
+    for component in components:
+        for patch in component.patches:
             knots, triangles = patch.net()
             vertices.append(patch.at(knots[:, 0], knots[:, 1]))
             faces.append(triangles + count)
@@ -176,7 +167,7 @@ def mesh_of(components: Sequence[Component]) -> tuple[Floats, np.ndarray]:
 
 
 def solid(components: Sequence[Component]) -> cq.Compound:
-    """CadQuery compound of all bodies."""
+    """Return the CadQuery compound of all bodies."""
     import cadquery as cq
 
-    return cq.Compound.makeCompound([body.solid() for one in components for body in one.bodies])
+    return cq.Compound.makeCompound([body.solid() for component in components for body in component.bodies])

@@ -7,15 +7,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from designgen.checks import expect, expect_positive
 from designgen.designs.structure import Box, Component, component
-from processor.model import Floats, UsageError
+from processor.model import Floats
 
 ABOUT = "truss bridge: two trusses of box sections on abutments, with floor beams and bracing"
 
 
 @dataclass(frozen=True)
 class Params:
-    """Sizes in mm; every bay looks like the next, as on real bridges."""
+    """Sizes in mm; all bays look alike, as on real bridges."""
 
     bays: int = 6
     bay_mm: float = 5_000.0
@@ -27,19 +28,17 @@ class Params:
     beam_mm: float = 350.0
 
     def __post_init__(self) -> None:
-        if not 2 <= self.bays <= 100:
-            raise UsageError(f"structure.bays: expected 2 to 100, got {self.bays}")
-        for key in ("bay_mm", "depth_mm", "width_mm", "height_mm", "chord_mm", "web_mm", "beam_mm"):
-            if not getattr(self, key) > 0.0:
-                raise UsageError(f"structure.{key}: expected a length above 0, got {getattr(self, key)!r}")
-        if not self.chord_mm < 0.3 * min(self.bay_mm, self.depth_mm, self.width_mm):
-            raise UsageError(f"structure.chord_mm: expected less than 0.3 of a bay's sizes, got {self.chord_mm!r}")
+        expect(2 <= self.bays <= 100, "structure.bays", self.bays, "2 to 100")
+        sizes = ("bay_mm", "depth_mm", "width_mm", "height_mm", "chord_mm", "web_mm", "beam_mm")
+        expect_positive(self, "structure", *sizes)
+        fits = self.chord_mm < 0.3 * min(self.bay_mm, self.depth_mm, self.width_mm)
+        expect(fits, "structure.chord_mm", self.chord_mm, "less than 0.3 of a bay's sizes")
 
 
 def build(params: Params) -> tuple[Component, ...]:
-    """Build trusses, floor beams, top bracing, abutments and the ground."""
+    """Return trusses, floor beams, top bracing, abutments and the ground."""
     x: Floats = params.bay_mm * np.arange(params.bays + 1.0)
-    found = []
+    components = []
     for name, y in (("truss-left", 0.5 * params.width_mm), ("truss-right", -0.5 * params.width_mm)):
         low = np.stack([x, np.full_like(x, y), np.full_like(x, params.height_mm)], axis=1)
         top = low[1:-1] + np.array([0.0, 0.0, params.depth_mm])
@@ -49,13 +48,13 @@ def build(params: Params) -> tuple[Component, ...]:
         middle = params.bays // 2
         bars += [_bar(top[i - 1], low[i + 1], params.web_mm) for i in range(1, middle)]
         bars += [_bar(low[i - 1], top[i - 1], params.web_mm) for i in range(params.bays - 1, middle, -1)]
-        found.append(component(name, bars))
+        components.append(component(name, bars))
     half = np.array([0.0, 0.5 * params.width_mm, 0.0])
     beams = [_bar(at - half, at + half, params.beam_mm) for at in _line(x, params.height_mm)]
-    found.append(component("floor-beams", beams))
+    components.append(component("floor-beams", beams))
     tops = _line(x[1:-1], params.height_mm + params.depth_mm)
-    found.append(component("top-bracing", [_bar(at - half, at + half, params.web_mm) for at in tops]))
-    # The abutments differ, and so does what stands beside them: the only things that tell one end from the other.
+    components.append(component("top-bracing", [_bar(at - half, at + half, params.web_mm) for at in tops]))
+    # Only the abutments and the boxes beside them break the symmetry of the two ends.
     size = np.array([1_500.0, params.width_mm + 2_000.0, params.height_mm - 0.5 * params.chord_mm])
     abutments = [
         Box(np.array([-600.0, 0.0, 0.5 * size[2]]), np.eye(3), size),
@@ -64,7 +63,7 @@ def build(params: Params) -> tuple[Component, ...]:
         Box(np.array([2_000.0, -7_000.0, 700.0]), np.eye(3), np.array([1_500.0, 900.0, 1_400.0])),
     ]
     ground = Box(np.array([0.5 * x[-1], 0.0, -50.0]), np.eye(3), np.array([x[-1] + 30_000.0, 40_000.0, 100.0]))
-    return (*found, component("abutments", abutments), component("ground", [ground]))
+    return (*components, component("abutments", abutments), component("ground", [ground]))
 
 
 def _line(x: Floats, z: float) -> Floats:
@@ -72,7 +71,7 @@ def _line(x: Floats, z: float) -> Floats:
 
 
 def _bar(start: Floats, end: Floats, size: float) -> Box:
-    """Return a square bar between two points; its sides stand upright where it can."""
+    """Return a square bar between two points, with two sides parallel to Y unless the bar runs along Y."""
     axis = np.asarray(end) - np.asarray(start)
     length = float(np.linalg.norm(axis))
     unit = axis / length

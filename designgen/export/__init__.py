@@ -1,0 +1,3 @@
+"""Scenes written as scan folders."""
+
+FORMATS = ("ply", "las", "laz", "e57", "ptx", "pcd", "xyz")

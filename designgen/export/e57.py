@@ -1,6 +1,6 @@
-"""E57 (ASTM E2807) with doubles: several scans a file, each with its pose, Cartesian or spherical.
+"""E57 files (ASTM E2807) in double precision: several scans, each with its pose, Cartesian or spherical.
 
-The library's own way to write a scan rounds coordinates to 32 bits, which at map coordinates loses decimetres.
+The library's own function rounds coordinates to 32 bits, which at map coordinates loses decimetres.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ CHUNK = 1_000_000
 
 
 def write(path: Path, scans: Sequence[Scan], *, spherical: bool) -> None:
-    """Write all scans, metres; points in the scan's frame, ``T_project_scan`` as its pose where there is one."""
+    """Write all scans in metres; points in the scan's frame, with ``T_project_scan`` as pose where there is one."""
     from pye57 import libe57
 
     image = libe57.ImageFile(str(path), "w")
@@ -46,17 +46,17 @@ def write(path: Path, scans: Sequence[Scan], *, spherical: bool) -> None:
 
 
 def names_read(stem: str, scans: Sequence[Scan]) -> list[str]:
-    """Return what a reader calls several scans of a file: by their own names, those of odd names by their numbers."""
-    found = []
+    """Return the names a reader gives to several scans of a file: their own, or numbers where they are unsuitable."""
+    names = []
     for number, scan in enumerate(scans, 1):
         odd = not scan.name.isprintable() or scan.name != scan.name.strip() or len(scan.name) > 100
         odd = odd or not scan.name or scan.name.startswith(".") or "/" in scan.name or "\\" in scan.name
-        found.append(f"{stem}-{number}" if odd else scan.name)
-    return found if len(set(found)) == len(found) else [f"{stem}-{number}" for number in range(1, len(scans) + 1)]
+        names.append(f"{stem}-{number}" if odd else scan.name)
+    return names if len(set(names)) == len(names) else [f"{stem}-{number}" for number in range(1, len(scans) + 1)]
 
 
 def _guid(*content: bytes) -> str:
-    """Return an identifier that follows from the content instead of chance: the same scan makes the same file."""
+    """Return an identifier computed from the content, so that the same scans give the same file."""
     digest = hashlib.sha256(b"".join(content)).hexdigest()
     return f"{{{digest[:8]}-{digest[8:12]}-{digest[12:16]}-{digest[16:20]}-{digest[20:32]}}}"
 
@@ -92,10 +92,10 @@ def _write_scan(image: Any, scans: Any, scan: Scan, number: int, *, spherical: b
         columns["intensity"] = scan.intensity
         low, high = float(scan.intensity.min()), float(scan.intensity.max())
         types["intensity"] = libe57.FloatNode(image, low, libe57.E57_SINGLE, low, high)
-    # Scans that were put into one cloud have the same numbers, which are no grid of the cloud's.
+    # A merged cloud has no grid of its own: the numbers of its scans repeat.
     if len(scan.grid_row) and not len(scan.point_station):
         for name, cells in (("rowIndex", scan.grid_row), ("columnIndex", scan.grid_column)):
-            columns[name] = cells.astype(np.longlong)  # of 64 bits by that name; the library takes "long" for 32
+            columns[name] = cells.astype(np.longlong)  # the library takes the type "long" for 32 bits
             least, most = int(cells.min()), int(cells.max())
             types[name] = libe57.IntegerNode(image, least, least, most)
     guid = _guid(f"{number} {scan.name}".encode(), points.tobytes())
@@ -126,7 +126,7 @@ def _write_scan(image: Any, scans: Any, scan: Scan, number: int, *, spherical: b
 
 
 def _spherical(points: Floats) -> dict[str, Any]:
-    """Range, azimuth and elevation of points (n, 3), as ASTM E2807 has them."""
+    """Return range, azimuth and elevation of points (n, 3) as defined by ASTM E2807."""
     level = np.hypot(points[:, 0], points[:, 1])
     return {
         "sphericalRange": np.hypot(level, points[:, 2]),
@@ -136,7 +136,7 @@ def _spherical(points: Floats) -> dict[str, Any]:
 
 
 def quaternion(R: Floats) -> tuple[float, float, float, float]:
-    """Return w, x, y, z of a rotation (3, 3), w not negative (Shepperd's method: no small divisor)."""
+    """Return w >= 0, x, y, z of a rotation (3, 3), by the method of Shepperd (1978), which avoids small divisors."""
     squares = np.array([np.trace(R), R[0, 0], R[1, 1], R[2, 2]])
     k = int(np.argmax(squares))
     if k == 0:

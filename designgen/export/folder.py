@@ -15,18 +15,19 @@ from typing import Any
 
 import numpy as np
 
-from designgen.export import formats
+from designgen.export import formats, solids
 from designgen.export.formats import Written
+from designgen.ply import write_mesh
 from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Picks, PointLabels, Scan, Scene, UsageError
 from processor.store import store
 
 PICKS, PICK_COLUMNS = "picks.csv", ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
-FEWEST_POINTS = 4  # that a reader takes for a scan
+FEWEST_POINTS = 4  # of a scan that a reader accepts
 
 
 @dataclass(frozen=True)
 class Exported:
-    """How many scans a folder holds, and the names of those that were left out as they saw next to nothing."""
+    """The number of scans in a folder, and the names of scans left out because they have too few points."""
 
     scans: int
     left_out: tuple[str, ...]
@@ -44,11 +45,12 @@ def export(
 ) -> Exported:
     """Write the scene file ``source`` as a new scan folder.
 
-    The folder is made under a temporary name and moved; ``spherical`` is for E57, ``step`` adds the design's
-    solids as STEP; without ``with_meshes`` an arch bridge's design is its curves and joints alone. Scans with fewer
-    points than a reader takes are left out. The truth's labels are named and ordered as the folder's scans are when
-    they are read. Raises UsageError when the folder exists and is not empty, for a
-    format that cannot hold the scene, where no scan is left, and without meshes for what is no arch bridge.
+    The folder is made under a temporary name and renamed. ``spherical`` is for E57; ``step`` adds the design's solids
+    as STEP; without ``with_meshes`` the design of an arch bridge has bottom edges and joints only. Scans of less than
+    FEWEST_POINTS points are left out. The truth's labels have the names and order of the scans as read from the folder.
+
+    Raises UsageError where the folder exists and is not empty, for a format that cannot hold the scene, where no scan
+    is left, and for a scene other than an arch bridge without meshes.
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UsageError(f"{folder}: exists and is not empty; name a new folder")
@@ -64,9 +66,7 @@ def export(
     try:
         written = _write(scene, making, format_, spherical=spherical, with_meshes=with_meshes)
         if step:
-            from designgen.cad import files
-
-            files.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
+            solids.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
         if with_truth:
             store.copy_truth(source, making / "truth.h5", lambda labels: _labels_as_read(labels, written))
         if folder.exists():
@@ -80,20 +80,20 @@ def export(
 
 
 def _labels_as_read(labels: Sequence[PointLabels], written: Sequence[Written]) -> tuple[PointLabels, ...]:
-    """Name the labels of scans, and order them, as a reader of the files finds the points."""
-    known = {one.scan: one for one in labels}
-    found = []
-    for name, scan, rows in (one for file in written for one in file.read_as):
-        if scan.name not in known:
+    """Return the labels with the names and order of the points as a reader finds them in the files."""
+    of_scan = {label.scan: label for label in labels}
+    result = []
+    for name, scan, rows in (entry for file in written for entry in file.read_as):
+        if scan.name not in of_scan:
             continue
-        given = known[scan.name]
+        label = of_scan[scan.name]
         columns = {
-            field.name: getattr(given, field.name)[rows]
-            for field in dataclasses.fields(given)
-            if field.metadata.get("shape") == ("n",) and len(getattr(given, field.name))
+            field.name: getattr(label, field.name)[rows]
+            for field in dataclasses.fields(label)
+            if field.metadata.get("shape") == ("n",) and len(getattr(label, field.name))
         }
-        found.append(dataclasses.replace(given, scan=name, **columns))
-    return tuple(found)
+        result.append(dataclasses.replace(label, scan=name, **columns))
+    return tuple(result)
 
 
 def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_meshes: bool) -> list[Written]:
@@ -130,7 +130,7 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_me
 
 
 def _write_picks(path: Path, picks: Picks, names: Mapping[str, str], scale: float) -> None:
-    """Write picked points between the scans that have ``names``, coordinates times ``scale``."""
+    """Write the picked points between scans in ``names`` (names in the folder by scan), coordinates times ``scale``."""
     with path.open("w", encoding="utf-8", newline="") as file:
         rows = csv.writer(file, lineterminator="\n")
         rows.writerow(PICK_COLUMNS)
@@ -140,13 +140,13 @@ def _write_picks(path: Path, picks: Picks, names: Mapping[str, str], scale: floa
 
 
 def _of_file(scans: Sequence[Scan]) -> list[str]:
-    """Lines of a file that holds several scans: what is the same for all of them."""
+    """Return the lines of project.toml about a file with several scans: what is the same for all of them."""
     sigmas = {scan.sigma_mm for scan in scans}
     return [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
 
 
 def _of_scan(scan: Scan, scale: float, *, own_pose: bool) -> list[str]:
-    """Lines of project.toml about one scan; with ``own_pose`` its file says where the scanner stood."""
+    """Return the lines of project.toml about one scan; ``own_pose``: the file contains the scanner's pose."""
     lines = [f"component = {_quoted(scan.component)}"] if scan.component else []
     if scan.station:
         lines.append(f"station = {_quoted(scan.station)}")
@@ -170,7 +170,7 @@ def _write_json(path: Path, content: dict[str, Any]) -> None:
 
 
 def _stems(scans: Sequence[Scan]) -> list[str]:
-    """Return each scan's name where it is a plain file name, else a number that is no other's name."""
+    """Return unique file stems: each scan's name if it is a plain file name, else a number."""
     plain = {scan.name for scan in scans if scan.name.replace("-", "").replace("_", "").isalnum()}
     stems = []
     for number, scan in enumerate(scans):
@@ -182,7 +182,7 @@ def _stems(scans: Sequence[Scan]) -> list[str]:
 
 
 def _design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool) -> str:
-    """Write the design, a structure's mesh in the folder's units; returns its file's name, empty without one."""
+    """Write the design, a structure's mesh times ``scale``; return its file name, empty without a design."""
     if scene.arch is not None:
         _write_json(folder / "design.json", _arch_design(scene.arch, folder if with_meshes else None))
     elif scene.frame is not None:
@@ -190,7 +190,7 @@ def _design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool) -> s
     elif scene.structure is not None:
         (folder / "design").mkdir(exist_ok=True)
         vertices = scene.structure.vertices * scale
-        formats.write_mesh(folder / "design/structure.ply", vertices, scene.structure.faces)
+        write_mesh(folder / "design/structure.ply", vertices, scene.structure.faces)
         return "design/structure.ply"
     else:
         return ""
@@ -198,7 +198,7 @@ def _design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool) -> s
 
 
 def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
-    """Return the design as JSON; meshes go to ``folder``, or nowhere."""
+    """Return the design as JSON, and write its meshes to ``folder`` unless it is None."""
     components: dict[str, dict[str, Any]] = {}
     for part in design.parts:
         components[part.name] = {
@@ -207,7 +207,7 @@ def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
         }
         if folder is not None:
             (folder / "design").mkdir(exist_ok=True)
-            formats.write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
+            write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
             components[part.name] = {"mesh": f"design/{part.name}.ply", **components[part.name]}
     joints = [
         {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, points.tolist(), strict=True))}

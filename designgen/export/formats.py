@@ -1,7 +1,7 @@
-"""Scans written in the formats of scanners and programs: points in the scan's own frame, its origin put back.
+"""Scans written in the file formats of scanners: points in the scan's own frame with its origin added.
 
-PLY in mm, all others in metres. Intensity goes along where there is one; ``station`` numbers (from 1, 0 = unknown)
-where a merged cloud says from which scanner a point was seen.
+PLY is in mm, all others in metres. Intensity is written where there is one, and of merged clouds the number of each
+point's station (from 1, 0 = unknown).
 """
 
 from __future__ import annotations
@@ -13,21 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from designgen.export import e57
+from designgen.ply import write_columns
 from processor.model import Floats, Ints, Scan, Stations, UsageError
 
 METRES = 0.001  # of a millimetre
 LAS_STEP_M = 0.0001
-FORMATS = ("ply", "las", "laz", "e57", "ptx", "pcd", "xyz")
 
 
 def station_numbers(scan: Scan) -> Ints:
-    """Return the stations' numbers (n,) of a merged cloud, (0,) of another."""
+    """Return the stations' numbers (n,) of a merged cloud, (0,) of any other."""
     return scan.point_station.astype(np.int64) + 1
-
-
-def write_mesh(path: Path, vertices: Floats, faces: Ints) -> None:
-    """Write a mesh as binary PLY with coordinates as doubles, mm."""
-    _write_ply(path, {axis: vertices[:, i] for i, axis in enumerate("xyz")}, faces)
 
 
 def write_ply(path: Path, scan: Scan) -> None:
@@ -37,22 +33,7 @@ def write_ply(path: Path, scan: Scan) -> None:
         columns["intensity"] = scan.intensity.astype(np.float32)
     if len(scan.point_station):
         columns["station"] = station_numbers(scan).astype(np.int32)
-    _write_ply(path, columns)
-
-
-def _write_ply(path: Path, columns: dict[str, Any], faces: Ints | None = None) -> None:
-    from plyfile import PlyData, PlyElement
-
-    count = len(columns["x"])
-    vertex = np.empty(count, dtype=[(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
-    for name, column in columns.items():
-        vertex[name] = column
-    elements = [PlyElement.describe(vertex, "vertex")]
-    if faces is not None:
-        face = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
-        face["vertex_indices"] = faces
-        elements.append(PlyElement.describe(face, "face"))
-    PlyData(elements, byte_order="<").write(str(path))
+    write_columns(path, columns)
 
 
 def write_las(path: Path, scan: Scan) -> None:
@@ -63,10 +44,10 @@ def write_las(path: Path, scan: Scan) -> None:
     header.scales = np.full(3, LAS_STEP_M)
     low = scan.points.min(axis=0) if len(scan.points) else np.zeros(3)
     header.offsets = np.floor((scan.origin + low) * METRES)
-    # The file's date would make every day's file another one.
+    # With a date, the bytes would change from day to day.
     header.creation_date = None
     las = laspy.LasData(header)
-    # Steps from the offset, without a detour over large coordinates.
+    # Steps from the offset, without large coordinates in between.
     shift = scan.origin - header.offsets / METRES
     steps = np.rint((scan.points + shift) * (METRES / LAS_STEP_M)).astype(np.int32)
     record = laspy.ScaleAwarePointRecord.zeros(len(scan.points), header=header)
@@ -82,24 +63,25 @@ def write_las(path: Path, scan: Scan) -> None:
 
 def write_pcd(path: Path, scan: Scan) -> None:
     """Write binary PCD in metres, coordinates as doubles."""
-    from pypcd4.pypcd4 import Encoding, PointCloud
-
-    columns: list[Any] = [(scan.points[:, i] + scan.origin[i]) * METRES for i in range(3)]
-    names: list[str] = ["x", "y", "z"]
-    types: list[Any] = [np.float64] * 3
+    columns: dict[str, Any] = {axis: (scan.points[:, i] + scan.origin[i]) * METRES for i, axis in enumerate("xyz")}
     if len(scan.intensity):
-        columns.append(scan.intensity.astype(np.float32))
-        names.append("intensity")
-        types.append(np.float32)
+        columns["intensity"] = scan.intensity.astype(np.float32)
     if len(scan.point_station):
-        columns.append(station_numbers(scan).astype(np.int32))
-        names.append("station")
-        types.append(np.int32)
-    PointCloud.from_points(columns, names, types).save(path, Encoding.BINARY)
+        columns["station"] = station_numbers(scan).astype(np.int32)
+    rows = np.empty(len(scan.points), [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    for name, column in columns.items():
+        rows[name] = column
+    types = [column.dtype for column in columns.values()]
+    header = (
+        f"VERSION 0.7\nFIELDS {' '.join(columns)}\nSIZE {' '.join(str(t.itemsize) for t in types)}\n"
+        f"TYPE {' '.join(t.kind.upper() for t in types)}\nCOUNT {' '.join('1' for _ in types)}\nWIDTH {len(rows)}\n"
+        f"HEIGHT 1\nVIEWPOINT 0.0 0.0 0.0 1.0 0.0 0.0 0.0\nPOINTS {len(rows)}\nDATA binary\n"
+    )
+    path.write_bytes(header.encode() + rows.tobytes())
 
 
 def write_xyz(path: Path, scan: Scan) -> None:
-    """Write text in metres to 0.1 micrometre; with a header where there is more than coordinates."""
+    """Write text in metres to 0.1 micrometre; with a header if there are columns besides the coordinates."""
     columns, names, forms = [(scan.points + scan.origin) * METRES], ["x", "y", "z"], ["%.7f"] * 3
     if len(scan.intensity):
         columns.append(scan.intensity[:, None])
@@ -114,9 +96,9 @@ def write_xyz(path: Path, scan: Scan) -> None:
 
 
 def write_ptx(path: Path, scan: Scan, stations: Stations | None) -> None:
-    """Write PTX: a grid a station, cut to the rows and columns that have returns.
+    """Write PTX: a grid for each station, cropped to the rows and columns with returns.
 
-    Points are in the scanner's frame, and the matrix is the scanner's pose: of a merged cloud that of each station.
+    Points are in the scanner's frame, and the matrix is the pose of the scanner: in a merged cloud, of each station.
     Raises UsageError for a scan without grid numbers or poses.
     """
     with path.open("w", encoding="ascii", newline="\n") as file:
@@ -126,7 +108,7 @@ def write_ptx(path: Path, scan: Scan, stations: Stations | None) -> None:
 
 
 def ptx_grids(scan: Scan, stations: Stations | None) -> list[tuple[Ints, Floats]]:
-    """Return the grids as PTX has them: rows of points in the file's order, pose of the scanner in the points' frame.
+    """Return the grids of a PTX file: rows of points in the file's order, pose of the scanner in the points' frame.
 
     Raises UsageError for a scan without grid numbers or poses.
     """
@@ -166,7 +148,7 @@ def _write_grid(file: Any, scan: Scan, rows: Ints, points: Floats, T_frame_scann
 
 @dataclass(frozen=True)
 class Written:
-    """A file of scans, by its name; of each scan that a reader finds in it the name, and its points by their rows."""
+    """A file of scans; for each scan that a reader finds in it the name, the scan, and the rows of its points."""
 
     name: str
     scans: tuple[Scan, ...]
@@ -176,13 +158,13 @@ class Written:
 def write_all(
     folder: Path, format_: str, scans: Sequence[tuple[str, Scan]], stations: Stations | None, *, spherical: bool
 ) -> list[Written]:
-    """Write scans under ``folder`` by their file stems: a file each, but E57 holds the stations of one place together.
+    """Write scans under ``folder`` by their file stems: a file each, but several stations together in one E57 file.
 
-    In E57 a lone scan and scans of components have a file each as well, so that what is said of files fits them.
+    Scans of components have a file each in E57, too, because project.toml names the component of a file.
     """
     if format_ == "e57":
-        apart = len(scans) == 1 or any(scan.component for _, scan in scans)
-        groups = [(stem, [scan]) for stem, scan in scans] if apart else [("scans", [scan for _, scan in scans])]
+        separate = len(scans) == 1 or any(scan.component for _, scan in scans)
+        groups = [(stem, [scan]) for stem, scan in scans] if separate else [("scans", [scan for _, scan in scans])]
         return [_write_e57(folder, stem, group, spherical=spherical) for stem, group in groups]
     if format_ == "ptx":
         return [_write_ptx(folder, stem, scan, stations) for stem, scan in scans]
@@ -200,8 +182,6 @@ def _all_rows(scan: Scan) -> Ints:
 
 
 def _write_e57(folder: Path, stem: str, scans: Sequence[Scan], *, spherical: bool) -> Written:
-    from designgen.export import e57
-
     e57.write(folder / f"{stem}.e57", scans, spherical=spherical)
     names = [stem] if len(scans) == 1 else e57.names_read(stem, scans)
     read_as = tuple((name, scan, _all_rows(scan)) for name, scan in zip(names, scans, strict=True))

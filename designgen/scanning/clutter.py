@@ -1,4 +1,4 @@
-"""Things in the way of scanners that are no part of what is scanned."""
+"""Objects that are scanned but are no part of the structure, and hide parts of it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from designgen.scanning.surfaces import Builder
 from processor.model import Floats
 
 UP = np.array([0.0, 0.0, 1.0])
-ABOVE_MM = 1_000.0  # how far a pole reaches past the line of sight
+ABOVE_MM = 1_000.0  # length of a pole beyond the line of sight
 
 
 def add_pole(
@@ -21,9 +21,9 @@ def add_pole(
     *,
     on_ground: bool,
 ) -> None:
-    """Add a pole along ``up`` (3,) across the line from a station (3,) to a target (3,), between two shares of it.
+    """Add a pole along ``up`` (3,) across the line from a station (3,) to a target (3,), between two fractions of it.
 
-    A pole ``on_ground`` starts at z = 0, another as far below the line as it reaches above it.
+    A pole ``on_ground`` starts at z = 0; any other extends as far below the line as above it.
     """
     at = station + (target - station) * rng.uniform(*shares) + rng.uniform(-500.0, 500.0, 3)
     radius = rng.uniform(25.0, 60.0)
@@ -32,7 +32,7 @@ def add_pole(
 
 
 def add_below_roof(builder: Builder, low: Floats, high: Floats, count: int, rng: np.random.Generator) -> None:
-    """Add lamps (balls without members) and pipes below a roof's box, and poles on the ground, in turn."""
+    """Add lamps (balls without members), pipes below a roof's box, and poles on the ground, in rotation."""
     span = high - low
     for i in range(count):
         at = low + rng.uniform(0.05, 0.95, 3) * span

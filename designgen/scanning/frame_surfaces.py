@@ -1,4 +1,4 @@
-"""A space frame's exact surfaces for rays: balls with flats and holes, hexagonal sleeves, cones, tubes."""
+"""The exact surfaces of a space frame: balls with flats and holes, hexagonal sleeves, cones, tubes."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 
 from designgen.designs import bolt_ball
 from designgen.designs.space_frame import HEXAGON, Frame
+from designgen.frames import perpendicular
 from designgen.scanning.surfaces import Builder
 from processor.model import Floats
 
@@ -13,7 +14,7 @@ DOWN = np.array([0.0, 0.0, -1.0])
 
 
 def add_frame(builder: Builder, frame: Frame) -> None:
-    """Add all of a frame; a ball's part is its row, members have none."""
+    """Add the whole frame; the part of a ball is its row, members have none (-1)."""
     for node, centre in enumerate(frame.centres):
         _add_ball(builder, node, centre, frame.ball(node))
     for member in range(len(frame.members)):
@@ -44,8 +45,7 @@ def _add_member(builder: Builder, frame: Frame, member: int) -> None:
         flat = frame.ball(int(node)).flat_distance
         tip = flat + joined.sleeve_length
         if frame.has_sleeve(member, end):
-            side = np.cross(out, np.eye(3)[np.argmin(np.abs(out))])
-            side /= np.linalg.norm(side)
+            side = perpendicular(out)
             ring = joined.sleeve_corner_radius * (HEXAGON[:, :2] @ np.stack([side, np.cross(out, side)]))
             near, far = origin + flat * out + ring, origin + tip * out + ring
             for k in range(6):

@@ -1,4 +1,4 @@
-"""How a recipe's scene is scanned: by rays of a device from stations, or sampled from its surfaces."""
+"""How a recipe's scene is scanned: by rays from stations, or by sampling its surfaces."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from processor.model import UsageError
 
 @dataclass(frozen=True)
 class ByRays:
-    """Scans by rays of a device."""
+    """A scan by rays of a device."""
 
     params: scanner.Params
     device: scanner.Scanner
@@ -22,7 +22,7 @@ class ByRays:
 
 Scanning = sampler.Params | ByRays
 
-# Keys of [scan] that not every kind of scene uses, and the kinds that do.
+# Keys of [scan] that only some kinds of scene use.
 OF_SOME_KINDS = {
     "inner_depth_mm": ("arch-bridge",),
     "member_reach_mm": ("space-frame",),
@@ -34,12 +34,12 @@ OF_SOME_KINDS = {
     "merged": ("space-frame", "structure"),
     "origin_mm": ("space-frame", "structure"),
 }
-# And those that a type of structure does not use: a stadium is scanned from within.
+# Keys that a type of structure does not use: a stadium is scanned from inside.
 NOT_OF_TYPES = {"stadium-roof": ("distance_mm",)}
 
 
 def read(recipe: Mapping[str, Any]) -> Scanning:
-    """Read the sections ``scan`` and ``scanner``. Raises UsageError that names the key for what cannot be."""
+    """Read the sections ``scan`` and ``scanner`` of a recipe. Raises UsageError that names the key at fault."""
     table = recipe.get("scan", {})
     mode = table.get("mode", sampler.MODE) if isinstance(table, Mapping) else sampler.MODE
     if mode not in (sampler.MODE, scanner.MODE):
@@ -47,19 +47,20 @@ def read(recipe: Mapping[str, Any]) -> Scanning:
     if mode == sampler.MODE:
         if "scanner" in recipe:
             raise UsageError(f"scanner: there is a scanner only with scan.mode = {scanner.MODE!r}")
-        sampled = filled(sampler.Params, recipe, "scan")
+        sampling = filled(sampler.Params, recipe, "scan")
         _check_used(recipe, sampler.Params)
-        return sampled
+        return sampling
     params = filled(scanner.Params, recipe, "scan")
     _check_used(recipe, scanner.Params)
-    own = recipe.get("scanner", {})
-    if not isinstance(own, Mapping):
-        raise UsageError(f"scanner: expected a section, got {own!r}")
-    return ByRays(params, filled(scanner.Scanner, {"scanner": {**scanner.preset(params.scanner), **own}}, "scanner"))
+    changes = recipe.get("scanner", {})
+    if not isinstance(changes, Mapping):
+        raise UsageError(f"scanner: expected a section, got {changes!r}")
+    numbers = {**scanner.preset(params.scanner), **changes}
+    return ByRays(params, filled(scanner.Scanner, {"scanner": numbers}, "scanner"))
 
 
 def _check_used(recipe: Mapping[str, Any], params: type) -> None:
-    """Raise UsageError for a key of ``scan`` that scenes of the recipe's kind do not use."""
+    """Raise UsageError for a key of ``scan`` that the recipe's kind of scene does not use."""
     kind, section = recipe.get("kind"), recipe.get("structure")
     unused = {key for key, kinds in OF_SOME_KINDS.items() if kind not in kinds}
     if kind == "structure" and isinstance(section, Mapping) and section.get("type") in NOT_OF_TYPES:

@@ -1,4 +1,4 @@
-"""Common points as somebody would pick them in pairs of scans, with the noise of a hand."""
+"""Points picked by hand in pairs of scans, with noise."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ import numpy as np
 from designgen.randomness import generator
 from processor.model import Floats, Picks, Scan, UsageError
 
-AWAY_FROM_A_LINE = 0.15  # of the longest side of three points: least distance of the third from it
+AWAY_FROM_A_LINE = 0.15  # least extent of the points across their line, as a fraction of their largest distance
 MOST_DRAWS = 10_000
 
 
 @dataclass(frozen=True)
 class Params:
-    """How points are picked; ``apart_mm`` is the least distance of two of them in a pair of scans."""
+    """How points are picked; ``apart_mm`` is the least distance between two points of a pair of scans."""
 
     points: int = 3
     sigma_mm: float = 5.0  # of each coordinate in each scan
@@ -24,10 +24,11 @@ class Params:
 
 
 def pick(scans: Sequence[Scan], T_project_scan: Sequence[Floats], params: Params, seed: int) -> tuple[Picks, Floats]:
-    """Pick points in scans in a ring, each tied to the two after it, and their true places (q, 3) in the project.
+    """Pick points in a ring of scans, each paired with the two after it; also their true places (q, 3) in the project.
 
-    The points are of the first scan of a pair, in both with noise: that the other sees them too is taken for granted.
-    Raises UsageError for less than two scans or three points, and where a scan has none far enough apart.
+    The points are points of the first scan of a pair; whether the second scan sees them is not checked. Coordinates in
+    both scans have noise. Raises UsageError for less than two scans or three points, and for a scan without points far
+    enough from one another.
     """
     if params.points < 3 or not params.sigma_mm >= 0.0 or not params.apart_mm >= 0.0:
         raise UsageError(
@@ -40,15 +41,15 @@ def pick(scans: Sequence[Scan], T_project_scan: Sequence[Floats], params: Params
     scan_a, scan_b, names = [], [], []
     in_a, in_b, places = [], [], []
     for a, b in _pairs(len(scans)):
-        own = _apart(scans[a], params, rng) + scans[a].origin
-        there = own @ T_project_scan[a][:3, :3].T + T_project_scan[a][:3, 3]
-        in_other = (there - T_project_scan[b][:3, 3]) @ T_project_scan[b][:3, :3]
-        places.append(there)
-        in_a.append(own + rng.normal(0.0, params.sigma_mm, own.shape))
-        in_b.append(in_other + rng.normal(0.0, params.sigma_mm, own.shape))
-        scan_a += [scans[a].name] * len(own)
-        scan_b += [scans[b].name] * len(own)
-        names += [f"P{k + 1}" for k in range(len(own))]
+        true_a = _draw_points(scans[a], params, rng) + scans[a].origin
+        place = true_a @ T_project_scan[a][:3, :3].T + T_project_scan[a][:3, 3]
+        true_b = (place - T_project_scan[b][:3, 3]) @ T_project_scan[b][:3, :3]
+        places.append(place)
+        in_a.append(true_a + rng.normal(0.0, params.sigma_mm, true_a.shape))
+        in_b.append(true_b + rng.normal(0.0, params.sigma_mm, true_b.shape))
+        scan_a += [scans[a].name] * len(place)
+        scan_b += [scans[b].name] * len(place)
+        names += [f"P{k + 1}" for k in range(len(place))]
     return Picks(tuple(scan_a), tuple(scan_b), tuple(names), np.vstack(in_a), np.vstack(in_b)), np.vstack(places)
 
 
@@ -57,18 +58,18 @@ def _pairs(count: int) -> list[tuple[int, int]]:
     return sorted((a, b) for a, b in ring)
 
 
-def _apart(scan: Scan, params: Params, rng: np.random.Generator) -> Floats:
-    """Draw points (k, 3) of a scan that are far from one another, no three of them in a line."""
+def _draw_points(scan: Scan, params: Params, rng: np.random.Generator) -> Floats:
+    """Draw points (k, 3) of a scan that are far from one another and from a common line."""
     for _ in range(MOST_DRAWS):
         if len(scan.points) < params.points:
             break
         chosen: Floats = scan.points[rng.choice(len(scan.points), params.points, replace=False)]
         sides = np.linalg.norm(chosen[:, None] - chosen, axis=2)[np.triu_indices(params.points, 1)]
-        # The second largest extent of the points: across the line they are nearest to.
+        # The second singular value is the points' extent across their best line.
         across = np.linalg.svd(chosen - chosen.mean(axis=0), compute_uv=False)[1]
         if sides.min() >= params.apart_mm and across > AWAY_FROM_A_LINE * sides.max():
             return chosen
     raise UsageError(
         f"picks: scan {scan.name} has no {params.points} points {params.apart_mm:g} mm from one another and away from "
-        "a line; ask for fewer points or a smaller picks.apart_mm"
+        "a line; give fewer points or a smaller picks.apart_mm"
     )

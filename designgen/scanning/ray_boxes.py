@@ -1,5 +1,5 @@
-"""Compiled kernels of the ray caster: the boxes that shapes cover on the grid, all in float64."""
-# Numba infers the types of the arguments: they stay without annotations.
+"""Compiled kernels of the ray caster: the boxes that shapes cover on the grid, in float64."""
+# Numba infers the types of the arguments: the kernels have no annotations.
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def boxes(centres, radii, reach, spread, step, lowest, rows, columns, side):  # type: ignore[no-untyped-def]
-    """Boxes (b, 5) of the pieces: piece, first and last column, first and last row.
+    """Return the boxes (b, 5) of the pieces: piece, first and last column, first and last row.
 
-    Columns run ``side`` beyond the first and the last, so that a box over the seam is there on both of its sides.
+    Columns extend ``side`` beyond the first and the last, so that a box over the seam is on both sides of it.
     """
-    found = np.empty((3 * len(radii), 5), np.int32)
+    result = np.empty((3 * len(radii), 5), np.int32)
     count = 0
     across = columns / (2.0 * np.pi)
     for k in range(len(radii)):
@@ -42,15 +42,18 @@ def boxes(centres, radii, reach, spread, step, lowest, rows, columns, side):  # 
             if whole:
                 a, z_ = -side, columns - 1 + side
             if a <= z_:
-                found[count, 0], found[count, 1], found[count, 2] = k, a, z_
-                found[count, 3], found[count, 4] = low, high
+                result[count, 0], result[count, 1], result[count, 2] = k, a, z_
+                result[count, 3], result[count, 4] = low, high
                 count += 1
-    return found[:count].copy()
+    return result[:count].copy()
 
 
 @njit(cache=True, nogil=True)
 def by_strip(boxes, width, strips, side):  # type: ignore[no-untyped-def]
-    """Copy boxes into each strip they touch, ``side`` columns on either side included: (c, 5), (strips + 1,)."""
+    """Return the boxes (c, 5) sorted by strip, and each strip's first (strips + 1,).
+
+    A box is in every strip it touches, with ``side`` columns on either side of the strip.
+    """
     start = np.zeros(strips + 1, np.int64)
     for fill in range(2):
         if fill:

@@ -1,27 +1,75 @@
-"""Compiled kernels of the ray caster: shapes against rays, all in float64.
+"""Compiled kernels of the ray caster: intersections of rays with shapes, in float64.
 
-Every kernel works on one strip of columns, alone, so that results do not depend on the threads. The shapes' numbers are
-those of :class:`designgen.scanning.surfaces.Builder`; a ray starts at the origin of the scanner's frame.
+Every kernel works on one strip of columns on its own, so that results do not depend on the number of threads. The
+numbers of a shape are those of :class:`designgen.scanning.surfaces.Builder`; rays start at the scanner's origin.
 """
-# Numba infers the types of the arguments: they stay without annotations.
+# Numba infers the types of the arguments: the kernels have no annotations.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
+from designgen.scanning.surfaces import CONE, DISC, SPHERE, TRIANGLE
+from processor.model import Floats, Ints, Labels, Shorts
+
 MISS = -1
-SLACK = 1e-9  # relative: two triangles that share an edge leave no gap
+SLACK = 1e-9  # relative, so that two triangles with a common edge leave no gap
 FEW_ROWS = 12  # testing so many rays costs no more than finding those that may meet a triangle
+
+
+class Shapes(NamedTuple):
+    """The shapes of a scene in the scanner's frame, a row each; see :class:`designgen.scanning.surfaces.Surfaces`."""
+
+    kind: npt.NDArray[np.int8]
+    numbers: Floats
+    cuts: Floats
+    cut_start: Ints
+
+
+class Pieces(NamedTuple):
+    """Bounding spheres in the scanner's frame, mm; a long shape has several."""
+
+    shape: Labels  # (k,)
+    centre: Floats  # (k, 3)
+    radius: Floats  # (k,)
+
+
+class Strip(NamedTuple):
+    """Adjacent columns of the grid, the columns cast beside them, and the boxes of pieces that they meet."""
+
+    boxes: Labels  # (b, 5): piece, first and last column, first and last row
+    first: int  # column
+    width: int
+    side: int  # columns cast on either side
+
+
+class Rays(NamedTuple):
+    """The rays of a strip."""
+
+    jitter: Shorts  # (width + 2 side, rows, 2) rotation of each ray to the left and upward, rad
+    largest_jitter: float  # bound of the rotations, rad
+    min_range: float  # mm; a nearer shape hides the ones behind it
+    max_range: float  # mm
+
+
+class Beam(NamedTuple):
+    """A beam whose radius at a range is ``exit_radius + half_divergence range``."""
+
+    exit_radius: float  # mm
+    half_divergence: float  # rad
 
 
 @njit(cache=True, nogil=True)
 def hit(kind, n, cuts, c0, c1, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Nearest range at which the ray d from the origin meets a shape from either side; infinite where it does not."""
-    if kind == 0:
+    """Return the least range at which the ray d from the origin meets a shape from either side; infinite if none."""
+    if kind == SPHERE:
         d2 = dx * dx + dy * dy + dz * dz
         b = (n[0] * dx + n[1] * dy + n[2] * dz) / d2
-        # From the foot of the perpendicular: no difference of large squares.
+        # About the foot of the perpendicular, to avoid a difference of large squares.
         fx, fy, fz = n[0] - b * dx, n[1] - b * dy, n[2] - b * dz
         inside = n[3] * n[3] - (fx * fx + fy * fy + fz * fz)
         if inside < 0.0:
@@ -32,17 +80,17 @@ def hit(kind, n, cuts, c0, c1, dx, dy, dz):  # type: ignore[no-untyped-def]
             if t <= 0.0:
                 continue
             ux, uy, uz = t * dx - n[0], t * dy - n[1], t * dz - n[2]
-            left = True
+            cut_off = False
             for c in range(c0, c1):
                 if cuts[c, 0] * ux + cuts[c, 1] * uy + cuts[c, 2] * uz > cuts[c, 3]:
-                    left = False
+                    cut_off = True
                     break
-            if left:
+            if not cut_off:
                 return t
         return np.inf
-    if kind == 1:
+    if kind == CONE:
         return hit_cone(n, dx, dy, dz)
-    if kind == 2:
+    if kind == DISC:
         slope = n[3] * dx + n[4] * dy + n[5] * dz
         if slope == 0.0:
             return np.inf
@@ -69,7 +117,7 @@ def hit(kind, n, cuts, c0, c1, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def cone_at(n, t, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Height z along a cone's axis at range t, distance squared from it less the radius squared, and d/dt of this."""
+    """Return height z along a cone's axis at range t, squared distance from it less squared radius, and its d/dt."""
     ux, uy, uz = t * dx - n[0], t * dy - n[1], t * dz - n[2]
     z = ux * n[3] + uy * n[4] + uz * n[5]
     rate = dx * n[3] + dy * n[4] + dz * n[5]
@@ -87,18 +135,18 @@ def cone_at(n, t, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Solve the straight cone moved by the bow near the hit, then Newton on the bowed one."""
+    """Return the least range of a cone: solve for the straight cone displaced by the bow, then Newton on the bowed."""
     rate = dx * n[3] + dy * n[4] + dz * n[5]
     taper = (n[7] - n[6]) / n[8]
     bowed = n[9] != 0.0 or n[10] != 0.0 or n[11] != 0.0
     ox, oy, oz = -n[0], -n[1], -n[2]
     z0 = ox * n[3] + oy * n[4] + oz * n[5]
-    # The range nearest to the axis is the start: the quadratic about it has no large terms.
+    # The quadratic equation is set up about the range nearest to the axis, where it has no large terms.
     wx, wy, wz = dx - rate * n[3], dy - rate * n[4], dz - rate * n[5]
     px, py, pz = ox - z0 * n[3], oy - z0 * n[4], oz - z0 * n[5]
     w2 = wx * wx + wy * wy + wz * wz
     near = -(px * wx + py * wy + pz * wz) / w2 if w2 > 1e-18 else 0.0
-    if rate != 0.0:  # a ray along the axis comes nearest to it far away
+    if rate != 0.0:  # a ray nearly along the axis is nearest to it far away
         enter, leave = -z0 / rate, (n[8] - z0) / rate
         near = min(max(near, min(enter, leave)), max(enter, leave))
     if bowed:
@@ -113,12 +161,12 @@ def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
     inside = b * b - a * c
     if inside < 0.0:
         return np.inf
-    # Both roots without a difference of like numbers; a is negative for a ray steeper than the cone, 0 along its side.
+    # Both roots without cancellation; a is negative for a ray steeper than the cone, 0 along its side.
     large = -b - np.sqrt(inside) if b > 0.0 else -b + np.sqrt(inside)
-    one = c / large if large != 0.0 else (0.0 if a != 0.0 else np.inf)
-    two = large / a if a != 0.0 else np.inf
+    root = c / large if large != 0.0 else (0.0 if a != 0.0 else np.inf)
+    other_root = large / a if a != 0.0 else np.inf
     for sign in range(2):
-        t = near + (min(one, two) if sign == 0 else max(one, two))
+        t = near + (min(root, other_root) if sign == 0 else max(root, other_root))
         if not np.isfinite(t):
             continue
         z = z0 + t * rate
@@ -132,7 +180,7 @@ def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
                 if abs(step) < 1e-9 * abs(t):
                     break
             z, value, slope = cone_at(n, t, dx, dy, dz)
-            if abs(value) > 1e-5 * n[6]:  # a grazing ray that Newton could not follow
+            if abs(value) > 1e-5 * n[6]:  # Newton did not converge for this grazing ray
                 continue
         if t > 0.0 and 0.0 <= z <= n[8] and n[6] + taper * z > 0.0:
             return t
@@ -140,87 +188,77 @@ def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def cast(  # type: ignore[no-untyped-def]
-    kind,
-    numbers,
-    cuts,
-    cut_start,
-    owner,
-    centres,
-    radii,
-    boxes,
-    first,
-    width,
-    side,
-    columns,
-    lowest,
-    step,
-    jitter,
-    turned,
-    least,
-    most,
-    beam,
-    beside,
-):
-    """Nearest shape and range of each ray of a strip and beside it: (width + 2 side, rows) each.
+def direction(ca, sa, level, rise, da, de):  # type: ignore[no-untyped-def]
+    """Return the direction of a ray rotated by da to the left and de upward, both rad.
 
-    Columns ``first - side`` to ``first + width - 1 + side`` are cast; beside the strip only ``beside`` (rows,) of them.
-
-    A third answer is the range at which a beam, of radius ``beam[0] + beam[1] range``, may touch a thing too thin for
-    the grid's rays; infinite where there is none.
+    ``ca``, ``sa``, ``level`` and ``rise`` are cosine and sine of azimuth and elevation. The result is of first order in
+    the encoders' noise: a unit vector to 1e-10.
     """
+    flat = level - de * rise
+    return flat * ca - da * sa, flat * sa + da * ca, rise + de * level
+
+
+@njit(cache=True, nogil=True)
+def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-untyped-def]
+    """Return shape and range of the nearest hit of each ray of a strip and beside it, (width + 2 side, rows) each.
+
+    ``grid`` is a :class:`designgen.scanning.raycast.Grid`. Beside the strip only the next ``beside`` (rows,) columns
+    are cast. No hit: -1 and infinite. The third result is the range at which the beam may touch a shape so thin that
+    the grid's rays may all miss it; infinite where there is none.
+    """
+    boxes, first, width, side = strip  # in local variables, as the inner loops are faster with them
+    kind, numbers, cuts, cut_start = shapes
+    owner, centres, radii = pieces
+    jitter, largest_jitter, min_range, max_range = rays
     rows = jitter.shape[1]
     best = np.full((width + 2 * side, rows), np.inf)
     thin = np.full((width + 2 * side, rows), np.inf)
     shape = np.full((width + 2 * side, rows), MISS, np.int32)
-    used = min(width, columns - first)
+    used = min(width, grid.columns - first)
     level, rise = np.empty(rows), np.empty(rows)
     for i in range(rows):
-        level[i], rise[i] = np.cos(lowest + step * i), np.sin(lowest + step * i)
+        level[i], rise[i] = np.cos(grid.lowest + grid.step * i), np.sin(grid.lowest + grid.step * i)
     for b in range(len(boxes)):
         k = boxes[b, 0]
-        i = owner[k]
-        cx, cy, cz, r2 = centres[k, 0], centres[k, 1], centres[k, 2], 1.000001 * radii[k] * radii[k]
+        i, radius = owner[k], radii[k]
+        cx, cy, cz, r2 = centres[k, 0], centres[k, 1], centres[k, 2], 1.000001 * radius * radius
         c2 = cx * cx + cy * cy + cz * cz
-        # A bit more than what the angle between rays of the grid spans there, across.
-        slim = thickness(kind[i], numbers[i]) < 1.5 * step * (np.sqrt(c2) + radii[k])
-        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        # Thinner than 1.5 times the distance between rays of the grid there.
+        slim = thickness(kind[i], numbers[i]) < 1.5 * grid.step * (np.sqrt(c2) + radius)
+        wide = kind[i] == TRIANGLE and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
         if wide:
             planes = edge_planes(numbers[i])
         for column in range(max(boxes[b, 1], first - side), min(boxes[b, 2], first + used - 1 + side) + 1):
             j = column - first + side
             away = max(first - column, column - first - used + 1)
-            azimuth = 2.0 * np.pi * column / columns
+            azimuth = 2.0 * np.pi * column / grid.columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
             low, high = boxes[b, 3], boxes[b, 4]
             if wide:
-                low, high = rows_within(planes, ca, sa, turned, lowest, step, low, high)
+                low, high = rows_within(planes, ca, sa, largest_jitter, grid, low, high)
             for row in range(low, high + 1):
                 if away > beside[row]:
                     continue
-                da, de = jitter[j, row, 0], jitter[j, row, 1]
-                # First order in the encoders' noise: the direction stays a unit vector to 1e-10.
-                flat = level[row] - de * rise[row]
-                dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
+                dx, dy, dz = direction(ca, sa, level[row], rise[row], jitter[j, row, 0], jitter[j, row, 1])
                 along = dx * cx + dy * cy + dz * cz
-                if along + radii[k] < 0.0 or along - radii[k] > best[j, row]:
+                if along + radius < 0.0 or along - radius > best[j, row]:
                     continue
                 if slim:
-                    near = radii[k] + beam[0] + beam[1] * along
+                    near = radius + beam.exit_radius + beam.half_divergence * along
                     if c2 - along * along <= near * near and along < thin[j, row]:
                         thin[j, row] = along
                 if c2 - along * along > r2 + 1e-9 * c2:
                     continue
                 t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
-                if t <= most and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
+                if t <= max_range and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
                     best[j, row], shape[j, row] = t, i
-    hide(shape, best, least)
+    hide(shape, best, min_range)
     return shape, best, thin
 
 
 @njit(cache=True, nogil=True)
 def edge_planes(n):  # type: ignore[no-untyped-def]
-    """Return inward unit normals (3, 3) of planes through the origin and a triangle's edges, 0 of one seen end on."""
+    """Return inward unit normals (3, 3) of the planes through the origin and a triangle's edges; 0 for one end on."""
     planes = np.zeros((3, 3))
     for k in range(3):
         a, b, c = 3 * k, 3 * ((k + 1) % 3), 3 * ((k + 2) % 3)
@@ -236,18 +274,19 @@ def edge_planes(n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def rows_within(planes, ca, sa, slack, lowest, step, low, high):  # type: ignore[no-untyped-def]
-    """First and last of the rows ``low`` to ``high`` of a column that are no further than ``slack`` beyond a plane.
+def rows_within(planes, ca, sa, slack, grid, low, high):  # type: ignore[no-untyped-def]
+    """Return first and last of the rows ``low`` to ``high`` of a column that are at most ``slack`` beyond each plane.
 
-    ``ca`` and ``sa`` are the cosine and sine of the column's azimuth. Where none is, the first is above the last.
+    ``ca`` and ``sa`` are the cosine and sine of the column's azimuth. If there is none, the first is above the last.
     """
+    lowest, step = grid.lowest, grid.step
     bottom, top = lowest + step * low, lowest + step * high
     for k in range(3):
         across, up = planes[k, 0] * ca + planes[k, 1] * sa, planes[k, 2]
         size = np.sqrt(across * across + up * up)
         if size <= slack:
             continue
-        # across cos e + up sin e >= -slack holds about one elevation.
+        # The elevations e with across cos e + up sin e >= -slack form one interval.
         middle, half = np.arctan2(up, across), np.arccos(-slack / size)
         a, z = np.inf, -np.inf
         for turn in range(-1, 2):
@@ -263,7 +302,7 @@ def rows_within(planes, ca, sa, slack, lowest, step, low, high):  # type: ignore
 
 @njit(cache=True, nogil=True)
 def hide(shape, best, least):  # type: ignore[no-untyped-def]
-    """Leave nothing of rays that end nearer than the scanner sees: what is there hides what is behind it."""
+    """Turn hits below the least range into misses: a shape too near hides the shapes behind it."""
     for j in range(best.shape[0]):
         for k in range(best.shape[1]):
             if best[j, k] < least:
@@ -272,106 +311,88 @@ def hide(shape, best, least):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def thickness(kind, n):  # type: ignore[no-untyped-def]
-    """Return the width of a ball or bar, of which nothing may be seen but from its side; infinite of faces."""
-    if kind == 0:
+    """Return the diameter of a ball or bar, which may fall between two rays; infinite for faces."""
+    if kind == SPHERE:
         return 2.0 * n[3]
-    return 2.0 * max(n[6], n[7]) if kind == 1 else np.inf
+    return 2.0 * max(n[6], n[7]) if kind == CONE else np.inf
 
 
 @njit(cache=True, nogil=True)
-def cast_around(  # type: ignore[no-untyped-def]
-    kind,
-    numbers,
-    cuts,
-    cut_start,
-    owner,
-    centres,
-    radii,
-    boxes,
-    first,
-    width,
-    side,
-    columns,
-    lowest,
-    step,
-    jitter,
-    turned,
-    least,
-    most,
-    number,
-    angle,
-    offsets,
-    count,
-):
-    """Cast sub-rays about the rays numbered in ``number`` (width + 2 side, rows; -1 = none): (count, offsets) each."""
-    m = len(offsets)
+def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # type: ignore[no-untyped-def]
+    """Return shape and range (m, k) of sub-rays about m rays of a strip.
+
+    ``number`` (width + 2 side, rows) is a ray's row in the result, -1 for none. The sub-rays' directions differ from
+    the ray's by ``angle`` (m,) times ``offsets`` (k, 2).
+    """
+    boxes, first, width, side = strip  # in local variables, as the inner loops are faster with them
+    kind, numbers, cuts, cut_start = shapes
+    owner, centres, radii = pieces
+    jitter, largest_jitter, min_range, max_range = rays
+    count, m = len(angle), len(offsets)
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
-    farthest = np.full(count, np.inf)  # of a ray's sub-rays
+    farthest = np.full(count, np.inf)  # range of each ray's sub-rays
     broadest = angle.max() if count else 0.0
     rows = number.shape[1]
     level, rise = np.empty(rows), np.empty(rows)
     for i in range(rows):
-        level[i], rise[i] = np.cos(lowest + step * i), np.sin(lowest + step * i)
+        level[i], rise[i] = np.cos(grid.lowest + grid.step * i), np.sin(grid.lowest + grid.step * i)
     for b in range(len(boxes)):
         k = boxes[b, 0]
         i = owner[k]
         cx, cy, cz, r = centres[k, 0], centres[k, 1], centres[k, 2], radii[k]
         c2 = cx * cx + cy * cy + cz * cz
-        wide = kind[i] == 3 and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        wide = kind[i] == TRIANGLE and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
         if wide:
             planes = edge_planes(numbers[i])
         for column in range(max(boxes[b, 1], first), min(boxes[b, 2], first + width - 1) + 1):
             j = column - first + side
-            azimuth = 2.0 * np.pi * column / columns
+            azimuth = 2.0 * np.pi * column / grid.columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
             low, high = boxes[b, 3], boxes[b, 4]
             if wide:
-                low, high = rows_within(planes, ca, sa, turned + broadest, lowest, step, low, high)
+                low, high = rows_within(planes, ca, sa, largest_jitter + broadest, grid, low, high)
             for row in range(low, high + 1):
                 ray = number[j, row]
                 if ray < 0:
                     continue
-                da, de = jitter[j, row, 0], jitter[j, row, 1]
-                flat = level[row] - de * rise[row]
-                dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
+                dx, dy, dz = direction(ca, sa, level[row], rise[row], jitter[j, row, 0], jitter[j, row, 1])
                 along = dx * cx + dy * cy + dz * cz
-                near = r + angle[ray] * abs(along) + 1e-6 * r  # the beam's edge may touch what its middle passes by
+                near = r + angle[ray] * abs(along) + 1e-6 * r  # the beam's edge may touch what its middle misses
                 if along + r < 0.0 or along - r > farthest[ray] or c2 - along * along > near * near + 1e-9 * c2:
                     continue
                 changed = False
                 for o in range(m):
                     da = jitter[j, row, 0] + angle[ray] * offsets[o, 0]
                     de = jitter[j, row, 1] + angle[ray] * offsets[o, 1]
-                    flat = level[row] - de * rise[row]
-                    dx, dy, dz = flat * ca - da * sa, flat * sa + da * ca, rise[row] + de * level[row]
+                    dx, dy, dz = direction(ca, sa, level[row], rise[row], da, de)
                     t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
-                    if t <= most and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
+                    if t <= max_range and (t < best[ray, o] or (t == best[ray, o] and i < shape[ray, o])):
                         best[ray, o], shape[ray, o] = t, i
                         changed = True
                 if changed:
                     farthest[ray] = best[ray].max()
-    hide(shape, best, least)
+    hide(shape, best, min_range)
     return shape, best
 
 
 @njit(cache=True, nogil=True)
 def normals(kind, numbers, shape, points):  # type: ignore[no-untyped-def]
-    """Return unit normals (n, 3), of either sense, at points (n, 3) on shapes (n,)."""
+    """Return unit normals (n, 3), of either sign, at points (n, 3) on shapes (n,)."""
     result = np.empty((len(shape), 3))
     for k in range(len(shape)):
         n = numbers[shape[k]]
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
         what = kind[shape[k]]
-        if what == 0:
+        if what == SPHERE:
             nx, ny, nz = x - n[0], y - n[1], z - n[2]
-        elif what == 1:
-            # The gradient of the bowed cone's equation, by its derivative along each axis.
+        elif what == CONE:
+            # The gradient of the bowed cone's equation.
             length = np.sqrt(x * x + y * y + z * z)
             nx = cone_slope(n, x, y, z, 1.0, 0.0, 0.0, length)
             ny = cone_slope(n, x, y, z, 0.0, 1.0, 0.0, length)
             nz = cone_slope(n, x, y, z, 0.0, 0.0, 1.0, length)
-        elif what == 2:
+        elif what == DISC:
             nx, ny, nz = n[3], n[4], n[5]
         else:
             ax, ay, az = n[3] - n[0], n[4] - n[1], n[5] - n[2]

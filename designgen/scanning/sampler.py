@@ -1,4 +1,4 @@
-"""Points sampled from exact surfaces with isotropic noise, as papers do: no station, no occlusion."""
+"""Points sampled from exact surfaces with isotropic noise, as in the papers: no stations, no occlusion."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from designgen.checks import expect
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
-from designgen.scanning.surfaces import Bools, Patch
-from processor.model import SOURCES, Codes, Floats, Labels, UsageError
+from designgen.designs.patch import Bools, Patch, within_triangle
+from designgen.frames import perpendicular
+from processor.model import SOURCES, Codes, Floats, Labels
 
 MODE = "surface"
 OUTLIER = SOURCES.index("outlier")
@@ -18,41 +20,36 @@ OUTLIER = SOURCES.index("outlier")
 
 @dataclass(frozen=True)
 class Params:
-    """How a scene is scanned (mm). ``spacing_mm`` d means one point in d^2 on average."""
+    """How surfaces are sampled, mm: on average one point in an area of ``spacing_mm`` squared."""
 
     mode: str = MODE
     spacing_mm: float = 10.0
     sigma_mm: float = 1.0  # of each coordinate
-    outlier_share: float = 0.0  # of all points, anywhere in the part's box and a tenth around it
-    inner_depth_mm: float = 1000.0  # how far into an open end the inner faces are seen
-    member_reach_mm: float = 0.0  # frames: members are sampled this far from each ball; 0 = all along
+    outlier_share: float = 0.0  # of all points; uniform in the part's box enlarged by a tenth
+    inner_depth_mm: float = 1000.0  # depth from an open end to which inner faces are sampled
+    member_reach_mm: float = 0.0  # frames: members are sampled to this distance from each ball; 0 = over their length
 
     def __post_init__(self) -> None:
-        _expect(0.05 <= self.spacing_mm <= 1000.0, "spacing_mm", self.spacing_mm, "0.05 to 1000")
-        _expect(0.0 <= self.sigma_mm <= 1000.0, "sigma_mm", self.sigma_mm, "0 to 1000")
-        _expect(0.0 <= self.outlier_share < 1.0, "outlier_share", self.outlier_share, "0 to less than 1")
-        _expect(self.inner_depth_mm > 0.0, "inner_depth_mm", self.inner_depth_mm, "a length above 0")
-        _expect(self.member_reach_mm >= 0.0, "member_reach_mm", self.member_reach_mm, "0 or a length")
-
-
-def _expect(fits: bool, key: str, came: object, expected: str) -> None:
-    if not fits:
-        raise UsageError(f"scan.{key}: expected {expected}, got {came!r}")
+        expect(0.05 <= self.spacing_mm <= 1000.0, "scan.spacing_mm", self.spacing_mm, "0.05 to 1000")
+        expect(0.0 <= self.sigma_mm <= 1000.0, "scan.sigma_mm", self.sigma_mm, "0 to 1000")
+        expect(0.0 <= self.outlier_share < 1.0, "scan.outlier_share", self.outlier_share, "0 to less than 1")
+        expect(self.inner_depth_mm > 0.0, "scan.inner_depth_mm", self.inner_depth_mm, "a length above 0")
+        expect(self.member_reach_mm >= 0.0, "scan.member_reach_mm", self.member_reach_mm, "0 or a length")
 
 
 def spacing_mm(params: object) -> float:
-    """Return the spacing of a sampled scene; NaN for another, which has it point by point."""
+    """Return the spacing of a sampled scene, mm; NaN for a scene by rays, where it differs from point to point."""
     return params.spacing_mm if isinstance(params, Params) else float("nan")
 
 
 def sigma_mm(params: object) -> float:
-    """Return the noise of a sampled scene; NaN for another, which has it point by point."""
+    """Return the noise of a sampled scene, mm; NaN for a scene by rays, where it differs from point to point."""
     return params.sigma_mm if isinstance(params, Params) else float("nan")
 
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points (n, 3), the part each belongs to (-1 = none) and its source (a row of SOURCES)."""
+    """Points (n, 3), mm, with the part of each (-1 = none) and its source (a row of SOURCES)."""
 
     points: Floats
     part: Labels
@@ -60,14 +57,14 @@ class Cloud:
 
 
 def scan_part(part: arch_part.ArchPart, number: int, params: Params, rng: np.random.Generator) -> Cloud:
-    """Scan one arch part in the bridge's frame; its points are labelled with its number."""
+    """Sample one arch part in the bridge's frame; its points are labelled with its number."""
     faces = arch_part.faces(part, params.inner_depth_mm)
     points = np.vstack([_on_face(face, params.spacing_mm, rng) for face in faces])
     return _with_errors(points, np.full(len(points), number), params, rng)
 
 
 def scan_frame(frame: space_frame.Frame, params: Params, rng: np.random.Generator) -> Cloud:
-    """Scan a whole frame; points of a ball are labelled with its node, those of members with -1."""
+    """Sample a whole frame; points of a ball are labelled with its node, those of members with -1."""
     clouds, labels = [], []
     for node, centre in enumerate(frame.centres):
         ball = frame.ball(node)
@@ -77,9 +74,9 @@ def scan_frame(frame: space_frame.Frame, params: Params, rng: np.random.Generato
         clouds.append(centre + ball.radius_mm * unit)
         labels.append(np.full(len(unit), node))
     for member in range(len(frame.members)):
-        members = _member(frame, member, params, rng)
-        clouds.append(members)
-        labels.append(np.full(len(members), -1))
+        points = _on_member(frame, member, params, rng)
+        clouds.append(points)
+        labels.append(np.full(len(points), -1))
     return _with_errors(np.vstack(clouds), np.concatenate(labels), params, rng)
 
 
@@ -89,22 +86,21 @@ def scan_patches(
     rng: np.random.Generator,
     hidden: Callable[[int, Floats, Floats], Bools] | None = None,
 ) -> Cloud:
-    """Scan faces with their parts' numbers: uniform by the area of their nets, on the faces themselves.
+    """Sample faces with their parts' numbers: uniform by the area of their nets, on the faces themselves.
 
-    ``hidden`` says of a face's row and numbers p, q (n,) on it which places another body covers: they are left out.
+    ``hidden`` takes a face's row and parameters p, q (n,), and marks the places that another body covers. They get no
+    points.
     """
     clouds, labels = [], []
     for row, (part, patch) in enumerate(patches):
         knots, triangles = patch.net()
         a, b, c = (patch.at(knots[:, 0], knots[:, 1])[triangles[:, i]] for i in range(3))
         area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1)
-        if not area.sum() > 0.0:  # all of it is missing
+        if not area.sum() > 0.0:  # the whole face is missing
             continue
         count = rng.poisson(area.sum() / params.spacing_mm**2)
         chosen = triangles[rng.choice(len(area), count, p=area / area.sum())]
-        u, v = rng.random(count), rng.random(count)
-        over = u + v > 1.0
-        u, v = np.where(over, 1.0 - u, u), np.where(over, 1.0 - v, v)
+        u, v = within_triangle(rng.random(count), rng.random(count))
         pq = knots[chosen[:, 0]] + u[:, None] * (knots[chosen[:, 1]] - knots[chosen[:, 0]])
         pq += v[:, None] * (knots[chosen[:, 2]] - knots[chosen[:, 0]])
         if hidden is not None:
@@ -115,13 +111,13 @@ def scan_patches(
 
 
 def _on_face(face: Face, spacing_mm: float, rng: np.random.Generator) -> Floats:
-    """Points (n, 3) on a face, uniform by area: proposals in (p, q), kept in proportion to the area element."""
+    """Sample points (n, 3) on a face, uniform by area: proposals uniform in (p, q), accepted by the area element."""
     p, q = (grid.ravel() for grid in np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 5), indexing="ij"))
     highest = 1.001 * float(face.element(p, q).max())
     count = rng.poisson(highest / spacing_mm**2)
     p, q = rng.uniform(size=count), rng.uniform(size=count)
-    kept = (rng.uniform(size=count) * highest < face.element(p, q)) & face.kept(p, q)
-    return face.at(p[kept], q[kept])
+    accepted = (rng.uniform(size=count) * highest < face.element(p, q)) & face.present(p, q)
+    return face.at(p[accepted], q[accepted])
 
 
 def _unit_vectors(count: int, rng: np.random.Generator) -> Floats:
@@ -131,13 +127,12 @@ def _unit_vectors(count: int, rng: np.random.Generator) -> Floats:
     return np.stack([rho * np.cos(angle), rho * np.sin(angle), z], axis=1)
 
 
-def _member(frame: space_frame.Frame, member: int, params: Params, rng: np.random.Generator) -> Floats:
-    """Sleeves, cones and tube of a member, as surfaces of revolution (the sleeve hexagonal) about its axis."""
+def _on_member(frame: space_frame.Frame, member: int, params: Params, rng: np.random.Generator) -> Floats:
+    """Sample a member's sleeves, cones and tube."""
     joined, (a, b) = frame.connection, frame.ends(member)
     length = float(np.linalg.norm(b - a))
     unit = (b - a) / length
-    side = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit))])
-    side /= np.linalg.norm(side)
+    side = perpendicular(unit)
     basis = np.stack([side, np.cross(unit, side), unit])
     reach = params.member_reach_mm or length
     tube = 0.5 * joined.tube_diameter
@@ -146,40 +141,44 @@ def _member(frame: space_frame.Frame, member: int, params: Params, rng: np.rando
         for node in frame.members[member]
     ]
 
-    def bowed(cloud: Floats) -> Floats:
+    def on_tube(low: float, high: float) -> Floats:
+        cloud = _on_cone((tube, tube), (low, high), params.spacing_mm, rng)
         q = (cloud[:, 2] - ends[0]) / (length - sum(ends))
-        moved: Floats = cloud @ basis + np.outer(4.0 * q * (1.0 - q), frame.bow(member))
-        return moved
+        bowed: Floats = a + (cloud @ basis + np.outer(4.0 * q * (1.0 - q), frame.bow(member)))
+        return bowed
 
-    found = []
+    points = []
     for end, (origin, sign) in enumerate(((a, 1.0), (b, -1.0))):
         tip = ends[end] - joined.cone_length
         axial = basis * np.array([[1.0], [1.0], [sign]])
-        near = [_cone(joined.sleeve_corner_radius + 3.0, tube, tip, ends[end], params.spacing_mm, rng)]
+        widest = joined.sleeve_corner_radius + 3.0
+        near = [_on_cone((widest, tube), (tip, ends[end]), params.spacing_mm, rng)]
         if frame.has_sleeve(member, end):
-            near.append(_prism(joined.sleeve_corner_radius, tip - joined.sleeve_length, tip, params.spacing_mm, rng))
-        found += [origin + cloud @ axial for cloud in near]
+            bounds = (tip - joined.sleeve_length, tip)
+            near.append(_on_prism(joined.sleeve_corner_radius, bounds, params.spacing_mm, rng))
+        points += [origin + cloud @ axial for cloud in near]
         if ends[end] < reach < 0.5 * length:
-            low, high = (ends[0], reach) if end == 0 else (length - reach, length - ends[1])
-            found.append(a + bowed(_cone(tube, tube, low, high, params.spacing_mm, rng)))
+            points.append(on_tube(ends[0], reach) if end == 0 else on_tube(length - reach, length - ends[1]))
     if reach >= 0.5 * length:
-        found.append(a + bowed(_cone(tube, tube, ends[0], length - ends[1], params.spacing_mm, rng)))
-    return np.vstack(found)
+        points.append(on_tube(ends[0], length - ends[1]))
+    return np.vstack(points)
 
 
-def _cone(r0: float, r1: float, z0: float, z1: float, spacing_mm: float, rng: np.random.Generator) -> Floats:
-    """Points on a cone or cylinder about z, uniform by area."""
+def _on_cone(radii: tuple[float, float], z: tuple[float, float], spacing_mm: float, rng: np.random.Generator) -> Floats:
+    """Sample points (n, 3) on a cone or cylinder about z, uniform by area; radii at both ends z."""
+    (r0, r1), (z0, z1) = radii, z
     slant = np.hypot(z1 - z0, r1 - r0)
     count = rng.poisson(np.pi * (r0 + r1) * slant / spacing_mm**2)
     t = rng.uniform(size=count)
-    if r0 != r1:  # the share of the area up to t is that of r^2
+    if r0 != r1:  # the area up to t is proportional to r^2 - r0^2
         t = (np.sqrt(r0 * r0 + t * (r1 * r1 - r0 * r0)) - r0) / (r1 - r0)
     r, angle = r0 + t * (r1 - r0), rng.uniform(0.0, 2.0 * np.pi, count)
     return np.stack([r * np.cos(angle), r * np.sin(angle), z0 + t * (z1 - z0)], axis=1)
 
 
-def _prism(corner_radius: float, z0: float, z1: float, spacing_mm: float, rng: np.random.Generator) -> Floats:
-    """Points on the six sides of a hexagonal prism about z (a hexagon's side is its corner radius)."""
+def _on_prism(corner_radius: float, z: tuple[float, float], spacing_mm: float, rng: np.random.Generator) -> Floats:
+    """Sample points (n, 3) on the sides of a hexagonal prism about z (a side is as long as the corner radius)."""
+    z0, z1 = z
     count = rng.poisson(6.0 * corner_radius * (z1 - z0) / spacing_mm**2)
     side, q = rng.integers(0, 6, count), rng.uniform(-0.5, 0.5, count) * corner_radius
     apothem = corner_radius * np.sqrt(0.75)
@@ -190,7 +189,7 @@ def _prism(corner_radius: float, z0: float, z1: float, spacing_mm: float, rng: n
 
 
 def _with_errors(points: Floats, part: Labels, params: Params, rng: np.random.Generator) -> Cloud:
-    """Add noise to every coordinate, and outliers after the points."""
+    """Return the points with noise in every coordinate, followed by outliers."""
     low, high = points.min(axis=0), points.max(axis=0)
     if params.sigma_mm > 0.0:
         points = points + params.sigma_mm * rng.standard_normal(points.shape)

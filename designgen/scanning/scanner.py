@@ -1,11 +1,11 @@
-"""A terrestrial laser scanner: its classes, its numbers, and how a recipe asks for scans by rays.
+"""A terrestrial laser scanner: its classes and numbers, and the parameters of scans by rays.
 
-Noise runs along the ray. A range R has the variance
+Noise is along the ray. The variance of a range R is
 
     noise_mm^2 + (noise_ppm R)^2 + (noise_signal_mm signal^signal_power)^2 + (footprint_share w tan(incidence))^2
 
-with the signal relative to a white matt surface seen square on at 10 m, and w the radius of the beam where it falls.
-What the device does with a ray is told in :mod:`designgen.scanning.returns`.
+The signal is relative to that of a white matt surface at normal incidence and 10 m; w is the beam's radius at R.
+The returns of a ray are modelled in :mod:`designgen.scanning.returns`.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from designgen.checks import expect
 from processor.model import Floats, UsageError
 
 if sys.version_info >= (3, 11):
@@ -26,15 +27,17 @@ else:
     import tomli as tomllib
 
 MODE = "rays"
-SIGNAL_RANGE_MM = 10_000.0  # where the signal is 1
-SPECULAR_POWER = 30.0  # of the cosine, for the mirror-like part of a reflection
+SIGNAL_RANGE_MM = 10_000.0  # range at which the signal is 1
+# Sub-rays of a beam, by their number: rings of (radius in radii of the beam, number of sub-rays) about its middle.
+BEAM_RINGS: dict[int, list[tuple[float, int]]] = {1: [], 7: [(0.7, 6)], 19: [(0.45, 6), (0.9, 12)]}
+SPECULAR_POWER = 30.0  # of the cosine, in the specular part of a reflection
 
 
 @dataclass(frozen=True)
 class Scanner:
-    """A class of scanner, see scanners.toml; ``offset_mm`` to ``tilt_urad`` are standard deviations of stations."""
+    """A class of scanner, see scanners.toml; ``offset_mm`` to ``tilt_urad`` are standard deviations over stations."""
 
-    behaviour: str = "phase"  # phase: a mixed pixel's range is the mean by energy; pulse: that of its strongest echo
+    behaviour: str = "phase"  # range of a mixed pixel: phase: mean weighted by energy; pulse: of the strongest echo
     noise_mm: float = 0.25
     noise_ppm: float = 5.0
     noise_signal_mm: float = 0.2
@@ -43,7 +46,7 @@ class Scanner:
     beam_exit_mm: float = 3.5
     divergence_mrad: float = 0.3
     footprint_share: float = 0.1
-    separation_mm: float = 0.0  # pulse: echoes closer than this are one
+    separation_mm: float = 0.0  # pulse: echoes closer than this merge
     min_range_mm: float = 400.0
     max_range_mm: float = 80_000.0
     threshold: float = 0.0005
@@ -53,21 +56,20 @@ class Scanner:
     tilt_urad: float = 15.0
 
     def __post_init__(self) -> None:
-        if self.behaviour not in ("phase", "pulse"):
-            raise UsageError(f"scanner.behaviour: expected phase or pulse, got {self.behaviour!r}")
+        expect(self.behaviour in ("phase", "pulse"), "scanner.behaviour", self.behaviour, "phase or pulse")
         for key in self.__dataclass_fields__:
-            if key not in ("behaviour", "signal_power") and getattr(self, key) < 0.0:
-                raise UsageError(f"scanner.{key}: expected 0 or more, got {getattr(self, key)!r}")
-        if not self.max_range_mm > self.min_range_mm:
-            raise UsageError(f"scanner.max_range_mm: expected more than min_range_mm, got {self.max_range_mm!r}")
+            if key not in ("behaviour", "signal_power"):
+                expect(getattr(self, key) >= 0.0, f"scanner.{key}", getattr(self, key), "0 or more")
+        further = self.max_range_mm > self.min_range_mm
+        expect(further, "scanner.max_range_mm", self.max_range_mm, "more than min_range_mm")
 
     def beam_angle(self, R: Floats) -> Floats:
-        """Return the angle (n,) of the beam's radius at ranges R (n,), rad."""
-        found: Floats = 0.5 * (1e-3 * self.divergence_mrad + self.beam_exit_mm / R)
-        return found
+        """Return the angle (n,) subtended by the beam's radius at ranges R (n,), rad."""
+        angle: Floats = 0.5 * (1e-3 * self.divergence_mrad + self.beam_exit_mm / R)
+        return angle
 
     def noise(self, R: Floats, signal: Floats, tangent: Floats) -> Floats:
-        """Return the standard deviation (n,) of ranges R (n,), mm, by signal and tangent of incidence."""
+        """Return the standard deviation (n,) of ranges R (n,), mm, by signal and tangent of the angle of incidence."""
         by_signal = self.noise_signal_mm * np.maximum(signal, 1e-12) ** self.signal_power
         spread = self.footprint_share * self.beam_angle(R) * R * tangent
         result: Floats = np.sqrt(self.noise_mm**2 + (self.noise_ppm * 1e-6 * R) ** 2 + by_signal**2 + spread**2)
@@ -75,15 +77,14 @@ class Scanner:
 
 
 def presets() -> dict[str, dict[str, Any]]:
-    """Return the classes of scanners by name, with what they are and where their numbers come from."""
-    found: dict[str, dict[str, Any]] = tomllib.loads(
-        (resources.files("designgen") / "scanners.toml").read_text("utf-8")
-    )
-    return found
+    """Return the classes of scanners in scanners.toml by name, with their descriptions and sources."""
+    classes: dict[str, dict[str, Any]]
+    classes = tomllib.loads((resources.files("designgen") / "scanners.toml").read_text("utf-8"))
+    return classes
 
 
 def preset(name: str) -> dict[str, Any]:
-    """Return the numbers of one class of scanner. UsageError names the classes there are."""
+    """Return the numbers of a class of scanner; UsageError for an unknown one."""
     known = presets()
     if name not in known:
         raise UsageError(f"scan.scanner: expected one of {', '.join(known)}, got {name!r}")
@@ -92,50 +93,46 @@ def preset(name: str) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Params:
-    """How stations scan a scene. The stations' places follow from the kind of scene."""
+    """How stations scan a scene; their places depend on the kind of scene."""
 
     mode: str = MODE
     scanner: str = "phase"
     step_mrad: float = 0.6
     sub_rays: int = 7
     reflectance: float = 0.5
-    specular: float = 0.3  # share of the reflection that is mirror-like, as on bare steel; 0 = matt
-    stations: tuple[int, ...] = (2, 2)  # two numbers: a grid below a frame; one: places that stay as more are added
+    specular: float = 0.3  # specular fraction of the reflection, as on bare steel; 0 = matt
+    stations: tuple[int, ...] = (2, 2)  # two: a grid below a frame; one: a sequence of which any length is a start
     distance_mm: float = 5_000.0  # of the stations from a part's surface
     height_mm: float = 1_600.0  # of the scanner above the ground
-    clutter: int = 0  # things in the way that are no part of the structure; poles go round the stations
-    registration_mm: float = 0.0  # standard deviation of each axis of a station's registered position
+    clutter: int = 0  # number of objects that are no part of the structure
+    registration_mm: float = 0.0  # standard deviation of a station's registered position along each axis
     registration_mrad: float = 0.0  # and of its attitude about each axis
-    registered: bool = True  # structures: whether the scans come with poses
-    repeated: int = 0  # structures: so many stations scan more than once, with a new heading
-    scans_at_first: int = 2  # how often
+    registered: bool = True  # structures: whether the scans have poses
+    repeated: int = 0  # structures: number of stations that scan more than once, each time with a new heading
+    scans_at_first: int = 2  # scans at each repeated station
     merged: bool = False  # one cloud in the project's frame instead of a scan a station
-    origin_mm: tuple[float, ...] = (0.0, 0.0, 0.0)  # of the scene in the project's coordinates: georeferenced
+    origin_mm: tuple[float, ...] = (0.0, 0.0, 0.0)  # of the scene in project coordinates, e.g. georeferenced
 
     def __post_init__(self) -> None:
-        _expect(0.05 <= self.step_mrad <= 50.0, "step_mrad", self.step_mrad, "0.05 to 50")
-        _expect(self.sub_rays in (1, 7, 19), "sub_rays", self.sub_rays, "1, 7 or 19")
-        _expect(0.0 < self.reflectance <= 1.0, "reflectance", self.reflectance, "above 0 to 1")
-        _expect(0.0 <= self.specular < 1.0, "specular", self.specular, "0 to less than 1")
-        _expect(all(n >= 1 for n in self.stations), "stations", list(self.stations), "one number or two, from 1")
-        _expect(len(self.stations) in (1, 2), "stations", list(self.stations), "one number or two")
-        _expect(len(self.origin_mm) == 3, "origin_mm", list(self.origin_mm), "three numbers")
-        _expect(self.scans_at_first >= 1, "scans_at_first", self.scans_at_first, "1 or more")
-        for key in ("distance_mm", "height_mm", "clutter", "registration_mm", "registration_mrad", "repeated"):
-            _expect(getattr(self, key) >= 0, key, getattr(self, key), "0 or more")
-        count = math.prod(self.stations)
-        _expect(self.repeated <= count, "repeated", self.repeated, f"no more than the {count} stations")
-        _expect(
-            self.registered or not self.merged, "merged", True, "false with registered = false: a cloud needs poses"
-        )
+        count, posed = math.prod(self.stations), self.registered or not self.merged
+        nonnegative = ("distance_mm", "height_mm", "clutter", "registration_mm", "registration_mrad", "repeated")
+        for fits, key, value, expected in (
+            (0.05 <= self.step_mrad <= 50.0, "step_mrad", self.step_mrad, "0.05 to 50"),
+            (self.sub_rays in BEAM_RINGS, "sub_rays", self.sub_rays, "1, 7 or 19"),
+            (0.0 < self.reflectance <= 1.0, "reflectance", self.reflectance, "above 0 to 1"),
+            (0.0 <= self.specular < 1.0, "specular", self.specular, "0 to less than 1"),
+            (all(n >= 1 for n in self.stations), "stations", list(self.stations), "one number or two, from 1"),
+            (len(self.stations) in (1, 2), "stations", list(self.stations), "one number or two"),
+            (len(self.origin_mm) == 3, "origin_mm", list(self.origin_mm), "three numbers"),
+            (self.scans_at_first >= 1, "scans_at_first", self.scans_at_first, "1 or more"),
+            *((getattr(self, key) >= 0, key, getattr(self, key), "0 or more") for key in nonnegative),
+            (self.repeated <= count, "repeated", self.repeated, f"no more than the {count} stations"),
+            (posed, "merged", True, "false with registered = false: a cloud needs poses"),
+        ):
+            expect(fits, f"scan.{key}", value, expected)
 
     def signal(self, cosine: Floats, R: Floats) -> Floats:
-        """Return the signal (n,) of a whole beam by the cosine of incidence and the range."""
+        """Return the signal (n,) of a whole beam by the cosine of the angle of incidence and the range, mm."""
         reflected = (1.0 - self.specular) * cosine + 4.0 * self.specular * cosine**SPECULAR_POWER
-        found: Floats = self.reflectance * reflected * (SIGNAL_RANGE_MM / R) ** 2
-        return found
-
-
-def _expect(fits: bool, key: str, came: object, expected: str) -> None:
-    if not fits:
-        raise UsageError(f"scan.{key}: expected {expected}, got {came!r}")
+        signal: Floats = self.reflectance * reflected * (SIGNAL_RANGE_MM / R) ** 2
+        return signal

@@ -1,20 +1,23 @@
-"""Scenes of arch bridges: parts as designed or as built, each scanned in a frame of its own."""
+"""Scenes of arch bridges: parts as designed or as built, each scanned in a separate frame."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from designgen.asbuilt import imperfections
 from designgen.designs import arch_bridge, arch_mesh, arch_part
-from designgen.randomness import generator, random_pose, rigid
+from designgen.designs.patch import Surface
+from designgen.frames import rigid
+from designgen.randomness import generator, random_pose
 from designgen.reading import filled
 from designgen.scanning import clutter, sampler, survey
 from designgen.scanning.modes import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
+from designgen.scenes import MADE_IN_MM
 from processor.model import (
     ArchDesign,
     ArchTruth,
@@ -28,12 +31,11 @@ from processor.model import (
     Truth,
 )
 
-MADE_IN_MM = "made in millimetres"
-EDGE_POINTS = 501  # of each bottom edge in the truth
+EDGE_POINTS = 501  # on each bottom edge in the truth
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
-    """Make the scene of an arch bridge, a scan a part in a frame of its own, and its truth."""
+    """Make the scene of an arch bridge, a scan of each part in a separate frame, and its truth."""
     parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
     errors = filled(imperfections.ArchParams, recipe, "asbuilt")
     ledger = imperfections.Ledger()
@@ -42,20 +44,20 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         built = imperfections.arch(parts, errors, [generator(seed, f"built {part.name}") for part in parts], ledger)
     grown = imperfections.expansion(errors.temperature_C)
     part_names = tuple(part.name for part in parts)
-    scans, labels, poses, key_bridge, key_scan, edges = [], [], [], [], [], []
+    scans, labels, poses, key_bridge, key_scan = [], [], [], [], []
     stations: Stations | None = None
     station_truth: list[StationTruth] = []
     for number, part in enumerate(built):
         T_scan_bridge = random_pose(generator(seed, f"pose {part.name}"))
         R, t = T_scan_bridge[:3, :3], T_scan_bridge[:3, 3]
-        # The steel grows about the origin of its scan: p_scan = grown (R p_bridge + t).
+        # The steel expands about the origin of its scan: p_scan = grown (R p_bridge + t).
         T_scan_grown = rigid(R, grown * t)
         if isinstance(scanning, ByRays):
-            found = _survey_part(part, number, part_names, grown, scanning, seed)
-            scan, label = survey.merged(found, part.name, T_scan_grown, len(stations.ids) if stations else 0, part.name)
-            ids, seen_from = found.truth.ids, T_scan_grown @ found.registered
-            stations = survey.with_stations(stations, ids, seen_from)
-            truth = found.truth
+            surveyed = _survey_part(part, number, part_names, grown, scanning, seed)
+            first_station = len(stations.ids) if stations else 0
+            scan, label = survey.merged(surveyed, part.name, T_scan_grown, first_station, part.name)
+            truth = surveyed.truth
+            stations = survey.with_stations(stations, truth.ids, T_scan_grown @ surveyed.registered)
             station_truth.append(dataclasses.replace(truth, T_project_station=T_scan_grown @ truth.T_project_station))
         else:
             cloud = sampler.scan_part(part, number, scanning, generator(seed, f"scan {part.name}"))
@@ -67,28 +69,21 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         poses.append(rigid(R.T, -R.T @ t))
         ends = np.array([_end_points(part, "start", part.s0), _end_points(part, "end", part.s1)])
         key_bridge.append(ends)
-        edges.append(_bottom_edges(part))
         key_scan.append(grown * (ends @ R.T + t))
-    design = ArchDesign(
-        tuple(_design_part(part) for part in parts),
-        tuple(f"J{j + 1}" for j in range(len(parts) - 1)),
-        part_names[:-1],
-        part_names[1:],
-        np.array([part.key_points(part.s1) for part in parts[:-1]]),
-    )
     scene = Scene(
         name,
         "arch-bridge",
         tuple(scans),
-        arch=design,
+        arch=_design(parts),
         stations=stations,
         temperature_C=imperfections.stated(errors.temperature_C),
         units="mm",
         units_reason=MADE_IN_MM,
     )
+    edges = np.array([_bottom_edges(part) for part in built])
     return scene, Truth(
         tuple(labels),
-        arch=ArchTruth(part_names, np.array(poses), np.array(key_scan), np.array(key_bridge), np.array(edges)),
+        arch=ArchTruth(part_names, np.array(poses), np.array(key_scan), np.array(key_bridge), edges),
         stations=survey.joined_truth(station_truth),
         as_built=ledger.record() if "asbuilt" in recipe else None,
         spacing_mm=sampler.spacing_mm(scanning),
@@ -99,7 +94,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
 def _survey_part(
     part: arch_part.ArchPart, number: int, part_names: tuple[str, ...], grown: float, scanning: ByRays, seed: int
 ) -> survey.Survey:
-    """Scan one part, larger by ``grown``, from stations all around it, in the bridge's frame."""
+    """Scan one part, enlarged by ``grown``, from stations around it, in the bridge's frame."""
     params = scanning.params
     builder = Builder()
     for patch in arch_part.ray_patches(part):
@@ -119,7 +114,7 @@ def _survey_part(
     return survey.survey(builder.done(), part_names, poses, scanning.device, params, seed)
 
 
-def _scaled(at: Callable[[Floats, Floats], Floats], factor: float) -> Callable[[Floats, Floats], Floats]:
+def _scaled(at: Surface, factor: float) -> Surface:
     return at if factor == 1.0 else lambda p, q: factor * at(p, q)
 
 
@@ -128,10 +123,16 @@ def _end_points(part: arch_part.ArchPart, end: str, s: float) -> Floats:
 
 
 def _bottom_edges(part: arch_part.ArchPart) -> Floats:
-    """Points (2, EDGE_POINTS, 3) along the left and right bottom edges as built."""
+    """Return points (2, EDGE_POINTS, 3) along the left and right bottom edges as built."""
     s = np.linspace(part.s0, part.s1, EDGE_POINTS)
     return np.array([part.point(s, side * part.b(s), np.zeros_like(s)) for side in (1.0, -1.0)])
 
 
-def _design_part(part: arch_part.ArchPart) -> DesignPart:
-    return DesignPart(part.name, *arch_mesh.triangulate(part), *part.bottom_edges())
+def _design(parts: tuple[arch_part.ArchPart, ...]) -> ArchDesign:
+    return ArchDesign(
+        tuple(DesignPart(part.name, *arch_mesh.triangulate(part), *part.bottom_edges()) for part in parts),
+        tuple(f"J{j + 1}" for j in range(len(parts) - 1)),
+        tuple(part.name for part in parts[:-1]),
+        tuple(part.name for part in parts[1:]),
+        np.array([part.key_points(part.s1) for part in parts[:-1]]),
+    )

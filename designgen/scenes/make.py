@@ -1,9 +1,11 @@
-"""From a recipe to a scene and its truth."""
+"""Make the scene of a recipe and its truth."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
+
+from threadpoolctl import threadpool_limits
 
 from designgen.scanning import modes
 from designgen.scenes import arch_bridge, space_frame, structure
@@ -14,13 +16,14 @@ MAKERS = {
     "space-frame": ("frame", space_frame.make),
     "structure": ("structure", structure.make),
 }
-EXTRA = {"structure": {"picks"}}  # sections that one kind alone has
+EXTRA = {"structure": {"picks"}}  # sections of one kind only
 
 
 def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple[Scene, Truth]:
-    """Make the scene of a recipe and its truth; ``seed`` replaces the recipe's own.
+    """Make the scene of a recipe and its truth; ``seed`` replaces that of the recipe.
 
-    Raises UsageError that names the key for an unknown kind or key, a wrong type or an impossible size.
+    The result depends on the recipe and seed, not on time, host or number of threads. Raises UsageError that names the
+    key for an unknown kind or key, a wrong type or an impossible size.
     """
     kind = recipe.get("kind")
     if kind not in MAKERS:
@@ -32,4 +35,6 @@ def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple
     used = recipe.get("seed", 0) if seed is None else seed
     if not isinstance(used, int) or isinstance(used, bool) or used < 0:
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")
-    return maker(name, recipe, modes.read(recipe), used)
+    # The number of BLAS threads changes the order of its sums, and with it the last bits.
+    with threadpool_limits(1, user_api="blas"):
+        return maker(name, recipe, modes.read(recipe), used)

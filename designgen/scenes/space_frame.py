@@ -1,4 +1,4 @@
-"""Scenes of space frames: bolt balls and members as designed or as built, scanned whole."""
+"""Scenes of space frames: bolt balls and members as designed or as built, scanned as a whole."""
 
 from __future__ import annotations
 
@@ -14,9 +14,8 @@ from designgen.reading import filled
 from designgen.scanning import clutter, frame_surfaces, sampler, survey
 from designgen.scanning.modes import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
+from designgen.scenes import MADE_IN_MM
 from processor.model import FrameDesign, FrameTruth, PointLabels, Scan, Scene, Truth
-
-MADE_IN_MM = "made in millimetres"
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
@@ -36,16 +35,21 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         frame_surfaces.add_frame(builder, built)
         low, high = built.centres.min(axis=0), built.centres.max(axis=0)
         clutter.add_below_roof(builder, low, high, params.clutter, generator(seed, "clutter"))
-        found = survey.survey(
-            builder.done(), names, survey.below(low, high, params, seed), scanning.device, params, seed
-        )
-        scans, labels, stations, station_truth = survey.in_project(found, origin, params.merged)
+        poses = survey.below(low, high, params, seed)
+        surveyed = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
+        scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
     else:
         cloud = sampler.scan_frame(built, scanning, generator(seed, "scan"))
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
         labels = (PointLabels("scan", names, cloud.part, cloud.source),)
-    diameters = np.full(len(frame.members), frame.connection.tube_diameter)
-    design = FrameDesign(ids, frame.centres + origin, frame.radii, frame.members[:, 0], frame.members[:, 1], diameters)
+    design = FrameDesign(
+        ids=ids,
+        centres=frame.centres + origin,
+        radii=frame.radii,
+        member_a=frame.members[:, 0],
+        member_b=frame.members[:, 1],
+        tube_diameters=np.full(len(frame.members), frame.connection.tube_diameter),
+    )
     lowest = built.centres - built.radii[:, None] * np.array([0.0, 0.0, 1.0])
     scene = Scene(
         name,

@@ -1,4 +1,4 @@
-"""Scenes of whole structures: roofs that moved, truss bridges to be stitched, plates and girders with defects."""
+"""Scenes of whole structures: displaced roofs, truss bridges in separate scans, plates and girders with defects."""
 
 from __future__ import annotations
 
@@ -8,15 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from designgen import sequences
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
-from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
+from designgen.designs import plate_row, structure, structure_types
+from designgen.designs.patch import Bools, Displacement, Patch
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import clutter, picking, sampler, scanner, survey
 from designgen.scanning.modes import ByRays, Scanning
-from designgen.scanning.surfaces import Bools, Builder, Patch
+from designgen.scanning.surfaces import Builder
+from designgen.scenes import MADE_IN_MM
+from designgen.sequences import van_der_corput
 from processor.model import (
     AsBuilt,
     DefectTruth,
@@ -33,31 +35,17 @@ from processor.model import (
 )
 
 TRUTH_STEP_MM = 250.0
-Surface = Callable[[Floats, Floats], Floats]
 Components = tuple[structure.Component, ...]
-Built = tuple[list[tuple[int, Patch]], Callable[[Floats], Floats] | None, DefectTruth | None]
-
-
-def design(recipe: Mapping[str, Any]) -> tuple[structure.Component, ...]:
-    """Return the components of a structure's recipe as designed."""
-    section = dict(recipe.get("structure", {}))
-    builders: dict[Any, Callable[[], tuple[structure.Component, ...]]] = {
-        "stadium-roof": lambda: stadium_roof.build(filled(stadium_roof.Params, {"structure": section}, "structure")),
-        "truss-bridge": lambda: truss_bridge.build(filled(truss_bridge.Params, {"structure": section}, "structure")),
-        "plate-row": lambda: plate_row.build(filled(plate_row.Params, {"structure": section}, "structure")),
-    }
-    kind = section.pop("type", None)
-    if kind not in builders:
-        raise UsageError(f"structure.type: expected one of {', '.join(builders)}, got {kind!r}")
-    return builders[kind]()
+PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
+Built = tuple[PartPatches, Displacement | None, DefectTruth | None]
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
-    """Make a structure's scene; ``structure.type`` says which: stadium-roof, truss-bridge or plate-row."""
-    components = design(recipe)
+    """Make the scene of a structure of type ``structure.type``: stadium-roof, truss-bridge or plate-row."""
+    components = structure_types.design(recipe)
     kind = recipe["structure"]["type"]
-    patches, move, defects = BUILDERS[kind](components, recipe, seed)
-    names = tuple(one.name for one in components)
+    patches, displacement, defects = BUILDERS[kind](components, recipe, seed)
+    names = tuple(component.name for component in components)
     stations, station_truth, picks = None, None, None
     origin = np.zeros(3)
     if isinstance(scanning, ByRays):
@@ -68,8 +56,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
             builder.patch(part, patch)
         poses = _places(kind, patches, params, seed)
         _add_poles(builder, poses, patches, params.clutter, seed)
-        found = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
-        scans, labels, stations, station_truth = survey.in_project(found, origin, params.merged)
+        surveyed = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
+        scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
         picks = _picks(recipe, scans, station_truth, seed)
         if not params.registered:
             scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
@@ -77,7 +65,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     else:
         if "picks" in recipe:
             raise UsageError('picks: points are picked in scans by rays; set scan.mode = "rays"')
-        # Where bodies meet, one hides the other: told by the design, as the movement is smooth. Plates only touch.
+        # Overlapping bodies cover each other, as built where they do as designed: displacements are smooth. Plates of a
+        # row only touch.
         hidden = None if kind == "plate-row" else _hidden(components)
         cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"), hidden)
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
@@ -89,13 +78,13 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         scans,
         stations=stations,
         units="mm",
-        units_reason="made in millimetres",
+        units_reason=MADE_IN_MM,
         structure=StructureDesign(kind, vertices + origin, faces),
         picks=picks,
     )
     return scene, Truth(
         labels,
-        structure=_truth(components, move, origin),
+        structure=_truth(components, displacement, origin),
         defects=defects and dataclasses.replace(defects, centres=defects.centres + origin),
         stations=station_truth,
         as_built=_ledger(kind, recipe),
@@ -117,13 +106,13 @@ def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth
 def _stadium(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
     if "asbuilt" not in recipe:
         return _as_designed(components), None, None
-    move = asbuilt_defects.movement(filled(asbuilt_defects.MovementParams, recipe, "asbuilt"), components)
-    moved = [(part, dataclasses.replace(patch, at=_moved(patch.at, move))) for part, patch in _as_designed(components)]
-    return moved, move, None
+    displacement = asbuilt_defects.movement(filled(asbuilt_defects.MovementParams, recipe, "asbuilt"), components)
+    built = [(part, patch.displaced(displacement)) for part, patch in _as_designed(components)]
+    return built, displacement, None
 
 
 def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
-    """Return how a roof moved; what is wrong with plates and girders is in the truth of their defects."""
+    """Return the displacement of a roof; defects of plates and girders are in the truth of defects instead."""
     ledger = imperfections.Ledger()
     if kind == "stadium-roof" and "asbuilt" in recipe:
         params = filled(asbuilt_defects.MovementParams, recipe, "asbuilt")
@@ -134,15 +123,6 @@ def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
     return ledger.record()
 
 
-def _moved(at: Surface, move: asbuilt_defects.Displacement) -> Surface:
-    def where(p: Floats, q: Floats) -> Floats:
-        points = at(p, q)
-        found: Floats = points + move(points)
-        return found
-
-    return where
-
-
 def _truss(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
     if "asbuilt" in recipe:
         raise UsageError("asbuilt: a truss-bridge is built as designed; leave the section asbuilt out")
@@ -150,27 +130,26 @@ def _truss(components: Components, recipe: Mapping[str, Any], seed: int) -> Buil
 
 
 def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
-    section = {key: value for key, value in recipe["structure"].items() if key != "type"}
-    form = filled(plate_row.Params, {"structure": section}, "structure")
+    form = structure_types.params(recipe)
     sizes = filled(asbuilt_defects.Params, recipe, "asbuilt")
-    patches: list[tuple[int, Patch]] = []
-    found: list[tuple[plate_row.Place, asbuilt_defects.Defect]] = []
+    patches: PartPatches = []
+    placed: list[tuple[plate_row.Place, asbuilt_defects.Defect]] = []
     for part, place in enumerate(plate_row.places(form)):
         if place.defect == "none":
             patches += [(part, patch) for patch in components[part].patches]
             continue
         defect = asbuilt_defects.draw(place.defect, sizes, form, generator(seed, f"defect {place.name}"), place.name)
         patches += [(part, patch) for patch in asbuilt_defects.damaged(place, plate_row.bodies(form, place), defect)]
-        found.append((place, defect))
-    centres = [place.origin + np.array([*defect.place, 0.0]) @ plate_row.AXES for place, defect in found]
+        placed.append((place, defect))
+    centres = [place.origin + np.array([*defect.place, 0.0]) @ plate_row.AXES for place, defect in placed]
     truth = DefectTruth(
-        np.arange(len(found)),
-        tuple(defect.kind for _, defect in found),
-        tuple(place.name for place, _ in found),
-        np.array(centres).reshape(-1, 3),
-        np.array([defect.area_mm2 for _, defect in found]),
-        np.array([defect.depth_max_mm for _, defect in found]),
-        np.array([defect.volume_mm3 for _, defect in found]),
+        ids=np.arange(len(placed)),
+        classes=tuple(defect.kind for _, defect in placed),
+        components=tuple(place.name for place, _ in placed),
+        centres=np.array(centres).reshape(-1, 3),
+        area_mm2=np.array([defect.area_mm2 for _, defect in placed]),
+        depth_max_mm=np.array([defect.depth_max_mm for _, defect in placed]),
+        volume_mm3=np.array([defect.volume_mm3 for _, defect in placed]),
     )
     return patches, None, truth
 
@@ -178,21 +157,21 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
 BUILDERS = {"stadium-roof": _stadium, "truss-bridge": _truss, "plate-row": _plates}
 
 
-def _as_designed(components: tuple[structure.Component, ...]) -> list[tuple[int, Patch]]:
-    return [(part, patch) for part, one in enumerate(components) for patch in one.patches]
+def _as_designed(components: Components) -> PartPatches:
+    return [(part, patch) for part, component in enumerate(components) for patch in component.patches]
 
 
 def _hidden(components: Components) -> Callable[[int, Floats, Floats], Bools]:
-    """Return a function that says which places on the design's faces lie inside of a body."""
+    """Return a function that marks the places on the design's faces inside of a body."""
     faces = [patch for _, patch in _as_designed(components)]
     inside = structure.covered(components)
     return lambda row, p, q: inside(faces[row].at(p, q))
 
 
-def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params, seed: int) -> dict[str, Floats]:
-    """Return where the stations stand: before a row of plates, beside a truss, within a stadium, on the ground.
+def _places(kind: str, patches: PartPatches, params: scanner.Params, seed: int) -> dict[str, Floats]:
+    """Return the stations' poses: on the ground before a row of plates, beside a truss, or inside of a stadium.
 
-    A station more leaves the others where they are.
+    More stations leave the first unchanged.
     """
     corners = np.vstack([patch.at(patch.p[[0, -1, -1, 0]], patch.q[[0, 0, -1, -1]]) for _, patch in patches])
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -200,29 +179,27 @@ def _places(kind: str, patches: list[tuple[int, Patch]], params: scanner.Params,
     for i in range(int(np.prod(params.stations))):
         station = f"S{i + 1}"
         rng = generator(seed, f"place {station}")
-        share = sequences.van_der_corput(i + 1)  # whatever the count
+        fraction = van_der_corput(i + 1)  # independent of the number of stations
         if kind == "plate-row":
-            at = np.array([low[0] + share * (high[0] - low[0]), low[1] - params.distance_mm, params.height_mm])
+            at = np.array([low[0] + fraction * (high[0] - low[0]), low[1] - params.distance_mm, params.height_mm])
         elif kind == "truss-bridge":
-            # Along both sides, and turn and turn about: neighbours on one side overlap.
+            # Along both sides, alternately; neighbours on one side overlap.
             side = 1.0 if i % 2 else -1.0
             at = np.array([12_000.0 * (i // 2) + 3_000.0, side * params.distance_mm, params.height_mm])
         else:
-            turn = 2.0 * np.pi * share
+            turn = 2.0 * np.pi * fraction
             reach = 0.5 * (high - low)[:2] * 0.45
             at = np.array([*(0.5 * (low + high)[:2] + reach * [np.cos(turn), np.sin(turn)]), params.height_mm])
         at[:2] += rng.uniform(-300.0, 300.0, 2)
-        again = params.scans_at_first if i < params.repeated else 1
-        for k in range(again):
+        scans = params.scans_at_first if i < params.repeated else 1
+        for k in range(scans):
             heading = generator(seed, f"heading {station} {k}").uniform(0.0, 2.0 * np.pi)
-            poses[station if again == 1 else f"{station}-{k + 1}"] = survey.levelled(at, heading)
+            poses[station if scans == 1 else f"{station}-{k + 1}"] = survey.levelled(at, heading)
     return poses
 
 
-def _add_poles(
-    builder: Builder, poses: dict[str, Floats], patches: list[tuple[int, Patch]], count: int, seed: int
-) -> None:
-    """Add poles on the ground, each between a station, in turn, and a face drawn above the ground."""
+def _add_poles(builder: Builder, poses: dict[str, Floats], patches: PartPatches, count: int, seed: int) -> None:
+    """Add poles on the ground, each between a station, in rotation, and a random face above the ground."""
     places = list(dict.fromkeys(tuple(T[:3, 3]) for T in poses.values()))  # some stations scan more than once
     half = np.array([0.5])
     middles = np.vstack([patch.at(half, half) for _, patch in patches])
@@ -234,15 +211,13 @@ def _add_poles(
         clutter.add_pole(builder, station, target, np.array([0.0, 0.0, 1.0]), (0.2, 0.4), rng, on_ground=True)
 
 
-def _truth(
-    components: tuple[structure.Component, ...], move: Callable[[Floats], Floats] | None, origin: Floats
-) -> StructureTruth | None:
-    """Return points of the design a step apart along every face but inside of other bodies, and how each has moved."""
-    if move is None:
+def _truth(components: Components, displacement: Displacement | None, origin: Floats) -> StructureTruth | None:
+    """Return points of the design along every face, but not inside of other bodies, with normals and displacements."""
+    if displacement is None:
         return None
     points, normals = [], []
-    for one in components:
-        for patch in one.patches:
+    for component in components:
+        for patch in component.patches:
             corners = patch.at(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
             count = max(2, int(np.linalg.norm(corners[1] - corners[0]) / TRUTH_STEP_MM))
             p, q = (x.ravel() for x in np.meshgrid((np.arange(count) + 0.5) / count, np.arange(8) / 8.0, indexing="ij"))
@@ -253,6 +228,6 @@ def _truth(
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)
-    seen = ~structure.covered(components)(x)
-    x = x[seen]
-    return StructureTruth(x + origin, np.vstack(normals)[seen], move(x))
+    visible = ~structure.covered(components)(x)
+    x = x[visible]
+    return StructureTruth(x + origin, np.vstack(normals)[visible], displacement(x))

@@ -29,7 +29,19 @@ from processor.scan_folder import fingerprint
 from processor.store.store import sync
 from processor.version import __version__
 
-PACKAGES = ("ezdxf", "h5py", "laspy", "lazrs", "numba", "numpy", "plyfile", "pye57", "pypcd4", "scipy", "trimesh")
+PACKAGES = (
+    "ezdxf",
+    "h5py",
+    "laspy",
+    "lazrs",
+    "numba",
+    "numpy",
+    "plyfile",
+    "pye57",
+    "python-neo-lzf",
+    "scipy",
+    "trimesh",
+)
 STATUS = {0: "done", 1: "in-part", 4: "limit-missed"}  # by the exit code of `processor run`
 # Errors of the output folder, not of an input.
 OUTPUT_GONE = tuple(os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT, errno.EROFS))

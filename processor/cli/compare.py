@@ -1,4 +1,4 @@
-"""Command ``processor compare``: two clouds without a design."""
+"""Command ``processor compare``: M3C2 between two clouds, without a design."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from processor.cli.common import LANGUAGES, say
 
 LENGTH = click.FloatRange(min=0.0, min_open=True)
 FILE = click.Path(path_type=Path)
-RADIUS = ("rad", "scale")  # in the names of options that other software has in place of diameters
+RADIUS = ("rad", "scale")  # in the names of options of other software, which takes radii
 
 
 class _Diameters(click.Command):
-    """A command whose lengths across are diameters: who gives a radius is told, and is not led to give it as one."""
+    """A command that explains, where an option for a radius is given, that its options are diameters."""
 
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         try:
@@ -24,8 +24,8 @@ class _Diameters(click.Command):
         except click.NoSuchOption as error:
             if any(part in error.option_name.lower() for part in RADIUS):
                 raise click.UsageError(
-                    f"No such option: {error.option_name}. What is measured across is given as a diameter, twice the "
-                    "radius: --projection-diameter of the cylinder, --normal-diameter of the sphere for normals.",
+                    f"No such option: {error.option_name}. Expected a diameter, twice the radius: "
+                    "--projection-diameter of the cylinder, --normal-diameter of the sphere for normals.",
                     ctx,
                 ) from error
             raise
@@ -47,15 +47,14 @@ class _Diameters(click.Command):
 def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: bool, **options: Any) -> None:
     """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
 
-    All lengths are in the clouds' own unit; what is not given is made from their density.
+    All lengths are in the unit of the clouds; those not given are derived from their density.
     """
     from processor.compare import compare as comparing
     from processor.report import comparison
 
-    lengths = ("normal_diameter", "projection_diameter", "max_depth")
-    request = comparing.Request(reference, compared, **options | {name: options[name] or 0.0 for name in lengths})
-    comparison.check_output(output, (reference, compared, request.core, request.normals))
-    record = comparison.write(output, comparing.compare(request, say), lang)
+    comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
+    given = {name: value for name, value in options.items() if value is not None}
+    record = comparison.write(output, comparing.compare(comparing.Request(reference, compared, **given), say), lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))
         return

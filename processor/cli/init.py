@@ -21,10 +21,10 @@ def init(folder: Path, force: bool, as_json: bool) -> None:
     Components are told by their names and by their shape against the design. What was unsure is said, and marked in
     the file: look at it before the first run.
     """
-    from processor.scan_folder import guess
+    from processor.scan_folder import files, guess
     from processor.store import store
 
-    path = folder / guess.PROJECT
+    path = folder / files.PROJECT
     if path.exists() and not force:
         raise UsageError(f"{path}: is there already; --force replaces it")
     found = guess.guess(folder)

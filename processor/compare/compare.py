@@ -1,4 +1,4 @@
-"""Plain M3C2 between two clouds, in their own unit, for those who have no design."""
+"""M3C2 between two clouds, in their own unit, without a design."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor import readers
+from processor import readers, store
 from processor.compare import diagnosis
 from processor.deviation import scales, statistics
 from processor.deviation.scales import Scales
@@ -22,17 +22,15 @@ from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
 from processor.model import Floats, InputError, UsageError
 from processor.readers import RawScan
+from processor.readers.common import FAR, ORIGIN_STEP
 from processor.scan_folder import normals as scan_folder_normals
-from processor.store import store
 
-FAR = 10_000.0  # units; beyond this an origin is taken off before any algebra
-ORIGIN_STEP = 1_000.0
 CLOUDS = ("reference", "compared", "core")
 
 
 @dataclass(frozen=True)
 class Request:
-    """What to compare, and how; lengths in the clouds' unit, 0 = derive it from their density."""
+    """Files and parameters of a comparison; lengths in the unit of the clouds, 0 = derived from their density."""
 
     reference: Path
     compared: Path
@@ -47,22 +45,22 @@ class Request:
         for name in ("normal_diameter", "projection_diameter", "max_depth", "registration_error"):
             value = getattr(self, name)
             if not (np.isfinite(value) and value >= 0.0):
-                raise UsageError(f"--{name.replace('_', '-')}: expected a length of 0 or more, got {value!r}")
+                raise UsageError(f"--{name.replace('_', '-')}: expected a length of 0 or more, found {value!r}")
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Distances at core points (k, 3), coordinates less ``origin`` (3,), with normals (k, 3), and how they came."""
+    """Distances and normals (k, 3) at core points, and how they were computed."""
 
     request: Request
-    origin: Floats
-    core: Floats
+    origin: Floats  # (3,)
+    core: Floats  # (k, 3), relative to ``origin``
     normals: Floats
     distances: Distances
     scales: Scales
     summary: Summary
-    unit: str  # "" = neither the reference nor the compared cloud says
-    units: dict[str, str]  # what each file says
+    unit: str  # "" = given by neither the reference nor the compared cloud
+    units: dict[str, str]  # of each file, "" = not given
     points: dict[str, int]
     hashes: dict[str, str]
     normals_from: str
@@ -71,7 +69,7 @@ class Comparison:
 
 @dataclass(frozen=True)
 class _Cloud:
-    """The scans of a file; placed by :meth:`less`."""
+    """The scans of a file."""
 
     path: Path
     scans: list[RawScan]
@@ -79,25 +77,25 @@ class _Cloud:
 
     @property
     def unit(self) -> str:
-        """Unit that the file says, or nothing."""
+        """Unit that the file gives, "" for none."""
         return next((scan.unit for scan in self.scans if scan.unit), "")
 
     @property
     def count(self) -> int:
-        """Points of all scans."""
+        """Number of points of all scans."""
         return sum(len(scan.points) for scan in self.scans)
 
     def lowest(self) -> Floats:
-        """Least coordinates (3,)."""
-        found: Floats = np.min([self._placed(scan, np.zeros(3)).min(axis=0) for scan in self.scans], axis=0)
-        return found
+        """Return the least coordinates (3,)."""
+        corner: Floats = np.min([self._placed(scan, np.zeros(3)).min(axis=0) for scan in self.scans], axis=0)
+        return corner
 
-    def less(self, origin: Floats) -> Floats:
-        """Points (n, 3) of all scans less an origin; offsets are taken from each other before they meet a point."""
+    def relative_to(self, origin: Floats) -> Floats:
+        """Return the points (n, 3) of all scans minus an origin; offsets are subtracted first, for precision."""
         return np.concatenate([self._placed(scan, origin) for scan in self.scans])
 
     def scanners(self, origin: Floats) -> list[Floats]:
-        """Where each scan (3,) was seen from, less an origin; NaN where the file does not say."""
+        """Return the scanner's position (3,) of each scan minus an origin; NaN where the file has none."""
         return [
             self._placed(replace(scan, points=np.zeros((1, 3)), origin=scan.position), origin)[0]
             if scan.position.size
@@ -110,46 +108,37 @@ class _Cloud:
         if not scan.T_project_scan.size:
             return scan.points + (scan.origin - origin)
         T = scan.T_project_scan
-        moved: Floats = scan.points @ T[:3, :3].T + (T[:3, :3] @ scan.origin + (T[:3, 3] - origin))
-        return moved
+        points: Floats = scan.points @ T[:3, :3].T + (T[:3, :3] @ scan.origin + (T[:3, 3] - origin))
+        return points
 
 
-def compare(request: Request, say: Callable[[str], None] = lambda _: None) -> Comparison:
-    """Measure from the reference to the compared cloud at every core point, in the core points' order.
+def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Comparison:
+    """Compute M3C2 distances from the reference to the compared cloud at every core point, in their order.
 
-    Without a core file every point of the reference is one; without a file of normals they are those of the
-    reference's planes, turned upwards; those of upright surfaces by :mod:`processor.geometry.normal_orientation`.
-    Raises InputError for a file that cannot be used, and where no core point at all has an answer.
+    Without a core file every point of the reference is a core point. Without a file of normals, planes are fitted to
+    the reference and their normals point upwards; normals of upright surfaces are oriented by
+    :mod:`processor.geometry.normal_orientation`. ``log`` receives one line a message. Raises InputError for a file that
+    cannot be used, and where no core point has a distance.
     """
-    reference, compared = _read(request.reference), _read(request.compared)
-    core_cloud = reference if request.core is None else _read(request.core)
-    clouds = [reference, compared] if request.core is None else [reference, compared, core_cloud]
-    for one in (reference, compared):
-        if one.count < m3c2.FEWEST_FOR_LOD:
-            raise InputError(
-                f"{one.path}: holds {one.count} point{'s' * (one.count > 1)}; expected a cloud: with fewer than "
-                f"{m3c2.FEWEST_FOR_LOD} there is no level of detection"
-            )
-    unit = _unit(clouds)
+    clouds = _read_clouds(request)
+    reference, compared = clouds["reference"], clouds["compared"]
+    unit = _unit(list(clouds.values()))
     origin = _origin(reference)
-    core = np.ascontiguousarray(core_cloud.less(origin))
-    first, second = (point_neighbors.of_spacing(one.less(origin)) for one in (reference, compared))
+    core = np.ascontiguousarray(clouds.get("core", reference).relative_to(origin))
+    first, second = (point_neighbors.of_spacing(cloud.relative_to(origin)) for cloud in (reference, compared))
     used = scales.derived(first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth)
-    if why := diagnosis.other_unit(first.cells.points, second.cells.points, used):
-        raise InputError(f"{request.reference} and {request.compared}: {why}")
-    units = {name: one.unit for name, one in zip(CLOUDS, clouds, strict=False)}
-    _say_scales(request, used, unit, units, say)
-    turned = None
+    if reason := diagnosis.other_unit(first.cells.points, second.cells.points, used):
+        raise InputError(f"{request.reference} and {request.compared}: {reason}")
+    units = {name: cloud.unit for name, cloud in clouds.items()}
+    _log_scales(request, used, unit, units, log)
     if request.normals is not None:
+        turned, source = None, f"file {request.normals.name}"
         normals = scan_folder_normals.read(request.normals, core, origin, used.projection_diameter_mm)
-        said = f"file {request.normals.name}"
     else:
-        fitted = m3c2.normals(_sorted(first, used.normal_diameter_mm), core, used.normal_diameter_mm)
-        scanner = _seen_from(reference, core, fitted, used.normal_diameter_mm, origin)
-        turned = normal_orientation.turned(fitted, core, used.normal_diameter_mm, scanner)
+        turned = _fitted_normals(reference, first, core, origin, used.normal_diameter_mm)
         normals = turned.normals
-        said = "planes of the reference, turned towards +z" + (", upright ones otherwise" if turned.upright else "")
-    found = m3c2.distances(
+        source = "planes of the reference, turned towards +z" + (", upright ones otherwise" if turned.upright else "")
+    distances = m3c2.distances(
         _sorted(first, used.projection_diameter_mm),
         _sorted(second, used.projection_diameter_mm),
         core,
@@ -158,43 +147,75 @@ def compare(request: Request, say: Callable[[str], None] = lambda _: None) -> Co
         max_depth_mm=used.max_depth_mm,
         registration_error_mm=request.registration_error,
     )
-    total = statistics.of_distances(found, core, normals, used.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER)
-    if not np.isfinite(found.distance).any():
-        why = diagnosis.no_answer(first.cells.points, second.cells.points, core, total.without_normal, used)
-        raise InputError(f"{request.reference} and {request.compared}: no core point has an answer: {why}")
+    summary = statistics.of_distances(
+        distances, core, normals, used.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER
+    )
+    if not np.isfinite(distances.distance).any():
+        reason = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
+        raise InputError(f"{request.reference} and {request.compared}: no core point has a distance: {reason}")
     if turned is not None and (note := turned_note(turned)):
-        say(note)
-    _say_doubts(total, used, say)
-    hashes = {name: one.sha256 for name, one in zip(CLOUDS, clouds, strict=False)}
-    if request.normals is not None:
-        hashes["normals"] = _sha256(request.normals)
-    points = {name: one.count for name, one in zip(CLOUDS, clouds, strict=False)}
-    return Comparison(request, origin, core, normals, found, used, total, unit, units, points, hashes, said, turned)
+        log(note)
+    _log_warnings(summary, used, log)
+    given = {} if request.normals is None else {"normals": _sha256(request.normals)}
+    return Comparison(
+        request,
+        origin=origin,
+        core=core,
+        normals=normals,
+        distances=distances,
+        scales=used,
+        summary=summary,
+        unit=unit,
+        units=units,
+        points={name: cloud.count for name, cloud in clouds.items()},
+        hashes={name: cloud.sha256 for name, cloud in clouds.items()} | given,
+        normals_from=source,
+        turned=turned,
+    )
+
+
+def _read_clouds(request: Request) -> dict[str, _Cloud]:
+    """Read the clouds of CLOUDS; without a core file there is no "core"."""
+    clouds = {name: _read(path) for name in CLOUDS if (path := getattr(request, name)) is not None}
+    for cloud in (clouds["reference"], clouds["compared"]):
+        if cloud.count < m3c2.FEWEST_FOR_LOD:
+            raise InputError(
+                f"{cloud.path}: holds {cloud.count} point{'s' * (cloud.count > 1)}; expected "
+                f"{m3c2.FEWEST_FOR_LOD} or more, which a level of detection needs"
+            )
+    return clouds
+
+
+def _fitted_normals(reference: _Cloud, grid: PointGrid, core: Floats, origin: Floats, diameter: float) -> Turned:
+    """Return oriented normals (k, 3) of planes fitted to the reference, whose points are in ``grid``."""
+    fitted = m3c2.normals(_sorted(grid, diameter), core, diameter)
+    scanner = _seen_from(reference, core, fitted, diameter, origin)
+    return normal_orientation.turned(fitted, core, diameter, scanner)
 
 
 def _seen_from(
     reference: _Cloud, core: Floats, fitted: CloudNormals, normal_diameter: float, origin: Floats
 ) -> Floats | None:
-    """Return where the reference was seen from (k, 3) at the core points whose normals need it, NaN elsewhere.
+    """Return the scanner's position (k, 3) at core points whose normals have no sign yet, NaN elsewhere.
 
-    None where the file knows no scanner.
+    None where all normals have a sign, or the file gives no scanner.
     """
     scanners = reference.scanners(origin)
     rows = np.flatnonzero(normal_orientation.undecided(fitted, normal_diameter))
-    if not len(rows) or not any(np.isfinite(one).all() for one in scanners):
+    if not len(rows) or not any(np.isfinite(position).all() for position in scanners):
         return None
-    found = np.full(core.shape, np.nan)
+    positions = np.full(core.shape, np.nan)
     if len(scanners) == 1:
-        found[rows] = scanners[0]
-        return found
-    _, nearest = cKDTree(reference.less(origin)).query(core[rows], workers=-1)
+        positions[rows] = scanners[0]
+        return positions
+    _, nearest = cKDTree(reference.relative_to(origin)).query(core[rows], workers=-1)
     ends = np.cumsum([len(scan.points) for scan in reference.scans])
-    found[rows] = np.array(scanners)[np.searchsorted(ends, nearest, side="right")]
-    return found
+    positions[rows] = np.array(scanners)[np.searchsorted(ends, nearest, side="right")]
+    return positions
 
 
 def _sorted(grid: PointGrid, diameter: float) -> PointGrid:
-    """Return a grid of the same points for a diameter, the same one where its cells fit."""
+    """Return a grid of the same points with cells that fit a diameter, the same grid if its cells do."""
     ratio = diameter / m3c2.CELLS_PER_DIAMETER / grid.cells.size
     return grid if 0.5 <= ratio <= 1.5 else m3c2.grid(grid.cells.points, diameter)
 
@@ -209,7 +230,7 @@ def _read(path: Path) -> _Cloud:
     else:
         raws = readers.read(path)
     if not sum(len(scan.points) for scan in raws):
-        raise InputError(f"{path}: holds no points")
+        raise InputError(f"{path}: expected points, found none")
     return _Cloud(path, [scan for scan in raws if len(scan.points)], _sha256(path))
 
 
@@ -222,90 +243,83 @@ def _sha256(path: Path) -> str:
 
 
 def _unit(clouds: list[_Cloud]) -> str:
-    """Return the unit that the reference or the compared file says, "" where neither does: a core file cannot for them.
+    """Return the unit of the reference or the compared file, "" if neither gives one; a core file does not count.
 
-    Raises InputError where files say different ones.
+    Raises InputError for files in different units.
     """
-    said = {one.unit: one.path for one in clouds if one.unit}
-    if len(said) > 1:
-        (a, first), (b, second) = list(said.items())[:2]
-        raise InputError(
-            f"{second}: is in {b}, but {first} is in {a}; expected clouds in one unit: convert one of them"
-        )
-    return next((one.unit for one in clouds[:2] if one.unit), "")
+    paths = {cloud.unit: cloud.path for cloud in clouds if cloud.unit}
+    if len(paths) > 1:
+        (a, first), (b, second) = list(paths.items())[:2]
+        raise InputError(f"{second}: expected clouds in one unit, found {b}, and {a} in {first}; convert one of them")
+    return next((cloud.unit for cloud in clouds[:2] if cloud.unit), "")
 
 
 def _origin(reference: _Cloud) -> Floats:
-    """Return whole thousands near to the reference where it is far from zero, however its points are ordered."""
+    """Return whole thousands below the reference if it is far from zero; independent of the order of its points."""
     lowest = reference.lowest()
     far = np.abs(lowest).max() > FAR
-    found: Floats = np.floor(lowest / ORIGIN_STEP) * ORIGIN_STEP if far else np.zeros(3)
-    return found
+    origin: Floats = np.floor(lowest / ORIGIN_STEP) * ORIGIN_STEP if far else np.zeros(3)
+    return origin
 
 
-def _say_scales(request: Request, used: Scales, unit: str, units: dict[str, str], say: Callable[[str], None]) -> None:
+def _log_scales(request: Request, used: Scales, unit: str, units: dict[str, str], log: Callable[[str], None]) -> None:
+    def source(given: float, derived_from: str) -> str:
+        return "given" if given else f"derived from {derived_from}"
+
     spacing = max(used.reference_spacing_mm, used.compared_spacing_mm)
-    say(
-        f"lengths are in the files' unit{f' ({unit})' if unit else ', which they do not say'}; "
+    log(
+        f"lengths are in the unit of the files{f' ({unit})' if unit else ', which they do not give'}; "
         f"spacing {used.reference_spacing_mm:.4g} (reference), {used.compared_spacing_mm:.4g} (compared)"
     )
     if note := unit_note(units, {"reference": request.reference, "compared": request.compared, "core": request.core}):
-        say(note)
-    held = np.pi / 4.0 * (used.projection_diameter_mm / spacing) ** 2
+        log(note)
     if request.normals is not None:
         unused = "; --normal-diameter is not used" if request.normal_diameter else ""
-        say(f"normals of file {request.normals.name}{unused}")
+        log(f"normals of file {request.normals.name}{unused}")
     else:
-        say(f"normal diameter {used.normal_diameter_mm:.6g}, {_how(request.normal_diameter, 'spacing and roughness')}")
-    say(f"projection diameter {used.projection_diameter_mm:.6g}, {_how(request.projection_diameter, 'the spacing')}")
-    say(f"max depth to either side {used.max_depth_mm:.6g}, {_how(request.max_depth, 'how far apart the clouds are')}")
-    say(f"a cylinder holds about {held:.3g} points of the sparser cloud")
+        log(f"normal diameter {used.normal_diameter_mm:.6g}, {source(request.normal_diameter, 'spacing, roughness')}")
+    log(f"projection diameter {used.projection_diameter_mm:.6g}, {source(request.projection_diameter, 'the spacing')}")
+    log(f"max depth to either side {used.max_depth_mm:.6g}, {source(request.max_depth, 'the distance of the clouds')}")
+    points = np.pi / 4.0 * (used.projection_diameter_mm / spacing) ** 2
+    log(f"a cylinder holds about {points:.3g} points of the sparser cloud")
 
 
 def turned_note(turned: Turned) -> str:
-    """Say how upright normals got their signs; nothing where +z decided all."""
+    """Return how normals of upright surfaces were oriented; "" where +z decided all signs."""
     if not turned.upright:
         return ""
-    said = [
-        f"{turned.upright} of {turned.up + turned.upright} normals are of upright surfaces, whose side +z does not tell"
+    parts = [
+        f"{turned.upright} of {turned.up + turned.upright} normals are of upright surfaces, not oriented by +z",
+        f"{turned.scanner} point towards the scanner" if turned.scanner else "",
+        f"{turned.neighbours} are oriented as the adjacent surface" if turned.neighbours else "",
+        f"{turned.convention}, of {turned.surfaces} connected surfaces, by convention: {normal_orientation.CONVENTION}"
+        if turned.convention
+        else "",
     ]
-    if turned.scanner:
-        said.append(f"{turned.scanner} look towards the scanner")
-    if turned.neighbours:
-        said.append(f"{turned.neighbours} look the way of the surface that theirs joins")
-    if turned.convention:
-        said.append(
-            f"{turned.convention}, of {turned.surfaces} connected surfaces, by convention:"
-            f" {normal_orientation.CONVENTION}"
-        )
-    return "; ".join(said)
+    return "; ".join(filter(None, parts))
 
 
 def unit_note(units: Mapping[str, str], files: Mapping[str, Any]) -> str:
-    """Say which of the files says the unit where not all do; nothing where all or none do."""
-    saying = [name for name, one in units.items() if one]
-    silent = [name for name, one in units.items() if not one]
-    if not (saying and silent):
+    """Return which files give the unit if some do and some do not; "" otherwise."""
+    with_unit = [name for name, unit in units.items() if unit]
+    without = [name for name, unit in units.items() if not unit]
+    if not (with_unit and without):
         return ""
     return (
-        f"the unit {units[saying[0]]} is said by {', '.join(str(files[name]) for name in saying)} alone; not by "
-        f"{', '.join(str(files[name]) for name in silent)}, whose coordinates must be in it too"
+        f"the unit {units[with_unit[0]]} is given by {', '.join(str(files[name]) for name in with_unit)} only; not by "
+        f"{', '.join(str(files[name]) for name in without)}, whose coordinates must have the same unit"
     )
 
 
-def _how(given: float, made_of: str) -> str:
-    return "given" if given else f"made of {made_of}"
-
-
-def _say_doubts(total: Summary, used: Scales, say: Callable[[str], None]) -> None:
-    if total.without_lod:
-        say(
-            f"{total.without_lod} of {total.core_points} core points have no level of detection: fewer than "
+def _log_warnings(summary: Summary, used: Scales, log: Callable[[str], None]) -> None:
+    if summary.without_lod:
+        log(
+            f"{summary.without_lod} of {summary.core_points} core points have no level of detection: fewer than "
             f"{m3c2.FEWEST_FOR_LOD} points of a cloud within {used.max_depth_mm:.6g} of them, or no normal; "
             "a larger --max-depth or --projection-diameter may help"
         )
-    if total.few_points > 0.1 * max(total.core_points - total.without_lod, 1):
-        say(
-            f"{total.few_points} core points have fewer than {scales.PAPER_POINTS_A_CYLINDER} points of a cloud in "
+    if summary.few_points > 0.1 * max(summary.core_points - summary.without_lod, 1):
+        log(
+            f"{summary.few_points} core points have fewer than {scales.PAPER_POINTS_A_CYLINDER} points of a cloud in "
             "their cylinder: their levels of detection are too small (a larger --projection-diameter helps)"
         )

@@ -64,7 +64,7 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
 
 def posed(scene: Scene, stitched: Any) -> tuple[Scan, ...]:
     """Return the scans with the poses that stitching found, without those that it could not place."""
-    T = dict(zip(stitched.scans, stitched.T_project_scan, strict=True))
+    T = dict(zip(stitched.scans.name, stitched.scans.T_project_scan, strict=True))
     return tuple(
         replace(scan, T_project_scan=T[scan.name]) if scan.name in T else scan
         for scan in scene.scans

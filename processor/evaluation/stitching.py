@@ -1,11 +1,11 @@
-"""Stitching held against the stations' true poses, after a datum fit."""
+"""Poses of stitched scans compared with the stations' true poses, after a datum fit."""
 
 from __future__ import annotations
 
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, Metric, Scene, Statistic, Truth
+from processor.model import NORMAL_95, Floats, Metric, Scene, Statistic, Status, Truth
 from processor.stitching import frames
 from processor.stitching.result import Result
 
@@ -13,53 +13,54 @@ POSITION_MM, ROTATION_MRAD = 0.5, 0.02
 WRONG_MM = 50.0
 AFTER_FIT = "station positions after datum fit"
 WRONG_BUT_OK = f"scans called ok, over {WRONG_MM:g} mm off"
-LEAST_SURE = 3  # scans without a flag that hold the datum alone
+LEAST_OK = 3  # scans without a flag that determine the datum alone
 NAN = float("nan")
 
 
 def datum(T: Floats, true: Floats) -> Floats:
-    """Motion (4, 4) of poses T (k, 4, 4) that brings them closest to the true ones: positions and attitudes weighed.
+    """Return the motion (4, 4) of poses T (k, 4, 4) that brings them closest to the true ones, by least squares.
 
-    A turn counts by how far it moves a point at the stations' mean distance from their middle.
+    A rotation is weighted by the displacement that it causes at the stations' mean distance from their centroid.
     """
-    middle = T[:, :3, 3].mean(axis=0)
-    reach = max(float(np.sqrt(((T[:, :3, 3] - middle) ** 2).sum(axis=1).mean())), 1000.0)
-    M = np.eye(4)
-    own = np.vstack([(one[:3, 3] + reach * np.vstack([axis, -axis])) for one in T for axis in one[:3, :3].T])
-    target = np.vstack([(one[:3, 3] + reach * np.vstack([axis, -axis])) for one in true for axis in one[:3, :3].T])
-    M = rigid.fit(own, target)
-    return M
+    centroid = T[:, :3, 3].mean(axis=0)
+    reach = max(float(np.sqrt(((T[:, :3, 3] - centroid) ** 2).sum(axis=1).mean())), 1000.0)
+    return rigid.fit(_axis_ends(T, reach), _axis_ends(true, reach))
+
+
+def _axis_ends(T: Floats, reach: float) -> Floats:
+    """Return points (6k, 3) at ``reach`` along the axes of poses T (k, 4, 4), to both sides."""
+    return np.vstack([pose[:3, 3] + reach * np.vstack([axis, -axis]) for pose in T for axis in pose[:3, :3].T])
 
 
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
-    """Compare poses with the stations' of the truth; the limits are those asked of scans with 2 mm of noise."""
+    """Compare poses with the stations' of the truth; the limits are those required of scans with 2 mm of noise."""
     if truth.stations is None:
         return []
+    scans = result.scans
     known = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
-    rows = [i for i, name in enumerate(result.scans) if name in known and np.isfinite(result.T_project_scan[i]).all()]
-    failed = sum(not np.isfinite(T).all() for T in result.T_project_scan)
-    metrics = [Metric("stitch", "scans not placed", float(failed), Statistic.COUNT)]
+    rows = [i for i, name in enumerate(scans.name) if name in known and scans.placed[i]]
+    metrics = [Metric("stitch", "scans not placed", float((~scans.placed).sum()), Statistic.COUNT)]
     if len(rows) < 2:
         return metrics
-    T = result.T_project_scan[rows]
-    true = np.stack([known[result.scans[i]] for i in rows])
-    sure = np.array([result.scan_status[i] == "ok" for i in rows])
-    # A scan that is rightly called weak may be centimetres off: it must not pull the good ones away from the truth.
-    fit = sure if sure.sum() >= LEAST_SURE else np.ones(len(rows), bool)
+    T = scans.T_project_scan[rows]
+    true = np.stack([known[scans.name[i]] for i in rows])
+    ok = np.array([scans.status[i] == Status.OK for i in rows])
+    # A scan that is rightly called weak may be centimetres off: it must not affect the datum.
+    fit = ok if ok.sum() >= LEAST_OK else np.ones(len(rows), bool)
     fitted = datum(T[fit], true[fit]) @ T
     off = np.linalg.norm(fitted[:, :3, 3] - true[:, :3, 3], axis=1)
     turn = 1e3 * np.array([rigid.rotation_angle(a[:3, :3] @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)])
-    # What picks by hand allow is no limit of the software's.
+    # The accuracy of points picked by hand is no limit of the software.
     position, rotation = (NAN, NAN) if result.method == "three-point" else (POSITION_MM, ROTATION_MRAD)
     metrics += [
         Metric("stitch", AFTER_FIT, float(off.max()), Statistic.MAX, unit="mm", limit=position),
         Metric("stitch", AFTER_FIT, float(np.sqrt((off**2).mean())), Statistic.RMS, unit="mm"),
         Metric("stitch", "rotations after datum fit", float(turn.max()), Statistic.MAX, unit="mrad", limit=rotation),
-        Metric("stitch", WRONG_BUT_OK, float((off[sure] > WRONG_MM).sum()), Statistic.COUNT, limit=0.0),
+        Metric("stitch", WRONG_BUT_OK, float((off[ok] > WRONG_MM).sum()), Statistic.COUNT, limit=0.0),
     ]
     if result.by_control:
-        apart = float(np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)[fit].max())
-        metrics.append(Metric("stitch", "station positions by control points", apart, Statistic.MAX, unit="mm"))
+        error = float(np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)[fit].max())
+        metrics.append(Metric("stitch", "station positions by control points", error, Statistic.MAX, unit="mm"))
     pulls = pulls_of(result, rows, true)
     if len(pulls):
         share = 100.0 * float((np.abs(pulls) < NORMAL_95).mean())
@@ -68,21 +69,21 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
 
 
 def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:
-    """Errors by standard deviations (m,) of poses: relative to the reference which holds the datum, or by control."""
-    held, M = -1, np.eye(4)
+    """Return errors by standard deviations (m,) of poses: relative to the reference scan, or by control points."""
+    scans, reference, M = result.scans, -1, np.eye(4)
     if not result.by_control:
-        if result.reference not in [result.scans[i] for i in rows]:
+        reference = scans.name.index(result.reference)
+        if reference not in rows:
             return np.empty(0)
-        held = result.scans.index(result.reference)
-        M = result.T_project_scan[held] @ rigid.invert(true[rows.index(held)])
-    found = []
-    for one, i in zip(true, rows, strict=True):
-        if i == held or not np.isfinite(result.position_sd[i]).all():
+        M = scans.T_project_scan[reference] @ rigid.invert(true[rows.index(reference)])
+    pulls = []
+    for true_pose, i in zip(true, rows, strict=True):
+        if i == reference or not np.isfinite(scans.position_sd[i]).all():
             continue
-        at = M @ one
-        place = result.position[i]
-        scan_place = rigid.apply(rigid.invert(result.T_project_scan[i]), place)
-        d = frames.difference(result.T_project_scan[i], at)
-        shift = place - rigid.apply(at, scan_place)
-        found.append(np.concatenate([shift / result.position_sd[i], d[:3] / result.rotation_sd[i]]))
-    return np.concatenate(found) if found else np.empty(0)
+        expected = M @ true_pose
+        position = scans.position[i]
+        in_scan = rigid.apply(rigid.invert(scans.T_project_scan[i]), position)
+        rotation = frames.difference(scans.T_project_scan[i], expected)[:3]
+        shift = position - rigid.apply(expected, in_scan)
+        pulls.append(np.concatenate([shift / scans.position_sd[i], rotation / scans.rotation_sd[i]]))
+    return np.concatenate(pulls) if pulls else np.empty(0)

@@ -1,4 +1,4 @@
-"""Scan files to points: one module a format, found by the file's suffix."""
+"""Readers of scan files: one module a format, chosen by the suffix of the file."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ARCHIVES = proprietary.ARCHIVES
 def read(path: Path) -> list[RawScan]:
     """Read the scans of a file, in the file's own unit.
 
-    Raises InputError for a file that is missing, damaged, empty or of a format that cannot be read.
+    Raises InputError for a file that is missing, damaged, empty or of an unsupported format.
     """
     suffix = path.suffix.lower()
     if is_closed(path):
@@ -29,23 +29,23 @@ def read(path: Path) -> list[RawScan]:
     if suffix not in _FORMATS:
         raise InputError(f"{path}: expected a scan file ({', '.join(SUFFIXES)}), found {suffix or 'no suffix'}")
     if not path.is_file():
-        raise InputError(f"{path}: {'a folder, expected a file' if path.is_dir() else 'there is no such file'}")
+        raise InputError(f"{path}: {'expected a file, found a folder' if path.is_dir() else 'no such file'}")
     if not path.stat().st_size:
         raise InputError(f"{path}: the file is empty; copy or export it again")
     module = _FORMATS[suffix]
     try:
         if getattr(module, "apart", lambda _: False)(path):
             return sandbox.read(path, module.__name__.rpartition(".")[2])
-        # A damaged float32 may be a signalling NaN, of which numpy warns; what is not finite is refused later.
+        # numpy warns of signalling NaNs in damaged files; coordinates that are not finite are refused later.
         with np.errstate(invalid="ignore", over="ignore"):
             scans: list[RawScan] = module.read(path)
         return scans
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from error
     except MemoryError:
-        raise InputError(f"{path}: takes more memory than there is") from None
+        raise InputError(f"{path}: needs more memory than is available; split the scan or thin it out") from None
 
 
 def is_closed(path: Path) -> bool:
-    """Whether a path has the suffix of a format that only its maker's software reads."""
+    """Whether a path has the suffix of a closed format, which only its maker's software reads."""
     return path.suffix.lower() in proprietary.FORMATS

@@ -1,4 +1,4 @@
-"""What every reader hands over, and the checks that all formats share."""
+"""The record that all readers return, and the checks that all formats share."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ import numpy.typing as npt
 
 from processor.model import Checked, Floats, InputError, Ints, Labels, column, optional
 
-FAR = 10_000.0  # units; beyond this an origin is taken off
+FAR = 10_000.0  # units; an origin is subtracted from coordinates beyond this
 ORIGIN_STEP = 1_000.0
 
 
 @dataclass(frozen=True)
 class RawScan(Checked):
-    """One scan as its file has it. The coordinate in the scan's frame is ``origin + points``, in ``unit``."""
+    """One scan as stored in its file. Coordinates in the scan's frame are ``origin + points``, in ``unit``."""
 
     name: str
     points: Floats = column("n", 3)
@@ -32,35 +32,35 @@ class RawScan(Checked):
     intensity: Floats = column("n")
     position: Floats = optional(3)  # of the scanner, in the scan's frame
     T_project_scan: Floats = optional(4, 4)
-    unit: str = ""  # "" = the format does not say
-    station: Ints = column("n", dtype=np.int64)  # number of the station a point was seen from, from 1; 0 = unknown
-    grid_row: Labels = column("n", dtype=np.int32)  # as the file has them: whether they are a scanner's is not known
+    unit: str = ""  # "" = not given by the format
+    station: Ints = column("n", dtype=np.int64)  # station that saw the point, from 1; 0 = unknown
+    grid_row: Labels = column("n", dtype=np.int32)  # as stored; see scan_folder.scanner_grid
     grid_column: Labels = column("n", dtype=np.int32)
-    step: float = 0.0  # what two coordinates differ by at least, in the type the file has them in; 0 = nothing
+    step: float = 0.0  # resolution of the coordinates in the file's number type; 0 = unlimited
 
 
-# How readers get the arrays they fill: in a process of its own (see apart) they lie in memory shared with the other.
+# How readers allocate the arrays they fill: in the process of ``sandbox`` they lie in shared memory.
 _new_array: Callable[[tuple[int, ...], type], npt.NDArray[Any]] = np.empty
 
 
 def room_for(*shape: int, dtype: type = np.float64) -> npt.NDArray[Any]:
-    """Return an array to be filled; of what is never written no memory is taken."""
+    """Return an array to be filled; pages that are never written take no memory."""
     return _new_array(shape, dtype)
 
 
 def give_room_by(new_array: Callable[[tuple[int, ...], type], npt.NDArray[Any]]) -> None:
-    """Let another function make the arrays of ``room_for``."""
+    """Replace the function that allocates the arrays of ``room_for``."""
     global _new_array
     _new_array = new_array
 
 
 def stem(path: Path) -> str:
-    """Return how a file calls its scan: its name without suffix, as text."""
+    """Return the name of a file's scan: the name of the file without suffix, as text."""
     return text_of(path.stem) or "scan"
 
 
 def text_of(name: str) -> str:
-    """Return the name of a file as text: by GB18030 where its bytes are no UTF-8."""
+    """Return the name of a file as text, decoded as GB18030 where it is not UTF-8."""
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -81,13 +81,13 @@ def make(
     grid: tuple[Labels, Labels] | None = None,
     single: bool = False,
 ) -> RawScan:
-    """Make the record from coordinates (n, 3), taking off an origin of whole thousands, in place, where they are far.
+    """Build the record from coordinates (n, 3); an origin of whole thousands is subtracted in place where they are far.
 
-    ``grid``: rows and columns (n,) of the scanner's grid. ``single``: the file has the coordinates in 32 bits. Raises
-    InputError for no points, and for coordinates that are not finite.
+    ``grid``: rows and columns (n,) of the scanner's grid. ``single``: coordinates are 32-bit floats in the file. Raises
+    InputError without points, and for coordinates that are not finite.
     """
     if not len(points):
-        raise InputError(f"{path}: scan {name!r} holds no points")
+        raise InputError(f"{path}: scan {name!r} holds no points; export it again")
     low, high = float(points.min()), float(points.max())  # NaN where there is one
     if not (np.isfinite(low) and np.isfinite(high)):
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
@@ -98,7 +98,7 @@ def make(
     farthest = max(-low, high)
     origin = np.zeros(3)
     if farthest > FAR:
-        # The middle of a sample: the first point may be a stray one.
+        # The median of a sample: a single point may be an outlier.
         sample = points[:: max(1, len(points) // 1000)]
         origin = np.floor(np.sort(sample, axis=0)[len(sample) // 2] / ORIGIN_STEP) * ORIGIN_STEP
         points -= origin
@@ -108,18 +108,19 @@ def make(
         name,
         points,
         origin,
-        np.asarray(intensity, np.float64),
-        np.asarray(position, np.float64),
-        np.asarray(T_project_scan, np.float64),
-        unit,
-        np.asarray(station, np.int64),
-        *(grid or (np.empty(0, np.int32),) * 2),
-        step,
+        intensity=np.asarray(intensity, np.float64),
+        position=np.asarray(position, np.float64),
+        T_project_scan=np.asarray(T_project_scan, np.float64),
+        unit=unit,
+        station=np.asarray(station, np.int64),
+        grid_row=grid[0] if grid else np.empty(0, np.int32),
+        grid_column=grid[1] if grid else np.empty(0, np.int32),
+        step=step,
     )
 
 
 def used_up(raw: RawScan, factor: float) -> Floats:
-    """Return the points times a factor, in the record's own memory: the record is not to be used afterwards."""
+    """Return the points times a factor, in the record's memory; the record must not be used afterwards."""
     points: Floats = raw.points
     points.flags.writeable = True
     if factor != 1.0:
@@ -129,23 +130,21 @@ def used_up(raw: RawScan, factor: float) -> Floats:
 
 @contextmanager
 def parsing(path: Path, kind: str) -> Iterator[None]:
-    """Turn whatever a format's library raises within into an InputError that names the file.
+    """Convert any error of a format's library into an InputError that names the file.
 
-    Native readers written in Rust panic with a BaseException, so that is caught here; an interrupt passes.
+    Readers written in Rust panic with a BaseException, so it is caught too; an interrupt is not.
     """
     try:
         yield
     except (InputError, KeyboardInterrupt, SystemExit, GeneratorExit):
         raise
     except BaseException as error:
-        said = (str(error).strip().splitlines() or [""])[0][:200]
-        raise InputError(
-            f"{path}: not a readable {kind} file: {said or type(error).__name__}; copy or export it again"
-        ) from error
+        message = (str(error).strip().splitlines() or [""])[0][:200] or type(error).__name__
+        raise InputError(f"{path}: not a readable {kind} file: {message}; copy or export it again") from error
 
 
 def check_room(path: Path, kind: str, declared: int, least_bytes: float, room: int) -> None:
-    """Raise InputError where ``declared`` points of at least ``least_bytes`` each cannot lie in ``room`` bytes."""
+    """Raise InputError if ``declared`` points of at least ``least_bytes`` each do not fit in ``room`` bytes."""
     if declared < 0 or declared * least_bytes > room:
         raise InputError(
             f"{path}: the header declares {declared} points, but the file has only {room} bytes for them; "
@@ -154,7 +153,7 @@ def check_room(path: Path, kind: str, declared: int, least_bytes: float, room: i
 
 
 def decoded(data: bytes) -> str:
-    """Text of bytes in UTF-8 or, failing that, GB18030 (sites in China), or else with marks for what is neither."""
+    """Decode bytes as UTF-8, or else as GB18030, or else as UTF-8 with replacement characters."""
     for encoding in ("utf-8-sig", "gb18030"):
         try:
             return data.decode(encoding)
@@ -164,7 +163,7 @@ def decoded(data: bytes) -> str:
 
 
 def first_named(columns: Any, pattern: str) -> str | None:
-    """First of some column names that matches a pattern as a whole, case aside."""
+    """Return the first column name that matches a whole pattern, ignoring case; None without one."""
     return next((name for name in columns if re.fullmatch(pattern, name, re.IGNORECASE)), None)
 
 
@@ -172,24 +171,24 @@ INTENSITY_NAMES = r"(scalar_)?(intensity|reflectance|reflectivity|amplitude)|i"
 STATION_NAMES = r"(scalar_)?station"
 
 
-# --- Records of fixed size, and columns filled from pieces: what binary PLY and PCD share.
+# --- Records of fixed size, and columns filled from pieces: used for binary PLY and PCD.
 
 
-PIECE_BYTES = 1 << 19  # small enough to stay in a processor's own cache between the passes over it
+PIECE_BYTES = 1 << 19  # fits in the cache of a processor core between the passes over it
 
 
 def of_records(file: BinaryIO, dtype: Any, wanted: Sequence[str], count: int) -> Iterator[Sequence[Any]]:
-    """Give the wanted fields, as columns, of the next ``count`` records of a file, piece by piece.
+    """Yield the wanted fields, as columns, of the next ``count`` records of a file, piece by piece.
 
-    Each piece is good until the next one is asked for.
+    A piece is valid until the next one is requested.
     """
     size = dtype.itemsize
     text = bytearray(max(1, min(count, PIECE_BYTES // size)) * size)
     view = memoryview(text)
     while count > 0:
         filled = 0
-        while filled < len(view) and (got := file.readinto(view[filled:])):  # type: ignore[attr-defined]
-            filled += got
+        while filled < len(view) and (read := file.readinto(view[filled:])):  # type: ignore[attr-defined]
+            filled += read
         records = np.frombuffer(text, dtype, min(filled // size, count))
         if not len(records):
             return
@@ -200,21 +199,21 @@ def of_records(file: BinaryIO, dtype: Any, wanted: Sequence[str], count: int) ->
 def fill(columns: Sequence[Floats], pieces: Iterable[Any]) -> None:
     """Fill columns, the first of them (n, 3), the others (n,), from pieces: lists of columns, or arrays (m, k).
 
-    Raises ValueError where the pieces hold fewer rows.
+    Raises ValueError if the pieces have fewer than n rows.
     """
-    found, count = 0, len(columns[0])
+    filled, count = 0, len(columns[0])
     for piece in pieces:
         if isinstance(piece, np.ndarray):
-            rows = slice(found, found + len(piece))
+            rows = slice(filled, filled + len(piece))
             columns[0][rows] = piece[:, :3]
             parts = list(piece.T)
         else:
             parts = piece
-            rows = slice(found, found + len(parts[0]))
+            rows = slice(filled, filled + len(parts[0]))
             for axis in range(3):
                 columns[0][rows, axis] = parts[axis]
         for values, part in zip(columns[1:], parts[3:], strict=True):
             values[rows] = part
-        found += len(parts[0])
-    if found != count:
-        raise ValueError(f"{count} points are declared, but {found} were found")
+        filled += len(parts[0])
+    if filled != count:
+        raise ValueError(f"expected {count} points as declared, found {filled}")

@@ -1,7 +1,7 @@
-"""E57 (ASTM E2807): several scans a file, each named and with the pose of its scanner, in whose frame points stay.
+"""E57 (ASTM E2807): several scans a file, each with a name and the pose of its scanner, in metres.
 
-Points whose invalid state is set are no returns and are left out; the others keep the row and column of the scanner's
-grid, where the scan has both. SI metres.
+Points stay in the frame of their scan. Points with an invalid state are left out; the others keep the row and column of
+the scanner's grid, if the scan has both.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import Floats, InputError
+from processor.model import Floats, InputError, Labels
 from processor.readers.common import RawScan, make, parsing, room_for, stem
 
 SUFFIXES = (".e57",)
@@ -26,12 +26,12 @@ PIECE = 1 << 18
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 LONGEST_NAME = 100
 GRID = ("rowIndex", "columnIndex")
-MOST_LINES = 2**31 - 1  # of a grid whose rows and columns fit their type
+MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
 def apart(path: Path) -> bool:
-    """Whether the file is read in a process of its own."""
+    """Whether the file is read in a separate process: always."""
     return True
 
 
@@ -41,23 +41,23 @@ def read(path: Path) -> list[RawScan]:
 
     _check_structure(path)
     with parsing(path, "E57"), path.open("rb") as opened:
-        # By its descriptor, as the library takes names in UTF-8 alone.
+        # By its descriptor: the library accepts names in UTF-8 only.
         by_descriptor = Path(f"/proc/self/fd/{opened.fileno()}")
         file = pye57.E57(str(by_descriptor if by_descriptor.exists() else path))
         try:
             count = file.scan_count
             if not count:
-                raise InputError(f"{path}: holds no scans")
-            called = names(stem(path), [_own_name(file.get_header(i)) for i in range(count)])
-            return [_read_scan(path, file, i, called) for i in range(count)]
+                raise InputError(f"{path}: expected scans, found none")
+            scan_names = names(stem(path), [_stored_name(file.get_header(i)) for i in range(count)])
+            return [_read_scan(path, file, i, scan_names) for i in range(count)]
         finally:
             file.close()
 
 
 def _check_structure(path: Path) -> None:
-    """Refuse a file whose header does not fit its size, and XML that declares types or entities of its own.
+    """Raise InputError if the header contradicts the size of the file, or the XML declares types or entities.
 
-    The XML of ASTM E2807 has neither; entities can be made to grow without bound or to name other files.
+    The XML of ASTM E2807 has neither; entities can expand without bound or refer to other files.
     """
     size = path.stat().st_size
     with path.open("rb") as file:
@@ -67,34 +67,37 @@ def _check_structure(path: Path) -> None:
         _, _, _, length, start, xml_length, page = HEADER.unpack(head)
         pages = -(-(start % PAGE + xml_length) // PAYLOAD) + 1
         if page != PAGE or length != size or start > size or xml_length > min(size, XML_LIMIT):
-            raise InputError(f"{path}: its header does not fit a file of {size} bytes; copy or export it again")
+            raise InputError(f"{path}: its header does not fit its size of {size} bytes; copy or export it again")
         first = start // PAGE
         file.seek(first * PAGE)
         raw = file.read(pages * PAGE)
-    # Each page ends in a check sum of four bytes.
+    # Each page ends in a checksum of four bytes.
     text = b"".join(raw[i : i + PAYLOAD] for i in range(0, len(raw), PAGE))
     text = text[start % PAGE : start % PAGE + xml_length]
     if text[:2] in (b"\xff\xfe", b"\xfe\xff") or b"\0" in text:
-        raise InputError(f"{path}: its XML is not in UTF-8, as the format has it; export it again")
+        raise InputError(f"{path}: expected XML in UTF-8, found another encoding; export it again")
     if re.search(rb"<!(DOCTYPE|ENTITY)", text, re.IGNORECASE):
-        raise InputError(f"{path}: its XML declares a document type or entities, which scans have not; it is not read")
+        raise InputError(f"{path}: its XML declares a document type or entities, which is not allowed; export it again")
     declared = re.match(rb"\s*<\?xml[^>]*encoding\s*=\s*[\"']([^\"']*)", text.removeprefix(b"\xef\xbb\xbf"))
     if declared and declared[1].lower() not in (b"utf-8", b"utf8", b"us-ascii"):
-        raise InputError(f"{path}: its XML is in {declared[1][:40]!r}, expected UTF-8; export it again")
+        encoding = declared[1][:40].decode("latin-1")
+        raise InputError(f"{path}: expected XML in UTF-8, found {encoding!r}; export it again")
 
 
-def names(stem: str, own: Sequence[str]) -> list[str]:
-    """Return how the scans of a file are called, by the file's stem and their own names in it.
+def names(stem: str, stored: Sequence[str]) -> list[str]:
+    """Return the names of the scans of a file, from the stem of the file and the names stored in it.
 
-    A lone scan is named by the file, as in other formats. Of several each keeps its own name where that is plain text
-    and no other's; the rest are numbered.
+    A single scan has the name of the file, as in other formats. Of several scans each keeps its stored name if that is
+    plain text and unique; the others are numbered.
     """
-    if len(own) == 1:
+    if len(stored) == 1:
         return [stem]
-    found = [
-        name if _is_plain(name) and own.count(name) == 1 else f"{stem}-{number}" for number, name in enumerate(own, 1)
+    numbered = [f"{stem}-{number}" for number in range(1, len(stored) + 1)]
+    mixed = [
+        name if _is_plain(name) and stored.count(name) == 1 else number
+        for name, number in zip(stored, numbered, strict=True)
     ]
-    return found if len(set(found)) == len(found) else [f"{stem}-{number}" for number in range(1, len(own) + 1)]
+    return mixed if len(set(mixed)) == len(mixed) else numbered
 
 
 def _is_plain(name: str) -> bool:
@@ -103,80 +106,93 @@ def _is_plain(name: str) -> bool:
     )
 
 
-def _own_name(header: Any) -> str:
+def _stored_name(header: Any) -> str:
     try:
         return str(header.node["name"].value()) if header.node.isDefined("name") else ""
     except UnicodeDecodeError:
         return ""
 
 
-def _read_scan(path: Path, file: Any, index: int, called: Sequence[str]) -> RawScan:
-    name, count = called[index], len(called)
+def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> RawScan:
+    name = scan_names[index]
     header = file.get_header(index)
     declared = int(header.point_count)
-    if declared > 8 * path.stat().st_size:  # less than a bit for a point
-        raise InputError(f"{path}: scan {index + 1} declares {declared} points, more than the file can hold")
+    if declared > 8 * path.stat().st_size:  # less than a bit a point
+        raise InputError(
+            f"{path}: scan {index + 1} declares {declared} points, more than the file can hold; copy or export it again"
+        )
     fields = set(header.point_fields)
     cartesian = fields.issuperset(CARTESIAN)
     if not cartesian and not fields.issuperset(SPHERICAL):
-        raise InputError(f"{path}: scan {name!r} has neither Cartesian nor spherical points ({', '.join(fields)})")
-    state = "cartesianInvalidState" if cartesian else "sphericalInvalidState"
+        raise InputError(
+            f"{path}: expected Cartesian or spherical points in scan {name!r}, found {', '.join(sorted(fields))}"
+        )
     axes = CARTESIAN if cartesian else SPHERICAL
-    wanted = [*axes, *({state, "intensity"} & fields)]
+    points, intensity, cells = _read_points(path, name, file, header, axes)
+    pose = _pose(path, name, header) if header.has_pose() else np.empty(0)
+    # Writers give single and merged clouds an identity pose too, so it is no evidence of a scanner's position.
+    posed = pose.size > 0 and (len(scan_names) > 1 or bool((pose != np.eye(4)).any()))
+    return make(
+        path,
+        name,
+        points,
+        unit=UNIT,
+        intensity=intensity,
+        position=np.zeros(3) if posed else (),
+        T_project_scan=pose,
+        grid=(cells[0], cells[1]) if cells else None,
+        single=_is_single(header, axes[0]),
+    )
+
+
+def _read_points(
+    path: Path, name: str, file: Any, header: Any, axes: Sequence[str]
+) -> tuple[Floats, Floats, list[Labels]]:
+    """Return points (n, 3), intensities and, if the scan has a grid, rows and columns (n,) of the valid points."""
+    declared, fields = int(header.point_count), set(header.point_fields)
+    state = "cartesianInvalidState" if axes is CARTESIAN else "sphericalInvalidState"
     points = room_for(declared, 3)
     intensity = room_for(declared if "intensity" in fields else 0)
-    data, buffers = file.make_buffers(wanted, min(declared, PIECE) or 1)
+    data, buffers = file.make_buffers([*axes, *({state, "intensity"} & fields)], min(declared, PIECE) or 1)
     grid = _grid_buffers(file, header, data, buffers, min(declared, PIECE) or 1)
     cells = [room_for(declared, dtype=np.int32) for _ in grid]
     reader = header.points.reader(buffers)
-    read = found = 0
+    read = count = 0
     while declared and (rows := reader.read()):
         read += rows
         if read > declared:
             break
         valid = data[state][:rows] == 0 if state in data else slice(None)
         columns = [data[axis][:rows][valid] for axis in axes]
-        kept = len(columns[0])
-        xyz = points[found : found + kept]
-        if cartesian:
+        part = slice(count, count + len(columns[0]))
+        if axes is CARTESIAN:
             for i in range(3):
-                xyz[:, i] = columns[i]
+                points[part, i] = columns[i]
         else:
-            xyz[:] = cartesian_from_spherical(*columns)
+            points[part] = cartesian_from_spherical(*columns)
         if len(intensity):
-            intensity[found : found + kept] = data["intensity"][:rows][valid]
+            intensity[part] = data["intensity"][:rows][valid]
         for field, lines in zip(grid, cells, strict=True):
             numbers = data[field][:rows][valid]
-            # Written so that NaN is refused as well.
-            if kept and not (numbers.min() >= 0 and numbers.max() < MOST_LINES):
+            # The comparisons are false for NaN.
+            if len(numbers) and not (numbers.min() >= 0 and numbers.max() < MOST_LINES):
                 grid, cells = (), []
                 break
-            lines[found : found + kept] = numbers
-        found += kept
+            lines[part] = numbers
+        count = part.stop
     if read != declared:
-        raise InputError(f"{path}: scan {name!r} declares {declared} points but holds {read}; copy it again")
-    if declared and not found:
+        raise InputError(
+            f"{path}: expected {declared} points in scan {name!r} as declared, found {read}; copy it again"
+        )
+    if declared and not count:
         raise InputError(f"{path}: scan {name!r} holds no returns: all of its {declared} points are marked invalid")
-    pose = _pose(path, name, header) if header.has_pose() else np.empty(0)
-    # Writers give a lone or merged cloud an identity pose too, so it says nothing of where a scanner stood.
-    posed = pose.size > 0 and (count > 1 or bool((pose != np.eye(4)).any()))
-    return make(
-        path,
-        name,
-        points[:found],
-        unit=UNIT,
-        intensity=intensity[:found],
-        position=np.zeros(3) if posed else (),
-        T_project_scan=pose,
-        grid=(cells[0][:found], cells[1][:found]) if cells else None,
-        single=_is_single(header, axes[0]),
-    )
+    return points[:count], intensity[:count], [lines[:count] for lines in cells]
 
 
 def _grid_buffers(file: Any, header: Any, data: dict[str, Any], buffers: Any, capacity: int) -> tuple[str, ...]:
-    """Have the grid's fields read along, and return their names: none where one is missing or is no number.
+    """Add buffers for the grid's fields and return their names: none if a field is missing or not a number.
 
-    The library's own buffers of 16 bits refuse larger numbers, and the file with them; doubles hold whatever comes.
+    The library's default buffers of 16 bits fail on larger numbers; float64 holds all of them.
     """
     from pye57 import libe57
 
@@ -198,7 +214,7 @@ def _is_single(header: Any, field: str) -> bool:
 
 
 def cartesian_from_spherical(distance: Floats, azimuth: Floats, elevation: Floats) -> Floats:
-    """Points (n, 3) of ranges and angles (n,) in rad; the elevation is 0 at the horizon, as in ASTM E2807."""
+    """Return points (n, 3) of ranges and angles (n,) in rad; the elevation is 0 at the horizon, as in ASTM E2807."""
     level = distance * np.cos(elevation)
     return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(elevation)], axis=1)
 
@@ -210,7 +226,9 @@ def _pose(path: Path, name: str, header: Any) -> Floats:
         w, x, y, z = (float(node["rotation"][key].value()) for key in "wxyz")
         length = float(np.sqrt(w * w + x * x + y * y + z * z))
         if not 0.99 < length < 1.01:
-            raise InputError(f"{path}: the pose of scan {name!r} has a quaternion of length {length:g}, expected 1")
+            raise InputError(
+                f"{path}: the pose of scan {name!r} has a quaternion of length {length:g}, expected 1; export it again"
+            )
         w, x, y, z = w / length, x / length, y / length, z / length
         pose[:3, :3] = [
             [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
@@ -220,5 +238,5 @@ def _pose(path: Path, name: str, header: Any) -> Floats:
     if node.isDefined("translation"):
         pose[:3, 3] = [float(node["translation"][key].value()) for key in "xyz"]
     if not np.isfinite(pose).all():
-        raise InputError(f"{path}: the pose of scan {name!r} holds numbers that are not finite")
+        raise InputError(f"{path}: the pose of scan {name!r} has numbers that are not finite; export it again")
     return pose

@@ -1,4 +1,4 @@
-"""LAS and LAZ. Metres, unless the file's own coordinate system names feet."""
+"""LAS and LAZ. Metres, unless the coordinate system of the file is in feet."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ SUFFIXES = (".las", ".laz")
 UNIT = "m"
 PIECE = 1_000_000
 PACKED = 0xC0  # bits of the point format
-LAZ_LIMIT = 2_000  # no real file is packed more tightly than this
+LAZ_LIMIT = 2_000  # compression ratio that no real file exceeds
 LINEAR_UNIT_KEYS = (3076, 4052)  # ProjLinearUnitsGeoKey, GeogLinearUnitsGeoKey of GeoTIFF
 VERTICAL_UNIT_KEY, MODEL_KEY, GEOGRAPHIC = 4099, 1024, 2
 EPSG_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 
 
 def apart(path: Path) -> bool:
-    """Whether the file is read in a process of its own: where it is compressed, by native code."""
+    """Whether the file is read in a separate process: if it is compressed, as native code decompresses it."""
     with path.open("rb") as file:
         head = file.read(105)
     return len(head) == 105 and bool(head[104] & PACKED)
@@ -34,34 +34,36 @@ def read(path: Path) -> list[RawScan]:
     import laspy
 
     _check_header(path)
-    found = 0
+    count = 0
     with parsing(path, "LAS"), laspy.open(str(path)) as file:
         header = file.header
         fits_degrees = bool((np.abs([header.mins, header.maxs])[:, :2] <= [180.0, 90.0]).all())
         unit = _unit(path, [*header.vlrs, *(header.evlrs or [])], fits_degrees)
         declared = int(header.point_count)
         if not np.isfinite([header.scales, header.offsets]).all() or not np.all(header.scales):
-            raise InputError(f"{path}: scales {header.scales} and offsets {header.offsets} make no coordinates")
+            raise InputError(
+                f"{path}: expected finite scales and offsets, and scales other than 0, found {header.scales} and "
+                f"{header.offsets}; export it again"
+            )
         points, intensity = room_for(declared, 3), room_for(declared)
         station = np.empty(declared, np.uint16)
         for piece in file.chunk_iterator(PIECE):
-            rows = slice(found, found + len(piece))
+            rows = slice(count, count + len(piece))
             for i, axis in enumerate("XYZ"):
                 column = points[rows, i]
                 np.multiply(piece[axis], header.scales[i], out=column)
                 column += header.offsets[i]
             intensity[rows] = piece["intensity"]
             station[rows] = piece["point_source_id"]
-            found += len(piece)
-    if found != declared:
-        raise InputError(f"{path}: the header declares {declared} points, but {found} were read; copy it again")
-    # 0 in all of the file: it does not say.
-    said = station if station.any() else ()
-    return [make(path, stem(path), points, unit=unit, intensity=intensity, station=said)]
+            count += len(piece)
+    if count != declared:
+        raise InputError(f"{path}: expected {declared} points as declared, found {count}; copy it again")
+    # 0 in all points: the stations are unknown.
+    return [make(path, stem(path), points, unit=unit, intensity=intensity, station=station if station.any() else ())]
 
 
 def _check_header(path: Path) -> None:
-    """Hold the counts of the header (LAS 1.4 R15, table 3) against the file's size: laspy makes room for them."""
+    """Check the counts of the header (LAS 1.4 R15, table 3) against the size of the file: laspy allocates by them."""
     size = path.stat().st_size
     with path.open("rb") as file:
         head = file.read(375)
@@ -75,7 +77,7 @@ def _check_header(path: Path) -> None:
         raise InputError(f"{path}: the header's counts do not fit the file of {size} bytes; copy or export it again")
     packed = bool(form & PACKED)
     check_room(path, "LAS", count, length / (LAZ_LIMIT if packed else 1), size - start)
-    # From version 1.3 on other data may follow the points.
+    # From version 1.3 on, other data may follow the points.
     if not packed and head[25] < 3 and size - start - count * length >= length:
         raise InputError(
             f"{path}: the header declares {count} points, but there is room for {(size - start) // length}; "
@@ -84,9 +86,10 @@ def _check_header(path: Path) -> None:
 
 
 def _unit(path: Path, vlrs: Any, fits_degrees: bool) -> str:
-    """Return the unit that the coordinate system names. Raises InputError for degrees, and for heights in another unit.
+    """Return the unit of the coordinate system. Raises InputError for degrees, and for heights in another unit.
 
-    A system in degrees beside coordinates that can be none (``fits_degrees``) is taken for a slip of the writer.
+    A system in degrees is ignored, as a mistake of the writer, if the coordinates exceed those of degrees (not
+    ``fits_degrees``).
     """
     unit, heights = "", ""
     for vlr in vlrs:
@@ -105,17 +108,21 @@ def _unit(path: Path, vlrs: Any, fits_degrees: bool) -> str:
     unit = unit or UNIT
     if heights and heights != unit:
         raise InputError(
-            f"{path}: x and y are in {unit}, z in {heights} by its coordinate system; export it in one unit"
+            f"{path}: expected one unit, found x and y in {unit}, z in {heights}, by its coordinate system; "
+            "export it in one unit"
         )
     return unit
 
 
 def _in_degrees(path: Path) -> InputError:
-    return InputError(f"{path}: its coordinates are longitude and latitude; export it in a projected system, in metres")
+    return InputError(
+        f"{path}: expected projected coordinates, found longitude and latitude; export it in a projected system, in "
+        "metres"
+    )
 
 
 def _last_unit(wkt: str) -> str:
-    """Return the last unit of length of a coordinate system in WKT, "" for one that is not known."""
+    """Return the last unit of length of a coordinate system in WKT, "" if it is unknown."""
     units = re.findall(r'(?<!ANGLE)UNIT\["([^"]*)",\s*([0-9.eE+-]+)', wkt)
     lengths = [(name, float(size)) for name, size in units if not 0.017 < float(size) < 0.018]
     if not lengths:

@@ -1,4 +1,4 @@
-"""Formats that only their makers' software reads, and how to get the scans out of them."""
+"""Closed formats, which only the software of their makers reads, and how to export scans from them."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ ARCHIVES = (".zip", ".7z", ".rar", ".gz", ".tar", ".tgz")
 
 
 def advice(suffix: str) -> str:
-    """Say of a suffix of FORMATS whose it is and how to export."""
-    maker, way = FORMATS[suffix]
+    """Return the maker of a format of FORMATS and how to export a scan from it."""
+    maker, menu = FORMATS[suffix]
     return (
-        f"{suffix} is a closed format that only software of its maker ({maker}) reads; export the scan to E57 there "
-        f"({way}), unmerged and with scanner positions where it asks, and give the E57 file instead"
+        f"expected an open format, found {suffix}, which only software of its maker ({maker}) reads; export the scan "
+        f"to E57 there ({menu}), unmerged and with scanner positions, and give the E57 file instead"
     )

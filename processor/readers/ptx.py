@@ -1,8 +1,8 @@
-"""PTX: a grid a scan, each with its scanner's pose; points stay in the scanner's frame. Metres.
+"""PTX: a grid a scan, each with the pose of its scanner; points stay in the scanner's frame. Metres.
 
-A scan is: columns, rows; the scanner's position; its three axes; the 4x4 matrix for row vectors, so it is transposed
-here; then a line a grid cell ``x y z intensity [r g b]``, column by column. A cell of ``0 0 0`` had no return and is
-left out; the others keep their row and column.
+A scan has lines for its columns, its rows, the scanner's position, the scanner's three axes, the 4x4 matrix for row
+vectors (transposed here), and for each grid cell ``x y z intensity [r g b]``, column by column. A cell of ``0 0 0`` had
+no return and is left out; the others keep their row and column.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ from processor.readers.common import RawScan, check_room, make, parsing, room_fo
 SUFFIXES = (".ptx",)
 UNIT = "m"
 SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
-MOST_LINES = 2**31 - 1  # of a grid whose rows and columns fit their type
-RIGID_TOLERANCE = 1e-3  # of R^T R from the identity: matrices are often written with few digits
+MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
+RIGID_TOLERANCE = 1e-3  # of R^T R - I: matrices are often written with few digits
 
 
 def read(path: Path) -> list[RawScan]:
@@ -37,7 +37,7 @@ def read(path: Path) -> list[RawScan]:
             with parsing(path, "PTX"):
                 first = rows.line()
     if not scans:
-        raise InputError(f"{path}: holds no scans")
+        raise InputError(f"{path}: expected scans, found none")
     if len(scans) == 1:
         return scans
     return [dataclasses.replace(scan, name=f"{stem(path)}-{i}") for i, scan in enumerate(scans, 1)]
@@ -55,44 +55,42 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     if len(numbers) != 10 or any(len(row) != width for row, width in zip(numbers, widths, strict=True)):
         raise InputError(
             f"{path}: scan {number} has no PTX header of ten lines (columns, rows, position, axes, matrix); "
-            "the file is cut off or damaged, or declares fewer cells than it holds"
+            "the file is cut off or damaged, or has more cells than declared: export it again"
         )
     cells = columns * lines
     if columns < 1 or lines < 1:
-        raise InputError(f"{path}: scan {number} declares a grid of {columns} x {lines} cells")
+        raise InputError(f"{path}: expected a grid of 1 x 1 cells or more, found {columns} x {lines} in scan {number}")
     check_room(path, "PTX", cells, SHORTEST_ROW, size)
     T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
     with parsing(path, "PTX"):
-        pass
-
         wide = rows.width() in (4, 7)
         points, intensity = room_for(cells, 3), room_for(cells if wide else 0)
-        # A cloud without a grid is often written as a single row or column.
+        # A cloud without a grid is often written as one row or column.
         gridded = cells if min(columns, lines) > 1 and max(columns, lines) <= MOST_LINES else 0
         row, column = (room_for(gridded, dtype=np.int32) for _ in range(2))
-        read = found = 0
+        read = count = 0
         for piece in rows.pieces((0, 1, 2, 3) if wide else (0, 1, 2), cells):
-            found = keep(piece, read, lines, found, points, intensity, row, column)
+            count = copy_returns(piece, read, lines, count, points, intensity, row, column)
             read += len(piece)
     if read != cells:
-        raise InputError(f"{path}: scan {number} declares {cells} cells, found {read}; copy or export it again")
-    if not found:
+        raise InputError(f"{path}: expected {cells} cells in scan {number}, found {read}; copy or export it again")
+    if not count:
         raise InputError(f"{path}: scan {number} holds no returns, only cells of 0 0 0")
     position = T_project_scan[:3, :3].T @ (np.array(numbers[2]) - T_project_scan[:3, 3])
     return make(
         path,
         stem(path),
-        points[:found],
+        points[:count],
         unit=UNIT,
-        intensity=intensity[: found if wide else 0],
+        intensity=intensity[: count if wide else 0],
         position=position,
         T_project_scan=T_project_scan,
-        grid=(row[:found], column[:found]) if gridded else None,
+        grid=(row[:count], column[:count]) if gridded else None,
     )
 
 
 def _rigid(path: Path, number: int, T: Floats) -> Floats:
-    """Return the pose with its rotation made exact. Raises InputError for a matrix that scales, mirrors or shears."""
+    """Return the pose with the nearest rotation. Raises InputError for a matrix that scales, mirrors or shears."""
     R = T[:3, :3]
     off = float(np.abs(R.T @ R - np.eye(3)).max()) if np.isfinite(T).all() else float("nan")
     if not (off < RIGID_TOLERANCE and np.linalg.det(R) > 0 and np.abs(T[3] - [0, 0, 0, 1]).max() < RIGID_TOLERANCE):
@@ -106,36 +104,33 @@ def _rigid(path: Path, number: int, T: Floats) -> Floats:
     return exact
 
 
-# --- Cells of a scanner's grid that had a return, sorted out of all: compiled.
-
-
 @njit(cache=True, nogil=True)
-def keep(
+def copy_returns(
     cells: Floats,
     first: int,
     lines: int,
-    found: int,
+    count: int,
     points: Floats,
     intensity: Floats,
     row: Labels,
     column: Labels,
 ) -> int:
-    """Copy those of cells (n, 3 or 4) that are not ``0 0 0`` behind the ``found`` returns that there are already.
+    """Copy the cells (n, 3 or 4) that are not ``0 0 0`` behind the ``count`` returns copied before.
 
-    Cells come column by column of ``lines`` cells each, the first of these being cell ``first``. ``points`` (m, 3),
-    ``intensity``, ``row`` and ``column`` (m,) are filled, but those that are empty. Returns the count of all returns.
+    Cells are in order of columns of ``lines`` cells; the first one has the number ``first``. Fills ``points`` (m, 3)
+    and those of ``intensity``, ``row`` and ``column`` (m,) that are not empty. Returns the number of all returns.
     """
     c, r = divmod(first, lines)
     for i in range(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
         if x != 0.0 or y != 0.0 or z != 0.0:
-            points[found, 0], points[found, 1], points[found, 2] = x, y, z
+            points[count, 0], points[count, 1], points[count, 2] = x, y, z
             if len(intensity):
-                intensity[found] = cells[i, 3]
+                intensity[count] = cells[i, 3]
             if len(row):
-                row[found], column[found] = r, c
-            found += 1
+                row[count], column[count] = r, c
+            count += 1
         r += 1
         if r == lines:
             r, c = 0, c + 1
-    return found
+    return count

@@ -1,7 +1,8 @@
-"""Reading in a process of its own, for formats whose libraries may crash, hang or ask for any memory on damaged files.
+"""Reading in a separate process, for formats whose libraries may crash, hang or exhaust memory on damaged files.
 
-One such process serves all files of a run; what it dies of is said, and the next file gets a new one. Points come back
-in shared memory, so nothing is copied. It may take ``SLACK_BYTES`` beyond the points themselves, and ``limit_s``.
+One process serves all files of a run. If it ends, an InputError gives the reason, and the next file gets a new process.
+Points are returned in shared memory, without a copy. The limits are ``SLACK_BYTES`` of memory beyond the points, and
+``limit_s`` of time.
 """
 
 from __future__ import annotations
@@ -31,12 +32,11 @@ import numpy.typing as npt
 from processor.jobs.child import end_with_parent
 from processor.jobs.process import end, isolated, start
 from processor.model import InputError
-from processor.readers import common
-from processor.readers.common import RawScan
+from processor.readers.common import RawScan, give_room_by
 
 SLACK_BYTES = 1 << 30
-LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # no library for a format is nearly as slow
-PATIENCE = 4.0  # times as long by the clock: the machine may be busy with other work
+LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # the libraries are much faster than this
+PATIENCE = 4.0  # ratio of elapsed to processor time: the machine may be busy
 START_S = 120.0
 ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column")
 SMALL = 1 << 16
@@ -62,14 +62,14 @@ _lock = threading.Lock()
 
 
 def limit_s(path: Path) -> float:
-    """Processor seconds that reading a file may take."""
+    """Return the limit of processor time for reading a file, s."""
     return LEAST_S + path.stat().st_size / BYTES_PER_S
 
 
 def read(path: Path, module: str) -> list[RawScan]:
-    """Read a file by a module of this package in another process.
+    """Read a file by a module of this package in the other process.
 
-    Raises InputError as the module does, and where the process crashes or takes more than its time.
+    Raises InputError as the module does, and if the process crashes or exceeds its time.
     """
     with _lock:
         helper = _running()
@@ -77,17 +77,17 @@ def read(path: Path, module: str) -> list[RawScan]:
             _send(
                 helper.channel, {"module": module, "path": os.fsencode(path.absolute()).hex(), "limit_s": limit_s(path)}
             )
-            # The process ends itself in time; this is for one that is stopped or cannot be ended.
+            # The process ends itself in time; this timeout is for one that is stopped or cannot be ended.
             helper.channel.settimeout(PATIENCE * limit_s(path) + 30.0)
-            said, descriptor = _receive(helper.channel)
+            answer, descriptor = _receive(helper.channel)
         except (OSError, EOFError) as error:
             raise _death(path, helper, error) from None
         except BaseException:
             _forget(helper)
             raise
-    if "error" in said:
-        raise InputError(f"{path}{said['error']}" if said["about_file"] else said["error"])
-    return _scans(said, descriptor)
+    if "error" in answer:
+        raise InputError(f"{path}{answer['error']}" if answer["about_file"] else answer["error"])
+    return _scans(answer, descriptor)
 
 
 def _running() -> _Helper:
@@ -109,9 +109,9 @@ def _running() -> _Helper:
         _receive(ours)
     except (OSError, EOFError):
         process.kill()
-        said = (process.communicate()[1].decode("utf-8", "replace").strip().splitlines() or ["no word from it"])[-1]
+        message = (process.communicate()[1].decode("utf-8", "replace").strip().splitlines() or ["no message"])[-1]
         ours.close()
-        raise InputError(f"a process for reading scans cannot be started: {said}") from None
+        raise InputError(f"a process for reading scans cannot be started: {message}") from None
     assert process.stderr is not None
     process.stderr.close()
     _helper = _Helper(process, ours)
@@ -130,12 +130,14 @@ def _death(path: Path, helper: _Helper, error: BaseException) -> InputError:
     _helper = None
     code = helper.end()
     if code in (-signal.SIGPROF, -signal.SIGALRM) or isinstance(error, TimeoutError):
-        why = f"reading took more than {limit_s(path):.0f} s, far more than a file of its size needs"
+        reason = f"reading took more than {limit_s(path):.0f} s, far more than a file of its size needs"
     elif code == -signal.SIGKILL:
-        why = "reading was killed, most likely for want of memory"
+        reason = "reading was killed, most likely for lack of memory"
     else:
-        why = f"the library that reads it crashed ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
-    return InputError(f"{path}: {why}; the file is damaged: copy or export it again")
+        reason = (
+            f"the library that reads it crashed ({signal.Signals(-code).name if code < 0 else f'exit code {code}'})"
+        )
+    return InputError(f"{path}: {reason}; the file is damaged: copy or export it again")
 
 
 @atexit.register
@@ -147,23 +149,23 @@ def close() -> None:
         helper.end()
 
 
-def _scans(said: dict[str, Any], descriptor: int) -> list[RawScan]:
+def _scans(answer: dict[str, Any], descriptor: int) -> list[RawScan]:
     try:
         length = os.fstat(descriptor).st_size
         shared = mmap.mmap(descriptor, length) if length else b""
     finally:
         os.close(descriptor)
     scans = []
-    for one in said["scans"]:
+    for scan in answer["scans"]:
         arrays: dict[str, Any] = {
             key: np.frombuffer(shared, dtype, math.prod(shape), offset).reshape(shape) if 0 not in shape else ()
-            for key, (offset, shape, dtype) in one["arrays"].items()
+            for key, (offset, shape, dtype) in scan["arrays"].items()
         }
-        scans.append(RawScan(one["name"], unit=one["unit"], step=one["step"], **arrays))
+        scans.append(RawScan(scan["name"], unit=scan["unit"], step=scan["step"], **arrays))
     return scans
 
 
-# --- messages: a length, JSON, and with those that have arrays a descriptor ----------------------------------------
+# --- messages: a length and JSON, with a file descriptor if there are arrays -----------------------------------------
 
 
 def _send(channel: socket.socket, message: dict[str, Any], descriptor: int | None = None) -> None:
@@ -179,26 +181,26 @@ def _send(channel: socket.socket, message: dict[str, Any], descriptor: int | Non
 def _receive(channel: socket.socket) -> tuple[dict[str, Any], int]:
     head, descriptors, _, _ = socket.recv_fds(channel, 8, 1)
     while len(head) < 8:
-        head += _some(channel, 8 - len(head))
+        head += _receive_some(channel, 8 - len(head))
     text = bytearray()
     while len(text) < struct.unpack("<Q", head)[0]:
-        text += _some(channel, struct.unpack("<Q", head)[0] - len(text))
+        text += _receive_some(channel, struct.unpack("<Q", head)[0] - len(text))
     message: dict[str, Any] = json.loads(text)
     return message, descriptors[0] if descriptors else -1
 
 
-def _some(channel: socket.socket, most: int) -> bytes:
-    found = channel.recv(min(most, 1 << 20))
-    if not found:
+def _receive_some(channel: socket.socket, most: int) -> bytes:
+    data = channel.recv(min(most, 1 << 20))
+    if not data:
         raise EOFError
-    return found
+    return data
 
 
 # --- the other process ---------------------------------------------------------------------------------------------
 
 
 class _Shared:
-    """Memory of which arrays are cut, and which the other process sees through one descriptor."""
+    """Shared memory for arrays, which the other process maps by one descriptor."""
 
     def __init__(self) -> None:
         self.end = 0
@@ -210,7 +212,7 @@ class _Shared:
                 self.descriptor = os.dup(file.fileno())
 
     def new(self, shape: tuple[int, ...], dtype: type) -> npt.NDArray[Any]:
-        """Return an array in the shared memory, and allow the process as much more."""
+        """Return an array in the shared memory, and raise the memory limit of the process by its size."""
         size = np.dtype(dtype).itemsize * math.prod(shape)
         if size < SMALL:
             return np.empty(shape, dtype)
@@ -223,7 +225,7 @@ class _Shared:
         return array
 
     def place(self, array: Any) -> int:
-        """Offset of an array's content in the shared memory, where it is put if it is not there yet."""
+        """Return the offset of an array in the shared memory; it is copied there if it is elsewhere."""
         address = _address(array)
         for first, size, offset in self.blocks:
             if first <= address and address + array.nbytes <= first + size:
@@ -250,7 +252,7 @@ def _allow(more: int) -> None:
 
 
 def _limit_memory(slack: int) -> None:
-    """Limit the address space to what is in use now and ``slack``; never above a limit that is there already."""
+    """Limit the address space to its present size plus ``slack``, but not above an existing limit."""
     pages = Path("/proc/self/statm")
     if not pages.exists():
         return
@@ -266,31 +268,31 @@ def serve() -> None:
     for name in ("laspy", "pye57"):
         importlib.import_module(name)
     for number in (signal.SIGPROF, signal.SIGALRM):
-        signal.signal(number, signal.SIG_DFL)  # ends the process even within a library
+        signal.signal(number, signal.SIG_DFL)  # ends the process even inside a library
     signal.signal(signal.SIGINT, signal.SIG_DFL)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     with contextlib.suppress(ValueError, OSError):
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     _send(channel, {})
-    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # what libraries complain of comes as errors too
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # libraries raise what they print here
     while True:
         try:
-            asked, _ = _receive(channel)
+            request, _ = _receive(channel)
         except (EOFError, OSError):
             return
         shared = _Shared()
-        common.give_room_by(shared.new)
+        give_room_by(shared.new)
         _limit_memory(SLACK_BYTES)
-        signal.setitimer(signal.ITIMER_PROF, asked["limit_s"])
-        signal.setitimer(signal.ITIMER_REAL, PATIENCE * asked["limit_s"])
-        said = _answer(Path(os.fsdecode(bytes.fromhex(asked["path"]))), asked["module"], shared)
+        signal.setitimer(signal.ITIMER_PROF, request["limit_s"])
+        signal.setitimer(signal.ITIMER_REAL, PATIENCE * request["limit_s"])
+        answer = _answer(Path(os.fsdecode(bytes.fromhex(request["path"]))), request["module"], shared)
         for timer in (signal.ITIMER_PROF, signal.ITIMER_REAL):
             signal.setitimer(timer, 0.0)
-        _send(channel, said, shared.descriptor)
+        _send(channel, answer, shared.descriptor)
         os.close(shared.descriptor)
         del shared
-        common.give_room_by(np.empty)
+        give_room_by(np.empty)
 
 
 def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:
@@ -298,21 +300,17 @@ def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:
         with np.errstate(invalid="ignore"):
             scans = importlib.import_module(f"processor.readers.{module}").read(path)
     except InputError as error:
-        said = str(error)
-        about = said.startswith(str(path))
-        return {"error": said.removeprefix(str(path)), "about_file": about}
+        message = str(error)
+        return {"error": message.removeprefix(str(path)), "about_file": message.startswith(str(path))}
     except OSError as error:
         return {"error": f": cannot be read ({error.strerror or error})", "about_file": True}
     except MemoryError:
-        return {
-            "error": ": takes more memory than a file of its size should; is it damaged?",
-            "about_file": True,
-        }
-    found = []
+        return {"error": ": needs more memory than a file of its size should; is it damaged?", "about_file": True}
+    records = []
     for scan in scans:
         arrays = {}
         for key in ARRAYS:
             array = getattr(scan, key)
             arrays[key] = (shared.place(array), array.shape, array.dtype.str)
-        found.append({"name": scan.name, "unit": scan.unit, "step": scan.step, "arrays": arrays})
-    return {"scans": found}
+        records.append({"name": scan.name, "unit": scan.unit, "step": scan.step, "arrays": arrays})
+    return {"scans": records}

@@ -1,7 +1,7 @@
 """Tables of numbers: XYZ, TXT, ASC, CSV, PTS. Any separator, header or none, decimal point or comma.
 
-Without a header the first three columns are x, y, z, and a fourth is the intensity where there are four columns or
-seven. A first line of one whole number is the count of points.
+Without a header the first three columns are x, y, z; the fourth is the intensity of tables with four or seven columns.
+A first line of one whole number is the number of points.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ UNIT = ""
 SNIFFED = 65_536
 SHORTEST_ROW = 6  # bytes: "0 0 0" and its end of line
 COMMENTS = ("#", "//", "%")
-COUNTED = 5  # rows that tell a column of numbers of points
+COUNTED = 5  # rows by which a column of row numbers is recognised
 SAMPLED = 200  # rows
 AXES = {
     "x": "x|easting|east",
@@ -48,10 +48,10 @@ UNIT_AFTER = r"[\s_\[(]*(?P<unit>mm|cm|m|ft|in)?[\])]?"
 
 @dataclass(frozen=True)
 class Layout:
-    """How a table is written."""
+    """The format of a table."""
 
     skip: int = 0  # lines before the first row
-    declared: int = -1  # points, -1 where no line says
+    declared: int = -1  # number of points, -1 where no line declares it
     header: tuple[str, ...] = ()
     separator: str | None = None  # None: blanks
     decimal_comma: bool = False
@@ -62,26 +62,24 @@ class Layout:
 
 
 def read(path: Path) -> list[RawScan]:
-    """Read a table of points as one scan, or a PTS file of several, each after its count."""
+    """Read a table of points as one scan, or a PTS file of several scans, each after its number of points."""
     layout = sniff(path)
     columns = _columns(path, layout)
-    wanted = [*columns.axes, *(one for one in (columns.intensity, columns.station) if one is not None)]
+    wanted = [*columns.axes, *(index for index in (columns.intensity, columns.station) if index is not None)]
     size = path.stat().st_size
-    found, declared = [], layout.declared
+    tables, declared = [], layout.declared
     with parsing(path, "text"), _opened(path, layout) as file:
-        rows = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
-        for _ in range(layout.skip):
-            rows.skip_line()
+        rows = _rows(file, layout)
         while True:
             check_room(path, "text", max(declared, 0), SHORTEST_ROW, size)
-            found.append(_filled(rows, wanted, declared))
+            tables.append(_filled(rows, wanted, declared))
             following = rows.line()
             if following is None or declared < 0:
                 break
             if not re.fullmatch(r"\d+", following):
-                raise InputError(f"{path}: the first line declares {declared} points, but more follow; export it again")
+                raise InputError(f"{path}: expected {declared} points as declared, found more; export it again")
             declared = int(following)
-    names = [stem(path)] if len(found) == 1 else [f"{stem(path)}-{i}" for i in range(1, len(found) + 1)]
+    names = [stem(path)] if len(tables) == 1 else [f"{stem(path)}-{i}" for i in range(1, len(tables) + 1)]
     return [
         make(
             path,
@@ -91,24 +89,24 @@ def read(path: Path) -> list[RawScan]:
             intensity=others[:, 0] if columns.intensity is not None else (),
             station=others[:, -1] if columns.station is not None else (),
         )
-        for name, (points, others) in zip(names, found, strict=True)
+        for name, (points, others) in zip(names, tables, strict=True)
     ]
 
 
 def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, Floats]:
-    """Return the coordinates (n, 3) of the rows that are declared, of all for -1, and what else is wanted (n, k)."""
-    room, found = declared if declared >= 0 else rows.likely_left(), 0
+    """Return coordinates (n, 3) and the other wanted columns (n, k) of the declared rows, for -1 of all rows."""
+    room, count = declared if declared >= 0 else rows.likely_left(), 0
     points, others = room_for(room, 3), room_for(room, len(wanted) - 3)
     for piece in rows.pieces(wanted, declared if declared >= 0 else 2**62):
-        if found + len(piece) > room:
+        if count + len(piece) > room:
             room = room + room // 4 + len(piece)
-            points, others = (_grown(column[:found], room) for column in (points, others))
-        points[found : found + len(piece)] = piece[:, :3]
-        others[found : found + len(piece)] = piece[:, 3:]
-        found += len(piece)
-    if found < declared:
-        raise ValueError(f"it declares {declared} points, but {found} follow")
-    return points[:found], others[:found]
+            points, others = (_grown(column[:count], room) for column in (points, others))
+        points[count : count + len(piece)] = piece[:, :3]
+        others[count : count + len(piece)] = piece[:, 3:]
+        count += len(piece)
+    if count < declared:
+        raise ValueError(f"expected {declared} points as declared, found {count}")
+    return points[:count], others[:count]
 
 
 def _grown(column: Floats, room: int) -> Floats:
@@ -118,18 +116,23 @@ def _grown(column: Floats, room: int) -> Floats:
 
 
 def numbers(path: Path, layout: Layout) -> Floats:
-    """Return all columns (n, k) of a table. Raises InputError for what is no number."""
+    """Return all columns (n, k) of a table. Raises InputError for a cell that is not a number."""
     with parsing(path, "text"), _opened(path, layout) as file:
-        rows = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
-        for _ in range(layout.skip):
-            rows.skip_line()
+        rows = _rows(file, layout)
         pieces = [piece.copy() for piece in rows.pieces(range(layout.columns))]
     return np.concatenate(pieces) if pieces else np.empty((0, layout.columns))
 
 
+def _rows(file: BinaryIO, layout: Layout) -> Rows:
+    rows = Rows(file, layout.separator, layout.decimal_comma, layout.comments_between)
+    for _ in range(layout.skip):
+        rows.skip_line()
+    return rows
+
+
 @contextmanager
 def _opened(path: Path, layout: Layout) -> Iterator[BinaryIO]:
-    """Open a table as bytes in which ASCII is ASCII, after its byte order mark."""
+    """Open a table in an encoding that contains ASCII, after its byte order mark."""
     if layout.encoding == "utf-16":
         yield io.BytesIO(path.read_bytes().decode("utf-16", "replace").encode())
         return
@@ -139,7 +142,7 @@ def _opened(path: Path, layout: Layout) -> Iterator[BinaryIO]:
 
 
 def sniff(path: Path) -> Layout:
-    """Find how a table is written from its first lines. Raises InputError where no row of numbers is among them."""
+    """Determine the format of a table from its first lines. Raises InputError if none of them is a row of numbers."""
     with path.open("rb") as file:
         head = file.read(SNIFFED)
     encoding = (
@@ -148,7 +151,7 @@ def sniff(path: Path) -> Layout:
     if not encoding and b"\0" in head:
         raise InputError(f"{path}: expected a table of numbers as text, found binary data")
     text = head.decode(encoding, "replace") if encoding else decoded(head)
-    encoding = encoding or "latin-1"  # never fails, and only numbers are read with it
+    encoding = encoding or "latin-1"  # never fails, and only numbers are decoded
     lines = text.splitlines()
     declared, header = -1, ""
     for number, line in enumerate(lines):
@@ -161,15 +164,21 @@ def sniff(path: Path) -> Layout:
         cells = _cells(stripped, separator, comma)
         names = tuple(_cells(header, *_separator(header))) if header else ()
         if stripped and not comment and len(cells) >= 3 and _is_row(cells, names):
-            later = any(mark in one for one in lines[number:] for mark in COMMENTS[1:])
             whole = lines[number:-1] if len(head) == SNIFFED else lines[number:]
-            following = [one.strip() for one in whole[:SAMPLED] if one.strip()] or [stripped]
-            # Whole numbers do not show how others are written.
-            comma = comma or (
-                separator in (None, ";") and any(_separator(one) == (separator, True) for one in following)
+            rows = [row.strip() for row in whole[:SAMPLED] if row.strip()] or [stripped]
+            # A first row of whole numbers does not show the decimal sign.
+            comma = comma or (separator in (None, ";") and any(_separator(row) == (separator, True) for row in rows))
+            return Layout(
+                skip=number,
+                declared=declared,
+                header=names,
+                separator=separator,
+                decimal_comma=comma,
+                columns=len(cells),
+                comments_between=any(mark in later for later in lines[number:] for mark in COMMENTS[1:]),
+                encoding=encoding,
+                sample=tuple(tuple(_cells(row, separator, comma)) for row in rows if not row.startswith(COMMENTS)),
             )
-            sample = tuple(tuple(_cells(one, separator, comma)) for one in following if not one.startswith(COMMENTS))
-            return Layout(number, declared, names, separator, comma, len(cells), later, encoding, sample)
         if stripped:
             header = re.sub(r"^(#|//|%)+\s*", "", stripped)
     raise InputError(
@@ -180,7 +189,7 @@ def sniff(path: Path) -> Layout:
 
 
 def _separator(line: str) -> tuple[str | None, bool]:
-    """Separator of a line (None = blanks) and whether its numbers have a decimal comma."""
+    """Return the separator of a line (None = blanks) and whether its numbers have a decimal comma."""
     if ";" in line:
         return ";", "," in line and "." not in line
     words = line.split()
@@ -200,16 +209,16 @@ def _cells(line: str, separator: str | None, decimal_comma: bool) -> list[str]:
 
 
 def _is_row(cells: Sequence[str], names: Sequence[str]) -> bool:
-    """Whether cells are all numbers, or those are that a header names as coordinates: others may be names of points."""
+    """Whether all cells are numbers, or at least the coordinates by a header: other cells may be names of points."""
     axes = _axes(names) if len(names) == len(cells) else []
-    return all(map(_is_number, [cells[one] for one in axes] or cells))
+    return all(map(_is_number, [cells[axis] for axis in axes] or cells))
 
 
 def _axes(header: Sequence[str]) -> list[int]:
-    """Columns that a header calls x, y and z; none where it does not call all three so."""
+    """Return the columns that a header names x, y and z; none unless it names all three."""
     names = [_bare(name) for name in header]
-    found = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
-    return [names.index(name) for name in found if name is not None] if all(found) else []
+    axes = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
+    return [names.index(name) for name in axes if name is not None] if all(axes) else []
 
 
 def _bare(name: str) -> str:
@@ -233,19 +242,20 @@ class _Columns:
 
 
 def _columns(path: Path, layout: Layout) -> _Columns:
-    """Columns of x, y, z, of the intensity and of the station, and the unit that a header names."""
+    """Return the columns of coordinates, intensity and station, and the unit that a header names."""
     names = [_bare(name) for name in layout.header]
-    found = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
-    if len(names) == layout.columns and all(found):
-        intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
-        units = [re.search(rf"{UNIT_AFTER}$", name or "", re.IGNORECASE) for name in found]
-        said = {(match.group("unit") or "").lower() for match in units if match}
-        if len(said) != 1:
-            raise InputError(f"{path}: the header gives x, y, z in different units ({', '.join(layout.header)})")
-        axes = [names.index(name) for name in found if name is not None]
-        others = [names.index(name) if name else None for name in (intensity, station)]
-        return _Columns(axes, others[0], others[1], said.pop())
-    if sum(map(bool, found)) > 1 and len(names) != layout.columns:
+    axes = [first_named(names, rf"({AXES[axis]})({UNIT_AFTER})") for axis in "xyz"]
+    if len(names) == layout.columns and all(axes):
+        matches = [re.search(rf"{UNIT_AFTER}$", name or "", re.IGNORECASE) for name in axes]
+        units = {(match.group("unit") or "").lower() for match in matches if match}
+        if len(units) != 1:
+            raise InputError(
+                f"{path}: expected x, y, z in one unit, found different units ({', '.join(layout.header)})"
+            )
+        others = [first_named(names, pattern) for pattern in (INTENSITY_NAMES, STATION_NAMES)]
+        intensity, station = (names.index(name) if name else None for name in others)
+        return _Columns([names.index(name) for name in axes if name is not None], intensity, station, units.pop())
+    if sum(map(bool, axes)) > 1 and len(names) != layout.columns:
         raise InputError(
             f"{path}: the header names {len(names)} columns ({' '.join(names)[:80]}), but rows have {layout.columns}"
         )
@@ -254,17 +264,17 @@ def _columns(path: Path, layout: Layout) -> _Columns:
 
 
 def _check_plain(path: Path, layout: Layout) -> None:
-    """Refuse a table without names of columns that can be read in two ways."""
+    """Raise InputError for a table without names of columns that is ambiguous."""
     rows = layout.sample
     if layout.columns == 6 and layout.separator == "," and all(re.fullmatch(r"[+-]?\d+", c) for r in rows for c in r):
         raise InputError(
-            f"{path}: commas may separate six whole numbers or be the decimal signs of three; "
+            f"{path}: commas are either separators of six whole numbers or decimal signs of three numbers; "
             "separate by semicolons, or name the columns in a first line"
         )
     counts = [row[0] for row in rows]
     counting = len(counts) >= COUNTED and counts[0].isdecimal() and layout.columns >= 4
     if counting and counts == [str(int(counts[0]) + i) for i in range(len(counts))]:
         raise InputError(
-            f"{path}: the first column only counts ({', '.join(counts[:3])}, ...); "
-            "name the columns in a first line (id x y z), or leave the numbers of the points out"
+            f"{path}: expected coordinates, found row numbers in the first column ({', '.join(counts[:3])}, ...); "
+            "name the columns in a first line (id x y z), or leave the row numbers out"
         )

@@ -49,7 +49,8 @@ def _put_field(target: dict[str, Any], field: dataclasses.Field[Any], value: Any
     elif "by" in metadata:
         _put(target, key, {str(row.pop(metadata["by"])): row for row in as_rows(value)})
     else:
-        _put(target, key, _value(value))
+        null = metadata.get("nullable") and np.isnan(value).all()
+        _put(target, key, None if null else _value(value))
 
 
 def _by_name(values: Any, names: Sequence[str], *further: Sequence[str]) -> dict[str, Any]:

@@ -1,6 +1,6 @@
-"""STEP and IFC designs as meshes, made by ``designgen import`` in a process of its own: no CAD kernel is loaded here.
+"""STEP and IFC designs as meshes, converted by ``designgen import`` in a separate process.
 
-What was made once is kept for the next time, under the hash of the file's bytes, in the user's cache folder.
+No CAD kernel is loaded here. Meshes are cached in the user's cache folder under the hash of the file's bytes.
 """
 
 from __future__ import annotations
@@ -20,22 +20,23 @@ import numpy as np
 
 from processor.jobs import process
 from processor.model import Floats, InputError, Ints
+from processor.scan_folder.meshes import CAD_SUFFIXES as SUFFIXES
+from processor.scan_folder.meshes import read_mesh
 from processor.version import __version__
 
-SUFFIXES = (".step", ".stp", ".ifc")
-LIMIT_S = 900.0  # designgen has a limit of its own, with a better message, below this one
-NO_UNIT = "no unit of length"
-SAID = "import.json"
+__all__ = ["SUFFIXES", "read"]
+
+LIMIT_S = 900.0  # designgen has a lower limit, with a better message
+NO_UNIT = "no unit of length"  # part of the message of designgen
+RECORD = "import.json"
 
 
 def read(path: Path, unit: str) -> tuple[Floats, Ints]:
-    """Vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file, one after another.
+    """Return vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file.
 
-    ``unit`` is that of a file that names none. Raises InputError without designgen, and for a file that it cannot take
-    whole.
+    ``unit`` is that of a file without a unit. Raises InputError without designgen, and for a file that cannot be
+    converted completely.
     """
-    from processor.scan_folder.meshes import read_mesh
-
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -43,9 +44,9 @@ def read(path: Path, unit: str) -> tuple[Floats, Ints]:
     key = hashlib.sha256(b"\0".join((content, path.suffix.lower().encode(), unit.encode(), __version__.encode())))
     with _cache() as cache:
         meshes = cache / key.hexdigest()
-        if not (meshes / SAID).is_file():
+        if not (meshes / RECORD).is_file():
             _import(path, content, unit, cache, meshes)
-        bodies = [read_mesh(meshes / one) for one in _names(meshes, path)]
+        bodies = [read_mesh(meshes / name) for name in _names(meshes, path)]
     counts = np.cumsum([0, *(len(vertices) for vertices, _ in bodies)])
     faces = [faces + first for (_, faces), first in zip(bodies, counts.tolist(), strict=False)]
     return np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces)
@@ -53,23 +54,23 @@ def read(path: Path, unit: str) -> tuple[Floats, Ints]:
 
 def _names(meshes: Path, path: Path) -> list[str]:
     try:
-        said = json.loads((meshes / SAID).read_text("utf-8"))
-        names = [str(body["mesh"]) for body in said["bodies"]]
-        problems = [str(problem) for problem in said["problems"]]
+        record = json.loads((meshes / RECORD).read_text("utf-8"))
+        names = [str(body["mesh"]) for body in record["bodies"]]
+        problems = [str(problem) for problem in record["problems"]]
     except (OSError, ValueError, KeyError, TypeError):
         shutil.rmtree(meshes, ignore_errors=True)
-        raise InputError(f"{meshes}: is damaged, and removed; run again") from None
+        raise InputError(f"{meshes}: was damaged and has been removed; run again") from None
     if problems:
         more = f", and {len(problems) - 1} more" if len(problems) > 1 else ""
-        raise InputError(f"{path}: not all of it could be turned into meshes ({problems[0]}{more}); export it again")
+        raise InputError(f"{path}: cannot be converted to meshes completely ({problems[0]}{more}); export it again")
     if not names or any(Path(name).name != name for name in names):
-        raise InputError(f"{path}: no body of it could be turned into a mesh; export it with solids or surfaces")
+        raise InputError(f"{path}: expected solids or surfaces, found none; export it with them")
     return names
 
 
 @contextmanager
 def _cache() -> Iterator[Path]:
-    """Give the folder of what was made before; one that is gone afterwards where the user can have none."""
+    """Yield the cache folder, or a temporary one if the user's cannot be written."""
     home = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
     place = Path(home, "steel-scan-check", "cad")
     if place.is_absolute():
@@ -83,27 +84,26 @@ def _cache() -> Iterator[Path]:
 
 
 def _designgen(path: Path) -> list[str]:
-    """Return the command of designgen: of this installation, or another one on the search path."""
+    """Return the command of designgen: of this installation, or else the one on the search path."""
     if importlib.util.find_spec("designgen") and importlib.util.find_spec("cadquery"):
         return [sys.executable, "-m", "designgen"]
-    found = shutil.which("designgen")
-    if found:
-        return [found]
+    program = shutil.which("designgen")
+    if program:
+        return [program]
     raise InputError(
-        f"{path}: to be turned into a mesh it needs designgen with its CAD kernel: "
-        "pip install 'steel-scan-check[designgen]'"
+        f"{path}: a CAD file needs designgen with its CAD kernel: pip install 'steel-scan-check[designgen]'"
     )
 
 
 def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) -> None:
-    """Make the meshes; they come to be at ``meshes`` whole."""
+    """Make the meshes in a temporary folder and rename it to ``meshes``, so that they are complete there."""
     command = _designgen(path)
     try:
         making = Path(tempfile.mkdtemp(prefix=".making-", dir=cache))
     except OSError as error:
         raise InputError(f"{cache}: cannot be written ({error.strerror or error})") from error
     try:
-        # A copy of the bytes that were hashed, under a name that no program takes for an option.
+        # A copy of the hashed bytes, under a name that cannot be mistaken for an option.
         source = making / f"design{path.suffix.lower()}"
         source.write_bytes(content)
         failure = _run(command, source, making / "meshes", "")
@@ -111,10 +111,10 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
             failure = _run(command, source, making / "meshes", unit)
         if failure:
             raise InputError(f"{path}: {failure.replace(f'{source}: ', '')}")
-        with suppress(OSError):  # another process was faster
+        with suppress(OSError):  # another process has made them meanwhile
             os.replace(making / "meshes", meshes)
         if not meshes.is_dir():
-            raise InputError(f"{path}: designgen import left no meshes")
+            raise InputError(f"{path}: expected meshes from designgen import, found none; run again")
     except OSError as error:
         raise InputError(f"{cache}: cannot be written ({error.strerror or error})") from error
     finally:
@@ -122,12 +122,12 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
 
 
 def _run(command: list[str], source: Path, out: Path, unit: str) -> str:
-    """Run designgen import; what it says where there are no meshes in the end."""
+    """Run designgen import; returns its error message if it made no meshes, else ""."""
     units = ["--units", unit] if unit else []
     ended = process.run([*command, "import", str(source), "-o", str(out), *units], own_group=False, timeout_s=LIMIT_S)
     if ended.cause is process.Cause.TIME:
         return f"designgen import did not end within {LIMIT_S:g} s"
-    if (out / SAID).is_file():
+    if (out / RECORD).is_file():
         return ""
     code = -ended.code if ended.cause is process.Cause.SIGNAL else ended.code
     return ended.last_line.removeprefix("error: ") or f"designgen import ended with exit code {code}"

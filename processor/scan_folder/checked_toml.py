@@ -1,4 +1,4 @@
-"""Values out of project.toml and design.json, each checked, with its place in the file in every message."""
+"""Checked values of project.toml and design.json; messages name their place in the file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from processor.scan_folder.units import known_unit
 
 
 def inside(folder: Path, text: str, where: str) -> Path:
-    """Path of a file that a text within ``folder`` names. Raises InputError for one that leads out of the folder."""
+    """Return the path of a file below ``folder``. Raises InputError for a path that leads out of the folder."""
     path = folder / text
     parts = text.replace("\\", "/").split("/")
     if "\0" in text or (path.is_absolute() and text.startswith(("/", "\\"))) or ".." in parts or ":" in parts[0]:
@@ -25,7 +25,7 @@ def inside(folder: Path, text: str, where: str) -> Path:
     except (OSError, RuntimeError, ValueError):
         stays = False
     if not stays:
-        raise InputError(f"{where}: {text!r} is a link that leads out of the folder; put the file itself there")
+        raise InputError(f"{where}: {text!r} is a link that leads out of the folder; copy the file there")
     if not path.exists():
         raise InputError(f"{where}: there is no file {text!r} in {folder}")
     return path
@@ -33,30 +33,30 @@ def inside(folder: Path, text: str, where: str) -> Path:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a file, and where it stands there."""
+    """A table of a file, and its place there."""
 
     where: str
     values: Mapping[str, Any]
 
     @classmethod
     def of(cls, where: str, value: Any) -> Table:
-        """Take a value as a table. Raises InputError where it is none."""
+        """Return a value as a table. Raises InputError for any other type."""
         if not isinstance(value, dict):
             raise InputError(f"{where}: expected a table of names and values, found {_kind(value)}")
         return cls(where, value)
 
     def only(self, known: Collection[str]) -> None:
-        """Raise InputError for a key that is not known."""
+        """Raise InputError for a key that is not in ``known``."""
         unknown = [key for key in self.values if key not in known]
         if unknown:
             raise InputError(f"{self.where}: unknown key {unknown[0]!r}; known are {', '.join(known)}")
 
     def _error(self, key: str, expected: str) -> InputError:
-        found = _kind(self.values[key]) if key in self.values else "nothing"
-        return InputError(f"{self.where}: expected {expected} as {key!r}, found {found}")
+        value = _kind(self.values[key]) if key in self.values else "nothing"
+        return InputError(f"{self.where}: expected {expected} as {key!r}, found {value}")
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Text that is not empty."""
+        """Return a text that is not empty."""
         value = self.values.get(key, default)
         if not isinstance(value, str) or (key in self.values and not value):
             raise self._error(key, "a text")
@@ -93,7 +93,7 @@ class Table:
         return value
 
     def array(self, key: str, *shape: int) -> Floats:
-        """Return an array of finite numbers; -1 in ``shape`` leaves an axis free."""
+        """Return an array of finite numbers; -1 in ``shape`` allows any length of an axis."""
         expected = "numbers of shape " + " x ".join("n" if n < 0 else str(n) for n in shape)
         try:
             array = np.array(self.values.get(key), np.float64)
@@ -105,7 +105,7 @@ class Table:
         return array
 
     def tables(self, key: str) -> list[Table]:
-        """List of tables; none where the key is absent."""
+        """Return a list of tables, empty without the key."""
         value = self.values.get(key, [])
         if not isinstance(value, list):
             raise self._error(key, "a list")

@@ -12,9 +12,9 @@ import numpy as np
 from processor.model import Control, Floats, InputError, Scan, Stations
 from processor.readers.common import decoded, parsing
 from processor.scan_folder.checked_toml import Table, inside
+from processor.scan_folder.files import CONTROL
 from processor.scan_folder.units import MM_PER_UNIT
 
-CONTROL = "control.csv"
 KEYS = ("name", "position", "sd_mm", "scan", "seen", "seen_sd_mm")
 COLUMNS = ("name", "scan", "x", "y", "z", "sd_mm")
 LARGEST_FILE = 16 * 2**20
@@ -22,42 +22,43 @@ LARGEST_FILE = 16 * 2**20
 
 @dataclass(frozen=True)
 class Measured:
-    """A target's place (3,) with its standard deviation, in the file's own unit: as known, or as seen in ``scan``."""
+    """A measurement of a target: its position (3,), in the unit of the file, and its standard deviation."""
 
-    where: str  # in which file this stands
+    where: str  # place in the file
     name: str
-    scan: str  # of a scan or station; empty: the place is known, in the project's frame
-    place: Floats
+    scan: str  # scan or station that saw the target; "" = known position in the project's frame
+    position: Floats
     sd_mm: float
 
 
 def read_control(folder: Path, project: Table) -> tuple[tuple[Measured, ...], Path | None]:
-    """Read what project.toml says of control points, and the table that holds them where there is one.
+    """Read the control points of project.toml, and return the path of their CSV file if there is one.
 
-    ``control`` is a list of tables, or names a CSV file; without, control.csv is read where it is there. Raises
-    InputError for what cannot be used.
+    ``control`` is a list of tables, or the name of a CSV file; without it control.csv is read if it exists. Raises
+    InputError for malformed entries.
     """
-    said = project.values.get("control")
-    if isinstance(said, list):
-        return tuple(one for table in project.tables("control") for one in _of_table(table)), None
-    if said is None and not (folder / CONTROL).exists():
+    given = project.values.get("control")
+    if isinstance(given, list):
+        return tuple(measured for table in project.tables("control") for measured in _from_table(table)), None
+    if given is None and not (folder / CONTROL).exists():
         return (), None
     path = inside(folder, project.text("control", CONTROL), project.where)
-    return tuple(_of_csv(path)), path
+    return tuple(_from_csv(path)), path
 
 
-def _of_table(table: Table) -> list[Measured]:
+def _from_table(table: Table) -> list[Measured]:
     table.only(KEYS)
     name = table.text("name")
-    found = []
+    measured = []
     if "position" in table.values:
-        found.append(Measured(table.where, name, "", table.array("position", 3), table.number("sd_mm", positive=True)))
+        sd = table.number("sd_mm", positive=True)
+        measured.append(Measured(table.where, name, "", table.array("position", 3), sd))
     if "scan" in table.values or "seen" in table.values:
         sd = _not_negative(table.where, table.number("seen_sd_mm", 0.0))
-        found.append(Measured(table.where, name, table.text("scan"), table.array("seen", 3), sd))
-    if not found:
+        measured.append(Measured(table.where, name, table.text("scan"), table.array("seen", 3), sd))
+    if not measured:
         raise InputError(f"{table.where}: expected 'position' with 'sd_mm', or 'scan' with 'seen', found neither")
-    return found
+    return measured
 
 
 def _not_negative(where: str, sd_mm: float) -> float:
@@ -66,7 +67,7 @@ def _not_negative(where: str, sd_mm: float) -> float:
     return sd_mm
 
 
-def _of_csv(path: Path) -> list[Measured]:
+def _from_csv(path: Path) -> list[Measured]:
     if not path.is_file() or path.stat().st_size > LARGEST_FILE:
         raise InputError(f"{path}: expected a table of control points, found a folder or more than 16 MB")
     try:
@@ -78,21 +79,21 @@ def _of_csv(path: Path) -> list[Measured]:
     header = tuple(name.strip().lower() for name in rows[0][1]) if rows else ()
     if sorted(header) != sorted(COLUMNS):
         raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}")
-    found = []
+    measured = []
     for line, row in rows[1:]:
         where = f"{path}: line {line}"
         cells = dict(zip(header, (cell.strip() for cell in row), strict=False))
         try:
-            place = np.array([float(cells[axis]) for axis in "xyz"])
+            position = np.array([float(cells[axis]) for axis in "xyz"])
             sd_mm = float(cells["sd_mm"] or "0")
         except (KeyError, ValueError):
             raise InputError(f"{where}: expected {','.join(COLUMNS)}, found {row}") from None
-        if not cells["name"] or not np.isfinite(place).all():
+        if not cells["name"] or not np.isfinite(position).all():
             raise InputError(f"{where}: expected a name and finite coordinates, found {row}")
         if not cells["scan"] and not 0.0 < sd_mm < np.inf:
-            raise InputError(f"{where}: expected sd_mm above 0 for coordinates that are known, found {sd_mm:g}")
-        found.append(Measured(where, cells["name"], cells["scan"], place, _not_negative(where, sd_mm)))
-    return found
+            raise InputError(f"{where}: expected sd_mm above 0 for known coordinates, found {sd_mm:g}")
+        measured.append(Measured(where, cells["name"], cells["scan"], position, _not_negative(where, sd_mm)))
+    return measured
 
 
 def control_points(
@@ -102,61 +103,60 @@ def control_points(
     stations: Stations | None,
     unit: str,
 ) -> Control | None:
-    """Put known and seen places together; None without any.
+    """Combine known and seen positions of targets; None without any.
 
     ``units`` are those of the scans' coordinates, ``unit`` is that of known ones. Raises InputError for a target that
-    is seen but not known, one given twice, a scan or station that is not there, and where no target was seen at all.
+    is seen but not known, or given twice, for an unknown scan or station, and if no target is seen at all.
     """
     if not measured:
         return None
-    known = [one for one in measured if not one.scan]
-    row = {one.name: i for i, one in enumerate(known)}
-    for i, one in enumerate(known):
-        if row[one.name] != i:
-            raise InputError(f"{one.where}: control point {one.name!r} has coordinates already; give them once")
-    seen = [one for one in measured if one.scan]
+    known = [target for target in measured if not target.scan]
+    row = {target.name: i for i, target in enumerate(known)}
+    for i, target in enumerate(known):
+        if row[target.name] != i:
+            raise InputError(f"{target.where}: control point {target.name!r} has coordinates already; give them once")
+    seen = [target for target in measured if target.scan]
     if not seen:
-        raise InputError(f"{known[0].where}: no control point is seen in a scan; say where one has it ('scan', 'seen')")
-    point: list[int] = []
-    scan: list[int] = []
-    station: list[int] = []
-    place: list[Floats] = []
-    for one in seen:
-        if one.name not in row:
-            raise InputError(f"{one.where}: {one.name!r} is seen in {one.scan!r}, but has no coordinates of its own")
-        s, k = _saw(one, scans, stations)
-        if (row[one.name], s, k) in zip(point, scan, station, strict=True):
-            raise InputError(f"{one.where}: {one.name!r} is seen in {one.scan!r} twice; give one place")
-        point.append(row[one.name])
-        scan.append(s)
-        station.append(k)
-        place.append(one.place * MM_PER_UNIT[units[s]])
+        raise InputError(f"{known[0].where}: no control point is seen in a scan; give one's place there (scan, seen)")
+    views: list[tuple[int, int, int]] = []  # rows of the point, of the scan and of the station
+    for target in seen:
+        if target.name not in row:
+            raise InputError(
+                f"{target.where}: {target.name!r} is seen in {target.scan!r}, but has no known coordinates; give them"
+            )
+        view = (row[target.name], *_scan_and_station(target, scans, stations))
+        if view in views:
+            raise InputError(f"{target.where}: {target.name!r} is seen in {target.scan!r} twice; give one place")
+        views.append(view)
+    point, scan, station = np.array(views).T
     return Control(
-        tuple(one.name for one in known),
-        np.array([one.place for one in known]) * MM_PER_UNIT[unit],
-        np.array([one.sd_mm for one in known]),
-        np.array(point),
-        np.array(scan),
-        np.array(station),
-        np.array(place),
-        np.array([one.sd_mm for one in seen]),
+        tuple(target.name for target in known),
+        positions=np.array([target.position for target in known]) * MM_PER_UNIT[unit],
+        sd=np.array([target.sd_mm for target in known]),
+        point=point,
+        scan=scan,
+        station=station,
+        seen=np.array([target.position * MM_PER_UNIT[units[s]] for target, s in zip(seen, scan, strict=True)]),
+        seen_sd=np.array([target.sd_mm for target in seen]),
     )
 
 
-def _saw(one: Measured, scans: Sequence[Scan], stations: Stations | None) -> tuple[int, int]:
-    """Row of the scan that saw a target, and of the station where the scan is of several (-1 = the scan's own)."""
-    named = [i for i, scan in enumerate(scans) if one.scan == scan.name]
-    named = named or [i for i, scan in enumerate(scans) if one.scan == scan.station]
+def _scan_and_station(target: Measured, scans: Sequence[Scan], stations: Stations | None) -> tuple[int, int]:
+    """Return the row of the scan that saw a target, and of the station in a merged scan (-1 = the scan's own)."""
+    named = [i for i, scan in enumerate(scans) if target.scan == scan.name]
+    named = named or [i for i, scan in enumerate(scans) if target.scan == scan.station]
     if len(named) > 1:
-        raise InputError(f"{one.where}: {one.scan!r} is the station of several scans; name the scan")
+        raise InputError(f"{target.where}: {target.scan!r} is the station of several scans; name the scan")
     merged = [i for i, scan in enumerate(scans) if not scan.position.size and len(scan.point_station)]
     if named and named[0] not in merged:
         return named[0], -1
-    if stations is not None and one.scan in stations.ids and merged:
+    if stations is not None and target.scan in stations.ids and merged:
         if len(merged) > 1:
-            raise InputError(f"{one.where}: station {one.scan!r} is one of several clouds'; join them first")
-        return merged[0], stations.ids.index(one.scan)
+            raise InputError(f"{target.where}: station {target.scan!r} is in several merged clouds; join them first")
+        return merged[0], stations.ids.index(target.scan)
     if named:
-        raise InputError(f"{one.where}: scan {one.scan!r} is of several stations; name the one that saw {one.name!r}")
-    there = [*(scan.name for scan in scans), *(stations.ids if stations is not None and merged else ())]
-    raise InputError(f"{one.where}: there is no scan or station {one.scan!r}; there are {', '.join(there)}")
+        raise InputError(
+            f"{target.where}: scan {target.scan!r} has several stations; name the one that saw {target.name!r}"
+        )
+    known = [*(scan.name for scan in scans), *(stations.ids if stations is not None and merged else ())]
+    raise InputError(f"{target.where}: unknown scan or station {target.scan!r}; expected one of {', '.join(known)}")

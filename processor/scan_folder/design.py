@@ -1,4 +1,4 @@
-"""Designs from files: design.json of an arch bridge or a space frame, or a table of balls; meshes of components."""
+"""Designs from files: design.json of an arch bridge or a space frame, a table of nodes, and surfaces."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from pathlib import Path
 import numpy as np
 
 from processor.geometry import box_girder
-from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints
+from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints, UsageError
 from processor.readers.common import decoded, parsing
 from processor.scan_folder import cad
 from processor.scan_folder.checked_toml import Table, inside
 from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
-from processor.scan_folder.units import MM_PER_UNIT, SYNONYMS
+from processor.scan_folder.units import MM_PER_UNIT, known_unit
 
 TEXT_LIMIT = 256 * 2**20
 
 
 def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | FrameDesign:
-    """Read a design in mm. ``table_unit`` is that of a CSV whose header names none.
+    """Read a design in mm. ``table_unit`` is the unit of a CSV file without one in its header.
 
-    Raises InputError for anything missing, unknown or inconsistent.
+    Raises InputError for missing, unknown or inconsistent entries.
     """
     suffix = path.suffix.lower()
     if suffix == ".csv":
-        return _read_balls(path, table_unit)
-    if suffix in (*cad.SUFFIXES, *MESH_SUFFIXES):
+        return _read_nodes(path, table_unit)
+    if is_surface(path):
         raise InputError(
             f"{path}: a {suffix[1:].upper()} file alone is a design of kind structure; an arch bridge or a space frame "
             "needs a design.json (its components may name such files as 'mesh')"
@@ -47,7 +47,7 @@ def read_design(folder: Path, path: Path, table_unit: str) -> ArchDesign | Frame
 
 
 def read_json(path: Path) -> Table:
-    """Read a JSON file whose content is an object. Raises InputError for any other."""
+    """Read a JSON file that holds an object. Raises InputError for any other."""
     try:
         data = json.loads(_text(path))
     except (ValueError, RecursionError) as error:
@@ -57,7 +57,9 @@ def read_json(path: Path) -> Table:
 
 def _text(path: Path) -> str:
     if path.stat().st_size > TEXT_LIMIT:
-        raise InputError(f"{path}: {path.stat().st_size} bytes are more than a design needs; is it the right file?")
+        raise InputError(
+            f"{path}: expected at most {TEXT_LIMIT} bytes, found {path.stat().st_size}; is it the right file?"
+        )
     try:
         return decoded(path.read_bytes())
     except OSError as error:
@@ -73,9 +75,26 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
         raise InputError(f"{design.where}: expected 'order', the names of the components from one end to the other")
     if len(set(order)) != len(order) or set(order) != set(components.values):
         raise InputError(
-            f"{design.where}: 'order' ({', '.join(order)}) does not name each of the components "
-            f"({', '.join(components.values)}) once"
+            f"{design.where}: expected each component ({', '.join(components.values)}) once in 'order', found "
+            f"{', '.join(order)}"
         )
+    joints = _joints(design, order, scale)
+    pairs = list(pairwise(order))
+    at = [None, *(joints[pair][1] for pair in pairs), None]
+    parts = tuple(
+        _part(folder, name, components.table(name), design.unit("units"), at[i : i + 2]) for i, name in enumerate(order)
+    )
+    return ArchDesign(
+        parts,
+        joint_names=tuple(joints[pair][0] for pair in pairs),
+        joint_left=tuple(left for left, _ in pairs),
+        joint_right=tuple(right for _, right in pairs),
+        joint_points=np.array([joints[pair][1] for pair in pairs]),
+    )
+
+
+def _joints(design: Table, order: Sequence[str], scale: float) -> dict[tuple[str, str], tuple[str, Floats]]:
+    """Return the name and the key points (8, 3), mm, of the joint of each two neighbours in ``order``."""
     joints: dict[tuple[str, str], tuple[str, Floats]] = {}
     for joint in design.tables("joints"):
         joint.only(("name", "left", "right", "points"))
@@ -84,35 +103,23 @@ def _arch(folder: Path, design: Table) -> ArchDesign:
         corners = np.stack([points.array(key, 3) for key in KEY_POINTS]) * scale
         sides = (joint.text("left"), joint.text("right"))
         if sides in joints:
-            raise InputError(f"{joint.where}: a second joint of {sides[0]} and {sides[1]}")
+            raise InputError(f"{joint.where}: expected one joint of {sides[0]} and {sides[1]}, found a second")
         joints[sides] = (joint.text("name"), corners)
-    expected = list(pairwise(order))
-    if set(expected) != set(joints):
-        wrong = sorted(set(expected) ^ set(joints))[0]
+    if different := sorted(set(pairwise(order)) ^ set(joints)):
         raise InputError(
-            f"{design.where}: expected one joint for each two neighbours in 'order' (left, right); see {wrong}"
+            f"{design.where}: expected one joint for each two neighbours in 'order' (left, right); see {different[0]}"
         )
-    at = [None, *(joints[sides][1] for sides in expected), None]
-    parts = tuple(
-        _part(folder, name, components.table(name), design.unit("units"), at[i : i + 2]) for i, name in enumerate(order)
-    )
-    return ArchDesign(
-        parts,
-        tuple(joints[sides][0] for sides in expected),
-        tuple(left for left, _ in expected),
-        tuple(right for _, right in expected),
-        np.array([joints[sides][1] for sides in expected]),
-    )
+    return joints
 
 
 def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floats | None]) -> DesignPart:
-    """Read a component between its joints' key points (8, 3, mm); without a mesh it gets one from what is known."""
+    """Read a component; without a mesh one is made from its edges and the key points (8, 3), mm, of its joints."""
     scale = MM_PER_UNIT[unit]
     part.only(("mesh", "bottom_edge_left", "bottom_edge_right", "plate_mm"))
     edges = [part.array(f"bottom_edge_{side}", -1, 3) * scale for side in ("left", "right")]
     for side, edge in zip(("left", "right"), edges, strict=True):
         if len(edge) < 2 or (np.abs(np.diff(edge, axis=0)).max(axis=1) == 0).any():
-            raise InputError(f"{part.where}: bottom_edge_{side} needs two points or more, none of them twice in a row")
+            raise InputError(f"{part.where}: expected two points or more in bottom_edge_{side}, none repeated in a row")
     plate_mm = part.number("plate_mm", box_girder.PLATE_MM, positive=True)
     if "mesh" in part.values:
         vertices, faces = read_surface(inside(folder, part.text("mesh"), part.where), unit)
@@ -121,7 +128,7 @@ def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floa
         vertices, faces = box_girder.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
     except InputError as error:
         raise InputError(f"{part.where}: without a mesh: {error}") from None
-    return DesignPart(name, vertices, faces, edges[0], edges[1], box_girder.SOURCE)
+    return DesignPart(name, vertices, faces, edges[0], edges[1], source=box_girder.SOURCE)
 
 
 def _frame(design: Table) -> FrameDesign:
@@ -133,14 +140,16 @@ def _frame(design: Table) -> FrameDesign:
         ids.append(node.integer("id"))
         centres.append(node.array("centre", 3) * scale)
         radii.append(node.number("radius", positive=True) * scale)
-    _check_balls(design.where, ids)
+    _check_ids(design.where, ids)
     known = set(ids)
     a, b, diameters = [], [], []
     for member in design.tables("members"):
         member.only(("a", "b", "tube_diameter"))
         ends = (member.integer("a"), member.integer("b"))
         if not known.issuperset(ends) or ends[0] == ends[1]:
-            raise InputError(f"{member.where}: a member from {ends[0]} to {ends[1]} needs two of the nodes' ids")
+            raise InputError(
+                f"{member.where}: expected ids of two different nodes, found a member from {ends[0]} to {ends[1]}"
+            )
         a.append(ends[0])
         b.append(ends[1])
         diameters.append(member.number("tube_diameter", positive=True) * scale)
@@ -148,25 +157,25 @@ def _frame(design: Table) -> FrameDesign:
         np.array(ids, np.int64),
         np.array(centres),
         np.array(radii),
-        np.array(a, np.int64),
-        np.array(b, np.int64),
-        np.array(diameters),
+        member_a=np.array(a, np.int64),
+        member_b=np.array(b, np.int64),
+        tube_diameters=np.array(diameters),
     )
 
 
-def _check_balls(where: str, ids: list[int]) -> None:
+def _check_ids(where: str, ids: list[int]) -> None:
     if not ids:
-        raise InputError(f"{where}: holds no nodes")
-    twice = sorted({one for one in ids if ids.count(one) > 1}) if len(set(ids)) != len(ids) else []
-    if twice:
-        raise InputError(f"{where}: id {twice[0]} is given more than once")
+        raise InputError(f"{where}: expected nodes, found none")
+    repeated = sorted({i for i in ids if ids.count(i) > 1}) if len(set(ids)) != len(ids) else []
+    if repeated:
+        raise InputError(f"{where}: id {repeated[0]} is given more than once; give each node its own")
 
 
-def _read_balls(path: Path, table_unit: str) -> FrameDesign:
-    """Read a table of balls: id, x, y, z, radius in any order of columns, named by a header (``x_mm`` names a unit)."""
+def _read_nodes(path: Path, table_unit: str) -> FrameDesign:
+    """Read a table of nodes: columns id, x, y, z, radius in any order, named by a header (``x_mm`` gives a unit)."""
     text = _text(path)
     first = text.split("\n", 1)[0]
-    separator = next((one for one in (";", "\t", ",") if one in first), ",")
+    separator = next((mark for mark in (";", "\t", ",") if mark in first), ",")
     with parsing(path, "CSV"):
         rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(map(str.strip, row))]
     header = [name.strip().lower() for name in rows[0]] if rows else []
@@ -179,10 +188,10 @@ def _read_balls(path: Path, table_unit: str) -> FrameDesign:
                 units.add(match.group(2))
     if set(columns) != {"id", "x", "y", "z", "radius"} or len(units) != 1:
         raise InputError(f"{path}: expected columns id,x,y,z,radius of one unit, found {first.strip()[:80]!r}")
-    said = units.pop() or table_unit
-    unit = SYNONYMS.get(said, said)
-    if unit not in MM_PER_UNIT:
-        raise InputError(f"{path}: unknown unit {said!r}; expected one of {', '.join(MM_PER_UNIT)}")
+    try:
+        unit = known_unit(units.pop() or table_unit)
+    except UsageError as error:
+        raise InputError(f"{path}: {error}") from None
     ids, numbers = [], []
     for line, row in enumerate(rows[1:], 2):
         try:
@@ -194,13 +203,21 @@ def _read_balls(path: Path, table_unit: str) -> FrameDesign:
         if not np.isfinite(values).all() or values[3] <= 0 or abs(ids[-1]) >= 2**53:
             raise InputError(f"{path}: line {line}: expected finite numbers and a radius above 0, found {row}")
         numbers.append(values)
-    _check_balls(str(path), ids)
+    _check_ids(str(path), ids)
     table = np.array(numbers) * MM_PER_UNIT[unit]
     return FrameDesign(np.array(ids, np.int64), table[:, :3], table[:, 3])
 
 
+def is_surface(path: Path) -> bool:
+    """Whether a file is a mesh or a CAD file by its suffix."""
+    return path.suffix.lower() in (*MESH_SUFFIXES, *cad.SUFFIXES)
+
+
 def read_surface(path: Path, unit: str) -> tuple[Floats, Ints]:
-    """Vertices (v, 3) in mm and triangles (f, 3) of a mesh in ``unit``, or of a CAD file with a unit of its own."""
+    """Return vertices (v, 3) in mm and triangles (f, 3) of a mesh, or of a CAD file.
+
+    ``unit`` is that of a mesh, and of a CAD file that has none.
+    """
     if path.suffix.lower() in cad.SUFFIXES:
         return cad.read(path, unit)
     vertices, faces = read_mesh(path)

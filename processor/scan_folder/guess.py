@@ -1,4 +1,4 @@
-"""What a scan folder's project.toml should say, guessed from its files; what was not sure is said."""
+"""The content of a scan folder's project.toml guessed from its files, with a list of what is not sure."""
 
 from __future__ import annotations
 
@@ -14,43 +14,43 @@ from processor import readers
 from processor.geometry import principal
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
 from processor.readers import RawScan
-from processor.scan_folder import cad, component_names
+from processor.scan_folder import component_names
 from processor.scan_folder.checked_toml import inside
-from processor.scan_folder.design import read_design, read_json, read_surface
+from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
+from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files
 from processor.scan_folder.meshes import MESH_SUFFIXES
-from processor.scan_folder.units import MM_PER_UNIT, known_unit
+from processor.scan_folder.units import MM_PER_UNIT, known_unit, radius
 
-PROJECT, STATIONS, SCANS, DESIGN = "project.toml", "stations.json", "scans", "design"
-DESIGNS = ("design.json", "design.csv")
-SURFACES = (*MESH_SUFFIXES, *cad.SUFFIXES)
-NOT_SCANS = ("design.csv", "picks.csv", "deviation.csv", "index.csv")
-TRIED = ("m", "mm", "cm", "inch", "ft")  # units, the likeliest first
-UNIT_TOLERANCE = 0.25  # of a scan's size against its design's
-LARGEST_M = 2000.0  # of a scan; what is larger is no scan in metres
-SAME_SHAPE, OTHER_SHAPE = 0.05, 0.15  # greatest difference of extents by the longest: taken for, not taken for
-FEW = 20_000  # points that a shape is measured from
+DESIGN = "design"
+UNITS = ("m", "mm", "cm", "inch", "ft")  # candidates, the likeliest first
+UNIT_TOLERANCE = 0.25  # relative difference of a scan's size from its design's
+LARGEST_M = 2000.0  # a scan larger than this is not in metres
+SAME_SHAPE, OTHER_SHAPE = 0.05, 0.15  # greatest difference of extents by the longest: up to, and beyond
+SAMPLE = 20_000  # points that extents are measured from
+
+Surface = tuple[Floats, Ints]
 
 
 @dataclass
 class ScanGuess:
-    """One file of scans: its component and station ("" = none), and why; ``sure`` where nothing speaks against it."""
+    """One file of scans with its component and station ("" = none); ``sure`` if nothing contradicts them."""
 
     file: str
     component: str = ""
     station: str = ""
     reason: str = ""
     sure: bool = True
-    error: str = ""  # why it could not be read
-    units: str = ""  # that its format says
+    error: str = ""  # why the file could not be read
+    units: str = ""  # given by the format
     stem: str = ""
-    near: tuple[str, ...] = ()  # components that it may be by its shape
+    similar: tuple[str, ...] = ()  # components of the scan's shape
     extents: Floats = field(default_factory=lambda: np.zeros(3))  # in the file's unit, longest first
     radius: float = 0.0  # from the middle
 
 
 @dataclass
 class Guess:
-    """What project.toml should say, each with its reason, and what was not sure."""
+    """The content of project.toml, each entry with its reason, and messages on what is not sure."""
 
     folder: str
     name: str
@@ -67,61 +67,60 @@ class Guess:
 
 
 def guess(folder: Path) -> Guess:
-    """Look at a folder's files and guess. Raises InputError where there are no scans, or no such folder."""
+    """Guess project.toml from the files of a folder. Raises InputError without scans, and without such a folder."""
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a scan folder, found {'a file' if folder.exists() else 'nothing'}")
-    found = Guess(str(folder), folder.resolve().name)
-    path = _find_design(folder, found)
-    design = _read_design(folder, path, found)
-    files = _scan_files(folder, path)
+    project = Guess(str(folder), folder.resolve().name)
+    path = _find_design(folder, project)
+    design = _read_design(folder, path, project)
+    files = scan_files(folder, (path,))
     if not files:
         raise InputError(
             f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
         )
-    found.scans = [_read_scan(folder, one, found) for one in files]
-    nominal = _sizes(design)
-    _guess_units(found, nominal)
+    project.scans = [_read_scan(folder, file, project) for file in files]
+    _guess_units(project, _sizes(design))
     if isinstance(design, ArchDesign):
-        _guess_components(found, design)
+        _guess_components(project, design)
     elif not design:
-        _guess_kind(found)
+        _guess_kind(project)
     if (folder / STATIONS).is_file():
-        found.stations = f"{STATIONS} gives the scanners' positions"
-    return found
+        project.stations = f"{STATIONS} gives the scanners' positions"
+    return project
 
 
 # --- design -----------------------------------------------------------------------------------------------------------
 
 
-def _find_design(folder: Path, found: Guess) -> Path | None:
+def _find_design(folder: Path, project: Guess) -> Path | None:
     for name in DESIGNS:
         if (folder / name).is_file():
-            found.design, found.design_reason = name, "found by its name"
+            project.design, project.design_reason = name, "found by its name"
             return folder / name
     surfaces = [
-        one
+        path
         for place in (folder, folder / DESIGN)
-        for one in (sorted(place.iterdir()) if place.is_dir() else [])
-        if one.suffix.lower() in SURFACES and one.is_file() and _is_surface(one)
+        for path in (sorted(place.iterdir()) if place.is_dir() else [])
+        if is_surface(path) and path.is_file() and _has_faces(path)
     ]
-    tables = [one for one in sorted(folder.glob("*.json")) if one.name != STATIONS and _says_kind(one)]
-    chosen = tables or surfaces
-    if len(chosen) > 1:
-        named = ", ".join(str(one.relative_to(folder)) for one in chosen[:5])
-        found.unsure.append(
-            f"design: {len(chosen)} files may be it ({named}): name one, of kind structure, or make a design.json"
+    tables = [path for path in sorted(folder.glob("*.json")) if path.name != STATIONS and _has_kind(path)]
+    candidates = tables or surfaces
+    if len(candidates) > 1:
+        named = ", ".join(str(path.relative_to(folder)) for path in candidates[:5])
+        project.unsure.append(
+            f"design: {len(candidates)} candidates ({named}): name one, of kind structure, or make a design.json"
         )
         return None
-    if chosen:
-        found.design = str(chosen[0].relative_to(folder))
-        found.design_reason = "the only file that may be one"
-        return chosen[0]
-    found.unsure.append("design: none is there, so nothing is held against one")
+    if candidates:
+        project.design = str(candidates[0].relative_to(folder))
+        project.design_reason = "the only candidate"
+        return candidates[0]
+    project.unsure.append("design: none found, so scans are not compared with one")
     return None
 
 
-def _is_surface(path: Path) -> bool:
-    """Whether a mesh has faces: a PLY or OBJ file may be a scan as well."""
+def _has_faces(path: Path) -> bool:
+    """Whether a mesh file has faces: a PLY file may be a scan."""
     if path.suffix.lower() != ".ply":
         return True
     with path.open("rb") as file:
@@ -129,83 +128,66 @@ def _is_surface(path: Path) -> bool:
     return any(line.startswith(b"element face") and not line.endswith(b" 0") for line in head.splitlines())
 
 
-def _says_kind(path: Path) -> bool:
+def _has_kind(path: Path) -> bool:
     try:
         return isinstance(read_json(path).values.get("kind"), str)
     except InputError:
         return False
 
 
-def _read_design(
-    folder: Path, path: Path | None, found: Guess
-) -> ArchDesign | FrameDesign | tuple[Floats, Ints] | None:
-    """Read the design; where it cannot be read that is said, and the guess goes on without."""
+def _read_design(folder: Path, path: Path | None, project: Guess) -> ArchDesign | FrameDesign | Surface | None:
+    """Read the design; if it cannot be read, a message is added and the guess continues without."""
     if path is None:
         return None
     try:
         inside(folder, str(path.relative_to(folder)), str(folder))
-        if path.suffix.lower() in SURFACES:
-            found.kind, found.kind_reason = "structure", f"{found.design} is one surface of the whole"
+        if is_surface(path):
+            project.kind, project.kind_reason = "structure", f"{project.design} is one surface of the whole"
             return read_surface(path, "mm")
         design = read_design(folder, path, "m")
     except InputError as error:
-        found.unsure.append(f"design: {error}")
+        project.unsure.append(f"design: {error}")
         return None
-    found.kind = "arch-bridge" if isinstance(design, ArchDesign) else "space-frame"
-    found.kind_reason = f"{found.design} is one"
+    project.kind = "arch-bridge" if isinstance(design, ArchDesign) else "space-frame"
+    project.kind_reason = f"the kind of {project.design}"
     return design
 
 
-def _sizes(design: ArchDesign | FrameDesign | tuple[Floats, Ints] | None) -> list[float]:
-    """Half the greatest extents in mm that a scan of the design may have: of the parts, or of the whole."""
+def _sizes(design: ArchDesign | FrameDesign | Surface | None) -> list[float]:
+    """Return the radii in mm that scans of the design may have: of each part, or of the whole."""
     if isinstance(design, ArchDesign):
-        return [_radius(part.vertices) for part in design.parts]
+        return [radius(part.vertices) for part in design.parts]
     if isinstance(design, FrameDesign):
-        return [_radius(design.centres)]
-    return [_radius(design[0])] if design else []
-
-
-def _radius(points: Floats) -> float:
-    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
-    return float(np.linalg.norm(points - middle, axis=1).max())
+        return [radius(design.centres)]
+    return [radius(design[0])] if design else []
 
 
 # --- scans ------------------------------------------------------------------------------------------------------------
 
 
-def _scan_files(folder: Path, design: Path | None) -> list[Path]:
-    files = []
-    for place in (folder, folder / SCANS):
-        for one in sorted(place.iterdir()) if place.is_dir() else []:
-            scan = one.suffix.lower() in readers.SUFFIXES and one.name not in NOT_SCANS and one != design
-            if not one.name.startswith(".") and ((scan and one.is_file()) or readers.is_closed(one)):
-                files.append(one)
-    return files
-
-
-def _read_scan(folder: Path, path: Path, found: Guess) -> ScanGuess:
-    one = ScanGuess(str(path.relative_to(folder)), stem=path.stem)
+def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
+    scan = ScanGuess(str(path.relative_to(folder)), stem=path.stem)
     try:
-        inside(folder, one.file, str(folder))
+        inside(folder, scan.file, str(folder))
         raws = readers.read(path)
     except InputError as error:
-        one.error = str(error).replace(f"{folder}/", "")
-        found.unsure.append(f"{one.file}: cannot be read, so it stands as a comment: {one.error}")
-        return one
-    one.units = known_unit(raws[0].unit) if raws[0].unit else ""
-    points = _thinned(raws)
+        scan.error = str(error).replace(f"{folder}/", "")
+        project.unsure.append(f"{scan.file}: cannot be read, so it is written as a comment: {scan.error}")
+        return scan
+    scan.units = known_unit(raws[0].unit) if raws[0].unit else ""
+    points = _sample(raws)
     local = points - points.mean(axis=0)
     along = local @ principal.of_points(local).axes
-    one.extents = np.sort(np.ptp(np.quantile(along, [0.001, 0.999], axis=0), axis=0))[::-1]
-    one.radius = _radius(local)
+    scan.extents = np.sort(np.ptp(np.quantile(along, [0.001, 0.999], axis=0), axis=0))[::-1]
+    scan.radius = radius(local)
     if len(raws) > 1:
-        one.reason = f"holds {len(raws)} scans: {', '.join(raw.name for raw in raws[:6])}"
-    return one
+        scan.reason = f"holds {len(raws)} scans: {', '.join(raw.name for raw in raws[:6])}"
+    return scan
 
 
-def _thinned(raws: Sequence[RawScan]) -> Floats:
-    """Take some of a file's points, in the frame of its poses where it has them, less the first origin."""
-    share = max(1, sum(len(raw.points) for raw in raws) // FEW)
+def _sample(raws: Sequence[RawScan]) -> Floats:
+    """Return every k-th point of a file, transformed by the poses of several scans, relative to the first origin."""
+    share = max(1, sum(len(raw.points) for raw in raws) // SAMPLE)
     pieces = []
     for raw in raws:
         points = raw.points[::share] + (raw.origin - raws[0].origin)
@@ -219,170 +201,173 @@ def _thinned(raws: Sequence[RawScan]) -> Floats:
 # --- guesses ----------------------------------------------------------------------------------------------------------
 
 
-def _guess_units(found: Guess, nominal: Sequence[float]) -> None:
-    """Take the unit of the formats; else that in which the scans are as large as the design; else metres."""
-    silent = [one for one in found.scans if not one.units and not one.error]
-    if found.design and found.kind == "structure" and Path(found.design).suffix.lower() in MESH_SUFFIXES:
-        found.design_units = "mm"
-        found.unsure.append(f"design_units: {found.design} does not say its unit; taken as mm, as CAD writes meshes")
-    if not silent:
-        said = sorted({one.units for one in found.scans if one.units})
-        found.units_reason = f"said by the scans themselves: {', '.join(said)}" if said else ""
+def _guess_units(project: Guess, nominal: Sequence[float]) -> None:
+    """Take the unit of the formats; else the one in which the scans have the design's size; else metres."""
+    without = [scan for scan in project.scans if not scan.units and not scan.error]
+    if project.design and project.kind == "structure" and Path(project.design).suffix.lower() in MESH_SUFFIXES:
+        project.design_units = "mm"
+        project.unsure.append(f"design_units: {project.design} has no unit; taken as mm, as CAD writes meshes")
+    if not without:
+        given = sorted({scan.units for scan in project.scans if scan.units})
+        project.units_reason = f"given by the scans' formats: {', '.join(given)}" if given else ""
         return
-    radius = float(np.median([one.radius for one in silent]))
     if nominal:
         sizes = np.array(nominal)
-        fits = {
-            unit: float(
-                np.abs(np.log(np.array([[one.radius * MM_PER_UNIT[unit]] for one in silent]) / sizes)).min(axis=1).max()
-            )
-            for unit in TRIED
+        misfits = {
+            unit: max(np.abs(np.log(scan.radius * MM_PER_UNIT[unit] / sizes)).min() for scan in without)
+            for unit in UNITS
         }
-        best = min(TRIED, key=fits.__getitem__)
-        found.units = best
-        if fits[best] <= np.log1p(UNIT_TOLERANCE):
-            found.units_reason = "in it the scans are as large as the design"
+        project.units = best = min(UNITS, key=misfits.__getitem__)
+        if misfits[best] <= np.log1p(UNIT_TOLERANCE):
+            project.units_reason = "the scans are as large as the design in it"
             return
-        found.units_reason = f"the nearest to the design's size, and off by a factor of {np.exp(fits[best]):.3g}"
+        project.units_reason = f"the nearest to the design's size, and off by a factor of {np.exp(misfits[best]):.3g}"
     else:
-        found.units = "m" if 2.0 * radius <= LARGEST_M else "mm"
-        found.units_reason = f"a scan is {2.0 * radius:.4g} of them across"
-    found.unsure.append(f"units: taken as {found.units}: {found.units_reason}")
+        extent = 2.0 * float(np.median([scan.radius for scan in without]))
+        project.units = "m" if extent <= LARGEST_M else "mm"
+        project.units_reason = f"a scan has an extent of {extent:.4g}"
+    project.unsure.append(f"units: taken as {project.units}: {project.units_reason}")
 
 
-def _guess_kind(found: Guess) -> None:
-    found.kind, found.kind_reason = "structure", "without a design it is the one that asks for none"
-    for one in found.scans:
-        one.station = component_names.station(one.stem)
-    found.unsure.append(
+def _guess_kind(project: Guess) -> None:
+    project.kind, project.kind_reason = "structure", "the only kind that needs no design"
+    for scan in project.scans:
+        scan.station = component_names.station(scan.stem)
+    project.unsure.append(
         "kind: taken as structure; a roof of bolt balls is a space-frame, a bridge in parts needs a design.json"
     )
 
 
-def _guess_components(found: Guess, design: ArchDesign) -> None:
-    """Find each scan's component by its name and by its shape; where the two differ, or leave a choice, say so."""
+def _guess_components(project: Guess, design: ArchDesign) -> None:
+    """Assign components to scans by name and shape; contradictions and ambiguities are added to ``unsure``."""
     names = [part.name for part in design.parts]
     shapes = {part.name: _extents(part.vertices, part.faces) for part in design.parts}
-    scale = MM_PER_UNIT[found.units or "m"]
-    for one in found.scans:
-        if one.error:
-            continue
-        own = one.extents * (MM_PER_UNIT[one.units] if one.units else scale)
-        differs = {name: float(np.abs(own - shape).max() / shape[0]) for name, shape in shapes.items()}
-        one.station = component_names.station(one.stem)
-        _choose(one, component_names.meant(one.stem, names), differs)
-    taken = {one.component for one in found.scans if one.sure}
-    for one in found.scans:
-        left = [name for name in one.near if name not in taken]
-        if left and not one.sure and len(one.near) > 1:
-            one.component = left[0]
-            one.reason += f"; {'of these it alone is left' if len(left) == 1 else 'taken in the order of the bridge'}"
+    scans = [scan for scan in project.scans if not scan.error]
+    for scan in scans:
+        extents = scan.extents * MM_PER_UNIT[scan.units or project.units or "m"]
+        differences = {name: float(np.abs(extents - shape).max() / shape[0]) for name, shape in shapes.items()}
+        scan.station = component_names.station(scan.stem)
+        _choose(scan, component_names.components(scan.stem, names), differences)
+    taken = {scan.component for scan in project.scans if scan.sure}
+    for scan in scans:
+        left = [name for name in scan.similar if name not in taken]
+        if left and not scan.sure and len(scan.similar) > 1:
+            scan.component = left[0]
+            scan.reason += f"; {'the only one of them left' if len(left) == 1 else 'taken in the order of the bridge'}"
             taken.add(left[0])
-    for one in found.scans:
-        if not one.sure and not one.error:
-            found.unsure.append(f"{one.file}: {one.component or 'no component'}: {one.reason}")
-    missing = [name for name in names if name not in {one.component for one in found.scans}]
+    project.unsure += [
+        f"{scan.file}: {scan.component or 'no component'}: {scan.reason}" for scan in scans if not scan.sure
+    ]
+    files = {name: [scan.file for scan in project.scans if scan.component == name] for name in names}
+    missing = [name for name in names if not files[name]]
     if missing:
-        found.unsure.append(f"no scan is taken for {', '.join(missing)}")
-    for name in names:
-        several = [one.file for one in found.scans if one.component == name]
-        if len(several) > 1:
-            found.unsure.append(f"{name}: {len(several)} scans are taken for it ({', '.join(several)})")
+        project.unsure.append(f"no scan is assigned to {', '.join(missing)}")
+    project.unsure += [
+        f"{name}: {len(files[name])} scans are assigned to it ({', '.join(files[name])})"
+        for name in names
+        if len(files[name]) > 1
+    ]
 
 
-def _choose(one: ScanGuess, named: Sequence[str], differs: dict[str, float]) -> None:
-    several = f"{one.reason}; " if one.reason else ""
-    by_shape = sorted(named or differs, key=lambda name: differs[name])
+def _choose(scan: ScanGuess, named: Sequence[str], differences: dict[str, float]) -> None:
+    """Choose a scan's component among those ``named`` by its file, else among all, by the differences of extents."""
+    several = f"{scan.reason}; " if scan.reason else ""
+    by_shape = sorted(named or differences, key=lambda name: differences[name])
     best = by_shape[0]
-    near = [name for name in by_shape if differs[name] <= SAME_SHAPE]
-    shape = f"extents within {100.0 * differs[best]:.2g} % of the design's"
+    similar = [name for name in by_shape if differences[name] <= SAME_SHAPE]
+    shape = f"extents within {100.0 * differences[best]:.2g} % of the design's"
     if len(named) == 1:
-        one.component = best
-        one.sure = differs[best] <= OTHER_SHAPE and not several
-        one.reason = f"{several}by its name; {shape}"
-        if differs[best] > OTHER_SHAPE:
-            nearest = min(differs, key=lambda name: differs[name])
-            one.reason = f"{several}by its name, but its extents are {100.0 * differs[best]:.0f} % off" + (
-                f"; it has the shape of {nearest}" if differs[nearest] <= SAME_SHAPE else ""
+        scan.component = best
+        scan.sure = differences[best] <= OTHER_SHAPE and not several
+        scan.reason = f"{several}by its name; {shape}"
+        if differences[best] > OTHER_SHAPE:
+            nearest = min(differences, key=lambda name: differences[name])
+            scan.reason = f"{several}by its name, but its extents differ by {100.0 * differences[best]:.0f} %" + (
+                f"; the extents match {nearest}" if differences[nearest] <= SAME_SHAPE else ""
             )
         return
-    one.component, one.near = best if near else "", tuple(name for name in differs if name in near)
-    one.sure = len(near) == 1 and not several
-    which = f"of {', '.join(named)}, which its name may mean, " if named else "its name says nothing; "
-    if not near:
-        one.reason = f"{several}{which}none has its shape (the nearest, {best}, is {100.0 * differs[best]:.0f} % off)"
-    elif len(near) > 1:
-        one.reason = f"{several}{which}{', '.join(one.near)} have its shape"
+    scan.component, scan.similar = best if similar else "", tuple(name for name in differences if name in similar)
+    scan.sure = len(similar) == 1 and not several
+    which = f"its name matches {', '.join(named)}; " if named else "its name matches no component; "
+    if not similar:
+        difference = f"the nearest, {best}, differs by {100.0 * differences[best]:.0f} %"
+        scan.reason = f"{several}{which}its extents match none of them ({difference})"
+    elif len(similar) > 1:
+        scan.reason = f"{several}{which}its extents match {', '.join(scan.similar)}"
     else:
-        one.reason = f"{several}{which}by its shape alone; {shape}"
+        scan.reason = f"{several}{which}by its shape alone; {shape}"
 
 
 def _extents(vertices: Floats, faces: Ints) -> Floats:
-    """Extents (3,) of a mesh along its principal axes, longest first."""
+    """Return the extents (3,) of a mesh along its principal axes, longest first."""
     along = (vertices - vertices.mean(axis=0)) @ principal.of_mesh(vertices, faces).axes
-    found: Floats = np.sort(np.ptp(along, axis=0))[::-1]
-    return found
+    extents: Floats = np.sort(np.ptp(along, axis=0))[::-1]
+    return extents
 
 
-# --- A guess of what a scan folder's project.toml should say, as that file and as JSON.
+# --- the guess as project.toml and as JSON ----------------------------------------------------------------------------
 
 
-def written(found: Guess) -> str:
-    """Return project.toml, with comments that say why, and what may be added."""
+def written(project: Guess) -> str:
+    """Return the text of project.toml, with reasons and further keys as comments."""
     lines = ["# Made by `processor init`. What is unsure is marked with a question mark."]
-    lines += [f"# ? {_one_line(text)}" for text in found.unsure] + [""]
-    lines.append(f"name = {_text(found.name)}")
-    lines.append(f"kind = {_text(found.kind)}  # {_one_line(found.kind_reason)}")
-    if found.units:
+    lines += [f"# ? {_one_line(text)}" for text in project.unsure] + [""]
+    lines.append(f"name = {_text(project.name)}")
+    lines.append(f"kind = {_text(project.kind)}  # {_one_line(project.kind_reason)}")
+    if project.units:
         lines.append(
-            f"units = {_text(found.units)}  # of scans whose format says none: {_one_line(found.units_reason)}"
+            f"units = {_text(project.units)}  # of scans whose format gives none: {_one_line(project.units_reason)}"
         )
     else:
-        lines.append(f'# units = "m"  # not needed: {_one_line(found.units_reason)}')
-    if found.design:
-        lines.append(f"design = {_text(found.design)}  # {_one_line(found.design_reason)}")
+        lines.append(f'# units = "m"  # not needed: {_one_line(project.units_reason)}')
+    if project.design:
+        lines.append(f"design = {_text(project.design)}  # {_one_line(project.design_reason)}")
     else:
         lines.append('# design = "design.json"  # or one mesh, STEP or IFC file of the whole, of kind structure')
-    if found.design_units:
-        lines.append(f"design_units = {_text(found.design_units)}  # of the mesh, which does not say")
+    if project.design_units:
+        lines.append(f"design_units = {_text(project.design_units)}  # of the mesh, which has no unit")
     lines.append("# temperature_C = 20.0  # of the steel while it was scanned")
-    if found.stations:
-        lines.append(f"# {_one_line(found.stations)}")
-    for one in found.scans:
-        lines += ["", *_scan_lines(one)]
+    if project.stations:
+        lines.append(f"# {_one_line(project.stations)}")
+    for scan in project.scans:
+        lines += ["", *_scan_lines(scan)]
     lines += ["", "# [tolerance]", '# standard = "GB 50205-2020"', ""]
     return "\n".join(lines)
 
 
-def _scan_lines(one: ScanGuess) -> list[str]:
-    if one.error:
-        return [f"# {one.file!a} cannot be read: {_one_line(one.error)}", "# [[scan]]", f"# file = {_text(one.file)}"]
-    lines = ["[[scan]]", f"file = {_text(one.file)}"]
-    reason = f"  # {'' if one.sure else '? '}{_one_line(one.reason)}" if one.reason else ""
-    if one.component:
-        lines.append(f"component = {_text(one.component)}{reason}")
+def _scan_lines(scan: ScanGuess) -> list[str]:
+    if scan.error:
+        return [
+            f"# {scan.file!a} cannot be read: {_one_line(scan.error)}",
+            "# [[scan]]",
+            f"# file = {_text(scan.file)}",
+        ]
+    lines = ["[[scan]]", f"file = {_text(scan.file)}"]
+    reason = f"  # {'' if scan.sure else '? '}{_one_line(scan.reason)}" if scan.reason else ""
+    if scan.component:
+        lines.append(f"component = {_text(scan.component)}{reason}")
     elif reason:
         lines.append(reason.strip())
-    if one.station:
-        lines.append(f"# station = {_text(one.station)}")
+    if scan.station:
+        lines.append(f"# station = {_text(scan.station)}")
     return lines
 
 
 def _text(text: str) -> str:
-    """Return a text as TOML has it between quotes."""
+    """Return a text quoted as in TOML."""
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _one_line(text: str) -> str:
-    return "".join(one if one.isprintable() else " " for one in " ".join(text.split()))
+    return "".join(c if c.isprintable() else " " for c in " ".join(text.split()))
 
 
-def as_json(found: Guess) -> dict[str, Any]:
-    """Return the guess as JSON can hold it."""
+def as_json(project: Guess) -> dict[str, Any]:
+    """Return the guess as an object for JSON."""
     keys = ("kind", "kind_reason", "design", "design_reason", "design_units", "units", "units_reason", "unsure")
     scan_keys = ("file", "component", "station", "reason", "sure", "error")
-    scans = [{key: getattr(one, key) for key in scan_keys} for one in found.scans]
-    return {"file": f"{found.folder}/{PROJECT}", "name": found.name} | {
-        **{key: getattr(found, key) for key in keys},
+    scans = [{key: getattr(scan, key) for key in scan_keys} for scan in project.scans]
+    return {"file": f"{project.folder}/{PROJECT}", "name": project.name} | {
+        **{key: getattr(project, key) for key in keys},
         "scans": scans,
     }

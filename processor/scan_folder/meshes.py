@@ -1,4 +1,4 @@
-"""Triangle meshes of a design: PLY, STL and OBJ files, and CAD files that are turned into meshes first."""
+"""Triangle meshes of a design from PLY, STL and OBJ files."""
 
 from __future__ import annotations
 
@@ -10,22 +10,28 @@ import numpy as np
 from processor.model import Floats, InputError, Ints
 from processor.readers import ply
 from processor.readers.common import parsing
-from processor.scan_folder import cad
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj")
+CAD_SUFFIXES = (".step", ".stp", ".ifc")  # converted to meshes first, see :mod:`processor.scan_folder.cad`
 
 
 def read_mesh(path: Path) -> tuple[Floats, Ints]:
-    """Vertices (v, 3) in the file's unit and triangles (f, 3) of a PLY, STL or OBJ file."""
+    """Return vertices (v, 3) in the file's unit and triangles (f, 3) of a PLY, STL or OBJ file.
+
+    Raises InputError for a file that is damaged, has no faces, or is of another format.
+    """
     suffix = path.suffix.lower()
     if suffix not in MESH_SUFFIXES:
-        known = ", ".join((*MESH_SUFFIXES, *cad.SUFFIXES))
+        known = ", ".join((*MESH_SUFFIXES, *CAD_SUFFIXES))
         raise InputError(f"{path}: expected a mesh or CAD file ({known}), found {suffix or 'no suffix'}")
     vertices, faces = _read_ply_mesh(path) if suffix == ".ply" else _read_other_mesh(path, suffix)
     if not len(vertices) or not len(faces):
         raise InputError(f"{path}: expected a mesh with faces, found {len(vertices)} vertices and {len(faces)} faces")
     if not np.isfinite(vertices).all() or faces.min() < 0 or faces.max() >= len(vertices):
-        raise InputError(f"{path}: holds vertices that are not finite, or faces of vertices that it has not")
+        raise InputError(
+            f"{path}: expected finite vertices and faces of these, found vertices that are not finite or faces of "
+            "vertices that do not exist; export it again"
+        )
     return vertices, faces
 
 
@@ -38,8 +44,8 @@ def _read_ply_mesh(path: Path) -> tuple[Floats, Ints]:
         vertex = data["vertex"].data
         vertices = np.stack([np.asarray(vertex[name], np.float64) for name in "xyz"], axis=1)
         fields = [prop.name for prop in data["face"].properties]
-        listed = next(name for name in ("vertex_indices", "vertex_index") if name in fields)
-        polygons: list[Any] = list(data["face"].data[listed])
+        indices = next(name for name in ("vertex_indices", "vertex_index") if name in fields)
+        polygons: list[Any] = list(data["face"].data[indices])
         faces = [(p[0], p[i], p[i + 1]) for p in polygons for i in range(1, len(p) - 1)]
     return vertices, np.array(faces, np.int64).reshape(-1, 3)
 
@@ -47,7 +53,7 @@ def _read_ply_mesh(path: Path) -> tuple[Floats, Ints]:
 def _read_other_mesh(path: Path, suffix: str) -> tuple[Floats, Ints]:
     import trimesh
 
-    # From an open file and without materials, the library has no way to look for other files.
+    # From an open file and without materials the library cannot open other files.
     with parsing(path, suffix[1:].upper()), path.open("rb") as file:
         options: dict[str, Any] = {"skip_materials": True} if suffix == ".obj" else {}
         mesh: Any = trimesh.load(file, file_type=suffix[1:], process=False, force="mesh", **options)

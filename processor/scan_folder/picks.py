@@ -1,4 +1,4 @@
-"""picks.csv of a scan folder: common points that were picked in two scans each."""
+"""picks.csv of a scan folder: common points picked in two scans each."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from processor.model import InputError, Picks, Scan
 from processor.readers.common import decoded, parsing
 from processor.scan_folder.units import MM_PER_UNIT
 
-PICKS = "picks.csv"
 COLUMNS = ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
 
 
 def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
-    """Read picked points; coordinates are in the scans' own ``unit``.
+    """Read picked points, whose coordinates are in the ``unit`` of the scans.
 
-    Raises InputError that names the line for whatever does not fit, and the scans there are for an unknown one.
+    Raises InputError, which names the line, for malformed rows and for scans that do not exist.
     """
     try:
         text = decoded(path.read_bytes())
@@ -43,7 +42,7 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
             if name not in known:
                 raise InputError(f"{where}: there is no scan {name!r}; there are {', '.join(sorted(known))}")
         if a == b:
-            raise InputError(f"{where}: a common point of scan {a!r} with itself; name two scans")
+            raise InputError(f"{where}: expected two scans, found {a!r} twice; name two scans")
         try:
             values = [float(cell) for cell in row[3:]]
         except ValueError:
@@ -55,6 +54,6 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
         points.append(row[2].strip())
         numbers.append(values)
     if not numbers:
-        raise InputError(f"{path}: holds no points; expected three or more a pair of scans")
+        raise InputError(f"{path}: holds no points; expected three or more for each pair of scans")
     table = np.array(numbers) * MM_PER_UNIT[unit]
     return Picks(tuple(names_a), tuple(names_b), tuple(points), table[:, :3], table[:, 3:])

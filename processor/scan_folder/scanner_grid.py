@@ -1,4 +1,4 @@
-"""Whether the rows and columns that a file gives are a scanner's grid: step ``stitch`` takes rays from them."""
+"""Check that the rows and columns in a file are a scanner's grid: step ``stitch`` derives rays from them."""
 
 from __future__ import annotations
 
@@ -8,28 +8,29 @@ from numba import njit
 from processor.geometry import scanner_rays
 from processor.model import Floats, Labels
 
-SAMPLE = 50_000  # points that the rays are found from; by chance, as every k-th may be of one row
-OFF = 0.03  # of the spread of the directions: how far rays may pass their points on average
-CELLS, CELLS_PER_POINT = 1 << 24, 32  # of a grid in memory; scans of the open sky have few returns
+SAMPLE = 50_000  # points that rays are fitted to; random, as every k-th point may be of the same row
+RAY_TOLERANCE = 0.03  # mean difference of rays from directions, relative to the spread of the directions
+CELLS, CELLS_PER_POINT = 1 << 24, 32  # largest grid; scans of the open sky have few returns
 
 Grid = tuple[Labels, Labels]
 NO_GRID: Grid = (np.empty(0, np.int32), np.empty(0, np.int32))
 
 
 def of_scanner(points: Floats, row: Labels, column: Labels, scanner: Floats) -> Grid:
-    """Return rows and columns (n,) of points (n, 3) seen from ``scanner`` (3,); none where they are not a scanner's.
+    """Return rows and columns (n,) of points (n, 3) seen from ``scanner`` (3,); none if they are not a scanner's.
 
-    A row must keep its height and a column its direction about one axis, and no two points may be in one cell: clouds
-    without a grid are written in made-up rows, merged ones with each scan's own, and depth cameras have other grids.
+    Points of a row must have the same elevation and points of a column the same azimuth about one axis, and no two
+    points may be in one cell. Clouds without a grid are written in arbitrary rows, merged clouds in those of each scan,
+    and depth cameras have other grids.
     """
     if not len(row):
         return NO_GRID
     if not _fits(row, column):
-        row, column = row - row.min(), column - column.min()  # a piece that was cut out
+        row, column = row - row.min(), column - column.min()  # a part of a larger grid
         if not _fits(row, column):
             return NO_GRID
     rows, columns = int(row.max()) + 1, int(column.max()) + 1
-    if _is_swept(points, row, column, scanner) and not _any_twice(row, column, rows, columns):
+    if _is_swept(points, row, column, scanner) and not _has_duplicates(row, column, rows, columns):
         return row, column
     return NO_GRID
 
@@ -39,22 +40,22 @@ def _fits(row: Labels, column: Labels) -> bool:
 
 
 def _is_swept(points: Floats, row: Labels, column: Labels, scanner: Floats) -> bool:
-    """Whether the rays that rows and columns stand for lead to the points."""
+    """Whether the rays of rows and columns lead to the points."""
     count = len(points)
-    some = np.arange(count) if count <= SAMPLE else np.random.default_rng(0).integers(0, count, SAMPLE)
-    r, c = row[some].astype(np.int64), column[some].astype(np.int64)
-    seen = points[some] - scanner
-    found = scanner_rays.fitted(seen, r, c)
-    if found is None:
+    sample = np.arange(count) if count <= SAMPLE else np.random.default_rng(0).integers(0, count, SAMPLE)
+    r, c = row[sample].astype(np.int64), column[sample].astype(np.int64)
+    local = points[sample] - scanner
+    rays = scanner_rays.fitted(local, r, c)
+    if rays is None:
         return False
-    u = seen / np.maximum(np.linalg.norm(seen, axis=1), 1e-9)[:, None]
-    off = np.linalg.norm(found.of(r, c) - u, axis=1).mean()
-    return bool(off < OFF * np.linalg.norm(u - u.mean(axis=0), axis=1).mean())
+    u = local / np.maximum(np.linalg.norm(local, axis=1), 1e-9)[:, None]
+    difference = np.linalg.norm(rays.of(r, c) - u, axis=1).mean()
+    return bool(difference < RAY_TOLERANCE * np.linalg.norm(u - u.mean(axis=0), axis=1).mean())
 
 
 @njit(cache=True, nogil=True)
-def _any_twice(row: Labels, column: Labels, rows: int, columns: int) -> bool:
-    """Whether two points are in one cell; a bit a cell."""
+def _has_duplicates(row: Labels, column: Labels, rows: int, columns: int) -> bool:
+    """Whether two points are in one cell; one bit a cell."""
     seen = np.zeros((rows * columns >> 3) + 1, np.uint8)
     for i in range(len(row)):
         cell = np.int64(column[i]) * rows + row[i]

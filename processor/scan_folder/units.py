@@ -1,9 +1,10 @@
-"""Units of length that input may be in."""
+"""Units of length of the input, and checks that a unit is plausible."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from processor.geometry import unit_ratio
 from processor.model import Floats, InputError, UsageError
 
 MM_PER_UNIT = {
@@ -16,8 +17,8 @@ MM_PER_UNIT = {
     "ft": 304.8,
     "us-ft": 1_200_000.0 / 3937.0,
 }
-LARGEST_KM = 10.0  # of what is measured to a millimetre; at a thousand times its size a step runs out of memory
-STRAY = 0.01  # share of a scan's points at either end of an axis that say nothing of its size
+LARGEST_KM = 10.0  # of anything measured to a millimetre; at a thousand times its size a step runs out of memory
+STRAY = 0.01  # share of a scan's points at either end of an axis that may be outliers
 SYNONYMS = {
     "in": "inch",
     "inches": "inch",
@@ -32,32 +33,71 @@ SYNONYMS = {
     "millimeter": "mm",
     "millimeters": "mm",
 }
+# Ratios of a scan's size to the design's that a mistaken unit causes. Of frames and whole structures often only a piece
+# is scanned, or the hall around them, so fewer ratios are certain.
+PART_RATIOS: tuple[float, ...] = (
+    1000.0, 304.8, 100.0, 1 / 0.0254, 25.4, 10.0, 1 / 0.3048, 0.1, 1 / 25.4, 0.0254, 0.01, 1 / 304.8, 0.001,
+)  # fmt: skip
+FRAME_RATIOS: tuple[float, ...] = (1000.0, 304.8, 25.4, 1 / 304.8, 0.001)
+STRUCTURE_RATIOS: tuple[float, ...] = (1000.0, 304.8, 1 / 304.8, 0.001)
+RATIO_TOLERANCE = 0.25
+SAMPLE = 100_000  # points
 
 
 def known_unit(text: str) -> str:
-    """Name of a unit as MM_PER_UNIT has it. Raises UsageError for any other, listing those known."""
+    """Return a unit by its name in MM_PER_UNIT. Raises UsageError, which lists the known units, for any other."""
     unit = SYNONYMS.get(text.strip().lower(), text.strip().lower())
     if unit not in MM_PER_UNIT:
         raise UsageError(f"unknown unit {text!r}; expected one of {', '.join(MM_PER_UNIT)}")
     return unit
 
 
-def check_extent(what: str, points: Floats, unit: str, reason: str, correct: str, stray: float = 0.0) -> None:
-    """Raise InputError where points (n, 3) in mm, read in ``unit``, are farther apart than any structure's.
+def radius(points: Floats) -> float:
+    """Return the largest distance of points (n, 3) from the middle of their box: a size that hardly depends on pose."""
+    middle = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    return float(np.linalg.norm(points - middle, axis=1).max())
 
-    Where they lie on the map does not matter. ``what`` names file and thing, ``correct`` what to do; ``stray`` is the
-    share of points at either end of an axis that do not count.
+
+def check_extent(what: str, points: Floats, unit: str, reason: str, advice: str, stray: float = 0.0) -> None:
+    """Raise InputError if points (n, 3) in mm, read in ``unit``, extend farther than any structure.
+
+    Their position on the map does not matter. ``what`` names file and object, ``reason`` the source of the unit;
+    ``stray`` is the share of points at either end of an axis that do not count.
     """
-    some = points[:: max(1, len(points) // 100_000)]
-    if not len(some):
+    sample = points[:: max(1, len(points) // SAMPLE)]
+    if not len(sample):
         return
-    low, high = np.quantile(some, [stray, 1.0 - stray], axis=0) if stray else (points.min(axis=0), points.max(axis=0))
-    across = float((high - low).max())
-    if across <= LARGEST_KM * MM_PER_UNIT["km"]:
+    low, high = np.quantile(sample, [stray, 1.0 - stray], axis=0) if stray else (points.min(axis=0), points.max(axis=0))
+    extent_mm = float((high - low).max())
+    if extent_mm <= LARGEST_KM * MM_PER_UNIT["km"]:
         return
-    own = across / MM_PER_UNIT[unit]
-    others = [f"{own * MM_PER_UNIT[one] / 1000.0:.3g} m if it were {one}" for one in ("m", "mm") if one != unit]
+    extent = extent_mm / MM_PER_UNIT[unit]
+    others = [f"{extent * MM_PER_UNIT[u] / 1000.0:.3g} m if it were {u}" for u in ("m", "mm") if u != unit]
     raise InputError(
-        f"{what} is {across / MM_PER_UNIT['km']:.3g} km across with its unit read as {unit} ({reason}), and no "
-        f"structure is over {LARGEST_KM:g} km; it would be {' and '.join(others)}: {correct}"
+        f"{what}: expected at most {LARGEST_KM:g} km across, found {extent_mm / MM_PER_UNIT['km']:.3g} km with its "
+        f"unit read as {unit} ({reason}); it would be {' and '.join(others)}: {advice}"
+    )
+
+
+def check_ratio(
+    what: str, points: Floats, nominal: Floats, ratios: tuple[float, ...], unit: str, reason: str, advice: str
+) -> None:
+    """Raise InputError if the size of a scan's points (n, 3), mm, differs from its design's by a ratio of units.
+
+    ``nominal`` (m, 3) are the vertices of the design, or none; sizes are distances from the middle. ``what`` names file
+    and scan, ``reason`` the source of ``unit``.
+    """
+    size = radius(nominal) if len(nominal) else 0.0
+    if not size > 0.0:
+        return
+    sample = points[:: max(1, len(points) // SAMPLE)]
+    centre = np.quantile(sample, [0.01, 0.99], axis=0).mean(axis=0)
+    ratio = float(np.quantile(np.linalg.norm(sample - centre, axis=1), 0.99)) / size
+    factor = unit_ratio.nearest_factor(ratio, ratios, RATIO_TOLERANCE)
+    if factor is None:
+        return
+    likely = [name for name, mm in MM_PER_UNIT.items() if abs(MM_PER_UNIT[unit] / mm / factor - 1.0) < 0.01]
+    raise InputError(
+        f"{what} is {ratio:.4g} times as large as the design, close to {factor:.4g}: its unit was read as {unit} "
+        f"({reason}), which seems wrong{f' (is it {likely[0]}?)' if likely else ''}; {advice}"
     )

@@ -1,4 +1,4 @@
-"""The radii that balls are made in: data, the user's own list, or nothing."""
+"""Catalogues of the radii in which spheres are made: data of the package, the user's list, or none."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ DEFAULT = "plausible"
 
 @dataclass(frozen=True)
 class Catalogue(Checked):
-    """Radii (m,) of balls in mm, ascending, and the standard deviation of a made ball's radius about its size.
+    """Radii (m,) of spheres in mm, ascending, and the standard deviation of a manufactured radius about its size.
 
-    Without radii the catalogue says nothing, and a ball's radius is free.
+    Without radii in the catalogue a sphere's radius is free.
     """
 
     radii: Floats = column("m")
     sd_mm: float = 0.4
     name: str = ""
-    verified: bool = False  # the sizes were held against a published catalogue
+    verified: bool = False  # the sizes were compared with a published catalogue
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -40,7 +40,7 @@ class Catalogue(Checked):
 
 
 def load(name: str = DEFAULT) -> Catalogue:
-    """Load a catalogue of the package by name. UsageError names those there are."""
+    """Load a catalogue of the package by name. Raises UsageError for an unknown name, with those available."""
     known = tomllib.loads((resources.files("processor.space_frame") / "catalogues.toml").read_text("utf-8"))
     if name not in known:
         raise UsageError(f"catalogue of balls: expected one of {', '.join(known)}, got {name!r}")
@@ -49,5 +49,5 @@ def load(name: str = DEFAULT) -> Catalogue:
 
 
 def of_radii(radii_mm: Sequence[float], sd_mm: float = 0.4, name: str = "given") -> Catalogue:
-    """Make a catalogue of the user's own list, in any order; an empty list leaves the radius free."""
+    """Make a catalogue of the user's list, in any order; an empty list leaves the radius free."""
     return Catalogue(np.unique(np.array(radii_mm, np.float64)), sd_mm, name, False)

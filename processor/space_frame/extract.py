@@ -1,12 +1,12 @@
-"""Every ball of a frame, by method ``ray``: members, then stations against each other, then balls, then the design.
+"""Method ``ray``: every sphere of a frame, by its members, the stations against each other, the spheres, the design.
 
-Source: paper 001 has the balls and their two estimators; what is here starts from the members instead of a crop a ball.
+Source: paper 001 has the spheres and their two estimators; this method starts from the members instead of a crop about
+each nominal node.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -14,273 +14,331 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.model import Floats, FrameDesign, Ints, Tolerance
 from processor.space_frame.catalogue import Catalogue
-from processor.space_frame.design import matching, movement
-from processor.space_frame.design.matching import Found, Matching
-from processor.space_frame.design.movement import Movement
+from processor.space_frame.design import matching
+from processor.space_frame.design.matching import Matching, NodePattern
+from processor.space_frame.design.movement import Movement, movement
 from processor.space_frame.members import junctions, members
 from processor.space_frame.members.members import Measured
-from processor.space_frame.members.records import Nodes, Tubes
-from processor.space_frame.points.corrected_source import Corrected, corrected_gathered
+from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.spheres import fit_all, quality, visibility
 from processor.space_frame.spheres.quality import Bools
-from processor.space_frame.spheres.records import Balls
+from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
 from processor.space_frame.stations.control_points import ControlPoints
+from processor.space_frame.stations.corrected_source import Corrected, corrected_gathered
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.tube_points import tube_points
 
-SAME_FRAME_SHARE = 0.6  # of the design's nodes that are found where it has them: the frames are the same
+SAME_FRAME_SHARE = 0.6  # of the design's nodes that are found in their places: the frames are the same
 NEAR_MM = 40.0  # of a node's nominal place, in the same frame
 NOMINAL_SD_MM = 20.0  # of a node that no axes fix, about its nominal place
-APART_MM = 0.15  # stations that seem less off each other than this are left where they are
+LEAST_STATION_SD_MM = 0.15  # stations with smaller shifts are not corrected
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the method.
+
+    ``expansion`` is the factor of the design's lengths by temperature. Where no control points fix the datum, all
+    stations share a shift of standard deviation ``datum_mm`` beside their own. ``limits`` has the tolerance of a
+    sphere's radius, for spheres without a catalogue's size.
+    """
+
+    members: members.Params = field(default_factory=members.Params)
+    expansion: float = 1.0
+    register_stations: bool = True
+    datum_mm: float = 0.0
+    limits: Tolerance | None = None
 
 
 @dataclass(frozen=True)
 class Extracted:
-    """All that was found of a frame; places are less the source's origin.
+    """Result of the method; places are less the source's origin.
 
-    Rows are nodes: found blind, or those of the design in its order and then what else was found. ``design_row`` (k,)
-    is the row of the design, -1 = none. ``datum`` (k, 3, 3) is the part of a centre's covariance that all nodes have in
-    common; the balls' own does not hold it. ``source`` has the points as the stations' corrections put them.
+    Rows are nodes: found blind, or those of the design in its order and then further ones found. ``design_row`` (k,)
+    is the row of the design, -1 = none. ``datum`` (k, 3, 3) is the part of a centre's covariance that is common to all
+    nodes; the spheres' own covariance excludes it. ``source`` has the points with the stations' corrections.
     """
 
     source: Source
     nodes: Nodes
-    tubes: Tubes
-    balls: Balls
+    members: Members
+    spheres: Spheres
     design_row: Ints
     datum: Floats
     stations: Stations | None = None
     matching: Matching | None = None
     movement: Movement | None = None
-    said: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
-class _Start:
-    """Where nodes are, to 20 mm, and pairs of them that a member may join; the design's row (k,) of each, -1 = none.
+class Start:
+    """Nodes known to 20 mm, and pairs of them that a member may join; the design's row (k,) of each, -1 = none.
 
-    ``pose`` is T_design_scan where the design had to be found, with the matching that says so.
+    ``pose`` is the matching that gave T_design_scan, where the design had to be located.
     """
 
-    starts: Floats
+    positions: Floats
     pairs: Ints
     design_row: Ints
     measured: Measured
     pose: Matching | None = None
-    said: tuple[str, ...] = ()
+    messages: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class _Registered:
+    """Source and members after the stations' corrections; no ``stations`` where they were not registered."""
+
+    source: Source
+    measured: Measured
+    stations: Stations | None = None
+
+    @property
+    def trusted(self) -> Stations | None:
+        """The stations, if their covariance may be used."""
+        return self.stations if self.stations is not None and self.stations.status in ("ok", "weak") else None
+
+    def shared_offset_at(self, points: Floats) -> Floats:
+        """Covariance (k, 3, 3) at points (k, 3) by an offset common to all ranges."""
+        return np.zeros((len(points), 3, 3)) if self.stations is None else self.stations.shared_offset_at(points)
+
+    def datum_at(self, points: Floats, datum_mm: float) -> Floats:
+        """Covariance (k, 3, 3) at points (k, 3) by the motion common to all stations."""
+        if self.trusted is None:
+            return np.tile(datum_mm**2 * np.eye(3), (len(points), 1, 1))
+        return self.trusted.datum_at(points)
 
 
 def extract(
     source: Source,
     design: FrameDesign | None,
     catalogue: Catalogue,
-    params: members.Params,
-    expansion: float = 1.0,
+    options: Options,
     control: ControlPoints | None = None,
-    register_stations: bool = True,
-    datum_mm: float = 0.0,
-    limits: Tolerance | None = None,
 ) -> Extracted | None:
-    """Find every node of a frame; None where the cloud has no members that meet.
-
-    ``expansion`` is the factor by which temperature lengthens the design. ``control`` points hold the datum; where
-    they do not, all stations share a shift of standard deviation ``datum_mm`` beside their own. ``limits`` say how far
-    a ball's radius may be off its nominal one, where no catalogue tells its size.
-    """
-    start = _blind(source, params) if design is None else _designed(source, design, catalogue, expansion, params)
+    """Find every node of a frame; None where the cloud has no members that meet."""
+    params = options.members
+    start = blind(source, params) if design is None else _designed(source, design, catalogue, options)
     if start is None:
         return None
-    measured, said = start.measured, list(start.said)
-    registered: Stations | None = None
-    apart = len(source.scanners) > 1 and measured.apart_mm > APART_MM
-    if register_stations and (apart or control is not None):
-        source, measured, registered = _registered(source, start, control, params, datum_mm)
-        said.append(registered.message)
-    design_row = start.design_row
+    registered = _register(source, start, control, options)
+    measured = registered.measured
     if design is None:
-        measured = members.believed(measured, params.largest_scatter_mm)
-        design_row = np.full(measured.nodes.count, -1, np.int64)
-    known = design_row >= 0
-    expected, disputed = np.full(len(design_row), np.nan), np.zeros(len(design_row), bool)
-    nodes = measured.nodes
-    if design is not None:
-        expected, disputed = _expected(start, design, source.origin, expansion)
-        nodes = _somewhere(nodes, start.starts)
-    trusted = registered is not None and registered.status in ("ok", "weak")
-    between = registered.between if registered is not None and trusted else None
-    found = fit_all.find_balls(source, nodes, measured.tubes, catalogue, expected, between, limits=limits)
-    smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
-    found = visibility.told(quality.ambiguous(found, disputed), source, smallest)
-    beside = np.zeros((len(found.radii), 3, 3))
-    datum = np.tile(datum_mm**2 * np.eye(3), (len(found.radii), 1, 1))
-    if registered is not None and trusted:
-        datum = registered.datum_at(found.centres)
-    if registered is not None:
-        beside = registered.shared_offset_at(found.centres)
-        found = quality.doubted(found, beside)
-    matched = moved = None
-    if design is not None and known.any():
-        matched, moved = _moved(
-            source,
-            measured.tubes,
-            found,
-            beside,
-            design,
-            start.pose,
-            registered if trusted else None,
-            expansion,
-            datum_mm,
-        )
+        measured = members.with_meeting_axes(measured, params.largest_scatter_mm)
+        start = replace(start, design_row=np.full(measured.nodes.count, -1, np.int64))
+    nodes, spheres = _fit_spheres(registered.source, measured, start, design, catalogue, options, registered.trusted)
+    shared_offset = registered.shared_offset_at(spheres.centres)
+    if registered.stations is not None:
+        spheres = quality.with_shared_offset(spheres, shared_offset)
+    matched = movements = None
+    if design is not None and (start.design_row >= 0).any():
+        matched, movements = _compare(registered, spheres, shared_offset, design, start.pose, options)
+    messages = [registered.stations.message] if registered.stations is not None else []
     return Extracted(
-        source, nodes, measured.tubes, found, design_row, datum + beside, registered, matched, moved, tuple(said)
+        source=registered.source,
+        nodes=nodes,
+        members=measured.members,
+        spheres=spheres,
+        design_row=start.design_row,
+        datum=registered.datum_at(spheres.centres, options.datum_mm) + shared_offset,
+        stations=registered.stations,
+        matching=matched,
+        movement=movements,
+        messages=(*start.messages, *messages),
     )
 
 
-def _blind(source: Source, params: members.Params) -> _Start | None:
+# --- nodes and members -----------------------------------------------------------------------------------------------
+
+
+def blind(source: Source, params: members.Params) -> Start | None:
+    """Find nodes and members without a design."""
     lines = members.rough_lines(source, params)
     graph = junctions.graph(lines) if len(lines.points) > 1 else None
     if graph is None or not len(graph.pairs):
         return None
-    points = members.points_near(source, graph.nodes, graph.pairs, params)
-    measured = members.measure(points, source.scanners, graph.nodes, graph.pairs, params)
-    return _Start(graph.nodes, graph.pairs, np.full(len(graph.nodes), -1, np.int64), measured)
+    rows = np.full(len(graph.nodes), -1, np.int64)
+    return _measured(source, graph.nodes, graph.pairs, rows, params)
 
 
-def _designed(
-    source: Source, design: FrameDesign, catalogue: Catalogue, expansion: float, params: members.Params
-) -> _Start | None:
-    """Measure at the design's nodes in its own frame; where they are not there, find the nodes blind and match them."""
+def _measured(
+    source: Source, positions: Floats, pairs: Ints, rows: Ints, params: members.Params, pose: Matching | None = None
+) -> Start:
+    """Measure the members between pairs of nodes at ``positions`` (k, 3)."""
+    points = members.points_near(source, positions, pairs, params)
+    measured = members.measure(points, source.scanners, positions, pairs, params)
+    return Start(positions=positions, pairs=pairs, design_row=rows, measured=measured, pose=pose)
+
+
+def _designed(source: Source, design: FrameDesign, catalogue: Catalogue, options: Options) -> Start | None:
+    """Measure at the design's nodes in its own frame; if they are not there, find the nodes blind and match them."""
     row = {int(id_): i for i, id_ in enumerate(design.ids)}
     pairs = np.array([[row[int(a)], row[int(b)]] for a, b in zip(design.member_a, design.member_b, strict=True)])
     pairs = pairs.reshape(-1, 2).astype(np.int64)
-    middle = design.centres.mean(axis=0)
-    starts = (design.centres - middle) * expansion + (middle - source.origin)
-    rows = np.arange(len(starts))
+    nominal, middle = matching.expanded(design, options.expansion)
     if len(pairs):
-        points = members.points_near(source, starts, pairs, params)
-        measured = members.measure(points, source.scanners, starts, pairs, params)
-        off = np.linalg.norm(measured.nodes.positions - starts, axis=1)
+        positions = nominal + (middle - source.origin)
+        nominal_start = _measured(source, positions, pairs, np.arange(len(positions)), options.members)
+        off = np.linalg.norm(nominal_start.measured.nodes.positions - positions, axis=1)
         if np.mean(off < NEAR_MM) >= SAME_FRAME_SHARE:
-            return _Start(starts, pairs, rows, measured)
-    blind = _blind(source, params)
-    if blind is None:
-        return None
-    seen = members.believed(blind.measured, params.largest_scatter_mm)
-    found = Found(seen.nodes.positions, source.origin, np.empty(0), np.empty(0), seen.tubes.node_a, seen.tubes.node_b)
+            return nominal_start
+    start = blind(source, options.members)
+    return None if start is None else _located(source, start, design, pairs, catalogue, options)
 
-    def sized() -> Found:
-        fitted = fit_all.find_balls(source, seen.nodes, seen.tubes, catalogue)
-        return replace(found, radii=fitted.radii, radius_sd=np.sqrt(fitted.covariance[:, 3, 3]))
 
-    pose = matching.match(found, design, expansion=expansion, sized=sized)
+def _located(
+    source: Source, start: Start, design: FrameDesign, pairs: Ints, catalogue: Catalogue, options: Options
+) -> Start:
+    """Locate the design among nodes found blind, and measure all members of both."""
+    seen = members.with_meeting_axes(start.measured, options.members.largest_scatter_mm)
+    node_a, node_b = seen.members.node_a, seen.members.node_b
+    pattern = NodePattern(seen.nodes.positions, source.origin, node_a=node_a, node_b=node_b)
+
+    def sized() -> NodePattern:
+        fitted = fit_all.fit_spheres(source, seen.nodes, seen.members, catalogue)
+        return replace(pattern, radii=fitted.radii, radius_sd=np.sqrt(fitted.covariance[:, 3, 3]))
+
+    pose = matching.match(pattern, design, expansion=options.expansion, sized=sized)
     if pose.status == "failed":
-        lost = _Start(blind.starts, blind.pairs, blind.design_row, blind.measured)
-        return replace(lost, said=(f"the design was not found in the cloud: {pose.message}",))
-    back = rigid.invert(pose.T_design_scan)
-    nominal = (design.centres - middle) * expansion + middle
-    starts = rigid.apply(back, nominal) - source.origin
-    # A node that was found is where it was found; one that was not, where the design has it.
-    other = pose.assignment < 0
-    starts[pose.assignment[~other]] = seen.nodes.positions[~other]
-    place = np.where(other, len(starts) + np.cumsum(other) - 1, pose.assignment)
-    ends = np.stack([seen.tubes.node_a, seen.tubes.node_b], axis=1)
-    whole = (ends >= 0).all(axis=1)
-    extra = place[ends[whole]]
-    every = np.unique(np.sort(np.vstack([pairs, extra]), axis=1), axis=0)
-    starts = np.vstack([starts, seen.nodes.positions[other]])
-    rows = np.concatenate([rows, np.full(int(other.sum()), -1)])
-    points = members.points_near(source, starts, every, params)
-    measured = members.measure(points, source.scanners, starts, every, params)
-    return _Start(starts, every, rows, measured, pose)
+        return replace(start, messages=(f"the design was not found in the cloud: {pose.message}",))
+    nominal, middle = matching.expanded(design, options.expansion)
+    positions = rigid.apply(rigid.invert(pose.T_design_scan), nominal + middle) - source.origin
+    # Found nodes are where they were found, the others where the design has them.
+    extra = pose.assignment < 0
+    positions[pose.assignment[~extra]] = seen.nodes.positions[~extra]
+    place = np.where(extra, len(positions) + np.cumsum(extra) - 1, pose.assignment)
+    ends = np.stack([node_a, node_b], axis=1)
+    found_pairs = place[ends[(ends >= 0).all(axis=1)]]
+    every = np.unique(np.sort(np.vstack([pairs, found_pairs]), axis=1), axis=0)
+    rows = np.concatenate([np.arange(len(positions)), np.full(int(extra.sum()), -1)])
+    positions = np.vstack([positions, seen.nodes.positions[extra]])
+    return _measured(source, positions, every, rows, options.members, pose)
 
 
-def _expected(start: _Start, design: FrameDesign, origin: Floats, expansion: float) -> tuple[Floats, Bools]:
-    """Nominal radii (k,) of the nodes, NaN = none or disputed; and which are: there poses that fit alike differ."""
+# --- stations --------------------------------------------------------------------------------------------------------
+
+
+def _register(source: Source, start: Start, control: ControlPoints | None, options: Options) -> _Registered:
+    """Register the stations on the members, and measure the members again after their corrections."""
+    measured = start.measured
+    shifted = len(source.scanners) > 1 and measured.station_sd_mm > LEAST_STATION_SD_MM
+    if not options.register_stations or not (shifted or control is not None):
+        return _Registered(source, measured)
+    on_tubes = tube_points(measured.points, measured.lines, measured.members)
+    stations = registration.register(on_tubes, *measured.axes, source.scanners, control, options.datum_mm)
+    if stations.status not in ("ok", "weak"):
+        return _Registered(source, measured, stations)
+    corrected = Corrected(source, stations)
+    points = corrected_gathered(measured.points, stations)
+    measured = members.measure(points, corrected.scanners, start.positions, start.pairs, options.members)
+    return _Registered(corrected, measured, stations)
+
+
+# --- spheres ---------------------------------------------------------------------------------------------------------
+
+
+def _fit_spheres(
+    source: Source,
+    measured: Measured,
+    start: Start,
+    design: FrameDesign | None,
+    catalogue: Catalogue,
+    options: Options,
+    stations: Stations | None,
+) -> tuple[Nodes, Spheres]:
+    """Fit a sphere at every node, with the nominal radii and the stations' covariance as priors."""
+    nodes = measured.nodes
+    expected, disputed = np.full(nodes.count, np.nan), np.zeros(nodes.count, bool)
+    if design is not None:
+        expected, disputed = _expected(start, design, source.origin, options.expansion)
+        nodes = _with_nominal_places(nodes, start.positions)
+    between = None if stations is None else stations.between
+    spheres = fit_all.fit_spheres(source, nodes, measured.members, catalogue, expected, between, limits=options.limits)
+    smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
+    spheres = quality.with_ambiguous_design(spheres, disputed)
+    return nodes, visibility.classified(spheres, source, smallest)
+
+
+def _expected(start: Start, design: FrameDesign, origin: Floats, expansion: float) -> tuple[Floats, Bools]:
+    """Nominal radii (k,) of the nodes, NaN = none or disputed, and which are disputed by rival poses."""
     rows = start.design_row
     expected = np.where(rows >= 0, design.radii[np.maximum(rows, 0)], np.nan)
     disputed = np.zeros(len(rows), bool)
     if start.pose is None or not len(start.pose.rivals):
         return expected, disputed
-    middle = design.centres.mean(axis=0)
-    tree = cKDTree((design.centres - middle) * expansion)
+    nominal, middle = matching.expanded(design, expansion)
+    tree = cKDTree(nominal)
     for T in start.pose.rivals:
-        # offset less offset first: added to the nodes either would cost them their digits
-        there = start.starts @ T[:3, :3].T + (T[:3, :3] @ origin + T[:3, 3] - middle)
-        distance, nearest = tree.query(there)
+        # offset less offset first: adding either to the nodes would lose digits
+        placed = start.positions @ T[:3, :3].T + (T[:3, :3] @ origin + T[:3, 3] - middle)
+        distance, nearest = tree.query(placed)
         other = np.where(distance < matching.FAR * matching.TOLERANCE_MM, design.radii[nearest], np.nan)
         disputed |= (rows >= 0) & (other != expected)
     return np.where(disputed, np.nan, expected), disputed
 
 
-def _registered(
-    source: Source, start: _Start, control: ControlPoints | None, params: members.Params, datum_mm: float
-) -> tuple[Source, Measured, Stations]:
-    """Register the stations on the tubes, and measure the tubes again where that moved them."""
-    measured = start.measured
-    tubes = measured.tubes
-    on_tubes = tube_points(measured.points, measured.lines, tubes)
-    found = registration.register(
-        on_tubes, tubes.points, tubes.directions, tubes.radii, source.scanners, control, datum_mm
-    )
-    if found.status not in ("ok", "weak"):
-        return source, measured, found
-    moved = Corrected(source, found)
-    points = corrected_gathered(measured.points, found)
-    return moved, members.measure(points, moved.scanners, start.starts, start.pairs, params), found
-
-
-def _somewhere(nodes: Nodes, starts: Floats) -> Nodes:
-    """Put nodes that no axes fix where the design has them, as vaguely as that is known."""
+def _with_nominal_places(nodes: Nodes, positions: Floats) -> Nodes:
+    """Put nodes that no axes fix at their nominal places, with a large covariance."""
     lost = ~np.isfinite(nodes.positions).all(axis=1)
-    positions, covariance = nodes.positions.copy(), nodes.covariance.copy()
-    positions[lost], covariance[lost] = starts[lost], NOMINAL_SD_MM**2 * np.eye(3)
-    return Nodes(positions, covariance, np.where(lost, 0, nodes.axes), nodes.scatter)
+    places, covariance = nodes.positions.copy(), nodes.covariance.copy()
+    places[lost], covariance[lost] = positions[lost], NOMINAL_SD_MM**2 * np.eye(3)
+    return Nodes(places, covariance, np.where(lost, 0, nodes.axes), nodes.scatter)
 
 
-def _moved(
-    source: Source,
-    tubes: Tubes,
-    found: Balls,
-    beside: Floats,
+# --- design ----------------------------------------------------------------------------------------------------------
+
+
+def _compare(
+    registered: _Registered,
+    spheres: Spheres,
+    shared_offset: Floats,
     design: FrameDesign,
     pose: Matching | None,
-    registered: Stations | None,
-    expansion: float,
-    datum_mm: float,
+    options: Options,
 ) -> tuple[Matching, Movement]:
-    """Match the balls as fitted with the design, and say how far each is from its nominal place."""
-    rows = np.flatnonzero(np.array([flag != "not-found" for flag in found.flag], bool))
-    place = np.full(len(found.radii), -1, np.int64)
+    """Match the fitted spheres with the design, and return the movement of each from its nominal place."""
+    rows = np.flatnonzero(np.array([flag != "not-found" for flag in spheres.flag], bool))
+    pattern = _pattern(spheres, rows, registered.measured.members, registered.source.origin)
+    matched = _matched(pattern, design, pose, options.expansion)
+    at, stations = pattern.positions.mean(axis=0), registered.trusted
+    common = np.diag([0.0, 0.0, 0.0, *3 * [options.datum_mm**2]]) if stations is None else stations.common(at)
+    covariance = spheres.covariance[rows, :3, :3] + shared_offset[rows]
+    movements = movement(matched, pattern, covariance, design, common, at, expansion=options.expansion)
+    assignment, weight = np.full(len(spheres.radii), -1, np.int64), np.zeros(len(spheres.radii))
+    assignment[rows], weight[rows] = matched.assignment, matched.weight
+    return replace(matched, assignment=assignment, weight=weight), replace(movements, found=rows[movements.found])
+
+
+def _pattern(spheres: Spheres, rows: Ints, joined: Members, origin: Floats) -> NodePattern:
+    """Return the spheres of some rows as a pattern of nodes."""
+    place = np.full(len(spheres.radii), -1, np.int64)
     place[rows] = np.arange(len(rows))
-    ends = [np.where(end >= 0, place[end], -1) for end in (tubes.node_a, tubes.node_b)]
-    sd = np.sqrt(found.covariance[rows, 3, 3])
-    nodes = Found(found.centres[rows], source.origin, found.radii[rows], sd, *ends)
-    if pose is not None:
-        # Where the pattern is has been decided: here it is only fitted again.
-        T = pose.T_design_scan
-        shifted = T[:3, :3] @ source.origin + T[:3, 3]
-        there = replace(nodes, positions=nodes.positions @ T[:3, :3].T, origin=shifted)
-        again = matching.match(there, design, expansion=expansion)
-        matched = replace(again, how=matching.REGISTERED, status=pose.status, rivals=pose.rivals, message=pose.message)
-        matched = replace(matched, T_design_scan=again.T_best_fit @ T, T_best_fit=again.T_best_fit @ T)
-    else:
-        matched = matching.match(nodes, design, expansion=expansion)
-    at = nodes.positions.mean(axis=0)
-    common = np.diag([0.0, 0.0, 0.0, *3 * [datum_mm**2]]) if registered is None else registered.common(at)
-    moved = movement.movement(
-        matched, nodes, found.covariance[rows, :3, :3] + beside[rows], design, common, at, expansion=expansion
+    return NodePattern(
+        positions=spheres.centres[rows],
+        origin=origin,
+        radii=spheres.radii[rows],
+        radius_sd=np.sqrt(spheres.covariance[rows, 3, 3]),
+        node_a=np.where(joined.node_a >= 0, place[joined.node_a], -1),
+        node_b=np.where(joined.node_b >= 0, place[joined.node_b], -1),
     )
+
+
+def _matched(pattern: NodePattern, design: FrameDesign, pose: Matching | None, expansion: float) -> Matching:
+    """Match the nodes with the design; where its pose is known from the search it is only refined."""
+    if pose is None:
+        return matching.match(pattern, design, expansion=expansion)
+    T = pose.T_design_scan
+    there = replace(pattern, positions=pattern.positions @ T[:3, :3].T, origin=T[:3, :3] @ pattern.origin + T[:3, 3])
+    refined = matching.match(there, design, expansion=expansion)
     return replace(
-        matched,
-        assignment=_spread(matched.assignment, rows, len(place), -1),
-        weight=_spread(matched.weight, rows, len(place), 0.0),
-    ), replace(moved, found=rows[moved.found])
-
-
-def _spread(values: Any, rows: Ints, count: int, missing: float) -> Any:
-    """Give values of some rows to all of them."""
-    whole = np.full(count, missing, values.dtype)
-    whole[rows] = values
-    return whole
+        refined,
+        how=matching.REGISTERED,
+        status=pose.status,
+        rivals=pose.rivals,
+        message=pose.message,
+        T_design_scan=refined.T_best_fit @ T,
+        T_best_fit=refined.T_best_fit @ T,
+    )

@@ -15,25 +15,25 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Params:
-    """Parameters (lengths in mm)."""
+    """Parameters of all methods (lengths in mm)."""
 
     method: str = METHODS[0]
     seed: int = 0
-    catalogue: str = "plausible"  # ray: of ball radii, by name; "none" leaves radii free
-    radii_mm: tuple[float, ...] = ()  # ray: a catalogue of one's own, instead
-    register_stations: bool = True  # ray: against each other, on the tubes, where they are off
-    datum_mm: float = 0.0  # ray: sd an axis of a shift that all stations share, where no control points hold them
+    catalogue: str = "plausible"  # ray: of radii, by name; "none" leaves radii free
+    radii_mm: tuple[float, ...] = ()  # ray: the user's catalogue, instead
+    register_stations: bool = True  # ray: against each other, on the tubes, where their errors require it
+    datum_mm: float = 0.0  # ray: sd an axis of a shift common to all stations, without control points
     members: members.Params = field(default_factory=members.Params)  # ray
-    crop_margin_mm: float = 20.0  # the paper's: beyond the nominal radius, about the nominal centre
-    tau_mm: float = 4.0  # ransac: distance from the surface within which a point consents; two sd of a 2 mm scanner
-    probability: float = 0.99  # ransac: that one minimal set was free of outliers
+    crop_margin_mm: float = 20.0  # the paper's methods: beyond the nominal radius, about the nominal centre
+    tau_mm: float = 4.0  # ransac: largest distance of an inlier from the surface; two sd of a 2 mm scanner
+    probability: float = 0.99  # ransac: that one minimal set has no outliers
     max_iterations: int = 10_000  # ransac: minimal sets at most
-    min_points: int = 20  # the paper's: fewer: low confidence; of a ball without members: no ball, and 40 is the least
-    radius_mm: float = NAN  # of balls without members: the known radius, held; NaN = estimated
-    max_balls: int = 10  # without members: to search for, one after another
+    min_points: int = 20  # the paper's methods: low confidence below it; without members: no sphere, and at least 40
+    radius_mm: float = NAN  # of spheres without members: the known radius, fixed; NaN = estimated
+    max_balls: int = 10  # without members: spheres to search for, in succession
 
     def check(self, has_design: bool) -> None:
-        """Raise UsageError for parameters that make no sense."""
+        """Raise UsageError for invalid parameters."""
         if self.method not in METHODS:
             raise UsageError(f"spheres: unknown method {self.method!r}; it has {', '.join(METHODS)}")
         for name, sound in (

@@ -11,12 +11,12 @@ from processor.model import NORMAL_95, Checked, Floats, Ints, column, names, opt
 
 @dataclass(frozen=True)
 class Result(Checked):
-    """The balls, a row each, in the input's own frame (its offset put back), mm. NaN = no answer.
+    """The spheres, a row each, in the input's own frame (its offset added), mm. NaN = no answer.
 
-    Method ``ray`` alone fills what is below ``reason``. ``bound_sd`` are the Cramér-Rao bounds of x, y, z, radius and
+    Only method ``ray`` fills the fields below ``reason``. ``bound_sd`` are the Cramér-Rao bounds of x, y, z, radius and
     lowest point, ``efficiency`` is bound over standard deviation of centre, radius and lowest point. Movements are in
-    the design's frame, relative to ``gauge``; tubes run from ``tube_start`` to ``tube_end`` between balls of these ids
-    (-1 = none). ``T_station`` (s, 4, 4) map places as registered to where the tubes have them.
+    the design's frame, relative to ``gauge``; tubes run from ``tube_start`` to ``tube_end`` between spheres of these
+    ids (-1 = none). ``T_station`` (s, 4, 4) map places as registered to corrected ones.
     """
 
     status: str  # ok | partial | failed
@@ -66,7 +66,7 @@ class Result(Checked):
     control_used: Ints = column("c", dtype=np.int64)  # 1 = yes, 0 = left out: the others speak against it
 
 
-# --- Movements of nodes held against a limit.
+# --- movements of nodes compared with a limit ------------------------------------------------------------------------
 
 
 PASS, FAIL, INDETERMINATE, NO_LIMIT = "pass", "fail", "indeterminate", "no limit"
@@ -76,7 +76,7 @@ PASS, FAIL, INDETERMINATE, NO_LIMIT = "pass", "fail", "indeterminate", "no limit
 class Judged:
     """Size (k,) of each movement, its 95 % half-width (k,), mm, and the verdict; NaN and "" where none is known.
 
-    The half-width is along the movement itself: a size that is not well above it is mostly noise.
+    The half-width is along the movement: a size that is not well above it is mostly noise.
     """
 
     size: Floats
@@ -85,11 +85,11 @@ class Judged:
 
 
 def of_result(result: Result) -> Judged:
-    """Judge all movements of a result.
+    """Compare all movements of a result with the limit.
 
-    Pass where size and interval keep within the limit, fail where it is beyond by more than the interval, else
-    indeterminate; that also where the design fits the nodes in other ways as well, and of a ball that was not seen:
-    where its axes meet is no ball's place.
+    Pass where size and interval are within the limit, fail where the size exceeds it by more than the interval, else
+    indeterminate. Also indeterminate where other poses of the design fit the nodes as well, and for a sphere that was
+    not seen: the point where its axes meet is not the sphere's centre.
     """
     size = np.linalg.norm(result.movement, axis=1)
     along = result.movement / np.where(size > 0.0, size, 1.0)[:, None]
@@ -97,7 +97,7 @@ def of_result(result: Result) -> Judged:
     ci95 = NORMAL_95 * np.sqrt(np.maximum(variance, 0.0))
     sure = result.matching == "ok"
     limit = result.movement_limit
-    seen = [one != "axes" for one in result.evidence]
+    seen = [evidence != "axes" for evidence in result.evidence]
     return Judged(
         size,
         ci95,

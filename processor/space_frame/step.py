@@ -1,9 +1,9 @@
-"""Balls of a space frame, or of a cloud without a design.
+"""Step ``spheres``: the spheres of a space frame, or of a cloud without a design.
 
-Method ``ray`` takes the whole scan, with or without a design: members first, then the nodes where they meet, then the
-balls on them. Where a cloud has no members, balls are searched for by themselves. ``ransac`` and ``least-squares`` are
-the source paper's (paper 001), fitted to a crop about every node of the design, or beside ``ray`` to the points that
-it took.
+Method ``ray`` uses the whole scan, with or without a design: members first, then the nodes where they meet, then the
+spheres at them. Where a cloud has no members, spheres are searched for by themselves. ``ransac`` and ``least-squares``
+are the source paper's (paper 001), fitted to a crop about every node of the design, or for comparison with ``ray`` to
+the points that it used.
 """
 
 from __future__ import annotations
@@ -24,17 +24,17 @@ __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "STREAMS", "Params", "Result", "r
 NAME = "spheres"
 NEEDS: tuple[str, ...] = ()
 STREAMS = ("ray",)  # methods that take points piece by piece
-COMPARES = True  # methods run for comparison are given the answer
+COMPARES = True  # methods run for comparison get the result of the main method
 KIND = "space-frame"
 
 
 def run(scene: Scene, params: Params, points: PointReader | None = None, answer_given: Result | None = None) -> Result:
-    """Find the balls of a scene: those of its design and what else there is, or those that are in the cloud.
+    """Find the spheres of a scene: those of its design and further ones, or those in the cloud.
 
-    ``status``: ok = an answer for every ball, partial = for some or ``max_balls`` reached, failed = for none; the flag
-    of each ball says what its answer is worth. Where the answer given is a frame's by ``ray``, the paper's methods are
-    run on its points, for comparison. ``points`` reads the points of a scene that is larger than memory.
-    Raises UsageError for parameters that make no sense, InputError for a cloud without members larger than memory.
+    ``status``: ok = an answer for every sphere, partial = for some or ``max_balls`` reached, failed = for none; the
+    flag of each sphere grades its answer. Where ``answer_given`` is that of a frame by ``ray``, the paper's methods run
+    on its points, for comparison. ``points`` reads the points of a scene that is larger than memory.
+    Raises UsageError for invalid parameters, InputError for a cloud without members that is larger than memory.
     """
     params.check(scene.frame is not None)
     limits = standards.default_for(scene.tolerance)
@@ -44,32 +44,32 @@ def run(scene: Scene, params: Params, points: PointReader | None = None, answer_
             if same is not None:
                 return same
         if scene.frame is None:
-            return _told(scene, isolated.search(merged(scene, with_scanner=True), params))
-        return _told(scene, isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits))
-    found = to_result.of_frame(scene, params, points)
-    if found is None and points is not None:
+            return _with_unused_control(scene, isolated.search(merged(scene, with_scanner=True), params))
+        return _with_unused_control(
+            scene, isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, params, limits)
+        )
+    result = to_result.of_frame(scene, params, points)
+    if result is not None:
+        return result
+    if points is not None:
         raise InputError(
             f"{scene.name}: no members that meet were found, and the cloud is too large to search otherwise"
         )
-    if found is None:
-        return _told(scene, _without_members(scene, params, limits))
-    return found
+    return _with_unused_control(scene, _without_members(scene, params, limits))
 
 
-def _told(scene: Scene, result: Result) -> Result:
-    """Say of control points that nothing was held by them."""
+def _with_unused_control(scene: Scene, result: Result) -> Result:
+    """Add the message that control points were not used, where there are any."""
     if scene.control is None:
         return result
     return replace(result, message="; ".join(filter(None, (result.message, to_result.UNUSED))))
 
 
 def _without_members(scene: Scene, params: Params, limits: Tolerance) -> Result:
-    """Find balls of a cloud without members: those of the design at its nodes, without one those that stand out."""
+    """Find spheres of a cloud without members: at the design's nodes, or without a design those that stand out."""
     if scene.frame is None:
         return isolated.search(merged(scene, with_scanner=True), params)
-    found = isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, replace(params, method="ransac"), limits)
-    said = "no members that meet: each ball was fitted at the design's node, by ransac and without its axes"
-    return replace(found, method=params.method, message=f"{said}; {found.message}")
-
-
-# --- evaluation ----------------------------------------------------------------------------------------------------
+    ransac = replace(params, method="ransac")
+    result = isolated.fit_nodes(merged(scene, with_scanner=False), scene.frame, ransac, limits)
+    message = "no members that meet: each ball was fitted at the design's node, by ransac and without its axes"
+    return replace(result, method=params.method, message=f"{message}; {result.message}")

@@ -1,18 +1,23 @@
-"""What method ``ray`` found of a frame, as the result of step ``spheres``."""
+"""Conversion of the result of method ``ray`` to the result of step ``spheres``."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
+import numpy.typing as npt
 
 from processor.limits import standards
 from processor.model import Floats, FrameDesign, Ints, Scene
-from processor.space_frame import catalogue, extract
+from processor.space_frame import catalogue
 from processor.space_frame.catalogue import Catalogue
-from processor.space_frame.extract import Extracted
+from processor.space_frame.extract import Extracted, Options, extract
 from processor.space_frame.params import Params
-from processor.space_frame.points.scene_source import PointReader, SceneSource, control_of, of_scene
+from processor.space_frame.points.scene_source import PointReader, SceneSource, of_scene
 from processor.space_frame.result import Result
 from processor.space_frame.spheres import baselines
+from processor.space_frame.stations.records import Stations
+from processor.space_frame.stations.sightings import control_of
 
 REFERENCE_C = 20.0
 EXPANSION_PER_K = 12e-6
@@ -22,28 +27,33 @@ UNUSED = "control points were not used: that takes members that meet, scanner po
 
 
 def of_frame(scene: Scene, params: Params, points: PointReader | None = None) -> Result | None:
-    """Find every ball of a frame's scene; None where the cloud has no members that meet."""
+    """Find every sphere of a frame's scene; None where the cloud has no members that meet."""
     source = of_scene(scene, points)
-    found = _extracted(source, scene, params)
-    return None if found is None else _result(found, source, scene)
+    extracted = _extracted(source, scene, params)
+    return None if extracted is None else _result(extracted, source, scene)
 
 
 def of_same_points(scene: Scene, params: Params) -> Result | None:
-    """Fit the balls that method ``ray`` finds by one of the paper's methods to the same points; None as above."""
-    found = _extracted(of_scene(scene), scene, params)
-    if found is None:
+    """Fit the spheres that method ``ray`` finds by one of the paper's methods to the same points; None as above."""
+    extracted = _extracted(of_scene(scene), scene, params)
+    if extracted is None:
         return None
+    ids, limits = _ids(extracted.design_row, scene.frame), standards.default_for(scene.tolerance)
     return baselines.compared(
-        found, _ids(found.design_row, scene.frame), params, standards.default_for(scene.tolerance)
+        extracted.source, extracted.nodes, extracted.members, extracted.spheres, ids, params, limits
     )
 
 
 def _extracted(source: SceneSource, scene: Scene, params: Params) -> Extracted | None:
     degrees = scene.temperature_C - REFERENCE_C if np.isfinite(scene.temperature_C) else 0.0
-    return extract.extract(
-        source, scene.frame, _catalogue(params), params.members, 1.0 + EXPANSION_PER_K * degrees,
-        control_of(scene, source), params.register_stations, params.datum_mm, standards.default_for(scene.tolerance),
-    )  # fmt: skip
+    options = Options(
+        members=params.members,
+        expansion=1.0 + EXPANSION_PER_K * degrees,
+        register_stations=params.register_stations,
+        datum_mm=params.datum_mm,
+        limits=standards.default_for(scene.tolerance),
+    )
+    return extract(source, scene.frame, _catalogue(params), options, control_of(scene, source))
 
 
 def _catalogue(params: Params) -> Catalogue:
@@ -52,92 +62,124 @@ def _catalogue(params: Params) -> Catalogue:
     return catalogue.of_radii(()) if params.catalogue == "none" else catalogue.load(params.catalogue)
 
 
-def _result(found: Extracted, source: SceneSource, scene: Scene) -> Result:
-    balls, k = found.balls, len(found.balls.radii)
-    covariance = balls.covariance.copy()
-    covariance[:, :3, :3] += found.datum
-    ids = _ids(found.design_row, scene.frame)
-    flag, reason = list(balls.flag), list(balls.reason)
-    for i in np.flatnonzero(found.design_row < 0).tolist() if scene.frame is not None else ():
+def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
+    spheres = extracted.spheres
+    covariance = spheres.covariance.copy()
+    covariance[:, :3, :3] += extracted.datum
+    ids = _ids(extracted.design_row, scene.frame)
+    reason = list(spheres.reason)
+    for i in np.flatnonzero(extracted.design_row < 0).tolist() if scene.frame is not None else ():
         reason[i] = "; ".join(filter(None, (reason[i], NOWHERE)))
-    matched, moved = found.matching, found.movement
-    movement, movement_ci95 = np.full((k, 3), np.nan), np.full((k, 3), np.nan)
-    movement_covariance = np.full((k, 3, 3), np.nan)
-    if moved is not None:
-        movement[moved.found], movement_ci95[moved.found] = moved.vector, moved.ci95
-        movement_covariance[moved.found] = moved.covariance
-    limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
-    missing = np.array([one == "not-found" for one in flag], bool)
-    lost = int(missing.sum())
-    tubes, stations = found.tubes, found.stations
-    half = 0.5 * tubes.lengths[:, None] * tubes.directions
-    said = [*found.said, balls.message, FRAME_ALONE]
-    held = stations is not None and stations.control
-    said += [UNUSED] if scene.control is not None and not held else []
-    said += [] if matched is None else [matched.message]
-    sure = matched is None or matched.status == "ok"
-    found_only = np.where(missing, np.nan, 1.0)  # of a ball that is not there the design's numbers are no answer
-    return Result(
-        status="failed" if lost == k else "ok" if not lost and sure else "partial",
+    missing = np.array([flag == "not-found" for flag in spheres.flag], bool)
+    found_only = np.where(missing, np.nan, 1.0)  # of a missing sphere the nominal values are no answer
+    result = Result(
+        status=_status(missing, extracted),
         method="ray",
-        message="; ".join(filter(None, said)),
+        message=_message(extracted, scene),
         ids=ids,
-        centres=(balls.centres + source.origin) * found_only[:, None],
-        radii=balls.radii * found_only,
-        lowest=(balls.lowest + source.origin) * found_only[:, None],
+        centres=(spheres.centres + source.origin) * found_only[:, None],
+        radii=spheres.radii * found_only,
+        lowest=(spheres.lowest + source.origin) * found_only[:, None],
         covariance=covariance * found_only[:, None, None],
-        lowest_sd=np.sqrt(balls.lowest_sd**2 + found.datum[:, 2, 2]) * found_only,
-        points=balls.points,
-        visible_fraction=balls.visible_fraction,
-        rms=balls.rms,
-        nominal_radii=balls.expected,
-        evidence=balls.evidence,
-        flag=tuple(flag),
+        lowest_sd=np.sqrt(spheres.lowest_sd**2 + extracted.datum[:, 2, 2]) * found_only,
+        points=spheres.points,
+        visible_fraction=spheres.visible_fraction,
+        rms=spheres.rms,
+        nominal_radii=spheres.expected,
+        evidence=spheres.evidence,
+        flag=spheres.flag,
         reason=tuple(reason),
-        sizes=balls.sizes,
-        axes=balls.axes,
-        stations=balls.stations,
-        bound_sd=np.hstack([np.sqrt(np.einsum("kii->ki", balls.bound)), balls.bound_lowest_sd[:, None]]),
-        efficiency=np.stack([balls.efficiency_centre, balls.efficiency_radius, balls.efficiency_lowest], axis=1),
+        sizes=spheres.sizes,
+        axes=spheres.axes,
+        stations=spheres.stations,
+        bound_sd=np.hstack([np.sqrt(np.einsum("kii->ki", spheres.bound)), spheres.bound_lowest_sd[:, None]]),
+        efficiency=np.stack([spheres.efficiency_centre, spheres.efficiency_radius, spheres.efficiency_lowest], axis=1),
+    )
+    result = _with_members(_with_design(result, extracted, scene), extracted, source.origin)
+    return result if extracted.stations is None else _with_stations(result, extracted.stations, source)
+
+
+def _status(missing: npt.NDArray[np.bool_], extracted: Extracted) -> str:
+    if missing.all():
+        return "failed"
+    matched = extracted.matching
+    return "ok" if not missing.any() and (matched is None or matched.status == "ok") else "partial"
+
+
+def _message(extracted: Extracted, scene: Scene) -> str:
+    messages = [*extracted.messages, extracted.spheres.message, FRAME_ALONE]
+    if scene.control is not None and (extracted.stations is None or not extracted.stations.control):
+        messages.append(UNUSED)
+    if extracted.matching is not None:
+        messages.append(extracted.matching.message)
+    return "; ".join(filter(None, messages))
+
+
+def _with_design(result: Result, extracted: Extracted, scene: Scene) -> Result:
+    """Add the movements of nodes, and the pose of the design."""
+    k, matched, movements = len(result.ids), extracted.matching, extracted.movement
+    limit = standards.find(standards.default_for(scene.tolerance), standards.NODE_PLACE)
+    movement, ci95, covariance = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3, 3), np.nan)
+    if movements is not None:
+        rows = movements.found
+        movement[rows], ci95[rows], covariance[rows] = movements.vector, movements.ci95, movements.covariance
+    return replace(
+        result,
         movement=movement,
-        movement_ci95=movement_ci95,
-        movement_covariance=movement_covariance,
+        movement_ci95=ci95,
+        movement_covariance=covariance,
         movement_limit=np.nan if limit is None else limit.high,
         movement_limit_source="" if limit is None else limit.source,
-        gauge="" if moved is None else moved.gauge,
+        gauge="" if movements is None else movements.gauge,
         matching="" if matched is None else matched.status,
         T_design_scan=np.empty(0) if matched is None else matched.T_design_scan,
         T_design_scan_covariance=np.empty(0) if matched is None else matched.covariance,
         T_rivals=np.empty((0, 4, 4)) if matched is None else matched.rivals,
-        tube_start=tubes.points - half + source.origin,
-        tube_end=tubes.points + half + source.origin,
-        tube_radii=tubes.radii,
-        tube_bow=np.hypot(*tubes.bow.T),
-        tube_a=np.where(tubes.node_a >= 0, ids[tubes.node_a], -1),
-        tube_b=np.where(tubes.node_b >= 0, ids[tubes.node_b], -1),
-        station_names=() if stations is None else source.names,
-        T_station=np.empty((0, 4, 4)) if stations is None else _in_place(stations.T_project_station, source.origin),
-        station_said=() if stations is None else stations.weak,
-        datum="" if stations is None else stations.datum,
-        control_names=() if stations is None else stations.control,
-        control_scan=() if stations is None else stations.control_scan,
-        control_off=np.empty((0, 3)) if stations is None else stations.control_off,
-        control_used=np.empty(0, np.int64) if stations is None else stations.control_used,
+    )
+
+
+def _with_members(result: Result, extracted: Extracted, origin: Floats) -> Result:
+    """Add the members' tubes."""
+    members = extracted.members
+    half = 0.5 * members.lengths[:, None] * members.directions
+    return replace(
+        result,
+        tube_start=members.points - half + origin,
+        tube_end=members.points + half + origin,
+        tube_radii=members.radii,
+        tube_bow=np.hypot(*members.bow.T),
+        tube_a=np.where(members.node_a >= 0, result.ids[members.node_a], -1),
+        tube_b=np.where(members.node_b >= 0, result.ids[members.node_b], -1),
+    )
+
+
+def _with_stations(result: Result, stations: Stations, source: SceneSource) -> Result:
+    """Add the stations' corrections, and the deviations at control points."""
+    return replace(
+        result,
+        station_names=source.names,
+        T_station=_in_place(stations.T_project_station, source.origin),
+        station_said=stations.weak,
+        datum=stations.datum,
+        control_names=stations.control,
+        control_scan=stations.control_scan,
+        control_off=stations.control_off,
+        control_used=stations.control_used,
     )
 
 
 def _ids(design_row: Ints, design: FrameDesign | None) -> Ints:
-    """Ids of the design's nodes, and numbers after the largest of them for others."""
+    """Ids of the design's nodes; others get numbers after the largest of them."""
     if design is None:
         return np.arange(len(design_row), dtype=np.int64)
     other = design_row < 0
-    found: Ints = np.where(other, 0, design.ids[np.maximum(design_row, 0)])
-    found[other] = int(design.ids.max(initial=-1)) + 1 + np.arange(int(other.sum()))
-    return found
+    ids: Ints = np.where(other, 0, design.ids[np.maximum(design_row, 0)])
+    ids[other] = int(design.ids.max(initial=-1)) + 1 + np.arange(int(other.sum()))
+    return ids
 
 
 def _in_place(T: Floats, origin: Floats) -> Floats:
-    """Return transforms (s, 4, 4) of places less an origin as those of places with it."""
-    found: Floats = T.copy()
-    found[:, :3, 3] += origin - T[:, :3, :3] @ origin
-    return found
+    """Convert transforms (s, 4, 4) of places less an origin to those of full coordinates."""
+    full: Floats = T.copy()
+    full[:, :3, 3] += origin - T[:, :3, :3] @ origin
+    return full

@@ -30,11 +30,6 @@ def turned(covariance: Floats, R: Floats) -> Floats:
     return rotated
 
 
-def of_file(T_frame_cloud: Floats, origin: Floats) -> Floats:
-    """Return the pose (4, 4) of a scan's file frame from that of a cloud, from which ``origin`` (3,) was subtracted."""
-    return rigid.with_origin(T_frame_cloud, origin)
-
-
 def difference(T: Floats, S: Floats) -> Floats:
     """Return the small motion (6,) that brings S to T: rotation about the origin of S, and the shift of that origin."""
     return np.concatenate([rigid.vector_from_rotation(T[:3, :3] @ S[:3, :3].T), T[:3, 3] - S[:3, 3]])

@@ -1,92 +1,139 @@
-"""What stitching answers."""
+"""The result of step ``stitch``."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
-from processor.model import Checked, Codes, Floats, Ints, column, names, newer
+from processor.model import (
+    Checked,
+    Flags,
+    Floats,
+    Ints,
+    Reason,
+    Rows,
+    Status,
+    Word,
+    column,
+    described,
+    name_lists,
+    names,
+    newer,
+    optional,
+    reasons,
+    words,
+)
 
-PRCS, GLCS = "PRCS", "GLCS"
+NAN = float("nan")
+
+
+class ProjectFrame(Word):
+    """The frame that the poses of all scans lead to."""
+
+    PRCS = "PRCS"  # that of the reference scan
+    GLCS = "GLCS"  # that of the control points, or the one that the given pose of the reference scan leads to
 
 
 @dataclass(frozen=True)
-class Held(Checked):
-    """What control points hold the scans by, a row a sighting; project's frame, mm. NaN = not placed, or not used."""
+class Scans(Rows):
+    """The scans with their poses in the project's frame, mm; NaN without a pose.
 
-    points: tuple[str, ...] = names("c")
-    scans: tuple[str, ...] = names("c")
-    off: Floats = column("c", 3)  # known less seen place, once all is adjusted
-    sd: Floats = column("c", 3)  # of it; where a sighting was left out, as the others predict it
-    share: Floats = column("c")  # of an error of a sighting that shows in its residual; the rest goes into the poses
-    used: Codes = column("c", dtype="uint8")  # type: ignore[arg-type]
-    holds: int = 0  # 1 = the project's frame is theirs; 0 = too few, and it is the reference scan's
+    Covariances: order (rotation about x, y, z of the project's frame in rad; translation in mm), left perturbation
+    T = exp(xi) T_project_scan. They are relative to the reference scan, unless control points fix the frame.
+    """
+
+    name: tuple[str, ...] = names("k")
+    status: tuple[Status, ...] = words("k", Status)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("k")
+    T_project_scan: Floats = column("k", 4, 4)
+    covariance: Floats = column("k", 6, 6)
+    position: Floats = column("k", 3, unit="mm")  # of the scanner; if unknown, of the centroid of the points
+    position_sd: Floats = column("k", 3, unit="mm")
+    rotation_sd: Floats = column("k", 3, unit="rad")  # about the project's axes
+    rivalry: Floats = column("k")  # score of the next best pose by that of the best one
+    T_rival_scan: Floats = column("k", 4, 4, nullable=True)
+    from_frame: tuple[str, ...] = names("k", json="from")  # of T_project_scan
+    to_frame: tuple[str, ...] = names("k", json="to")
+
+    @property
+    def placed(self) -> Flags:
+        """Which scans (k,) have a pose."""
+        return np.asarray(np.isfinite(self.T_project_scan).all(axis=(1, 2)))
+
+
+@dataclass(frozen=True)
+class Pairs(Rows):
+    """Pairs of scans, each registered by itself; ``covariance`` is in the frame of a, ordered as in :class:`Scans`."""
+
+    a: tuple[str, ...] = names("p")
+    b: tuple[str, ...] = names("p")
+    overlap: Floats = column("p")  # share of the surface of both scans that the other one sees too
+    residual: Floats = column("p", unit="mm")  # rms
+    used: Flags = column("p", dtype=np.bool_)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("p")
+    shared: Ints = column("p", dtype=np.int64)  # planar pieces or picked points that both scans have
+    T_a_b: Floats = column("p", 4, 4)
+    covariance: Floats = column("p", 6, 6)
+    scale: Floats = column("p")  # three-point: of b in a; with six parameters a diagnostic
+    scale_sd: Floats = column("p")
+    from_frame: tuple[str, ...] = names("p", json="from")  # of T_a_b
+    to_frame: tuple[str, ...] = names("p", json="to")
+
+
+@dataclass(frozen=True)
+class Closures(Rows):
+    """Misclosures of loops of pairs, by the pairs' own poses."""
+
+    loop: tuple[tuple[str, ...], ...] = name_lists("l")  # names of the scans; the first again at the end
+    mm: Floats = column("l", unit="mm")
+    mrad: Floats = column("l", unit="mrad")
+    ratio: Floats = column("l")  # chi-square by the pairs' covariances over its 6 freedoms
+
+
+@dataclass(frozen=True)
+class ControlSightings(Rows):
+    """Sightings of control points after the adjustment, in the project's frame; NaN in scans without a pose."""
+
+    point: tuple[str, ...] = names("c", json="name")
+    scan: tuple[str, ...] = names("c")
+    off: Floats = column("c", 3, unit="mm")  # known less seen place
+    sd: Floats = column("c", 3, unit="mm")  # of ``off``; of an unused sighting that of its prediction by the others
+    share: Floats = column("c")  # of an error of the sighting that is visible in ``off``; the poses absorb the rest
+    used: Flags = column("c", dtype=np.bool_)
+
+
+@dataclass(frozen=True)
+class ControlPoints(Checked):
+    """How control points fix the frame of the scans."""
+
+    holds: bool = False  # whether the project's frame is theirs; False: too few, it is the reference scan's
     redundancy: int = 0  # freedoms
-    ratio: float = float("nan")  # squares of misfits by covariances, by the redundancy: 1 is usual
-    loosened: float = 1.0  # standard deviations of control points were taken so many times as large
+    ratio: float = NAN  # chi-square of the misfits over the redundancy; expected: 1
+    loosened: float = 1.0  # factor that the standard deviations of control points were multiplied by
+    sightings: ControlSightings = dataclasses.field(default_factory=ControlSightings)
 
 
 @dataclass(frozen=True)
 class Result(Checked):
-    """All scans in one frame, the project's. NaN = no answer.
+    """All scans in one frame, the project's, as ``frame`` names it. NaN = no value."""
 
-    The project's frame is that of the reference scan (PRCS), or one given from outside (GLCS): that of the control
-    points, or the one that scan's given pose leads to. Covariances: order (turn about x, y, z of the project's frame in
-    rad; translation in mm), left perturbation T = exp(xi) T_project_scan, relative to the reference, which is held,
-    unless control points hold all.
-    """
-
-    status: str  # ok | partial | failed
-    method: str
-    message: str = ""
+    status: Status = described(words=Status)
+    method: str = described()
+    reasons: tuple[Reason, ...] = reasons()
     reference: str = ""
-    # a row a scan
-    scans: tuple[str, ...] = names("k")
-    scan_status: tuple[str, ...] = names("k")  # ok | ambiguous | weak | failed
-    scan_message: tuple[str, ...] = names("k")
-    T_project_scan: Floats = column("k", 4, 4)
-    covariance: Floats = column("k", 6, 6)
-    position: Floats = column("k", 3)  # of the scanner, or of the middle of the points where it is not known; project
-    position_sd: Floats = column("k", 3)
-    rotation_sd: Floats = column("k", 3)  # rad, about the project's axes
-    rivalry: Floats = column("k")  # score of the next best pose by the best one's
-    T_rival_scan: Floats = column("k", 4, 4)
-    # a row a pair
-    pair_a: tuple[str, ...] = names("p")
-    pair_b: tuple[str, ...] = names("p")
-    overlap: Floats = column("p")  # share of both scans' faces that the other one sees too
-    residual: Floats = column("p")  # rms, mm
-    used: Codes = column("p", dtype="uint8")  # type: ignore[arg-type]
-    pair_message: tuple[str, ...] = names("p")
-    T_a_b: Floats = column("p", 4, 4)  # by the pair alone
-    pair_covariance: Floats = column("p", 6, 6)  # in the frame of a
-    pair_pieces: Ints = column("p", dtype="int64")  # type: ignore[arg-type]
-    scale: Floats = column("p")  # three-point: of b in a; a diagnostic where six parameters were asked for
-    scale_sd: Floats = column("p")
-    # a row a loop; names joined by " > ", the first again at the end
-    loops: tuple[str, ...] = names("l")
-    closure_mm: Floats = column("l")
-    closure_mrad: Floats = column("l")
-    closure_ratio: Floats = column("l")  # by what the pairs' covariances let expect: chi-square by its 6 freedoms
-    noise_mm: float = float("nan")  # of single points along the ray, as found
-    patch_mm: float = float("nan")  # of what neighbouring points have in common, as found
-    ends_share: float = float("nan")  # the same of ends of faces, by the standard deviation of a single one
-    control: Held | None = newer()
+    scans: Scans = dataclasses.field(default_factory=Scans)
+    pairs: Pairs = dataclasses.field(default_factory=Pairs)
+    closures: Closures = dataclasses.field(default_factory=Closures)
+    noise_mm: float = NAN  # estimated standard deviation of single points along the ray
+    patch_mm: float = NAN  # the same of the error that neighbouring points have in common
+    ends_share: float = NAN  # the same of ends of faces, by the standard deviation of a single end
+    frame: ProjectFrame = described(ProjectFrame.PRCS, words=ProjectFrame)
+    T_GLCS_PRCS: Floats = optional(4, 4)
+    control: ControlPoints | None = newer()
 
     @property
     def by_control(self) -> bool:
-        """Whether control points hold the frame."""
-        return self.control is not None and bool(self.control.holds)
-
-    @property
-    def frame(self) -> str:
-        """Name of the frame that T_project_scan leads to: PRCS, the reference scan's, or GLCS, given from outside."""
-        given = self.reference in self.scans and not np.array_equal(self.reference_pose, np.eye(4))
-        return GLCS if self.by_control or given else PRCS
-
-    @property
-    def reference_pose(self) -> Floats:
-        """Pose (4, 4) of the reference scan, and so of PRCS, in the project's frame."""
-        found: Floats = self.T_project_scan[self.scans.index(self.reference)]
-        return found
+        """Whether control points fix the frame."""
+        return self.control is not None and self.control.holds

@@ -2,18 +2,22 @@
 
 ``automatic`` places the scans by the flat faces they share and by what each scanner looked through, then adjusts all of
 them at once on these faces and their ends. ``three-point`` takes three or more picked points a pair (picks.csv), as in
-paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``. Where control points are
-given, three or more that span a plane, what either found is laid into their frame, and corrected by them.
+paper 003, and chains the pairs; six parameters, or the paper's seven with ``scale = "free"``. Three or more control
+points that span a plane fix the frame of either method's result and correct its poses.
 """
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping, Sequence
+
 import numpy as np
 
-from processor.model import Floats, InputError, Scan, Scene, UsageError
+from processor.model import Floats, InputError, Reason, Scan, Scene, UsageError, reason
 from processor.stitching import automatic, three_point, to_result
 from processor.stitching.params import METHODS, Params
 from processor.stitching.result import Result
+from processor.stitching.three_point import PairFit, Picked
+from processor.stitching.to_result import Network
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
 
@@ -49,81 +53,110 @@ def run(scene: Scene, params: Params) -> Result:
     reference = names.index(params.reference) if params.reference else 0
     picked = three_point.by_pair(scene.picks, scene.scans)
     if params.method == "three-point":
-        network, said = _three_point(scene, picked, reference, params)
+        if not picked:
+            raise InputError(
+                f"{scene.name}: method three-point needs common points; expected picks.csv in the scan folder"
+            )
+        network = _by_picks(scene.scans, picked, reference, params)
     else:
-        network, said = _automatic(scene.scans, picked, reference, params), []
-    network, more = to_result.controlled(network, scene)
-    return to_result.result(scene.scans, network, reference, params, [*more, *said])
+        network = _automatic(scene.scans, picked, reference, params)
+    return to_result.result(scene.scans, to_result.controlled(network, scene), reference, params)
 
 
-def _automatic(
-    scans: tuple[Scan, ...], picked: three_point.Picked, reference: int, params: Params
-) -> to_result.Network:
-    found = automatic.stitch(scans, params, reference, picked)
-    origins = np.stack([cloud.origin for cloud in found.clouds])
-    gross = [pair.is_gross for pair in found.pairs]
-    messages = [
-        "its own pose contradicts the others" if bad else "by itself it would stand elsewhere" if other else ""
-        for bad, other in zip(gross, found.elsewhere, strict=True)
-    ]
-    tau, noise = found.solution.tau, float(np.median([cloud.sigma_mm for cloud in found.clouds]))
-    return to_result.Network(
-        found.solution.T, found.solution.covariance, origins, found.coarse.rivalry, found.coarse.T_rival,
-        found.coarse.contrary, found.coarse.overlap, found.pairs,
-        np.array(found.overlap), [not bad for bad in gross], messages,
-        dissent=found.contradictions, refuted=found.refuted,
-        spread=(noise, tau[0], tau[1]), point_mm=noise,
-    )  # fmt: skip
+def _automatic(scans: Sequence[Scan], picked: Picked, reference: int, params: Params) -> Network:
+    registered = automatic.stitch(scans, params, reference, picked)
+    solution, coarse = registered.solution, registered.coarse
+    gross = [pair.is_gross for pair in registered.pairs]
+    noise = float(np.median([cloud.sigma_mm for cloud in registered.clouds]))
+    return Network(
+        T=solution.T,
+        covariance=solution.covariance,
+        origins=np.stack([cloud.origin for cloud in registered.clouds]),
+        rivalry=coarse.rivalry,
+        T_rival=coarse.T_rival,
+        contrary=coarse.contrary,
+        largest_overlap=coarse.overlap,
+        pairs=registered.pairs,
+        overlap=np.array(registered.overlap),
+        used=[not is_gross for is_gross in gross],
+        pair_reasons=[
+            (reason("stitch.pair-contradicts"),) if is_gross else (reason("stitch.pair-elsewhere"),) if other else ()
+            for is_gross, other in zip(gross, registered.elsewhere, strict=True)
+        ],
+        contradictions=registered.contradictions,
+        refuted=registered.refuted,
+        estimated=(noise, solution.tau[0], solution.tau[1]),
+        point_mm=noise,
+    )
 
 
-def _three_point(
-    scene: Scene, picked: three_point.Picked, reference: int, params: Params
-) -> tuple[to_result.Network, list[str]]:
-    if not picked:
-        raise InputError(f"{scene.name}: method three-point needs common points; expected picks.csv in the scan folder")
-    scans = scene.scans
-    found, messages, scales, said = [], [], [], []
-    lost: list[list[str]] = [[] for _ in scans]
-    ties: dict[tuple[int, int], three_point.PairFit] = {}
+def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Params) -> Network:
+    names, k = [scan.name for scan in scans], len(scans)
     origins = np.stack([_origin(scan) for scan in scans])
+    fits: dict[tuple[int, int], PairFit] = {}
+    shortages: dict[tuple[int, int], Reason] = {}
     for (a, b), (in_a, in_b) in picked.items():
         try:
-            ties[a, b] = three_point.fit_pair(in_a - origins[a], in_b - origins[b], params.scale == "free")
+            fits[a, b] = three_point.fit_pair(in_a - origins[a], in_b - origins[b], params.scale == "free")
         except three_point.TooFewError as error:
-            said.append(f"pair {scans[a].name}, {scans[b].name} not used: {error}, three that span a plane are needed")
-            lost[a].append(f"{error} with {scans[b].name}")
-            lost[b].append(f"{error} with {scans[a].name}")
-    pooled = three_point.pooled(list(ties.values())) if ties else []
-    for (a, b), one in zip(ties, pooled, strict=True):
-        warning = three_point.verdict(one.scale, one.scale_sd, params.scale_limit_ppm, one.scaled_freedoms)
-        if one.is_outlier and not warning:
-            warning = f"its picks scatter by {one.sd_mm:.2g} mm, far more than the others': a blunder among them"
-        if warning:
-            said.append(f"pair {scans[a].name}, {scans[b].name}: {warning}")
-        found.append(three_point.as_pair(a, b, one))
-        messages.append(warning)
-        scales.append((one.scale, three_point.widened(one.scale_sd, one.scaled_freedoms)))
-    T, covariance = three_point.adjust(found, len(scans), reference)
-    none = np.full((len(scans), 4, 4), np.nan)
-    scale = np.array(scales).reshape(-1, 2)
-    network = to_result.Network(
-        T, covariance, origins, np.zeros(len(scans)), none, np.zeros(len(scans)), np.ones(len(scans)), found,
-        np.full(len(found), np.nan), [True] * len(found),
-        messages, scale[:, 0], scale[:, 1], lost=_unplaced(lost, {row for key in ties for row in key}),
-        point_mm=float(np.median([one.sd_mm for one in pooled])) if pooled else float("nan"),
-    )  # fmt: skip
-    return network, said
+            shortages[a, b] = error.shortage
+    pooled = three_point.pooled(list(fits.values())) if fits else []
+    pairs = [three_point.as_pair(a, b, fit) for (a, b), fit in zip(fits, pooled, strict=True)]
+    pair_reasons = [_of_pair(fit, params) for fit in pooled]
+    unused = [
+        reason("stitch.pair-not-used", a=names[a], b=names[b], shortage=shortage)
+        for (a, b), shortage in shortages.items()
+    ]
+    of_pairs = [
+        reason("stitch.of-pair", a=names[a], b=names[b], reason=single)
+        for (a, b), row in zip(fits, pair_reasons, strict=True)
+        for single in row
+    ]
+    T, covariance = three_point.adjust(pairs, k, reference)
+    return Network(
+        T=T,
+        covariance=covariance,
+        origins=origins,
+        rivalry=np.zeros(k),
+        T_rival=np.full((k, 4, 4), np.nan),
+        contrary=np.zeros(k),
+        largest_overlap=np.ones(k),
+        pairs=pairs,
+        overlap=np.full(len(pairs), np.nan),
+        used=[True] * len(pairs),
+        pair_reasons=pair_reasons,
+        scale=np.array([fit.scale for fit in pooled]),
+        scale_sd=np.array([three_point.widened(fit.scale_sd, fit.scaled_freedoms) for fit in pooled]),
+        unplaced=_unplaced(names, shortages, {row for pair in fits for row in pair}),
+        point_mm=float(np.median([fit.sd_mm for fit in pooled])) if pooled else float("nan"),
+        reasons=(*unused, *of_pairs),
+    )
 
 
-def _unplaced(too_few: list[list[str]], tied: set[int]) -> list[str]:
-    """Say why a scan of three-point may be without a pose: the pairs it has too few picks in, or no pairs at all."""
-    found = []
-    for row, said in enumerate(too_few):
-        if said:
-            found.append(f"{', '.join(said)}, three that span a plane are needed")
+def _of_pair(fit: PairFit, params: Params) -> tuple[Reason, ...]:
+    """Return the likely cause of the pair's scale, or of the scatter of its picks."""
+    cause = three_point.cause_of_scale(fit.scale, fit.scale_sd, params.scale_limit_ppm, fit.scaled_freedoms)
+    if cause is None and fit.is_outlier:
+        cause = reason("stitch.picks-scatter", sd_mm=fit.sd_mm)
+    return () if cause is None else (cause,)
+
+
+def _unplaced(
+    names: Sequence[str], shortages: Mapping[tuple[int, int], Reason], tied: Collection[int]
+) -> tuple[Reason, ...]:
+    """Return why each scan of three-point may have no pose: its pairs with too few picks, or no pairs at all."""
+    reasons = []
+    for row in range(len(names)):
+        short = tuple(
+            reason("stitch.shortage-with-scan", shortage=shortage, scan=names[a if row == b else b])
+            for (a, b), shortage in shortages.items()
+            if row in (a, b)
+        )
+        if short:
+            reasons.append(reason("stitch.too-few-picks", shortages=short))
         else:
-            found.append("its picks lead to scans that are not placed" if row in tied else "no picks with other scans")
-    return found
+            reasons.append(reason("stitch.picks-of-unplaced") if row in tied else reason("stitch.no-picks"))
+    return tuple(reasons)
 
 
 def _origin(scan: Scan) -> Floats:

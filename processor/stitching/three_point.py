@@ -14,30 +14,24 @@ from scipy.stats import f
 from scipy.stats import t as student
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, Picks, Scan
+from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
 from processor.stitching import frames
+from processor.stitching.common_points import LEAST_HEIGHT, LEAST_POINTS, units_slip
 from processor.stitching.fine.pair_checks import Pair
 
-LEAST_POINTS = 3
 LEAST_SD_MM = 1e-6  # of picks without any error, as in tests
-UNIT_SLIPS = (
-    (1000.0, "m and mm"),
-    (304.8, "feet and mm"),
-    (39.3701, "inches and m"),
-    (25.4, "inches and mm"),
-    (12.0, "inches and feet"),
-    (10.0, "cm and mm"),
-    (3.28084, "feet and m"),
-)
 BY_CHANCE = 1e-3  # probability that the picks of any pair of a network scatter so much
 SCALE_BY_CHANCE = 2.7e-3  # probability of a scale that is called other than 1: three standard deviations, if known
-LEAST_HEIGHT = 1e-3  # of a triangle by its longest side: below this its corners count as on a line
 
 Picked = dict[tuple[int, int], tuple[Floats, Floats]]  # picks (n, 3) in the file frames of both scans, by rows a < b
 
 
 class TooFewError(ValueError):
-    """Fewer than three points, or all on a line: these determine no pose."""
+    """Fewer than three points, or all on a line, determine no pose; ``shortage`` says which of the two."""
+
+    def __init__(self, shortage: Reason) -> None:
+        super().__init__(shortage.code)
+        self.shortage = shortage
 
 
 @dataclass(frozen=True)
@@ -84,12 +78,12 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     """
     n = len(points_a)
     if n < LEAST_POINTS:
-        raise TooFewError(f"{n} common points")
+        raise TooFewError(reason("stitch.few-points", points=n))
     middle_a, middle_b = points_a.mean(axis=0), points_b.mean(axis=0)
     a, b = points_a - middle_a, points_b - middle_b
     widths = np.linalg.svd(b, compute_uv=False)
     if widths[0] <= 0.0 or widths[1] < LEAST_HEIGHT * widths[0]:
-        raise TooFewError("all common points on a line")
+        raise TooFewError(reason("stitch.points-on-a-line"))
     R = rigid.fit(b, a)[:3, :3]
     rotated = b @ R.T
     scale = float((a * rotated).sum() / (rotated**2).sum())
@@ -154,30 +148,22 @@ def _with_sd(fit: PairFit, sd: float, freedoms: int, scaled_sd: float, scaled_fr
     )  # fmt: skip
 
 
-def verdict(scale: float, sd: float, limit_ppm: float, freedoms: float = np.inf) -> str:
-    """Return the likely cause of a scale other than 1, or nothing; ``freedoms`` are those that ``sd`` is known by."""
+def cause_of_scale(scale: float, sd: float, limit_ppm: float, freedoms: float = np.inf) -> Reason | None:
+    """Return the likely cause of a scale other than 1, or None; ``freedoms`` are those that ``sd`` is known by."""
     off = 1e6 * abs(scale - 1.0)
     slip = units_slip(scale)
     if slip:
-        return f"scale {scale:.5g}: units mixed up ({slip})?"
+        return reason("stitch.scale-of-units", scale=scale, units=slip)
     if off <= float(student.isf(0.5 * SCALE_BY_CHANCE, freedoms)) * 1e6 * sd:
-        return ""
+        return None
     if off > limit_ppm:
-        return f"scale {scale:.6f}: a blunder in the picks"
-    width = 1e6 * NORMAL_95 * widened(sd, freedoms)
-    return f"scale {1e6 * (scale - 1.0):+.0f} ± {width:.0f} ppm: temperature (12 ppm a kelvin), instrument or picks"
+        return reason("stitch.scale-by-blunder", scale=scale)
+    return reason("stitch.scale", ppm=1e6 * (scale - 1.0), ci95_ppm=1e6 * NORMAL_95 * widened(sd, freedoms))
 
 
 def widened(sd: float, freedoms: float) -> float:
     """Scale a standard deviation known by a few freedoms such that 1.96 of it contain 95 % (Student's t)."""
     return float(student.isf(0.025, freedoms)) / NORMAL_95 * sd
-
-
-def units_slip(scale: float) -> str:
-    """Return the two units whose ratio a scale is, within 2 %, or nothing."""
-    return next(
-        (units for ratio, units in UNIT_SLIPS if min(abs(scale / ratio - 1.0), abs(scale * ratio - 1.0)) < 0.02), ""
-    )
 
 
 def as_pair(a: int, b: int, fit: PairFit) -> Pair:

@@ -1,4 +1,4 @@
-"""From what a method found to the result: the project's frame, statuses, pairs and loops."""
+"""From the poses of either method to the result: the project's frame, statuses, pairs and loops."""
 
 from __future__ import annotations
 
@@ -8,157 +8,213 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, InputError, Scan, Scene
+from processor.model import NORMAL_95, Floats, InputError, Reason, Scan, Scene, Status, reason
 from processor.stitching import frames
 from processor.stitching.coarse.network import AMBIGUOUS
 from processor.stitching.fine import control_points, pair_checks
 from processor.stitching.fine.contradictions import Contradiction
 from processor.stitching.fine.pair_checks import Pair
 from processor.stitching.params import Params
-from processor.stitching.result import Held, Result
+from processor.stitching.result import NAN, Closures, ControlPoints, Pairs, ProjectFrame, Result, Scans
 
-CONTRARY = 0.25  # of what speaks for a pose; people and cars that moved make some
-LOST = "shares too little with the others to be placed"
-LITTLE = 0.1  # of both scans' faces
+CONTRARY = 0.25  # least share of the support that contradicts a pose; people and cars that move cause some
+LITTLE = 0.1  # overlap of both scans
 
 
 @dataclass(frozen=True)
 class Network:
-    """Poses of scans as found, T_ref_scan (k, 4, 4) in frames less ``origins`` (k, 3), and all that stands beside."""
+    """Poses T_ref_scan (k, 4, 4) of scans less ``origins`` (k, 3), and what the result states of them and of pairs."""
 
     T: Floats
-    covariance: Floats  # (6k, 6k): turns about each scan's own origin
+    covariance: Floats  # (6k, 6k): rotations about each scan's own origin
     origins: Floats
     rivalry: Floats
     T_rival: Floats
-    contrary: Floats  # (k,) what speaks against a scan's pose by what speaks for it
-    shared: Floats  # (k,) its largest overlap with another scan
+    contrary: Floats  # (k,) score that contradicts a scan's pose by the score that supports it
+    largest_overlap: Floats  # (k,) with another scan
     pairs: list[Pair]
     overlap: Floats
     used: list[bool]
-    messages: list[str]
+    pair_reasons: list[tuple[Reason, ...]]
     scale: Floats = field(default_factory=lambda: np.empty(0))
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
-    refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`placing.refuted`
-    dissent: Sequence[Contradiction] = ()  # about each scan's pose, where faces hold it
-    spread: tuple[float, float, float] = (float("nan"),) * 3  # noise, patches, ends
-    lost: Sequence[str] = ()  # why each scan that has no pose has none
-    against: Sequence[str] = ()  # what control points have against each scan's pose
-    point_mm: float = float("nan")  # standard deviation of a single point, or of a pick
-    base: Floats | None = None  # (4, 4) where poses lead to in the project; None: from the reference's frame
-    held: Held | None = None
+    refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`network.refuted`
+    contradictions: Sequence[Contradiction] = ()  # of each scan's pose by faces
+    estimated: tuple[float, float, float] = (NAN, NAN, NAN)  # noise, patches, ends
+    unplaced: Sequence[Reason] = ()  # why each scan has no pose, where it has none
+    by_control: Sequence[Reason | None] = ()  # contradictions of each scan's pose by control points
+    point_mm: float = NAN  # standard deviation of a single point or of a pick
+    base: Floats | None = None  # (4, 4) from the poses' frame to the project; None: by the reference scan
+    control: ControlPoints | None = None
+    reasons: tuple[Reason, ...] = ()
 
 
-def controlled(network: Network, scene: Scene) -> tuple[Network, tuple[str, ...]]:
-    """Lay a network into the frame of control points, where there are any and they are enough; and what to say."""
+def controlled(network: Network, scene: Scene) -> Network:
+    """Transform a network into the frame of control points, if there are any and they determine it."""
     if scene.control is None or not len(scene.control.scan):
-        return network, ()
+        return network
     names = [scan.name for scan in scene.scans]
     try:
-        found = control_points.hold(
+        placed = control_points.adjust(
             scene.control, names, network.T, network.covariance, network.origins, network.point_mm
         )
     except InputError as error:
         raise InputError(f"{scene.name}: {error}") from None
-    if not found.held.holds:
-        return replace(network, held=found.held), found.said
-    base = rigid.transform(np.eye(3), found.centre)
+    network = replace(network, control=placed.control, reasons=(*placed.reasons, *network.reasons))
+    if not placed.control.holds:
+        return network
     return replace(
-        network, T=found.T, covariance=found.covariance, T_rival=found.M @ network.T_rival,
-        against=found.against, base=base, held=found.held,
-    ), found.said  # fmt: skip
-
-
-def result(scans: Sequence[Scan], network: Network, reference: int, params: Params, said: Sequence[str] = ()) -> Result:
-    """Write a result; see :class:`Result` for its frames."""
-    given = scans[reference].T_project_scan
-    T_project_file = given if given.size else np.eye(4)
-    # The reference's cloud frame in the project, or the control points' where these hold all.
-    own_base = T_project_file @ rigid.transform(np.eye(3), network.origins[reference])
-    base = own_base if network.base is None else network.base
-    k = len(scans)
-    T, C = np.full((k, 4, 4), np.nan), np.full((k, 6, 6), np.nan)
-    place, place_sd, turn_sd = np.full((k, 3), np.nan), np.full((k, 3), np.nan), np.full((k, 3), np.nan)
-    rival = np.full((k, 4, 4), np.nan)
-    status, message = [], []
-    for s in range(k):
-        if not np.isfinite(network.T[s]).all():
-            status.append("failed")
-            message.append((network.lost[s] if network.lost else "") or LOST)
-            continue
-        posed = base @ network.T[s]
-        T[s] = frames.of_file(posed, network.origins[s])
-        place[s] = posed[:3, 3]
-        own = network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
-        own = frames.turned(own, base[:3, :3])
-        C[s] = frames.about_origin(own, place[s])
-        turn_sd[s], place_sd[s] = np.sqrt(np.diag(own)[:3]), np.sqrt(np.diag(own)[3:])
-        if np.isfinite(network.T_rival[s]).all():
-            rival[s] = frames.of_file(base @ network.T_rival[s], network.origins[s])
-        state, why = _judged(network, s, place_sd[s], turn_sd[s], params)
-        status.append(state)
-        message.append(why)
-    names = [scan.name for scan in scans]
-    found = network.pairs
-    heavy = np.array([1.0 / max(float(np.trace(p.covariance[3:, 3:])), 1e-12) for p in found])
-    used = np.array(network.used, bool)
-    good = [p for p, u in zip(found, used, strict=True) if u]
-    loops = pair_checks.loops(good, heavy[used], reference, k) if good else []
-    states = set(status)
-    overall = "ok" if states <= {"ok"} else "failed" if states - {"failed"} == set() or k < 2 else "partial"
-    if sum(one != "failed" for one in status) < 2:
-        overall = "failed"
-    text = list(said) + [f"{n}: {m}" for n, m in zip(names, message, strict=True) if m]
-    count = len(found)
-    return Result(
-        overall, params.method, "; ".join(text), names[reference],
-        tuple(names), tuple(status), tuple(message), T, C, place, place_sd, turn_sd, network.rivalry, rival,
-        tuple(names[p.a] for p in found), tuple(names[p.b] for p in found),
-        network.overlap, np.array([p.residual for p in found]), used.astype(np.uint8), tuple(network.messages),
-        np.array([_pair_of_files(p, network.origins) for p in found]).reshape(-1, 4, 4),
-        np.array([_pair_covariance(p, network.origins) for p in found]).reshape(-1, 6, 6),
-        np.array([p.pieces for p in found], np.int64),
-        network.scale if len(network.scale) else np.full(count, np.nan),
-        network.scale_sd if len(network.scale_sd) else np.full(count, np.nan),
-        tuple(" > ".join(names[i] for i in loop.rows) for loop in loops),
-        np.array([loop.mm for loop in loops]), np.array([loop.mrad for loop in loops]),
-        np.array([loop.ratio for loop in loops]), *network.spread, control=network.held,
+        network, T=placed.T, covariance=placed.covariance, T_rival=placed.M @ network.T_rival,
+        by_control=placed.contradictions, base=rigid.transform(np.eye(3), placed.centre),
     )  # fmt: skip
 
 
-def _judged(network: Network, s: int, place_sd: Floats, turn_sd: Floats, params: Params) -> tuple[str, str]:
-    rivalry = float(network.rivalry[s])
+def result(scans: Sequence[Scan], network: Network, reference: int, params: Params) -> Result:
+    """Write a result; see :class:`Result` for its frames."""
+    given = scans[reference].T_project_scan
+    base = network.base
+    if base is None:  # from the frame of the reference's cloud
+        base = (given if given.size else np.eye(4)) @ rigid.transform(np.eye(3), network.origins[reference])
+    names = [scan.name for scan in scans]
+    T_reference = rigid.with_origin(base @ network.T[reference], network.origins[reference])
+    is_global = network.base is not None or not np.array_equal(T_reference, np.eye(4))
+    frame = ProjectFrame.GLCS if is_global else ProjectFrame.PRCS
+    table = _scans(names, network, base, frame, params)
+    states = table.status
+    status = Status.OK if set(states) == {Status.OK} else Status.PARTIAL
+    if sum(state != Status.FAILED for state in states) < 2:
+        status = Status.FAILED
+    of_scans = (
+        reason("stitch.of-scan", scan=name, reason=single)
+        for name, row in zip(names, table.reasons, strict=True)
+        for single in row
+    )
+    noise, patch, ends = network.estimated
+    return Result(
+        status=status,
+        method=params.method,
+        reasons=(*network.reasons, *of_scans),
+        reference=names[reference],
+        scans=table,
+        pairs=_pairs(names, network),
+        closures=_closures(names, network),
+        noise_mm=noise,
+        patch_mm=patch,
+        ends_share=ends,
+        frame=frame,
+        T_GLCS_PRCS=T_reference if is_global else np.empty(0),
+        control=network.control,
+    )
+
+
+def _scans(names: Sequence[str], network: Network, base: Floats, frame: ProjectFrame, params: Params) -> Scans:
+    k = len(names)
+    T, T_rival, covariance = np.full((k, 4, 4), NAN), np.full((k, 4, 4), NAN), np.full((k, 6, 6), NAN)
+    position, position_sd, rotation_sd = np.full((k, 3), NAN), np.full((k, 3), NAN), np.full((k, 3), NAN)
+    status = list[Status]()
+    reasons = list[tuple[Reason, ...]]()
+    for s in range(k):
+        if not np.isfinite(network.T[s]).all():
+            status.append(Status.FAILED)
+            reasons.append((network.unplaced[s] if network.unplaced else reason("stitch.no-overlap"),))
+            continue
+        posed = base @ network.T[s]
+        T[s] = rigid.with_origin(posed, network.origins[s])
+        position[s] = posed[:3, 3]
+        of_scan = frames.turned(network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6], base[:3, :3])
+        covariance[s] = frames.about_origin(of_scan, position[s])
+        rotation_sd[s], position_sd[s] = np.sqrt(np.diag(of_scan)[:3]), np.sqrt(np.diag(of_scan)[3:])
+        if np.isfinite(network.T_rival[s]).all():
+            T_rival[s] = rigid.with_origin(base @ network.T_rival[s], network.origins[s])
+        state, why = _assess(network, s, position_sd[s], rotation_sd[s], params)
+        status.append(state)
+        reasons.append(() if why is None else (why,))
+    return Scans(
+        name=tuple(names),
+        status=tuple(status),
+        reasons=tuple(reasons),
+        T_project_scan=T,
+        covariance=covariance,
+        position=position,
+        position_sd=position_sd,
+        rotation_sd=rotation_sd,
+        rivalry=network.rivalry,
+        T_rival_scan=T_rival,
+        from_frame=tuple(map(_socs, names)),
+        to_frame=(str(frame),) * k,
+    )
+
+
+def _assess(
+    network: Network, s: int, position_sd: Floats, rotation_sd: Floats, params: Params
+) -> tuple[Status, Reason | None]:
+    """Return the status of a scan with a pose, and the first reason that it is not ok."""
     if network.contrary[s] > CONTRARY:
-        return "weak", f"much speaks against its pose ({100.0 * network.contrary[s]:.0f} % of what speaks for it)"
-    if network.dissent and network.dissent[s].counts:
-        other = network.dissent[s]
-        return "weak", (
-            f"{other.agree} faces agree that it stands {other.shift_mm:.2g} mm and {other.turn_mrad:.2g} mrad "
-            f"elsewhere, {other.hold} speak against that: something moved in between, or the scan is bent"
+        return Status.WEAK, reason("stitch.free-space", percent=100.0 * network.contrary[s])
+    if network.contradictions and network.contradictions[s].counts:
+        other = network.contradictions[s]
+        return Status.WEAK, reason(
+            "stitch.faces-contradict",
+            agree=other.agree,
+            shift_mm=other.shift_mm,
+            turn_mrad=other.turn_mrad,
+            contradict=other.hold,
         )
-    if network.against and network.against[s]:
-        return "weak", network.against[s]
-    if network.shared[s] < LITTLE:
-        return "weak", f"it shares little with any other scan ({100.0 * network.shared[s]:.0f} %)"
-    if rivalry > AMBIGUOUS:
-        return "ambiguous", f"another pose speaks for itself as well ({100.0 * rivalry:.0f} % of this one's score)"
-    if not np.isfinite(place_sd).all():
-        return "weak", "nothing tells how sure its pose is"
-    if place_sd.max() > params.weak_mm or 1e3 * turn_sd.max() > params.weak_mrad:
-        place, turn = NORMAL_95 * place_sd.max(), 1e3 * NORMAL_95 * turn_sd.max()
-        return "weak", f"its pose is sure to {place:.2g} mm and {turn:.2g} mrad only"
+    if network.by_control and (contradiction := network.by_control[s]):
+        return Status.WEAK, contradiction
+    if network.largest_overlap[s] < LITTLE:
+        return Status.WEAK, reason("stitch.little-overlap", percent=100.0 * network.largest_overlap[s])
+    if network.rivalry[s] > AMBIGUOUS:
+        return Status.AMBIGUOUS, reason("stitch.rival-pose", percent=100.0 * network.rivalry[s])
+    if not np.isfinite(position_sd).all():
+        return Status.WEAK, reason("stitch.no-covariance")
+    if position_sd.max() > params.weak_mm or 1e3 * rotation_sd.max() > params.weak_mrad:
+        position, rotation = NORMAL_95 * position_sd.max(), 1e3 * NORMAL_95 * rotation_sd.max()
+        return Status.WEAK, reason("stitch.uncertain-pose", position_mm=position, rotation_mrad=rotation)
     if len(network.refuted) and network.refuted[s] > 0.0:
-        return "ambiguous", (
-            f"{100.0 * network.refuted[s]:.2g} % of what it shares with the only scan beside it was looked through, as "
-            "where a structure repeats itself or things moved: a third scan, common points or control would tell"
-        )
-    return "ok", ""
+        return Status.AMBIGUOUS, reason("stitch.looked-through", percent=100.0 * network.refuted[s])
+    return Status.OK, None
 
 
-def _pair_of_files(pair: Pair, origins: Floats) -> Floats:
-    T = rigid.transform(np.eye(3), origins[pair.a]) @ pair.T_a_b
-    return frames.of_file(T, origins[pair.b])
+def _pairs(names: Sequence[str], network: Network) -> Pairs:
+    pairs, origins = network.pairs, network.origins
+    unknown = np.full(len(pairs), NAN)
+    return Pairs(
+        a=tuple(names[pair.a] for pair in pairs),
+        b=tuple(names[pair.b] for pair in pairs),
+        overlap=network.overlap,
+        residual=np.array([pair.residual for pair in pairs]),
+        used=np.array(network.used, bool),
+        reasons=tuple(network.pair_reasons),
+        shared=np.array([pair.pieces for pair in pairs], np.int64),
+        T_a_b=np.array(
+            [
+                rigid.with_origin(rigid.transform(np.eye(3), origins[pair.a]) @ pair.T_a_b, origins[pair.b])
+                for pair in pairs
+            ]
+        ),
+        covariance=np.array(
+            [frames.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a]) for pair in pairs]
+        ),
+        scale=network.scale if len(network.scale) else unknown,
+        scale_sd=network.scale_sd if len(network.scale_sd) else unknown,
+        from_frame=tuple(_socs(names[pair.b]) for pair in pairs),
+        to_frame=tuple(_socs(names[pair.a]) for pair in pairs),
+    )
 
 
-def _pair_covariance(pair: Pair, origins: Floats) -> Floats:
-    return frames.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a])
+def _closures(names: Sequence[str], network: Network) -> Closures:
+    used = [pair for pair, is_used in zip(network.pairs, network.used, strict=True) if is_used]
+    weights = np.array([1.0 / max(float(np.trace(pair.covariance[3:, 3:])), 1e-12) for pair in used])
+    loops = pair_checks.loops(used, weights, len(names)) if used else []
+    return Closures(
+        loop=tuple(tuple(names[i] for i in loop.rows) for loop in loops),
+        mm=np.array([loop.mm for loop in loops]),
+        mrad=np.array([loop.mrad for loop in loops]),
+        ratio=np.array([loop.ratio for loop in loops]),
+    )
+
+
+def _socs(name: str) -> str:
+    """Name the frame of a scan's file: the scanner's own coordinate system."""
+    return f"SOCS({name})"

@@ -1,8 +1,8 @@
 """Records to HDF5 groups and back, by walking the fields of their dataclasses.
 
-A field is a dataset of its name (arrays, numbers, text, lists of text) or a group (a record; a tuple of records with
-members 0000, 0001, ...). A field that is None is left out. Text is of fixed length in UTF-8, so nothing in a file
-refers to a heap, and its size is known before it is read.
+A field is a dataset of the same name (arrays, numbers, text, lists of text) or a group (a record; a tuple of records
+with members 0000, 0001, ...). A field that is None is left out. Text has a fixed length in UTF-8, so no dataset refers
+to a heap, and sizes are known before data are read.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Hook = Callable[..., Any]
 
 
 class DecodeError(ValueError):
-    """A group that does not hold the record it should; ``problems`` says all that is wrong with it."""
+    """A group that does not hold the expected record; ``problems`` lists all its faults."""
 
     def __init__(self, problems: list[str]) -> None:
         super().__init__("; ".join(problems))
@@ -37,7 +37,7 @@ class DecodeError(ValueError):
 
 
 def write_array(group: Any, name: str, array: np.typing.NDArray[np.generic]) -> None:
-    """Write an array; a large one in chunks of rows, shuffled and compressed."""
+    """Write an array, one of more than ``PLAIN_ITEMS`` items in chunks of rows, shuffled and compressed."""
     if array.size <= PLAIN_ITEMS:
         _create(group, name, array)
         return
@@ -54,12 +54,12 @@ def write_array(group: Any, name: str, array: np.typing.NDArray[np.generic]) -> 
 
 
 def _create(group: Any, name: str, data: Any, **options: Any) -> None:
-    """Write a dataset and close it: where its bytes go must not depend on how long Python keeps its object."""
+    """Write a dataset and close it, so that its place in the file is independent of Python's garbage collection."""
     group.create_dataset(name, data=data, **options).id.close()
 
 
 def write_text(group: Any, name: str, text: str) -> None:
-    """Write one text."""
+    """Write a text."""
     data = _encoded(text)
     _create(group, name, np.array(data, _text_type(len(data))))
 
@@ -98,7 +98,7 @@ def _value(found: Any) -> Any:
 
 def _encoded(text: str) -> bytes:
     if "\0" in text:
-        raise RecordError(f"text with a zero character cannot be stored: {text[:40]!r}")
+        raise RecordError(f"expected text without zero characters, found {text[:40]!r}")
     return text.encode("utf-8", "replace")
 
 
@@ -111,7 +111,7 @@ def write_record(
 ) -> None:
     """Write the fields of a record into a group, except those of ``skip``.
 
-    ``hooks`` names another writer for records of a type. Raises TypeError for a field of a kind that has no form here.
+    ``hooks`` maps a type of record to another writer. Raises TypeError for a field of a type that cannot be stored.
     """
     for field in dataclasses.fields(record):
         if field.name not in skip:
@@ -122,7 +122,9 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
     if value is None:
         return
     if "shape" in metadata:
-        write_array(group, name, value)
+        write_array(group, name, value.view(np.uint8) if value.dtype == np.bool_ else value)
+    elif "lists" in metadata:
+        write_texts(group, name, [json.dumps(row, ensure_ascii=False) for row in value])
     elif "reasons" in metadata:
         rows = (
             [[reason_object(item) for item in row] for row in value]
@@ -152,7 +154,7 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
         else:
             write_record(member, value, hooks=hooks)
     else:
-        raise TypeError(f"{group.name}/{name}: no form for a {type(value).__name__} in a file")
+        raise TypeError(f"{group.name}/{name}: a {type(value).__name__} cannot be stored")
 
 
 def read_record(
@@ -161,9 +163,10 @@ def read_record(
     hooks: Mapping[type, Hook] = types.MappingProxyType({}),
     given: Mapping[str, Any] = types.MappingProxyType({}),
 ) -> Record:
-    """Read a record of type ``cls`` from a group; fields in ``given`` are not read but taken from there.
+    """Read a record of type ``cls`` from a group; fields in ``given`` are taken from there and not read.
 
-    Raises DecodeError with every member that is missing, unknown, or not of its field's type and shape.
+    ``hooks`` maps a type of record to another reader. Raises DecodeError that lists every member that is missing,
+    unknown, or not of its field's type and shape.
     """
     problems: list[str] = []
     values = dict(given)
@@ -196,8 +199,11 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     kind = allowed[0] if union else hint
     if "shape" in metadata:
         return read_array(group, name, metadata["dtype"], len(metadata["shape"]))
+    if "lists" in metadata:
+        return _read_json(group, name, lambda row: tuple(map(str, row)))
     if "reasons" in metadata:
-        return _read_reasons(group, name, bool(metadata["reasons"]))
+        by_row = bool(metadata["reasons"])
+        return _read_json(group, name, lambda row: tuple(map(_reason, row)) if by_row else _reason(row))
     if kind is str or ("words" in metadata and "axis" not in metadata):
         return read_text(group, name)
     if kind in (bool, int, float):
@@ -211,19 +217,19 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
         raise DecodeError([f"{where}: expected a group, found a dataset"])
     if typing.get_origin(kind) is tuple:
         return _read_members(group[name], typing.get_args(kind)[0], hooks)
-    return _read_one(group[name], kind, hooks)
+    return _read_member(group[name], kind, hooks)
 
 
-def _read_reasons(group: Any, name: str, by_row: bool) -> Any:
+def _read_json(group: Any, name: str, made: Callable[[Any], Any]) -> tuple[Any, ...]:
+    """Read texts of JSON, and what ``made`` makes of each."""
     where = f"{group.name}/{name}"
     try:
-        rows = [json.loads(_decoded(item, where)) for item in _dataset(group, name, "S", 1)[()].tolist()]
-        return tuple(tuple(map(_reason, row)) if by_row else _reason(row) for row in rows)
+        return tuple(made(json.loads(_decoded(item, where))) for item in _dataset(group, name, "S", 1)[()].tolist())
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
-        raise DecodeError([f"{where}: expected reasons as JSON ({error})"]) from None
+        raise DecodeError([f"{where}: expected JSON ({error})"]) from None
 
 
-def _read_one(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:
+def _read_member(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:
     hook = hooks.get(kind)
     return hook(group) if hook else read_record(group, kind, hooks)
 
@@ -236,7 +242,7 @@ def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[An
     items = []
     for name in expected:
         try:
-            items.append(_read_one(group[name], kind, hooks))
+            items.append(_read_member(group[name], kind, hooks))
         except DecodeError as error:
             problems += error.problems
     if problems:
@@ -245,20 +251,20 @@ def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[An
 
 
 def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
-    """Read an array of float64 or int64 of ``ndim`` axes (an absent one is empty, of any number of axes)."""
-    stored = np.dtype(dtype).str[1:]
+    """Read an array with ``ndim`` axes, bool from uint8; an absent optional array is empty, with any number of axes."""
+    stored = np.dtype(np.uint8 if dtype is np.bool_ else dtype).str[1:]
     if name in group and isinstance(group[name], h5py.Dataset) and group[name].size == 0:
         ndim = group[name].ndim
     return _dataset(group, name, stored, ndim)[()]
 
 
 def column(group: Any, name: str, dtype: type) -> Any:
-    """Return a column as it lies in the file, to be read in slices; an absent one is empty."""
+    """Return the dataset of a column, to be read in slices; an absent optional column is empty."""
     return _dataset(group, name, np.dtype(dtype).str[1:], 1)
 
 
 def read_text(group: Any, name: str) -> str:
-    """Read one text."""
+    """Read a text."""
     return _decoded(_dataset(group, name, "S", 0)[()], f"{group.name}/{name}")
 
 
@@ -276,8 +282,8 @@ def _dataset(group: Any, name: str, stored: str, ndim: int) -> Any:
     dataset = group[name]
     if not isinstance(dataset, h5py.Dataset):
         raise DecodeError([f"{where}: expected a dataset, found a group"])
-    got = dataset.dtype.kind + ("" if dataset.dtype.kind == "S" else str(dataset.dtype.itemsize))
-    if got != stored or dataset.ndim != ndim or dataset.dtype.byteorder == ">":
+    actual = dataset.dtype.kind + ("" if dataset.dtype.kind == "S" else str(dataset.dtype.itemsize))
+    if actual != stored or dataset.ndim != ndim or dataset.dtype.byteorder == ">":
         raise DecodeError(
             [f"{where}: expected type {stored} with {ndim} axes, found {dataset.dtype.str} with {dataset.ndim}"]
         )

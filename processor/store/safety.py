@@ -1,8 +1,8 @@
-"""What an HDF5 file from outside must not contain, found from its structure before any data is read.
+"""Checks of an HDF5 file's structure before any data are read.
 
-HDF5 follows external links, virtual datasets and raw data in other files without a word, so a file can show the
-content of another one of the disk; and a file of a few bytes can declare any size. A file that passes here holds only
-hard links to groups and to datasets of numbers or fixed text, stored in the file, in at least the bytes they need.
+HDF5 follows external links, virtual datasets and raw data in other files silently, so a file can show the content of
+another file of the disk; and a file of a few bytes can declare any size. An accepted file has only hard links to groups
+and to datasets of numbers or text of fixed length, stored in the file itself in at least the bytes they need.
 """
 
 from __future__ import annotations
@@ -18,16 +18,17 @@ import h5py
 
 GZIP_LIMIT = 1032  # deflate's largest possible expansion
 CHUNK_LIMIT = 64 * 2**20
-ROOM = 1 << 16  # bytes of a size that need no proof
+ROOM = 1 << 16  # bytes; compressed datasets up to this size may expand by more than GZIP_LIMIT
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
-
-
 MEMORY_BYTES = 1 << 30  # for a file's structure
 
 
 @contextmanager
 def limited_memory() -> Iterator[None]:
-    """Let this process take no more than ``MEMORY_BYTES`` beyond what it has: a damaged size may ask for any."""
+    """Limit the address space of this process to ``MEMORY_BYTES`` above its present size.
+
+    HDF5 allocates whatever size a damaged file declares.
+    """
     pages = Path("/proc/self/statm")
     soft, hard = resource.getrlimit(resource.RLIMIT_AS)
     if not pages.exists():
@@ -45,46 +46,47 @@ def limited_memory() -> Iterator[None]:
 
 
 def problems(file: Any, path: Path) -> list[str]:
-    """List all that is refused in an open file; nothing is read but its structure."""
-    found: list[str] = []
+    """List all faults of an open file; only its structure is read."""
+    faults: list[str] = []
     seen: set[int] = {h5py.h5o.get_info(file.id).addr}
-    stored = _group(file, found, seen)
+    stored = _group(file, faults, seen)
     if stored > path.stat().st_size:
-        found.append(f"its datasets claim {stored} bytes of a file of {path.stat().st_size}")
-    return found
+        faults.append(f"its datasets have {stored} bytes in a file of {path.stat().st_size}")
+    return faults
 
 
-def _group(group: Any, found: list[str], seen: set[int]) -> int:
+def _group(group: Any, faults: list[str], seen: set[int]) -> int:
+    """Append the faults of a group and of all below it; returns the bytes stored by its datasets."""
     stored = 0
-    _attributes(group, found)
+    _attributes(group, faults)
     for name in group:
         where = f"{group.name.rstrip('/')}/{name}"
         link = group.get(name, getlink=True)
         if not isinstance(link, h5py.HardLink):
-            found.append(f"{where}: a link to another place ({type(link).__name__}) is not accepted")
+            faults.append(f"{where}: a link to another place ({type(link).__name__}) is not accepted")
             continue
         item = group[name]
         address = h5py.h5o.get_info(item.id).addr
         if address in seen:
-            found.append(f"{where}: is linked a second time")
+            faults.append(f"{where}: is linked a second time")
             continue
         seen.add(address)
         if isinstance(item, h5py.Group):
-            stored += _group(item, found, seen)
+            stored += _group(item, faults, seen)
         elif isinstance(item, h5py.Dataset):
-            found += [f"{where}: {what}" for what in _dataset(item)]
+            faults += [f"{where}: {fault}" for fault in _dataset(item)]
             stored += item.id.get_storage_size()
-            _attributes(item, found)
+            _attributes(item, faults)
         else:
-            found.append(f"{where}: neither a group nor a dataset")
+            faults.append(f"{where}: neither a group nor a dataset")
     return stored
 
 
-def _attributes(item: Any, found: list[str]) -> None:
+def _attributes(item: Any, faults: list[str]) -> None:
     for name in item.attrs:
         attribute = item.attrs.get_id(name)
         if not _plain(attribute.dtype):
-            found.append(f"{item.name}@{name}: type {attribute.dtype} is not accepted")
+            faults.append(f"{item.name}@{name}: type {attribute.dtype} is not accepted")
 
 
 def _plain(dtype: Any) -> bool:
@@ -115,6 +117,6 @@ def _dataset(dataset: Any) -> list[str]:
         return [f"chunks of {chunk} bytes are not accepted (at most {CHUNK_LIMIT})"]
     expected = math.prod(-(-int(n) // int(c)) for n, c in zip(dataset.shape, dataset.chunks, strict=True))
     if dataset.id.get_num_chunks() != expected:
-        # HDF5 would read what was never written as zeros.
+        # HDF5 reads a chunk that was never written as zeros.
         return [f"holds {dataset.id.get_num_chunks()} of its {expected} chunks"]
     return []

@@ -1,4 +1,4 @@
-"""A scan in an HDF5 group: its points in tiles, and every other column of it in the same order."""
+"""A scan in an HDF5 group: its points in tiles, and its other per-point columns in the same order."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 import h5py
 import numpy as np
 
+import processor.store.codec as codec
+import processor.store.tiles as tiles
 from processor.model import Floats, Ints, Scan
-from processor.store import codec, tiles
 from processor.store.codec import DecodeError
 
 AXES = ("x", "y", "z")
@@ -18,7 +19,7 @@ NO_STATIONS = np.empty(0, np.int32)
 
 
 def write_scan(group: Any, scan: Scan) -> Ints:
-    """Write a scan into a group; returns the row (n,) of ``scan.points`` that lies in each place of the file."""
+    """Write a scan into a group; returns the row (n,) of ``scan.points`` at each position of the file."""
     tiled = tiles.arrange(scan.points)
     sorted_columns = {
         field.name: getattr(scan, field.name)[tiled.order]
@@ -39,14 +40,14 @@ def write_scan(group: Any, scan: Scan) -> Ints:
 
 
 def read_scan(group: Any) -> Scan:
-    """Read a scan. Raises DecodeError also for points that are not finite or lie outside of their tile."""
+    """Read a scan. Raises DecodeError also for points that are not finite or lie outside their tile."""
     grid, cell, _, count, columns = _read_tiles(group)
     data = tuple(column[()] for column in columns)
     if not all(np.isfinite(column).all() for column in data):
         raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
     wrong = tiles.misplaced(grid, cell, count, (data[0], data[1], data[2]))
     if wrong:
-        raise DecodeError([f"{group.name}/points: {wrong} points lie outside of the tile that the index gives them"])
+        raise DecodeError([f"{group.name}/points: {wrong} points lie outside their tile of the index"])
     scan = codec.read_record(group, Scan, given={"points": grid.millimetres((data[0], data[1], data[2]))})
     if not np.isfinite(scan.origin).all():
         raise DecodeError([f"{group.name}/origin: is not finite"])
@@ -57,19 +58,19 @@ PER_POINT = tuple(f.name for f in dataclasses.fields(Scan) if f.metadata.get("sh
 
 
 def read_scan_alone(group: Any) -> Scan:
-    """Read a scan without its points and what stands beside them."""
+    """Read a scan with empty per-point columns."""
     _read_tiles(group)
     none = {f.name: np.empty(0, f.metadata["dtype"]) for f in dataclasses.fields(Scan) if f.name in PER_POINT}
     return codec.read_record(group, Scan, given=none)
 
 
 def count(group: Any) -> int:
-    """Points of a scan's group."""
+    """Return the number of points of a scan's group."""
     return int(sum(_read_tiles(group)[3].tolist()))
 
 
 def shape(group: Any, name: str) -> tuple[int, ...]:
-    """Shape of a per-point column of a scan's group."""
+    """Return the shape of a per-point column of a scan's group."""
     if name == "points":
         return (count(group), 3)
     return (len(_column(group, name)),)
@@ -80,7 +81,7 @@ def _column(group: Any, name: str) -> Any:
 
 
 def pieces(group: Any, name: str, size: int) -> Iterator[Any]:
-    """Yield a per-point column of a scan's group, ``size`` points at a time. DecodeError for what is not finite."""
+    """Yield a per-point column of a scan's group, ``size`` rows at a time. DecodeError for points not finite."""
     if name == "points":
         grid, _, _, _, columns = _read_tiles(group)
         for start in range(0, len(columns[0]), size):
@@ -109,20 +110,23 @@ def _read_tiles(group: Any) -> tuple[tiles.Grid, Ints, Ints, Ints, list[Any]]:
     start, count = (codec.read_array(points, name, np.int64, 1) for name in ("start", "count"))
     columns = [points[axis] for axis in AXES]
     types = {column.dtype.str for column in columns if isinstance(column, h5py.Dataset) and column.ndim == 1}
-    if len(types) != 1 or not types <= {"<i4", "<f8"} or not all(isinstance(one, h5py.Dataset) for one in columns):
+    if len(types) != 1 or not types <= {"<i4", "<f8"} or not all(isinstance(c, h5py.Dataset) for c in columns):
         raise DecodeError([f"{where}: expected x, y, z as columns of int32 or of float64"])
     lengths = {len(column) for column in columns}
     if len(lengths) != 1 or offset.shape != (3,) or lower.shape != (3,) or cell.shape[1:] != (3,):
-        raise DecodeError([f"{where}: its columns do not fit each other"])
+        raise DecodeError([f"{where}: its columns differ in length or shape"])
     grid = tiles.Grid(steps, offset, lower, edge)
-    found = tiles.problems(grid, cell, start, count, lengths.pop())
-    if found:
-        raise DecodeError([f"{where}: {what}" for what in found])
+    faults = tiles.problems(grid, cell, start, count, lengths.pop())
+    if faults:
+        raise DecodeError([f"{where}: {fault}" for fault in faults])
     return grid, cell, start, count, columns
 
 
 def read_box(group: Any, lower: Floats, upper: Floats) -> Floats:
-    """Points (m, 3) of a scan's group within ``lower <= p <= upper`` (mm), from the tiles that the box touches."""
+    """Return the points (m, 3) of a scan's group with ``lower <= p <= upper`` (mm).
+
+    Only the tiles that the box touches are read.
+    """
     grid, cell, start, count, columns = _read_tiles(group)
     low, high = grid.cell_range(lower, upper)
     rows = np.flatnonzero(((cell >= low) & (cell <= high)).all(axis=1))

@@ -5,7 +5,7 @@ A file has the root attributes ``format``, ``format_version``, ``units`` and ``h
 (:mod:`processor.store.tiles`), each coordinate a column of its own, with every other column of the scan and its truth
 labels in the same order. The same content makes the same bytes.
 
-Files from outside are not trusted: :mod:`processor.store.safety` looks at the structure before any data is read.
+Files are not trusted: :mod:`processor.store.safety` checks their structure before any data are read.
 """
 
 from __future__ import annotations
@@ -24,13 +24,17 @@ from typing import Any, TypeVar
 import h5py
 import numpy as np
 
-from processor.model import Floats, InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
-from processor.store import codec, safety, scan_tiles
+import processor.store.codec as codec
+import processor.store.safety as safety
+import processor.store.scan_tiles as scan_tiles
+from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
 from processor.store.codec import DecodeError
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
-FORMAT_VERSION = "1.3"
-READABLE = ("1.2", FORMAT_VERSION)  # of scenes and truths: what is newer in a record may be absent there
+FORMAT_VERSION = "1.3"  # of scenes and truths
+READABLE = ("1.2", FORMAT_VERSION)  # fields added since may be absent
+RESULTS_VERSION = "2.0"
+RESULTS_HISTORY = ["1.0 to 1.3: one flat record a step", "2.0: nested tables; words and reasons with codes"]
 HISTORY = [
     "1.0: first",
     "1.1: grid and surface of each point, scanner poses, whole structures, what was built otherwise",
@@ -39,7 +43,7 @@ HISTORY = [
     "1.3: control points",
 ]
 
-# All that HDF5 and h5py raise for a damaged file; none of it names the file or helps its user.
+# Exceptions of HDF5 and h5py for a damaged file; none of them names the file.
 DAMAGE = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError, RecursionError)
 
 T = TypeVar("T")
@@ -51,10 +55,10 @@ Pieces = Callable[[int, str], tuple[tuple[int, ...], Iterator[Any]]]
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a temporary path beside ``path``; what was written there takes its place once it is safe on the disk.
+    """Yield a temporary path beside ``path``, and replace ``path`` by it once its content is on the disk.
 
-    Raises InputError where the file cannot be written. On any error the temporary file is removed and ``path`` is left
-    as it was.
+    Raises InputError where the file cannot be written. On any error the temporary file is removed and ``path`` stays
+    unchanged.
     """
     temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
@@ -63,18 +67,18 @@ def replacing(path: Path) -> Iterator[Path]:
         os.replace(temporary, path)
         sync(path.parent)
     except (OSError, RuntimeError) as error:
-        # Of a full disk HDF5 says so within a text of its own, and not always as an OSError.
-        said = re.search(r"error message = '([^']*)'", str(error))
-        if isinstance(error, RuntimeError) and not said:
+        # HDF5 reports a full disk within a longer text, and not always as an OSError.
+        message = re.search(r"error message = '([^']*)'", str(error))
+        if isinstance(error, RuntimeError) and not message:
             raise
-        why = said[1] if said else getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be written ({why})") from error
+        reason = message[1] if message else getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be written ({reason}); free the disk or choose another folder") from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def sync(path: Path) -> None:
-    """Wait until a file or folder is on the disk."""
+    """Wait until a file or folder is written to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
@@ -84,12 +88,12 @@ def sync(path: Path) -> None:
 
 @contextmanager
 def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterator[Any]:
-    # HDF5 can end the process at once when the disk is full. What is small is made in memory and written as bytes.
+    # HDF5 may abort the process when the disk is full. Small files are made in memory and written as bytes.
     small = kind != "scene"
     driver: dict[str, Any] = {"driver": "core", "backing_store": False} if small else {}
     with replacing(path) as temporary, h5py.File(temporary, "x", libver="earliest", **driver) as file:
-        header = {"format": FORMATS[kind], "format_version": FORMAT_VERSION, "units": "mm"}
-        header["history"] = json.dumps(HISTORY)
+        version, history = (RESULTS_VERSION, RESULTS_HISTORY) if kind == "results" else (FORMAT_VERSION, HISTORY)
+        header = {"format": FORMATS[kind], "format_version": version, "units": "mm", "history": json.dumps(history)}
         for name, text in header.items():
             file.attrs.create(name, text.encode(), dtype=h5py.string_dtype("utf-8", len(text)))
         codec.write_text(file, "provenance", json.dumps(provenance, sort_keys=True, ensure_ascii=False))
@@ -100,10 +104,10 @@ def _new_file(path: Path, kind: str, provenance: Mapping[str, object]) -> Iterat
 
 
 def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mapping[str, object]) -> None:
-    """Write a scene, with its truth beside it where there is one.
+    """Write a scene, and its truth if there is one.
 
-    ``provenance`` is anything that JSON can hold. Points are kept to 0.0001 mm (0.001 mm beyond an extent of 400 m).
-    Raises InputError for points that are not finite, scans of one name, and labels that do not fit their scan.
+    ``provenance`` is any JSON object. Points are rounded to 0.0001 mm (0.001 mm beyond an extent of 400 m). Raises
+    InputError for points that are not finite, two scans of the same name, and labels that do not fit their scan.
     """
     _check(path, scene)
     orders: dict[str, Ints] = {}
@@ -121,27 +125,30 @@ def write_scene(path: Path, scene: Scene, truth: Truth | None, provenance: Mappi
 def _check(path: Path, scene: Scene) -> None:
     names = [scan.name for scan in scene.scans]
     if len(set(names)) != len(names):
-        raise InputError(f"{path}: the scene has more than one scan of one name ({', '.join(sorted(names))})")
+        raise InputError(f"{path}: expected scans of different names, found {', '.join(sorted(names))}; rename one")
     for scan in scene.scans:
         bad = int(np.count_nonzero(~np.isfinite(scan.points).all(axis=1)))
         if bad or not np.isfinite(scan.origin).all():
-            raise InputError(f"{path}: scan {scan.name!r} has {bad or 'an origin of'} points that are not finite")
+            culprit = f"{bad} points" if bad else "an origin"
+            raise InputError(f"{path}: scan {scan.name!r} has {culprit} with coordinates that are not finite")
 
 
 def _in_order(labels: PointLabels, orders: Mapping[str, Ints], path: Path) -> PointLabels:
     order = orders.get(labels.scan)
     if order is None:
-        raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r} that the scene has not")
+        raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r}, which is not in the scene")
     per_point = (field.name for field in dataclasses.fields(labels) if field.metadata.get("shape") == ("n",))
     columns = {name: getattr(labels, name) for name in per_point}
     for name, column in columns.items():
         if len(column) not in (0, len(order)):
-            raise InputError(f"{path}: {len(column)} labels ({name}) for the {len(order)} points of {labels.scan!r}")
+            raise InputError(
+                f"{path}: expected {len(order)} labels ({name}) of the points of {labels.scan!r}, found {len(column)}"
+            )
     return dataclasses.replace(labels, **{name: column[order] for name, column in columns.items() if len(column)})
 
 
 def write_truth(path: Path, truth: Truth, provenance: Mapping[str, object] | None = None) -> None:
-    """Write a truth on its own; its labels stay in the order given."""
+    """Write a truth to a file without a scene; its labels keep the order given."""
     with _new_file(path, "truth", provenance or {}) as file:
         codec.write_record(file.create_group("truth"), truth)
 
@@ -149,9 +156,9 @@ def write_truth(path: Path, truth: Truth, provenance: Mapping[str, object] | Non
 def copy_truth(
     src: Path, dst: Path, labels: Callable[[tuple[PointLabels, ...]], tuple[PointLabels, ...]] | None = None
 ) -> bool:
-    """Write the truth of ``src`` to a file ``dst`` of its own. Without one nothing is written: False.
+    """Write the truth of ``src`` to a file ``dst`` without a scene. Returns False, and writes nothing, without a truth.
 
-    ``labels`` makes the copy's labels of the points of those there are.
+    ``labels`` maps the labels of the points to those of the copy.
     """
     truth = read_truth(src)
     if truth is None:
@@ -163,7 +170,7 @@ def copy_truth(
 
 
 def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, object]) -> None:
-    """Write the results of steps in the order they ran."""
+    """Write the results of steps, in the order they ran."""
     with _new_file(path, "results", provenance) as file:
         results = file.create_group("results")
         for i, run in enumerate(runs):
@@ -175,21 +182,21 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
 
 @contextmanager
 def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
-    """Open a file of one of ``kinds`` that passes vetting. Raises InputError for any other and for damage."""
+    """Open a file of one of ``kinds`` whose structure is safe to read. Raises InputError for any other, or damage."""
     try:
         with safety.limited_memory():
             file = h5py.File(path, "r", locking=False)
         with file:
             with safety.limited_memory():
-                found = safety.problems(file, path)
-            found = found or _header_problems(file, kinds)
-            if found:
-                raise DecodeError(found)
+                faults = safety.problems(file, path)
+            faults = faults or _header_problems(file, kinds)
+            if faults:
+                raise DecodeError(faults)
             yield file
     except DecodeError as error:
         raise InputError(f"{path}: {_listed(error.problems)}") from error
     except FileNotFoundError:
-        raise InputError(f"{path}: there is no such file") from None
+        raise InputError(f"{path}: no such file") from None
     except DAMAGE as error:
         wanted = " or ".join(FORMATS[kind] for kind in kinds)
         raise InputError(
@@ -212,13 +219,16 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
     wanted = [FORMATS[kind] for kind in kinds]
     if header["format"] not in wanted:
         return [f"expected format {' or '.join(wanted)}, found {header['format'] or 'none'}"]
-    found = []
-    readable = (FORMAT_VERSION,) if header["format"] == FORMATS["results"] else READABLE
+    faults = []
+    results = header["format"] == FORMATS["results"]
+    readable = (RESULTS_VERSION,) if results else READABLE
     if header["format_version"] not in readable:
-        found.append(f"expected format_version {' or '.join(readable)}, found {header['format_version'] or 'none'}")
+        found = header["format_version"] or "none"
+        advice = "; run processor run again" if results else ""
+        faults.append(f"expected format_version {' or '.join(readable)}, found {found}{advice}")
     if header["units"] != "mm":
-        found.append(f"expected units mm, found {header['units'] or 'none'}")
-    return found
+        faults.append(f"expected units mm, found {header['units'] or 'none'}")
+    return faults
 
 
 def _attribute(file: Any, name: str) -> str:
@@ -233,10 +243,9 @@ def _group(file: Any, name: str) -> Any:
 
 
 def read_scene(path: Path, points: bool = True) -> Scene:
-    """Read a scene; its points come in the order of their tiles. Raises InputError with all that is wrong.
+    """Read a scene; its points are in the order of their tiles. Raises InputError that lists all faults.
 
-    Without ``points`` the scans have none, nor anything else that stands beside them; see
-    :mod:`processor.store.streaming`.
+    With ``points`` false the per-point columns of the scans are empty; see :mod:`processor.store.streaming`.
     """
     with opened(path, ["scene"]) as file:
         return _decode_scene(file, scan_tiles.read_scan if points else scan_tiles.read_scan_alone)
@@ -246,29 +255,14 @@ def _decode_scene(file: Any, read_scan: Callable[[Any], Scan]) -> Scene:
     scene = codec.read_record(_group(file, "scene"), Scene, hooks={Scan: read_scan})
     names = [scan.name for scan in scene.scans]
     if len(set(names)) != len(names):
-        raise DecodeError(["/scene/scans: two scans have one name"])
+        raise DecodeError(["/scene/scans: two scans have the same name"])
     return scene
 
 
-def read_points_in_box(path: Path, scan_name: str, lower: Floats, upper: Floats) -> Floats:
-    """Points (m, 3) of a scan within ``lower <= p <= upper`` (mm, relative to the scan's origin).
-
-    Reads the tiles that the box touches and no others. Raises InputError where the file has no such scan.
-    """
-    lower, upper = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
-    with opened(path, ["scene"]) as file:
-        scans = _group(file, "scene").get("scans")
-        members = list(scans.values()) if isinstance(scans, h5py.Group) else []
-        names = [codec.read_text(group, "name") for group in members]
-        if scan_name not in names:
-            raise DecodeError([f"expected a scan {scan_name!r}, found {', '.join(names) or 'none'}"])
-        return scan_tiles.read_box(members[names.index(scan_name)], lower, upper)
-
-
 def read_truth(path: Path, labels: bool = True) -> Truth | None:
-    """Read the truth from a scene file or a file of its own; None where a scene has none. For evaluation alone.
+    """Read the truth from a scene or truth file; None for a scene without truth. For evaluation only.
 
-    Without ``labels`` what each point really is stays in the file.
+    With ``labels`` false the labels of the points are not read.
     """
     with opened(path, ["scene", "truth"]) as file:
         if "truth" not in file and _attribute(file, "format") == FORMATS["scene"]:
@@ -277,7 +271,7 @@ def read_truth(path: Path, labels: bool = True) -> Truth | None:
 
 
 def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRun, ...]:
-    """Read results in the order they ran; ``result_classes`` gives each step's Result record by the step's name.
+    """Read results in the order they ran; ``result_classes`` maps a step's name to its Result record.
 
     Raises InputError for a step that is not among them, and for a damaged file.
     """
@@ -300,19 +294,19 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
-    """Read what a file says of how it was made."""
+    """Read how a file was made: the JSON object given to the writer."""
     with opened(path, list(FORMATS)) as file:
         try:
-            found = json.loads(codec.read_text(file, "provenance"))
+            provenance = json.loads(codec.read_text(file, "provenance"))
         except json.JSONDecodeError:
-            found = None
-        if not isinstance(found, dict):
+            provenance = None
+        if not isinstance(provenance, dict):
             raise DecodeError(["/provenance: expected a JSON object"])
-        return found
+        return provenance
 
 
 def problems(path: Path) -> list[str]:
-    """List all that is wrong with a scene, truth or results file; an empty list means that it can be read."""
+    """List all faults of a scene, truth or results file; an empty list means that it can be read."""
 
     def attempt(read: Callable[[Path], object]) -> list[str]:
         try:
@@ -326,20 +320,20 @@ def problems(path: Path) -> list[str]:
         with opened(path, list(FORMATS)) as file:
             return _attribute(file, "format")
 
-    found = attempt(read_kind)
-    if found:
-        return found
+    faults = attempt(read_kind)
+    if faults:
+        return faults
     kind = read_kind(path)
-    found = attempt(read_provenance)
+    faults = attempt(read_provenance)
     if kind == FORMATS["scene"]:
-        found += attempt(read_scene)
+        faults += attempt(read_scene)
     if kind != FORMATS["results"]:
-        return found + attempt(read_truth)
-    return found + attempt(_read_runs_plainly)
+        return faults + attempt(read_truth)
+    return faults + attempt(_read_run_headers)
 
 
-def _read_runs_plainly(path: Path) -> None:
-    """Read the parts of each run that are the same for all steps."""
+def _read_run_headers(path: Path) -> None:
+    """Read the fields of each run that are the same for all steps."""
     with opened(path, ["results"]) as file:
         for group in _group(file, "results").values():
             codec.read_record(group, StepRun, given={"result": None}) if isinstance(group, h5py.Group) else None
@@ -349,11 +343,11 @@ def _read_runs_plainly(path: Path) -> None:
 
 
 def scene_hash(scene: Scene, pieces: Pieces | None = None) -> str:
-    """SHA-256 (hex) of all that a scene holds: names, types, shapes and bytes of its fields, in their order.
+    """Return the SHA-256 (hex) of a scene: names, types, shapes and bytes of its fields, in their order.
 
-    It depends on nothing else: not on the truth, the file's name, or the versions of the software. ``pieces`` gives
-    the columns of points that a scene was read without, piece by piece: by the scan's number and the column's name its
-    shape, and its parts in turn.
+    It depends on nothing else: not on the truth, the file's name or the versions of the software. ``pieces`` gives the
+    per-point columns of a scene that was read without points: for a scan's number and a column's name, the column's
+    shape and an iterator over its parts.
     """
     digest = hashlib.sha256()
     _feed(digest, "scene", scene, pieces)

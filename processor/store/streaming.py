@@ -1,4 +1,4 @@
-"""Points of a scene's file piece by piece, for clouds that are larger than memory."""
+"""Points of a scene file piece by piece, for clouds larger than memory."""
 
 from __future__ import annotations
 
@@ -8,50 +8,51 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import processor.store.scan_tiles as scan_tiles
 from processor.model import Floats, Labels
-from processor.store import scan_tiles, store
+from processor.store.store import opened
 
 PIECE = 1 << 20
 
 
 @dataclass(frozen=True)
 class StoredPoints:
-    """The points of the scans of an open scene file, a scan being a number in the file's order."""
+    """The points of the scans of an open scene file; a scan is named by its number in the file."""
 
     scans: tuple[Any, ...]
 
     def counts(self) -> tuple[int, ...]:
-        """Points of all scans."""
+        """Return the number of points of each scan."""
         return tuple(scan_tiles.count(scan) for scan in self.scans)
 
     def read(self, scan: int, size: int = PIECE) -> Iterator[tuple[Floats, Labels]]:
-        """Yield points (n, 3), less the scan's origin, and the station (n,) of each, or an empty one."""
+        """Yield points (n, 3), relative to the scan's origin, and their stations: (n,), or empty where unknown."""
         stations = scan_tiles.pieces(self.scans[scan], "point_station", size)
         for points in scan_tiles.pieces(self.scans[scan], "points", size):
             yield points, next(stations, scan_tiles.NO_STATIONS)
 
     def within(self, boxes: Sequence[tuple[Floats, Floats]]) -> Boxed:
-        """Return the points within a box a scan alone: lower and upper corner (3,), less the scan's origin."""
+        """Restrict each scan to a box: lower and upper corner (3,), mm, relative to the scan's origin."""
         return Boxed(self.scans, tuple(boxes))
 
     def pieces(self, scan: int, name: str) -> tuple[tuple[int, ...], Iterator[Any]]:
-        """Return the shape of a scan's column and the column in pieces; see :func:`.store.scene_hash`."""
+        """Return the shape of a per-point column and an iterator over it; see :func:`.store.scene_hash`."""
         return scan_tiles.shape(self.scans[scan], name), scan_tiles.pieces(self.scans[scan], name, PIECE)
 
 
 @dataclass(frozen=True)
 class Boxed:
-    """Points within a box of each scan, without their stations; only the tiles that it touches are read."""
+    """Points within a box of each scan, without their stations; only the tiles that a box touches are read."""
 
     scans: tuple[Any, ...]
     boxes: tuple[tuple[Floats, Floats], ...]
 
     def counts(self) -> tuple[int, ...]:
-        """Points of all scans that are in the boxes."""
+        """Return the number of points of each scan within its box."""
         return tuple(len(scan_tiles.read_box(scan, *box)) for scan, box in zip(self.scans, self.boxes, strict=True))
 
     def read(self, scan: int, size: int = PIECE) -> Iterator[tuple[Floats, Labels]]:
-        """Yield points (n, 3), less the scan's origin, in the order of the file."""
+        """Yield points (n, 3), relative to the scan's origin, in the order of the file."""
         points = scan_tiles.read_box(self.scans[scan], *self.boxes[scan])
         for start in range(0, len(points), size):
             yield points[start : start + size], scan_tiles.NO_STATIONS
@@ -59,7 +60,7 @@ class Boxed:
 
 @contextmanager
 def points_of(path: Path) -> Iterator[StoredPoints]:
-    """Open a scene's file for its points. Raises InputError for a file that is damaged or of another kind."""
-    with store.opened(path, ["scene"]) as file:
+    """Open a scene file for its points. Raises InputError for a file that is damaged or of another kind."""
+    with opened(path, ["scene"]) as file:
         scans = file["scene"]["scans"]
         yield StoredPoints(tuple(scans[name] for name in scans) if hasattr(scans, "keys") else ())

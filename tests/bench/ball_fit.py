@@ -19,7 +19,7 @@ from scipy.optimize import least_squares
 
 from processor.geometry.sphere import algebraic
 from processor.space_frame import catalogue
-from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
 from processor.space_frame.spheres import fit_all
 
@@ -67,7 +67,7 @@ def trial(rng, draws, radius, count, visible, sigma, several, prior=None, likeli
     nodes = Nodes(start, covariance, np.zeros(draws, np.int64), np.full(draws, np.nan))
     params = fit_all.Params(sigma_mm=2.0, process_hole_mm=0.0)
     got = fit_all.fit_crops(
-        moved, stations, nodes, Tubes(), catalogue.of_radii([]), None, np.zeros((len(stations), 3, 3)), params
+        moved, stations, nodes, Members(), catalogue.of_radii([]), None, np.zeros((len(stations), 3, 3)), params
     )
     errors = np.column_stack([got.centres, got.radii - radius])
     plain = []

@@ -56,20 +56,21 @@ def measured(scene, truth, params):
     wall, cpu = time.monotonic() - wall, time.process_time() - cpu
     found = {metric.name: metric.value for metric in stitching_evaluation.check(scene, result, truth)}
     true = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
-    rows = [i for i, name in enumerate(result.scans) if np.isfinite(result.T_project_scan[i]).all()]
-    pulls = stitching.pulls_of(result, rows, np.stack([true[result.scans[i]] for i in rows]))
+    scans = result.scans
+    rows = np.flatnonzero(scans.placed).tolist()
+    pulls = stitching.pulls_of(result, rows, np.stack([true[scans.name[i]] for i in rows]))
     return {
         "points": int(sum(len(scan.points) for scan in scene.scans)),
         "position_mm": found.get("station positions after datum fit, max", float("inf")),
         "rotation_mrad": found.get("rotations after datum fit, max", float("inf")),
-        "stated_position_mm": float(np.nanmax(result.position_sd)),
-        "stated_rotation_mrad": float(1e3 * np.nanmax(result.rotation_sd)),
+        "stated_position_mm": float(np.nanmax(scans.position_sd)),
+        "stated_rotation_mrad": float(1e3 * np.nanmax(scans.rotation_sd)),
         "components": len(pulls),
         "within_95": float((np.abs(pulls) < stitching.NORMAL_95).mean()) if len(pulls) else float("nan"),
         "pull_rms": float(np.sqrt(np.mean(pulls**2))) if len(pulls) else float("nan"),
-        "flags": [s for s in result.scan_status if s != "ok"],
-        "pairs_used": f"{int(result.used.sum())}/{len(result.used)}",
-        "closure_mm": float(result.closure_mm.max()) if len(result.closure_mm) else float("nan"),
+        "flags": [s for s in scans.status if s != "ok"],
+        "pairs_used": f"{int(result.pairs.used.sum())}/{len(result.pairs)}",
+        "closure_mm": float(result.closures.mm.max()) if len(result.closures) else float("nan"),
         "wall_s": wall,
         "cpu_s": cpu,
     }

@@ -60,24 +60,24 @@ def figures(scene, truth, draw):
         result = stitching_step.run(
             scene, stitching_step.Params(method="three-point", scale=scale, weak_mm=1e3, weak_mrad=1e2)
         )
-        base = result.T_project_scan[0] @ np.linalg.inv(T[0])
+        base = result.scans.T_project_scan[0] @ np.linalg.inv(T[0])
         C = expected(base @ T, pairs, places, scale == "free")
         shift, ratio, pull = [], [], []
         for s in range(1, len(T)):
             want = base @ T[s]
-            own = np.linalg.inv(result.T_project_scan[s])
-            place = own[:3, :3] @ result.position[s] + own[:3, 3]
-            d = result.position[s] - (want[:3, :3] @ place + want[:3, 3])
-            station = result.T_project_scan[s][:3, 3] - want[:3, 3]
+            own = np.linalg.inv(result.scans.T_project_scan[s])
+            place = own[:3, :3] @ result.scans.position[s] + own[:3, 3]
+            d = result.scans.position[s] - (want[:3, :3] @ place + want[:3, 3])
+            station = result.scans.T_project_scan[s][:3, 3] - want[:3, 3]
             shift.append(np.linalg.norm(station))
             ratio.append(station / np.sqrt(np.diag(C[s])[3:]))
-            pull.append(d / result.position_sd[s])
+            pull.append(d / result.scans.position_sd[s])
         found[name] = {
             "position_mm": float(max(shift)),
             "expected_mm": float(np.sqrt(max(np.trace(one[3:, 3:]) for one in C))),
             "by_expected": float(np.sqrt(np.mean(np.square(ratio)))),
             "within_95": float((np.abs(pull) < 1.96).mean()),
-            "not_placed": int((~np.isfinite(result.T_project_scan).all(axis=(1, 2))).sum()),
+            "not_placed": int((~result.scans.placed).sum()),
         }
     return found
 

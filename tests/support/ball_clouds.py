@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from processor.space_frame.members.records import Nodes, Tubes
-from processor.space_frame.points.source import InMemory
+from processor.space_frame.members.records import Members, Nodes
+from tests.support.memory_source import InMemory
 
 SLEEVE, TUBE, HOLE = 18.0, 30.0, 10.0
 MEMBERS = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0], [0.55, 0.55, 0.63], [-0.55, -0.55, 0.63]], float)
@@ -37,7 +37,7 @@ def first_hit(origin, rays, centre, radius, sleeve=SLEEVE, members=MEMBERS, hole
 
 
 def frame(rng, centres, radii, stations, step_mrad=1.2, sigma=2.0, node_sd=0.5, shifts=None, **kinds):
-    """A cloud of balls seen from stations, and nodes and tubes as their axes would give them."""
+    """A cloud of balls seen from stations, and nodes and members as their axes would give them."""
     points, station = [], []
     for s, at in enumerate(stations):
         for centre, radius in zip(centres, radii, strict=True):
@@ -65,20 +65,20 @@ def frame(rng, centres, radii, stations, step_mrad=1.2, sigma=2.0, node_sd=0.5, 
     m = len(units) * k
     axis, node = np.tile(units, (k, 1)), np.repeat(np.arange(k), len(units))
     side = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis), axis=1)]) if m else np.empty((0, 3))
-    tubes = Tubes(
-        centres[node] + 500.0 * axis,
-        axis,
-        side / np.linalg.norm(side, axis=1)[:, None] if m else side,
-        np.full(m, 800.0),
-        np.full(m, TUBE),
-        np.zeros((m, 2)),
-        np.zeros((m, 5, 5)),
-        node,
-        np.full(m, -1),
-        np.full(m, 100),
-        np.full(m, 2.0),
+    found = Members(
+        points=centres[node] + 500.0 * axis,
+        directions=axis,
+        side=side / np.linalg.norm(side, axis=1)[:, None] if m else side,
+        lengths=np.full(m, 800.0),
+        radii=np.full(m, TUBE),
+        bow=np.zeros((m, 2)),
+        covariance=np.zeros((m, 5, 5)),
+        node_a=node,
+        node_b=np.full(m, -1),
+        count=np.full(m, 100),
+        rms=np.full(m, 2.0),
     )
-    return source, nodes, tubes
+    return source, nodes, found
 
 
 def grid_of_balls(k, radii, height=6000.0):

@@ -4,31 +4,32 @@ import numpy as np
 
 from processor.defects.result import CLASSES
 from processor.defects.result import Result as Defects
-from processor.model import Scan, Scene, StepRun, StructureDesign
+from processor.model import Scan, Scene, StepRun, StructureDesign, reason
 from processor.pipeline import Execution
+from processor.stitching.common_points import UnitSlip
+from processor.stitching.result import Closures, Pairs, Scans
 from processor.stitching.result import Result as Stitching
 
 PROVENANCE = {"input": "site", "input_sha256": "0" * 64, "seed": 0, "software": {}, "parameters": []}
-SCAN_MESSAGES = (
-    "",
-    "much speaks against its pose (31 % of what speaks for it)",
-    "it shares little with any other scan (4 %)",
-    "another pose speaks for itself as well (97 % of this one's score)",
-    "nothing tells how sure its pose is",
-    "2.3 % of what it shares with the only scan beside it was looked through, as where a structure "
-    "repeats itself or things moved: a third scan, common points or control would tell",
-    "7 faces agree that it stands 3.1 mm and 0.086 mrad elsewhere, 5 speak against that: something moved in between, "
-    "or the scan is bent",
-    "its pose is sure to 25 mm and 1.2e+02 mrad only",
-    "shares too little with the others to be placed",
+SCAN_REASONS = (
+    None,
+    reason("stitch.free-space", percent=31.0),
+    reason("stitch.little-overlap", percent=4.0),
+    reason("stitch.rival-pose", percent=97.0),
+    reason("stitch.no-covariance"),
+    reason("stitch.looked-through", percent=2.3),
+    reason("stitch.faces-contradict", agree=7, shift_mm=3.1, turn_mrad=0.086, contradict=5),
+    reason("stitch.uncertain-pose", position_mm=25.0, rotation_mrad=120.0),
+    reason("stitch.no-overlap"),
 )
 STATES = ("ok", "weak", "weak", "ambiguous", "weak", "ambiguous", "weak", "weak", "failed")
-PAIR_MESSAGES = (
-    "its own pose contradicts the others",
-    "by itself it would stand elsewhere",
-    "scale 0.0010000: units mixed up (m and mm)?",
-    "scale 1.004000: a blunder in the picks",
-    "scale -120 ± 80 ppm: temperature (12 ppm a kelvin), instrument or picks",
+PAIR_REASONS = (
+    reason("stitch.pair-contradicts"),
+    reason("stitch.pair-elsewhere"),
+    reason("stitch.scale-of-units", scale=0.001, units=UnitSlip.M_MM),
+    reason("stitch.scale-by-blunder", scale=1.004),
+    reason("stitch.scale", ppm=-120.0, ci95_ppm=80.0),
+    reason("stitch.picks-scatter", sd_mm=38.0),
 )
 
 
@@ -44,27 +45,38 @@ def plate(columns=24, rows=12, side=50.0):
 def scene(names=("S1",), name="site"):
     points, design = plate()
     scans = tuple(Scan(one, points, np.zeros(3), T_project_scan=np.eye(4)) for one in names)
-    return Scene(name, "structure", scans, structure=design, units="mm", units_reason="said by project.toml")
+    return Scene(name, "structure", scans, structure=design, units="mm", units_reason="given in project.toml")
 
 
 def stitching(names=("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9")):
-    """Nine scans in all states, five pairs with all that is said of pairs, and a loop."""
-    k, p = len(names), len(PAIR_MESSAGES)
+    """Nine scans in all states, six pairs with all reasons of pairs, and a loop."""
+    k, p = len(names), len(PAIR_REASONS)
     pose = np.tile(np.eye(4), (k, 1, 1))
     pose[:, :3, 3] = 1000.0 * np.column_stack([np.arange(k), np.arange(k) % 3, np.zeros(k)])
     pose[-1] = np.nan
-    said = [f"{one}: {text}" for one, text in zip(names, SCAN_MESSAGES, strict=True) if text]
-    said.append(f"pair {names[0]}, {names[5]} not used: 2 common points, three that span a plane are needed")
-    line = "all common points on a line, three that span a plane are needed"
-    said.append(f"pair {names[1]}, {names[5]} not used: {line}")
-    said += [f"pair {names[0]}, {names[i]}: {text}" for i, text in enumerate(PAIR_MESSAGES[2:], 1)]
+    few, line = reason("stitch.few-points", points=2), reason("stitch.points-on-a-line")
+    reasons = [
+        reason("stitch.of-scan", scan=name, reason=one) for name, one in zip(names, SCAN_REASONS, strict=True) if one
+    ]
+    reasons.append(reason("stitch.pair-not-used", a=names[0], b=names[5], shortage=few))
+    reasons.append(reason("stitch.pair-not-used", a=names[1], b=names[5], shortage=line))
+    reasons += [reason("stitch.of-pair", a=names[0], b=names[i], reason=one) for i, one in enumerate(PAIR_REASONS, 1)]
+    scans = Scans(
+        name=names, status=STATES, reasons=[(one,) if one else () for one in SCAN_REASONS], T_project_scan=pose,
+        covariance=np.zeros((k, 6, 6)), position=pose[:, :3, 3], position_sd=np.full((k, 3), 0.2),
+        rotation_sd=np.full((k, 3), 1e-5), rivalry=np.full(k, 0.5), T_rival_scan=np.full((k, 4, 4), np.nan),
+        from_frame=names, to_frame=("PRCS",) * k,
+    )  # fmt: skip
+    pairs = Pairs(
+        a=(names[0],) * p, b=names[1 : p + 1], overlap=np.linspace(0.2, 0.9, p), residual=np.linspace(0.5, 1.0, p),
+        used=np.arange(p) > 0, reasons=[(one,) for one in PAIR_REASONS], shared=np.full(p, 12),
+        T_a_b=np.tile(np.eye(4), (p, 1, 1)), covariance=np.zeros((p, 6, 6)), scale=np.ones(p),
+        scale_sd=np.full(p, np.nan), from_frame=names[1 : p + 1], to_frame=(names[0],) * p,
+    )  # fmt: skip
+    loop = (*names[:3], names[0])
     return Stitching(
-        "partial", "automatic", "; ".join(said), names[0], names, STATES, SCAN_MESSAGES, pose,
-        np.zeros((k, 6, 6)), pose[:, :3, 3], np.full((k, 3), 0.2), np.full((k, 3), 1e-5), np.full(k, 0.5),
-        np.full((k, 4, 4), np.nan), (names[0],) * p, names[1 : p + 1], np.linspace(0.2, 0.9, p),
-        np.linspace(0.5, 1.0, p), np.array([0, 1, 1, 1, 1], np.uint8), PAIR_MESSAGES, np.tile(np.eye(4), (p, 1, 1)),
-        np.zeros((p, 6, 6)), np.full(p, 12), np.ones(p), np.full(p, np.nan),
-        (" > ".join([*names[:3], names[0]]),), np.array([0.4]), np.array([0.1]), np.array([1.1]),
+        status="partial", method="automatic", reasons=reasons, reference=names[0], scans=scans, pairs=pairs,
+        closures=Closures(loop=(loop,), mm=np.array([0.4]), mrad=np.array([0.1]), ratio=np.array([1.1])),
     )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ NAN = float("nan")
 
 
 def own(**limits):
-    return standards.with_own(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
+    return standards.override(Tolerance(), {key: np.array(value) for key, value in limits.items()}, "project.toml")
 
 
 def chord(value, sd):
@@ -108,7 +108,7 @@ def test_quantities_of_the_edges_by_hand():
 
 def test_a_limit_that_nothing_is_held_against_is_said():
     assert chain.unused_limits(GB) == []
-    mixed = standards.with_own(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
+    mixed = standards.override(GB, {"bow_mm": np.array([4.0]), "span_mm": np.array([-1.0, 1.0])}, "project.toml")
     assert [limit.key for limit in chain.unused_limits(mixed)] == ["bow_mm"]
     params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
     assembly = SimpleNamespace(

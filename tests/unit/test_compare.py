@@ -241,8 +241,8 @@ def test_a_unit_is_claimed_for_those_that_say_it_alone(tmp_path, monkeypatch, ca
         record = json.loads((tmp_path / "out" / "compare.json").read_text())
         assert (record["unit"] == "m") == bool(unit)
         assert (" m," in out) == bool(unit)
-        assert "the unit m is said by core.csv alone; not by " in out
-        assert "the unit m is said by" in err
+        assert "the unit m is given by core.csv only; not by " in out
+        assert "the unit m is given by" in err
     found = compare.compare(Request(a, b))
     assert comparison.as_json(found)["unit_note"] is None
 

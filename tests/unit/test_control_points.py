@@ -176,14 +176,14 @@ def test_a_csv_is_no_scan_and_may_name_stations_of_a_merged_cloud(tmp_path):
     assert [scan.name for scan in scene.scans] == ["roof"]
     assert (scene.control.scan.tolist(), scene.control.station.tolist()) == ([0, 0], [0, 1])
     (tmp_path / "control.csv").write_text(CSV.replace("T1,b,", "T1,roof,"))
-    with pytest.raises(InputError, match="of several stations; name the one"):
+    with pytest.raises(InputError, match="has several stations; name the one"):
         folder.read_input(tmp_path)
 
 
 @pytest.mark.parametrize(
     ("toml", "csv", "said"),
     [
-        (TABLES.replace('"b"', '"c"'), None, "no scan or station 'c'; there are a, b"),
+        (TABLES.replace('"b"', '"c"'), None, "unknown scan or station 'c'; expected one of a, b"),
         (TABLES.replace("sd_mm = 1.0", "sd_mm = 0.0"), None, "a number above 0"),
         (TABLES.replace("sd_mm = 1.0", ""), None, "a number as 'sd_mm'"),
         (TABLES.replace("seen_sd_mm = 0.5", "seen_sd_mm = -1"), None, "0 mm or more"),
@@ -191,7 +191,7 @@ def test_a_csv_is_no_scan_and_may_name_stations_of_a_merged_cloud(tmp_path):
         (TABLES.replace("[2000.0, 4000.0, 300.0]", "[2000.0, nan, 300.0]"), None, "numbers of shape 3"),
         ('[[control]]\nname = "T1"\n', None, "found neither"),
         ('[[control]]\nname = "T1"\nposition = [0, 0, 0]\nsd_mm = 1.0\n', None, "no control point is seen"),
-        ('[[control]]\nname = "T1"\nscan = "a"\nseen = [0, 0, 0]\n', None, "no coordinates of its own"),
+        ('[[control]]\nname = "T1"\nscan = "a"\nseen = [0, 0, 0]\n', None, "no known coordinates"),
         (TABLES + TABLES, None, "has coordinates already"),
         ("", CSV + "T1,b,0,0,0,\n", "seen in 'b' twice"),
         ("", CSV.replace("sd_mm\n", "sd\n"), "expected columns name,scan,x,y,z,sd_mm"),

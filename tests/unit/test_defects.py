@@ -5,7 +5,7 @@ import pytest
 
 from designgen import recipes
 from designgen.asbuilt import defects
-from designgen.designs import plate_row
+from designgen.designs import plate_row, structure_types
 from designgen.scenes import structure as scenes_structure
 from processor.model import UsageError
 
@@ -23,7 +23,7 @@ def row_of(row, kinds, sizes, seed=1):
     """Components as designed, faces as built with the component of each, and the truth."""
     structure = {"type": "plate-row", "components": list(kinds), **row}
     recipe = {"kind": "structure", "structure": structure, "asbuilt": sizes}
-    components = scenes_structure.design(recipe)
+    components = structure_types.design(recipe)
     return components, *scenes_structure.BUILDERS["plate-row"](components, recipe, seed)[::2]
 
 
@@ -69,7 +69,7 @@ def missing(component, built):
     """Area missing from the front, its centre (3,), and the volume that the closed faces lack."""
     ((design, now),) = fronts(component, built)
     middle = [0.5 * (k[1:] + k[:-1]) for k in (now.p, now.q)]
-    gone = ~now.kept
+    gone = ~now.present
     pp, qq = (grid[gone] for grid in np.meshgrid(*middle, indexing="ij"))
     corner, one, two = design.at(np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0]))
     area = np.outer(np.diff(now.p), np.diff(now.q))[gone] * np.linalg.norm(np.cross(one - corner, two - corner))
@@ -143,7 +143,7 @@ def test_a_girder_loses_steel_where_its_web_ends():
         middle = 800.0 + 300.0
         assert abs(z - middle) <= 0.2 * 568.0
         end = next(patch for _, patch in patches if patch.name == "0 +a")
-        assert not end.kept.all()
+        assert not end.present.all()
         web = components[0].bodies[0]
         assert web.centre[0] + 0.5 * web.size[0] == pytest.approx(1500.0)
 

@@ -9,15 +9,18 @@ import cadquery as cq
 import numpy as np
 import pytest
 import trimesh
+from click.testing import CliRunner
 from scipy.integrate import quad
 
-from designgen import curves, recipes
+import designgen
+from designgen import batch, curves, recipes
+from designgen.cli import commands
 from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, space_frame
 from designgen.export import folder as export_folder
 from designgen.randomness import generator
 from designgen.scanning import sampler
 from designgen.scenes.make import make
-from processor.model import UsageError
+from processor.model import InputError, UsageError
 from processor.scan_folder import folder
 from processor.store import store
 
@@ -244,20 +247,93 @@ def test_an_exported_folder_holds_design_and_truth(tmp_path):
 
 
 def test_the_command_line(tmp_path):
-    def designgen(*arguments):
+    def run(*arguments):
         command = [sys.executable, "-m", "designgen", *map(str, arguments)]
         return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
 
-    listed = designgen("list").stdout
+    listed = run("list").stdout
     assert all(name in listed for name in ("arch-d1", "balls-100", "bolt_ball"))
     scene = tmp_path / "s.h5"
-    done = designgen("make", "balls-100", "-o", scene, "--seed", 4, "--set", "scan.spacing_mm=20", "--json")
+    done = run("make", "balls-100", "-o", scene, "--seed", 4, "--set", "scan.spacing_mm=20", "--json")
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout)["seed"] == 4
     assert store.read_provenance(scene)["parameters"]["scan"]["spacing_mm"] == 20
-    assert designgen("make", "no-such", "-o", tmp_path / "x.h5").returncode == 2
-    assert designgen("make", tmp_path / "no.toml", "-o", tmp_path / "x.h5").returncode == 3
-    assert designgen("export", tmp_path / "no.h5", "-o", tmp_path / "f", "--format", "ply").returncode == 3
-    assert designgen("export", scene, "-o", tmp_path / "f", "--format", "ptx").returncode == 2  # no grid
-    assert designgen("export", scene, "-o", tmp_path / "f", "--format", "ply", "--spherical").returncode == 2
+    assert run("make", "no-such", "-o", tmp_path / "x.h5").returncode == 2
+    assert run("make", tmp_path / "no.toml", "-o", tmp_path / "x.h5").returncode == 3
+    assert run("export", tmp_path / "no.h5", "-o", tmp_path / "f", "--format", "ply").returncode == 3
+    assert run("export", scene, "-o", tmp_path / "f", "--format", "ptx").returncode == 2  # no grid
+    assert run("export", scene, "-o", tmp_path / "f", "--format", "ply", "--spherical").returncode == 2
     assert sorted(p.name for p in tmp_path.iterdir()) == ["s.h5"]
+
+
+def test_scenes_are_made_from_python_as_by_the_command(tmp_path):
+    settings = {"scan.spacing_mm": np.float64(80.0), "bridge.joints": (0.2, 0.4, 0.6, 0.8)}
+    scene, truth = designgen.make("arch-s1", seed=3, settings=settings)
+    changes = ["scan.spacing_mm=80.0", "bridge.joints=[0.2, 0.4, 0.6, 0.8]"]
+    arguments = ["make", "arch-s1", "-o", str(tmp_path / "s.h5"), "--seed", "3"]
+    done = CliRunner().invoke(commands, [*arguments, *(text for change in changes for text in ("--set", change))])
+    assert done.exit_code == 0, done.output
+    provenance = store.read_provenance(tmp_path / "s.h5")
+    store.write_scene(tmp_path / "python.h5", scene, truth, provenance)
+    assert (tmp_path / "python.h5").read_bytes() == (tmp_path / "s.h5").read_bytes()
+    own = tmp_path / "own.toml"
+    own.write_text((ROOT / "designgen/recipes/arch-s1.toml").read_text("utf-8"), "utf-8")
+    again, _ = designgen.make(own, 3, settings)
+    assert again.name == "own"
+    np.testing.assert_array_equal(again.scans[2].points, scene.scans[2].points)
+    default, _ = designgen.make("arch-s1", settings=settings)
+    assert not np.array_equal(default.scans[2].points[:5], scene.scans[2].points[:5])
+    with pytest.raises(UsageError, match="no recipe 'tent'"):
+        designgen.make("tent")
+    with pytest.raises(UsageError, match=r"scan.sigma: unknown key"):
+        designgen.make("arch-s1", settings={"scan.sigma": 1.0})
+    with pytest.raises(UsageError, match=r"setting seed.a: seed is not a section"):
+        designgen.make("arch-s1", settings={"seed.a": 1.0})
+    with pytest.raises(InputError, match="not a readable recipe"):
+        designgen.make(tmp_path / "none.toml")
+
+
+def test_the_package_loads_at_once_and_is_typed():
+    code = (
+        "import designgen, sys; assert designgen.__version__; assert not {'numpy', 'scipy', 'click'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+    assert (ROOT / "designgen/py.typed").is_file()
+
+
+def test_the_list_has_columns():
+    lines = CliRunner().invoke(commands, ["list"]).output.splitlines()
+    assert lines[0] == "component types"
+    entries = [line for line in lines if line.startswith("  ")]
+    assert set(recipes.named()) < {line.split()[0] for line in entries}
+    column = max(len(line.split()[0]) for line in entries) + 4
+    assert all(line[column - 1] == " " and line[column] != " " for line in entries)
+
+
+def test_the_software_of_a_scene_is_what_makes_it():
+    code = (
+        "import sys, designgen\n"
+        "for name in ('arch-s1', 'frame-small', 'plates-defects', 'arch-s1-rays'):\n"
+        "    rays = name in ('arch-s1-rays', 'plates-defects')\n"
+        "    coarse = {'scan.step_mrad': 50.0} if rays else {'scan.spacing_mm': 200.0}\n"
+        "    designgen.make(name, settings=coarse)\n"
+        "from processor.store import store\n"
+        "print(*{module.partition('.')[0] for module in sys.modules})\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT, capture_output=True, text=True)
+    loaded = set(done.stdout.split())
+    assert set(batch.SOFTWARE) <= loaded
+    assert not {"cadquery", "OCP"} & loaded
+    assert set(batch.software()) == {"designgen", *batch.SOFTWARE}
+
+
+LAYERS = ("designs", "asbuilt", "scanning", "scenes", "export")  # each imports only those before it, and cad none
+
+
+def test_imports_go_one_way():
+    for number, layer in enumerate(LAYERS):
+        for path in (ROOT / "designgen" / layer).glob("*.py"):
+            text = path.read_text("utf-8")
+            assert not any(f"designgen.{later}" in text for later in LAYERS[number + 1 :]), path
+    for path in (ROOT / "designgen/cad").glob("*.py"):
+        assert not any(f"designgen.{layer}" in path.read_text("utf-8") for layer in LAYERS), path

@@ -143,7 +143,8 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
         Scan("a", points[::2]), Scan("b", rigid.apply(rigid.invert(T), points[1::2])), Scan("c", points + 3000.0),
     )  # fmt: skip
     several = Scene("bracket", "structure", scans, structure=scene.structure, units="mm")
-    stitched = SimpleNamespace(scans=("a", "b", "c"), T_project_scan=np.array([np.eye(4), T, np.full((4, 4), np.nan)]))
+    table = SimpleNamespace(name=("a", "b", "c"), T_project_scan=np.array([np.eye(4), T, np.full((4, 4), np.nan)]))
+    stitched = SimpleNamespace(scans=table)
     result = deviation_step.run(several, deviation_step.Params(), earlier={"stitch": stitched})
     assert result.points_read == len(points)
     assert result.status == "ok"

@@ -194,17 +194,17 @@ def test_a_scan_larger_than_any_structure_has_a_wrong_unit(tmp_path):
     write_ply(tmp_path / "scans/hall.ply", surface() * 10_000.0)
     text = 'kind = "structure"\nunits = "{}"\ndesign = "design.ply"\n[[scan]]\nfile = "scans/hall.ply"\n'
     project(tmp_path, text.format("m"))
-    why = r"hall\.ply: scan 'hall' is .* km across .*read as m \(said by project\.toml\).* m if it were mm: say"
+    why = r"hall\.ply: scan 'hall': .* km .*read as m \(given in project\.toml\).* m if it were mm: give"
     with pytest.raises(InputError, match=why):
         folder.read_input(tmp_path)
     project(tmp_path, text.format("mm"))
     assert len(folder.read_input(tmp_path).scans) == 1
-    with pytest.raises(InputError, match=r"scan 'hall' is .*read as m \(asked for by --units\)"):
+    with pytest.raises(InputError, match=r"scan 'hall' .*read as m \(given by --units\)"):
         folder.read_input(tmp_path, "m")
     # The scan is right and of a piece only; the design alone is not.
     write_ply(tmp_path / "scans/hall.ply", surface() * 500.0)
     project(tmp_path, 'design_units = "m"\n' + text.format("mm"))
-    with pytest.raises(InputError, match=r"design\.ply: the design is 40 km across .*'design_units' or 'units'"):
+    with pytest.raises(InputError, match=r"design\.ply: the design: .* 40 km .*'design_units' or 'units'"):
         folder.read_input(tmp_path)
 
 
@@ -233,7 +233,7 @@ PROJECTS = {
     "key": ("colour = 1", "unknown key 'colour'; known are name, kind, units"),
     "scan key": (SCAN + "weight = 1", r"scan 1: unknown key 'weight'; known are file, component"),
     "kind": ('kind = "tower"', "unknown kind 'tower'; expected one of arch-bridge, space-frame"),
-    "other kind": ('kind = "space-frame"', "design is of kind arch-bridge, but project.toml says space-frame"),
+    "other kind": ('kind = "space-frame"', "expected a design of kind space-frame by project.toml, found arch-bridge"),
     "unit": ('units = "furlong"', "unknown unit 'furlong'; expected one of mm"),
     "type": ("name = 3", "expected a text as 'name', found 3"),
     "number": ('temperature_C = "warm"', "expected a number as 'temperature_C', found 'warm'"),

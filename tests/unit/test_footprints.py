@@ -8,6 +8,8 @@ import pytest
 from designgen.designs import structure
 from designgen.scanning import footprints, scanner
 from designgen.scanning import returns as scanning_returns
+from designgen.scanning.ray_kernels import Beam
+from designgen.scanning.raycast import Grid
 from designgen.scanning.surfaces import Builder
 
 QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
@@ -17,9 +19,9 @@ def mark_every_ray(monkeypatch):
     """Cut every ray of a strip into sub-rays."""
     mark = footprints.mark
 
-    def every(surface, t, thin, side, used, *rest):
-        edge, near = mark(surface, t, thin, side, used, *rest)
-        edge[side : side + used] = True
+    def every(surface, t, thin, used, margin, *rest):
+        edge, near = mark(surface, t, thin, used, margin, *rest)
+        edge[margin.side : margin.side + used] = True
         return edge, near
 
     monkeypatch.setattr(footprints, "mark", every)
@@ -191,10 +193,13 @@ def test_a_beam_on_two_plates_gives_a_mixed_pixel_by_the_device():
 def marked(surface, t, reach, side=0, used=None, across=0.01, level=1.0):
     """Mark the rays of a grid of steps of 10 mrad whose footprints reach so far, rad; nothing is thin."""
     rows = surface.shape[1]
-    return footprints.mark(
-        surface, t, np.full(t.shape, np.inf), side, len(surface) - 2 * side if used is None else used,
-        np.full(rows, side, np.int32), np.zeros(rows, bool), np.full(rows, level), 0.01, across, 1.0, (0.0, reach), 1.0,
-    )  # fmt: skip
+    beside = np.full(rows, side, np.int32)
+    margin = footprints.Margin(
+        side=side, cast=beside, marked=beside, whole=np.zeros(rows, bool), level=np.full(rows, level)
+    )
+    grid = Grid(step=0.01, lowest=0.0, rows=rows, columns=2.0 * np.pi / across)
+    used = len(surface) - 2 * side if used is None else used
+    return footprints.mark(surface, t, np.full(t.shape, np.inf), used, margin, grid, Beam(0.0, reach), 1.0, 1.0)
 
 
 def test_edges_are_where_a_neighbour_is_on_another_surface():

@@ -211,7 +211,7 @@ def a_frame():
         metric("balls called ok, lowest point over 3 mm off", 1.0, 0.0, unit="", step="spheres", method="ransac"),
     )
     execution, truth = of_frame(result, with_truth()[0])
-    scene = dataclasses.replace(execution.scene, units_reason="said by project.toml")
+    scene = dataclasses.replace(execution.scene, units_reason="given in project.toml")
     return dataclasses.replace(execution, scene=scene), ErrorReport(metrics, truth.true_radii, truth.true_centres)
 
 

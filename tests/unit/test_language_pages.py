@@ -17,8 +17,9 @@ from processor.defects.result import CLASSES
 from processor.defects.result import Result as Defects
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
+from processor.model import reason
 from processor.report import all_figures, comparison, page
-from processor.stitching.result import Held
+from processor.stitching.result import ControlPoints, ControlSightings
 from processor.validation import changes, night
 from processor.validation import summary as nights_summary
 from tests.support import step_results, validation_nights
@@ -52,7 +53,6 @@ STITCH_CHECKS = (
     "scans not placed", "station positions after datum fit, max", "station positions after datum fit, rms",
     "rotations after datum fit, max", "scans called ok, over 50 mm off", "pose components within their 95 % intervals",
     "station positions by control points, max",
-    "three-point: scans not placed",
 )  # fmt: skip
 DEFECT_CHECKS = (
     *(f"{kind}: missed of 2" for kind in CLASSES), "paper: step: missed of 1", "false alarms", "surface examined",
@@ -65,51 +65,60 @@ def stitched():
     first = step_results.stitching()
     other = dataclasses.replace(first, method="three-point")
     made = step_results.execution(("stitch", "automatic", "{}", first), ("stitch", "three-point", "{}", other),
-                                  names=first.scans)  # fmt: skip
-    return made, ErrorReport(checks_of("stitch", *STITCH_CHECKS))
+                                  names=first.scans.name)  # fmt: skip
+    of_other = metric("scans not placed", 1.0, step="stitch", method="three-point")
+    return made, ErrorReport((*checks_of("stitch", *STITCH_CHECKS), of_other))
 
 
 def controlled():
-    """Scans held by control points, with all that is said of these."""
+    """Scans fixed by control points, with all reasons about these."""
     first = step_results.stitching()
-    seen = (
-        ("P1", "P2", "P2"),
-        ("S1", "S1", "S2"),
-        np.ones((3, 3)),
-        np.ones((3, 3)),
-        np.full(3, 0.4),
-        np.array([1, 1, 0]),
+    sightings = ControlSightings(
+        point=("P1", "P2", "P2"), scan=("S1", "S1", "S2"), off=np.ones((3, 3)), sd=np.ones((3, 3)),
+        share=np.full(3, 0.4), used=[True, True, False],
+    )  # fmt: skip
+    suspects = (
+        reason("stitch.suspect-point", point="P2"),
+        reason("stitch.suspect-sighting", point="P2", scan="S2"),
+        reason("stitch.suspect-pose", scan="S2"),
     )
-    said = (
-        "held by 2 control points seen 3 times: residuals 1.2 mm (rms), redundancy 3",
-        "control points seen without a standard deviation are taken to be seen to 2.1 mm, as a single point of the "
-        "scans or a pick is",
-        "control point P2 left out: 52.0 mm off what the others say",
-        "the sighting of control point P2 in S2 left out: 52.0 mm off what the others say",
-        "what control points say is contradicted by control point P1, the sighting of control point P2 in S2, "
-        "the pose of S2, and it cannot be told by which: their standard deviations are taken to be 5.1 times as large",
-        "control points scatter more than they should: their standard deviations are taken to be 1.7 times as large",
-        "control points not used: 2 of them seen in scans that were placed, three that span a plane are needed",
-        "control points not used: all of them nearly on a line, three that span a plane are needed",
+    reasons = (
+        reason("stitch.control-used", points=2, sightings=3, rms_mm=1.2, redundancy=3),
+        reason("stitch.control-sd-assumed", sd_mm=2.1),
+        *(reason("stitch.control-left-out", suspect=suspect, size_mm=52.0) for suspect in suspects[:2]),
+        reason("stitch.control-undecided", suspects=suspects, factor=5.1),
+        reason("stitch.control-scatters", factor=1.7),
+        reason("stitch.control-not-used", shortage=reason("stitch.control-few", points=2)),
+        reason("stitch.control-not-used", shortage=reason("stitch.control-on-a-line")),
     )
-    scans = (*first.scan_message[:4], first.scan_message[-1],
-             "its control points say that it stands 170.0 mm elsewhere",
-             "2 common points with S1, all common points on a line with S2, three that span a plane are needed",
-             "no picks with other scans", "its picks lead to scans that are not placed")  # fmt: skip
-    first = dataclasses.replace(first, control=Held(*seen, 1, 3, 0.9), message="; ".join(said), scan_message=scans)
-    made = step_results.execution(("stitch", "automatic", "{}", first), names=first.scans)
+    few, line = reason("stitch.few-points", points=2), reason("stitch.points-on-a-line")
+    shortages = tuple(
+        reason("stitch.shortage-with-scan", shortage=shortage, scan=scan)
+        for shortage, scan in ((few, "S1"), (line, "S2"))
+    )
+    of_scans = (
+        *first.scans.reasons[:4],
+        first.scans.reasons[-1],
+        (reason("stitch.control-contradicts", shift_mm=170.0),),
+        (reason("stitch.too-few-picks", shortages=shortages),),
+        (reason("stitch.no-picks"),),
+        (reason("stitch.picks-of-unplaced"),),
+    )
+    control = ControlPoints(holds=True, redundancy=3, ratio=0.9, sightings=sightings)
+    scans = dataclasses.replace(first.scans, reasons=of_scans)
+    first = dataclasses.replace(first, control=control, reasons=reasons, scans=scans)
+    made = step_results.execution(("stitch", "automatic", "{}", first), names=first.scans.name)
     return made, ErrorReport(checks_of("stitch", *STITCH_CHECKS))
 
 
 def given():
     """Scans in the frame that the reference's given pose leads to."""
     first = step_results.stitching()
-    pose = np.array(first.T_project_scan)
+    pose = np.array(first.scans.T_project_scan)
     pose[:, :3, 3] += 5e5
-    made = step_results.execution(
-        ("stitch", "automatic", "{}", dataclasses.replace(first, T_project_scan=pose)), names=first.scans
-    )
-    return made, ErrorReport()
+    scans = dataclasses.replace(first.scans, T_project_scan=pose)
+    result = dataclasses.replace(first, scans=scans, frame="GLCS", T_GLCS_PRCS=pose[0])
+    return step_results.execution(("stitch", "automatic", "{}", result), names=scans.name), ErrorReport()
 
 
 def searched():
@@ -296,7 +305,7 @@ def test_the_line_of_a_night_in_chinese(told):
 def two_nights(out, lang):
     stored = {figure["name"] for case in validation_nights.Simulated(1).cases for figure in case["figures"]}
     figures_of = {name: (0.5, 0.2 if "bias" in name else None, "mm") for name in stored}
-    figures_of |= dict.fromkeys((*STITCH_CHECKS[:-1], *DEFECT_CHECKS), (1.0, None, "mm"))
+    figures_of |= dict.fromkeys((*STITCH_CHECKS, *DEFECT_CHECKS), (1.0, None, "mm"))
     rays = '[scan]\nmode = "rays"\nscanner = "phase"\nstep_mrad = 1.5\n'
     cases = (
         validation_nights.case(),

@@ -90,8 +90,8 @@ def test_picks_go_through_the_folder_and_tie_the_scans(tmp_path):
     np.testing.assert_allclose(read.picks.in_b, scene.picks.in_b, atol=1e-9)
     found = stitching_step.run(scene, stitching_step.Params(method="three-point", weak_mm=100.0, weak_mrad=10.0))
     T = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
-    base = found.T_project_scan[0] @ rigid.invert(T[scene.scans[0].name])
-    for scan, posed in zip(scene.scans, found.T_project_scan, strict=True):
+    base = found.scans.T_project_scan[0] @ rigid.invert(T[scene.scans[0].name])
+    for scan, posed in zip(scene.scans, found.scans.T_project_scan, strict=True):
         off = posed[:3, 3] - (base @ T[scan.name])[:3, 3]
         assert np.linalg.norm(off) < 60.0  # six points of 5 mm, some metres from the station
     assert all(metric.passed for metric in stitching_evaluation.check(scene, found, truth))  # no limit for a hand

@@ -41,14 +41,14 @@ FACES = ((0, 1, 3), (0, 3, 2), (4, 5, 7), (4, 7, 6), (0, 1, 5), (0, 5, 4), (2, 3
     ],
 )
 def test_names_mean_components(stem, expected):
-    assert component_names.meant(stem, ORDER) == expected
+    assert component_names.components(stem, ORDER) == expected
 
 
 def test_names_of_a_chinese_design():
     order = ["拱脚一", "拱肋一", "拱肋十二"]
-    assert component_names.meant("rib12", order) == ["拱肋十二"]
-    assert component_names.meant("拱肋1", order) == ["拱肋一"]
-    assert component_names.meant("foot", order) == ["拱脚一"]
+    assert component_names.components("rib12", order) == ["拱肋十二"]
+    assert component_names.components("拱肋1", order) == ["拱肋一"]
+    assert component_names.components("foot", order) == ["拱脚一"]
 
 
 @pytest.mark.parametrize(
@@ -125,7 +125,7 @@ def test_a_bridge_with_names_and_without(bridge):
     }
     assert [file for file, one in scans.items() if not one["sure"]] == ["scans/B.xyz"]  # both feet have its shape
     assert len(said["unsure"]) == 1
-    assert "of these it alone is left" in said["unsure"][0]
+    assert "the only one of them left" in said["unsure"][0]
     scene = folder.read_input(bridge)
     assert (scene.name, scene.kind, scene.units) == ("东桥", "arch-bridge", "m")
     assert {scan.name: scan.component for scan in scene.scans}["A"] == "rib1"
@@ -139,10 +139,10 @@ def test_a_name_that_its_shape_contradicts_is_said(bridge):
     assert found.units == "mm"
     one = next(one for one in found.scans if one.file == "rib1.xyz")
     assert (one.component, one.sure) == ("rib1", False)
-    assert "it has the shape of rib2" in one.reason
+    assert "the extents match rib2" in one.reason
     odd = next(one for one in found.scans if one.file == "odd.xyz")
     assert (odd.component, odd.sure) == ("", False)
-    assert any("no scan is taken for" in text and "foot1" in text for text in found.unsure)
+    assert any("no scan is assigned to" in text and "foot1" in text for text in found.unsure)
 
 
 @pytest.mark.parametrize(("unit", "factor"), [("m", 1.0), ("mm", 1000.0), ("cm", 100.0), ("inch", 1 / 0.0254)])
@@ -157,7 +157,7 @@ def test_no_design_and_a_scan_that_cannot_be_read(tmp_path):
     (tmp_path / "cut.ply").write_bytes(b"ply\nformat")
     done = init(tmp_path)
     assert done.exit_code == 0, done.output
-    assert "? design: none is there" in done.output
+    assert "? design: none found" in done.output
     assert "? cut.ply: cannot be read" in done.output
     text = (tmp_path / "project.toml").read_text("utf-8")
     assert '# station = "S2"' in text

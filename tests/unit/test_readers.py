@@ -252,7 +252,7 @@ def test_spherical_points_by_hand():
 
 SCANS = [path for path in sorted(DATA.rglob("*")) if path.suffix in readers.SUFFIXES] if DATA.is_dir() else []
 REFUSED = {
-    "bunny_8.pts": "declares 8 points, but more follow",
+    "bunny_8.pts": "expected 8 points as declared, found more",
     "multiple-and-transform.ptx": "not a rotation and a translation",
 }
 # Points of each scan, less those without a return, and the unit: as headers, line counts and grids say.

@@ -118,8 +118,8 @@ def test_a_pts_file_of_several_scans(tmp_path):
     ("text", "why"),
     [
         ("1,5,2,5,3,5\n1,6,2,6,3,6\n", "decimal signs of three"),
-        ("".join(f"{i} {i * 0.1:.2f} 2.5 3.5\n" for i in range(1, 9)), r"only counts \(1, 2, 3, ...\)"),
-        ("2\n1 2 3\n4 5 6\n7 8 9\n", "declares 2 points, but more follow"),
+        ("".join(f"{i} {i * 0.1:.2f} 2.5 3.5\n" for i in range(1, 9)), r"in the first column \(1, 2, 3, ...\)"),
+        ("2\n1 2 3\n4 5 6\n7 8 9\n", "expected 2 points as declared, found more"),
         ("2\n1 2 3\n4 5 6\n5\n7 8 9\n", "declares 5 points"),
     ],
 )

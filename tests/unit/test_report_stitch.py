@@ -7,11 +7,15 @@ import pytest
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
-from processor.model import Scan
+from processor.model import Scan, StepRun
 from processor.report import all_figures, page
+from processor.report.record_json import as_object
 from processor.report.stitching import view
+from processor.stitching.result import ControlPoints, ControlSightings
+from processor.store import store
 from tests.support import step_results
 from tests.support.browser import opened, picture, read_over
+from tests.support.records import assert_equal
 
 NAMES = ("S1", "S2", "S3", "<b>S4</b>")
 APART = 4.0  # mm of S2's wall behind that of S1
@@ -34,9 +38,33 @@ def made():
     ]
     scans.append(Scan(NAMES[3], wall[:100], np.zeros(3)))
     stitched = step_results.stitching((*NAMES, "S5", "S6", "S7", "S8", "S9"))
-    result = dataclasses.replace(stitched, T_project_scan=poses, position=poses[:, :3, 3])
+    placed = dataclasses.replace(stitched.scans, T_project_scan=poses, position=poses[:, :3, 3])
+    result = dataclasses.replace(stitched, scans=placed)
     execution = step_results.execution(("stitch", "automatic", "{}", result), names=NAMES)
     return dataclasses.replace(execution, scene=dataclasses.replace(execution.scene, scans=tuple(scans)))
+
+
+def test_a_result_comes_back_from_its_file(tmp_path):
+    sightings = ControlSightings(
+        point=("P1", "=P2"), scan=("S1", "S2"), off=np.ones((2, 3)), sd=np.ones((2, 3)), share=np.ones(2),
+        used=[True, False],
+    )  # fmt: skip
+    control = ControlPoints(holds=True, redundancy=3, ratio=0.9, sightings=sightings)
+    result = dataclasses.replace(step_results.stitching(), control=control, frame="GLCS", T_GLCS_PRCS=np.eye(4))
+    store.write_results(tmp_path / "r.h5", (StepRun("stitch", "automatic", "{}", result),), {})
+    (back,) = store.read_results(tmp_path / "r.h5", {"stitch": type(result)})
+    assert_equal(back.result, result)
+    assert store.problems(tmp_path / "r.h5") == []
+
+
+def test_a_result_as_json_has_names_truth_values_and_nulls():
+    written = as_object(step_results.stitching())
+    assert written["closures"][0]["loop"] == ["S1", "S2", "S3", "S1"]
+    assert [bool(pair["used"]) for pair in written["pairs"]] == [False, True, True, True, True, True]
+    assert written["scans"][0]["T_rival_scan"] is None
+    assert (written["scans"][1]["from"], written["scans"][1]["to"]) == ("S2", "PRCS")
+    assert written["scans"][1]["reasons"][0]["code"] == "stitch.free-space"
+    assert "control" not in written
 
 
 def test_each_point_says_how_far_the_other_scan_lies(made):

@@ -10,9 +10,10 @@ import trimesh
 from scipy.optimize import brentq, minimize_scalar
 
 from designgen.designs import arch_bridge, arch_part, space_frame, structure
+from designgen.designs.patch import Patch
 from designgen.scanning import clutter, frame_surfaces, ray_kernels, raycast, scanner, survey
 from designgen.scanning import returns as scanning_returns
-from designgen.scanning.surfaces import Builder, Patch
+from designgen.scanning.surfaces import Builder
 from processor.model import UsageError
 
 QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})

@@ -15,7 +15,7 @@ from processor.model import InputError, Scan, Scene, StationTruth, Truth, UsageE
 from processor.report import results_folder
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
-from processor.stitching.result import Held
+from processor.stitching.result import ControlPoints, Scans
 from processor.store import store
 from tests.support import stitch_clouds
 from tests.support.stitch_clouds import four
@@ -25,7 +25,7 @@ def errors(result, T):
     """Errors of positions (k, 3), mm, and of rotations (k,), mrad, relative to the first scan."""
     base = np.linalg.inv(T[0])
     shifts, turns = [], []
-    for pose, true in zip(result.T_project_scan, T, strict=True):
+    for pose, true in zip(result.scans.T_project_scan, T, strict=True):
         want = base @ true
         shifts.append(pose[:3, 3] - want[:3, 3])
         turns.append(1e3 * Rotation.from_matrix(pose[:3, :3] @ want[:3, :3].T).magnitude())
@@ -42,28 +42,28 @@ def test_four_scans_of_a_room_are_registered(room):
     T, _, result = room
     assert result.status == "ok"
     assert result.frame == "PRCS"
-    assert set(result.scan_status) == {"ok"}
+    assert set(result.scans.status) == {"ok"}
     shift, turn = errors(result, T)
     # With 78 thousand points of 2 mm in a scan the walls alone determine a pose to a few hundredths of a millimetre.
     assert np.abs(shift).max() < 0.2
     assert turn.max() < 0.05
-    assert result.used.all()
-    assert len(result.pair_a) == 6
-    assert len(result.loops) == 3
-    assert result.closure_mm.max() < 0.5
+    assert result.pairs.used.all()
+    assert len(result.pairs) == 6
+    assert len(result.closures) == 3
+    assert result.closures.mm.max() < 0.5
 
 
 def test_covariance_is_that_of_a_left_perturbation_in_the_project_frame(room):
     """The covariance of a point follows from it, and agrees with the stated one of the scanner's position."""
-    _, _, result = room
+    scans = room[2].scans
     for T, C, position, sd in zip(
-        result.T_project_scan[1:], result.covariance[1:], result.position[1:], result.position_sd[1:], strict=True
+        scans.T_project_scan[1:], scans.covariance[1:], scans.position[1:], scans.position_sd[1:], strict=True
     ):
         np.testing.assert_allclose(T[:3, 3], position, atol=1e-9)
         x, y, z = position
         J = np.hstack([np.array([[0, z, -y], [-z, 0, x], [y, -x, 0]]), np.eye(3)])
         np.testing.assert_allclose(np.sqrt(np.diag(J @ C @ J.T)), sd, rtol=1e-4)
-    assert not result.covariance[0].any()
+    assert not scans.covariance[0].any()
 
 
 def test_result_is_independent_of_the_frames_of_the_scans(room):
@@ -81,8 +81,9 @@ def test_result_is_independent_of_the_frames_of_the_scans(room):
         back.append(D)
     result = stitching_step.run(Scene("room", "structure", tuple(turned)), stitching_step.Params())
     assert result.status == "ok"
-    poses = [np.linalg.inv(back[0]) @ T_s @ D for T_s, D in zip(result.T_project_scan, back, strict=True)]
-    shift, turn = errors(dataclasses.replace(first, T_project_scan=np.array(poses)), T)
+    poses = [np.linalg.inv(back[0]) @ T_s @ D for T_s, D in zip(result.scans.T_project_scan, back, strict=True)]
+    table = dataclasses.replace(first.scans, T_project_scan=np.array(poses))
+    shift, turn = errors(dataclasses.replace(first, scans=table), T)
     assert np.abs(shift).max() < 0.2
     assert turn.max() < 0.05
 
@@ -102,7 +103,7 @@ def test_result_is_independent_of_the_order_of_points(room):
             )
         )
     again = stitching_step.run(Scene("room", "structure", tuple(mixed)), stitching_step.Params())
-    np.testing.assert_allclose(again.T_project_scan, first.T_project_scan, rtol=0.0, atol=1e-4)
+    np.testing.assert_allclose(again.scans.T_project_scan, first.scans.T_project_scan, rtol=0.0, atol=1e-4)
 
 
 def test_a_room_with_a_symmetry_is_ambiguous():
@@ -113,10 +114,13 @@ def test_a_room_with_a_symmetry_is_ambiguous():
     # Levelled: upside down the room would fit as well.
     result = stitching_step.run(Scene("empty", "structure", scans), stitching_step.Params(levelled_mrad=20.0))
     assert result.status == "partial"
-    assert result.scan_status[1] == "ambiguous"
+    assert result.scans.status[1] == "ambiguous"
     # Either the pose or its rival is right.
     true = np.linalg.inv(T[0]) @ T[1]
-    off = [np.linalg.norm(poses[1][:3, 3] - true[:3, 3]) for poses in (result.T_project_scan, result.T_rival_scan)]
+    off = [
+        np.linalg.norm(poses[1][:3, 3] - true[:3, 3])
+        for poses in (result.scans.T_project_scan, result.scans.T_rival_scan)
+    ]
     assert min(off) < 5.0
 
 
@@ -130,7 +134,7 @@ def test_scans_of_different_places_are_never_called_ok():
         things=((np.array([-2000.0, 3000.0, 0.0]), np.array([-500.0, 4000.0, 2600.0])),),
     )
     result = stitching_step.run(Scene("two", "structure", (scans[0], other)), stitching_step.Params())
-    assert result.scan_status[1] != "ok"
+    assert result.scans.status[1] != "ok"
     assert result.status != "ok"
 
 
@@ -139,7 +143,7 @@ def test_scans_without_a_grid_are_registered():
     result = stitching_step.run(Scene("room", "structure", scans), stitching_step.Params(reference="S2"))
     assert result.reference == "S2"
     base = np.linalg.inv(T[1])
-    for pose, true in zip(result.T_project_scan, T, strict=True):
+    for pose, true in zip(result.scans.T_project_scan, T, strict=True):
         np.testing.assert_allclose(pose[:3, 3], (base @ true)[:3, 3], atol=0.3)
 
 
@@ -151,9 +155,9 @@ def test_a_given_pose_of_the_reference_defines_the_project_frame():
     assert stitching_step.applies(scene)
     result = stitching_step.run(scene, stitching_step.Params())
     want = given @ np.linalg.inv(T[0]) @ T[2]
-    np.testing.assert_allclose(result.T_project_scan[0], given)
+    np.testing.assert_allclose(result.scans.T_project_scan[0], given)
     assert result.frame == "GLCS"
-    np.testing.assert_allclose(result.position[2], want[:3, 3], atol=0.5)
+    np.testing.assert_allclose(result.scans.position[2], want[:3, 3], atol=0.5)
 
 
 def test_bad_input_is_rejected_with_a_message():
@@ -186,7 +190,7 @@ def test_scans_without_usable_structure_are_not_ok_and_do_not_crash(kind):
     }[kind]
     scans = tuple(Scan(name, made()) for name in ("a", "b"))
     result = stitching_step.run(Scene("s", "structure", scans), stitching_step.Params())
-    assert result.scan_status[1] != "ok"
+    assert result.scans.status[1] != "ok"
     assert result.status in ("partial", "failed")
 
 
@@ -198,7 +202,7 @@ def test_intervals_cover_over_seeds():
         T, scans = four(seed, step_mrad=20.0)
         result = stitching_step.run(Scene("room", "structure", scans), stitching_step.Params())
         shift, _ = errors(result, T)
-        pulls.append(shift[1:] / result.position_sd[1:])
+        pulls.append(shift[1:] / result.scans.position_sd[1:])
     assert (np.abs(pulls) < 1.96).mean() > 0.8
     assert 0.4 < np.sqrt(np.mean(np.square(pulls))) < 1.5
 
@@ -219,8 +223,8 @@ def test_a_run_writes_all_reports(room, tmp_path):
     assert np.array(written["scans"][1]["covariance"]).shape == (6, 6)
     rows = (tmp_path / "out" / "stitch.csv").read_text().splitlines()
     poses = np.array([[float(x) for x in row.split(",")[2:18]] for row in rows[1:]]).reshape(-1, 4, 4)
-    np.testing.assert_array_equal(poses, execution.runs[0].result.T_project_scan)
-    np.testing.assert_allclose(poses, result.T_project_scan, atol=1e-2)  # a scene file rounds to 0.01 mm
+    np.testing.assert_array_equal(poses, execution.runs[0].result.scans.T_project_scan)
+    np.testing.assert_allclose(poses, result.scans.T_project_scan, atol=1e-2)  # a scene file rounds to 0.01 mm
     names = {path.name for path in (tmp_path / "out").rglob("*")}
     assert names >= {
         "stitch-scans.csv",
@@ -238,11 +242,12 @@ def checks_of(T, true, status, **more):
     """Checks of given poses (k, 4, 4) against true ones, by name."""
     k = len(T)
     names = tuple(f"S{i + 1}" for i in range(k))
-    made = stitching_step.Result(
-        "ok", "automatic", reference="S1", scans=names, scan_status=status, scan_message=("",) * k, T_project_scan=T,
-        position=T[:, :3, 3], position_sd=np.full((k, 3), 1.0), rotation_sd=np.full((k, 3), 1e-4),
-        covariance=np.zeros((k, 6, 6)), rivalry=np.zeros(k), T_rival_scan=np.full((k, 4, 4), np.nan), **more,
+    scans = Scans(
+        name=names, status=status, reasons=((),) * k, T_project_scan=T, position=T[:, :3, 3],
+        position_sd=np.full((k, 3), 1.0), rotation_sd=np.full((k, 3), 1e-4), covariance=np.zeros((k, 6, 6)),
+        rivalry=np.zeros(k), T_rival_scan=np.full((k, 4, 4), np.nan), from_frame=names, to_frame=names,
     )  # fmt: skip
+    made = stitching_step.Result(status="ok", method="automatic", reference="S1", scans=scans, **more)
     truth = Truth(stations=StationTruth(names, true))
     return {metric.name: metric.value for metric in stitching_evaluation.check(Scene("s", "structure"), made, truth)}
 
@@ -262,7 +267,7 @@ def test_poses_by_control_points_are_checked_in_the_control_frame():
     T = true.copy()
     T[:, 0, 3] += 3.0  # common to all, which a datum fit would absorb
     free = checks_of(T, true, ("ok",) * 4)
-    controlled = checks_of(T, true, ("ok",) * 4, control=Held(holds=1))
+    controlled = checks_of(T, true, ("ok",) * 4, control=ControlPoints(holds=True))
     assert "station positions by control points, max" not in free
     assert controlled["station positions by control points, max"] == pytest.approx(3.0)
     assert controlled["station positions after datum fit, max"] == pytest.approx(0.0, abs=1e-6)
@@ -280,11 +285,11 @@ def test_two_real_scans_of_a_room_are_registered():
     result = stitching_step.run(Scene("rooms", "structure", scans), stitching_step.Params())
     # The sensor's errors are common to whole walls: an adjustment that takes them as independent would state 0.6 mm.
     # Plain ICP on halves of the room scatters by 5 to 15 mm and several mrad.
-    assert result.scan_status[1] == "weak"
-    assert "sure to" in result.scan_message[1]
-    assert 3.0 < 1.96 * result.position_sd[1].max() < 30.0
-    assert 1.0 < 1960.0 * result.rotation_sd[1].max() < 15.0
-    T = result.T_project_scan[1].copy()
+    assert result.scans.status[1] == "weak"
+    assert [one.code for one in result.scans.reasons[1]] == ["stitch.uncertain-pose"]
+    assert 3.0 < 1.96 * result.scans.position_sd[1].max() < 30.0
+    assert 1.0 < 1960.0 * result.scans.rotation_sd[1].max() < 15.0
+    T = result.scans.T_project_scan[1].copy()
     # The robot's odometry, published with the data, gives 0.69 rad about the vertical.
     assert np.arctan2(T[1, 0], T[0, 0]) == pytest.approx(0.69, abs=0.05)
     o3d = pytest.importorskip("open3d")

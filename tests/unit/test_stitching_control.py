@@ -1,4 +1,4 @@
-"""Scans held by control points: by hand, by another solver, by draws, and from a folder to its tables."""
+"""Scans fixed by control points: by hand, by another solver, by draws, and from a folder to its tables."""
 
 import csv
 import dataclasses
@@ -13,7 +13,8 @@ from scipy.stats import chi2
 
 from processor.cli import run
 from processor.geometry import rigid
-from processor.model import Control, InputError
+from processor.model import Control, InputError, reason
+from processor.report.record_json import as_object
 from processor.stitching import step as stitching_step
 from processor.stitching.fine import control_points
 from tests.support.stitch_clouds import four, pose
@@ -58,8 +59,14 @@ def toy(seed, count=6, wrong=None, known_sd=0.5, seen_sd=0.8, each=2):
     return T, C, true, Control(tuple(f"P{i}" for i in range(count)), known, np.full(count, known_sd), *rows)
 
 
-def held(T, C, points, point_mm=1.0):
-    return control_points.hold(points, NAMES[: len(T)], T, C, np.zeros((len(T), 3)), point_mm)
+def adjusted(T, C, points, point_mm=1.0):
+    return control_points.adjust(points, NAMES[: len(T)], T, C, np.zeros((len(T), 3)), point_mm)
+
+
+def suspects(found):
+    """Kind and names of what was left out."""
+    out = [one.values["suspect"] for one in found.reasons if one.code == "stitch.control-left-out"]
+    return [(one.code, one.values) for one in out]
 
 
 def in_site(found):
@@ -73,13 +80,15 @@ def test_a_square_worked_by_hand():
     known = square + np.array([1000.0, 2000.0, 50.0]) + np.outer(high, [0.0, 0.0, 1.0])
     rows = np.arange(4), np.zeros(4, int), np.full(4, -1), square, np.full(4, 1.2)
     points = Control(("A", "B", "C", "D"), known, np.full(4, 1.6), *rows)  # of both together 2 mm
-    found = held(np.eye(4)[None], np.zeros((6, 6)), points)
+    found = adjusted(np.eye(4)[None], np.zeros((6, 6)), points)
     np.testing.assert_allclose(in_site(found)[0, :3, 3], [1000.0, 2000.0, 50.0], atol=1e-9)
-    np.testing.assert_allclose(found.held.off, np.outer(high, [0.0, 0.0, 1.0]), atol=1e-6)
-    np.testing.assert_allclose(found.held.sd, np.tile(2.0 * np.sqrt([5 / 8, 5 / 8, 1 / 4]), (4, 1)), rtol=1e-6)
-    np.testing.assert_allclose(found.held.share, 0.5, rtol=1e-6)
-    assert found.held.redundancy == 6
-    assert found.held.ratio == pytest.approx(4.0 / 2.0**2 / 6.0)
+    np.testing.assert_allclose(found.control.sightings.off, np.outer(high, [0.0, 0.0, 1.0]), atol=1e-6)
+    np.testing.assert_allclose(
+        found.control.sightings.sd, np.tile(2.0 * np.sqrt([5 / 8, 5 / 8, 1 / 4]), (4, 1)), rtol=1e-6
+    )
+    np.testing.assert_allclose(found.control.sightings.share, 0.5, rtol=1e-6)
+    assert found.control.redundancy == 6
+    assert found.control.ratio == pytest.approx(4.0 / 2.0**2 / 6.0)
     # The pose: 2 mm by four points, and 2 mm at 100 mm.
     sd = np.sqrt(np.diag(found.covariance))
     np.testing.assert_allclose(sd, [1e-2, 1e-2, 2.0 / np.sqrt(8e4), 1.0, 1.0, 1.0], rtol=1e-6)
@@ -88,7 +97,7 @@ def test_a_square_worked_by_hand():
 def test_the_adjustment_is_that_of_another_solver():
     """All unknowns at once by scipy: the frame, the scans' motions, the points' places; its poses and covariance."""
     T, C, _, points = toy(3)
-    found = held(T, C, points)
+    found = adjusted(T, C, points)
     whiten = np.linalg.inv(np.linalg.cholesky(C[6:, 6:]))
     start = found.M @ T[0]
 
@@ -111,7 +120,7 @@ def test_the_adjustment_is_that_of_another_solver():
                           xtol=1e-15, ftol=1e-15, gtol=1e-15)  # fmt: skip
     np.testing.assert_allclose(found.T[:, :3, 3], poses(other.x)[:, :3, 3], atol=2e-4)
     np.testing.assert_allclose(found.T[:, :3, :3], poses(other.x)[:, :3, :3], atol=1e-8)
-    assert found.held.ratio * found.held.redundancy == pytest.approx(2.0 * other.cost, rel=1e-5)
+    assert found.control.ratio * found.control.redundancy == pytest.approx(2.0 * other.cost, rel=1e-5)
     covariance = np.linalg.inv(other.jac.T @ other.jac)
 
     # Turns and shifts of the scans in the site, by numbers, through the other solver's covariance.
@@ -135,15 +144,15 @@ def test_intervals_hold_over_draws_and_nothing_is_doubted_without_a_blunder():
     inside, squares, normal, doubted = [], [], [], 0
     for seed in range(draws):
         T, C, true, points = toy(seed)
-        found = held(T, C, points)
+        found = adjusted(T, C, points)
         off = in_site(found)[:, :3, 3] - true[:, :3, 3]
         turn = [Rotation.from_matrix(a[:3, :3] @ b[:3, :3].T).as_rotvec()
                 for a, b in zip(found.T, true, strict=True)]  # fmt: skip
         sd = np.sqrt(np.diag(found.covariance)).reshape(-1, 6)
         inside.append(np.abs(np.hstack([turn, off])) < 1.96 * sd)
-        squares.append(found.held.ratio * found.held.redundancy)
-        normal.append(found.held.off / found.held.sd)
-        doubted += not found.held.used.all() or found.held.loosened > 1.0
+        squares.append(found.control.ratio * found.control.redundancy)
+        normal.append(found.control.sightings.off / found.control.sightings.sd)
+        doubted += not found.control.sightings.used.all() or found.control.loosened > 1.0
     assert 0.935 < np.mean(inside) < 0.965
     assert np.all(np.mean(inside, axis=0) > 0.90)
     assert np.mean(squares) == pytest.approx(12 * 3 - 6, rel=0.05)
@@ -157,7 +166,7 @@ def test_control_points_correct_the_network_too():
     with_control, alone = [], []
     for seed in range(30):
         T, C, true, points = toy(seed, known_sd=0.1, seen_sd=0.1, count=12)
-        found = held(T, C, points)
+        found = adjusted(T, C, points)
         with_control.append((in_site(found) - true)[1:, :3, 3])
         alone.append((SITE @ T - true)[1:, :3, 3])
     assert np.std(with_control) < 0.25 * np.std(alone)
@@ -167,30 +176,36 @@ def test_control_points_correct_the_network_too():
 def test_a_point_with_a_blunder_is_named_and_left_out(off):
     for seed in range(5):
         T, C, true, points = toy(seed, wrong=(2, [0.6 * off, 0.0, -0.8 * off]))
-        found = held(T, C, points)
-        assert found.said[1].startswith("control point P2 left out: ")
-        assert len(found.said) == 2
-        np.testing.assert_array_equal(found.held.used, [name != "P2" for name in found.held.points])
-        assert float(found.said[1].split(": ")[1].split(" mm")[0]) == pytest.approx(off, rel=0.35)
+        found = adjusted(T, C, points)
+        assert suspects(found) == [("stitch.suspect-point", {"point": "P2"})]
+        assert len(found.reasons) == 2
+        np.testing.assert_array_equal(
+            found.control.sightings.used, [name != "P2" for name in found.control.sightings.point]
+        )
+        assert found.reasons[1].values["size_mm"] == pytest.approx(off, rel=0.35)
         assert np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]).max() < 6.0
-        left_out = found.held.used == 0
-        assert (np.linalg.norm(found.held.off[left_out] / found.held.sd[left_out], axis=1) > 3.0).all()
+        left_out = found.control.sightings.used == 0
+        assert (
+            np.linalg.norm(found.control.sightings.off[left_out] / found.control.sightings.sd[left_out], axis=1) > 3.0
+        ).all()
 
 
 def test_two_points_with_blunders_are_left_out_one_after_the_other():
     T, C, _, points = toy(6, count=8, wrong=([1, 5], [[40.0, 0.0, 0.0], [0.0, -25.0, 10.0]]))
-    found = held(T, C, points)
-    assert [one.split(" left out")[0] for one in found.said[1:]] == ["control point P1", "control point P5"]
+    found = adjusted(T, C, points)
+    assert suspects(found) == [("stitch.suspect-point", {"point": name}) for name in ("P1", "P5")]
+    assert len(found.reasons) == 3
 
 
 def test_a_sighting_with_a_blunder_is_left_out_alone():
     T, C, _, points = toy(1, each=3)
     seen = points.seen.copy()
     seen[4] += [0.0, 60.0, 0.0]
-    found = held(T, C, dataclasses.replace(points, seen=seen))
+    found = adjusted(T, C, dataclasses.replace(points, seen=seen))
     scan = NAMES[points.scan[4]]
-    assert found.said[1] == f"the sighting of control point P1 in {scan} left out: {found.said[1].split(': ')[1]}"
-    np.testing.assert_array_equal(found.held.used, np.arange(18) != 4)
+    assert suspects(found) == [("stitch.suspect-sighting", {"point": "P1", "scan": scan})]
+    assert len(found.reasons) == 2
+    np.testing.assert_array_equal(found.control.sightings.used, np.arange(18) != 4)
 
 
 def test_a_scan_that_its_control_points_contradict_is_weak():
@@ -198,19 +213,20 @@ def test_a_scan_that_its_control_points_contradict_is_weak():
     T, C, _, points = toy(5, count=8, each=3)
     wrong = T.copy()
     wrong[2, :3, 3] += [150.0, -80.0, 30.0]
-    found = held(wrong, C, points)
-    assert [bool(one) for one in found.against] == [False, False, True, False]
-    assert found.against[2].startswith("its control points say that it stands 17")
-    np.testing.assert_array_equal(found.held.used, points.scan != 2)
+    found = adjusted(wrong, C, points)
+    assert [one is not None for one in found.contradictions] == [False, False, True, False]
+    assert found.contradictions[2].code == "stitch.control-contradicts"
+    assert 169.95 < found.contradictions[2].values["shift_mm"] < 179.95
+    np.testing.assert_array_equal(found.control.sightings.used, points.scan != 2)
 
 
 def test_where_it_cannot_be_told_which_point_is_wrong_intervals_hold_it():
     """Three points: one of them 40 mm off, and any of them may be it."""
     T, C, true, points = toy(2, count=3, wrong=(0, [40.0, 0.0, 0.0]))
-    found = held(T, C, points)
-    assert "it cannot be told by which" in found.said[1]
-    assert found.held.used.all()
-    assert found.held.loosened > 5.0
+    found = adjusted(T, C, points)
+    assert found.reasons[1].code == "stitch.control-undecided"
+    assert found.control.sightings.used.all()
+    assert found.control.loosened > 5.0
     sd = np.sqrt(np.diag(found.covariance)).reshape(-1, 6)[:, 3:]
     assert (np.abs(in_site(found)[:, :3, 3] - true[:, :3, 3]) < 3.0 * sd).all()
 
@@ -219,32 +235,31 @@ def test_sightings_that_do_not_say_how_sure_they_are_count_as_single_points():
     """Taken as exact, they would contradict one another; as sure as stated, they give what stated ones do."""
     T, C, _, points = toy(3, seen_sd=0.8)
     blank = dataclasses.replace(points, seen_sd=np.zeros(len(points.seen_sd)))
-    stated, found = held(T, C, points), held(T, C, blank, point_mm=0.8)
+    stated, found = adjusted(T, C, points), adjusted(T, C, blank, point_mm=0.8)
     np.testing.assert_array_equal(found.T, stated.T)
-    assert "taken to be seen to 0.8 mm" in found.said[1]
-    assert (found.held.share > 0.0).all()
-    assert (found.held.share < 1.0).all()
+    assert found.reasons[1] == reason("stitch.control-sd-assumed", sd_mm=0.8)
+    assert (found.control.sightings.share > 0.0).all()
+    assert (found.control.sightings.share < 1.0).all()
 
 
 @pytest.mark.parametrize("count", [1, 2])
 def test_one_or_two_points_hold_nothing(count):
     T, C, _, points = toy(0, count=count)
-    found = held(T, C, points)
-    assert found.said == (
-        f"control points not used: {count} of them seen in scans that were placed, three that span a plane are needed",
-    )
+    found = adjusted(T, C, points)
+    shortage = reason("stitch.control-few", points=count)
+    assert found.reasons == (reason("stitch.control-not-used", shortage=shortage),)
     np.testing.assert_array_equal(found.T, T)
     np.testing.assert_array_equal(found.covariance, C)
-    assert not found.held.used.any()
-    assert not found.held.holds
+    assert not found.control.sightings.used.any()
+    assert not found.control.holds
 
 
 def test_points_on_a_line_cannot_turn_the_scans_round_it():
     """Three points 3 mm off a line: by noise alone the scans might lie either way round."""
     T, C, _, points = toy(0, count=4, each=1)
     places = SITE[:3, 3] + np.array([[0.0, 0.0, 0.0], [5e3, 3.0, 0.0], [1e4, 0.0, 0.0], [2e4, 0.0, 3.0]])
-    found = held(T, C, dataclasses.replace(points, positions=places))
-    assert "all of them nearly on a line" in found.said[0]
+    found = adjusted(T, C, dataclasses.replace(points, positions=places))
+    assert found.reasons == (reason("stitch.control-not-used", shortage=reason("stitch.control-on-a-line")),)
 
 
 def test_scans_that_were_not_placed_neither_hold_nor_hinder():
@@ -252,18 +267,18 @@ def test_scans_that_were_not_placed_neither_hold_nor_hinder():
     T, C = T.copy(), C.copy()
     T[3] = np.nan
     C[18:] = C[:, 18:] = np.nan
-    found = held(T, C, points)
+    found = adjusted(T, C, points)
     assert np.isnan(found.T[3]).all()
     assert np.isnan(found.covariance[18:]).all()
     assert np.isfinite(found.covariance[:18, :18]).all()
-    np.testing.assert_array_equal(found.held.used, points.scan != 3)
-    assert np.isnan(found.held.off[points.scan == 3]).all()
+    np.testing.assert_array_equal(found.control.sightings.used, points.scan != 3)
+    assert np.isnan(found.control.sightings.off[points.scan == 3]).all()
 
 
 def test_control_points_in_other_units_are_refused():
     T, C, _, points = toy(0)
     with pytest.raises(InputError, match=r"units mixed up \(m and mm\)"):
-        held(T, C, dataclasses.replace(points, positions=points.positions / 1000.0))
+        adjusted(T, C, dataclasses.replace(points, positions=points.positions / 1000.0))
 
 
 # --- the step -------------------------------------------------------------------------------------------------------
@@ -289,17 +304,19 @@ def test_picked_scans_are_laid_to_control_points():
     result = stitching_step.run(dataclasses.replace(scene, control=points), stitching_step.Params(method="three-point"))
     want = SITE @ T
     assert (free.frame, result.frame) == ("PRCS", "GLCS")
-    off = result.T_project_scan[:, :3, 3] - want[:, :3, 3]
+    scans = result.scans
+    off = scans.T_project_scan[:, :3, 3] - want[:, :3, 3]
     assert np.abs(off).max() < 4.0
     middle = [scan.points.mean(axis=0) for scan in scene.scans]
-    at = [rigid.apply(a, p) - rigid.apply(b, p) for a, b, p in zip(result.T_project_scan, want, middle, strict=True)]
-    assert (np.abs(at) < 4.0 * result.position_sd).all()
-    assert (result.position_sd > 0.0).all()  # the reference is not held
+    at = [rigid.apply(a, p) - rigid.apply(b, p) for a, b, p in zip(scans.T_project_scan, want, middle, strict=True)]
+    assert (np.abs(at) < 4.0 * scans.position_sd).all()
+    assert (scans.position_sd > 0.0).all()  # the reference is not held
     assert result.control.redundancy == 3 * 30 - 6
-    assert result.message.startswith("held by 6 control points seen 30 times: residuals ")
+    used = result.reasons[0]
+    assert (used.code, used.values["points"], used.values["sightings"]) == ("stitch.control-used", 6, 30)
     # the pairs' own poses are as they were
-    np.testing.assert_array_equal(result.T_a_b, free.T_a_b)
-    np.testing.assert_array_equal(result.closure_mm, free.closure_mm)
+    np.testing.assert_array_equal(result.pairs.T_a_b, free.pairs.T_a_b)
+    np.testing.assert_array_equal(result.closures.mm, free.closures.mm)
 
 
 def test_without_control_points_nothing_changes():
@@ -309,9 +326,8 @@ def test_without_control_points_nothing_changes():
         stitching_step.run(dataclasses.replace(scene, control=one), stitching_step.Params(method="three-point"))
         for one in (None, few)
     ]
-    for field in dataclasses.fields(results[0]):
-        if field.name not in ("control", "message"):
-            np.testing.assert_array_equal(*(getattr(one, field.name) for one in results))
+    without, with_few = (as_object(dataclasses.replace(one, control=None, reasons=())) for one in results)
+    np.testing.assert_equal(with_few, without)
     assert results[0].control is None
 
 
@@ -339,10 +355,10 @@ def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
     ran = CliRunner().invoke(run.commands, ["run", str(folder), "-o", str(tmp_path / "out"), "--steps", "stitch"])
     assert ran.exit_code in (0, 1), ran.output
     said = ran.output.replace("\n", " ")
-    assert "held by 5 control points seen 20 times" in said
-    assert "control point T3 left out: 7" in said
-    assert "without a standard deviation are taken to be seen to 1." in said  # noise of 2 mm, along the rays
-    assert "cannot be told" not in said
+    assert "fixed by 5 control points in 20 sightings" in said
+    assert "control point T3 is left out: it is 7" in said
+    assert "without a standard deviation are given 1." in said  # noise of 2 mm, along the rays
+    assert "cannot be decided" not in said
     found = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
     at = np.array([one["T_project_scan"] for one in found["scans"]])
     np.testing.assert_allclose(at[:, :3, 3], (SITE @ T)[:, :3, 3], atol=1.5)

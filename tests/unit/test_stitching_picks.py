@@ -10,9 +10,16 @@ from processor.model import InputError, Picks, Scan, Scene
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
 from processor.stitching import three_point
+from processor.stitching.common_points import UnitSlip
 from tests.support.stitch_clouds import four, pose
 
+SCALES = {"stitch.scale", "stitch.scale-by-blunder", "stitch.scale-of-units"}
+BLUNDERS = {"stitch.scale-by-blunder", "stitch.picks-scatter"}
 CORNERS = np.array([[0.0, 0.0, 0.0], [9000.0, 0.0, 500.0], [2000.0, 7000.0, 4000.0], [8000.0, 6000.0, 100.0]])
+
+
+def codes(reasons):
+    return [reason.code for reason in reasons]
 
 
 def test_three_points_worked_by_hand():
@@ -39,11 +46,12 @@ def test_seven_parameters_absorb_a_scale_that_six_show():
 
 
 def test_likely_cause_of_a_scale():
-    assert "m and mm" in three_point.verdict(1000.3, 1e-4, 1000.0)
-    assert "inches" in three_point.verdict(1.0 / 25.4, 1e-6, 1000.0)
-    assert "blunder" in three_point.verdict(1.02, 1e-4, 1000.0)
-    assert "temperature" in three_point.verdict(1.00024, 1e-5, 1000.0)
-    assert three_point.verdict(1.0001, 1e-4, 1000.0) == ""
+    slips = [three_point.cause_of_scale(scale, 1e-6, 1000.0) for scale in (1000.3, 1.0 / 25.4)]
+    assert [slip.code for slip in slips] == ["stitch.scale-of-units"] * 2
+    assert [slip.values["units"] for slip in slips] == [UnitSlip.M_MM, UnitSlip.INCHES_MM]
+    assert three_point.cause_of_scale(1.02, 1e-4, 1000.0).code == "stitch.scale-by-blunder"
+    assert three_point.cause_of_scale(1.00024, 1e-5, 1000.0).code == "stitch.scale"
+    assert three_point.cause_of_scale(1.0001, 1e-4, 1000.0) is None
 
 
 @pytest.mark.parametrize(
@@ -90,16 +98,18 @@ def test_a_chain_of_all_scans_with_picks_of_5_mm():
         T, scene = network(seed, 5.0)
         result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
         assert result.status in ("ok", "partial")  # partial if a scan is weak by chance
-        assert "failed" not in result.scan_status
+        assert "failed" not in result.scans.status
         want = np.linalg.inv(T[0]) @ T
-        off = result.T_project_scan[1:, :3, 3] - want[1:, :3, 3]
+        off = result.scans.T_project_scan[1:, :3, 3] - want[1:, :3, 3]
         errors.append(np.abs(off).max())
-        at = np.array([(T_s @ [*p, 1.0])[:3] for T_s, p in zip(result.T_project_scan, _places(scene), strict=True)])
+        at = np.array(
+            [(T_s @ [*p, 1.0])[:3] for T_s, p in zip(result.scans.T_project_scan, _places(scene), strict=True)]
+        )
         true = np.array([(T_s @ [*p, 1.0])[:3] for T_s, p in zip(want, _places(scene), strict=True)])
-        pulls.append((at - true)[1:] / result.position_sd[1:])
+        pulls.append((at - true)[1:] / result.scans.position_sd[1:])
     assert np.median(errors) < 30.0
     assert 0.85 < (np.abs(pulls) < 1.96).mean() <= 0.99
-    assert len(result.loops) == 1
+    assert len(result.closures) == 1
 
 
 def _places(scene):
@@ -109,15 +119,16 @@ def _places(scene):
 def test_exact_picks_give_exact_poses_and_close_the_loop():
     T, scene = network(1, 0.0)
     result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
-    np.testing.assert_allclose(result.T_project_scan, np.linalg.inv(T[0]) @ T, atol=1e-6)
-    assert result.closure_mm[0] < 1e-6
-    assert sorted(result.loops[0].split(" > ")[1:]) == ["S1", "S2", "S3", "S4", "S5"]
+    np.testing.assert_allclose(result.scans.T_project_scan, np.linalg.inv(T[0]) @ T, atol=1e-6)
+    assert result.closures.mm[0] < 1e-6
+    assert sorted(result.closures.loop[0][1:]) == ["S1", "S2", "S3", "S4", "S5"]
 
 
 def test_a_scan_in_other_units_is_reported():
     _, scene = network(2, 1.0, scale=0.001)
     result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
-    assert "units mixed up (m and mm)" in result.message
+    of_pairs = [one.values["reason"] for one in result.reasons if one.code == "stitch.of-pair"]
+    assert {one.values["units"] for one in of_pairs if one.code == "stitch.scale-of-units"} == {UnitSlip.M_MM}
 
 
 def test_picks_are_read_in_the_scans_units(tmp_path):
@@ -139,7 +150,7 @@ def test_picks_are_read_in_the_scans_units(tmp_path):
     [
         ("a,b,c\n", "expected columns scan_a,scan_b"),
         ("HEAD\nA,C,P,1,2,3,4,5,6\n", "line 2: there is no scan 'C'; there are A, B"),
-        ("HEAD\nA,A,P,1,2,3,4,5,6\n", "with itself"),
+        ("HEAD\nA,A,P,1,2,3,4,5,6\n", "expected two scans, found 'A' twice"),
         ("HEAD\nA,B,P,1,2,3,4,5\n", "expected 9 cells, found 8"),
         ("HEAD\nA,B,P,1,2,x,4,5,6\n", "expected six numbers"),
         ("HEAD\nA,B,P,1,2,nan,4,5,6\n", "expected finite numbers"),
@@ -163,7 +174,7 @@ def test_automatic_accepts_a_pose_by_picks():
     picks = Picks(("S1",) * 3, ("S2",) * 3, ("P", "Q", "R"), in_a, in_b)
     scene = dataclasses.replace(Scene("room", "structure", scans[:2]), picks=picks)
     result = stitching_step.run(scene, stitching_step.Params())
-    assert np.linalg.norm(result.T_project_scan[1][:3, 3] - want[:3, 3]) < 0.5
+    assert np.linalg.norm(result.scans.T_project_scan[1][:3, 3] - want[:3, 3]) < 0.5
 
 
 @pytest.mark.parametrize("scale", ["fixed", "free"])
@@ -176,8 +187,8 @@ def test_intervals_with_three_points_a_pair_cover(scale):
         want = np.linalg.inv(T[0]) @ T
         for s in range(1, len(T)):
             place = [*_places(scene)[s], 1.0]
-            off = (result.T_project_scan[s] @ place - want[s] @ place)[:3]
-            inside.append(np.abs(off) < 1.96 * result.position_sd[s])
+            off = (result.scans.T_project_scan[s] @ place - want[s] @ place)[:3]
+            inside.append(np.abs(off) < 1.96 * result.scans.position_sd[s])
     assert 0.9 <= np.mean(inside) <= 0.99
 
 
@@ -188,30 +199,31 @@ def test_a_blunder_in_one_pair_does_not_widen_the_intervals_of_others():
     result = stitching_step.run(dataclasses.replace(scene, picks=dataclasses.replace(scene.picks, in_a=in_a)),
                         stitching_step.Params(method="three-point"))  # fmt: skip
     clean = stitching_step.run(scene, stitching_step.Params(method="three-point"))
-    assert "blunder" in result.message
-    assert np.nanmax(result.position_sd) < 3.0 * np.nanmax(clean.position_sd)
+    of_pairs = [one.values["reason"] for one in result.reasons if one.code == "stitch.of-pair"]
+    assert BLUNDERS.intersection(codes(of_pairs))
+    assert np.nanmax(result.scans.position_sd) < 3.0 * np.nanmax(clean.scans.position_sd)
     want = np.linalg.inv(T[0]) @ T
-    assert np.abs(result.T_project_scan[:, :3, 3] - want[:, :3, 3]).max() < 30.0
+    assert np.abs(result.scans.T_project_scan[:, :3, 3] - want[:, :3, 3]).max() < 30.0
 
 
 @pytest.mark.parametrize("points", [3, 6])
 def test_a_scale_of_one_is_rarely_reported(points):
     """Picks of 5 mm without a scale: 2 % of 200 pairs at most are reported, also with two freedoms a pair."""
-    messages = [
-        message
+    rows = [
+        row
         for seed in range(40)
-        for message in stitching_step.run(
+        for row in stitching_step.run(
             network(seed, 5.0, points=points)[1], stitching_step.Params(method="three-point")
-        ).pair_message
+        ).pairs.reasons
     ]
-    assert sum("scale" in message for message in messages) <= 0.02 * len(messages)
+    assert sum(bool(SCALES.intersection(codes(row))) for row in rows) <= 0.02 * len(rows)
 
 
 def test_a_single_pair_needs_a_larger_scale_to_be_reported():
     """With two freedoms a scale 5 standard deviations off may be chance (19 in Student's t), with many it is not."""
-    assert three_point.verdict(1.0005, 1e-4, 1000.0, 2) == ""
-    assert "temperature" in three_point.verdict(1.0005, 1e-4, 1000.0, 60)
-    assert "± 430 ppm" in three_point.verdict(1.003, 1e-4, 5000.0, 2)
+    assert three_point.cause_of_scale(1.0005, 1e-4, 1000.0, 2) is None
+    assert three_point.cause_of_scale(1.0005, 1e-4, 1000.0, 60).code == "stitch.scale"
+    assert three_point.cause_of_scale(1.003, 1e-4, 5000.0, 2).values["ci95_ppm"] == pytest.approx(430.0, abs=0.5)
 
 
 def test_a_true_scale_is_reported_and_its_interval_covers():
@@ -220,8 +232,11 @@ def test_a_true_scale_is_reported_and_its_interval_covers():
         result = stitching_step.run(
             network(seed, 2.0, scale=1.0 / 1.004)[1], stitching_step.Params(method="three-point")
         )
-        inside += (np.abs(result.scale - 1.004) < 1.96 * result.scale_sd).tolist()
-        reported += ["scale 1.004" in text or "scale 1.003" in text for text in result.pair_message]
+        inside += (np.abs(result.pairs.scale - 1.004) < 1.96 * result.pairs.scale_sd).tolist()
+        reported += [
+            codes(row) == ["stitch.scale-by-blunder"] and row[0].values["scale"] == pytest.approx(1.004, abs=1e-3)
+            for row in result.pairs.reasons
+        ]
     assert 0.88 < np.mean(inside) < 0.99
     assert np.mean(reported) > 0.9
 
@@ -236,8 +251,11 @@ def test_a_scan_that_cannot_be_placed_has_a_reason():
     lone = Scan("S6", scene.scans[0].points)
     scene = dataclasses.replace(scene, scans=(*scene.scans, lone), picks=few)
     result = stitching_step.run(scene, stitching_step.Params(method="three-point"))
-    assert result.scan_status[4:] == ("failed", "failed")
-    assert result.scan_message[4] == (
-        "1 common points with S1, 2 common points with S4, three that span a plane are needed"
-    )
-    assert result.scan_message[5] == "no picks with other scans"
+    assert result.scans.status[4:] == ("failed", "failed")
+    assert codes(result.scans.reasons[4]) == ["stitch.too-few-picks"]
+    shortages = result.scans.reasons[4][0].values["shortages"]
+    assert [(one.values["scan"], one.values["shortage"].code) for one in shortages] == [
+        ("S1", "stitch.few-points"), ("S4", "stitch.few-points"),
+    ]  # fmt: skip
+    assert [one.values["shortage"].values["points"] for one in shortages] == [1, 2]
+    assert codes(result.scans.reasons[5]) == ["stitch.no-picks"]

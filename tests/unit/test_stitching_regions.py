@@ -23,10 +23,10 @@ def test_systematic_range_errors_raise_the_standard_deviations():
     good, bad = (
         stitching_step.run(Scene("room", "structure", some), stitching_step.Params()) for some in (scans, crooked)
     )
-    off = np.linalg.norm(bad.T_project_scan[1:, :3, 3] - want[1:, :3, 3], axis=1)
+    off = np.linalg.norm(bad.scans.T_project_scan[1:, :3, 3] - want[1:, :3, 3], axis=1)
     assert off.max() > 0.5  # far more than the noise makes
-    assert (bad.position_sd[1:].max(axis=1) > 2.0 * good.position_sd[1:].max(axis=1)).all()
-    assert (off < 4.0 * np.linalg.norm(bad.position_sd[1:], axis=1)).all()
+    assert (bad.scans.position_sd[1:].max(axis=1) > 2.0 * good.scans.position_sd[1:].max(axis=1)).all()
+    assert (off < 4.0 * np.linalg.norm(bad.scans.position_sd[1:], axis=1)).all()
 
 
 def test_a_board_that_moved_during_one_scan_does_not_bias_its_pose():
@@ -39,8 +39,8 @@ def test_a_board_that_moved_during_one_scan_does_not_bias_its_pose():
     changed = (*scans[:2], dataclasses.replace(scans[2], points=points), scans[3])
     result = stitching_step.run(Scene("room", "structure", changed), stitching_step.Params())
     want = np.linalg.inv(T[0]) @ T
-    off = np.abs(result.T_project_scan[1:, :3, 3] - want[1:, :3, 3])
-    assert (off < 4.0 * result.position_sd[1:]).all()
+    off = np.abs(result.scans.T_project_scan[1:, :3, 3] - want[1:, :3, 3])
+    assert (off < 4.0 * result.scans.position_sd[1:]).all()
     assert off.max() < 0.25
 
 
@@ -51,7 +51,7 @@ def test_a_wall_that_moved_during_one_scan_is_contradicted_by_the_rejected_faces
     shifted = inside + np.where(inside[:, 0] > 6900.0, 3.0, 0.0)[:, None] * [1.0, 0.0, 0.0]
     wrong = dataclasses.replace(scans[2], points=(shifted - T[2][:3, 3]) @ T[2][:3, :3])
     result = stitching_step.run(Scene("room", "structure", (*scans[:2], wrong, scans[3])), stitching_step.Params())
-    off = np.linalg.inv(T[0]) @ T - result.T_project_scan
+    off = np.linalg.inv(T[0]) @ T - result.scans.T_project_scan
     assert np.abs(off[2, :3, 3]).max() > 1.0  # else the test would be void
-    assert result.scan_status == ("ok", "ok", "weak", "ok")
-    assert "faces agree that it stands" in result.scan_message[2]
+    assert result.scans.status == ("ok", "ok", "weak", "ok")
+    assert [one.code for one in result.scans.reasons[2]] == ["stitch.faces-contradict"]

@@ -1,4 +1,4 @@
-"""The store: what is written comes back, bytes repeat, boxes are cut right, and nothing from outside is trusted."""
+"""The store: records come back as written, bytes repeat, boxes are cut right, and files are not trusted."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
+from processor import store
 from processor.model import (
     ArchDesign,
     ArchTruth,
@@ -28,7 +29,6 @@ from processor.model import (
     names,
 )
 from processor.space_frame import step as space_frame_step
-from processor.store import store
 
 HALF_STEP = 0.5e-4 * (1.0 + 1e-6)  # mm: points are kept to 0.0001 mm
 
@@ -78,6 +78,16 @@ def written(tmp_path):
 
 def lexicographic(points):
     return points[np.lexsort(points.T)]
+
+
+def in_box(path, lower, upper):
+    """Points of a file's first scan within a box."""
+    with store.points_of(path) as points:
+        whole = (np.full(3, -np.inf), np.full(3, np.inf))
+        boxed = points.within([(np.asarray(lower), np.asarray(upper)), *[whole] * (len(points.scans) - 1)])
+        pieces = [piece for piece, _ in boxed.read(0)]
+        assert boxed.counts()[0] == sum(map(len, pieces))
+    return np.concatenate([np.empty((0, 3)), *pieces])
 
 
 def same(a, b):
@@ -204,17 +214,17 @@ def test_precision_follows_the_extent(tmp_path, size_mm, steps):
     assert off <= 0.5 * steps * (1 + 1e-4)
     lower, upper = points.min(axis=0) + 100.0, points.max(axis=0) - [size_mm / 2, 200.0, 0.0]
     inside = back.points[((back.points >= lower) & (back.points <= upper)).all(axis=1)]
-    assert np.array_equal(lexicographic(store.read_points_in_box(path, "s", lower, upper)), lexicographic(inside))
+    assert np.array_equal(lexicographic(in_box(path, lower, upper)), lexicographic(inside))
 
 
 def test_one_point_and_points_in_one_place(tmp_path):
     path = tmp_path / "one.h5"
-    scans = (Scan("one", [[1.0, 2.0, 3.0]]), Scan("same", np.full((100, 3), 7.25)), Scan("none"))
+    scans = (Scan("none"), Scan("one", [[1.0, 2.0, 3.0]]), Scan("same", np.full((100, 3), 7.25)))
     store.write_scene(path, Scene("o", "structure", scans), None, {})
     back = store.read_scene(path)
-    assert [scan.points.tolist() for scan in back.scans[::2]] == [[[1.0, 2.0, 3.0]], []]
-    assert (back.scans[1].points == 7.25).all()
-    assert len(store.read_points_in_box(path, "none", np.full(3, -1.0), np.ones(3))) == 0
+    assert [scan.points.tolist() for scan in back.scans[:2]] == [[], [[1.0, 2.0, 3.0]]]
+    assert (back.scans[2].points == 7.25).all()
+    assert len(in_box(path, np.full(3, -1.0), np.ones(3))) == 0
 
 
 def test_boxes_match_a_plain_cut(written):
@@ -224,10 +234,9 @@ def test_boxes_match_a_plain_cut(written):
         lower = rng.uniform([-500, -500, -500], [18_000, 1_500, 2_500])
         upper = lower + rng.uniform(0.0, [9_000, 2_000, 2_000])
         plain = points[((points >= lower) & (points <= upper)).all(axis=1)]
-        cut = store.read_points_in_box(written, "s1", lower, upper)
-        assert np.array_equal(lexicographic(cut), lexicographic(plain))
-    # A box of no size on a point holds that point: bounds count.
-    assert len(store.read_points_in_box(written, "s1", points[5], points[5])) >= 1
+        assert np.array_equal(lexicographic(in_box(written, lower, upper)), lexicographic(plain))
+    # Bounds are inclusive: a box of zero size on a point holds that point.
+    assert len(in_box(written, points[5], points[5])) >= 1
 
 
 def test_a_box_reads_only_its_tiles(tmp_path):
@@ -243,14 +252,9 @@ def test_a_box_reads_only_its_tiles(tmp_path):
     path.write_bytes(content)
     lower, upper = np.array([100.0, -50.0, -50.0]), np.array([900.0, 2_100.0, 3_100.0])
     plain = points[((points >= lower) & (points <= upper)).all(axis=1)]
-    assert abs(len(store.read_points_in_box(path, "s", lower, upper)) - len(plain)) <= 1  # of rounding
+    assert abs(len(in_box(path, lower, upper)) - len(plain)) <= 1  # of rounding
     with pytest.raises(InputError, match="damaged"):
         store.read_scene(path)
-
-
-def test_unknown_scan_in_a_box(written):
-    with pytest.raises(InputError, match=r"scan 's9', found s1, s2"):
-        store.read_points_in_box(written, "s9", np.zeros(3), np.ones(3))
 
 
 # --- truth and results ---------------------------------------------------------------------------------------------
@@ -340,11 +344,20 @@ def test_scenes_that_are_not_written(tmp_path):
     nan = Scene("n", "structure", (Scan("s", [[0.0, np.nan, 0.0]]),))
     fine = Scene("f", "structure", (Scan("s", np.eye(3)),))
     for scene, truth, why in [
-        (twice, None, "one name"),
+        (twice, None, "different names, found s, s"),
         (nan, None, "not finite"),
-        (fine, Truth((PointLabels("s", (), [0], [0]),)), "1 labels"),
-        (fine, Truth((PointLabels("t", (), [0], [0]),)), "'t' that the scene has not"),
+        (fine, Truth((PointLabels("s", (), [0], [0]),)), "expected 3 labels .* found 1"),
+        (fine, Truth((PointLabels("t", (), [0], [0]),)), "'t', which is not in the scene"),
     ]:
         with pytest.raises(InputError, match=why):
             store.write_scene(path, scene, truth, {})
     assert not path.exists()
+
+
+def test_results_of_the_old_format_are_refused_with_what_to_do(tmp_path):
+    path = tmp_path / "results.h5"
+    store.write_results(path, [], {})
+    with h5py.File(path, "r+") as file:
+        file.attrs["format_version"] = np.bytes_("1.3")
+    with pytest.raises(InputError, match=r"expected format_version 2\.0, found 1\.3; run processor run again"):
+        store.read_results(path, {})

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from designgen import recipes, sequences
+from designgen.designs import structure_types
 from designgen.scanning import scanner, survey
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import make, structure
@@ -31,7 +32,7 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
         found = [survey.below(low, high, params, 3), survey.around(AXES, low, HALF, params, 3, "p/")]
         for name in ("stadium-roof", "truss-bridge", "plates-defects"):
             recipe = recipes.load(name)[1]
-            components = structure.design(recipe)
+            components = structure_types.design(recipe)
             patches, _, _ = structure.BUILDERS[recipe["structure"]["type"]](components, recipe, 1)
             found.append(structure._places(recipe["structure"]["type"], patches, params, 3))
         return found

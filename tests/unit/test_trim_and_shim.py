@@ -250,7 +250,7 @@ def test_what_is_not_known_is_said():
     assert unknown.action == "unknown"
     assert np.isnan(unknown.cut).all()
     assert codes(unknown) == ["gaps-unknown"]
-    no_groove = proposed(along(-3.0), limits=standards.with_own(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x"))
+    no_groove = proposed(along(-3.0), limits=standards.override(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x"))
     assert (no_groove.action, no_groove.probability) == ("nothing", 1.0)
     assert codes(no_groove)[0] == "no-groove-limit"
     by_thickness = proposed(along(-3.0), limits=standards.load("JTG arch rib"))

@@ -1,32 +1,41 @@
-"""How stitching reports."""
+"""The report of step ``stitch``."""
 
 from __future__ import annotations
 
-import collections
+from collections import Counter
 
-from processor.model import StepRun
+from processor.language.messages import Message, text
+from processor.model import Status, StepRun
 from processor.pipeline import Execution
 from processor.report.section import StepReport
-from processor.report.stitching import figures, results, tables, view
+from processor.report.stitching import figures, tables, view
 from processor.stitching.result import Result
 
 
-def _summary(result: Result) -> tuple[str, str]:
-    statuses = collections.Counter(result.scan_status)
-    head = f"{result.status}, {statuses['ok']} of {len(result.scans)} scans without a flag"
-    named = ", ".join(f"{statuses[one]} {one}" for one in ("ambiguous", "weak", "failed") if statuses[one])
-    pairs = f"{int(result.used.sum())} of {len(result.used)} pairs used."
-    return head, f"Flagged: {named}. {pairs}" if named else pairs
+def _summary(result: Result) -> tuple[Message, Message]:
+    counts = Counter(result.scans.status)
+    head = text(
+        "{status}, {ok} of {scans} scans without a flag",
+        status=result.status,
+        ok=counts[Status.OK],
+        scans=len(result.scans),
+    )
+    pairs = text("{used} of {pairs} pairs used.", used=int(result.pairs.used.sum()), pairs=len(result.pairs))
+    flags = tuple(
+        text("{count} {status}", count=counts[status], status=status)
+        for status in (Status.AMBIGUOUS, Status.WEAK, Status.FAILED)
+        if counts[status]
+    )
+    return head, text("Flagged: {flags}. {pairs}", flags=flags, pairs=pairs) if flags else pairs
 
 
 def _files(_: Execution, run: StepRun) -> dict[str, bytes]:
-    return {results.POSES: results.poses(run.result)}
+    return {"stitch.csv": tables.poses_csv(run.result)}
 
 
 REPORT = StepReport(
-    title="Stitching",
+    title=text("Stitching"),
     summary=_summary,
-    written=results.written,
     tables=tables.of_runs,
     figures=figures.of_runs,
     files=_files,

@@ -1,144 +1,181 @@
-"""Tables of stitched scans."""
+"""Tables of stitched scans, and their poses as a file for other programs."""
 
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 
 import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import Message, text
 from processor.model import NORMAL_95, StepRun
-from processor.report.table import Table
-from processor.stitching.result import GLCS, Held, Result
+from processor.report.table import FORMULA, Table
+from processor.stitching.result import ProjectFrame, Result
 
-SOCS_NOTE = "SOCS: the scanner's own coordinate system, that of a scan's file."
-PRCS_NOTE = "PRCS: the project's, in which all scans are put together: that of the reference scan."
-TO_PRCS = (
-    f"{SOCS_NOTE} {PRCS_NOTE} GLCS: a global one: nothing leads there without control points or a given pose, so PRCS "
-    "stands for it. Each matrix maps SOCS to PRCS, mm."
+OF_SCAN = "stitch.of-scan"  # code of reasons that the table of scans has too
+TO_PRCS = text(
+    "SOCS: the scanner's own coordinate system, that of a scan's file. PRCS: the project's, in which all scans are "
+    "registered: that of the reference scan. GLCS: a global one; without control points or a given pose PRCS is used "
+    "in its place. Each matrix maps SOCS to PRCS, mm."
 )
-BY_POSE = "GLCS: the one from outside that the given pose of the reference scan leads to."
-BY_CONTROL = "GLCS: the one from outside that the coordinates of the control points are in."
-TO_GLCS = "Each matrix maps SOCS, or PRCS where it says so, to GLCS, mm."
-CONTROL_NOTE = (
-    "Known place minus where the scans have it, once all is adjusted; a row a sighting. Share: how much of an error "
-    "of a sighting shows here, the rest goes into the poses. Of what is not used, sd is that of its prediction."
+TO_GLCS_BY_POSE = text(
+    "SOCS: the scanner's own coordinate system, that of a scan's file. PRCS: the project's, that of the reference "
+    "scan. GLCS: the global one that the given pose of the reference scan leads to. Each matrix maps SOCS, or PRCS "
+    "where its name has it, to GLCS, mm."
+)
+TO_GLCS_BY_CONTROL = text(
+    "SOCS: the scanner's own coordinate system, that of a scan's file. PRCS: the project's, that of the reference "
+    "scan. GLCS: the global one of the control points' coordinates. Each matrix maps SOCS, or PRCS where its name has "
+    "it, to GLCS, mm."
 )
 
 
 def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
-    """Tables of stitched scans; ``runs`` are the answer and the methods compared with it."""
-    found: list[Table] = []
+    """Tabulate stitched scans; ``runs`` are the result and those of the methods compared with it."""
+    tables: list[Table] = []
     for number, run in enumerate(runs):
-        found += _of_result(run.result, run.method, f"-{run.method}" if number else "")
-    return found
+        result, suffix = run.result, f"-{run.method}" if number else ""
+        tables += [
+            _scans(result, run.method, suffix),
+            _pairs(result, run.method, suffix),
+            _loops(result, run.method, suffix),
+            _matrices(result, run.method),
+            *_control(result, run.method, suffix),
+            *_remarks(result, run.method),
+        ]
+    return tables
 
 
-def _of_result(result: Result, method: str, suffix: str) -> list[Table]:
-    ci, turn = NORMAL_95 * result.position_sd, 1e3 * NORMAL_95 * result.rotation_sd
-    scans = tuple(
-        (
-            name,
-            result.scan_status[i],
-            *result.position[i].tolist(),
-            *ci[i].tolist(),
-            *turn[i].tolist(),
-            float(result.rivalry[i]),
-            result.scan_message[i],
-        )
-        for i, name in enumerate(result.scans)
-    )
-    pairs = tuple(
-        (
-            a,
-            result.pair_b[i],
-            100.0 * float(result.overlap[i]),
-            float(result.residual[i]),
-            int(result.pair_pieces[i]),
-            "yes" if result.used[i] else "no",
-            1e6 * float(result.scale[i] - 1.0),
-            1e6 * NORMAL_95 * float(result.scale_sd[i]),
-            result.pair_message[i],
-        )
-        for i, a in enumerate(result.pair_a)
-    )
-    loops = tuple(
-        zip(
-            result.loops,
-            result.closure_mm.tolist(),
-            result.closure_mrad.tolist(),
-            result.closure_ratio.tolist(),
-            strict=True,
-        )
-    )
-    own = [(f"T_{result.frame}_SOCS({name})", T) for name, T in zip(result.scans, result.T_project_scan, strict=True)]
-    # The project's own frame is that of the reference scan: a frame from outside stands beside it.
-    whole = [("T_GLCS_PRCS", result.reference_pose)] if result.frame == GLCS else []
-    matrices = tuple(
-        (name, *(float(x) for x in row)) for name, T in [*whole, *own] if np.isfinite(T).all() for row in T[:3]
-    )
-    held = (
-        "Half widths of 95 % intervals hold the errors of control points too."
-        if result.by_control
-        else f"Half widths of 95 % intervals are relative to {result.reference}, which is held."
-    )
-    note = f"{SOCS_NOTE} {PRCS_NOTE} {BY_CONTROL if result.by_control else BY_POSE} {TO_GLCS}"
-    return [
-        Table(
-            f"Scans in the project's frame, method {method}",
-            ("scan", "status", "x_mm", "y_mm", "z_mm", "ci95_x_mm", "ci95_y_mm", "ci95_z_mm", "ci95_about_x_mrad",
-             "ci95_about_y_mrad", "ci95_about_z_mrad", "rivalry", "message"),
-            scans,
-            f"stitch-scans{suffix}",
-            f"Scanner positions. {held} Rivalry: what speaks for the next best pose, by what speaks for this one.",
-        ),
-        Table(
-            f"Pairs of scans, method {method}",
-            ("a", "b", "overlap_percent", "residual_mm", "shared", "used", "scale_ppm", "scale_ci95_ppm", "message"),
-            pairs,
-            f"stitch-pairs{suffix}",
-            "Shared: flat pieces, or picked points, that both scans saw. Scale of b in a is a diagnostic.",
-        ),
-        Table(
-            f"Misclosures of loops, method {method}",
-            ("loop", "mm", "mrad", "ratio"),
-            loops,
-            f"stitch-loops{suffix}",
-            "By the pairs' own poses. Ratio: squared misclosure by what the pairs' covariances let expect; 1 is usual.",
-        ),
-        Table(
-            f"Matrices, method {method}",
-            ("matrix", "x", "y", "z", "shift_mm"),
-            matrices,
-            "",
-            note if result.frame == GLCS else TO_PRCS,
-            on_terminal=False,
-        ),
-        *_control(result.control, method, suffix),
-        *_remarks(result, method),
-    ]  # fmt: skip
-
-
-def _control(held: Held | None, method: str, suffix: str) -> list[Table]:
-    if held is None:
-        return []
+def _scans(result: Result, method: str, suffix: str) -> Table:
+    scans = result.scans
+    ci95, turn_ci95 = NORMAL_95 * scans.position_sd, 1e3 * NORMAL_95 * scans.rotation_sd
     rows = tuple(
         (
             name,
-            held.scans[i],
-            *held.off[i].tolist(),
-            *held.sd[i].tolist(),
-            100.0 * float(held.share[i]),
-            "yes" if held.used[i] else "no",
+            scans.status[i],
+            *scans.position[i].tolist(),
+            *ci95[i].tolist(),
+            *turn_ci95[i].tolist(),
+            float(scans.rivalry[i]),
+            scans.reasons[i],
         )
-        for i, name in enumerate(held.points)
+        for i, name in enumerate(scans.name)
+    )
+    columns = (
+        "scan", "status", "x_mm", "y_mm", "z_mm", "ci95_x_mm", "ci95_y_mm", "ci95_z_mm", "ci95_about_x_mrad",
+        "ci95_about_y_mrad", "ci95_about_z_mrad", "rivalry", "message",
+    )  # fmt: skip
+    note = text(
+        "Scanner positions. Half widths of 95 % intervals include the errors of control points. Rivalry: score of the "
+        "next best pose over that of this one."
+    )
+    if not result.by_control:
+        note = text(
+            "Scanner positions. Half widths of 95 % intervals are relative to {reference}, whose pose is fixed. "
+            "Rivalry: score of the next best pose over that of this one.",
+            reference=result.reference,
+        )
+    title = text("Scans in the project's frame, method {method}", method=method)
+    return Table(title, columns, rows, f"stitch-scans{suffix}", note)
+
+
+def _pairs(result: Result, method: str, suffix: str) -> Table:
+    pairs = result.pairs
+    rows = tuple(
+        (
+            a,
+            pairs.b[i],
+            100.0 * float(pairs.overlap[i]),
+            float(pairs.residual[i]),
+            int(pairs.shared[i]),
+            _yes_no(pairs.used[i]),
+            1e6 * float(pairs.scale[i] - 1.0),
+            1e6 * NORMAL_95 * float(pairs.scale_sd[i]),
+            pairs.reasons[i],
+        )
+        for i, a in enumerate(pairs.a)
+    )
+    columns = (
+        "a", "b", "overlap_percent", "residual_mm", "shared", "used", "scale_ppm", "scale_ci95_ppm", "message",
+    )  # fmt: skip
+    note = text(
+        "Shared: planar pieces, or picked points, that both scans have. The scale of b in a is a diagnostic value."
+    )
+    return Table(text("Pairs of scans, method {method}", method=method), columns, rows, f"stitch-pairs{suffix}", note)
+
+
+def _loops(result: Result, method: str, suffix: str) -> Table:
+    closures = result.closures
+    rows = tuple(
+        (" > ".join(loop), float(closures.mm[i]), float(closures.mrad[i]), float(closures.ratio[i]))
+        for i, loop in enumerate(closures.loop)
+    )
+    note = text(
+        "By the pairs' own poses. Ratio: squared misclosure over its expected value by the pairs' covariances; "
+        "usually about 1."
+    )
+    title = text("Misclosures of loops, method {method}", method=method)
+    return Table(title, ("loop", "mm", "mrad", "ratio"), rows, f"stitch-loops{suffix}", note)
+
+
+def _matrices(result: Result, method: str) -> Table:
+    named = [
+        (f"T_{result.frame}_SOCS({name})", T)
+        for name, T in zip(result.scans.name, result.scans.T_project_scan, strict=True)
+    ]
+    note = TO_PRCS
+    if result.frame == ProjectFrame.GLCS:
+        named.insert(0, ("T_GLCS_PRCS", result.T_GLCS_PRCS))
+        note = TO_GLCS_BY_CONTROL if result.by_control else TO_GLCS_BY_POSE
+    rows = tuple((name, *row.tolist()) for name, T in named if np.isfinite(T).all() for row in T[:3])
+    title = text("Matrices, method {method}", method=method)
+    return Table(title, ("matrix", "x", "y", "z", "shift_mm"), rows, "", note, on_terminal=False)
+
+
+def _control(result: Result, method: str, suffix: str) -> list[Table]:
+    if result.control is None:
+        return []
+    sightings = result.control.sightings
+    rows = tuple(
+        (
+            name,
+            sightings.scan[i],
+            *sightings.off[i].tolist(),
+            *sightings.sd[i].tolist(),
+            100.0 * float(sightings.share[i]),
+            _yes_no(sightings.used[i]),
+        )
+        for i, name in enumerate(sightings.point)
     )
     columns = ("point", "scan", "dx_mm", "dy_mm", "dz_mm", "sd_x_mm", "sd_y_mm", "sd_z_mm", "share_percent", "used")
-    return [Table(f"Control points (mm), method {method}", columns, rows, f"control{suffix}", CONTROL_NOTE)]
+    note = text(
+        "Known minus measured place after the adjustment, a row a sighting. Share: how much of an error of the "
+        "sighting is visible here; the poses absorb the rest. The sd of an unused sighting is that of its prediction."
+    )
+    return [Table(text("Control points (mm), method {method}", method=method), columns, rows, f"control{suffix}", note)]
 
 
 def _remarks(result: Result, method: str) -> list[Table]:
-    """Table what is said of the whole: the page has it as its message, a terminal has tables alone."""
-    of_scans = {f"{name}: {said}" for name, said in zip(result.scans, result.scan_message, strict=True)}
-    rows = tuple((one,) for one in result.message.split("; ") if one and one not in of_scans)
-    return [Table(f"Remarks, method {method}", ("remark",), rows, on_page=False)] if rows else []
+    """Tabulate the reasons that are of no single scan, for the terminal; the page has all reasons as a paragraph."""
+    rows = tuple((single,) for single in result.reasons if single.code != OF_SCAN)
+    return [Table(text("Remarks, method {method}", method=method), ("remark",), rows, on_page=False)] if rows else []
+
+
+def _yes_no(value: np.bool_) -> Message:
+    return text("yes") if value else text("no")
+
+
+def poses_csv(result: Result) -> bytes:
+    """Write poses as CSV: a row a scan, the 4 x 4 matrix row by row, mm, and the frames it maps from and to."""
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(["scan", "status", *(f"m{i}{j}" for i in range(4) for j in range(4)), "from", "to"])
+    scans = result.scans
+    for i, name in enumerate(scans.name):
+        # A spreadsheet would take such a name for a formula.
+        safe = f"'{name}" if name.startswith(FORMULA[:4]) else name
+        matrix = [repr(float(x)) if np.isfinite(x) else "" for x in scans.T_project_scan[i].ravel()]
+        writer.writerow([safe, scans.status[i], *matrix, scans.from_frame[i], scans.to_frame[i]])
+    return out.getvalue().encode("utf-8")

@@ -1,4 +1,4 @@
-"""What the page's script draws of stitched scans: their points, by how far the other scans' surface lies from them."""
+"""Live view of stitched scans for the page's script: points coloured by the distance of the other scans' surface."""
 
 from __future__ import annotations
 
@@ -10,92 +10,88 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.geometry import parallel, rigid
-from processor.model import NORMAL_95, Floats, Scan, Scene, StepRun
+from processor.language.messages import text
+from processor.model import NORMAL_95, Floats, Scan, Scene, Status, StepRun
 from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS, colour_limit
 from processor.report.surface_view import spacing
-from processor.report.table import shown
-from processor.stitching.result import Result
+from processor.stitching.result import Result, Scans
 
 MOST_POINTS = 60_000  # of all scans: about 1.4 MB of the page
 MOST_SEARCHED = 400_000  # of each scan
 NEIGHBOURS = 12
 REACH_MM = 200.0  # of neighbours, at most
-LEAST_FLAT = 4.0  # how much wider than thick neighbours lie, to be of one surface
+LEAST_FLAT = 4.0  # least ratio of width to thickness of neighbours that are one surface
 TONES = ("#0072B2", "#D55E00")  # of stations without and with a flag
 
 
 def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return what the page draws of the scans that were placed, mm; None where there are fewer than two."""
     result: Result = runs[0].result
-    row = {name: i for i, name in enumerate(result.scans)}
+    scans = result.scans
+    row = {name: i for i, name in enumerate(scans.name)}
     placed = [
         (scan, row[scan.name])
         for scan in scene.scans
-        if len(scan.points) and scan.name in row and np.isfinite(result.T_project_scan[row[scan.name]]).all()
+        if len(scan.points) and scan.name in row and scans.placed[row[scan.name]]
     ]
     if len(placed) < 2:
         return None
-    first = np.array([_first(scan, result.T_project_scan[i]) for scan, i in placed])
+    first = np.array([rigid.apply(scans.T_project_scan[i], scan.points[:1] + scan.origin)[0] for scan, i in placed])
     origin: Floats = np.round(first.mean(axis=0))
-    clouds = [_placed(scan, result.T_project_scan[i], origin) for scan, i in placed]
+    clouds = [_in_project(scan, scans.T_project_scan[i], origin) for scan, i in placed]
     trees = parallel.each(cKDTree, clouds)
     step = max(1, -(-sum(map(len, clouds)) // MOST_POINTS))
     drawn = [cloud[::step] for cloud in clouds]
-    apart = [
-        _apart(drawn[k], trees[k], trees[:k] + trees[k + 1 :], result.position[i] - origin)
+    distances = [
+        _distances(drawn[k], trees[k], trees[:k] + trees[k + 1 :], scans.position[i] - origin)
         for k, (_, i) in enumerate(placed)
     ]
     parts, marks = [], []
     for k, (scan, i) in enumerate(placed):
         places = np.rint(drawn[k]).astype(int).ravel()
-        parts.append({"name": scan.name, "edges": [], "points": places, "residual": apart[k].round(3)})
-        if np.isfinite(result.position[i]).all():
-            marks.append(_station(result, i, k, origin))
-    made: dict[str, Any] = plain(
+        parts.append({"name": scan.name, "edges": [], "points": places, "residual": distances[k].round(3)})
+        if np.isfinite(scans.position[i]).all():
+            marks.append(_station(scans, i, k, origin))
+    data: dict[str, Any] = plain(
         {
-            "title": "Scans in space",
+            "title": text("Scans in space"),
             "arrows": "",
-            "values": "distances between scans",
-            "from": "from the other scans at",
-            "side": "towards the scanner",
+            "values": text("distances between scans"),
+            "from": text("from the other scans at"),
+            "side": text("towards the scanner"),
             "method": runs[0].method,
             "origin": origin,
             "stops": DIVERGING_STOPS,
             "tones": TONES,
             "spacing": spacing(np.vstack(drawn)),
-            "limit": colour_limit(np.concatenate(apart)),
+            "limit": colour_limit(np.concatenate(distances)),
             "parts": parts,
             "marks": marks,
         }
     )
-    return made
+    return data
 
 
-def _first(scan: Scan, T: Floats) -> Floats:
-    found: Floats = rigid.apply(T, scan.points[:1] + scan.origin)[0]
-    return found
-
-
-def _placed(scan: Scan, T: Floats, origin: Floats) -> Floats:
+def _in_project(scan: Scan, T: Floats, origin: Floats) -> Floats:
     """Return points (n, 3) of a scan, at most MOST_SEARCHED, in the project's frame less ``origin``."""
     points = scan.points[:: max(1, -(-len(scan.points) // MOST_SEARCHED))]
     shift = T[:3, :3] @ scan.origin + (T[:3, 3] - origin)
-    found: Floats = points[np.isfinite(points).all(axis=1)] @ T[:3, :3].T + shift
-    return found
+    transformed: Floats = points[np.isfinite(points).all(axis=1)] @ T[:3, :3].T + shift
+    return transformed
 
 
-def _apart(points: Floats, own: cKDTree, others: Sequence[cKDTree], scanner: Floats) -> Floats:
-    """Tell how far the other scans' surface lies from that of points (n, 3), positive to their scanner; NaN = none.
+def _distances(points: Floats, own: cKDTree, others: Sequence[cKDTree], scanner: Floats) -> Floats:
+    """Return the distance (n,) of points (n, 3) from the nearest other scan's surface, positive to their scanner.
 
-    Both surfaces are the means of NEIGHBOURS points, along the normal of the other scan's, of that which is nearest.
+    Both surfaces are the means of NEIGHBOURS points; the distance is along the normal of the other one. NaN = none.
     """
-    nearest, away = np.full(len(points), -1), np.full(len(points), np.inf)
+    nearest, least = np.full(len(points), -1), np.full(len(points), np.inf)
     for k, other in enumerate(others):
-        far = other.query(points, distance_upper_bound=REACH_MM, workers=-1)[0]
-        nearer = far < away
-        nearest[nearer], away[nearer] = k, far[nearer]
-    found = np.full(len(points), np.nan)
+        distance = other.query(points, distance_upper_bound=REACH_MM, workers=-1)[0]
+        nearer = distance < least
+        nearest[nearer], least[nearer] = k, distance[nearer]
+    distances = np.full(len(points), np.nan)
     for k, other in enumerate(others):
         rows = np.flatnonzero(nearest == k)
         if not len(rows):
@@ -111,25 +107,25 @@ def _apart(points: Floats, own: cKDTree, others: Sequence[cKDTree], scanner: Flo
             normal *= np.where(np.einsum("ni,ni->n", normal, scanner - middle) < 0.0, -1.0, 1.0)[:, None]
         flat = size[:, 1] > LEAST_FLAT**2 * size[:, 0]
         off = np.einsum("ni,ni->n", normal, middle - near.mean(axis=1))
-        found[rows[flat]] = off[flat]
-    return found
+        distances[rows[flat]] = off[flat]
+    return distances
 
 
 def _neighbours(tree: cKDTree, points: Floats) -> tuple[npt.NDArray[np.float64], Floats]:
-    """Return the NEIGHBOURS points (n, k, 3) of a tree nearest to points (n, 3), and how far they reach (n,)."""
+    """Return the NEIGHBOURS points (n, k, 3) of a tree nearest to points (n, 3), and their greatest distance (n,)."""
     k = min(NEIGHBOURS, tree.n)
-    far, at = tree.query(points, k=[*range(1, k + 1)], workers=-1)
-    return np.asarray(tree.data)[at], far[:, -1]
+    distance, at = tree.query(points, k=[*range(1, k + 1)], workers=-1)
+    return np.asarray(tree.data)[at], distance[:, -1]
 
 
-def _station(result: Result, i: int, part: int, origin: Floats) -> dict[str, Any]:
-    sd = ", ".join(shown(float(NORMAL_95 * value)) for value in result.position_sd[i])
+def _station(scans: Scans, i: int, part: int, origin: Floats) -> dict[str, Any]:
+    sd = tuple((NORMAL_95 * scans.position_sd[i]).tolist())
     return {
         "part": part,
-        "tone": int(result.scan_status[i] != "ok"),
-        "name": result.scans[i],
-        "text": f"{result.scan_status[i]}, ± {sd} mm",
-        "at": np.round(result.position[i] - origin, 1),
+        "tone": int(scans.status[i] != Status.OK),
+        "name": scans.name[i],
+        "text": text("{status}, ± {ci95} mm", status=scans.status[i], ci95=sd),
+        "at": np.round(scans.position[i] - origin, 1),
         "radius": 0.0,
         "label": True,
     }

@@ -1,9 +1,9 @@
-"""Search for the rigid motion that lays found nodes onto a design's, by the pattern they make.
+"""Search for the rigid motions that map found nodes onto a design's, by the pattern of the nodes.
 
-A corner of three found nodes is laid onto every corner of the design's that is as large; each such pose is then held
-against ever more of the found nodes around it and fitted to them, and those that few nodes follow are dropped. From one
-corner of true nodes all poses come that lay it onto the design: a pattern that repeats itself gives all its answers.
-Nothing is random: corners are tried in a fixed order, from the middle of the cloud outward.
+A triangle of three found nodes is mapped onto every triangle of the design with the same sides. Each such pose is then
+tested on successively more of the found nodes around it and fitted to them; poses that few nodes support are dropped.
+One triangle of true nodes gives all poses that map it onto the design: a repetitive pattern gives all its answers.
+The search is deterministic: triangles are tried in a fixed order, from the middle of the cloud outward.
 """
 
 from __future__ import annotations
@@ -17,51 +17,51 @@ from processor.model import Floats, Ints
 
 Bools = npt.NDArray[np.bool_]
 
-NEIGHBOURS = 12  # of a node, that corners are made of
-CORNERS = 24  # tried at most
-ENOUGH = 2  # corners that led to the best pose: more bring nothing new
-FLAT = 0.35  # sine of the angle of a corner that holds a turn about its sides
-STAGES = (12, 36, 108)  # found nodes about the corner that a pose is held against, one after another
-FEW, SPREAD = 32, 128  # nodes all over the cloud, then
+NEIGHBOURS = 12  # of a node, for triangles
+CORNERS = 24  # triangles tried at most
+ENOUGH = 2  # triangles with a supported pose: more give no new poses
+FLAT = 0.35  # least sine of a triangle's angle
+STAGES = (12, 36, 108)  # found nodes about the triangle that a pose is tested on, one after another
+FEW, SPREAD = 32, 128  # then nodes all over the cloud
 MANY = 1000  # poses that agree with a neighbourhood
-BLOCK = 4096  # poses looked at together
+BLOCK = 4096  # poses tested together
 LEAST_SHARE = 0.5  # of the nodes that must lie on the design's at each stage
 KEPT_SHARE = 0.8  # of the best pose's
-MOST = 64  # poses that are looked at in full
+MOST = 64  # poses that are tested on all nodes
 SAME_SHARE = 0.5  # of the shortest distance of two nodes: poses that differ less are one
 
 
-def poses(found: Floats, design: Floats, tolerance_mm: float) -> Floats:
-    """Poses T_design_found (h, 4, 4) under which many of found nodes (k, 3) lie on nodes of the design (d, 3).
+def poses(nodes: Floats, design: Floats, tolerance_mm: float) -> Floats:
+    """Poses T_design_found (h, 4, 4) under which many of the found nodes (k, 3) lie on nodes of the design (d, 3).
 
-    ``tolerance_mm`` is how far off its place a node may be. Best first by the number of nodes that agree; all of it is
-    relative to the coordinates' origin, which should be near.
+    ``tolerance_mm`` is the largest deviation of a node from its place. Best first by the number of nodes that agree;
+    coordinates are relative to their origin, which should be near.
     """
-    tree, own = cKDTree(design), cKDTree(found)
+    tree, node_tree = cKDTree(design), cKDTree(nodes)
     around = _neighbours(design, tree)
-    middle = np.median(found, axis=0)
-    seeds = np.argsort(np.linalg.norm(found - middle, axis=1), kind="stable")
-    spread = _spread_out(found, SPREAD)
+    middle = np.median(nodes, axis=0)
+    seeds = np.argsort(np.linalg.norm(nodes - middle, axis=1), kind="stable")
+    spread = _spread_out(nodes, SPREAD)
     answers: list[Floats] = []
-    best, led, tried = 0, 0, 0
-    apart = SAME_SHARE * float(np.min(tree.query(design, k=2)[0][:, 1]))
+    best, successful, tried = 0, 0, 0
+    distance = SAME_SHARE * float(np.min(tree.query(design, k=2)[0][:, 1]))
     for seed in seeds:
-        corner = _corner(found, own, int(seed))
+        corner = _corner(nodes, node_tree, int(seed))
         if corner is None:
             continue
         tried += 1
-        start = _starts(found, corner, design, around, tolerance_mm)
-        near = own.query(found[seed], k=min(STAGES[-1], len(found)))[1]
-        T = _grown(start, found, np.atleast_1d(near), spread, design, tree, tolerance_mm)
-        for one in T:
-            count = int((tree.query(rigid.apply(one, found))[0] < tolerance_mm).sum())
-            if count < LEAST_SHARE * min(len(found), len(design)):
+        start = _starts(nodes, corner, design, around, tolerance_mm)
+        near = node_tree.query(nodes[seed], k=min(STAGES[-1], len(nodes)))[1]
+        T = _grown(start, nodes, np.atleast_1d(near), spread, design, tree, tolerance_mm)
+        for pose in T:
+            count = int((tree.query(rigid.apply(pose, nodes))[0] < tolerance_mm).sum())
+            if count < LEAST_SHARE * min(len(nodes), len(design)):
                 continue
-            if not any(_same(one, other, found, apart) for other in answers):
-                answers.append(one)
+            if not any(_same(pose, other, nodes, distance) for other in answers):
+                answers.append(pose)
                 best = max(best, count)
-        led += len(T) > 0 and best > 0
-        if led >= ENOUGH or tried >= CORNERS:
+        successful += len(T) > 0 and best > 0
+        if successful >= ENOUGH or tried >= CORNERS:
             break
     return np.array(answers).reshape(-1, 4, 4)
 
@@ -69,17 +69,17 @@ def poses(found: Floats, design: Floats, tolerance_mm: float) -> Floats:
 def _neighbours(points: Floats, tree: cKDTree) -> Ints:
     """Rows (n, NEIGHBOURS) of the nearest other points."""
     k = min(NEIGHBOURS, len(points) - 1)
-    found: Ints = tree.query(points, k=k + 1)[1][:, 1:].astype(np.int64)
-    return found
+    rows: Ints = tree.query(points, k=k + 1)[1][:, 1:].astype(np.int64)
+    return rows
 
 
-def _corner(found: Floats, tree: cKDTree, seed: int) -> Ints | None:
-    """Rows (3,) of a seed and two of its neighbours that make a good corner with it; None without one."""
-    near = tree.query(found[seed], k=min(NEIGHBOURS + 1, len(found)))[1][1:]
-    out = found[near] - found[seed]
+def _corner(nodes: Floats, tree: cKDTree, seed: int) -> Ints | None:
+    """Rows (3,) of a seed and two of its neighbours that form a triangle with a wide angle at it; None without one."""
+    near = tree.query(nodes[seed], k=min(NEIGHBOURS + 1, len(nodes)))[1][1:]
+    out = nodes[near] - nodes[seed]
     length = np.linalg.norm(out, axis=1)
     sine = np.linalg.norm(np.cross(out[:, None], out[None]), axis=2) / np.maximum(length[:, None] * length, 1e-300)
-    # The nearest two that open wide enough.
+    # The nearest two with a wide enough angle.
     reach = np.where(sine > max(FLAT, 0.0), np.maximum(length[:, None], length), np.inf)
     a, b = np.unravel_index(np.argmin(reach), reach.shape)
     if not np.isfinite(reach[a, b]):
@@ -87,9 +87,9 @@ def _corner(found: Floats, tree: cKDTree, seed: int) -> Ints | None:
     return np.array([seed, near[a], near[b]])
 
 
-def _starts(found: Floats, corner: Ints, design: Floats, around: Ints, tolerance_mm: float) -> Floats:
-    """Poses (h, 4, 4) that lay a corner of found nodes onto each corner of the design that is as large."""
-    u, v = found[corner[1]] - found[corner[0]], found[corner[2]] - found[corner[0]]
+def _starts(nodes: Floats, corner: Ints, design: Floats, around: Ints, tolerance_mm: float) -> Floats:
+    """Poses (h, 4, 4) that map a triangle of found nodes onto each triangle of the design with the same sides."""
+    u, v = nodes[corner[1]] - nodes[corner[0]], nodes[corner[2]] - nodes[corner[0]]
     sides = design[around] - design[:, None]
     length = np.linalg.norm(sides, axis=2)
     slack = 2.0 * tolerance_mm
@@ -101,7 +101,7 @@ def _starts(found: Floats, corner: Ints, design: Floats, around: Ints, tolerance
     keep = (a != b) & (np.abs(third - np.linalg.norm(u - v)) < slack)
     at, a, b = at[keep], a[keep], b[keep]
     target = np.stack([design[at], design[around[at, a]], design[around[at, b]]], axis=1)
-    return fitted(np.broadcast_to(found[corner], target.shape), target, np.ones(target.shape[:2]))
+    return fitted(np.broadcast_to(nodes[corner], target.shape), target, np.ones(target.shape[:2]))
 
 
 def fitted(source: Floats, target: Floats, weight: Floats) -> Floats:
@@ -121,20 +121,20 @@ def fitted(source: Floats, target: Floats, weight: Floats) -> Floats:
 
 
 def _grown(
-    T: Floats, found: Floats, near: Ints, spread: Ints, design: Floats, tree: cKDTree, tolerance_mm: float
+    T: Floats, nodes: Floats, near: Ints, spread: Ints, design: Floats, tree: cKDTree, tolerance_mm: float
 ) -> Floats:
-    """Return the poses among T (h, 4, 4) that ever more nodes follow, fitted to them; best first, MOST at most."""
+    """Return the poses among T (h, 4, 4) that remain through all stages, fitted; best first, MOST at most."""
     stages = [(near[:count], 1.5) for count in STAGES] + [(spread[:FEW], 2.5), (spread, 2.0)]
     number, error = np.empty(0), np.empty(0)
     for rows, wide in stages:
-        # Many poses that a neighbourhood cannot tell apart: more of it would not either.
+        # Where many poses agree with a neighbourhood, a larger one does not separate them either.
         if len(T) > MANY and len(rows) > STAGES[1] and rows is not spread:
             continue
-        # A pose from few nodes, a node's place being off, swings: the gate is wider than a node may be off.
+        # A pose from few nodes with deviations is turned: the gate is wider than the largest deviation of a node.
         gate = wide * tolerance_mm
         for refit in (True, False):
             parts = [
-                _followed(T[first : first + BLOCK], found[rows], design, tree, gate, tolerance_mm, refit=refit)
+                _supported(T[first : first + BLOCK], nodes[rows], design, tree, gate, tolerance_mm, refit=refit)
                 for first in range(0, len(T), BLOCK)
             ]
             if not parts:
@@ -145,18 +145,18 @@ def _grown(
     return T[np.lexsort((error, -number))][:MOST]
 
 
-def _followed(
+def _supported(
     T: Floats, nodes: Floats, design: Floats, tree: cKDTree, gate: float, tolerance_mm: float, *, refit: bool
 ) -> tuple[Floats, Floats, Floats]:
-    """Poses (h, 4, 4), fitted anew if asked, how many (h,) of nodes (n, 3) followed them before, and how far off."""
-    moved = np.einsum("hij,nj->hni", T[:, :3, :3], nodes) + T[:, None, :3, 3]
-    distance, index = tree.query(moved, distance_upper_bound=gate, workers=-1)
+    """Poses (h, 4, 4), fitted again with ``refit``; number (h,) of nodes (n, 3) that supported each, and error."""
+    placed = np.einsum("hij,nj->hni", T[:, :3, :3], nodes) + T[:, None, :3, 3]
+    distance, index = tree.query(placed, distance_upper_bound=gate, workers=-1)
     on = np.isfinite(distance)
     size = np.where(on, distance, 0.0)
     number = on.sum(axis=1)
     if refit:
         weight = on / (1.0 + (size / (0.5 * tolerance_mm)) ** 2)
-        T = fitted(np.broadcast_to(nodes, moved.shape), design[np.where(on, index, 0)], weight)
+        T = fitted(np.broadcast_to(nodes, placed.shape), design[np.where(on, index, 0)], weight)
     return T, number.astype(np.float64), size.sum(axis=1)
 
 
@@ -170,6 +170,6 @@ def _spread_out(points: Floats, count: int) -> Ints:
     return np.array(chosen)
 
 
-def _same(a: Floats, b: Floats, points: Floats, apart: float) -> bool:
+def _same(a: Floats, b: Floats, points: Floats, distance: float) -> bool:
     corners = np.array([points.min(axis=0), points.max(axis=0), points[0], points[-1]])
-    return bool(np.abs(rigid.apply(a, corners) - rigid.apply(b, corners)).max() < apart)
+    return bool(np.abs(rigid.apply(a, corners) - rigid.apply(b, corners)).max() < distance)

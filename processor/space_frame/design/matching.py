@@ -1,15 +1,16 @@
-"""Which node is which: the pattern of found nodes against a design's, in the same frame or in any other.
+"""Correspondence of found nodes to a design's, in the same frame or in any other.
 
-The design's own frame is tried first. Where it does not explain the pattern, poses are searched
-(:mod:`processor.space_frame.design.constellation`) and held against all that is known: how many nodes agree and how
-closely, the balls' radii, the members. A regular grid looks the same one bay on, or turned; then what differs must
-decide, and if nothing does the answer is ``ambiguous`` and names every candidate.
+The design's own frame is tried first. Where it does not explain the pattern of nodes, poses are searched for
+(:mod:`processor.space_frame.design.constellation`) and scored by all evidence: the number of nodes that agree and how
+closely, the spheres' radii, the members. A regular grid looks the same one bay on, or turned; then the differences
+decide, and without any the answer is ``ambiguous`` and lists every candidate.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -19,28 +20,46 @@ from processor.model import Checked, Floats, FrameDesign, Ints, column
 from processor.space_frame.design import constellation
 
 SAME, REGISTERED = "same frame", "registered"
-TOLERANCE_MM = 60.0  # that a node may be off its nominal place
+TOLERANCE_MM = 60.0  # largest deviation of a node from its nominal place
 LEAST_SHARE = 0.5  # of the smaller pattern's nodes that must agree
-DOUBTFUL_SHARE = 0.05  # missing and extra nodes both: another pose may explain them
-DOUBTED_SHARE = 0.1  # of the nodes: where a pose leads by no more of them, balls are asked too
+DOUBTFUL_SHARE = 0.05  # of missing and of extra nodes: beyond it another pose may explain them
+DOUBTED_SHARE = 0.1  # of the nodes: where a pose leads by fewer, the spheres' radii are used too
 FAR = 2.0  # tolerances: a node farther from its nominal place is another node
-NODE_ODDS = 4.0  # log odds that a pose loses by a found node that is none of the design's while one of those is missing
-INDEPENDENT = 20  # nodes' distances count as at most so many: those of neighbours go together
+NODE_ODDS = 4.0  # log odds that a pose loses by a found node without a design node while a design node is missing
+INDEPENDENT = 20  # nodes at most whose distances count as independent: those of neighbours are correlated
 DECISIVE = 7.0  # log odds, 1000 to 1
 NEAR = 19  # nodes about one that may be a bay's length off
 UPRIGHT_COS = 0.996  # 5 degrees
 TUKEY = 4.685
 MEDIAN_OF_3 = 1.538  # of the length of a normal vector in space, per sd
+RADIUS_ODDS = 4.0  # lost at most by a sphere of another size
+RADIUS_SD_MM = 1.0  # of spheres against the catalogue, beside the measurement's
+MEMBER_ODDS = 2.0  # lost by a member that is not in the design
+
+
+@dataclass(frozen=True)
+class NodePattern:
+    """Found nodes (k, 3) less ``origin``, mm; radii and their sd (k,) of fitted spheres, NaN or empty = unknown.
+
+    ``node_a`` and ``node_b`` are the rows of the nodes at both ends of each member found, -1 = none.
+    """
+
+    positions: Floats
+    origin: Floats = field(default_factory=lambda: np.zeros(3))
+    radii: Floats = field(default_factory=lambda: np.empty(0))
+    radius_sd: Floats = field(default_factory=lambda: np.empty(0))
+    node_a: Ints = field(default_factory=lambda: np.empty(0, np.int64))
+    node_b: Ints = field(default_factory=lambda: np.empty(0, np.int64))
 
 
 @dataclass(frozen=True)
 class Matching(Checked):
-    """Which found node is which of the design, and the pose that says so.
+    """Correspondence of each found node, and the pose that it rests on.
 
-    ``T_design_scan`` maps coordinates of the scan (the origin put back) to the design's frame; ``covariance`` (turn
-    about the design frame's axes, translation; T = exp(xi) T) takes the nodes' movements for random: it says how well
-    the nodes tell the frame. It is 0 where the frame was found to be the design's own, for then nothing was estimated.
-    ``T_best_fit`` is the best fit over all matched nodes in either case.
+    ``T_design_scan`` maps coordinates of the scan (the origin added) to the design's frame; its ``covariance`` (turn
+    about the design frame's axes, translation; T = exp(xi) T) treats the nodes' movements as random. It is 0 where the
+    frame is the design's own, for then nothing was estimated. ``T_best_fit`` is the best fit over all matched nodes in
+    either case.
     """
 
     status: str  # ok | ambiguous | failed
@@ -53,17 +72,15 @@ class Matching(Checked):
     weight: Floats = column("k")  # of each node in the best fit
     missing: Ints = column("d", dtype=np.int64)  # rows of the design without a node
     rivals: Floats = column("r", 4, 4)  # other T_design_scan that explain as much
-    scatter_mm: float = float("nan")  # of the matched nodes about their nominal places, sd an axis, robust
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A pose T_design_found of local coordinates, what it assigns, and its log odds (less is better)."""
+    """A pose T_design_found of local coordinates, its assignment, and its log odds (less is better)."""
 
     T: Floats
     assignment: Ints
     weight: Floats
-    rms: float
     odds: float
 
     @property
@@ -71,145 +88,122 @@ class _Candidate:
         return int((self.assignment >= 0).sum())
 
 
+@dataclass(frozen=True)
+class _Problem:
+    """The nodes and the design; ``nominal`` places (d, 3) are less ``middle``."""
+
+    nodes: NodePattern
+    design: FrameDesign
+    nominal: Floats
+    middle: Floats
+    tolerance_mm: float
+
+    @cached_property
+    def tree(self) -> cKDTree:
+        """Tree of the nominal places."""
+        return cKDTree(self.nominal)
+
+    @property
+    def fewer(self) -> int:
+        """Number of nodes of the smaller pattern."""
+        return min(len(self.nodes.positions), len(self.nominal))
+
+
+def expanded(design: FrameDesign, expansion: float) -> tuple[Floats, Floats]:
+    """Nominal places (d, 3) less their mean, all lengths times ``expansion``, and the mean (3,)."""
+    middle = design.centres.mean(axis=0) if len(design.centres) else np.zeros(3)
+    return (design.centres - middle) * expansion, middle
+
+
 def match(
-    found: Found,
+    nodes: NodePattern,
     design: FrameDesign,
     tolerance_mm: float = TOLERANCE_MM,
     expansion: float = 1.0,
-    sized: Callable[[], Found] | None = None,
+    sized: Callable[[], NodePattern] | None = None,
 ) -> Matching:
     """Match found nodes with a design's, each being up to about ``tolerance_mm`` off its nominal place.
 
-    ``expansion`` is the factor of all lengths by temperature. Up to a good part of the nodes may be missing or extra.
-    ``sized`` gives the same nodes with their balls' radii, where ``found`` has none: it is called only where the
+    ``expansion`` is the factor of all lengths by temperature. Up to half of the nodes may be missing or extra.
+    ``sized`` returns the same nodes with their spheres' radii, where ``nodes`` has none: it is called only where the
     pattern leaves more than one pose.
     """
-    k, middle = len(found.positions), design.centres.mean(axis=0) if len(design.centres) else np.zeros(3)
-    nominal = (design.centres - middle) * expansion
-    if k == 0 or len(nominal) == 0:
-        return _failed(k, len(nominal), "no nodes" if k == 0 else "the design has no nodes")
-    to_design = rigid.transform(np.eye(3), found.origin - middle)
-    same = _judged(to_design, found, design, nominal, tolerance_mm, fit=False)
-    least = LEAST_SHARE * min(k, len(nominal))
-    fits = same is not None and same.matched >= least
-    if same is not None and fits:
-        lacking, extra = 1.0 - same.matched / len(nominal), 1.0 - same.matched / k
-        few = min(lacking, extra) <= DOUBTFUL_SHARE or k < 4
-        if few or not _better_nearby(to_design, same.matched, found.positions, nominal, tolerance_mm):
-            return _answer(same, [], SAME, found, design, middle, nominal, "")
-    candidates = _searched(found, design, nominal, tolerance_mm) if k >= 4 and len(nominal) >= 4 else []
-    candidates = [one for one in candidates if one.matched >= max(least, 4)]
-    every = [same, *candidates] if same is not None and fits else candidates
-    every = _by_radii(every, design, min(k, len(nominal)), sized)
-    if same is not None and fits:
+    nominal, middle = expanded(design, expansion)
+    k, d = len(nodes.positions), len(nominal)
+    if k == 0 or d == 0:
+        return _failed(k, d, "no nodes" if k == 0 else "the design has no nodes")
+    problem = _Problem(nodes, design, nominal, middle, tolerance_mm)
+    to_design = rigid.transform(np.eye(3), nodes.origin - middle)
+    least = LEAST_SHARE * problem.fewer
+    same = _candidate(to_design, problem, fit=False)
+    if same is not None and same.matched < least:
+        same = None
+    if same is not None:
+        few = min(1.0 - same.matched / d, 1.0 - same.matched / k) <= DOUBTFUL_SHARE or k < 4
+        if few or not _better_nearby(to_design, same.matched, problem):
+            return _answer(same, [], SAME, problem, "")
+    candidates = _searched(problem) if k >= 4 and d >= 4 else []
+    candidates = [candidate for candidate in candidates if candidate.matched >= max(least, 4)]
+    every = _with_radii([same, *candidates] if same is not None else candidates, problem, sized)
+    if same is not None:
         same, candidates = every[0], every[1:]
-        apart = 5.0 * tolerance_mm
         rivals = [
-            one for one in candidates
-            if one.odds < same.odds - DECISIVE and not _alike(one.T, to_design, found.positions, apart)
+            rival for rival in candidates
+            if rival.odds < same.odds - DECISIVE and not _alike(rival.T, to_design, nodes.positions, 5.0 * tolerance_mm)
         ]  # fmt: skip
-        said = "the frames agree, but another pose explains more nodes" if rivals else ""
-        return _answer(same, rivals[:1], SAME, found, design, middle, nominal, said)
+        message = "the frames agree, but another pose explains more nodes" if rivals else ""
+        return _answer(same, rivals[:1], SAME, problem, message)
     if not every:
-        return _failed(k, len(nominal), "no pose lays half of the nodes onto the design's")
-    return _chosen(every, found, design, middle, nominal)
+        return _failed(k, d, "no pose lays half of the nodes onto the design's")
+    return _best(every, problem)
 
 
-def _by_radii(
-    candidates: list[_Candidate], design: FrameDesign, most: int, sized: Callable[[], Found] | None
-) -> list[_Candidate]:
-    """Weigh candidates by the balls' radii too, if there are several that so many as ``most`` nodes do not decide on.
-
-    A true pose may lose to a false one by the nodes that the one lacks and the other happens to have: what few nodes
-    say is not taken for an answer before the balls were asked.
-    """
-    if sized is None or len(candidates) < 2:
-        return candidates
-    odds = np.sort([one.odds for one in candidates])
-    lacking = most - max(one.matched for one in candidates)
-    if odds[1] > odds[0] + DECISIVE + NODE_ODDS * max(lacking, DOUBTED_SHARE * most):
-        return candidates
-    found = sized()
-    return [replace(one, odds=one.odds + radius_odds(found, design, one.assignment)) for one in candidates]
+# --- candidates ------------------------------------------------------------------------------------------------------
 
 
-def _better_nearby(T: Floats, matched: int, positions: Floats, nominal: Floats, tolerance_mm: float) -> bool:
-    """Whether more nodes agree one bay on, or turned by quarters about the design's middle: a grid's usual mistakes."""
-    tree = cKDTree(nominal)
-    middle = np.argsort(np.linalg.norm(nominal, axis=1), kind="stable")[:4]
-    bays = (nominal[tree.query(nominal[middle], k=min(NEAR, len(nominal)))[1][:, 1:]] - nominal[middle, None]).reshape(
-        -1, 3
-    )
-    centre = 0.5 * (nominal.min(axis=0) + nominal.max(axis=0))
-    tried = [rigid.transform(np.eye(3), side * bay) for bay in bays for side in (-1.0, 1.0)]
-    for quarter in range(1, 4):
-        R = rigid.rotation_from_vector(np.array([0.0, 0.0, 0.5 * np.pi * quarter]))
-        tried.append(rigid.transform(R, centre - R @ centre))
-    moved = rigid.apply(T, positions)
-    counts = [
-        (tree.query(rigid.apply(one, moved), distance_upper_bound=tolerance_mm)[0] < np.inf).sum() for one in tried
-    ]
-    return bool(max(counts) > matched)
-
-
-def _chosen(
-    candidates: list[_Candidate], found: Found, design: FrameDesign, middle: Floats, nominal: Floats
-) -> Matching:
-    """Take the best of the candidates, if it is better by far; else an upright one before those that are not."""
-    candidates = sorted(candidates, key=lambda one: one.odds)
-    level = [one for one in candidates if one.odds < candidates[0].odds + DECISIVE]
-    said = ""
-    upright = [one for one in level if one.T[2, 2] > UPRIGHT_COS]
-    if upright and len(upright) < len(level):
-        said = "the pattern turned over fits as well: taken as it stands upright, gravity along -Z in both frames"
-        level = upright
-    if len(level) > 1:
-        said = f"{len(level)} poses explain the pattern alike"
-    return _answer(level[0], level[1:], REGISTERED, found, design, middle, nominal, said)
-
-
-def _searched(found: Found, design: FrameDesign, nominal: Floats, tolerance_mm: float) -> list[_Candidate]:
-    middle = np.median(found.positions, axis=0)
+def _searched(problem: _Problem) -> list[_Candidate]:
+    positions = problem.nodes.positions
+    middle = np.median(positions, axis=0)
     back = rigid.transform(np.eye(3), -middle)
-    found_poses = constellation.poses(found.positions - middle, nominal, tolerance_mm)
-    judged = [_judged(T @ back, found, design, nominal, tolerance_mm, fit=True) for T in found_poses]
-    return [one for one in judged if one is not None]
+    poses = constellation.poses(positions - middle, problem.nominal, problem.tolerance_mm)
+    candidates = [_candidate(T @ back, problem, fit=True) for T in poses]
+    return [candidate for candidate in candidates if candidate is not None]
 
 
-def _judged(
-    T: Floats, found: Found, design: FrameDesign, nominal: Floats, tolerance_mm: float, *, fit: bool
-) -> _Candidate | None:
-    """Assign nodes under a pose (4, 4), fit it to them if asked, and weigh what speaks against it."""
-    tree, reach = cKDTree(nominal), FAR * tolerance_mm
-    assignment, weight = _mutual(T, found.positions, nominal, tree, reach), np.empty(0)
+def _candidate(T: Floats, problem: _Problem, *, fit: bool) -> _Candidate | None:
+    """Assign nodes under a pose (4, 4), with ``fit`` fit it to them, and compute its odds; None for too few nodes."""
+    positions, nominal = problem.nodes.positions, problem.nominal
+    assignment, weight = _mutual(T, problem), np.empty(0)
     for _ in range(5 if fit else 1):
         on = assignment >= 0
         if on.sum() < 3:
             if fit or not on.any():
                 return None
             break
-        best, weight = robust_fit(found.positions[on], nominal[assignment[on]])
+        best, weight = robust_fit(positions[on], nominal[assignment[on]])
         if not fit:
             break
         before, T = assignment, best
-        assignment = _mutual(T, found.positions, nominal, tree, reach)
+        assignment = _mutual(T, problem)
         if np.array_equal(before, assignment):
             break
     on = assignment >= 0
     if fit and on.sum() < 3:
         return None
-    every = np.zeros(len(assignment))
-    every[on] = weight if len(weight) == on.sum() else 1.0
-    off = rigid.apply(T, found.positions[on]) - nominal[assignment[on]]
+    weights = np.zeros(len(assignment))
+    weights[on] = weight if len(weight) == on.sum() else 1.0
+    off = rigid.apply(T, positions[on]) - nominal[assignment[on]]
     rms = float(np.sqrt(np.mean(np.sum(off**2, axis=1))))
     odds = -NODE_ODDS * int(on.sum()) + min(int(on.sum()), INDEPENDENT) * float(np.log(max(rms, 1e-6)))
-    odds += radius_odds(found, design, assignment) + member_odds(found, design, assignment)
-    return _Candidate(T, assignment, every, rms, odds)
+    odds += radius_odds(problem.nodes, problem.design, assignment)
+    odds += member_odds(problem.nodes, problem.design, assignment)
+    return _Candidate(T, assignment, weights, odds)
 
 
-def _mutual(T: Floats, positions: Floats, nominal: Floats, tree: cKDTree, reach: float) -> Ints:
+def _mutual(T: Floats, problem: _Problem) -> Ints:
     """Row of the nominal node (k,) that is each node's nearest and whose nearest it is; -1 = none within reach."""
-    distance, index = tree.query(rigid.apply(T, positions), distance_upper_bound=reach, workers=-1)
+    positions, reach = problem.nodes.positions, FAR * problem.tolerance_mm
+    distance, index = problem.tree.query(rigid.apply(T, positions), distance_upper_bound=reach, workers=-1)
     assignment = np.full(len(positions), -1, np.int64)
     near = np.flatnonzero(np.isfinite(distance))
     near = near[np.lexsort((distance[near], index[near]))]
@@ -222,7 +216,7 @@ def _mutual(T: Floats, positions: Floats, nominal: Floats, tree: cKDTree, reach:
 def robust_fit(source: Floats, target: Floats) -> tuple[Floats, Floats]:
     """Rigid T_target_source (4, 4) of paired points (n, 3), n >= 3, and the weight (n,) of each pair, at most 1.
 
-    Tukey's biweight on the distances, their scale from the median: a node that is far off does not draw the others.
+    Tukey's biweight on the distances, with their scale from the median: distant nodes get no weight.
     """
     weight = np.ones(len(source))
     T = rigid.fit(source, target)
@@ -237,42 +231,135 @@ def robust_fit(source: Floats, target: Floats) -> tuple[Floats, Floats]:
 
 
 def _weighted_fit(source: Floats, target: Floats, weight: Floats) -> Floats:
-    found: Floats = constellation.fitted(source[None], target[None], weight[None])[0]
-    return found
+    T: Floats = constellation.fitted(source[None], target[None], weight[None])[0]
+    return T
 
 
-def _alike(a: Floats, b: Floats, points: Floats, apart: float) -> bool:
-    return bool(np.abs(rigid.apply(a, points) - rigid.apply(b, points)).max() < apart)
+def _with_radii(
+    candidates: list[_Candidate], problem: _Problem, sized: Callable[[], NodePattern] | None
+) -> list[_Candidate]:
+    """Add the odds by the spheres' radii, if several candidates are left that the nodes do not decide on.
+
+    A true pose may lose to a false one by a few nodes that are missing by chance: a lead of few nodes is not decisive
+    without the radii.
+    """
+    if sized is None or len(candidates) < 2:
+        return candidates
+    most = problem.fewer
+    odds = np.sort([candidate.odds for candidate in candidates])
+    lacking = most - max(candidate.matched for candidate in candidates)
+    if odds[1] > odds[0] + DECISIVE + NODE_ODDS * max(lacking, DOUBTED_SHARE * most):
+        return candidates
+    nodes = sized()
+    return [replace(c, odds=c.odds + radius_odds(nodes, problem.design, c.assignment)) for c in candidates]
 
 
-def _answer(
-    chosen: _Candidate, rivals: list[_Candidate], how: str, found: Found, design: FrameDesign, middle: Floats,
-    nominal: Floats, said: str,
-) -> Matching:  # fmt: skip
+def _better_nearby(T: Floats, matched: int, problem: _Problem) -> bool:
+    """Whether more nodes agree one bay on, or turned by quarters about the design's middle: a grid's usual mistakes."""
+    nominal, tree = problem.nominal, problem.tree
+    middle = np.argsort(np.linalg.norm(nominal, axis=1), kind="stable")[:4]
+    neighbours = tree.query(nominal[middle], k=min(NEAR, len(nominal)))[1][:, 1:]
+    bays = (nominal[neighbours] - nominal[middle, None]).reshape(-1, 3)
+    centre = 0.5 * (nominal.min(axis=0) + nominal.max(axis=0))
+    tried = [rigid.transform(np.eye(3), side * bay) for bay in bays for side in (-1.0, 1.0)]
+    for quarter in range(1, 4):
+        R = rigid.rotation_from_vector(np.array([0.0, 0.0, 0.5 * np.pi * quarter]))
+        tried.append(rigid.transform(R, centre - R @ centre))
+    placed, reach = rigid.apply(T, problem.nodes.positions), problem.tolerance_mm
+    counts = [(tree.query(rigid.apply(pose, placed), distance_upper_bound=reach)[0] < np.inf).sum() for pose in tried]
+    return bool(max(counts) > matched)
+
+
+def _alike(a: Floats, b: Floats, points: Floats, distance: float) -> bool:
+    return bool(np.abs(rigid.apply(a, points) - rigid.apply(b, points)).max() < distance)
+
+
+# --- odds by radii and members ---------------------------------------------------------------------------------------
+
+
+def radius_odds(nodes: NodePattern, design: FrameDesign, assignment: Ints) -> float:
+    """Log odds that a pose loses by spheres of other sizes than the design's."""
+    if not len(nodes.radii) or not len(design.radii):
+        return 0.0
+    on = (assignment >= 0) & np.isfinite(nodes.radii)
+    off = nodes.radii[on] - design.radii[assignment[on]]
+    sd = np.hypot(nodes.radius_sd[on] if len(nodes.radius_sd) else 0.0, RADIUS_SD_MM)
+    odds = np.minimum(0.5 * (off / np.where(np.isfinite(sd), sd, np.inf)) ** 2, RADIUS_ODDS)
+    return float(np.sum(odds[np.isfinite(odds)]))
+
+
+def member_odds(nodes: NodePattern, design: FrameDesign, assignment: Ints) -> float:
+    """Log odds that a pose loses by members between its nodes where the design has none."""
+    if not len(nodes.node_a) or not len(design.member_a):
+        return 0.0
+    rows = match_members(assignment, nodes.node_a, nodes.node_b, design)
+    a, b = _ends(assignment, nodes.node_a), _ends(assignment, nodes.node_b)
+    return MEMBER_ODDS * float(((rows < 0) & (a >= 0) & (b >= 0)).sum())
+
+
+def match_members(assignment: Ints, node_a: Ints, node_b: Ints, design: FrameDesign) -> Ints:
+    """Row of the design's member (m,) between the same nodes as each member found, -1 = extra.
+
+    ``node_a`` and ``node_b`` (m,) are rows of the found nodes, -1 = none.
+    """
+    row_of = {int(id_): row for row, id_ in enumerate(design.ids)}
+    count = len(design.ids)
+    nominal = {}
+    for row, (id_a, id_b) in enumerate(zip(design.member_a, design.member_b, strict=True)):
+        a, b = row_of.get(int(id_a), -1), row_of.get(int(id_b), -1)
+        nominal[min(a, b) * count + max(a, b)] = row
+    ends = zip(_ends(assignment, node_a).tolist(), _ends(assignment, node_b).tolist(), strict=True)
+    return np.array(
+        [nominal.get(min(i, j) * count + max(i, j), -1) if i >= 0 and j >= 0 else -1 for i, j in ends], np.int64
+    )
+
+
+def _ends(assignment: Ints, node: Ints) -> Ints:
+    rows: Ints = np.where(node >= 0, assignment[node], -1) if len(assignment) else np.full(len(node), -1)
+    return rows
+
+
+# --- the answer ------------------------------------------------------------------------------------------------------
+
+
+def _best(candidates: list[_Candidate], problem: _Problem) -> Matching:
+    """Take the best candidate if it leads decisively; else prefer upright ones, and report the rest as rivals."""
+    candidates = sorted(candidates, key=lambda candidate: candidate.odds)
+    level = [candidate for candidate in candidates if candidate.odds < candidates[0].odds + DECISIVE]
+    message = ""
+    upright = [candidate for candidate in level if candidate.T[2, 2] > UPRIGHT_COS]
+    if upright and len(upright) < len(level):
+        message = "the pattern turned over fits as well: taken as it stands upright, gravity along -Z in both frames"
+        level = upright
+    if len(level) > 1:
+        message = f"{len(level)} poses explain the pattern alike"
+    return _answer(level[0], level[1:], REGISTERED, problem, message)
+
+
+def _answer(chosen: _Candidate, rivals: list[_Candidate], how: str, problem: _Problem, message: str) -> Matching:
+    nodes, nominal, middle = problem.nodes, problem.nominal, problem.middle
     on = chosen.assignment >= 0
-    nodes, places, weight = found.positions[on], nominal[chosen.assignment[on]], chosen.weight[on]
-    best, covariance, scatter = chosen.T, np.zeros((6, 6)), float("nan")
+    positions, places, weight = nodes.positions[on], nominal[chosen.assignment[on]], chosen.weight[on]
+    best, covariance = chosen.T, np.zeros((6, 6))
     if on.sum() >= 3:
-        best = _weighted_fit(nodes, places, weight)
-        off = rigid.apply(best, nodes) - places
-        scatter = float(np.median(np.linalg.norm(off, axis=1))) / MEDIAN_OF_3
+        best = _weighted_fit(positions, places, weight)
         if how == REGISTERED:
-            covariance = _covariance(rigid.apply(best, nodes), off, weight, middle)
-    T = best if how == REGISTERED else rigid.transform(np.eye(3), found.origin - middle)
+            placed = rigid.apply(best, positions)
+            covariance = _covariance(placed, placed - places, weight, middle)
+    T = best if how == REGISTERED else rigid.transform(np.eye(3), nodes.origin - middle)
     missing = np.setdiff1d(np.arange(len(nominal)), chosen.assignment[on])
-    told = f"{how}: {int(on.sum())} nodes of {len(nominal)}, {len(missing)} missing, {int((~on).sum())} extra"
+    summary = f"{how}: {int(on.sum())} nodes of {len(nominal)}, {len(missing)} missing, {int((~on).sum())} extra"
     return Matching(
-        "ambiguous" if rivals else "ok",
-        how,
-        "; ".join(one for one in (told, said) if one),
-        _full(T, found.origin, middle),
-        covariance,
-        _full(best, found.origin, middle),
-        chosen.assignment,
-        chosen.weight,
-        missing,
-        np.array([_full(one.T, found.origin, middle) for one in rivals]).reshape(-1, 4, 4),
-        scatter,
+        status="ambiguous" if rivals else "ok",
+        how=how,
+        message="; ".join(filter(None, (summary, message))),
+        T_design_scan=_full(T, nodes.origin, middle),
+        covariance=covariance,
+        T_best_fit=_full(best, nodes.origin, middle),
+        assignment=chosen.assignment,
+        weight=chosen.weight,
+        missing=missing,
+        rivals=np.array([_full(rival.T, nodes.origin, middle) for rival in rivals]).reshape(-1, 4, 4),
     )
 
 
@@ -295,89 +382,20 @@ def _covariance(placed: Floats, off: Floats, weight: Floats, middle: Floats) -> 
     about = np.eye(6)
     # a turn about the middle is one about the origin and a translation by - w x middle
     about[3:, :3] = [[0.0, -middle[2], middle[1]], [middle[2], 0.0, -middle[0]], [-middle[1], middle[0], 0.0]]
-    one = about @ inverse @ meat @ inverse @ about.T
-    found: Floats = 0.5 * (one + one.T)
-    return found
+    C = about @ inverse @ meat @ inverse @ about.T
+    symmetric: Floats = 0.5 * (C + C.T)
+    return symmetric
 
 
 def _failed(k: int, d: int, message: str) -> Matching:
     nothing = np.full((4, 4), np.nan)
     return Matching(
-        "failed", "", message, nothing, np.full((6, 6), np.nan), nothing, np.full(k, -1), np.zeros(k), np.arange(d)
+        status="failed",
+        message=message,
+        T_design_scan=nothing,
+        covariance=np.full((6, 6), np.nan),
+        T_best_fit=nothing,
+        assignment=np.full(k, -1),
+        weight=np.zeros(k),
+        missing=np.arange(d),
     )
-
-
-# --- What balls' sizes and members say of which found node is which of the design.
-
-
-RADIUS_ODDS = 4.0  # at most, by a ball of another size
-RADIUS_SD_MM = 1.0  # of balls against the catalogue, beside the measurement's
-MEMBER_ODDS = 2.0  # by a member that is not in the design
-
-
-@dataclass(frozen=True)
-class Found:
-    """Found nodes (k, 3) less ``origin``, mm; radii and their sd (k,) where balls were fitted, NaN or empty = unknown.
-
-    ``node_a`` and ``node_b`` are the rows of the nodes at both ends of each tube found, -1 = none.
-    """
-
-    positions: Floats
-    origin: Floats
-    radii: Floats
-    radius_sd: Floats
-    node_a: Ints
-    node_b: Ints
-
-    @classmethod
-    def bare(cls, positions: Floats, origin: Floats | None = None) -> Found:
-        """Make a record of nodes of which nothing but the places is known."""
-        none, no_rows = np.empty(0), np.empty(0, np.int64)
-        return cls(positions, np.zeros(3) if origin is None else origin, none, none, no_rows, no_rows)
-
-
-def radius_odds(found: Found, design: FrameDesign, assignment: Ints) -> float:
-    """Log odds that a pose loses by balls of other sizes than the design's."""
-    if not len(found.radii) or not len(design.radii):
-        return 0.0
-    on = (assignment >= 0) & np.isfinite(found.radii)
-    off = found.radii[on] - design.radii[assignment[on]]
-    sd = np.hypot(found.radius_sd[on] if len(found.radius_sd) else 0.0, RADIUS_SD_MM)
-    odds = np.minimum(0.5 * (off / np.where(np.isfinite(sd), sd, np.inf)) ** 2, RADIUS_ODDS)
-    return float(np.sum(odds[np.isfinite(odds)]))
-
-
-def member_odds(found: Found, design: FrameDesign, assignment: Ints) -> float:
-    """Log odds that a pose loses by tubes between its nodes where the design has no member."""
-    if not len(found.node_a) or not len(design.member_a):
-        return 0.0
-    rows, _ = match_members(assignment, found.node_a, found.node_b, design)
-    a, b = _ends(assignment, found.node_a), _ends(assignment, found.node_b)
-    return MEMBER_ODDS * float(((rows < 0) & (a >= 0) & (b >= 0)).sum())
-
-
-def match_members(assignment: Ints, node_a: Ints, node_b: Ints, design: FrameDesign) -> tuple[Ints, Ints]:
-    """Row of the design's member (m,) that each tube between found nodes is, -1 = extra; and the rows without a tube.
-
-    ``node_a`` and ``node_b`` (m,) are rows of the found nodes, -1 = none.
-    """
-    row_of = {int(id_): row for row, id_ in enumerate(design.ids)}
-    pairs = [
-        (row_of.get(int(a), -1), row_of.get(int(b), -1)) for a, b in zip(design.member_a, design.member_b, strict=True)
-    ]
-    count = len(design.ids)
-    nominal = {min(a, b) * count + max(a, b): row for row, (a, b) in enumerate(pairs)}
-    a, b = _ends(assignment, node_a), _ends(assignment, node_b)
-    rows = np.array(
-        [
-            nominal.get(min(i, j) * count + max(i, j), -1) if i >= 0 and j >= 0 else -1
-            for i, j in zip(a.tolist(), b.tolist(), strict=True)
-        ],
-        np.int64,
-    )
-    return rows, np.setdiff1d(np.arange(len(pairs)), rows)
-
-
-def _ends(assignment: Ints, node: Ints) -> Ints:
-    found: Ints = np.where(node >= 0, assignment[node], -1) if len(assignment) else np.full(len(node), -1)
-    return found

@@ -1,38 +1,37 @@
-"""Lengths that a mistaken unit explains."""
+"""Detection of lengths in a wrong unit."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from processor.geometry import unit_ratio
 from processor.model import Floats
 
 FACTORS = (1000.0, 304.8, 25.4)  # m, feet and inches read as mm, or the other way round
-NEAR = 0.02  # share by which a factor may be missed
-PLAUSIBLE_MM = (5.0, 2000.0)  # radii of anything that is called a ball or a target
+NEAR = 0.02  # relative tolerance of a factor
+PLAUSIBLE_MM = (5.0, 2000.0)  # radii of any sphere or target
 COMMON_MM = (20.0, 300.0)  # radii of most of them
 
 
 def between(known: Floats, seen: Floats) -> str:
-    """Name the factor of a unit, or one over it, by which lengths (n,) exceed others (n,); empty without one."""
+    """Return the factor of a unit, or its inverse, by which lengths (n,) exceed others (n,); empty without one."""
     sound = (known > 0.0) & (seen > 0.0)
     if not sound.any():
         return ""
     ratio = float(np.median(known[sound] / seen[sound]))
-    for factor in FACTORS:
-        if abs(ratio / factor - 1.0) < NEAR:
-            return f"{factor:g}"
-        if abs(ratio * factor - 1.0) < NEAR:
-            return f"1/{factor:g}"
-    return ""
+    factor = unit_ratio.nearest_factor(ratio, unit_ratio.with_inverses(FACTORS), NEAR)
+    if factor is None:
+        return ""
+    return f"{factor:g}" if factor > 1.0 else f"1/{1.0 / factor:g}"
 
 
 def implausible(radius: float) -> str:
-    """Say what is wrong with a radius in mm that no ball or target has; empty for one that some have."""
+    """Return a message if a radius (mm) is outside of those of spheres and targets; else an empty text."""
     if PLAUSIBLE_MM[0] <= radius <= PLAUSIBLE_MM[1]:
         return ""
-    said = f"no ball or target has a radius of {radius:.{0 if radius >= 100.0 else 3}f} mm"
+    message = f"no ball or target has a radius of {radius:.{0 if radius >= 100.0 else 3}f} mm"
     for factor in FACTORS:
         for scale, how in ((1.0 / factor, f"1/{factor:g}"), (factor, f"{factor:g}")):
             if COMMON_MM[0] <= radius * scale <= COMMON_MM[1]:
-                return f"{said}: the unit may be wrong, {how} of it would be {radius * scale:.1f} mm"
-    return said
+                return f"{message}: the unit may be wrong, {how} of it would be {radius * scale:.1f} mm"
+    return message

@@ -1,30 +1,67 @@
-"""One tube fitted to the points about its line: a round cylinder whose axis may be bowed.
+"""Model of one tube: a round cylinder whose axis may be bowed, its residuals and one Gauss-Newton step.
 
 In a frame along the line, z from the tube's middle and h half of its length, the axis is at
 
     x = a + c z / h + e (1 - (z / h)^2),    y = b + d z / h + f (1 - (z / h)^2),    |z| <= h
 
-with no bow beyond the ends. Where the scanner is known a residual is the range measured less the range at which the
-ray meets the cylinder: noise runs along the ray, and this residual has neither the bias nor the loss of an orthogonal
-one. Where it is unknown it is the distance from the surface.
+with no bow beyond the ends. Where the scanner is known a residual is the measured range less the range at which the ray
+meets the cylinder: noise runs along the ray, and this residual has neither the bias nor the loss of efficiency of an
+orthogonal distance. Where it is unknown the residual is the distance from the surface.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
 
+from processor.model import Floats, Ints
+
 NP = 7  # a, b, c, d, r, e, f; mm
-GRAZING_COS = 0.2  # of incidence by the model: rays that graze more tell of mixed pixels, not of the tube
+GRAZING_COS = 0.2  # of incidence by the model: rays that graze more are often mixed pixels
 ACROSS_MM = 0.4  # noise across the ray: angles and footprint of the beam
+
+
+class Observations(NamedTuple):
+    """Points near one tube in its frame, sorted by station: those of group g are rows bounds[g] to bounds[g + 1]."""
+
+    points: Floats  # (n, 3)
+    rays: Floats  # (n, 3) unit vectors from the scanner
+    known: npt.NDArray[np.bool_]  # (n,) the scanner is known
+    bounds: Ints  # (g + 1,)
+
+
+class Shifts(NamedTuple):
+    """Shifts (g, 2) of the stations across the tube, and their standard deviations (g,); 0 = fixed. mm."""
+
+    values: Floats
+    sd: Floats
+
+
+class Weighting(NamedTuple):
+    """Least cosine of incidence, largest weighted residual, standard deviations of a range and of the bow. mm."""
+
+    least_cos: float
+    cut: float
+    sigma: float
+    bow_sd: float
+
+
+class Solution(NamedTuple):
+    """Inverse of the normal equations (7, 7), and the change (g, 7, 2) of the parameters by each station's shift."""
+
+    inverse: Floats
+    response: Floats
 
 
 @njit(cache=True, nogil=True, inline="always")
 def residual(p, h, px, py, pz, ux, uy, uz, by_ray, J):  # type: ignore[no-untyped-def]
     """Residual of a point seen along the unit vector u, and the cosine of incidence; J (7,) gets the derivatives.
 
-    The cosine is 0 for a ray that passes the cylinder by.
+    The cosine is 0 for a ray that misses the cylinder.
     """
     s = pz / h
     bend = 1.0 - s * s if -1.0 < s < 1.0 else 0.0
@@ -90,47 +127,18 @@ def solve(A, y, n, x, inverse, want_inverse):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def spread_of(values, n):  # type: ignore[no-untyped-def]
-    """Estimate the standard deviation of normal values by their median absolute size."""
-    return 1.4826 * np.median(np.abs(values[:n]))
+def step(p, h, observations, shifts, free, weighting, sizes, solution):  # type: ignore[no-untyped-def]
+    """One Gauss-Newton step of the first ``free`` parameters over points with |z| <= h and |residual| <= cut.
 
-
-@njit(cache=True, nogil=True)
-def step(  # type: ignore[no-untyped-def]
-    p, h, P, U, seen, bounds, shifts, free, least_cos, cut, sigma, bow_sd, station_sd, sizes, inverse, response,
-):  # fmt: skip
-    """One Gauss-Newton step of the first ``free`` parameters over points with |z| <= h and |residual| <= cut mm.
-
-    Group g, the points of one station, is rows ``bounds[g]`` to ``bounds[g + 1]``. Where its ``station_sd`` (g,) is
-    above 0 a station is moved across the tube by ``shifts`` (g, 2), which are estimated too and have that standard
-    deviation; they are eliminated, and the inverse of the normal equations knows of them. ``response`` (g, 7, 2) gets
-    how the parameters move with a movement of each station, ``sizes`` the weighted residuals.
-    Returns (points used, sum of squared weighted residuals, largest movement, whether it could be solved).
+    Where stations' standard deviations are above 0 their shifts are estimated too; they are eliminated, and the inverse
+    of the normal equations includes them. ``sizes`` (n,) gets the weighted residuals.
+    Returns (points used, sum of squared weighted residuals, largest change, whether it could be solved).
     """
-    groups = len(bounds) - 1
-    A, y, J, x = np.zeros((groups, NP, NP)), np.zeros((groups, NP)), np.zeros(NP), np.zeros(NP)
-    n, total = 0, 0.0
-    k2 = (ACROSS_MM / sigma) ** 2
-    q = p.copy()
-    for g in range(groups):
-        q[0], q[1] = p[0] + shifts[g, 0], p[1] + shifts[g, 1]
-        for i in range(bounds[g], bounds[g + 1]):
-            if abs(P[i, 2]) > h:
-                continue
-            v, cos = residual(q, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
-            if cos < least_cos:
-                continue
-            w = 1.0 / (1.0 + k2 * (1.0 - cos * cos) / (cos * cos)) if seen[i] else 1.0
-            if w * v * v > cut * cut:
-                continue
-            sizes[n] = np.sqrt(w) * v
-            n += 1
-            total += w * v * v
-            for a in range(free):
-                weighted = w * J[a]
-                y[g, a] -= weighted * v
-                for b in range(a + 1):
-                    A[g, a, b] += weighted * J[b]
+    _, _, sigma, bow_sd = weighting
+    inverse, response = solution
+    groups = len(observations.bounds) - 1
+    A, y, x = np.zeros((groups, NP, NP)), np.zeros((groups, NP)), np.zeros(NP)
+    n, total = _sum_up(p, h, observations, shifts.values, free, weighting, sizes, A, y)
     if n < 2 * free:
         return n, total, 0.0, False
     N, right = np.zeros((NP, NP)), np.zeros(NP)
@@ -143,54 +151,96 @@ def step(  # type: ignore[no-untyped-def]
         for a in range(5, NP):
             N[a, a] += (sigma / bow_sd) ** 2
             right[a] -= (sigma / bow_sd) ** 2 * p[a]
-    moving = station_sd.max() > 0.0
+    moving = shifts.sd.max() > 0.0
     if moving:
         for g in range(groups):
-            ratio = (sigma / station_sd[g]) ** 2
-            d00, d11, d10 = A[g, 0, 0] + ratio, A[g, 1, 1] + ratio, A[g, 1, 0]
-            det = d00 * d11 - d10 * d10
-            r0, r1 = y[g, 0] - ratio * shifts[g, 0], y[g, 1] - ratio * shifts[g, 1]
+            ratio, d00, d11, d10, det, r0, r1 = _shift_equations(A[g], y[g], shifts.values[g], sigma / shifts.sd[g])
             for a in range(free):
-                a0, a1 = column(A[g], a, 0), column(A[g], a, 1)
+                a0, a1 = element(A[g], a, 0), element(A[g], a, 1)
                 e0, e1 = (d11 * a0 - d10 * a1) / det, (d00 * a1 - d10 * a0) / det
                 right[a] -= e0 * r0 + e1 * r1
                 for b in range(a + 1):
-                    N[a, b] -= e0 * column(A[g], b, 0) + e1 * column(A[g], b, 1)
+                    N[a, b] -= e0 * element(A[g], b, 0) + e1 * element(A[g], b, 1)
     if not solve(N, right, free, x, inverse, True):
         return n, total, 0.0, False
     if moving:
         for g in range(groups):
-            ratio = (sigma / station_sd[g]) ** 2
-            d00, d11, d10 = A[g, 0, 0] + ratio, A[g, 1, 1] + ratio, A[g, 1, 0]
-            det = d00 * d11 - d10 * d10
-            r0, r1 = y[g, 0] - ratio * shifts[g, 0], y[g, 1] - ratio * shifts[g, 1]
+            ratio, d00, d11, d10, det, r0, r1 = _shift_equations(A[g], y[g], shifts.values[g], sigma / shifts.sd[g])
             for a in range(free):
-                r0 -= column(A[g], a, 0) * x[a]
-                r1 -= column(A[g], a, 1) * x[a]
-            shifts[g, 0] += (d11 * r0 - d10 * r1) / det
-            shifts[g, 1] += (d00 * r1 - d10 * r0) / det
+                r0 -= element(A[g], a, 0) * x[a]
+                r1 -= element(A[g], a, 1) * x[a]
+            shifts.values[g, 0] += (d11 * r0 - d10 * r1) / det
+            shifts.values[g, 1] += (d00 * r1 - d10 * r0) / det
             for a in range(free):
                 response[g, a, 0] = response[g, a, 1] = 0.0
                 for b in range(free):
-                    b0, b1 = column(A[g], b, 0), column(A[g], b, 1)
+                    b0, b1 = element(A[g], b, 0), element(A[g], b, 1)
                     response[g, a, 0] += inverse[a, b] * ratio * (d11 * b0 - d10 * b1) / det
                     response[g, a, 1] += inverse[a, b] * ratio * (d00 * b1 - d10 * b0) / det
-    moved = 0.0
+    largest = 0.0
     for a in range(free):
         p[a] += x[a]
-        moved = max(moved, abs(x[a]))
-    return n, total, moved, True
+        largest = max(largest, abs(x[a]))
+    return n, total, largest, True
+
+
+@njit(cache=True, nogil=True)
+def _sum_up(p, h, observations, shifts, free, weighting, sizes, A, y):  # type: ignore[no-untyped-def]
+    """Add each group's points to its normal equations A (g, 7, 7), lower half, and y (g, 7); fill their ``sizes``.
+
+    Returns the number of points and the sum of their squared weighted residuals.
+    """
+    P, U, known, bounds = observations
+    least_cos, cut, sigma, _ = weighting
+    J = np.zeros(NP)
+    n, total = 0, 0.0
+    k2 = (ACROSS_MM / sigma) ** 2
+    q = p.copy()
+    for g in range(len(bounds) - 1):
+        q[0], q[1] = p[0] + shifts[g, 0], p[1] + shifts[g, 1]
+        for i in range(bounds[g], bounds[g + 1]):
+            if abs(P[i, 2]) > h:
+                continue
+            v, cos = residual(q, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], known[i], J)
+            if cos < least_cos:
+                continue
+            w = 1.0 / (1.0 + k2 * (1.0 - cos * cos) / (cos * cos)) if known[i] else 1.0
+            if w * v * v > cut * cut:
+                continue
+            sizes[n] = np.sqrt(w) * v
+            n += 1
+            total += w * v * v
+            for a in range(free):
+                weighted = w * J[a]
+                y[g, a] -= weighted * v
+                for b in range(a + 1):
+                    A[g, a, b] += weighted * J[b]
+    return n, total
 
 
 @njit(cache=True, nogil=True, inline="always")
-def column(A, a, k):  # type: ignore[no-untyped-def]
+def _shift_equations(A, y, shift, relative_sd):  # type: ignore[no-untyped-def]
+    """Return the equations of a station's shift: prior's ratio, matrix (3 elements), determinant and right side."""
+    ratio = relative_sd**2
+    d00, d11, d10 = A[0, 0] + ratio, A[1, 1] + ratio, A[1, 0]
+    return ratio, d00, d11, d10, d00 * d11 - d10 * d10, y[0] - ratio * shift[0], y[1] - ratio * shift[1]
+
+
+@njit(cache=True, nogil=True, inline="always")
+def element(A, a, k):  # type: ignore[no-untyped-def]
     """Element (a, k) of a symmetric matrix whose lower half is filled."""
     return A[a, k] if a >= k else A[k, a]
 
 
 @njit(cache=True, nogil=True)
-def roughly(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
-    """Start from an algebraic circle whose centre runs along a line: linear in (a, b, c, d, and the constant)."""
+def spread_of(values, n):  # type: ignore[no-untyped-def]
+    """Estimate the standard deviation of normal values by their median absolute size."""
+    return 1.4826 * np.median(np.abs(values[:n]))
+
+
+@njit(cache=True, nogil=True)
+def circle_along(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
+    """Start ``p`` from an algebraic circle whose centre runs along a line: linear in (a, b, c, d, and the constant)."""
     A, y, x, inverse = np.zeros((5, 5)), np.zeros(5), np.zeros(5), np.zeros((5, 5))
     J = np.empty(5)
     for turn in range(3):
@@ -226,18 +276,18 @@ def roughly(P, low, high, reach, p, h):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def reach_of(p, h, P, U, seen, bounds, shifts, sigma, bins, width, span):  # type: ignore[no-untyped-def]
-    """Find the ends of the stretch that lies on the cylinder, by bins of ``width`` over +-span about the middle.
+def extent_of(p, h, observations, shifts, sigma, bins, width):  # type: ignore[no-untyped-def]
+    """Find the ends of the stretch of points on the cylinder, by bins of ``width`` to both sides of the middle.
 
-    Stations are moved by ``shifts`` as in :func:`step`.
-
-    Outward from the middle every point on the surface adds to a sum and every other one takes away from it: a point's
-    part is 2 less its squared residual in standard deviations, which counts for 6 at most: one mixed pixel in five
-    points does no harm. The end is where the sum is largest.
+    Stations are shifted as in :func:`step`. Outward from the middle each point contributes 2 less its squared residual
+    in standard deviations, limited to 6, to a sum: points on the surface raise it, others lower it, and one mixed pixel
+    in five points does no harm. The end is where the sum is largest.
     """
+    P, U, known, bounds = observations
     J = np.zeros(NP)
     bins[:] = 0.0
     count = len(bins)
+    span = 0.5 * width * count
     q = p.copy()
     for g in range(len(bounds) - 1):
         q[0], q[1] = p[0] + shifts[g, 0], p[1] + shifts[g, 1]
@@ -245,11 +295,11 @@ def reach_of(p, h, P, U, seen, bounds, shifts, sigma, bins, width, span):  # typ
             at = int(np.floor((P[i, 2] + span) / width))
             if at < 0 or at >= count:
                 continue
-            v, cos = residual(q, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], seen[i], J)
+            v, cos = residual(q, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], known[i], J)
             if cos >= GRAZING_COS:
                 bins[at] += 2.0 - min(6.0, (v * cos / sigma) ** 2)
                 continue
-            # A ray that grazes or passes by says something only where its point is far off the surface.
+            # A ray that grazes or misses is evidence only where its point is far off the surface.
             dx, dy = P[i, 0] - q[0] - q[2] * P[i, 2] / h, P[i, 1] - q[1] - q[3] * P[i, 2] / h
             if np.sqrt(dx * dx + dy * dy) - p[4] > max(5.0 * sigma, 12.0):
                 bins[at] -= 4.0

@@ -1,10 +1,10 @@
-"""How much the voxels about each voxel lie along a line, and along which."""
+"""Linearity and direction of the voxels about each voxel."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -19,8 +19,7 @@ WIDE = SIDE + 2 * HALO
 LEAST_VOXELS = 4
 
 
-@dataclass(frozen=True)
-class Linearity:
+class Linearity(NamedTuple):
     """Of each voxel's window: 1 - sqrt(second / first eigenvalue) (v,), the first axis (v, 3) and the mean (v, 3)."""
 
     values: Floats
@@ -61,15 +60,16 @@ def principal(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def fill(local, block, cells, blocks, starts, beside):  # type: ignore[no-untyped-def]
+def fill(local, block, voxels):  # type: ignore[no-untyped-def]
     """Write the rows of the voxels in a block and its halo to ``local`` (WIDE, WIDE, WIDE); -1 = empty."""
     local[:] = -1
-    x0, y0, z0 = blocks[block, 0] * SIDE - HALO, blocks[block, 1] * SIDE - HALO, blocks[block, 2] * SIDE - HALO
+    cells, corner = voxels.cells, voxels.blocks[block]
+    x0, y0, z0 = corner[0] * SIDE - HALO, corner[1] * SIDE - HALO, corner[2] * SIDE - HALO
     for k in range(27):
-        other = beside[block, k]
+        other = voxels.beside[block, k]
         if other < 0:
             continue
-        for i in range(starts[other], starts[other + 1]):
+        for i in range(voxels.starts[other], voxels.starts[other + 1]):
             x, y, z = cells[i, 0] - x0, cells[i, 1] - y0, cells[i, 2] - z0
             if 0 <= x < WIDE and 0 <= y < WIDE and 0 <= z < WIDE:
                 local[x, y, z] = i
@@ -105,18 +105,20 @@ def window(local, means, x, y, z, ball, stop, out):  # type: ignore[no-untyped-d
 
 
 @njit(cache=True, nogil=True)
-def measure(cells, means, blocks, starts, beside, ball, small, least, values, axes, centres, first, last):  # type: ignore[no-untyped-def]
+def measure(voxels, ball, small, least, linear, first, last):  # type: ignore[no-untyped-def]
     """Fill in linearity, axis and mean of the voxels of blocks first..last; the large window where the small fails."""
     local = np.empty((WIDE, WIDE, WIDE), np.int32)
+    values, axes, centres = linear
+    cells, blocks = voxels.cells, voxels.blocks
     m = np.empty(9)
     for block in range(first, last):
-        fill(local, block, cells, blocks, starts, beside)
-        for i in range(starts[block], starts[block + 1]):
+        fill(local, block, voxels)
+        for i in range(voxels.starts[block], voxels.starts[block + 1]):
             x = cells[i, 0] - blocks[block, 0] * SIDE + HALO
             y = cells[i, 1] - blocks[block, 1] * SIDE + HALO
             z = cells[i, 2] - blocks[block, 2] * SIDE + HALO
             for scale in range(2):
-                n = window(local, means, x, y, z, ball, small if scale == 0 else len(ball), m)
+                n = window(local, voxels.means, x, y, z, ball, small if scale == 0 else len(ball), m)
                 if n < LEAST_VOXELS:
                     continue
                 l1, l2, dx, dy, dz = principal(m[0], m[1], m[2], m[3], m[4], m[5])
@@ -135,18 +137,14 @@ def ball(radius2: int) -> Ints:
     every = np.stack(np.meshgrid(*[np.arange(-reach, reach + 1)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
     square = (every**2).sum(axis=1)
     order = np.argsort(square, kind="stable")
-    found: Ints = every[order[square[order] <= radius2]]
-    return found
+    offsets: Ints = every[order[square[order] <= radius2]]
+    return offsets
 
 
 def linearity(voxels: Voxels, least: float, threads: int = 0) -> Linearity:
-    """Linearity of each voxel's window: the small window, and the large one where that is below ``least``."""
+    """Return the linearity of each voxel's window: the small one, and the large one where that is below ``least``."""
     offsets = ball(LARGE2)
     small = len(ball(SMALL2))
-    values, axes, centres = np.zeros(voxels.count), np.zeros((voxels.count, 3)), voxels.means.copy()
-    kernel = partial(
-        measure, voxels.cells, voxels.means, voxels.blocks, voxels.starts, voxels.beside, offsets, small, least, values,
-        axes, centres,
-    )  # fmt: skip
-    over_ranges(kernel, len(voxels.blocks), threads)
-    return Linearity(values, axes, centres)
+    linear = Linearity(np.zeros(len(voxels.cells)), np.zeros((len(voxels.cells), 3)), voxels.means.copy())
+    over_ranges(partial(measure, voxels, offsets, small, least, linear), len(voxels.blocks), threads)
+    return linear

@@ -1,4 +1,4 @@
-"""Records of what is known of a frame's members and nodes before any ball is fitted."""
+"""Records of a frame's members and nodes before any sphere is fitted."""
 
 from __future__ import annotations
 
@@ -11,26 +11,26 @@ from processor.model import Checked, Floats, Ints, column
 
 @dataclass(frozen=True)
 class Nodes(Checked):
-    """Nodes as the axes of their tubes give them: mm, less the origin of the source.
+    """Nodes where the axes of their members meet: mm, less the origin of the source.
 
-    ``covariance`` is that of the point where the axes meet, with what the axes' scatter says of eccentric joints.
-    Fewer than three axes is weak evidence: such a node needs a ball to be believed.
+    ``covariance`` is that of the meeting point; it includes the axes' scatter by eccentric joints. A node of fewer than
+    three axes has weak support: it needs a sphere to be confirmed.
     """
 
     positions: Floats = column("k", 3)
     covariance: Floats = column("k", 3, 3)
-    axes: Ints = column("k", dtype=np.int64)  # that the position rests on
+    axes: Ints = column("k", dtype=np.int64)  # number that the position rests on
     scatter: Floats = column("k")  # distance of the axes from the position, rms, mm; NaN for one axis
 
     @property
     def count(self) -> int:
-        """Nodes in all."""
+        """Number of nodes."""
         return len(self.positions)
 
 
 @dataclass(frozen=True)
-class Tubes(Checked):
-    """Tubes of members: the straight line through the ends of each cylinder, and its bow beside it; mm.
+class Members(Checked):
+    """Members as tubes: the straight line through the ends of each cylinder, and the bow beside it; mm.
 
     ``points`` are the middles of that line, ``directions`` run from node a to node b, ``side`` is a unit vector across
     and the other one is ``directions x side``. With t along the direction from the middle, the axis is at
@@ -56,5 +56,5 @@ class Tubes(Checked):
     @property
     def other(self) -> Floats:
         """The second unit vectors (m, 3) across."""
-        found: Floats = np.cross(self.directions, self.side)
-        return found
+        other: Floats = np.cross(self.directions, self.side)
+        return other

@@ -1,4 +1,4 @@
-"""Straight stretches: linear voxels that continue each other, joined, and the line through each such set."""
+"""Straight stretches: sets of linear voxels that continue each other, and the line through each set."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
@@ -13,24 +13,20 @@ from processor.space_frame.members.linearity import HALO, SMALL2, WIDE, Linearit
 from processor.space_frame.points.voxels import SIDE, Voxels
 
 MOST_TURN = np.cos(np.deg2rad(12.0))  # between the axes of two windows of one tube
-MOST_APART = 0.45  # voxels, that the mean of one window may lie off the axis of another: they are both on the tube
+MOST_OFF = 0.45  # voxels: largest distance of the mean of one window from the axis of another on the same tube
 
 
 @dataclass(frozen=True)
 class Segments:
-    """Lines (s,): ``points`` in the middle of what was seen, unit ``directions``, ``halves`` of the length seen, mm.
-
-    ``spreads`` are rms distances of the voxels from the line.
-    """
+    """Lines (s,): ``points`` in the middle of the stretch seen, unit ``directions``, ``halves`` of its length, mm."""
 
     points: Floats
     directions: Floats
     halves: Floats
-    spreads: Floats
 
     @property
     def count(self) -> int:
-        """Segments in all."""
+        """Number of segments."""
         return len(self.points)
 
 
@@ -44,12 +40,14 @@ def root_of(parent, i):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def join(cells, blocks, starts, beside, offsets, values, axes, centres, least, turn, apart, parent):  # type: ignore[no-untyped-def]
+def join(voxels, offsets, linear, least, most_off, parent):  # type: ignore[no-untyped-def]
     """Join linear voxels near each other whose windows lie on one line; a set's root is its first voxel."""
     local = np.empty((WIDE, WIDE, WIDE), np.int32)
+    values, axes, centres = linear
+    cells, blocks = voxels.cells, voxels.blocks
     for block in range(len(blocks)):
-        fill(local, block, cells, blocks, starts, beside)
-        for i in range(starts[block], starts[block + 1]):
+        fill(local, block, voxels)
+        for i in range(voxels.starts[block], voxels.starts[block + 1]):
             if values[i] < least:
                 continue
             x = cells[i, 0] - blocks[block, 0] * SIDE + HALO
@@ -60,7 +58,7 @@ def join(cells, blocks, starts, beside, offsets, values, axes, centres, least, t
                 if j <= i or values[j] < least:
                     continue
                 cos = axes[i, 0] * axes[j, 0] + axes[i, 1] * axes[j, 1] + axes[i, 2] * axes[j, 2]
-                if abs(cos) < turn:
+                if abs(cos) < MOST_TURN:
                     continue
                 sign = 1.0 if cos > 0.0 else -1.0
                 ux, uy, uz = (
@@ -71,7 +69,7 @@ def join(cells, blocks, starts, beside, offsets, values, axes, centres, least, t
                 dx, dy, dz = centres[j, 0] - centres[i, 0], centres[j, 1] - centres[i, 1], centres[j, 2] - centres[i, 2]
                 along = dx * ux + dy * uy + dz * uz
                 off2 = dx * dx + dy * dy + dz * dz - along * along / (ux * ux + uy * uy + uz * uz)
-                if off2 > apart * apart:
+                if off2 > most_off * most_off:
                     continue
                 a, b = root_of(parent, i), root_of(parent, j)
                 if a < b:
@@ -84,11 +82,8 @@ def join(cells, blocks, starts, beside, offsets, values, axes, centres, least, t
 
 def segments(voxels: Voxels, linear: Linearity, least: float, least_length_mm: float) -> Segments:
     """Join the voxels whose linearity is at least ``least``; lines shorter than ``least_length_mm`` are left out."""
-    parent = np.arange(voxels.count)
-    join(
-        voxels.cells, voxels.blocks, voxels.starts, voxels.beside, ball(SMALL2)[1:], linear.values, linear.directions,
-        linear.means, least, MOST_TURN, MOST_APART * voxels.size_mm, parent,
-    )  # fmt: skip
+    parent = np.arange(len(voxels.cells))
+    join(voxels, ball(SMALL2)[1:], linear, least, MOST_OFF * voxels.size_mm, parent)
     rows = np.flatnonzero(linear.values >= least)
     order = rows[np.argsort(parent[rows], kind="stable")]
     _, first = np.unique(parent[order], return_index=True)
@@ -96,28 +91,28 @@ def segments(voxels: Voxels, linear: Linearity, least: float, least_length_mm: f
 
 
 @njit(cache=True, nogil=True)
-def lines_of(means, starts, points, directions, halves, spreads):  # type: ignore[no-untyped-def]
+def lines_of(means, starts, points, directions, halves):  # type: ignore[no-untyped-def]
     """Fill in the line through each set of means, rows starts[k] to starts[k + 1]."""
     for k in range(len(starts) - 1):
-        own = means[starts[k] : starts[k + 1]]
-        n = len(own)
+        cells = means[starts[k] : starts[k + 1]]
+        n = len(cells)
         middle = np.zeros(3)
         for i in range(n):
             for j in range(3):
-                middle[j] += own[i, j] / n
+                middle[j] += cells[i, j] / n
         m = np.zeros(6)
         for i in range(n):
-            x, y, z = own[i, 0] - middle[0], own[i, 1] - middle[1], own[i, 2] - middle[2]
+            x, y, z = cells[i, 0] - middle[0], cells[i, 1] - middle[1], cells[i, 2] - middle[2]
             m[0] += x * x / n
             m[1] += y * y / n
             m[2] += z * z / n
             m[3] += x * y / n
             m[4] += x * z / n
             m[5] += y * z / n
-        l1, _, dx, dy, dz = principal(m[0], m[1], m[2], m[3], m[4], m[5])
+        _, _, dx, dy, dz = principal(m[0], m[1], m[2], m[3], m[4], m[5])
         low, high = np.inf, -np.inf
         for i in range(n):
-            t = (own[i, 0] - middle[0]) * dx + (own[i, 1] - middle[1]) * dy + (own[i, 2] - middle[2]) * dz
+            t = (cells[i, 0] - middle[0]) * dx + (cells[i, 1] - middle[1]) * dy + (cells[i, 2] - middle[2]) * dz
             low, high = min(low, t), max(high, t)
         # Of both directions the one whose largest component is positive.
         largest = dx if abs(dx) >= abs(dy) and abs(dx) >= abs(dz) else dy if abs(dy) >= abs(dz) else dz
@@ -126,12 +121,11 @@ def lines_of(means, starts, points, directions, halves, spreads):  # type: ignor
             points[k, j] = middle[j] + 0.5 * (low + high) * d
             directions[k, j] = sign * d
         halves[k] = 0.5 * (high - low)
-        spreads[k] = np.sqrt(max(m[0] + m[1] + m[2] - l1, 0.0))
 
 
 def _lines(means: Floats, starts: Ints, least_length_mm: float) -> Segments:
     count = len(starts) - 1
-    points, directions, halves, spreads = np.empty((count, 3)), np.empty((count, 3)), np.empty(count), np.empty(count)
-    lines_of(means, starts, points, directions, halves, spreads)
+    points, directions, halves = np.empty((count, 3)), np.empty((count, 3)), np.empty(count)
+    lines_of(means, starts, points, directions, halves)
     keep = 2.0 * halves >= least_length_mm
-    return Segments(points[keep], directions[keep], halves[keep], spreads[keep])
+    return Segments(points[keep], directions[keep], halves[keep])

@@ -1,6 +1,6 @@
 """Points as whole steps of 0.01 mm, and a share of them chosen by a hash of these steps.
 
-Whether a point is kept depends on nothing but its own coordinates: not on its place in the file, nor on chunks.
+The choice of a point depends on its own coordinates alone: not on its place in the file, nor on chunks.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -14,8 +14,8 @@ from processor.geometry.parallel import over_ranges
 from processor.space_frame.points.source import Source
 
 STEPS_PER_MM = 100.0
-REACH = 2**30  # steps: 10.7 km from the origin; what is farther off, or not a number, is no point of a frame
-WHOLE = 2**32  # the hash's range: a threshold of so much keeps every point
+REACH = 2**30  # steps: 10.7 km from the origin; points beyond it, or not a number, are left out
+WHOLE = 2**32  # the hash's range: this threshold keeps every point
 
 Steps = npt.NDArray[np.int32]
 
@@ -31,8 +31,11 @@ def hashed(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def keep(points, threshold, kept, counts, piece, first, last):  # type: ignore[no-untyped-def]
-    """Write the steps of the points first..last whose hash is below a threshold to ``kept`` from row ``first``."""
+def sample(points, threshold, sampled, first, last):  # type: ignore[no-untyped-def]
+    """Write the steps of points first..last whose hash is below a threshold to ``sampled`` from row ``first``.
+
+    Returns the number of points written.
+    """
     n = first
     for i in range(first, last):
         fx, fy, fz = points[i, 0] * 100.0, points[i, 1] * 100.0, points[i, 2] * 100.0
@@ -40,30 +43,23 @@ def keep(points, threshold, kept, counts, piece, first, last):  # type: ignore[n
             continue
         x, y, z = np.int32(np.rint(fx)), np.int32(np.rint(fy)), np.int32(np.rint(fz))
         if hashed(x, y, z) < threshold:
-            kept[n, 0], kept[n, 1], kept[n, 2] = x, y, z
+            sampled[n, 0], sampled[n, 1], sampled[n, 2] = x, y, z
             n += 1
-    counts[piece] = n - first
-
-
-def threshold_of(share: float) -> np.uint64:
-    """Threshold below which the hashes of a share of all points lie."""
-    found: np.uint64 = np.uint64(min(max(round(share * WHOLE), 0), WHOLE))
-    return found
+    return n - first
 
 
 def thinned(source: Source, most: int, threads: int = 0) -> Steps:
     """Return steps (n, 3) of about ``most`` points of a source, or of all if they are fewer; in no certain order."""
-    threshold = threshold_of(most / max(source.count, 1))
+    threshold = np.uint64(min(max(round(most / max(source.count, 1) * WHOLE), 0), WHOLE))
     pieces: list[Steps] = []
     for chunk in source.chunks():
-        found = np.empty((len(chunk.points), 3), np.int32)
-        ranges: list[tuple[int, Steps]] = []
+        sampled = np.empty((len(chunk.points), 3), np.int32)
+        parts: list[Steps] = []
 
-        def run(first: int, last: int, points=chunk.points, found=found, ranges=ranges) -> None:  # type: ignore[no-untyped-def]
-            count = np.zeros(1, np.int64)
-            keep(points, threshold, found, count, 0, first, last)
-            ranges.append((first, found[first : first + count[0]]))
+        def run(first: int, last: int, points=chunk.points, sampled=sampled, parts=parts) -> None:  # type: ignore[no-untyped-def]
+            number = sample(points, threshold, sampled, first, last)
+            parts.append(sampled[first : first + number])
 
         over_ranges(run, len(chunk.points), threads, least=100_000)
-        pieces.extend(one.copy() for _, one in ranges)
+        pieces.extend(part.copy() for part in parts)
     return np.concatenate([np.empty((0, 3), np.int32), *pieces])

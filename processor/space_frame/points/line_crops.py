@@ -1,15 +1,15 @@
-"""Points near lines: of each line as many as its room holds, chosen by their hash, in one pass over the cloud.
+"""Points near lines: for each line as many as its room holds, chosen by their hash, in one pass over the cloud.
 
-A line keeps the points whose hash lies below a threshold of its own. When its room overflows the threshold is halved,
-so at the end it is the largest power of two for which they fit: which points are kept depends on no order.
+A line keeps the points whose hash is below its threshold. When its room overflows the threshold is halved. At the end
+it is the largest power of two for which the points fit, so that the choice does not depend on their order.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,12 +27,11 @@ CELL_FIELD = 20
 LEAST_RANGE = 50_000  # points a thread takes at once
 
 
-@dataclass(frozen=True)
-class Gathered:
+class Gathered(NamedTuple):
     """Points near lines: of line i those in rows ``i * room`` to ``i * room + counts[i]``.
 
     ``places`` are points in whole steps less ``middles`` (m, 3), 21 bits a coordinate, ``stations`` where each was
-    seen from; both are sorted, by station first. ``shares`` (m,) of all points of the line are kept.
+    seen from; both are sorted, by station first. ``shares`` (m,) of all points near the line are kept.
     """
 
     room: int
@@ -43,9 +42,8 @@ class Gathered:
     shares: Floats
 
 
-@dataclass(frozen=True)
-class Corridors:
-    """Lines (m,) and their cells: what is near is within ``reach_mm``, from ``low`` to ``high`` along the line."""
+class Corridors(NamedTuple):
+    """Lines (m,) and the cells about them: within ``reach_mm``, from ``low`` to ``high`` along each line."""
 
     points: Floats
     directions: Floats
@@ -57,20 +55,29 @@ class Corridors:
     lines: Labels  # of all cells, one after another
 
 
+class Entries(NamedTuple):
+    """Points near lines (n,): the line, the place as in :class:`Gathered`, and the station."""
+
+    lines: Labels
+    places: Ints
+    stations: npt.NDArray[np.int16]
+
+
 @njit(cache=True, nogil=True)
-def cells_near(points, directions, low, high, reach, cell, keys, lines, start, first, last):  # type: ignore[no-untyped-def]
-    """Write cells that the corridors of lines first..last touch, from entry ``start`` on; with no room only count."""
-    n = start
+def cells_near(points, directions, low, high, reach, keys, lines):  # type: ignore[no-untyped-def]
+    """Write the cells that the lines' corridors touch, with their lines; returns their number. Empty: only count."""
+    n = 0
     count_only = len(keys) == 0
+    cell = CELL_MM
     slack = reach + 0.5 * np.sqrt(3.0) * cell
     half = 1 << (CELL_FIELD - 1)
-    for m in range(first, last):
+    for m in range(len(points)):
         x0 = y0 = z0 = 0
         box_lo, box_hi = np.empty(3), np.empty(3)
         for i in range(3):
             a, b = points[m, i] + low[m] * directions[m, i], points[m, i] + high[m] * directions[m, i]
             box_lo[i], box_hi[i] = min(a, b) - reach, max(a, b) + reach
-        # Along the axis that the line follows most, slabs of cells; in each slab only those near the line.
+        # Slabs of cells along the coordinate axis nearest to the line; in each slab only those near the line.
         k = 0
         for i in range(1, 3):
             if abs(directions[m, i]) > abs(directions[m, k]):
@@ -107,7 +114,7 @@ def cells_near(points, directions, low, high, reach, cell, keys, lines, start, f
 
 @njit(cache=True, nogil=True)
 def tabulate(sorted_keys, starts, table, spans):  # type: ignore[no-untyped-def]
-    """Enter cells with their spans of entries in an open table."""
+    """Enter cells with their spans of entries in an open hash table."""
     for i in range(len(sorted_keys)):
         at = slot_of(table, sorted_keys[i])
         table[at] = sorted_keys[i]
@@ -116,11 +123,9 @@ def tabulate(sorted_keys, starts, table, spans):  # type: ignore[no-untyped-def]
 
 def corridors(points: Floats, directions: Floats, low: Floats, high: Floats, reach_mm: float) -> Corridors:
     """Prepare lines through points (m, 3) along unit directions (m, 3), from ``low`` to ``high`` (m,) along each."""
-    arguments = (points, directions, low, high, reach_mm, CELL_MM)
-    none, nothing = np.empty(0, np.int64), np.empty(0, np.int32)
-    count = cells_near(*arguments, none, nothing, 0, 0, len(points))
+    count = cells_near(points, directions, low, high, reach_mm, np.empty(0, np.int64), np.empty(0, np.int32))
     keys, lines = np.empty(count, np.int64), np.empty(count, np.int32)
-    cells_near(*arguments, keys, lines, 0, 0, len(points))
+    cells_near(points, directions, low, high, reach_mm, keys, lines)
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     first = np.flatnonzero(np.diff(keys, prepend=EMPTY))
@@ -128,19 +133,26 @@ def corridors(points: Floats, directions: Floats, low: Floats, high: Floats, rea
     slots = 1 << max(4, int(2 * len(unique)).bit_length())
     table, spans = np.full(slots, EMPTY, np.int64), np.zeros((slots, 2), np.int64)
     tabulate(unique, np.append(first, count), table, spans)
-    return Corridors(points, directions, low, high, reach_mm, table, spans, lines[order])
+    return Corridors(
+        points=points,
+        directions=directions,
+        low=low,
+        high=high,
+        reach_mm=reach_mm,
+        keys=table,
+        spans=spans,
+        lines=lines[order],
+    )
 
 
 @njit(cache=True, nogil=True)
-def near(  # type: ignore[no-untyped-def]
-    coordinates, scale, station, points, directions, low, high, reach, cell, table, spans, lines, thresholds, middles,
-    found, places, stations,
-):  # fmt: skip
-    """Write line, place and station of every point near a line; one entry for each line. Returns their number."""
+def near(coordinates, scale, station, corridors, thresholds, middles, entries):  # type: ignore[no-untyped-def]
+    """Write an entry for every point and each line that it is near; returns their number, at most the room there is."""
+    points, directions, low, high, reach, table, spans, lines = corridors
     n = 0
     half = 1 << (CELL_FIELD - 1)
-    held, at = np.int64(-2), np.uint64(0)
-    mm, per_cell = 1.0 / STEPS_PER_MM, 1.0 / cell
+    last_key, at = np.int64(-2), np.uint64(0)
+    mm, per_cell = 1.0 / STEPS_PER_MM, 1.0 / CELL_MM
     for i in range(len(coordinates)):
         fx, fy, fz = coordinates[i, 0] * scale, coordinates[i, 1] * scale, coordinates[i, 2] * scale
         if not (abs(fx) < REACH and abs(fy) < REACH and abs(fz) < REACH):
@@ -152,8 +164,8 @@ def near(  # type: ignore[no-untyped-def]
             | ((np.int64(np.floor(py * per_cell)) + half) << CELL_FIELD)
             | (np.int64(np.floor(pz * per_cell)) + half)
         )
-        if key != held:
-            at, held = slot_of(table, key), key
+        if key != last_key:
+            at, last_key = slot_of(table, key), key
         if table[at] == EMPTY:
             continue
         h = hashed(x, y, z)
@@ -166,26 +178,25 @@ def near(  # type: ignore[no-untyped-def]
             if t < low[m] or t > high[m] or dx * dx + dy * dy + dz * dz - t * t > reach * reach:
                 continue
             qx, qy, qz = x - middles[m, 0] + HALF, y - middles[m, 1] + HALF, z - middles[m, 2] + HALF
-            if min(qx, qy, qz) < 0 or max(qx, qy, qz) >= 2 * HALF or n >= len(found):
+            if min(qx, qy, qz) < 0 or max(qx, qy, qz) >= 2 * HALF or n >= len(entries.lines):
                 continue
-            found[n] = m
-            places[n] = (qx << (2 * FIELD)) | (qy << FIELD) | qz
-            stations[n] = station[i] if len(station) else -1
+            entries.lines[n] = m
+            entries.places[n] = (qx << (2 * FIELD)) | (qy << FIELD) | qz
+            entries.stations[n] = station[i] if len(station) else -1
             n += 1
     return n
 
 
 @njit(cache=True, nogil=True)
-def insert(  # type: ignore[no-untyped-def]
-    found, new_places, new_stations, middles, room, counts, thresholds, places, stations, first, last
-):
-    """Put entries of lines first..last into their room; where it overflows a line halves its threshold and drops."""
-    for i in range(len(found)):
-        m = found[i]
+def insert(entries, middles, room, counts, thresholds, places, stations, first, last):  # type: ignore[no-untyped-def]
+    """Put the entries of lines first..last into their room; on overflow halve the line's threshold and drop points."""
+    for i in range(len(entries.lines)):
+        m = entries.lines[i]
         if m < first or m >= last:
             continue
         base = m * room
-        if hash_of(new_places[i], middles[m]) >= thresholds[m]:
+        value = hash_of(entries.places[i], middles[m])
+        if value >= thresholds[m]:
             continue
         while counts[m] == room:
             thresholds[m] = thresholds[m] >> np.uint64(1)
@@ -197,14 +208,14 @@ def insert(  # type: ignore[no-untyped-def]
             counts[m] = n
             if thresholds[m] == 0:
                 break
-        if counts[m] < room and hash_of(new_places[i], middles[m]) < thresholds[m]:
-            places[base + counts[m]], stations[base + counts[m]] = new_places[i], new_stations[i]
+        if counts[m] < room and value < thresholds[m]:
+            places[base + counts[m]], stations[base + counts[m]] = entries.places[i], entries.stations[i]
             counts[m] += 1
 
 
 @njit(cache=True, nogil=True, inline="always")
 def hash_of(place, middle):  # type: ignore[no-untyped-def]
-    """Hash of the point that a place stands for."""
+    """Hash of the point at a place."""
     mask = (1 << FIELD) - 1
     x = (place >> (2 * FIELD)) - HALF + middle[0]
     y = ((place >> FIELD) & mask) - HALF + middle[1]
@@ -214,7 +225,7 @@ def hash_of(place, middle):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def arrange(counts, room, places, stations, most_station, first, last):  # type: ignore[no-untyped-def]
-    """Sort the entries of lines first..last by station, then by place: sums over them never vary."""
+    """Sort the points of lines first..last by station, then by place, so that sums over them do not vary."""
     heads = np.zeros(most_station + 3, np.int64)
     for m in range(first, last):
         base, n = m * room, counts[m]
@@ -224,14 +235,16 @@ def arrange(counts, room, places, stations, most_station, first, last):  # type:
         for s in range(1, len(heads)):
             heads[s] += heads[s - 1]
         starts = heads.copy()
-        own, at = places[base : base + n].copy(), stations[base : base + n].copy()
+        unsorted, at = places[base : base + n].copy(), stations[base : base + n].copy()
         for i in range(n):
             k = base + heads[at[i] + 1]
-            places[k], stations[k] = own[i], at[i]
+            places[k], stations[k] = unsorted[i], at[i]
             heads[at[i] + 1] += 1
         for s in range(len(starts) - 1):
             if starts[s + 1] - starts[s] > 1:
-                places[base + starts[s] : base + starts[s + 1]].sort()
+                # Not .sort(): numba gives it the same symbols as argsort, and kernels cached by two processes collide.
+                run = places[base + starts[s] : base + starts[s + 1]]
+                run[:] = run[np.argsort(run)]
 
 
 def gather(
@@ -250,32 +263,29 @@ def gather(
     thresholds = np.full(count, WHOLE, np.uint64)
     counts = np.zeros(count, np.int64)
     places, stations = np.empty(count * room, np.int64), np.full(count * room, -1, np.int16)
-    fixed = (
-        lines.points, lines.directions, lines.low, lines.high, lines.reach_mm, CELL_MM, lines.keys, lines.spans,
-        lines.lines,
-    )  # fmt: skip
+    least = max(count // (threads or usable()), 1)
     for coordinates, station in stretches:
-        pieces: list[tuple[Labels, Ints, npt.NDArray[np.int16]]] = []
+        pieces: list[Entries] = []
 
-        def run(first: int, last: int, coordinates=coordinates, station=station, pieces=pieces) -> None:  # type: ignore[no-untyped-def]
+        def find(first: int, last: int, coordinates=coordinates, station=station, pieces=pieces) -> None:  # type: ignore[no-untyped-def]
             n = 3 * (last - first) + 64  # entries: a point belongs to few lines
-            own = station[first:last] if len(station) else station
+            seen_from = station[first:last] if len(station) else station
             while True:
-                room_for = (np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n, np.int16))
-                found = near(coordinates[first:last], scale, own, *fixed, thresholds, middles, *room_for)
-                if found < n:
+                entries = Entries(np.empty(n, np.int32), np.empty(n, np.int64), np.empty(n, np.int16))
+                number = near(coordinates[first:last], scale, seen_from, lines, thresholds, middles, entries)
+                if number < n:
                     break
                 n *= 2
-            pieces.append((room_for[0][:found], room_for[1][:found], room_for[2][:found]))
+            pieces.append(Entries(entries.lines[:number], entries.places[:number], entries.stations[:number]))
 
-        over_ranges(run, len(coordinates), threads, least=LEAST_RANGE)
-        into = (middles, room, counts, thresholds, places, stations)
-
-        def keep(first: int, last: int, pieces=pieces, into=into) -> None:  # type: ignore[no-untyped-def]
+        def keep(first: int, last: int, pieces=pieces) -> None:  # type: ignore[no-untyped-def]
             for entries in pieces:
-                insert(*entries, *into, first, last)  # type: ignore[call-arg]
+                insert(entries, middles, room, counts, thresholds, places, stations, first, last)
 
-        over_ranges(keep, count, threads, least=max(count // (threads or usable()), 1))
+        over_ranges(find, len(coordinates), threads, least=LEAST_RANGE)
+        over_ranges(keep, count, threads, least=least)
     most_station = int(stations.max(initial=-1)) if count else -1
     over_ranges(partial(arrange, counts, room, places, stations, most_station), count, threads)
-    return Gathered(room, counts, places, stations, middles, thresholds / WHOLE)
+    return Gathered(
+        room=room, counts=counts, places=places, stations=stations, middles=middles, shares=thresholds / WHOLE
+    )

@@ -1,4 +1,4 @@
-"""Points gathered in voxels, and voxels in blocks: sparse, so that the room needed grows with what was scanned.
+"""Sparse voxels of points, in blocks: memory grows with the scanned surface alone.
 
 Sums are of whole steps in 64-bit integers: exact, and so the same in any order.
 """
@@ -6,7 +6,7 @@ Sums are of whole steps in 64-bit integers: exact, and so the same in any order.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -21,8 +21,7 @@ OFFSET = 1 << (FIELD - 1)
 EMPTY = -1
 
 
-@dataclass(frozen=True)
-class Voxels:
+class Voxels(NamedTuple):
     """Occupied voxels in the order of their blocks.
 
     ``cells`` (v, 3) are voxel numbers, ``means`` (v, 3) of their points in mm, ``counts`` (v,). Block b holds the rows
@@ -38,14 +37,14 @@ class Voxels:
     beside: Ints  # (b, 27)
 
     @property
-    def count(self) -> int:
-        """Voxels in all."""
+    def number(self) -> int:
+        """Number of voxels."""
         return len(self.cells)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def slot_of(keys, key):  # type: ignore[no-untyped-def]
-    """Find the slot of a key in an open table whose length is a power of two, or the empty one it would take."""
+    """Return the slot of a key in an open table whose length is a power of two, or the empty slot for it."""
     mask = np.uint64(len(keys) - 1)
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
     at = (h ^ (h >> np.uint64(32))) & mask
@@ -56,12 +55,12 @@ def slot_of(keys, key):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def accumulate(steps, size, keys, sums):  # type: ignore[no-untyped-def]
-    """Add points to the table of voxels; returns (rows done, slots taken), and stops when the table is half full."""
+    """Add points to the table of voxels; returns the rows done, and stops when the table is half full."""
     used = 0
     room = len(keys) // 2
     for i in range(len(steps)):
         if used >= room:
-            return i, used
+            return i
         x, y, z = (
             np.int64(steps[i, 0]) + (OFFSET * size),
             np.int64(steps[i, 1]) + (OFFSET * size),
@@ -82,16 +81,16 @@ def accumulate(steps, size, keys, sums):  # type: ignore[no-untyped-def]
         sums[at, 1] += x - a * size
         sums[at, 2] += y - b * size
         sums[at, 3] += z - c * size
-    return len(steps), used
+    return len(steps)
 
 
 def gathered(steps: Steps, size_mm: float, least: int) -> Voxels:
-    """Voxels of ``size_mm`` that hold at least ``least`` of the points given as steps (n, 3)."""
+    """Return the voxels of ``size_mm`` with at least ``least`` of the points given as steps (n, 3)."""
     size = round(size_mm * STEPS_PER_MM)
     slots = 1 << max(14, int(len(steps) // 4).bit_length())
     while True:
         keys, sums = np.full(slots, EMPTY, np.int64), np.zeros((slots, 4), np.int64)
-        done, _ = accumulate(steps, size, keys, sums)
+        done = accumulate(steps, size, keys, sums)
         if done == len(steps):
             break
         slots *= 4
@@ -109,22 +108,22 @@ def gathered(steps: Steps, size_mm: float, least: int) -> Voxels:
     cells = np.repeat(blocks, sizes, axis=0) * SIDE + within - OFFSET
     means = cells * size_mm + sums[:, 1:] / (sums[:, :1] * STEPS_PER_MM)
     return Voxels(
-        size_mm,
-        cells,
-        means,
-        sums[:, 0],
-        blocks - (OFFSET >> BITS),
-        np.append(starts, len(keys)),
-        _beside(blocks, block_keys, width),
+        size_mm=size_mm,
+        cells=cells,
+        means=means,
+        counts=sums[:, 0].copy(),
+        blocks=blocks - (OFFSET >> BITS),
+        starts=np.append(starts, len(keys)),
+        beside=_beside(blocks, block_keys, width),
     )
 
 
 def _beside(blocks: Ints, keys: Ints, width: int) -> Ints:
     """Rows (b, 27) of the blocks about each, x slowest."""
-    found = np.full((len(blocks), 27), EMPTY, np.int64)
+    rows = np.full((len(blocks), 27), EMPTY, np.int64)
     for i in range(27):
         around = blocks + np.array([i // 9 - 1, i // 3 % 3 - 1, i % 3 - 1])
         key = (around[:, 0] << width | around[:, 1]) << width | around[:, 2]
         at = np.minimum(np.searchsorted(keys, key), max(len(keys) - 1, 0))
-        found[:, i] = np.where(keys[at] == key, at, EMPTY) if len(keys) else EMPTY
-    return found
+        rows[:, i] = np.where(keys[at] == key, at, EMPTY) if len(keys) else EMPTY
+    return rows

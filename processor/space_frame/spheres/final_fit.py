@@ -1,39 +1,185 @@
-"""Compiled final fit of every ball whose size is chosen: state, covariance, bound and what it rests on."""
+"""Compiled final fit of every sphere whose size is chosen: state, covariance, bound and what it rests on."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 from numba import njit
 
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints, Labels
-from processor.space_frame.spheres.gauss_newton import inverse_of, normal_equations, residual, solve, variance, weight
-from processor.space_frame.spheres.size_selection import AROUND_MM, COARSE_MM, fit_one, rows_within, segments, taken
+from processor.model import Floats
+from processor.space_frame.spheres.gauss_newton import (
+    NormalEquations,
+    Prior,
+    Unknowns,
+    inverse_of,
+    normal_equations,
+    residual,
+    solve,
+    variance,
+    weight,
+)
+from processor.space_frame.spheres.records import (
+    CELLS,
+    CENTRE_CHI2,
+    DEGREES,
+    FITTED,
+    POINTS,
+    RMS,
+    SCALE,
+    STATIONS,
+    AimedCrops,
+    Finished,
+    Masks,
+    Priors,
+    Residuals,
+    StochasticModel,
+)
+from processor.space_frame.spheres.size_selection import (
+    AROUND_MM,
+    COARSE_MM,
+    fit_one,
+    mask_of,
+    segments,
+    within,
+)
 
-SETTLED_MM = 1e-6
-TURNS = 4  # of the scale and the fit by it
+TOLERANCE_MM = 1e-6
+TURNS = 4  # alternations of the scale and the fit by it
 LARGEST_BIAS = 0.3  # sd
 BANDS, SECTORS = 10, 20  # cells of equal area that the visible share is counted in
 
 
+def finish(
+    crops: AimedCrops,
+    masks: Masks,
+    model: StochasticModel,
+    model_points: float,
+    priors: Priors,
+    states: Floats,
+    catch: float,
+    threads: int = 0,
+) -> Finished:
+    """Fit every node whose state (k, 4) is finite, with the priors of its centre and size.
+
+    The scale about the noise model is estimated for each sphere, with as many degrees of freedom as points and
+    ``model_points`` more, which the noise model is worth. Bounds are those of the noise and the priors with every point
+    at its full weight and stations fixed. ``catch`` is the reach of the first steps, mm.
+    """
+    nodes, count = len(states), len(crops.points)
+    residuals = Residuals(np.zeros(count), np.zeros(count), np.zeros(count))
+    finished = Finished(
+        states=np.full((nodes, 4), np.nan),
+        covariances=np.full((nodes, 4, 4), np.nan),
+        bounds=np.full((nodes, 4, 4), np.nan),
+        numbers=np.zeros((nodes, 8)),
+        residuals=residuals,
+    )
+    kernel = partial(_finish_range, crops, masks, model, model_points, priors, states, catch, finished)
+    over_ranges(kernel, nodes, threads)
+    return finished
+
+
 @njit(cache=True, nogil=True, error_model="numpy")
-def leftover(  # type: ignore[no-untyped-def]
-    points, rays, ranges, station, chosen, noise, state, shifts, gains, covariance, errors, cosines, on, cells
-):  # fmt: skip
+def _finish_range(crops, masks, model, model_points, priors, states, catch, finished, first, last):  # type: ignore[no-untyped-def]
+    for k in range(first, last):
+        if not np.isnan(states[k, 0]) and crops.start[k + 1] > crops.start[k]:
+            _finish_at(k, crops, masks, model, model_points, priors, states[k].copy(), catch, finished)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _finish_at(k, crops, masks, model, model_points, priors, state, catch, finished):  # type: ignore[no-untyped-def]
+    """Fit node ``k`` from ``state``; see :func:`finish`."""
+    rows, observations = within(crops, k, state[3] - AROUND_MM, state[3] + AROUND_MM)
+    n = len(rows)
+    if n == 0:
+        return
+    shifts = np.zeros((segments(observations.station), 3))
+    unknowns = Unknowns(state, shifts, np.zeros((len(shifts), 3, 8)))
+    prior = Prior(priors.centre_weight[k], priors.sizes[k], priors.size_weights[k])
+    chosen, covariance = np.zeros(n, np.uint8), np.zeros((4, 4))
+    used = fit_one(
+        observations, mask_of(masks, k), model, prior, catch, TOLERANCE_MM, state, shifts, chosen, covariance
+    )
+    if used < 1:
+        return
+    local = StochasticModel(model.noise.copy(), model.shift_covariance)
+    residuals = Residuals(np.zeros(n), np.zeros(n), np.zeros(n))
+    used, scale, degrees = _scaled(
+        observations, chosen, model.noise, local, model_points, prior, unknowns, covariance, residuals
+    )
+    if used < 1:
+        return
+    # variables for False and True: numba compiles a kernel anew for every literal
+    robust, whole = n < 0, n > 0
+    normal = NormalEquations(np.empty((4, 4)), np.empty(4))
+    normal_equations(observations, chosen, local, 1.0, robust, prior, unknowns, normal)
+    if not inverse_of(normal.H, covariance):
+        return
+    weights, _, _, plain, seen, stations = leftover(observations, chosen, local.noise, unknowns, covariance, residuals)
+    fixed = StochasticModel(local.noise, local.shift_covariance[:0])
+    used = normal_equations(observations, chosen, fixed, 1.0, whole, prior, unknowns, normal)
+    if not inverse_of(normal.H, finished.bounds[k]):
+        return
+    chi2 = 0.0
+    for i in range(3):
+        for j in range(3):
+            chi2 += state[i] * prior.centre_weight[i, j] * state[j]
+    _without_bias(observations, chosen, local.noise, state, covariance)
+    finished.states[k] = state
+    finished.covariances[k] = covariance
+    for i in range(n):
+        finished.residuals.errors[rows[i]] = residuals.errors[i]
+        finished.residuals.cosines[rows[i]] = residuals.cosines[i]
+        finished.residuals.weights[rows[i]] = residuals.weights[i]
+    numbers = finished.numbers[k]
+    numbers[POINTS], numbers[CELLS], numbers[STATIONS] = used, seen, stations
+    numbers[RMS] = np.sqrt(plain / max(weights, 1e-9))
+    numbers[SCALE], numbers[DEGREES] = scale, degrees
+    numbers[CENTRE_CHI2], numbers[FITTED] = chi2, 1.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _scaled(observations, chosen, noise, local, model_points, prior, unknowns, covariance, residuals):  # type: ignore[no-untyped-def]
+    """Alternate the scale about the noise model and the fit; ``local.noise`` becomes the noise times its square.
+
+    Returns points used (below 1: failed), the scale and its degrees of freedom.
+    """
+    scale, used, degrees = 1.0, 0, 0.0
+    steps = 10 if len(chosen) > 0 else 6  # a variable: see the literals above
+    for turn in range(TURNS):
+        weights, squares, leverages, _, _, _ = leftover(
+            observations, chosen, local.noise, unknowns, covariance, residuals
+        )
+        free = max(weights - leverages, 0.0)
+        degrees = model_points + free
+        scale2 = (model_points + squares * scale * scale) / degrees if degrees > 0.0 else 1.0
+        scale = np.sqrt(scale2)
+        for i in range(3):
+            local.noise[i] = noise[i] * scale2
+        tolerance = TOLERANCE_MM if turn + 1 == TURNS else COARSE_MM
+        used = solve(observations, chosen, local, 1.0, prior, unknowns, tolerance, steps, covariance)
+        if used < 1:
+            break
+    return used, scale, degrees
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def leftover(observations, chosen, noise, unknowns, covariance, residuals):  # type: ignore[no-untyped-def]
     """Fill each chosen point's residual, cosine and weight.
 
-    Returns the sums of w, of w u^2, of w leverage and of w e^2, cells and stations.
-
-    Residuals are divided by sqrt(1 - leverage), so that their spread is the noise itself however few there are.
+    Returns the sums of w, of w u^2, of w leverage and of w e^2, and the numbers of visible cells and of stations.
+    Residuals are divided by sqrt(1 - leverage): their spread is that of the noise, also for few points.
     """
-    J, K = np.empty(4), np.empty(4)
+    points, rays, ranges, station = observations
+    state, shifts, gains = unknowns
+    errors, cosines, on = residuals
+    J, K, cells = np.empty(4), np.empty(4), np.zeros(BANDS * SECTORS, np.int64)
     weights, squares, leverages, plain = 0.0, 0.0, 0.0, 0.0
     segment, inside, stations, seen = 0, False, 0, 0
-    for i in range(len(cells)):
-        cells[i] = 0
     for i in range(len(points)):
         on[i] = 0.0
         if chosen[i] == 1:
@@ -64,15 +210,9 @@ def leftover(  # type: ignore[no-untyped-def]
                 leverages += w * h
                 if w > 0.0:
                     inside = True
-                    sphere_x = points[i, 0] - state[0] - shifts[segment, 0]
-                    sphere_y = points[i, 1] - state[1] - shifts[segment, 1]
-                    sphere_z = points[i, 2] - state[2] - shifts[segment, 2]
-                    d = np.sqrt(sphere_x**2 + sphere_y**2 + sphere_z**2)
-                    band = min(max(int(np.floor((sphere_z / d + 1.0) * (BANDS / 2.0))), 0), BANDS - 1)
-                    turn = math.atan2(sphere_y, sphere_x) / (2.0 * np.pi) + 0.5
-                    sector = min(max(int(np.floor(turn * SECTORS)), 0), SECTORS - 1)
-                    seen += 1 - cells[band * SECTORS + sector]
-                    cells[band * SECTORS + sector] = 1
+                    cell = _cell_of(points[i], state, shifts[segment])
+                    seen += 1 - cells[cell]
+                    cells[cell] = 1
         if i + 1 == len(points) or station[i + 1] != station[i]:
             segment += 1
             if inside:
@@ -82,13 +222,45 @@ def leftover(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bias(  # type: ignore[no-untyped-def]
-    points, rays, ranges, chosen, noise, state, covariance, found
-):
+def _cell_of(point, state, shift):  # type: ignore[no-untyped-def]
+    """Return the cell of the sphere's surface, of BANDS x SECTORS, that a point lies over."""
+    x, y, z = point[0] - state[0] - shift[0], point[1] - state[1] - shift[1], point[2] - state[2] - shift[2]
+    d = np.sqrt(x**2 + y**2 + z**2)
+    band = min(max(int(np.floor((z / d + 1.0) * (BANDS / 2.0))), 0), BANDS - 1)
+    turn = math.atan2(y, x) / (2.0 * np.pi) + 0.5
+    sector = min(max(int(np.floor(turn * SECTORS)), 0), SECTORS - 1)
+    return band * SECTORS + sector
+
+
+# --- bias ------------------------------------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _without_bias(observations, chosen, noise, state, covariance):  # type: ignore[no-untyped-def]
+    """Take the bias by curvature off the state, and half of that by unknown rays, whose spread the covariance gets."""
+    off = np.zeros(4)
+    bias(observations, chosen, noise, state, covariance, off)
+    largest = 0.0
+    for i in range(4):
+        largest = max(largest, abs(off[i]) / np.sqrt(covariance[i, i]))
+    if largest < LARGEST_BIAS:  # the series does not hold for a larger one
+        for i in range(4):
+            state[i] -= off[i]
+    # Where rays are unknown the bias lies between none and all of ``off``: uniform, its variance is off^2 / 12.
+    lean(observations.points, observations.rays, chosen, noise, state, covariance, off)
+    for i in range(4):
+        state[i] -= 0.5 * off[i]
+        for j in range(4):
+            covariance[i, j] += off[i] * off[j] / 12.0
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def bias(observations, chosen, noise, state, covariance, off):  # type: ignore[no-untyped-def]
     """Fill the bias (4,) of least squares by the residuals' curvature, -1/2 C sum J w trace(C H).
 
     Source: M. J. Box, Bias in nonlinear estimation, J. Roy. Statist. Soc. B 33 (1971), 171-201.
     """
+    points, rays, ranges, _ = observations
     cx, cy, cz, r = state[0], state[1], state[2], state[3]
     total, J, v, u = np.zeros(4), np.empty(4), np.empty(3), np.empty(3)
     for i in range(len(points)):
@@ -121,17 +293,17 @@ def bias(  # type: ignore[no-untyped-def]
         for p in range(4):
             total[p] += w * J[p] * trace
     for p in range(4):
-        found[p] = 0.0
+        off[p] = 0.0
         for q in range(4):
-            found[p] -= 0.5 * covariance[p, q] * total[q]
+            off[p] -= 0.5 * covariance[p, q] * total[q]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lean(points, rays, chosen, noise, state, covariance, found):  # type: ignore[no-untyped-def]
-    """Fill what noise moves the state (4,) by where rays are unknown, if it is the same in all directions.
+def lean(points, rays, chosen, noise, state, covariance, off):  # type: ignore[no-untyped-def]
+    """Fill the bias of the state (4,) where rays are unknown, for noise that is the same in all directions.
 
-    Noise across the normal of a sphere takes points off its centre by variance / distance in the mean. Of noise along a
-    ray only a part is across.
+    Noise across the normal of a sphere moves points outward by variance / distance on the mean. Of noise along a ray
+    only a part is across.
     """
     J, total = np.empty(4), np.zeros(4)
     for i in range(len(points)):
@@ -145,163 +317,6 @@ def lean(points, rays, chosen, noise, state, covariance, found):  # type: ignore
             for p in range(4):
                 total[p] += w * J[p]
     for p in range(4):
-        found[p] = 0.0
+        off[p] = 0.0
         for q in range(4):
-            found[p] -= covariance[p, q] * total[q]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def finish_at(  # type: ignore[no-untyped-def]
-    k, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise,
-    believed, centre_weight, sizes, size_weights, states, catch, shift_covariance, found, covariances, bounds,
-    numbers, errors, cosines, on,
-):  # fmt: skip
-    """Fit node ``k``; see :func:`finish`."""
-    if np.isnan(states[k, 0]) or start[k + 1] == start[k]:
-        return
-    a, b = start[k], start[k + 1]
-    rows = rows_within(points[a:b], states[k, 3] - AROUND_MM, states[k, 3] + AROUND_MM)
-    n = len(rows)
-    if n == 0:
-        return
-    p, u, L, s = taken(rows, points[a:b], rays[a:b], ranges[a:b], station[a:b])
-    e, c, w = np.zeros(n), np.zeros(n), np.zeros(n)
-    ap, ad = axis_points[end_start[k] : end_start[k + 1]], axes[end_start[k] : end_start[k + 1]]
-    keep = keep_off[end_start[k] : end_start[k + 1]]
-    state = states[k].copy()
-    origin = np.zeros(3)
-    shifts = np.zeros((segments(s), 3))
-    gains = np.zeros((len(shifts), 3, 8))
-    chosen = np.zeros(n, np.uint8)
-    covariance, cells = np.zeros((4, 4)), np.zeros(BANDS * SECTORS, np.int64)
-    used = fit_one(
-        p, u, L, s, ap, ad, keep, hole, least_cosine, noise, origin, centre_weight[k], sizes[k], size_weights[k],
-        shift_covariance, catch, SETTLED_MM, state, shifts, chosen, covariance,
-    )  # fmt: skip
-    if used < 1:
-        return
-    scale = 1.0
-    local = noise.copy()
-    free = 0.0
-    # as variables: numba compiles a kernel anew for every literal
-    steps, robust, whole = 6, False, True
-    if n > 0:
-        steps, robust, whole = 10, n < 0, n > 0
-    for turn in range(TURNS):
-        weights, squares, leverages, plain, seen, stations = leftover(
-            p, u, L, s, chosen, local, state, shifts, gains, covariance, e, c, w, cells,
-        )  # fmt: skip
-        free = max(weights - leverages, 0.0)
-        scale2 = (believed + squares * scale * scale) / (believed + free) if believed + free > 0.0 else 1.0
-        scale = np.sqrt(scale2)
-        for i in range(3):
-            local[i] = noise[i] * scale2
-        used = solve(
-            p, u, L, s, chosen, local, 1.0, origin, centre_weight[k], sizes[k], size_weights[k], shift_covariance,
-            SETTLED_MM if turn + 1 == TURNS else COARSE_MM, state, shifts, gains, steps, covariance,
-        )  # fmt: skip
-        if used < 1:
-            break
-    if used < 1:
-        return
-    H, g = np.empty((4, 4)), np.empty(4)
-    normal_equations(
-        p, u, L, s, chosen, local, 1.0, robust, origin, centre_weight[k], sizes[k], size_weights[k],
-        shift_covariance, state, shifts, gains, H, g,
-    )  # fmt: skip
-    if not inverse_of(H, covariance):
-        return
-    weights, squares, leverages, plain, seen, stations = leftover(
-        p, u, L, s, chosen, local, state, shifts, gains, covariance, e, c, w, cells,
-    )  # fmt: skip
-    bound = np.empty((4, 4))
-    used = normal_equations(
-        p, u, L, s, chosen, local, 1.0, whole, origin, centre_weight[k], sizes[k], size_weights[k],
-        shift_covariance[:0], state, shifts, gains, H, g,
-    )  # fmt: skip
-    if not inverse_of(H, bound):
-        return
-    chi2 = 0.0
-    for i in range(3):
-        for j in range(3):
-            chi2 += state[i] * centre_weight[k, i, j] * state[j]
-    off = np.zeros(4)
-    bias(p, u, L, chosen, local, state, covariance, off)
-    largest = 0.0
-    for i in range(4):
-        largest = max(largest, abs(off[i]) / np.sqrt(covariance[i, i]))
-    if largest < LARGEST_BIAS:  # beyond it the series has no meaning, nor has the ball
-        for i in range(4):
-            state[i] -= off[i]
-    # Where rays are unknown noise moves the ball by nothing to all of this; as far off are both from the middle.
-    lean(p, u, chosen, local, state, covariance, off)
-    for i in range(4):
-        state[i] -= 0.5 * off[i]
-        for j in range(4):
-            covariance[i, j] += off[i] * off[j] / 12.0
-    for i in range(n):
-        errors[a + rows[i]], cosines[a + rows[i]], on[a + rows[i]] = e[i], c[i], w[i]
-    for i in range(4):
-        found[k, i] = state[i]
-        for j in range(4):
-            covariances[k, i, j], bounds[k, i, j] = covariance[i, j], bound[i, j]
-    numbers[k, 0], numbers[k, 1], numbers[k, 2] = used, seen, stations
-    numbers[k, 3] = np.sqrt(plain / max(weights, 1e-9))
-    numbers[k, 4], numbers[k, 5] = scale, believed + free
-    numbers[k, 6], numbers[k, 7] = chi2, 1.0
-
-
-def finish(
-    crops: tuple[Ints, Floats, Floats, Floats, Labels],
-    ends: tuple[Ints, Floats, Floats, Floats],
-    limits: tuple[float, float],
-    noise: Floats,
-    believed: float,
-    centre_weight: Floats,
-    sizes: Floats,
-    size_weights: Floats,
-    states: Floats,
-    catch: float,
-    shift_covariance: Floats,
-    threads: int = 0,
-) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats, Floats]:
-    """Fit every node whose state (k, 4) is finite, with its size's prior, and say how well.
-
-    ``believed`` is how many points the noise model is worth: the scale about it is estimated ball by ball, its squares
-    with as many degrees of freedom as points, and the model's own beside them. The bounds are those of the noise and
-    the priors with every point at its full weight and stations that stand still.
-
-    ``crops``, ``ends`` and ``limits`` are those of :func:`~processor.space_frame.spheres.size_selection.choose`,
-    without the tubes'.
-    Returns states (k, 4), covariances (k, 4, 4), bounds (k, 4, 4), numbers (k, 8) = points, cells, stations, rms, scale
-    about the noise model, degrees of freedom, chi-square of the centre's prior, whether it fitted; and of every point
-    residual, cosine and weight.
-    """
-    nodes, count = len(states), len(crops[1])
-    found, numbers = np.full((nodes, 4), np.nan), np.zeros((nodes, 8))
-    covariances, bounds = np.full((nodes, 4, 4), np.nan), np.full((nodes, 4, 4), np.nan)
-    errors, cosines, on = np.zeros(count), np.zeros(count), np.zeros(count)
-    over_ranges(
-        lambda a, b: _finish_range(
-            a, b, *crops, *ends, *limits, noise, believed, centre_weight, sizes, size_weights, states, catch,
-            shift_covariance, found, covariances, bounds, numbers, errors, cosines, on,
-        ),
-        nodes,
-        threads,
-    )  # fmt: skip
-    return found, covariances, bounds, numbers, errors, cosines, on
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _finish_range(  # type: ignore[no-untyped-def]
-    begin, end, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine,
-    noise, believed, centre_weight, sizes, size_weights, states, catch, shift_covariance, found, covariances, bounds,
-    numbers, errors, cosines, on,
-):  # fmt: skip
-    """Fit nodes ``begin`` to ``end``; see :func:`finish`."""
-    for k in range(begin, end):
-        finish_at(
-            k, start, points, rays, ranges, station, end_start, axis_points, axes, keep_off, hole, least_cosine, noise,
-            believed, centre_weight, sizes, size_weights, states, catch, shift_covariance, found, covariances, bounds,
-            numbers, errors, cosines, on,
-        )  # fmt: skip
+            off[p] -= covariance[p, q] * total[q]

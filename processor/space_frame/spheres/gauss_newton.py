@@ -1,18 +1,156 @@
-"""Compiled Gauss-Newton solution of one ball: centre and radius by robust residuals along the ray, with priors.
+"""Compiled Gauss-Newton fit of one sphere: centre and radius by robust residuals along the ray, with priors.
 
-Each station may have moved as a whole by an unknown shift of known covariance (its registration): it is estimated with
-the ball and so enters the ball's covariance.
+Each station may be shifted as a whole by an unknown vector of known covariance (from its registration). The shift is
+estimated with the sphere and so enters the sphere's covariance. Coordinates are less the node's position, so that the
+prior of the centre has mean 0.
 """
+# Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
+import numpy.typing as npt
 from numba import njit
+
+from processor.model import Floats, Labels
+
+LEAST_COSINE = 0.15
+FULL_SD, CUT_SD = 3.0, 4.5  # residuals up to the first have weight 1, beyond the second weight 0
+
+
+class Observations(NamedTuple):
+    """Points of one sphere, sorted by station; see :class:`~processor.space_frame.spheres.records.AimedCrops`."""
+
+    points: Floats
+    rays: Floats
+    ranges: Floats
+    station: Labels
+
+
+class Mask(NamedTuple):
+    """Mask of one sphere; see :class:`~processor.space_frame.spheres.records.Masks`."""
+
+    axis_points: Floats
+    axes: Floats
+    keep_off: Floats
+    hole: float
+    least_cosine: float
+
+
+class Prior(NamedTuple):
+    """Inverse covariance (3, 3) of the centre about 0, and radius with its weight (1 / variance)."""
+
+    centre_weight: Floats
+    radius: float
+    radius_weight: float
+
+
+class Unknowns(NamedTuple):
+    """State (x, y, z, r), shift (g, 3) of each station in turn, and the gains (g, 3, 8) that eliminate the shifts."""
+
+    state: Floats
+    shifts: Floats
+    gains: Floats
+
+
+class NormalEquations(NamedTuple):
+    """Matrix H (4, 4) and gradient g (4,) of the state."""
+
+    H: Floats
+    g: Floats
+
+
+Flags = npt.NDArray[np.uint8]
+
+
+# --- residuals and the choice of points ------------------------------------------------------------------------------
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def residual(px, py, pz, ux, uy, uz, cx, cy, cz, r):  # type: ignore[no-untyped-def]
+    """Residual, cosine of incidence on the model (0 = missed), and the residual's derivatives by centre and radius."""
+    wx, wy, wz = cx - px, cy - py, cz - pz
+    if ux == 0.0 and uy == 0.0 and uz == 0.0:
+        d = np.sqrt(wx * wx + wy * wy + wz * wz)
+        if d < 1e-9:
+            return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return d - r, 1.0, wx / d, wy / d, wz / d, -1.0
+    a = ux * wx + uy * wy + uz * wz
+    vx, vy, vz = wx - a * ux, wy - a * uy, wz - a * uz
+    under = r * r - (vx * vx + vy * vy + vz * vz)
+    if under <= 0.0:
+        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    root = np.sqrt(under)
+    return root - a, root / r, -ux - vx / root, -uy - vy / root, -uz - vz / root, r / root
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def weight(t):  # type: ignore[no-untyped-def]
+    """Weight of a residual of t sd: redescending, with almost full efficiency for normal noise."""
+    t = abs(t)
+    if t <= FULL_SD:
+        return 1.0
+    if t >= CUT_SD:
+        return 0.0
+    q = (t - FULL_SD) / (CUT_SD - FULL_SD)
+    return (1.0 - q * q) ** 2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def variance(noise, distance, cosine):  # type: ignore[no-untyped-def]
+    """Variance of a range: constant, signal (R^2 / cosine) and footprint (tangent^2) parts, mm^2."""
+    c2 = cosine * cosine
+    return noise[0] + noise[1] * distance * distance / cosine + noise[2] * (1.0 - c2) / c2
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def select(points, rays, mask, state, gate, chosen):  # type: ignore[no-untyped-def]
+    """Mark points in ``chosen`` (n,) by where their rays meet the model, and count those on visible surface.
+
+    1: the ray meets the sphere's own visible surface. 2: it meets masked surface, that is flats and sleeves
+    (``keep_off`` from each member's axis) or the process hole about the lowest point. 0: it misses the model or its
+    incidence is below ``least_cosine``. The choice does not use the noisy point itself. ``gate`` (mm) only saves work:
+    it is far beyond the noise.
+    """
+    cx, cy, cz, r = state[0], state[1], state[2], state[3]
+    total = 0
+    for i in range(len(points)):
+        chosen[i] = 0
+        e, cosine, jx, jy, jz, _ = residual(
+            points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], cx, cy, cz, r
+        )
+        if cosine < mask.least_cosine or abs(e) > gate:
+            continue
+        if rays[i, 0] == 0.0 and rays[i, 1] == 0.0 and rays[i, 2] == 0.0:
+            qx, qy, qz = -r * jx, -r * jy, -r * jz
+        else:
+            qx = points[i, 0] - e * rays[i, 0] - cx
+            qy = points[i, 1] - e * rays[i, 1] - cy
+            qz = points[i, 2] - e * rays[i, 2] - cz
+        masked = qz < 0.0 and qx * qx + qy * qy < mask.hole * mask.hole
+        for m in range(len(mask.axes)):
+            if masked:
+                break
+            dx, dy, dz = mask.axes[m, 0], mask.axes[m, 1], mask.axes[m, 2]
+            sx = qx + cx - mask.axis_points[m, 0]
+            sy = qy + cy - mask.axis_points[m, 1]
+            sz = qz + cz - mask.axis_points[m, 2]
+            along = sx * dx + sy * dy + sz * dz
+            across2 = sx * sx + sy * sy + sz * sz - along * along
+            masked = along > 0.0 and across2 < mask.keep_off[m] * mask.keep_off[m]
+        chosen[i] = 2 if masked else 1
+        total += not masked
+    return total
+
+
+# --- normal equations and their solution -----------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def inverse_of(A, out):  # type: ignore[no-untyped-def]
-    """Inverse of a positive definite matrix by Cholesky's factors; False where it has none."""
+    """Invert a positive definite matrix by Cholesky's factors; returns False if it is not positive definite."""
     n = len(A)
     L = np.zeros((n, n))
     for i in range(n):
@@ -45,11 +183,11 @@ def inverse_of(A, out):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
-    """Add one station's information A (4, 4) and gradient b (4,) to the ball's, its unknown shift eliminated.
+def _add_shifted(A, b, T, shift, normal, gain):  # type: ignore[no-untyped-def]
+    """Add one station's information A (4, 4) and gradient b (4,), its unknown shift of covariance T eliminated.
 
-    ``gain`` (3, 8) is left so that the shift's own step is -(gain[:, :4] . step of the ball + gain[:, 4]), and that the
-    shift's covariance, were the ball known, is gain[:, 5:].
+    ``gain`` (3, 8) is filled so that the shift's own step is -(gain[:, :4] . step of the state + gain[:, 4]), and the
+    shift's covariance given the state is gain[:, 5:].
     """
     W, S = np.empty((3, 3)), np.empty((3, 3))
     if not inverse_of(T, W):
@@ -73,34 +211,41 @@ def _add_station(A, b, T, shift, H, g, gain):  # type: ignore[no-untyped-def]
             gain[i, k] = total
     for i in range(4):
         for j in range(4):
-            H[i, j] += A[i, j]
+            normal.H[i, j] += A[i, j]
             for k in range(3):
-                H[i, j] -= A[i, k] * gain[k, j]
-        g[i] += b[i]
+                normal.H[i, j] -= A[i, k] * gain[k, j]
+        normal.g[i] += b[i]
         for k in range(3):
-            g[i] -= A[i, k] * gain[k, 4]
+            normal.g[i] -= A[i, k] * gain[k, 4]
     return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(  # type: ignore[no-untyped-def]
-    points, rays, ranges, station, chosen, noise, stretch, whole, centre, centre_weight, radius, radius_weight,
-    shift_covariance, state, shifts, gains, H, g,
-):  # fmt: skip
-    """Fill H (4, 4) and gradient g (4,) at ``state``; returns the number of points of weight above 0.
-
-    ``stretch`` widens the robust cut; ``whole`` gives all these points their full weight. Points are sorted by station.
-    """
+def _start_from(prior, state, normal):  # type: ignore[no-untyped-def]
+    """Set the normal equations to those of the prior alone."""
+    H, g = normal.H, normal.g
     for i in range(4):
         g[i] = 0.0
         for j in range(4):
             H[i, j] = 0.0
     for i in range(3):
         for j in range(3):
-            H[i, j] = centre_weight[i, j]
-            g[i] += centre_weight[i, j] * (state[j] - centre[j])
-    H[3, 3] = radius_weight
-    g[3] = radius_weight * (state[3] - radius)
+            H[i, j] = prior.centre_weight[i, j]
+            g[i] += prior.centre_weight[i, j] * state[j]
+    H[3, 3] = prior.radius_weight
+    g[3] = prior.radius_weight * (state[3] - prior.radius)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def normal_equations(observations, chosen, model, stretch, whole, prior, unknowns, normal):  # type: ignore[no-untyped-def]
+    """Fill the normal equations at the unknowns; returns the number of points of weight above 0.
+
+    ``stretch`` widens the robust cut; ``whole`` gives all these points their full weight.
+    """
+    points, rays, ranges, station = observations
+    state, shifts, gains = unknowns
+    H, g = normal.H, normal.g
+    _start_from(prior, state, normal)
     A, b, J = np.zeros((4, 4)), np.zeros(4), np.empty(4)
     n = len(points)
     used, segment, inside = 0, 0, 0
@@ -113,7 +258,7 @@ def normal_equations(  # type: ignore[no-untyped-def]
                 points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], cx, cy, cz, state[3]
             )
             if cosine > 0.02:
-                v = variance(noise, ranges[i], max(cosine, 0.1))
+                v = variance(model.noise, ranges[i], max(cosine, 0.1))
                 w = weight(e / (stretch * np.sqrt(v)))
                 if w > 0.0:
                     used += 1
@@ -128,10 +273,10 @@ def normal_equations(  # type: ignore[no-untyped-def]
                 for q in range(p):
                     A[q, p] = A[p, q]
             s = station[i]
-            moved = False
-            if inside > 0 and s >= 0 and s < len(shift_covariance) and shift_covariance[s, 0, 0] > 0.0:
-                moved = _add_station(A, b, shift_covariance[s], shifts[segment], H, g, gains[segment])
-            if not moved:
+            eliminated = False
+            if inside > 0 and s >= 0 and s < len(model.shift_covariance) and model.shift_covariance[s, 0, 0] > 0.0:
+                eliminated = _add_shifted(A, b, model.shift_covariance[s], shifts[segment], normal, gains[segment])
+            if not eliminated:
                 for p in range(4):
                     g[p] += b[p]
                     for q in range(4):
@@ -149,30 +294,25 @@ def normal_equations(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve(  # type: ignore[no-untyped-def]
-    points, rays, ranges, station, chosen, noise, stretch, centre, centre_weight, radius, radius_weight,
-    shift_covariance, settled, state, shifts, gains, steps, covariance,
-):  # fmt: skip
-    """Move ``state`` (x, y, z, r) and ``shifts`` by at most ``steps`` Gauss-Newton steps; returns points used, or -1.
+def solve(observations, chosen, model, stretch, prior, unknowns, tolerance, steps, covariance):  # type: ignore[no-untyped-def]
+    """Move state and shifts by at most ``steps`` Gauss-Newton steps; returns the number of points used, or -1.
 
-    A step below ``settled`` mm is the last. ``covariance`` (4, 4) is the inverse of the information at the last but one
-    state. -1: nothing determines the ball.
+    Iteration stops after a step below ``tolerance`` mm. ``covariance`` (4, 4) is the inverse of the information at the
+    last but one state. -1: the sphere is not determined.
     """
-    H, g = np.empty((4, 4)), np.empty(4)
+    state, shifts, gains = unknowns
+    normal = NormalEquations(np.empty((4, 4)), np.empty(4))
     used = 0
     for _ in range(steps):
-        used = normal_equations(
-            points, rays, ranges, station, chosen, noise, stretch, steps < 0, centre, centre_weight,
-            radius, radius_weight,
-            shift_covariance, state, shifts, gains, H, g,
-        )  # fmt: skip
-        if not inverse_of(H, covariance):
+        # a variable for False: numba compiles a kernel anew for every literal
+        used = normal_equations(observations, chosen, model, stretch, steps < 0, prior, unknowns, normal)
+        if not inverse_of(normal.H, covariance):
             return -1
         step = np.zeros(4)
         size = 0.0
         for i in range(4):
             for j in range(4):
-                step[i] -= covariance[i, j] * g[j]
+                step[i] -= covariance[i, j] * normal.g[j]
             size = max(size, abs(step[i]))
         scale = 1.0 if size <= 0.2 * state[3] else 0.2 * state[3] / size
         for i in range(4):
@@ -185,92 +325,6 @@ def solve(  # type: ignore[no-untyped-def]
                 for j in range(4):
                     move += gains[k, i, j] * scale * step[j]
                 shifts[k, i] -= move
-        if size < settled:
+        if size < tolerance:
             break
     return used
-
-
-# --- Compiled residuals of points on balls, and which points count for a ball.
-
-
-LEAST_COSINE = 0.15
-WHOLE, NOTHING = 3.0, 4.5  # in sd: residuals up to the first count whole, beyond the second not at all
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def residual(px, py, pz, ux, uy, uz, cx, cy, cz, r):  # type: ignore[no-untyped-def]
-    """Residual, cosine of incidence on the model (0 = missed), and the residual's derivatives by centre and radius."""
-    wx, wy, wz = cx - px, cy - py, cz - pz
-    if ux == 0.0 and uy == 0.0 and uz == 0.0:
-        d = np.sqrt(wx * wx + wy * wy + wz * wz)
-        if d < 1e-9:
-            return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-        return d - r, 1.0, wx / d, wy / d, wz / d, -1.0
-    a = ux * wx + uy * wy + uz * wz
-    vx, vy, vz = wx - a * ux, wy - a * uy, wz - a * uz
-    under = r * r - (vx * vx + vy * vy + vz * vz)
-    if under <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
-    root = np.sqrt(under)
-    return root - a, root / r, -ux - vx / root, -uy - vy / root, -uz - vz / root, r / root
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def weight(t):  # type: ignore[no-untyped-def]
-    """Weight of a residual of t sd: it redescends, and is all but fully efficient for normal noise."""
-    t = abs(t)
-    if t <= WHOLE:
-        return 1.0
-    if t >= NOTHING:
-        return 0.0
-    q = (t - WHOLE) / (NOTHING - WHOLE)
-    return (1.0 - q * q) ** 2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def variance(noise, distance, cosine):  # type: ignore[no-untyped-def]
-    """Variance of a range: constant, signal (R^2 / cosine) and footprint (tangent^2) parts, mm^2."""
-    c2 = cosine * cosine
-    return noise[0] + noise[1] * distance * distance / cosine + noise[2] * (1.0 - c2) / c2
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def select(  # type: ignore[no-untyped-def]
-    points, rays, axis_points, axes, keep_off, hole, state, least_cosine, gate, chosen
-):
-    """Mark by 1 the points whose rays meet the model where the ball's own surface is to be seen; returns their number.
-
-    By 2 those that are kept off, by 0 those that miss the model or come in too slantwise.
-
-    The choice looks at where the ray meets the model and never at the noisy point: it keeps off the flats and sleeves
-    (``keep_off`` from each member's axis), the process hole about the lowest point, and grazing incidence. ``gate``
-    only spares work: it is far beyond the noise.
-    """
-    cx, cy, cz, r = state[0], state[1], state[2], state[3]
-    total = 0
-    for i in range(len(points)):
-        chosen[i] = 0
-        e, cosine, jx, jy, jz, _ = residual(
-            points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], cx, cy, cz, r
-        )
-        if cosine < least_cosine or abs(e) > gate:
-            continue
-        if rays[i, 0] == 0.0 and rays[i, 1] == 0.0 and rays[i, 2] == 0.0:
-            qx, qy, qz = -r * jx, -r * jy, -r * jz
-        else:
-            qx = points[i, 0] - e * rays[i, 0] - cx
-            qy = points[i, 1] - e * rays[i, 1] - cy
-            qz = points[i, 2] - e * rays[i, 2] - cz
-        masked = qz < 0.0 and qx * qx + qy * qy < hole * hole
-        for m in range(len(axes)):
-            if masked:
-                break
-            dx, dy, dz = axes[m, 0], axes[m, 1], axes[m, 2]
-            sx = qx + cx - axis_points[m, 0]
-            sy = qy + cy - axis_points[m, 1]
-            sz = qz + cz - axis_points[m, 2]
-            along = sx * dx + sy * dy + sz * dz
-            masked = along > 0.0 and sx * sx + sy * sy + sz * sz - along * along < keep_off[m] * keep_off[m]
-        chosen[i] = 2 if masked else 1
-        total += not masked
-    return total

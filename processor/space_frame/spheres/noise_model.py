@@ -1,7 +1,7 @@
-"""The noise of ranges as the balls themselves show it, and the scatter of radii about their sizes.
+"""Noise of ranges, estimated from the residuals on all spheres, and the scatter of radii about their sizes.
 
-Both are read from all balls of a frame together, for one ball has too few points. What is stated of a scanner only
-starts the estimate.
+All spheres of a frame are used together, for one sphere has too few points. Values stated for the scanner only start
+the estimate.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ MAD = 1.482602218505602
 LEAST_MM = 0.02
 LIMB_STEP, LIMB_POINTS = 0.05, 40
 LIMB = np.arange(0.15, 0.451, LIMB_STEP)
-RADII = 10  # a stated scatter of radii is worth as many balls
+RADII = 10  # the stated scatter of radii has the weight of as many spheres
 
 
 def variances_of(noise: Floats, cosines: Floats, ranges: Floats) -> Floats:
     """Variances (n,) of ranges by the model's parts (3,)."""
     c2 = np.maximum(cosines, 0.1) ** 2
-    found: Floats = noise[0] + noise[1] * ranges**2 / np.sqrt(c2) + noise[2] * (1.0 - c2) / c2
-    return found
+    variances: Floats = noise[0] + noise[1] * ranges**2 / np.sqrt(c2) + noise[2] * (1.0 - c2) / c2
+    return variances
 
 
 def noise_model(
     errors: Floats, cosines: Floats, ranges: Floats, weights: Floats, start: Floats
 ) -> tuple[Floats, float]:
-    """Return the variance's parts (3,) (constant, by range^2 / cosine, by tangent^2), and how many points say so.
+    """Return the variance's parts (3,) (constant, by range^2 / cosine, by tangent^2), and the number of points used.
 
-    ``errors`` (n,) are residuals free of leverage; ``weights`` (n,) > 0 mark those on balls. The scale of each cell of
-    range and incidence comes from the median of the residuals' sizes; the parts fit its square and are none of them
-    negative. With fewer than 60 points the ``start`` stays, worth 10 points.
+    ``errors`` (n,) are residuals corrected for leverage; ``weights`` (n,) > 0 mark those on spheres. The scale of each
+    cell of range and incidence is estimated by the median absolute residual; non-negative parts are fitted to its
+    square. With fewer than 60 points the ``start`` is returned, with the weight of 10 points.
     """
     on = weights > 0.0
     e, c, L = np.abs(errors[on]), cosines[on], ranges[on]
@@ -46,7 +46,8 @@ def noise_model(
         return start, 10.0
     whole = float(MAD * np.median(e))
     band = np.floor(np.log(np.maximum(L, NEAREST_MM) / NEAREST_MM) / np.log(RATIO)).astype(np.int64)
-    cell = (band * len(COSINES) + np.searchsorted(COSINES, c, side="right")).astype(np.int16)  # sorted in one pass
+    # 16 bits: sorted in one pass
+    cell = (band * len(COSINES) + np.searchsorted(COSINES, c, side="right")).astype(np.int16)
     order = np.argsort(cell, kind="stable")
     edges = np.flatnonzero(np.diff(cell[order])) + 1
     rows, variances, counts = [], [], []
@@ -64,7 +65,7 @@ def noise_model(
     model = np.full(len(b), whole**2)
     parts = np.array([whole**2, 0.0, 0.0])
     size = np.abs(A).max(axis=0)
-    for _ in range(5):  # a variance of n points has the standard deviation sqrt(2.7 / n) of itself by its median
+    for _ in range(5):  # a variance by the median of n points has the relative standard deviation sqrt(2.7 / n)
         w = np.sqrt(np.array(counts)) / model
         parts = nnls((A / size) * w[:, None], b * w)[0] / size
         model = np.maximum(A @ parts, 1e-3 * whole**2)
@@ -75,10 +76,10 @@ def noise_model(
 
 
 def limb_cosine(errors: Floats, cosines: Floats, ranges: Floats, weights: Floats, noise: Floats, least: float) -> float:
-    """Return the cosine of incidence from which on residuals have no bias: ``least`` or more, 0.5 at most.
+    """Return the least cosine of incidence at which residuals have no bias: from ``least`` to 0.5.
 
-    Near the limb a wide beam is cut and its mean range is not that of its middle. Bands of the cosine whose median
-    residual is off by more than a tenth of the noise, and by more than chance, are left out, and one band beyond them.
+    Near the limb a wide beam is cut, and its mean range differs from that of its centre. Bands of the cosine are left
+    out whose median residual exceeds a tenth of the noise and its own standard error, and one band beyond them.
     """
     on = (weights > 0.0) & (cosines < LIMB[-1])
     c = cosines[on]
@@ -96,16 +97,16 @@ def limb_cosine(errors: Floats, cosines: Floats, ranges: Floats, weights: Floats
 
 
 def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float) -> float:
-    """Return the likeliest standard deviation of radii about their sizes, mm.
+    """Return the most likely standard deviation of radii about their sizes, mm.
 
-    ``radii`` (k,) and ``variances`` (k,) are of fits with ``used_sd`` as prior. It is taken out again, so that each
-    ball says what its points alone do; the stated scatter counts as ten balls. Balls that know little are left out.
+    ``radii`` (k,) and ``variances`` (k,) are of fits with a prior of sd ``used_sd``, which is removed first: only the
+    points count. The stated scatter has the weight of ten spheres. Spheres with little information are left out.
     """
-    off, own = _off_sizes(radii, variances, sizes, used_sd, stated_sd)
+    off, variance = _off_sizes(radii, variances, sizes, used_sd, stated_sd)
     if not len(off):
         return stated_sd
     grid = stated_sd * np.geomspace(0.2, 2.5, 128)
-    total = own[None] + grid[:, None] ** 2
+    total = variance[None] + grid[:, None] ** 2
     cost = (np.log(total) + off[None] ** 2 / total).sum(axis=1)
     cost += RADII * (np.log(grid**2) + stated_sd**2 / grid**2)
     return float(grid[np.argmin(cost)])
@@ -114,14 +115,13 @@ def radius_scatter(radii: Floats, variances: Floats, sizes: Floats, used_sd: flo
 def radius_offset(
     radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float
 ) -> tuple[float, float]:
-    """Return what radii lie off their sizes in the mean of all balls, mm, and its standard deviation.
+    """Return the mean deviation of all radii from their sizes, mm, and its standard deviation.
 
-    Ranges that are wrong alike at all stations, or means over a wide beam, make every ball too small or too large, and
-    no ball alone shows it.
-    Arguments are those of :func:`radius_scatter`; ``used_sd`` is also what radii scatter by.
+    A range error common to all stations, or a wide beam, makes every sphere too small or too large; a single sphere
+    does not show it. Arguments are those of :func:`radius_scatter`; ``used_sd`` is also the scatter of radii.
     """
-    off, own = _off_sizes(radii, variances, sizes, used_sd, stated_sd)
-    weight = 1.0 / (own + used_sd**2)
+    off, variance = _off_sizes(radii, variances, sizes, used_sd, stated_sd)
+    weight = 1.0 / (variance + used_sd**2)
     total = float(weight.sum())
     return (float((weight * off).sum()) / total, total**-0.5) if total > 0.0 else (0.0, np.inf)
 
@@ -129,11 +129,11 @@ def radius_offset(
 def _off_sizes(
     radii: Floats, variances: Floats, sizes: Floats, used_sd: float, stated_sd: float
 ) -> tuple[Floats, Floats]:
-    """Radii less sizes (j,) by the points alone, and their variances (j,), of balls that know something of it."""
+    """Radii less sizes (j,) from the points alone, and their variances (j,), of spheres with enough information."""
     prior = 1.0 / used_sd**2
     weight = 1.0 / variances - prior
     good = np.isfinite(weight) & (weight > 0.1 * prior)
-    own = 1.0 / weight[good]
-    off = (radii[good] / variances[good] - sizes[good] * prior) * own - sizes[good]
-    near = np.abs(off) < 4.0 * np.sqrt(own + stated_sd**2)
-    return off[near], own[near]
+    variance = 1.0 / weight[good]
+    off = (radii[good] / variances[good] - sizes[good] * prior) * variance - sizes[good]
+    near = np.abs(off) < 4.0 * np.sqrt(variance + stated_sd**2)
+    return off[near], variance[near]

@@ -1,113 +1,108 @@
-"""The ends of members at nodes, and how far from their axes a ball's surface is hidden by sleeves and flats."""
+"""Member ends at nodes, and how far from their axes sleeves and flats hide a sphere's surface."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
-from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.members.records import Members, Nodes
 
 # Of a hexagon's corner radius: the median distance from its axis of a point on it is 0.901, of a round sleeve 1.
 MEDIAN_OF_CORNER = 0.901
-SLEEVE_OF_TUBE = 0.70  # corner radius of a sleeve whose points are too few, as a share of its tube's radius
+SLEEVE_OF_TUBE = 0.70  # corner radius of a sleeve with too few points, as a share of its tube's radius
 SLEEVE_MM = 25.0  # where the tube's radius is not known either
-FLAT_MM = 1.0  # a flat is milled so much wider than its sleeve
-AXIS_MM = 1.5  # what the axis may be off at the node
+FLAT_MM = 1.0  # by which a milled flat is wider than its sleeve
+AXIS_MM = 1.5  # allowance for the error of the axis at the node
 LEAST_POINTS = 8
-CLASS_MM = 4.0  # tubes within this are of one class, and have sleeves alike
+CLASS_MM = 4.0  # tubes within this are of one class, and have equal sleeves
 
 
-@dataclass(frozen=True)
-class Ends:
-    """Members at nodes: those of node i in rows ``start[i]`` to ``start[i + 1]``.
+class Ends(NamedTuple):
+    """Member ends at nodes: those of node i in rows ``start[i]`` to ``start[i + 1]``."""
 
-    ``points`` (m, 3) on the axis less the node's position, ``directions`` (m, 3) away from it, ``tube_radii`` (m,).
-    """
-
-    start: Ints
-    points: Floats
-    directions: Floats
-    tube_radii: Floats
+    start: Ints  # (k + 1,)
+    points: Floats  # (m, 3) on the axis, less the node's position
+    directions: Floats  # (m, 3) away from the node
+    tube_radii: Floats  # (m,)
 
 
-def ends(nodes: Nodes, tubes: Tubes) -> Ends:
+def ends(nodes: Nodes, members: Members) -> Ends:
     """List the members' ends by node. The foot of the node on each axis stands for the axis."""
-    node = np.concatenate([tubes.node_a, tubes.node_b])
-    row = np.concatenate([np.arange(len(tubes.node_a))] * 2)
-    sign = np.concatenate([np.ones(len(tubes.node_a)), -np.ones(len(tubes.node_b))])
-    held = np.flatnonzero(node >= 0)
-    order = held[np.argsort(node[held], kind="stable")]
+    node = np.concatenate([members.node_a, members.node_b])
+    row = np.concatenate([np.arange(len(members.node_a))] * 2)
+    sign = np.concatenate([np.ones(len(members.node_a)), -np.ones(len(members.node_b))])
+    at_node = np.flatnonzero(node >= 0)
+    order = at_node[np.argsort(node[at_node], kind="stable")]
     node, row, sign = node[order], row[order], sign[order]
     start = np.searchsorted(node, np.arange(nodes.count + 1)).astype(np.int64)
-    direction = tubes.directions[row]
-    to_axis = tubes.points[row] - nodes.positions[node]
+    direction = members.directions[row]
+    to_axis = members.points[row] - nodes.positions[node]
     foot = to_axis - np.einsum("mi,mi->m", to_axis, direction)[:, None] * direction
-    return Ends(start, foot, direction * sign[:, None], tubes.radii[row])
+    return Ends(start, foot, direction * sign[:, None], members.radii[row])
 
 
-def first_guess(found: Ends) -> Floats:
-    """Corner radii (m,) of sleeves by the size of the tubes alone, mm."""
-    guess: Floats = np.where(np.isfinite(found.tube_radii), SLEEVE_OF_TUBE * found.tube_radii, SLEEVE_MM)
+def first_guess(member_ends: Ends) -> Floats:
+    """Corner radii (m,) of sleeves from the radii of the tubes alone, mm."""
+    radii = member_ends.tube_radii
+    guess: Floats = np.where(np.isfinite(radii), SLEEVE_OF_TUBE * radii, SLEEVE_MM)
     return guess
 
 
-def measured(found: Ends, start: Ints, points: Floats, centres: Floats, radii: Floats, threads: int = 0) -> Floats:
-    """Corner radii (m,) of sleeves from the points just beyond the balls, mm.
+def measured(member_ends: Ends, start: Ints, points: Floats, states: Floats, threads: int = 0) -> Floats:
+    """Corner radii (m,) of sleeves from the points (n, 3) just beyond the spheres (k, 4), mm.
 
-    The larger of an end's own and the median of the ends with tubes alike: too much hidden costs a few points, too
-    little costs the truth. The guess stays where there are no points.
+    The larger of an end's own radius and the median over ends of the same class is taken: masking too much loses a few
+    points, masking too little biases the fit. The guess from the tube remains where there are no points.
     """
-    guess = first_guess(found)
-    # NaN tubes look as far as the widest plausible sleeve
-    widest = np.where(np.isfinite(found.tube_radii), found.tube_radii + 6.0, 50.0)
-    medians, counts = np.full(len(guess), np.nan), np.zeros(len(guess), np.int64)
-    over_ranges(
-        lambda a, b: _medians(
-            a, b, start, points, found.start, found.points, found.directions, widest, centres, radii, medians, counts
-        ),
-        len(radii),
-        threads,
-    )
-    own = np.where(counts >= LEAST_POINTS, medians / MEDIAN_OF_CORNER, np.nan)
-    corner = guess.copy()
-    classes = np.where(np.isfinite(found.tube_radii), np.rint(found.tube_radii / CLASS_MM), -1.0)
-    for one in np.unique(classes):
-        rows = classes == one
-        seen = own[rows & np.isfinite(own)]
+    radii = member_ends.tube_radii
+    # without a tube's radius, as far as the widest plausible sleeve
+    widest = np.where(np.isfinite(radii), radii + 6.0, 50.0)
+    medians, counts = np.full(len(radii), np.nan), np.zeros(len(radii), np.int64)
+    kernel = partial(_medians, start, points, member_ends, widest, states, medians, counts)
+    over_ranges(kernel, len(states), threads)
+    single = np.where(counts >= LEAST_POINTS, medians / MEDIAN_OF_CORNER, np.nan)
+    corner = first_guess(member_ends)
+    classes = np.where(np.isfinite(radii), np.rint(radii / CLASS_MM), -1.0)
+    for number in np.unique(classes):
+        rows = classes == number
+        seen = single[rows & np.isfinite(single)]
         if len(seen) >= 3:
             corner[rows] = np.median(seen)
-    larger = np.isfinite(own) & (own > corner) & (counts >= 2 * LEAST_POINTS)
-    result: Floats = np.where(larger, own, corner)
+    larger = np.isfinite(single) & (single > corner) & (counts >= 2 * LEAST_POINTS)
+    result: Floats = np.where(larger, single, corner)
     return result
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _medians(begin, end, start, points, end_start, foot, directions, widest, centres, radii, found, counts):  # type: ignore[no-untyped-def]
-    """Fill median distance from the axis and number of points 4 to 25 mm beyond each end's ball."""
-    for k in range(begin, end):
-        if np.isnan(radii[k]):
+def _medians(start, points, member_ends, widest, states, medians, counts, first, last):  # type: ignore[no-untyped-def]
+    """Fill median distance from the axis and number of the points 4 to 25 mm beyond each end's sphere."""
+    for k in range(first, last):
+        radius = states[k, 3]
+        if np.isnan(radius):
             continue
         off = np.empty(start[k + 1] - start[k])
-        for m in range(end_start[k], end_start[k + 1]):
-            near, far = radii[k] + 4.0, radii[k] + 25.0
-            kept = 0
+        for m in range(member_ends.start[k], member_ends.start[k + 1]):
+            near, far = radius + 4.0, radius + 25.0
+            dx, dy, dz = member_ends.directions[m, 0], member_ends.directions[m, 1], member_ends.directions[m, 2]
+            foot = member_ends.points[m]
+            number = 0
             for i in range(start[k], start[k + 1]):
                 x, y, z = points[i, 0], points[i, 1], points[i, 2]
-                dx, dy, dz = directions[m, 0], directions[m, 1], directions[m, 2]
-                out = (x - centres[k, 0]) * dx + (y - centres[k, 1]) * dy + (z - centres[k, 2]) * dz
+                out = (x - states[k, 0]) * dx + (y - states[k, 1]) * dy + (z - states[k, 2]) * dz
                 if out < near or out > far:
                     continue
-                x, y, z = x - foot[m, 0], y - foot[m, 1], z - foot[m, 2]
+                x, y, z = x - foot[0], y - foot[1], z - foot[2]
                 along = x * dx + y * dy + z * dz
                 d2 = x * x + y * y + z * z - along * along
                 if d2 <= widest[m] * widest[m]:
-                    off[kept] = np.sqrt(max(d2, 0.0))
-                    kept += 1
-            counts[m] = kept
-            if kept > 0:
-                found[m] = np.median(off[:kept])
+                    off[number] = np.sqrt(max(d2, 0.0))
+                    number += 1
+            counts[m] = number
+            if number > 0:
+                medians[m] = np.median(off[:number])

@@ -1,24 +1,98 @@
-"""Records of fitted balls."""
+"""Records of fitted spheres, and the argument tuples of the compiled fits."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Checked, Floats, Ints, column, names
+from processor.model import Checked, Floats, Ints, Labels, column, names
 
 AMBIGUOUS = 14.0  # in chi-square: below it the runner-up's size is more than a thousandth as likely
+POINTS, CELLS, STATIONS, RMS, SCALE, DEGREES, CENTRE_CHI2, FITTED = range(8)  # columns of ``Fits.numbers``
+
+
+class AimedCrops(NamedTuple):
+    """Points about k nodes with their rays: those of node i are rows ``start[i]`` to ``start[i + 1]``, by station."""
+
+    start: Ints  # (k + 1,)
+    points: Floats  # (n, 3) less their node, mm
+    rays: Floats  # (n, 3) unit vectors from the scanner; 0 where it is unknown
+    ranges: Floats  # (n,) mm
+    station: Labels  # (n,) rows of the scanners; -1 = unknown
+
+
+class Masks(NamedTuple):
+    """Where spheres' own surfaces cannot be seen: member ends of node i are rows ``start[i]`` to ``start[i + 1]``."""
+
+    start: Ints  # (k + 1,)
+    axis_points: Floats  # (m, 3) on the axis, less the node, mm
+    axes: Floats  # (m, 3) unit vectors away from the node
+    keep_off: Floats  # (m,) distance from the axis within which sleeves and flats hide the sphere, mm
+    tube_off: Floats  # (m,) the same of the member's tube
+    hole: float  # radius of the cap about the lowest point that the process hole takes, mm
+    least_cosine: float  # of incidence
+
+
+class StochasticModel(NamedTuple):
+    """Parts (3,) of a range's variance, mm^2, and the covariance (s, 3, 3) of each station's unknown shift."""
+
+    noise: Floats
+    shift_covariance: Floats
+
+
+class Sizes(NamedTuple):
+    """What is tried for k nodes: a catalogue's sizes, and the priors of centre and size."""
+
+    sizes: Floats  # (m,) radii, mm
+    weight: float  # 1 / variance of a radius about its size; 0 where radii are free
+    expected: Floats  # (k,) nominal radii, NaN = none
+    surprise: float  # by which the energy of a size other than the expected one is raised
+    free: bool  # radii are free: sizes are starts only
+    centre_weight: Floats  # (k, 3, 3) inverse covariances of the nodes
+
+
+class Chosen(NamedTuple):
+    """Of k nodes the best state (x, y, z, r), its size and energy, and size and energy of the runner-up."""
+
+    states: Floats
+    sizes: Floats
+    energy: Floats
+    second: Floats
+    second_energy: Floats
+
+
+class Priors(NamedTuple):
+    """Priors of k fits: inverse covariances (k, 3, 3) of centres, sizes (k,) and their weights (k,)."""
+
+    centre_weight: Floats
+    sizes: Floats
+    size_weights: Floats
+
+
+class Residuals(NamedTuple):
+    """Of n gathered points the residual (corrected for leverage, mm), cosine of incidence and robust weight."""
+
+    errors: Floats
+    cosines: Floats
+    weights: Floats
+
+
+class Finished(NamedTuple):
+    """Output of the final fit of k nodes; columns of ``numbers`` (k, 8) are named at the top of this module."""
+
+    states: Floats
+    covariances: Floats
+    bounds: Floats
+    numbers: Floats
+    residuals: Residuals
 
 
 @dataclass(frozen=True)
 class Fits:
-    """What the compiled fits say of k nodes: states (x, y, z, r) less the node's position, mm.
-
-    ``numbers`` (k, 8): points, cells, stations, rms, scale about the noise model, degrees of freedom, chi-square of the
-    centre's prior, whether it fitted.
-    """
+    """Results of the compiled fits of k nodes: states (x, y, z, r) less the node's position, mm."""
 
     states: Floats
     covariance: Floats
@@ -27,35 +101,39 @@ class Fits:
     energy: Floats
     second: Floats
     second_energy: Floats
-    numbers: Floats
+    numbers: Floats  # (k, 8)
+
+    @property
+    def fitted(self) -> npt.NDArray[np.bool_]:
+        """Whether each node (k,) has a fit."""
+        converged: npt.NDArray[np.bool_] = np.asarray(self.numbers[:, FITTED] > 0)
+        return converged
 
     @property
     def margin(self) -> Floats:
         """Energy (k,) by which the runner-up loses; infinite without one."""
         with np.errstate(invalid="ignore"):
-            found: Floats = np.where(np.isfinite(self.energy), self.second_energy - self.energy, 0.0)
-        return found
-
-    @property
-    def beyond_doubt(self) -> npt.NDArray[np.bool_]:
-        """Balls (k,) whose size no better knowledge of the noise will change."""
-        found: npt.NDArray[np.bool_] = self.clear & (self.margin > 5.0 * AMBIGUOUS)
-        return found
+            margin: Floats = np.where(np.isfinite(self.energy), self.second_energy - self.energy, 0.0)
+        return margin
 
     @property
     def clear(self) -> npt.NDArray[np.bool_]:
-        """Balls (k,) that are well seen and of no doubtful size."""
-        found: npt.NDArray[np.bool_] = (self.numbers[:, 7] > 0) & (self.numbers[:, 0] >= 30) & (self.margin > AMBIGUOUS)
-        return found
+        """Spheres (k,) that are well seen and of no doubtful size."""
+        return self.fitted & (self.numbers[:, POINTS] >= 30) & (self.margin > AMBIGUOUS)
+
+    @property
+    def final_size(self) -> npt.NDArray[np.bool_]:
+        """Spheres (k,) whose size no better estimate of the noise will change."""
+        return self.clear & (self.margin > 5.0 * AMBIGUOUS)
 
 
 @dataclass(frozen=True)
-class Balls(Checked):
-    """Balls at k nodes, mm: centres less the source's origin.
+class Spheres(Checked):
+    """Spheres at k nodes, mm: centres less the source's origin.
 
-    ``covariance`` is of x, y, z and radius. ``bound`` is the least covariance that any unbiased estimate from these
-    points and priors may have (Cramér and Rao), the stations standing still; ``efficiency_*`` is the bound's standard
-    deviation over the stated one. ``evidence``: ball (its points alone) | fused (with the axes) | axes (no points).
+    ``covariance`` is of x, y, z and radius. ``bound`` is the least covariance of any unbiased estimate from these
+    points and priors (Cramér and Rao), the stations being fixed; ``efficiency_*`` is the bound's standard deviation
+    over the stated one. ``evidence``: ball (its points alone) | fused (with the axes) | axes (no points).
     """
 
     centres: Floats = column("k", 3)
@@ -73,7 +151,7 @@ class Balls(Checked):
     stations: Ints = column("k", dtype=np.int64)
     axes: Ints = column("k", dtype=np.int64)
     rms: Floats = column("k")
-    scale: Floats = column("k")  # of the residuals, over what the noise of all balls says
+    scale: Floats = column("k")  # of the residuals, over the noise model of all spheres
     sizes: Floats = column("k")  # of the catalogue; NaN = none
     second_sizes: Floats = column("k")
     margin: Floats = column("k")  # energy by which the second size loses
@@ -83,7 +161,5 @@ class Balls(Checked):
     reason: tuple[str, ...] = names("k")
     noise: Floats = column(3)  # variance of a range: constant, by range^2 / cosine, by tangent^2
     radius_sd: float = float("nan")  # scatter of radii about their sizes
-    station_sd: float = float(
-        "nan"
-    )  # of each station's place along each axis, as the balls show it; NaN = it was given
+    station_sd: float = float("nan")  # of each station's place along each axis, from the spheres; NaN = it was given
     message: str = ""

@@ -1,27 +1,48 @@
 """Compiled kernels of the stations' self-registration: the normal equations, tubes eliminated, and small algebra.
 
-All sums run in one order, whatever the threads; LAPACK's and BLAS's digits vary with theirs.
+All sums run in one order for any number of threads; those of LAPACK and BLAS do not.
 """
 # Numba infers the types of the arguments: they stay without annotations.
 
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
 from processor.geometry.parallel import over_ranges
-from processor.model import Floats, Ints
-from processor.space_frame.stations.residual_kernels import LEAST, STATION, TUBE
+from processor.model import Floats
+from processor.space_frame.stations.residual_kernels import LEAST, STATION, TUBE, Axes, Layout
 
-MOVED = (0, 1, 2, 3, 7)  # of what an observation tells of, what follows the station
-BLOCKS = 16  # of tubes, that are summed apart and then together
+MOVED = (0, 1, 2, 3, 7)  # unknowns of an observation that depend on the station
+BLOCKS = 16  # of tubes, that are summed separately and then together
+
+
+class Equations(NamedTuple):
+    """Information N (q, 8, 8) and N y (q, 8) of observations, their weights (q,), and the floor.
+
+    ``floor`` is the variance by which an observation deviates beyond its points' noise along e1 and e2, mm^2.
+    """
+
+    N: Floats
+    b: Floats
+    weight: Floats
+    floor: float
+
+
+class Geometry(NamedTuple):
+    """Axes of the tubes, places (s, 3) of the stations, and the prior information (m, 8) on each tube's unknowns."""
+
+    axes: Axes
+    places: Floats
+    prior: Floats
 
 
 @njit(cache=True, nogil=True)
 def cholesky(A):  # type: ignore[no-untyped-def]
-    """Lower factor of a positive definite matrix, in one thread's fixed order; LAPACK's digits vary with threads."""
+    """Lower factor of a positive definite matrix; NaN where it is not positive definite."""
     n = len(A)
     L = np.zeros((n, n))
     for i in range(n):
@@ -60,18 +81,20 @@ def solve(L, B):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def product(A, B):  # type: ignore[no-untyped-def]
-    """Multiply A by B, summed in one order; that of a BLAS depends on its threads."""
-    found = np.zeros((A.shape[0], B.shape[1]))
+    """Multiply A by B, summed in one order."""
+    C = np.zeros((A.shape[0], B.shape[1]))
     for i in range(A.shape[0]):
         for k in range(A.shape[1]):
             for j in range(B.shape[1]):
-                found[i, j] += A[i, k] * B[k, j]
-    return found
+                C[i, j] += A[i, k] * B[k, j]
+    return C
 
 
 @njit(cache=True, nogil=True)
-def arm(axis, e1, e2, half, place):  # type: ignore[no-untyped-def]
-    """How what an observation tells of (8, 7) changes with its station's unknowns, turned about ``place``."""
+def arm(geometry, j, s):  # type: ignore[no-untyped-def]
+    """Return the derivatives (8, 7) of the unknowns of an observation of tube ``j`` by those of its station ``s``."""
+    axes, place = geometry.axes, geometry.places[s]
+    axis, e1, e2, half = axes.line[j], axes.e1[j], axes.e2[j], axes.half[j]
     G = np.zeros((TUBE, STATION))
     mx, my, mz = axis[0] - place[0], axis[1] - place[1], axis[2] - place[2]
     for k in range(2):
@@ -87,7 +110,7 @@ def arm(axis, e1, e2, half, place):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def with_floor(N, b, floor):  # type: ignore[no-untyped-def]
-    """Information and its product of an observation that may lie off by ``floor`` (variance, mm^2) along e1 and e2."""
+    """Information N and N y of an observation that deviates by variance ``floor`` (mm^2) along e1 and e2."""
     if floor == 0.0:
         return N.copy(), b.copy()
     a, c, d = N[0, 0] + 1.0 / floor, N[0, 1], N[1, 1] + 1.0 / floor
@@ -102,17 +125,19 @@ def with_floor(N, b, floor):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def add_tube(N, b, weight, floor, first, last, station, axis, e1, e2, half, places, prior, H, g):  # type: ignore[no-untyped-def]
-    """Add to the upper half of H, and to g, what the observations first..last of one tube tell of their stations."""
-    number = last - first
+def add_tube(j, equations, layout, geometry, H, g):  # type: ignore[no-untyped-def]
+    """Add to the upper half of H, and to g, the stations' equations by the observations of tube ``j``, eliminated."""
+    N, b, weight, floor = equations
+    first, station = layout.of_tube[j], layout.station
+    number = layout.of_tube[j + 1] - first
     width = STATION * number
-    A, total = np.diag(prior), np.zeros(TUBE)
+    A, total = np.diag(geometry.prior[j]), np.zeros(TUBE)
     K = np.zeros((TUBE, width))
     local, right = np.zeros((width, width)), np.zeros(width)
     for o in range(number):
         q = first + o
         M, y = with_floor(N[q], b[q], floor)
-        G = arm(axis, e1, e2, half, places[station[q]])
+        G = arm(geometry, j, station[q])
         at = STATION * o
         for a in range(TUBE):
             y[a] *= weight[q]
@@ -140,7 +165,7 @@ def add_tube(N, b, weight, floor, first, last, station, axis, e1, e2, half, plac
             right[c] += value * S[k, width]
             for d in range(STATION * (c // STATION), width):
                 local[c, d] -= value * S[k, d]
-    for o in range(number):  # observations are in the order of their stations
+    for o in range(number):  # observations are sorted by station
         at = STATION * station[first + o]
         for c in range(STATION):
             g[at + c] += right[STATION * o + c]
@@ -152,99 +177,95 @@ def add_tube(N, b, weight, floor, first, last, station, axis, e1, e2, half, plac
 
 
 @njit(cache=True, nogil=True)
-def _reduced(  # type: ignore[no-untyped-def]
-    N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, prior, H, g, first, last
-):
-    m = len(tube_obs) - 1
+def _reduced(equations, layout, geometry, H, g, first, last):  # type: ignore[no-untyped-def]
+    m = len(layout.of_tube) - 1
     for block in range(first, last):
         for j in range(block * m // BLOCKS, (block + 1) * m // BLOCKS):
-            if tube_obs[j + 1] - tube_obs[j] > 1:
-                add_tube(
-                    N, b, weight, floor, tube_obs[j], tube_obs[j + 1], station, axis[j], e1[j], e2[j], half[j], places,
-                    prior[j], H[block], g[block],
-                )  # fmt: skip
+            if layout.of_tube[j + 1] - layout.of_tube[j] > 1:
+                add_tube(j, equations, layout, geometry, H[block], g[block])
 
 
-def reduced(
-    N: Floats, b: Floats, weight: Floats, floor: float, tube_obs: Ints, station: Ints, axis: Floats, e1: Floats,
-    e2: Floats, half: Floats, places: Floats, prior: Floats, threads: int = 0,
-) -> tuple[Floats, Floats]:  # fmt: skip
+def reduced(equations: Equations, layout: Layout, geometry: Geometry, threads: int = 0) -> tuple[Floats, Floats]:
     """Sum up the stations' normal matrix (7 s, 7 s) and right side (7 s,), tubes eliminated one after another.
 
-    An observation sees the tube's unknowns less the station's motion: y = a_j - G x_s. ``prior`` (m, 8) is the
-    information on each tube's own unknowns. The number of blocks is fixed, so that the sum does not vary with threads.
+    An observation measures the tube's unknowns less the station's motion: y = a_j - G x_s. The number of blocks is
+    fixed, so that the sum does not vary with threads.
     """
-    size = STATION * len(places)
+    size = STATION * len(geometry.places)
     H, g = np.zeros((BLOCKS, size, size)), np.zeros((BLOCKS, size))
-    arguments = (N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, prior)
-    over_ranges(partial(_reduced, *arguments, H, g), BLOCKS, threads)
+    over_ranges(partial(_reduced, equations, layout, geometry, H, g), BLOCKS, threads)
     upper = H.sum(axis=0)
     return np.triu(upper) + np.triu(upper, 1).T, g.sum(axis=0)
 
 
 @njit(cache=True, nogil=True)
-def _tubes(  # type: ignore[no-untyped-def]
-    N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, prior, x, off, found, differs, begin, end
-):
+def _tubes(equations, layout, geometry, x, off, unknowns, scores, begin, end):  # type: ignore[no-untyped-def]
+    N, b, weight, floor = equations
+    station = layout.station
     for j in range(begin, end):
-        first, last = tube_obs[j], tube_obs[j + 1]
+        first, last = layout.of_tube[j], layout.of_tube[j + 1]
         if last == first:
             continue
-        A, total = np.diag(prior[j]), np.zeros(TUBE)
+        A, total = np.diag(geometry.prior[j]), np.zeros(TUBE)
         for q in range(first, last):
             M, y = with_floor(N[q], b[q], floor)
-            G = arm(axis[j], e1[j], e2[j], half[j], places[station[q]])
+            G = arm(geometry, j, station[q])
             A += weight[q] * M
-            moved = np.zeros(TUBE)
+            motion = np.zeros(TUBE)
             for k in MOVED:
                 for c in range(STATION):
-                    moved[k] += G[k, c] * x[STATION * station[q] + c]
+                    motion[k] += G[k, c] * x[STATION * station[q] + c]
             for a in range(TUBE):
                 for k in MOVED:
-                    y[a] += M[a, k] * moved[k]
+                    y[a] += M[a, k] * motion[k]
             total += weight[q] * y
         L = cholesky(A)
         if np.isnan(L[0, 0]):
             continue
         a = solve(L, total.reshape(-1, 1))[:, 0]
-        found[j] = a
+        unknowns[j] = a
         for q in range(first, last):
             M, y = with_floor(N[q], b[q], floor)
-            G = arm(axis[j], e1[j], e2[j], half[j], places[station[q]])
+            G = arm(geometry, j, station[q])
             rest = -a
             for k in MOVED:
                 for c in range(STATION):
                     rest[k] += G[k, c] * x[STATION * station[q] + c]
-            u0, u1 = y[0], y[1]
-            for k in range(TUBE):
-                u0 += M[0, k] * rest[k]
-                u1 += M[1, k] * rest[k]
-            # variance of u is N - N A^-1 N, where the observation has its part in the tube's unknowns
-            S = solve(L, np.ascontiguousarray(M[:, :2]))
-            v00, v01, v11 = M[0, 0], M[0, 1], M[1, 1]
-            for k in range(TUBE):
-                v00 -= weight[q] * M[0, k] * S[k, 0]
-                v01 -= weight[q] * M[0, k] * S[k, 1]
-                v11 -= weight[q] * M[1, k] * S[k, 1]
-            c00, c01, c11 = M[0, 0] + 1.0 / off, M[0, 1], M[1, 1] + 1.0 / off
-            det = c00 * c11 - c01 * c01
-            differs[q, 0] = (c11 * u0 * u0 - 2.0 * c01 * u0 * u1 + c00 * u1 * u1) / det
-            differs[q, 1] = (c11 * v00 - 2.0 * c01 * v01 + c00 * v11) / det
-            s00, s01, s11 = v00 * v00 + v01 * v01, v01 * (v00 + v11), v01 * v01 + v11 * v11
-            differs[q, 2] = (c11 * s00 - 2.0 * c01 * s01 + c00 * s11) / det
+            _score(M, y, rest, L, weight[q], off, scores[q])
+
+
+@njit(cache=True, nogil=True)
+def _score(M, y, rest, L, weight, off, score):  # type: ignore[no-untyped-def]
+    """Fill the score (3,) of one observation; see :func:`tubes`."""
+    u0, u1 = y[0], y[1]
+    for k in range(TUBE):
+        u0 += M[0, k] * rest[k]
+        u1 += M[1, k] * rest[k]
+    # the variance of u is N - N A^-1 N, for the observation has a part in the tube's unknowns
+    S = solve(L, np.ascontiguousarray(M[:, :2]))
+    v00, v01, v11 = M[0, 0], M[0, 1], M[1, 1]
+    for k in range(TUBE):
+        v00 -= weight * M[0, k] * S[k, 0]
+        v01 -= weight * M[0, k] * S[k, 1]
+        v11 -= weight * M[1, k] * S[k, 1]
+    c00, c01, c11 = M[0, 0] + 1.0 / off, M[0, 1], M[1, 1] + 1.0 / off
+    det = c00 * c11 - c01 * c01
+    score[0] = (c11 * u0 * u0 - 2.0 * c01 * u0 * u1 + c00 * u1 * u1) / det
+    score[1] = (c11 * v00 - 2.0 * c01 * v01 + c00 * v11) / det
+    s00, s01, s11 = v00 * v00 + v01 * v01, v01 * (v00 + v11), v01 * v01 + v11 * v11
+    score[2] = (c11 * s00 - 2.0 * c01 * s01 + c00 * s11) / det
 
 
 def tubes(
-    N: Floats, b: Floats, weight: Floats, floor: float, tube_obs: Ints, station: Ints, axis: Floats, e1: Floats,
-    e2: Floats, half: Floats, places: Floats, prior: Floats, x: Floats, off: float, threads: int = 0,
-) -> tuple[Floats, Floats]:  # fmt: skip
-    """Unknowns (m, 8) of the tubes given the stations' x (7 s,), and how each observation differs from them.
+    equations: Equations, layout: Layout, geometry: Geometry, x: Floats, off: float, threads: int = 0
+) -> tuple[Floats, Floats]:
+    """Unknowns (m, 8) of the tubes given the stations' x (7 s,), and the score (q, 3) of each observation.
 
-    The difference (q, 3) is the score statistic of an observation that lies off by ``off`` (variance, mm^2) along e1
-    and e2, u' (N + 1/off)^-1 u of u = N (y - a + G x); what it is on average if none does; and how much this grows
-    with each mm^2 by which they do.
+    The score statistic tests for a deviation of variance ``off`` (mm^2) of an observation along e1 and e2:
+    u' (N + 1/off)^-1 u of u = N (y - a + G x). With it come its expectation without deviations, and the growth of the
+    expectation with each mm^2 of their variance.
     """
-    found, differs = np.zeros((len(tube_obs) - 1, TUBE)), np.zeros((len(station), 3))
-    arguments = (N, b, weight, floor, tube_obs, station, axis, e1, e2, half, places, prior, x, off)
-    over_ranges(partial(_tubes, *arguments, found, differs), len(tube_obs) - 1, threads, LEAST)
-    return found, differs
+    count = len(layout.of_tube) - 1
+    unknowns, scores = np.zeros((count, TUBE)), np.zeros((len(layout.station), 3))
+    over_ranges(partial(_tubes, equations, layout, geometry, x, off, unknowns, scores), count, threads, LEAST)
+    return unknowns, scores

@@ -1,4 +1,4 @@
-"""The motions of all stations a posteriori, the variances of their prior being estimated along the way."""
+"""Posterior of the motions of all stations, with the variances of their prior estimated from the data."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from processor.space_frame.stations.normal_equations import cholesky, product, s
 from processor.space_frame.stations.residual_kernels import STATION
 
 # of turn (rad), translation and offset of the ranges (mm)
-START = (5e-5, 2.0, 0.5)  # sd: where the iteration starts, nothing more
+START = (5e-5, 2.0, 0.5)  # sd: start of the iteration
 SMALLEST = (1e-8, 1e-3, 1e-3)
 LOOSE = (1e-2, 1e3, 1e2)
-LEAST_TOLD = 0.5  # motions the data must tell of before they say anything of a variance
-ALLOWED = 6.0  # in log density below the likeliest variance
+LEAST_DETERMINED = 0.5  # number of motions that the data must determine for an estimate of their variance
+ALLOWED = 6.0  # in log density below the most likely variance
 
 
 def corrections(x: Floats, places: Floats) -> Floats:
@@ -26,26 +26,26 @@ def corrections(x: Floats, places: Floats) -> Floats:
 
 
 def common_motion(places: Floats) -> Floats:
-    """How the stations' unknowns (7 s,) follow a turn about the frame's origin and a translation (6,) of them all."""
-    found = np.zeros((len(places), STATION, 6))
-    found[:, :3, :3] = np.eye(3)
-    found[:, 3:6] = rigid.motion(places)
-    return found.reshape(-1, 6)
+    """Return derivatives (7 s, 6) of the unknowns by a turn of all stations about the origin and a translation."""
+    M = np.zeros((len(places), STATION, 6))
+    M[:, :3, :3] = np.eye(3)
+    M[:, 3:6] = rigid.motion(places)
+    return M.reshape(-1, 6)
 
 
 def mean_gain(M: Floats, precision: Floats) -> Floats:
-    """How the common motion (6,) that fits the stations' unknowns best follows each of them (6, 7 s)."""
+    """Return derivatives (6, 7 s) of the best-fitting common motion by the stations' unknowns."""
     weighted = np.ascontiguousarray(M.T) * precision
-    found: Floats = solve(cholesky(product(weighted, M)), weighted)
-    return found
+    gain: Floats = solve(cholesky(product(weighted, M)), weighted)
+    return gain
 
 
 class Posterior:
     """The unknowns of stations at ``places`` (s, 3), x = (turn, translation, offset of the ranges) of each.
 
-    A priori they are normal about zero, about a shift that all share of sd ``datum_mm`` an axis, or about any common
-    motion where control points hold the whole cloud. The three
-    variances are those under which the unknowns' sum of squares is what the data make one expect (MacKay 1992).
+    A priori they are normal about zero, about a common shift of sd ``datum_mm`` an axis, or about any common motion
+    where control points fix the whole cloud. The three variances are those for which the unknowns' sum of squares has
+    its posterior expectation (MacKay 1992).
     """
 
     def __init__(self, places: Floats, control: ControlPoints | None, datum_mm: float = 0.0) -> None:
@@ -62,14 +62,14 @@ class Posterior:
             self.untouched = self.variance.copy()
         self.control = control
         self.free = control is not None and control.hold_all
-        # of each kind, how many are not common to all stations where a common motion is free
+        # of each kind, the number that is not common to all stations where a common motion is free
         self.number = np.array([3.0, 3.0, 1.0]) * len(self.places) - np.array([3.0, 3.0, 0.0]) * self.free
 
     def doubted(self, H: Floats, g: Floats, x: Floats) -> Doubt:
-        """Hold the control points against each other; H and g are the tubes' equations at x."""
-        # Where they do not hold all, what they say has gone into the variances: that would excuse them.
+        """Test the control points against each other; H and g are the tubes' equations at x."""
+        # Where they do not fix the cloud alone, the variances were estimated with them, which would hide an outlier.
         P = self._prior(self.variance if self.free else self.untouched)
-        if self.free:  # what is left without one of them may not hold all
+        if self.free:  # the rest without one of them may not fix the cloud
             gain = mean_gain(self.M, self.precision(self.variance))
             loose = np.repeat(np.array(LOOSE[:2]) ** -2.0, 3)
             P = P + product(np.ascontiguousarray(gain.T) * loose, gain)
@@ -77,21 +77,21 @@ class Posterior:
         def solved(some: ControlPoints) -> tuple[Floats, Floats]:
             Hs, gs = some.added(H, g, x, self.places)
             right = np.column_stack([gs - product(P, x[:, None])[:, 0], np.eye(len(x))])
-            both = solve(cholesky(Hs + P), right)
-            return both[:, 0], np.ascontiguousarray(both[:, 1:])
+            solution = solve(cholesky(Hs + P), right)
+            return solution[:, 0], np.ascontiguousarray(solution[:, 1:])
 
         return doubted(self.control or ControlPoints(), x, self.places, solved)
 
     def step(self, H: Floats, g: Floats, x: Floats, rounds: int) -> tuple[Floats, Floats]:
-        """Return the change of x (7 s,) and the covariance a posteriori; H and g are the tubes' equations at x.
+        """Return the change of x (7 s,) and the posterior covariance; H and g are the tubes' equations at x.
 
-        ``rounds`` is how often the variances are estimated anew.
+        The variances are estimated again ``rounds`` times.
         """
         H, g = self._with_control(H, g, x)
         change, C = np.zeros(len(x)), np.zeros_like(H)
         for turn in range(rounds + 1):
-            _, solved = self._solved(H, g, x, self.variance)
-            change, C = solved[:, 0], solved[:, 1:]
+            _, solution = self._solved(H, g, x, self.variance)
+            change, C = solution[:, 0], solution[:, 1:]
             if turn < rounds:
                 self._estimate(x + change, C)
         return change, C
@@ -99,9 +99,9 @@ class Posterior:
     def integrated(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
         """Return change and covariance as :meth:`step` does, averaged over all variances that the data allow.
 
-        With few stations, or weak ties, the variances are known poorly: one guess of them would make the covariance
-        too small. Their prior is uniform in log sd above what the data can resolve and in the sd itself below
-        (Gelman 2006 on why not in the log there). The kinds are averaged over one by one, about the likeliest.
+        With few stations or weak ties the variances are poorly known, and a single estimate of them would make the
+        covariance too small. Their prior is uniform in log sd above the data's resolution, and in the sd itself below
+        (Gelman 2006). The kinds are averaged one by one, about the most likely variances.
         """
         H, g = self._with_control(H, g, x)
         resolved = self._resolution(H)
@@ -113,29 +113,29 @@ class Posterior:
         for kind, values in enumerate(nodes):
             tried = np.tile(sd, (len(values), 1))
             tried[:, kind] = values
-            found = [self._solved(H, g, x, one**2) for one in tried]
+            solutions = [self._solved(H, g, x, trial**2) for trial in tried]
             log = np.array([
-                self._evidence(L, g, solved[:, 0], x, one**2, resolved)
-                for (L, solved), one in zip(found, tried, strict=True)
+                self._evidence(L, g, solution[:, 0], x, trial**2, resolved)
+                for (L, solution), trial in zip(solutions, tried, strict=True)
             ])  # fmt: skip
             weight = np.exp(log - log.max())
             weight /= weight.sum()
-            mean = np.sum(weight[:, None] * np.array([solved[:, 0] for _, solved in found]), axis=0)
+            mean = np.sum(weight[:, None] * np.array([solution[:, 0] for _, solution in solutions]), axis=0)
             change += mean - best[:, 0]
-            for w, (_, solved) in zip(weight, found, strict=True):
-                off = solved[:, 0] - mean
-                C += w * (solved[:, 1:] - best[:, 1:] + off[:, None] * off)
+            for w, (_, solution) in zip(weight, solutions, strict=True):
+                off = solution[:, 0] - mean
+                C += w * (solution[:, 1:] - best[:, 1:] + off[:, None] * off)
             variance[kind] = float(np.sum(weight * values**2))
         self.variance = variance
         return change, 0.5 * (C + C.T)
 
     def precision(self, variance: Floats) -> Floats:
         """Information (7 s,) of the prior on each unknown."""
-        found: Floats = 1.0 / variance[self.kind]
-        return found
+        precision: Floats = 1.0 / variance[self.kind]
+        return precision
 
     def _solved(self, H: Floats, g: Floats, x: Floats, variance: Floats) -> tuple[Floats, Floats]:
-        """Factor L of the matrix a posteriori, and the change (7 s,) beside the covariance, (7 s, 1 + 7 s)."""
+        """Factor L of the posterior's matrix, and the change (7 s,) beside the covariance, (7 s, 1 + 7 s)."""
         P = self._prior(variance)
         L = cholesky(H + P)
         return L, solve(L, np.column_stack([g - product(P, x[:, None])[:, 0], np.eye(len(x))]))
@@ -145,29 +145,29 @@ class Posterior:
         P = np.diag(precision)
         if self.free:
             P -= product(precision[:, None] * self.M, mean_gain(self.M, precision))
-        elif self.datum_mm > 0.0:  # D and a common shift of its own variance, by Woodbury's identity
+        elif self.datum_mm > 0.0:  # a common shift of its own variance, by Woodbury's identity
             weighted = precision[:, None] * self.M[:, 3:]
             inner = product(np.ascontiguousarray(self.M[:, 3:].T), weighted) + np.eye(3) / self.datum_mm**2
             P -= product(weighted, solve(cholesky(inner), np.ascontiguousarray(weighted.T)))
-        found: Floats = 0.5 * (P + P.T)
-        return found
+        symmetric: Floats = 0.5 * (P + P.T)
+        return symmetric
 
     def _with_control(self, H: Floats, g: Floats, x: Floats) -> tuple[Floats, Floats]:
         return (H, g) if self.control is None else self.control.added(H, g, x, self.places)
 
     def _estimate(self, x: Floats, C: Floats) -> None:
-        own, spread = x, np.diag(C)
+        motion, spread = x, np.diag(C)
         if self.free:
             gain = np.eye(len(x)) - product(self.M, mean_gain(self.M, self.precision(self.variance)))
-            own, spread = product(gain, x[:, None])[:, 0], np.einsum("pq,pq->p", product(gain, C), gain)
+            motion, spread = product(gain, x[:, None])[:, 0], np.einsum("pq,pq->p", product(gain, C), gain)
         for kind, least in enumerate(SMALLEST):
             of_kind = self.kind == kind
-            told = self.number[kind] - float(spread[of_kind].sum()) / self.variance[kind]
-            if told > LEAST_TOLD:
-                self.variance[kind] = max(float(np.sum(own[of_kind] ** 2)) / told, least**2)
+            determined = self.number[kind] - float(spread[of_kind].sum()) / self.variance[kind]
+            if determined > LEAST_DETERMINED:
+                self.variance[kind] = max(float(np.sum(motion[of_kind] ** 2)) / determined, least**2)
 
     def _resolution(self, H: Floats) -> Floats:
-        """Sd (3,) with which the data tell a station's unknowns from the others', whatever they are."""
+        """Sd (3,) with which the data resolve a station's unknowns relative to the others', without a prior."""
         loose = np.array(LOOSE) ** 2
         C = solve(cholesky(H + self._prior(loose)), np.eye(len(H)))
         gain = np.eye(len(H)) - product(self.M, mean_gain(self.M, self.precision(loose)))
@@ -177,8 +177,8 @@ class Posterior:
     def _allowed(
         self, H: Floats, g: Floats, x: Floats, sd: Floats, kind: int, resolved: Floats
     ) -> tuple[Floats, Floats]:
-        """Return the likeliest sd (3,) along one ``kind``, and those (n,) that the data allow, even in the log."""
-        if self.number[kind] < 1.0:  # one station, held by control points: nothing to compare it with
+        """Return the most likely sd (3,) along one ``kind``, and those (n,) that the data allow, even in the log."""
+        if self.number[kind] < 1.0:  # one station, fixed by control points: nothing to compare it with
             return sd, sd[kind : kind + 1]
 
         def density(value: float) -> float:
@@ -190,7 +190,7 @@ class Posterior:
             return self._evidence(L, g, solve(L, right[:, None])[:, 0], x, tried**2, resolved)
 
         coarse = resolved[kind] * 2.0 ** np.arange(-5, 14)
-        value = np.array([density(one) for one in coarse])
+        value = np.array([density(trial) for trial in coarse])
         best = sd.copy()
         top = int(np.argmax(value))
         best[kind] = coarse[top]
@@ -199,7 +199,7 @@ class Posterior:
             return best, coarse[near]
         step = 0.25 * np.log(2.0)
         peak, width = float(np.log(coarse[top])), step
-        for _ in range(2):  # the density is next to normal: two parabolas find its top and width
+        for _ in range(2):  # the density is almost normal: two parabolas find its top and width
             low, middle, high = (density(float(np.exp(peak + shift))) for shift in (-step, 0.0, step))
             bend = low - 2.0 * middle + high
             if not bend < 0.0:

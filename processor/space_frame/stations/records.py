@@ -1,4 +1,4 @@
-"""What the stations' registration takes and gives: points on tubes, and corrections with what remains uncertain."""
+"""Input and output of the stations' registration: points on tubes, and corrections with their covariance."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ class TubePoints:
 
 @dataclass(frozen=True)
 class Stations(Checked):
-    """Corrections of all stations, and what remains uncertain after they are applied.
+    """Corrections of all stations, and their covariance.
 
-    Off the ranges of a station goes its ``range_offset``; then ``T_project_station`` (s, 4, 4) maps its points, in the
-    project's frame as registered less the origin, to where they belong: see :meth:`corrected`.
+    A station's ``range_offset`` is subtracted from its ranges; then ``T_project_station`` (s, 4, 4) maps its points, in
+    the project's frame as registered less the origin, to their corrected places: see :meth:`corrected`.
 
     ``covariance`` (7 s, 7 s) is of each station's (turn about x, y, z through ``places`` (s, 3), translation, range
-    offset) in turn; rad and mm, T = exp(xi) T. It holds both what is left between the stations and the motion that all
-    have in common; NaN where nothing tells of it.
+    offset) in turn; rad and mm, T = exp(xi) T. It includes the errors between the stations and the motion that is
+    common to all; NaN where it is unknown.
     """
 
-    status: str  # ok | weak | single | unknown | doubtful: what stations seem off may be the beam's width
+    status: str  # ok | weak | single | unknown | doubtful: the beam's width may explain the stations' errors
     message: str
     T_project_station: Floats = column("s", 4, 4)
     places: Floats = column("s", 3)
@@ -46,22 +46,22 @@ class Stations(Checked):
     before_rad: float = float("nan")  # and of its turn
     range_offset: Floats = column("s")  # of a station's ranges less the mean of all, mm
     range_offset_sd: float = float("nan")  # of all stations, as scanned
-    shared_offset_sd: float = 0.0  # of what all ranges may be off alike, for an offset or a wide beam; in no covariance
+    shared_offset_sd: float = 0.0  # of an error common to all ranges, by an offset or a wide beam; in no covariance
     observations: Ints = column("s", dtype=np.int64)  # tubes that a station has in common with others
-    weak: tuple[str, ...] = names("s")  # which motions of a station the tubes do not tell; empty = all told
+    weak: tuple[str, ...] = names("s")  # motions of a station that the tubes do not determine; empty = none
     range_sd: Floats = column("s")  # scale of the residuals along the ray, mm
-    floor_mm: float = 0.0  # sd of what an observation of a tube lies off beyond the points' noise
+    floor_mm: float = 0.0  # sd by which an observation of a tube deviates beyond the points' noise
     axis_points: Floats = column("m", 3)  # of the tubes after the corrections, and their directions and radii
     axis_directions: Floats = column("m", 3)
     axis_radii: Floats = column("m")
-    datum: str = ""  # what says where all stations together lie, and how well
-    control: tuple[str, ...] = names("c")  # targets as they were seen, a row a sighting
+    datum: str = ""  # what fixes all stations together, and its uncertainty
+    control: tuple[str, ...] = names("c")  # control points, a row a sighting
     control_scan: tuple[str, ...] = names("c")  # the stations that saw them
     control_off: Floats = column("c", 3)  # target minus sighting after the corrections
     control_used: Ints = column("c", dtype=np.int64)  # 1 = yes
 
     def corrected(self, points: Floats, station: Labels) -> Floats:
-        """Return points (n, 3) of stations (n,), less the origin, where they belong; those of station -1 unmoved."""
+        """Return points (n, 3) of stations (n,), less the origin, after the corrections; those of -1 unmoved."""
         return kernels.corrected(
             np.ascontiguousarray(points), station, self.places, self.range_offset, self.T_project_station
         )
@@ -69,53 +69,53 @@ class Stations(Checked):
     def effect(self, points: Floats, influence: Floats, relative: bool = False) -> Floats:
         """Covariance (k, d, d) that the stations add to estimates near points (k, 3).
 
-        ``influence`` is how an estimate follows the stations' points: (k, s) weights adding up to 1 for centres that
-        move as the weighted mean of the stations does, or (k, s, d, 3) derivatives by a shift of a station's points at
-        the place, for d parameters each. ``relative`` leaves out what all stations have in common (:meth:`common`).
+        ``influence`` are the derivatives of an estimate by the stations' points: (k, s) weights that add up to 1, for
+        centres that move with the weighted mean of the stations, or (k, s, d, 3) derivatives of d parameters by a shift
+        of a station's points there. ``relative`` leaves out the motion common to all stations (:meth:`common`).
         """
         if influence.ndim == 2:
             influence = influence[:, :, None, None] * np.eye(3)
         covariance = self.covariance
         if relative and np.isfinite(self.before_mm):
-            own = np.eye(len(covariance)) - normals.product(
-                common_motion(self.places), mean_gain(common_motion(self.places), self._precision())
+            M = common_motion(self.places)
+            relative_part = np.eye(len(covariance)) - normals.product(M, mean_gain(M, self._precision()))
+            covariance = normals.product(
+                normals.product(relative_part, covariance), np.ascontiguousarray(relative_part.T)
             )
-            covariance = normals.product(normals.product(own, covariance), np.ascontiguousarray(own.T))
         return kernels.effect(np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance)
 
     def common(self, place: Floats) -> Floats:
-        """Covariance (6, 6) of the motion all stations have in common: turn about ``place`` (3,), translation.
+        """Covariance (6, 6) of the motion common to all stations: turn about ``place`` (3,), translation.
 
-        It is that of the rigid motion which fits the stations' own motions best, weighted as they scatter.
+        That motion is the best fit to the stations' motions, weighted by their prior variances.
         """
         if not np.isfinite(self.before_mm):
-            known: Floats = self.covariance[:6, :6].copy()
-            return known
+            first: Floats = self.covariance[:6, :6].copy()
+            return first
         gain = mean_gain(common_motion(self.places - place), self._precision())
-        found: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
-        return found
+        covariance: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
+        return covariance
 
     def shared_offset_at(self, points: Floats) -> Floats:
-        """Covariance (k, 3, 3) that an offset all ranges share adds at points (k, 3): along the mean of their rays."""
+        """Covariance (k, 3, 3) by an offset common to all ranges at points (k, 3): along the mean of their rays."""
         ray = points[:, None] - self.places
         squared = np.maximum(np.sum(ray**2, axis=2, keepdims=True), 1e-300)
-        near = np.sum(ray / squared**1.5, axis=1) / np.sum(1.0 / squared, axis=1)  # points a station as it is near
-        found: Floats = self.shared_offset_sd**2 * near[:, :, None] * near[:, None]
-        return found
+        near = np.sum(ray / squared**1.5, axis=1) / np.sum(1.0 / squared, axis=1)  # a station's points by its distance
+        covariance: Floats = self.shared_offset_sd**2 * near[:, :, None] * near[:, None]
+        return covariance
 
     def datum_at(self, points: Floats) -> Floats:
-        """Covariance (k, 3, 3) that the motion of all stations adds to anything at points (k, 3), the same for all."""
+        """Covariance (k, 3, 3) that the motion common to all stations adds at points (k, 3)."""
         middle = points.mean(axis=0) if len(points) else np.zeros(3)
         J = rigid.motion(points - middle)
-        found: Floats = np.einsum("kip,pq,kjq->kij", J, self.common(middle), J)
-        return found
+        covariance: Floats = np.einsum("kip,pq,kjq->kij", J, self.common(middle), J)
+        return covariance
 
     @property
     def between(self) -> Floats:
-        """Covariance (s, 3, 3) of each station's place against all the others': without what they have in common."""
-        alone = np.eye(len(self.places))
-        return self.effect(self.places, alone, relative=True)
+        """Covariance (s, 3, 3) of each station's place relative to the others: without their common motion."""
+        return self.effect(self.places, np.eye(len(self.places)), relative=True)
 
     def _precision(self) -> Floats:
-        one = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
-        return np.tile(one, len(self.places))
+        station = np.repeat(np.array([self.before_rad, self.before_mm, self.range_offset_sd]), (3, 3, 1)) ** -2.0
+        return np.tile(station, len(self.places))

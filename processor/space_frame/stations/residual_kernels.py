@@ -1,15 +1,16 @@
 """Compiled kernels of the stations' self-registration: points of tubes against their axes.
 
-What an observation tells of, in this order: offsets of a tube's axis along e1 and e2 at the middle of what is seen,
-how far the axis leaves it at the end of what is seen (zeta = 1), again along e1 and e2, bow along e1 and e2 as the
-factor of zeta^2 - 1/3, radius, and the offset of the ranges; all mm. The last is the station's alone. All sums run over
-one observation in the points' order: no answer depends on the threads.
+An observation is the set of points of one tube from one station. Its unknowns, in this order: offsets of the tube's
+axis along e1 and e2 at the middle of the stretch seen, its further offsets along e1 and e2 at the end of that stretch
+(zeta = 1), bow along e1 and e2 as the factor of zeta^2 - 1/3, radius, and offset of the ranges; all mm. The last
+belongs to the station alone. Sums over an observation run in the points' order and do not depend on threads.
 """
 # Numba infers the types of the arguments: they stay without annotations.
 
 from __future__ import annotations
 
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -17,17 +18,36 @@ from numba import njit
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints, Labels
 
-TUBE = 8  # what an observation tells of; a tube has the first seven
+TUBE = 8  # unknowns of an observation; a tube has the first seven
 STATION = 7  # unknowns of a station: turn about its own place, translation, offset of its ranges
 ASIDE = 0.01  # variance of the noise across the ray over that along it
-LEAST = 32  # items that are worth a thread's turn
+LEAST = 32  # items of a range for one thread
+
+
+class Layout(NamedTuple):
+    """Observations (q,): their points, tube and station. Those of tube j are ``of_tube[j]`` to ``of_tube[j + 1]``."""
+
+    start: Ints  # (q + 1,) of the points
+    tube: Ints  # (q,)
+    station: Ints  # (q,)
+    of_tube: Ints  # (m + 1,)
+
+
+class Axes(NamedTuple):
+    """Axes of tubes: point and direction (m, 6), two unit vectors (m, 3) across, half length and radius (m,)."""
+
+    line: Floats
+    e1: Floats
+    e2: Floats
+    half: Floats
+    radius: Floats
 
 
 @njit(cache=True, nogil=True)
 def grouped(tube_start, station, stations, most):  # type: ignore[no-untyped-def]
-    """Order of points (CSR by tube) by tube and station, stable, and where each pair's points start; -1 left out.
+    """Order of points (CSR by tube) by tube and station, stable, and the start of each pair's points; -1 left out.
 
-    Of the stations that see a tube those ``most`` are taken that have the most points on it.
+    Of the stations that see a tube, the ``most`` with the most points on it are used.
     """
     tubes = len(tube_start) - 1
     order = np.empty(len(station), np.int64)
@@ -60,7 +80,7 @@ def grouped(tube_start, station, stations, most):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True)
 def extent(points, start, at, along):  # type: ignore[no-untyped-def]
-    """Where along each axis its points (CSR by tube) begin and end; -1 and 1 for a tube without."""
+    """First and last of the points (CSR by tube) along each axis; -1 and 1 for a tube without points."""
     low, high = np.full(len(at), -1.0), np.full(len(at), 1.0)
     for j in range(len(at)):
         first, last = np.inf, -np.inf
@@ -75,11 +95,10 @@ def extent(points, start, at, along):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _residuals(  # type: ignore[no-untyped-def]
-    points, start, tube, station, T, offset, scanners, axis, e1, e2, half, radius, steepest, found, first, last
-):
+def _residuals(points, layout, T, offset, scanners, axes, steepest, seen, first, last):  # type: ignore[no-untyped-def]
+    axis, e1, e2, half, radius = axes
     for q in range(first, last):
-        j, s = tube[q], station[q]
+        j, s = layout.tube[q], layout.station[q]
         M = T[s]
         ax, ay, az = axis[j, 0], axis[j, 1], axis[j, 2]
         dx, dy, dz = axis[j, 3], axis[j, 4], axis[j, 5]
@@ -90,7 +109,7 @@ def _residuals(  # type: ignore[no-untyped-def]
         oz = M[2, 0] * cx + M[2, 1] * cy + M[2, 2] * cz + M[2, 3] - az
         o1 = ox * e1[j, 0] + oy * e1[j, 1] + oz * e1[j, 2]
         o2 = ox * e2[j, 0] + oy * e2[j, 1] + oz * e2[j, 2]
-        for i in range(start[q], start[q + 1]):
+        for i in range(layout.start[q], layout.start[q + 1]):
             x, y, z = points[i, 0], points[i, 1], points[i, 2]
             px = M[0, 0] * x + M[0, 1] * y + M[0, 2] * z + M[0, 3] - ax
             py = M[1, 0] * x + M[1, 1] * y + M[1, 2] * z + M[1, 3] - ay
@@ -113,40 +132,40 @@ def _residuals(  # type: ignore[no-untyped-def]
             cosine = -(n1 * u1 + n2 * u2)
             if cosine < steepest:
                 continue
-            found[i, 0], found[i, 1] = length - offset[s] - t, cosine
+            seen[i, 0], seen[i, 1] = length - offset[s] - t, cosine
             # zeta is the model's, too: the noise of the range must not enter the weights
-            found[i, 2], found[i, 3] = n1, n2
-            found[i, 4] = zeta + (t - length) / length * ((px - ox) * dx + (py - oy) * dy + (pz - oz) * dz) / half[j]
+            seen[i, 2], seen[i, 3] = n1, n2
+            seen[i, 4] = zeta + (t - length) / length * ((px - ox) * dx + (py - oy) * dy + (pz - oz) * dz) / half[j]
 
 
 def residuals(
-    points: Floats, start: Ints, tube: Ints, station: Ints, T: Floats, offset: Floats, scanners: Floats, axis: Floats,
-    e1: Floats, e2: Floats, half: Floats, radius: Floats, steepest: float, threads: int = 0,
-) -> Floats:  # fmt: skip
-    """Residual, cosine, normal along e1 and e2, and zeta of each point of observations ``start`` (q + 1,).
+    points: Floats,
+    layout: Layout,
+    T: Floats,
+    offset: Floats,
+    scanners: Floats,
+    axes: Axes,
+    steepest: float,
+    threads: int = 0,
+) -> Floats:
+    """Residual, cosine of incidence, normal along e1 and e2, and zeta of each point (n, 5).
 
-    The residual is the measured range less the one at which the ray meets the tube, and cosine that of its incidence
-    there; a ray that meets the tube more steeply than ``steepest``, or not at all, gets the cosine 0. Points and
-    scanners are moved by their station's T (s, 4, 4) before, and ranges are less its offset (s,).
+    The residual is the measured range less the range at which the ray meets the tube; the cosine is that of incidence
+    there, or 0 for a ray with a cosine below ``steepest`` and one that misses the tube. Points and scanners are moved
+    by their station's T (s, 4, 4) before, and ranges reduced by its offset (s,).
     """
-    found = np.zeros((len(points), 5))
-    over_ranges(
-        partial(
-            _residuals, points, start, tube, station, T, offset, scanners, axis, e1, e2, half, radius, steepest, found
-        ),
-        len(start) - 1,
-        threads,
-        LEAST,
-    )
-    return found
+    seen = np.zeros((len(points), 5))
+    kernel = partial(_residuals, points, layout, T, offset, scanners, axes, steepest, seen)
+    over_ranges(kernel, len(layout.tube), threads, LEAST)
+    return seen
 
 
 @njit(cache=True, nogil=True)
-def _observations(seen, start, station, scale, cut, N, b, count, first, last):  # type: ignore[no-untyped-def]
+def _observations(seen, layout, scale, cut, N, b, first, last):  # type: ignore[no-untyped-def]
     for q in range(first, last):
-        sigma = scale[station[q]]
+        sigma = scale[layout.station[q]]
         f = np.empty(TUBE)
-        for i in range(start[q], start[q + 1]):
+        for i in range(layout.start[q], layout.start[q + 1]):
             cosine, v = seen[i, 1], seen[i, 0] / (cut * sigma)
             if cosine == 0.0 or abs(v) >= 1.0:
                 continue
@@ -161,28 +180,25 @@ def _observations(seen, start, station, scale, cut, N, b, count, first, last):  
                 b[q, a] += w * f[a] * distance
                 for c in range(a + 1):
                     N[q, a, c] += w * f[a] * f[c]
-            count[q] += 1
         for a in range(TUBE):
             for c in range(a):
                 N[q, c, a] = N[q, a, c]
 
 
-def observations(
-    seen: Floats, start: Ints, station: Ints, scale: Floats, cut: float, threads: int = 0
-) -> tuple[Floats, Floats, Ints]:
-    """Information N (q, 8, 8) and N y (q, 8) from each observation, and its count of points.
+def observations(seen: Floats, layout: Layout, scale: Floats, cut: float, threads: int = 0) -> tuple[Floats, Floats]:
+    """Information N (q, 8, 8) and N y (q, 8) of each observation.
 
-    The normal distance -residual * cosine is a linear function of the unknowns. Noise along the ray moves it by cosine
-    times ``scale`` (s,), its station's, and a little more: angles are not exact. Tukey's biweight with ``cut`` scales.
+    The normal distance -residual * cosine is a linear function of the unknowns. Its noise is cosine times the station's
+    ``scale`` (s,), and slightly more for the error of angles. Tukey's biweight with ``cut`` scales.
     """
-    q = len(start) - 1
-    N, b, count = np.zeros((q, TUBE, TUBE)), np.zeros((q, TUBE)), np.zeros(q, np.int64)
-    over_ranges(partial(_observations, seen, start, station, scale, cut, N, b, count), q, threads, LEAST)
-    return N, b, count
+    q = len(layout.tube)
+    N, b = np.zeros((q, TUBE, TUBE)), np.zeros((q, TUBE))
+    over_ranges(partial(_observations, seen, layout, scale, cut, N, b), q, threads, LEAST)
+    return N, b
 
 
 @njit(cache=True, nogil=True)
-def _effect(points, influence, places, covariance, found, first, last):  # type: ignore[no-untyped-def]
+def _effect(points, influence, places, covariance, effects, first, last):  # type: ignore[no-untyped-def]
     s_count, d_count = influence.shape[1], influence.shape[2]
     for k in range(first, last):
         rows, stations = np.zeros((s_count, d_count, STATION)), np.empty(s_count, np.int64)
@@ -212,18 +228,18 @@ def _effect(points, influence, places, covariance, found, first, last):  # type:
                         for i in range(STATION):
                             for j in range(STATION):
                                 value += rows[p, d, i] * block[i, j] * rows[q, e, j]
-                        found[k, d, e] += value
+                        effects[k, d, e] += value
 
 
 def effect(points: Floats, influence: Floats, places: Floats, covariance: Floats, threads: int = 0) -> Floats:
-    """Covariance (k, d, d) of estimates near points (k, 3) that follow the stations by ``influence`` (k, s, d, 3)."""
-    found = np.zeros((len(points), influence.shape[2], influence.shape[2]))
-    over_ranges(partial(_effect, points, influence, places, covariance, found), len(points), threads, LEAST)
-    return found
+    """Covariance (k, d, d) of estimates near points (k, 3) with derivatives ``influence`` (k, s, d, 3) by stations."""
+    effects = np.zeros((len(points), influence.shape[2], influence.shape[2]))
+    over_ranges(partial(_effect, points, influence, places, covariance, effects), len(points), threads, LEAST)
+    return effects
 
 
 @njit(cache=True, nogil=True)
-def _corrected(points, station, places, offset, T, found, first, last):  # type: ignore[no-untyped-def]
+def _corrected(points, station, places, offset, T, moved, first, last):  # type: ignore[no-untyped-def]
     for i in range(first, last):
         s = station[i]
         if s < 0 or s >= len(places):
@@ -232,11 +248,11 @@ def _corrected(points, station, places, offset, T, found, first, last):  # type:
         shorter = offset[s] / max(np.sqrt(x * x + y * y + z * z), 1e-300)
         x, y, z = points[i, 0] - shorter * x, points[i, 1] - shorter * y, points[i, 2] - shorter * z
         for k in range(3):
-            found[i, k] = T[s, k, 0] * x + T[s, k, 1] * y + T[s, k, 2] * z + T[s, k, 3]
+            moved[i, k] = T[s, k, 0] * x + T[s, k, 1] * y + T[s, k, 2] * z + T[s, k, 3]
 
 
 def corrected(points: Floats, station: Labels, places: Floats, offset: Floats, T: Floats, threads: int = 0) -> Floats:
-    """Take their station's range offset off points (n, 3), and move them by its T; in sums a coordinate."""
-    found: Floats = points.copy()
-    over_ranges(partial(_corrected, points, station, places, offset, T, found), len(points), threads, 20_000)
-    return found
+    """Subtract their station's range offset from points (n, 3), and move them by its T; in sums a coordinate."""
+    moved: Floats = points.copy()
+    over_ranges(partial(_corrected, points, station, places, offset, T, moved), len(points), threads, 20_000)
+    return moved

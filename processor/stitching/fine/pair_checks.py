@@ -69,7 +69,7 @@ def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
     )  # fmt: skip
 
 
-def loops(pairs: list[Pair], weights: Floats, reference: int, count: int) -> list[Loop]:
+def loops(pairs: list[Pair], weights: Floats, count: int) -> list[Loop]:
     """Return the loops that pairs close over the maximum spanning tree by weight, with their misclosures."""
     order = np.argsort(-weights, kind="stable")
     group = list(range(count))

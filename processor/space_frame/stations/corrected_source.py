@@ -1,10 +1,10 @@
-"""The cloud as it is when the stations' corrections are applied."""
+"""A source, or gathered points, with the stations' corrections applied."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -20,26 +20,26 @@ from processor.space_frame.stations.records import Stations
 
 @dataclass(frozen=True)
 class Corrected:
-    """A source whose points, and scanners, are where the stations' corrections put them."""
+    """A source whose points and scanners are moved by the stations' corrections."""
 
     source: Source
     stations: Stations
 
     @property
     def origin(self) -> Floats:
-        """What was taken off all coordinates (3,), mm."""
+        """Offset (3,) that was subtracted from all coordinates, mm."""
         return self.source.origin
 
     @property
     def scanners(self) -> Floats:
         """Corrected positions (s, 3) less the origin."""
         T = self.stations.T_project_station
-        found: Floats = np.einsum("sij,sj->si", T[:, :3, :3], self.source.scanners) + T[:, :3, 3]
-        return found
+        positions: Floats = np.einsum("sij,sj->si", T[:, :3, :3], self.source.scanners) + T[:, :3, 3]
+        return positions
 
     @property
     def count(self) -> int:
-        """Points in all."""
+        """Number of points."""
         return self.source.count
 
     def chunks(self) -> Iterator[Chunk]:
@@ -49,25 +49,21 @@ class Corrected:
 
 
 def corrected_gathered(gathered: Gathered, stations: Stations, threads: int = 0) -> Gathered:
-    """Points gathered near lines, each moved as its station is; rounded to the same steps of 0.01 mm."""
+    """Points gathered near lines, each moved by its station's correction; rounded to the same steps of 0.01 mm."""
     places = gathered.places.copy()
-    kernel = partial(
-        moved, gathered.counts, gathered.room, gathered.places, gathered.stations, gathered.middles, stations.places,
-        stations.range_offset, stations.T_project_station, places,
-    )  # fmt: skip
+    kernel = partial(_correct, gathered, stations.places, stations.range_offset, stations.T_project_station, places)
     over_ranges(kernel, len(gathered.counts), threads)
-    return replace(gathered, places=places)
+    return gathered._replace(places=places)
 
 
 @njit(cache=True, nogil=True)
-def moved(  # type: ignore[no-untyped-def]
-    counts, room, places, stations, middles, scanners, offset, T, found, first, last
-):
-    """Write places of gathered points after the corrections; what left a line's reach stays at its edge."""
+def _correct(gathered, scanners, offset, T, corrected, first, last):  # type: ignore[no-untyped-def]
+    """Write the corrected places of points near lines first..last; beyond a line's reach they stay at its edge."""
+    places, room, middles = gathered.places, gathered.room, gathered.middles
     mask, most = (1 << FIELD) - 1, 2 * HALF - 1
     for m in range(first, last):
-        for i in range(m * room, m * room + counts[m]):
-            s = stations[i]
+        for i in range(m * room, m * room + gathered.counts[m]):
+            s = gathered.stations[i]
             if s < 0 or s >= len(scanners):
                 continue
             w = places[i]
@@ -82,4 +78,4 @@ def moved(  # type: ignore[no-untyped-def]
                 value = T[s, k, 0] * x + T[s, k, 1] * y + T[s, k, 2] * z + T[s, k, 3]
                 step = np.int64(np.rint(value * STEPS_PER_MM)) - middles[m, k] + HALF
                 place = (place << FIELD) | min(max(step, 0), most)
-            found[i] = place
+            corrected[i] = place

@@ -3,19 +3,24 @@
 import numpy as np
 import pytest
 
+from processor.space_frame import extract
 from processor.space_frame.members import members
-from processor.space_frame.members.records import Nodes, Tubes
-from processor.space_frame.points.source import InMemory
+from processor.space_frame.members.records import Members, Nodes
 from tests.support import frame_clouds
 from tests.support.frame_clouds import STATIONS
+from tests.support.memory_source import InMemory
 
 PARAMS = members.Params()
 
 
 def find(source, params=None):
     """Nodes and tubes found blind."""
-    found = members.find(source, params or members.Params())
-    return (Nodes(), Tubes()) if found is None else (found.nodes, found.tubes)
+    params = params or members.Params()
+    start = extract.blind(source, params)
+    if start is None:
+        return Nodes(), Members()
+    found = members.with_meeting_axes(start.measured, params.largest_scatter_mm)
+    return found.nodes, found.members
 
 
 def measure(source, starts, pairs, params=None):
@@ -23,7 +28,7 @@ def measure(source, starts, pairs, params=None):
     params = params or members.Params()
     points = members.points_near(source, starts, pairs, params)
     found = members.measure(points, source.scanners, starts, pairs, params)
-    return found.nodes, found.tubes
+    return found.nodes, found.members
 
 
 @pytest.fixture(scope="module")

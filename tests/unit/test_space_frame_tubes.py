@@ -5,6 +5,7 @@ import pytest
 
 from processor.space_frame.members import tubes
 from processor.space_frame.members.cylinder import NP, residual
+from processor.space_frame.members.cylinder_fit import Errors
 from processor.space_frame.points import line_crops
 from tests.support import frame_clouds
 
@@ -23,7 +24,8 @@ def fitted(cloud, station, scanners=STATIONS, bow_share=BOW_SHARE, off_mm=0.0, v
     gathered = line_crops.gather([(cloud, station)], 100.0, near, 8192)
     rough = tubes.rough(gathered, scanners, middle, direction, half - 450.0, half, (15.0, 110.0), 256, 1)
     cos = tubes.least_cosine(rough, 0.2) if least_cos is None else least_cos
-    return rough, tubes.refined(gathered, scanners, rough, half, (15.0, 110.0), 256, bow_share, cos, variance, 1)
+    errors = Errors(bow_share, cos, *variance)
+    return rough, tubes.refined(gathered, scanners, rough, half, (15.0, 110.0), 256, errors, 1)
 
 
 def scan(rng, sigma=1.0, count=700, bow=(0.0, 0.0), moved=None, ends=True, stations=STATIONS):

@@ -7,14 +7,17 @@ import pytest
 from scipy.spatial import cKDTree
 
 from processor.geometry import parallel
-from processor.space_frame.points.corrected_source import Corrected, corrected_gathered
-from processor.space_frame.points.source import InMemory
+from processor.space_frame.points.hash_sampling import STEPS_PER_MM
+from processor.space_frame.points.line_crops import corridors, gather
 from processor.space_frame.stations import normal_equations, residual_kernels
 from processor.space_frame.stations import posterior as stations_posterior
 from processor.space_frame.stations.control_points import ControlPoints
+from processor.space_frame.stations.corrected_source import Corrected, corrected_gathered
 from processor.space_frame.stations.records import TubePoints
 from processor.space_frame.stations.registration import register
+from processor.space_frame.stations.residual_kernels import Axes, Layout
 from tests.support import tube_clouds
+from tests.support.memory_source import InMemory
 
 
 def frame(seed, nx=4, ny=4, grid=(2, 2), **how):
@@ -411,10 +414,9 @@ def test_residuals_are_those_of_rays_met_with_a_cylinder():
     e1 /= np.linalg.norm(e1)
     scanner = np.array([[3000.0, -8000.0, -4000.0]])
     points = a + rng.uniform(-800.0, 800.0, (50, 1)) * d + rng.normal(0.0, 18.0, (50, 3))
-    seen = residual_kernels.residuals(
-        points, np.array([0, 50]), np.array([0]), np.array([0]), np.eye(4)[None], np.array([0.25]), scanner,
-        np.concatenate([a, d])[None], e1[None], np.cross(d, e1)[None], np.array([800.0]), np.array([30.0]), 0.3,
-    )  # fmt: skip
+    layout = Layout(np.array([0, 50]), np.array([0]), np.array([0]), np.array([0, 1]))
+    axes = Axes(np.concatenate([a, d])[None], e1[None], np.cross(d, e1)[None], np.array([800.0]), np.array([30.0]))
+    seen = residual_kernels.residuals(points, layout, np.eye(4)[None], np.array([0.25]), scanner, axes, 0.3)
     met = 0
     for point, (residual, cosine, n1, n2, zeta) in zip(points, seen, strict=True):
         ray = point - scanner[0]
@@ -462,8 +464,10 @@ def test_eliminating_the_tubes_is_solving_for_all_at_once():
     weight = rng.uniform(0.5, 1.0, q)
     prior = np.tile([1e-3] * 7 + [1e14], (tubes, 1))
     arguments = (
-        N, b, weight, 0.0, np.arange(0, q + 1, per), station, axis, e1, e2, half, places, prior
-    )  # fmt: skip
+        normal_equations.Equations(N, b, weight, 0.0),
+        Layout(np.zeros(q + 1, np.int64), tube, station, np.arange(0, q + 1, per)),
+        normal_equations.Geometry(Axes(axis, e1, e2, half, np.ones(tubes)), places, prior),
+    )
     H, g = normal_equations.reduced(*arguments)
     # One row a point: tube's seven unknowns less the station's motion of the axis at the middle and at its end.
     A, right = [], []
@@ -547,9 +551,6 @@ def test_the_prior_of_a_free_common_motion_leaves_it_free():
 
 
 def test_a_source_and_gathered_points_are_corrected_alike():
-    from processor.space_frame.points.hash_sampling import STEPS_PER_MM
-    from processor.space_frame.points.line_crops import corridors, gather
-
     _, seen, rng = frame(2, per_pair=30)
     found = registered(seen, rng)
     source = InMemory(seen.points.points, seen.points.station, seen.scanners, chunk_size=1000)

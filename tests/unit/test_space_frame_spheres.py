@@ -5,14 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
+from processor.limits import standards
 from processor.model import UsageError
 from processor.space_frame import catalogue
-from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.members.records import Members, Nodes
+from processor.space_frame.params import Params as PaperParams
 from processor.space_frame.points import sphere_crops
-from processor.space_frame.points.source import InMemory
-from processor.space_frame.spheres.baselines import paper_estimates
-from processor.space_frame.spheres.fit_all import Params, find_balls
+from processor.space_frame.spheres import baselines
+from processor.space_frame.spheres.fit_all import Params, fit_spheres
 from tests.support.ball_clouds import frame, grid_of_balls
+from tests.support.memory_source import InMemory
 
 STATIONS = np.array([[1000.0, 500.0, 0.0], [9000.0, 1000.0, 0.0], [5000.0, 7000.0, 0.0]])
 SIZES = (45.0, 50.0, 60.0, 80.0)
@@ -29,7 +31,7 @@ def roof():
 @pytest.fixture(scope="module")
 def found(roof):
     _, _, _, source, nodes, tubes = roof
-    return find_balls(source, nodes, tubes, catalogue.load())
+    return fit_spheres(source, nodes, tubes, catalogue.load())
 
 
 def same_bytes(a, b):
@@ -60,8 +62,8 @@ def test_order_chunks_and_threads_change_nothing(roof, found):
     _, _, _, source, nodes, tubes = roof
     order = np.random.default_rng(1).permutation(source.count)
     mixed = InMemory(source.points[order], source.station[order], source.scanners, chunk_size=3001)
-    assert same_bytes(found, find_balls(mixed, nodes, tubes, catalogue.load()))
-    alone = find_balls(source, nodes, tubes, catalogue.load(), params=Params(threads=1))
+    assert same_bytes(found, fit_spheres(mixed, nodes, tubes, catalogue.load()))
+    alone = fit_spheres(source, nodes, tubes, catalogue.load(), params=Params(threads=1))
     assert same_bytes(found, alone)
 
 
@@ -69,12 +71,12 @@ def test_moving_all_by_the_map_grid_moves_nothing(roof, found):
     """Coordinates travel less an origin: what that origin is does not enter."""
     _, _, _, source, nodes, tubes = roof
     moved = dataclasses.replace(source, origin=np.array([5e8, 4.3e9, 1e5]))
-    assert same_bytes(found, find_balls(moved, nodes, tubes, catalogue.load()))
+    assert same_bytes(found, fit_spheres(moved, nodes, tubes, catalogue.load()))
 
 
 def test_a_free_radius_is_found_too(roof):
     centres, radii, _, source, nodes, tubes = roof
-    found = find_balls(source, nodes, tubes, catalogue.of_radii([]))
+    found = fit_spheres(source, nodes, tubes, catalogue.of_radii([]))
     good = np.array(found.flag) == "ok"
     assert good.sum() >= 9
     assert np.abs((found.radii - radii) / np.sqrt(found.covariance[:, 3, 3]))[good].max() < 4.0
@@ -85,7 +87,7 @@ def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
     _centres, _, sizes, source, nodes, tubes = roof
     nominal = sizes.copy()
     nominal[[2, 7]] += 10.0
-    found = find_balls(source, nodes, tubes, catalogue.load(), expected_mm=nominal)
+    found = fit_spheres(source, nodes, tubes, catalogue.load(), expected_mm=nominal)
     assert np.flatnonzero(np.array(found.flag) == "wrong-size").tolist() == [2, 7]
     assert "60 mm instead of 70 mm" in found.reason[2]
     assert np.array(found.flag)[np.delete(np.arange(12), [2, 7])].tolist() == ["ok"] * 10
@@ -94,7 +96,7 @@ def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
 def test_without_scanners_the_bias_is_said_to_stand(roof):
     centres, radii, _, source, nodes, tubes = roof
     unknown = InMemory(source.points)
-    found = find_balls(unknown, nodes, tubes, catalogue.load())
+    found = fit_spheres(unknown, nodes, tubes, catalogue.load())
     assert "bias" in found.message
     assert "in the intervals" in found.message
     good = np.array(found.flag) == "ok"
@@ -111,11 +113,11 @@ def test_a_node_without_points_is_known_from_its_axes_alone(roof):
         axes=np.append(nodes.axes, 4),
         scatter=np.append(nodes.scatter, 0.5),
     )
-    found = find_balls(source, away, tubes, catalogue.load())
+    found = fit_spheres(source, away, tubes, catalogue.load())
     assert (found.evidence[-1], found.flag[-1]) == ("axes", "low-confidence")
     assert np.isnan(found.radii[-1])
     assert "axes alone" in found.reason[-1]
-    known = find_balls(source, away, tubes, catalogue.load(), expected_mm=np.append(np.full(12, np.nan), 60.0))
+    known = fit_spheres(source, away, tubes, catalogue.load(), expected_mm=np.append(np.full(12, np.nan), 60.0))
     assert known.radii[-1] == 60.0
     assert known.lowest[-1, 2] == pytest.approx(6000.0 - 60.0)
     assert known.lowest_sd[-1] > 0.5
@@ -128,7 +130,7 @@ def test_a_target_on_a_mount_needs_no_member_and_no_catalogue():
         rng, centre, [70.0], np.array([[0.0, -5000.0, 1500.0]]), 0.8, 1.0, members=np.empty((0, 3)), hole=0.0
     )
     start = Nodes(centre + np.array([3.0, -4.0, 2.0]), np.full((1, 3, 3), np.nan), np.zeros(1, int), np.full(1, np.nan))
-    found = find_balls(source, start, Tubes(), catalogue.of_radii([]))
+    found = fit_spheres(source, start, Members(), catalogue.of_radii([]))
     assert found.evidence == ("ball",)
     assert found.flag == ("ok",)
     error = np.append(found.centres[0] - centre[0], found.radii[0] - 70.0)
@@ -142,11 +144,11 @@ def test_stations_that_moved_are_noticed_and_enter_the_covariance():
     stations = np.vstack([STATIONS, [[0.0, 8000.0, 0.0]]])
     shifts = rng.normal(0.0, 2.0, (4, 3))
     source, nodes, tubes = frame(rng, centres, radii, stations, shifts=shifts)
-    found = find_balls(source, nodes, tubes, catalogue.load())
+    found = fit_spheres(source, nodes, tubes, catalogue.load())
     assert 0.7 < found.station_sd < 4.0
     assert "stations disagree" in found.message
     pull = (found.lowest[:, 2] - centres[:, 2] + radii) / found.lowest_sd
-    still = find_balls(source, nodes, tubes, catalogue.load(), station_covariance=np.zeros((4, 3, 3)))
+    still = fit_spheres(source, nodes, tubes, catalogue.load(), station_covariance=np.zeros((4, 3, 3)))
     assert (still.lowest_sd < 0.6 * found.lowest_sd).mean() > 0.7
     assert np.sqrt(np.mean(pull**2)) < 1.6
 
@@ -195,17 +197,19 @@ def test_crops_of_many_points_keep_an_even_share_whatever_the_order():
 
 def test_the_papers_estimators_run_on_the_same_points(roof, found):
     _, radii, _, source, nodes, tubes = roof
-    near = sphere_crops.gather(source, nodes.positions, 190.0)
-    plain = paper_estimates(near, nodes, tubes, found)
-    drawn = paper_estimates(near, nodes, tubes, found, "ransac", seed=1)
-    assert (plain.points == drawn.points).all()
+    limits = standards.default_for(None)
+    plain, drawn = (
+        baselines.compared(source, nodes, tubes, found, np.arange(12), PaperParams(method, seed=1), limits)
+        for method in ("least-squares", "ransac")
+    )
+    assert (drawn.points <= plain.points).all()  # those that consent
     assert (plain.points >= 0.8 * found.points).all()
     ours = np.median(np.abs(found.radii - radii))
     for other in (plain, drawn):
         assert np.isfinite(other.radii).all()
         assert ours < np.median(np.abs(other.radii - radii))
     with pytest.raises(UsageError, match="ransac"):
-        paper_estimates(near, nodes, tubes, found, "magic")
+        PaperParams("magic").check(True)
 
 
 def test_catalogues_are_data_and_say_whether_they_were_checked():

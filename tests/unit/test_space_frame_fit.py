@@ -4,11 +4,22 @@ import numpy as np
 import pytest
 
 from processor.space_frame import catalogue
-from processor.space_frame.members.records import Nodes, Tubes
+from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
 from processor.space_frame.spheres import fit_all
-from processor.space_frame.spheres.gauss_newton import inverse_of, residual, select, solve, weight
+from processor.space_frame.spheres.gauss_newton import (
+    Mask,
+    Observations,
+    Prior,
+    Unknowns,
+    inverse_of,
+    residual,
+    select,
+    solve,
+    weight,
+)
 from processor.space_frame.spheres.noise_model import limb_cosine, noise_model, radius_offset, radius_scatter
+from processor.space_frame.spheres.records import StochasticModel
 from tests.bench import ball_fit
 
 
@@ -50,18 +61,8 @@ def test_selection_looks_at_the_ray_and_not_at_the_noisy_point():
         member = np.array([0.0, np.sin(0.65), -np.cos(0.65)])[None]  # its axis leaves the ball near (0, 30)
         chosen = np.zeros(len(at), np.uint8)
         state = np.array([0.0, 0.0, 0.0, 50.0])
-        count = select(
-            points,
-            np.tile(up, (len(at), 1)),
-            np.zeros((1, 3)),
-            member,
-            np.array([15.0]),
-            15.0,
-            state,
-            0.15,
-            40.0,
-            chosen,
-        )
+        mask = Mask(np.zeros((1, 3)), member, np.array([15.0]), 15.0, 0.15)
+        count = select(points, np.tile(up, (len(at), 1)), mask, state, 40.0, chosen)
         assert chosen.tolist() == [2, 2, 1, 0, 0, 2]
         assert count == 1
 
@@ -95,10 +96,10 @@ def test_a_station_that_may_have_moved_is_worth_less():
     station = np.repeat([0, 1], 20).astype(np.int32)
     T = np.tile(4.0 * np.eye(3), (2, 1, 1))
     state, covariance = np.array([0.0, 0.0, 0.0, 50.0]), np.empty((4, 4))
-    still = np.zeros((3, 3))
     used = solve(
-        points, u, np.full(40, 1e4), station, np.ones(40, np.uint8), np.array([1.0, 0.0, 0.0]), 1.0, np.zeros(3), still,
-        50.0, 0.0, T, 1e-9, state, np.zeros((2, 3)), np.zeros((2, 3, 8)), 20, covariance,
+        Observations(points, u, np.full(40, 1e4), station), np.ones(40, np.uint8),
+        StochasticModel(np.array([1.0, 0.0, 0.0]), T), 1.0, Prior(np.zeros((3, 3)), 50.0, 0.0),
+        Unknowns(state, np.zeros((2, 3)), np.zeros((2, 3, 8))), 1e-9, 20, covariance,
     )  # fmt: skip
     assert used == 40
     J = np.zeros((40, 10))
@@ -159,7 +160,7 @@ def test_without_rays_half_of_what_noise_may_bring_is_taken_off_and_the_rest_is_
         unfixed = np.full((draws, 3, 3), np.nan)
         nodes = Nodes(np.zeros((draws, 3)), unfixed, np.zeros(draws, np.int64), np.full(draws, np.nan))
         params = fit_all.Params(sigma_mm=2.0, process_hole_mm=0.0)
-        found = fit_all.fit_crops(crops, np.empty((0, 3)), nodes, Tubes(), catalogue.of_radii([]), params=params)
+        found = fit_all.fit_crops(crops, np.empty((0, 3)), nodes, Members(), catalogue.of_radii([]), params=params)
         return found.radii - radius, found.covariance[:, 3, 3]
 
     chance = 4.0 * sigma / np.sqrt(draws * count)

@@ -6,7 +6,7 @@ import pytest
 from processor.geometry.parallel import over_ranges
 from processor.space_frame.members import linearity, segments
 from processor.space_frame.points import hash_sampling, line_crops, voxels
-from processor.space_frame.points.source import InMemory
+from tests.support.memory_source import InMemory
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def test_voxels_are_those_of_numpy(cloud):
     unique, inverse, count = np.unique(cell, axis=0, return_inverse=True, return_counts=True)
     means = np.stack([np.bincount(inverse.ravel(), cloud[:, i]) for i in range(3)], axis=1) / count[:, None]
     rows = {tuple(c): i for i, c in enumerate(unique.tolist())}
-    assert found.count == (count >= 2).sum()
+    assert found.number == (count >= 2).sum()
     at = [rows[tuple(c)] for c in found.cells.tolist()]
     assert (found.counts == count[at]).all()
     assert np.abs(found.means - means[at]).max() < 1e-8
@@ -37,7 +37,7 @@ def test_voxels_are_those_of_numpy(cloud):
 def test_linearity_is_that_of_the_window(cloud):
     found = voxels.gathered(np.rint(cloud * 100.0).astype(np.int32), 100.0, 2)
     linear = linearity.linearity(found, 2.0)  # never linear enough: the better of both windows
-    for i in np.random.default_rng(2).integers(0, found.count, 100):
+    for i in np.random.default_rng(2).integers(0, found.number, 100):
         best = 0.0
         for radius2 in (linearity.SMALL2, linearity.LARGE2):
             near = ((found.cells - found.cells[i]) ** 2).sum(axis=1) <= radius2

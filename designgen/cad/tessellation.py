@@ -1,0 +1,79 @@
+"""Triangle meshes of shapes of the CAD kernel (Open CASCADE)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from OCP.BRep import BRep_Tool
+from OCP.BRepMesh import BRepMesh_IncrementalMesh
+from OCP.BRepTools import BRepTools
+from OCP.IMeshTools import IMeshTools_MeshAlgoType, IMeshTools_Parameters
+from OCP.Message import Message_ProgressRange
+from OCP.TopAbs import TopAbs_FACE, TopAbs_REVERSED
+from OCP.TopExp import TopExp
+from OCP.TopLoc import TopLoc_Location
+from OCP.TopoDS import TopoDS
+from OCP.TopTools import TopTools_IndexedMapOfShape
+
+from designgen.cad.bodies import ANGLE_RAD
+from processor.model import Floats, Ints
+
+
+def mesh_faces(shape: Any, tolerance_mm: float, *, large: bool = False) -> int:
+    """Mesh every face of a shape, in place of any earlier mesh; return the number of triangles.
+
+    ``large`` selects the kernel's other algorithm, whose time does not grow with the square of a face's triangles.
+    """
+    BRepTools.Clean_s(shape)
+    if large:
+        parameters = IMeshTools_Parameters()
+        parameters.Deflection, parameters.Angle = tolerance_mm, ANGLE_RAD
+        parameters.MeshAlgo = IMeshTools_MeshAlgoType.IMeshTools_MeshAlgoType_Delabella
+        BRepMesh_IncrementalMesh(shape, parameters, Message_ProgressRange())
+    else:
+        BRepMesh_IncrementalMesh(shape, tolerance_mm, False, ANGLE_RAD, False)
+    return sum(mesh.NbTriangles() for _, mesh, _ in _meshes(shape) if mesh is not None)
+
+
+def facets(shape: Any) -> tuple[Floats, Ints, float]:
+    """Return vertices (v, 3), triangles (f, 3) and the kernel's figure of the deviation of a meshed shape.
+
+    Vertices shared by faces are merged, so that the mesh of a closed solid is closed; normals point outward. Raises
+    ValueError for a face without a mesh.
+    """
+    points, triangles, deviation, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0.0, 0
+    for face, mesh, location in _meshes(shape):
+        if mesh is None:
+            raise ValueError("a face cannot be meshed")
+        of_face = np.array([mesh.Node(i).Coord() for i in range(1, mesh.NbNodes() + 1)], np.float64).reshape(-1, 3)
+        if not location.IsIdentity():
+            T = location.Transformation()
+            matrix = np.array([[T.Value(row, column) for column in (1, 2, 3, 4)] for row in (1, 2, 3)])
+            of_face = of_face @ matrix[:, :3].T + matrix[:, 3]
+        corners = np.array([mesh.Triangle(i).Get() for i in range(1, mesh.NbTriangles() + 1)], np.int64).reshape(-1, 3)
+        if face.Orientation() == TopAbs_REVERSED:
+            corners = corners[:, [0, 2, 1]]
+        points.append(of_face)
+        triangles.append(corners - 1 + count)
+        count += len(of_face)
+        deviation = max(deviation, float(mesh.Deflection()))
+    return *_merged(np.vstack(points), np.vstack(triangles)), deviation
+
+
+def _meshes(shape: Any) -> list[tuple[Any, Any, Any]]:
+    """Return every face of a shape with its mesh, None where it has none, and the mesh's location."""
+    faces, result = TopTools_IndexedMapOfShape(), []
+    TopExp.MapShapes_s(shape, TopAbs_FACE, faces)
+    for i in range(1, faces.Extent() + 1):
+        face, location = TopoDS.Face_s(faces.FindKey(i)), TopLoc_Location()
+        result.append((face, BRep_Tool.Triangulation_s(face, location), location))
+    return result
+
+
+def _merged(points: Floats, triangles: Ints) -> tuple[Floats, Ints]:
+    # Faces have separate vertices along a common edge; 1e-5 mm is far below any edge and far above rounding.
+    _, first, inverse = np.unique(np.round(points, 5), axis=0, return_index=True, return_inverse=True)
+    faces = inverse.reshape(-1)[triangles]
+    proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    return points[first], faces[proper].astype(np.int64)

@@ -1,0 +1,82 @@
+"""The CAD solids of a recipe's design as STEP files (AP214, mm)."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from designgen.cad.process import escape
+from designgen.designs import arch_bridge, arch_part, space_frame, structure, structure_types
+from designgen.reading import filled
+from processor.model import UsageError
+from processor.store import store
+
+if TYPE_CHECKING:
+    import cadquery as cq
+
+WRITTEN = "1970-01-01T00:00:00"  # date in every file, so that the same design gives the same bytes
+
+
+def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
+    """Write the solids of a recipe's design in the scene's frame, a file for each arch part; return the files.
+
+    Raises UsageError where the recipe has no design.
+    """
+    folder.mkdir(exist_ok=True)
+    kind = recipe.get("kind")
+    if kind == "arch-bridge":
+        parts = arch_bridge.build(filled(arch_bridge.Params, recipe, "bridge"))
+        written = [folder / f"{part.name}.step" for part in parts]
+        for path, part in zip(written, parts, strict=True):
+            write_step(path, {part.name: arch_part.solid(part)})
+        return written
+    if kind == "space-frame":
+        path = folder / "frame.step"
+        shapes = {"frame": space_frame.solid(space_frame.build(filled(space_frame.Params, recipe, "frame")))}
+    elif kind == "structure":
+        path = folder / "structure.step"
+        components = structure_types.design(recipe)
+        shapes = {component.name: structure.solid([component]) for component in components}
+    else:
+        raise UsageError("--step: the scene does not name the recipe it was made from, so its solids are not known")
+    write_step(path, shapes, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))
+    return [path]
+
+
+def write_step(path: Path, shapes: Mapping[str, cq.Shape], origin_mm: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+    """Write shapes with their names as one STEP file; the same shapes give the same bytes.
+
+    ``origin_mm`` (3,) is the position of the shapes' own origin. Raises InputError where the file cannot be written.
+    """
+    import cadquery as cq
+
+    assembly = cq.Assembly(name="assembly")
+    location = cq.Location(cq.Vector(*map(float, origin_mm)))
+    # The kernel takes the bytes of a name for letters, so names are inserted into the text afterwards.
+    placeholders = {f"name-{number:06d}-of-shape": name for number, name in enumerate(shapes)}
+    for placeholder, shape in zip(placeholders, shapes.values(), strict=True):
+        assembly.add(shape, name=placeholder, loc=location)
+    with store.replacing(path) as temporary:
+        assembly.export(str(temporary), exportType="STEP")
+        text = temporary.read_text("ascii")
+        # The kernel writes the date and the temporary file's name.
+        header = f"FILE_NAME('{_quoted(path.stem)}','{WRITTEN}',(''),(''),'','','');\n"
+        text = re.sub(r"FILE_NAME\(.*?\);\s*(?=FILE_SCHEMA)", lambda _: header, text, count=1, flags=re.S)
+        # It numbers the parts of assemblies through all files of a process, and breaks lines by the number's length.
+        numbers = itertools.count(1)
+        text = re.sub(
+            r"(NEXT_ASSEMBLY_USAGE_OCCURRENCE\(')\d+([^;]*;)",
+            lambda m: m[1] + str(next(numbers)) + re.sub(r"\s*\n\s*", "", m[2]),
+            text,
+        )
+        text = re.sub(r"'(name-\d{6}-of-shape)'", lambda m: f"'{_quoted(placeholders[m[1]])}'", text)
+        temporary.write_text(text, "ascii")
+
+
+def _quoted(name: str) -> str:
+    """Return a name as it is written between the quotes of a STEP file."""
+    plain = "".join(c if c.isprintable() else " " for c in name)
+    return escape(plain.replace("\\", "\\\\").replace("'", "''"))

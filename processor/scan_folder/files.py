@@ -1,0 +1,30 @@
+"""Names of the files of a scan folder, and the scan files in it."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from pathlib import Path
+
+from processor import readers
+
+PROJECT = "project.toml"
+TRUTH = "truth.h5"
+STATIONS = "stations.json"
+PICKS = "picks.csv"
+CONTROL = "control.csv"
+DESIGNS = ("design.json", "design.csv")
+SCANS = "scans"
+NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL, "index.csv")
+
+
+def scan_files(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
+    """Return the files in ``folder`` and ``folder/scans`` in a format of scans, open or closed, except ``excluded``."""
+    paths = [path for place in (folder, folder / SCANS) if place.is_dir() for path in sorted(place.iterdir())]
+    return [path for path in paths if not path.name.startswith(".") and _may_be_scan(path, excluded)]
+
+
+def _may_be_scan(path: Path, excluded: Collection[Path | None]) -> bool:
+    if readers.is_closed(path):
+        return True
+    named = path.suffix.lower() in readers.SUFFIXES and path.name not in NOT_SCANS
+    return named and path not in excluded and path.is_file()

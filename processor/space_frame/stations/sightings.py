@@ -1,0 +1,63 @@
+"""The control points of a scene as its scanners saw them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.model import Floats, InputError, Ints, Scene
+from processor.space_frame.design import unit_mistakes
+from processor.space_frame.points.scene_source import SceneSource, pose_of
+from processor.space_frame.stations.control_points import ControlPoints
+
+FARTHEST_MM = 1000.0  # control points farther from their sightings are in another frame
+
+
+def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
+    """Return the sightings of the scene's control points; None without any from a known scanner.
+
+    Raises InputError where the control points are in another frame or unit than the scans.
+    """
+    if scene.control is None or not len(scene.control.scan):
+        return None
+    control = scene.control
+    scanner = np.array(
+        [source.scanner_of[s] if k < 0 else k for s, k in zip(control.scan, control.station, strict=True)]
+    )
+    rows = np.flatnonzero((scanner >= 0) & (scanner < len(source.scanners)))
+    if not len(rows):
+        return None
+    measured = np.empty((len(rows), 3))
+    for i, row in enumerate(rows.tolist()):
+        T = pose_of(scene.scans[control.scan[row]])
+        measured[i] = T[:3, :3] @ control.seen[row] + (T[:3, 3] - source.origin)
+    point, target = control.point[rows], control.positions[control.point[rows]] - source.origin
+    off = float(np.median(np.linalg.norm(target - measured, axis=1)))
+    if off > FARTHEST_MM:
+        factor = unit_mistakes.between(*_spans(point, scanner[rows], target, measured))
+        if factor:
+            raise InputError(
+                f"{scene.name}: control points lie {factor} times as far apart as the scans have them: one of the two "
+                "is in another unit; correct the unit of the control points or of the scans"
+            )
+        raise InputError(
+            f"{scene.name}: control points lie {off / 1000.0:.3g} m from where the scans have them (median); give "
+            "the scans poses in the frame of the control points, or their coordinates in the scans' frame"
+        )
+    return ControlPoints(
+        ids=tuple(control.ids[k] for k in point.tolist()),
+        measured=measured,
+        target=target,
+        sd=np.repeat(control.seen_sd[rows, None], 3, axis=1),
+        share=np.eye(len(source.scanners))[scanner[rows]],
+        point=point,
+        target_sd=control.sd[point],
+        scanners=source.names,
+    )
+
+
+def _spans(point: Ints, scanner: Ints, target: Floats, measured: Floats) -> tuple[Floats, Floats]:
+    """Distances (n,) between control points that one scanner saw, as known and as measured; independent of poses."""
+    a, b = np.triu_indices(len(point), 1)
+    both = (scanner[a] == scanner[b]) & (point[a] != point[b])
+    a, b = a[both], b[both]
+    return np.linalg.norm(target[a] - target[b], axis=1), np.linalg.norm(measured[a] - measured[b], axis=1)
