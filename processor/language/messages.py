@@ -17,7 +17,7 @@ import importlib.resources
 import math
 import string
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -113,11 +113,30 @@ class Messages(string.Formatter):
             return f"{value:.3f}"
         return format(value, format_spec)
 
-    def sentences(self, reasons: tuple[Reason, ...]) -> str:
-        """Write reasons one after the other, as sentences."""
+    def sentences(self, messages: Iterable[Message]) -> str:
+        """Write messages one after the other, as sentences; names keep their case."""
         stop, space = ("。", "") if self.code == "zh" else (".", " ")
-        written = (self.text(one) for one in reasons)
-        return space.join(one[:1].upper() + one[1:] + ("" if one.endswith((stop, "?")) else stop) for one in written)
+        sentences = []
+        for message in messages:
+            written = self.text(message)
+            if not self._starts_with_name(message):
+                written = written[:1].upper() + written[1:]
+            sentences.append(written + ("" if written.endswith((stop, "?")) else stop))
+        return space.join(sentences)
+
+    def _starts_with_name(self, message: Any) -> bool:
+        """Tell whether a message starts with a value that is a name from the input."""
+        if isinstance(message, list | tuple):
+            return bool(message) and self._starts_with_name(message[0])
+        if isinstance(message, Word) or not isinstance(message, Text | Reason):
+            return isinstance(message, str) and not isinstance(message, Word)
+        template = (
+            self.texts.get(message.template, message.template)
+            if isinstance(message, Text)
+            else (self.reasons.get(message.code, message.code))
+        )
+        literal, name, *_ = next(iter(self.parse(template)), ("", None))
+        return not literal and bool(name) and self._starts_with_name((message.values or {}).get(name))
 
     def of_scripts(self, scripts: str) -> dict[str, str]:
         """Return the texts that the page's own scripts show: those that stand there between quotation marks."""

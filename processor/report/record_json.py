@@ -55,9 +55,10 @@ def _put_field(target: dict[str, Any], field: dataclasses.Field[Any], value: Any
 
 def _by_name(values: Any, names: Sequence[str], *further: Sequence[str]) -> dict[str, Any]:
     """Name the items along each axis of an array; a part of it without any number is an empty object."""
-    if not np.isfinite(values).any():
-        return {}
-    return {name: _by_name(item, *further) if further else item for name, item in zip(names, values, strict=True)}
+    found = dict(zip(names, values, strict=True))
+    if further:
+        found = {name: _by_name(item, *further) if np.isfinite(item).any() else {} for name, item in found.items()}
+    return found
 
 
 def _absent(value: Any, metadata: Mapping[str, Any]) -> bool:

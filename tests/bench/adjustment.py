@@ -64,7 +64,7 @@ def key_point_errors(design, result, truth):
     for i in range(len(result.components)):
         turn = truth.T_bridge_scan[i][:3, :3]
         for end, joint in enumerate((i - 1, i)):
-            off = result.key_points_scan[i, end] - truth.key_points_scan[i, end]
+            off = result.components.key_points_scan[i, end] - truth.key_points_scan[i, end]
             if 0 <= joint < len(frames) and np.isfinite(off).all():
                 found.append(rigid.apply(rigid.transform(frames[joint].T @ turn, np.zeros(3)), off))
     return np.vstack(found)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from processor.geometry import mesh_distance, rigid
+from processor.model import reason
 from processor.preassembly.chain import adjustment, span_and_closure
 from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import joint_end, plate_sides

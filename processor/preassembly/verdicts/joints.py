@@ -19,6 +19,7 @@ from processor.adjustment.extremes import draws
 from processor.limits import standards as limits_of
 from processor.model import (
     Checked,
+    Flags,
     Floats,
     Limit,
     Reason,
@@ -73,10 +74,10 @@ class ComparedLimits(Rows):
     clause: tuple[str, ...] = names("v")
     edition: tuple[str, ...] = names("v")
     source: tuple[str, ...] = names("v")
-    verified: Bools = column("v", dtype=np.bool_)
+    verified: Flags = column("v", dtype=np.bool_)
 
     @property
-    def bounds_known(self) -> Bools:
+    def bounds_known(self) -> Flags:
         """Mark the limits (v,) that do not depend on an unknown size."""
         return ~(np.isnan(self.low) | np.isnan(self.high))
 
