@@ -128,15 +128,14 @@ class Messages(string.Formatter):
         """Tell whether a message starts with a value that is a name from the input."""
         if isinstance(message, list | tuple):
             return bool(message) and self._starts_with_name(message[0])
-        if isinstance(message, Word) or not isinstance(message, Text | Reason):
+        if not isinstance(message, Text | Reason):
             return isinstance(message, str) and not isinstance(message, Word)
-        template = (
-            self.texts.get(message.template, message.template)
-            if isinstance(message, Text)
-            else (self.reasons.get(message.code, message.code))
-        )
+        if isinstance(message, Text):
+            template = self.texts.get(message.template, message.template)
+        else:
+            template = self.reasons.get(message.code, message.code)
         literal, name, *_ = next(iter(self.parse(template)), ("", None))
-        return not literal and bool(name) and self._starts_with_name((message.values or {}).get(name))
+        return not literal and bool(name) and self._starts_with_name((message.values or {}).get(name or ""))
 
     def of_scripts(self, scripts: str) -> dict[str, str]:
         """Return the texts that the page's own scripts show: those that stand there between quotation marks."""

@@ -59,7 +59,7 @@ def member(i, ends, edges, unseen, without):
     if i in without:
         return Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))
     count = len(stations.chainage) // 2
-    at = np.vstack([preassembly._at_stations(edges[i, k], lines[k]) for k in range(2)])
+    at = np.vstack([preassembly._at_chainages(edges[i, k], lines[k]) for k in range(2)])
     departure = np.einsum("kai,ki->ka", stations.axes, at - stations.points)
     measured = dataclasses.replace(
         stations,

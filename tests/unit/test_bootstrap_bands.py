@@ -67,9 +67,9 @@ def test_a_part_as_built_is_laid_on_its_design():
     strays = middle + rng.uniform(1_500.0, 3_000.0, (50, 3))
     T = arch_clouds.random_pose(rng)
     scan = Scan("rib2", rigid.apply(T, np.vstack([built, strays])), component="rib2")
-    found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok", "")
+    found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok")
     part = methods.PartFeatures(
-        name="rib2", scan=scan, attitude=found, ends=(None, None), lines=np.empty((0, 3)), edges=None, trouble=""
+        name="rib2", scan=scan, attitude=found, ends=(None, None), lines=np.empty((0, 3)), edges=None, reasons=()
     )
     laid = bootstrap_bands._as_designed(part, design)
     assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)

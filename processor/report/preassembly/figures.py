@@ -1,4 +1,4 @@
-"""Figures of an assembled bridge: its gaps, its linear error, and what only the adjustment knows."""
+"""Figures of an assembled bridge: its gaps, its linear error, and what only the adjustment states."""
 
 from __future__ import annotations
 
@@ -28,13 +28,13 @@ from processor.report.style import (
     rounded,
 )
 
-OWN_ERROR_ALPHA = 0.4  # of the lines of how far a method errs by itself
+AS_DESIGNED_ALPHA = 0.4  # of the lines of a method's error for parts exactly as designed
 GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
 TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest |d|", 1, 3, "largest"))
 
 
 def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
-    """Draw the first run's bridge beside the linear error of all; what a result does not hold is left out."""
+    """Draw the first run's bridge and the linear error of all; what a result does not have is left out."""
     result: Result = runs[0].result
     found: Drawn = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
     adjustment = result.adjustment
@@ -219,7 +219,7 @@ def _draw_deviations(axes: Axes, run: StepRun, deviations: Deviations, k: int) -
             continue
         band = deviations.ci95[on]
         if run.result.bands_as_designed:
-            axes.plot(station, band, color=colour, linewidth=width, alpha=OWN_ERROR_ALPHA)
+            axes.plot(station, band, color=colour, linewidth=width, alpha=AS_DESIGNED_ALPHA)
         else:
             low, high = (np.maximum(deviation + sign * band, LEAST_SHOWN_MM) for sign in (-1.0, 1.0))
             axes.fill_between(station, low, high, color=colour, alpha=0.2, linewidth=0.0)

@@ -25,7 +25,7 @@ ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
 
 
 def gap_vectors(result: Result) -> tuple[Message, bytes]:
-    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without an answer says so."""
+    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without a result says so."""
     measures = () if result.adjustment is None else result.adjustment.joints.measures
     shown = range(len(measures))[:MOST_JOINTS]
     known = [j for j in shown if np.isfinite(measures[j].gaps).all()]
