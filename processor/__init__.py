@@ -12,11 +12,12 @@ from typing import TYPE_CHECKING, Any
 from processor.version import __version__
 
 if TYPE_CHECKING:
-    from processor.api.arrays import CorePoints, SphereFit, fit_sphere, m3c2
+    from processor.api.arrays import CorePoints, Pose, SphereFit, fit_sphere, m3c2, register
     from processor.api.runs import Results, check, read, run
 
 __all__ = [
     "CorePoints",
+    "Pose",
     "Results",
     "SphereFit",
     "__version__",
@@ -24,9 +25,11 @@ __all__ = [
     "fit_sphere",
     "m3c2",
     "read",
+    "register",
     "run",
 ]
-_RUNS, _ARRAYS = ("Results", "check", "read", "run"), ("CorePoints", "SphereFit", "fit_sphere", "m3c2")
+_RUNS = ("Results", "check", "read", "run")
+_ARRAYS = ("CorePoints", "Pose", "SphereFit", "fit_sphere", "m3c2", "register")
 _HOMES = dict.fromkeys(_RUNS, "processor.api.runs") | dict.fromkeys(_ARRAYS, "processor.api.arrays")
 
 

@@ -8,16 +8,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from processor.deviation import measure as deviation_measure
 from processor.geometry import m3c2 as m3c2_distances
-from processor.geometry import normal_orientation
+from processor.geometry import mesh_distance, normal_orientation, principal, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.geometry.merging import MergedCloud
+from processor.geometry.mesh_distance import MeshSurface
 from processor.model import Floats, Reason, Status
 from processor.space_frame.params import Params
 from processor.space_frame.spheres import isolated
 
 LEAST_EXTENT_MM = 2.0  # nothing that is scanned is smaller: the coordinates are in metres
 LEAST_POINTS = 10
+LEAST_SCAN = 100
+MOST_RATIO = 30.0  # of the extents of a scan and its design; beyond it the units differ
+CLEARLY = 0.1  # difference of shares of points that face the scanner between two poses
 
 
 @dataclass(frozen=True)
@@ -43,6 +48,22 @@ class CorePoints(Distances):
 
     core: Floats
     normals: Floats
+
+
+@dataclass(frozen=True)
+class Pose:
+    """Pose of a scan in its design.
+
+    ``T_design_scan`` (4, 4) maps the scan's coordinates to the design's, mm. ``covariance`` (6, 6): rotation about the
+    design's axes in rad, translation in mm, for a small motion applied on the left; NaN where the points do not
+    determine the pose. ``status``: ok; ambiguous = another pose fits about as well, ``rival`` (4, 4); weak = the points
+    do not determine every motion; failed = most points are not at the design. ``rival`` is None without another pose.
+    """
+
+    T_design_scan: Floats
+    covariance: Floats
+    status: Status
+    rival: Floats | None
 
 
 def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.ArrayLike | None = None) -> SphereFit:
@@ -94,6 +115,77 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
         points=int(found.points[0]),
         rms=float(found.rms[0]),
     )
+
+
+def register(
+    points: npt.ArrayLike, vertices: npt.ArrayLike, faces: npt.ArrayLike, scanners: npt.ArrayLike | None = None
+) -> Pose:
+    """Register a scan to the mesh of its design, from any pose.
+
+    A scan that lies at the design is fitted from there; else principal axes give the coarse pose in every attitude that
+    they allow (paper 002, section 2.3). The best is refined by robust point-to-surface least squares.
+
+    Parameters
+    ----------
+    points : (n, 3), mm, of a scan; 100 or more.
+    vertices, faces : (v, 3) in mm and (f, 3), a triangle mesh whose normals point outward.
+    scanners : (3,) or (n, 3), from where each point was measured, in the points' frame. Of two poses that fit alike the
+        one is taken in which more of the surface faces the scanner. None = unknown.
+
+    Returns
+    -------
+    The pose, with its covariance and status.
+
+    Raises
+    ------
+    ValueError : wrong shapes, NaN, too few points, faces that name no vertex, points and mesh in different units.
+    """
+    cloud, corners = _points(points, "points", LEAST_SCAN), _points(vertices, "vertices", 3)
+    triangles = np.asarray(faces)
+    if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
+        raise ValueError(f"faces: expected an array (f, 3) of whole numbers, got {triangles.dtype} {triangles.shape}")
+    if not len(triangles) or triangles.min() < 0 or triangles.max() >= len(corners):
+        raise ValueError(f"faces: expected numbers of vertices from 0 to {len(corners) - 1}")
+    ratio = float(np.ptp(cloud, axis=0).max() / np.ptp(corners, axis=0).max())
+    if not 1.0 / MOST_RATIO < ratio < MOST_RATIO:
+        raise ValueError(f"points: {ratio:.3g} times as large as the mesh; expected both in mm")
+    scan_origin, origin = cloud.mean(axis=0), corners.mean(axis=0)
+    local = cloud - scan_origin
+    surface = mesh_distance.of_design(corners - origin, triangles.astype(np.int64))
+    given = rigid.transform(np.eye(3), scan_origin - origin)
+    placed = surface_registration.place(local, surface, given, "auto")
+    rival = placed.T_rival if placed.ambiguity < principal.AMBIGUOUS else None
+    if rival is not None and scanners is not None:
+        seen_from = np.broadcast_to(_finite(scanners, "scanners"), cloud.shape) - scan_origin
+        shares = [_facing_share(local, seen_from, surface, T) for T in (placed.T, rival)]
+        if shares[1] > shares[0] + CLEARLY:
+            placed = surface_registration.place(local, surface, rival, "fine")
+        rival = None if abs(shares[1] - shares[0]) > CLEARLY else rival
+    determined = bool(np.isfinite(placed.T_best_fit).all())
+    T = placed.T_best_fit if determined else placed.T
+    near, _ = surface.tree.query(rigid.apply(T, local), distance_upper_bound=surface_registration.NEAR_MM, workers=-1)
+    if np.isfinite(near).mean() < surface_registration.NEAR_SHARE:
+        status = Status.FAILED
+    elif rival is not None:
+        status = Status.AMBIGUOUS
+    else:
+        status = Status.WEAK if placed.weak or not determined else Status.OK
+    return Pose(
+        T_design_scan=deviation_measure.global_pose(T, scan_origin, origin),
+        covariance=rigid.about_origin(placed.covariance, origin),
+        status=status,
+        rival=None if rival is None else deviation_measure.global_pose(rival, scan_origin, origin),
+    )
+
+
+def _facing_share(points: Floats, scanners: Floats, surface: MeshSurface, T: Floats) -> float:
+    """Share of points (n, 3), placed by T (4, 4), whose facet faces the scanner, of those that lie on a facet."""
+    placed = rigid.apply(T, points)
+    facet, _, _ = surface.distances(placed, surface_registration.NEAR_MM)
+    on = facet >= 0
+    sight = rigid.apply(T, scanners)[on] - placed[on]
+    facing = np.einsum("ni,ni->n", surface.normals[facet[on]], sight) > 0.0
+    return float(facing.mean()) if on.any() else 0.0
 
 
 def m3c2(

@@ -13,11 +13,8 @@ from scipy.spatial import cKDTree
 
 from processor import readers, store
 from processor.compare import diagnosis
-from processor.deviation import scales, statistics
-from processor.deviation.scales import Scales
-from processor.deviation.statistics import Summary
-from processor.geometry import m3c2, normal_orientation, point_neighbors
-from processor.geometry.m3c2 import CloudNormals, Distances
+from processor.geometry import m3c2, neighbors, normal_orientation
+from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
 from processor.model import Floats, InputError, UsageError
@@ -125,8 +122,10 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     unit = _unit(list(clouds.values()))
     origin = _origin(reference)
     core = np.ascontiguousarray(clouds.get("core", reference).relative_to(origin))
-    first, second = (point_neighbors.of_spacing(cloud.relative_to(origin)) for cloud in (reference, compared))
-    used = scales.derived(first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth)
+    first, second = (neighbors.of_spacing(cloud.relative_to(origin)) for cloud in (reference, compared))
+    used = m3c2.derive_scales(
+        first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth
+    )
     if reason := diagnosis.other_unit(first.cells.points, second.cells.points, used):
         raise InputError(f"{request.reference} and {request.compared}: {reason}")
     units = {name: cloud.unit for name, cloud in clouds.items()}
@@ -147,9 +146,7 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         max_depth_mm=used.max_depth_mm,
         registration_error_mm=request.registration_error,
     )
-    summary = statistics.of_distances(
-        distances, core, normals, used.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER
-    )
+    summary = m3c2.summary(distances, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     if not np.isfinite(distances.distance).any():
         reason = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
         raise InputError(f"{request.reference} and {request.compared}: no core point has a distance: {reason}")
@@ -320,6 +317,6 @@ def _log_warnings(summary: Summary, used: Scales, log: Callable[[str], None]) ->
         )
     if summary.few_points > 0.1 * max(summary.core_points - summary.without_lod, 1):
         log(
-            f"{summary.few_points} core points have fewer than {scales.PAPER_POINTS_A_CYLINDER} points of a cloud in "
+            f"{summary.few_points} core points have fewer than {m3c2.PAPER_POINTS_A_CYLINDER} points of a cloud in "
             "their cylinder: their levels of detection are too small (a larger --projection-diameter helps)"
         )

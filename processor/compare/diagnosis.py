@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.deviation.scales import Scales
 from processor.geometry import unit_ratio
+from processor.geometry.m3c2 import Scales
 from processor.model import Floats
 
 # Ratios of mm to cm, inch, ft, m; of cm to ft, m; of inch to m.

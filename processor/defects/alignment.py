@@ -1,8 +1,8 @@
-"""Stations fitted to each other and the whole to the design, so that what is left is the structure's own.
+"""Alignment of stations to each other, and of the whole to the design; what remains is the structure's own deviation.
 
-Where several stations see one place they must agree, whatever is wrong with the structure there: from that each
-station's small movement and range offset follow. The whole is then fitted to the design with weights that leave out
-what does not fit: components that moved are few.
+Stations that see one place must agree, whatever the structure's deviation there: this gives a small movement and a
+range offset of each station. The whole is then fitted to the design with redescending weights, as components that moved
+are few.
 """
 
 from __future__ import annotations
@@ -17,43 +17,58 @@ from processor.geometry import rigid
 from processor.model import Floats, Ints
 
 BLOCK_MM = 80.0
-# Standard deviations of what a station may be off where nothing says otherwise: turn (rad), place (mm), range (mm).
+# Prior standard deviations of a station's error: rotation (rad), translation (mm), range offset (mm).
 PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
 WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)
-FLOOR_MM = 0.15  # of a block's mean: beams, encoders and the steel's own surface
-FEWEST_COMPONENTS = 3  # by which a whole is fitted: of fewer none can be told to be off
+FLOOR_MM = 0.15  # standard deviation of a block's mean: beams, encoders and the roughness of the steel
+FEWEST_COMPONENTS = 3  # to fit the whole by: of fewer, a component that moved cannot be identified
 ROUNDS = 12
 CAUCHY = 2.385
+MOST_COUPLED = 3_000_000  # blocks times stations, beyond which stations are not fitted
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What each station and the whole were moved by: turns about ``centre`` (rad), translations and ranges (mm).
+    """Movements of stations and of the whole: rotations about ``centre`` (rad), translations and range offsets (mm).
 
-    ``moves`` (k, 7) are of the stations, ``whole`` (6,) of everything; ``covariance`` (6, 6) is that of the whole.
+    ``movements`` (k, 7) are of the stations, ``whole`` (6,) of everything; ``covariance`` (6, 6) is that of the whole.
     """
 
     centre: Floats
-    moves: Floats
+    movements: Floats
     whole: Floats
     covariance: Floats
     fitted: bool
 
     def corrections(self, points: Floats, outward: Floats, rays: Floats, station: Ints) -> Floats:
-        """Return what to take off deviations (n,) at points (n, 3) seen along unit rays (n, 3), mm."""
+        """Return the corrections (n,) to subtract from deviations at points (n, 3) along unit rays (n, 3), mm."""
         J = _derivative(points - self.centre, outward, rays)
-        found: Floats = np.einsum("nk,nk->n", J, self.moves[station]) + J[:, :6] @ self.whole
-        return found
+        correction: Floats = np.einsum("nk,nk->n", J, self.movements[station]) + J[:, :6] @ self.whole
+        return correction
 
     def sd(self, points: Floats, outward: Floats) -> Floats:
-        """Return the standard deviation (n,) that the fit of the whole leaves in a deviation at points (n, 3), mm."""
+        """Return the standard deviation (n,) of a deviation at points (n, 3) by the fit of the whole, mm."""
         J = _derivative(points - self.centre, outward, np.zeros_like(points))[:, :6]
-        found: Floats = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, self.covariance, J), 0.0))
-        return found
+        sd: Floats = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, self.covariance, J), 0.0))
+        return sd
+
+
+@dataclass(frozen=True)
+class StationBlocks:
+    """Observations of stations summed up by blocks of cells; ``variance`` is of the mean.
+
+    ``cell`` is the cell nearest to the middle of the points: a place on the face, as the mean of places need not be.
+    """
+
+    block: Ints  # (n,)
+    station: Ints
+    mean: Floats
+    variance: Floats
+    cell: Ints
 
 
 def none(surface: DesignSurface, stations: int, error_mm: float) -> Alignment:
-    """Leave all where it is; the whole is known to ``error_mm`` along each axis."""
+    """Return the alignment that moves nothing; the whole has a standard deviation of ``error_mm`` along each axis."""
     covariance = np.zeros((6, 6))
     covariance[3:, 3:] = np.eye(3) * error_mm**2
     centre = surface.vertices.mean(axis=0)
@@ -61,26 +76,34 @@ def none(surface: DesignSurface, stations: int, error_mm: float) -> Alignment:
 
 
 def align(
-    pairs: Pairs, surface: DesignSurface, stations: Stations, error_mm: float, apart: frozenset[int] = frozenset()
+    pairs: Pairs, surface: DesignSurface, stations: Stations, error_mm: float, excluded: frozenset[int] = frozenset()
 ) -> Alignment:
-    """Fit stations to each other, and where there are components enough the whole to the design.
+    """Fit stations to each other, and the whole to the design if there are enough components.
 
-    Components ``apart`` are known to have moved or bent: the whole is fitted by the others.
+    ``excluded`` are components that moved or are deformed: the whole is fitted by the others.
     """
     start = none(surface, len(stations.names), error_mm)
-    block, station, mean, variance, place = _blocks(pairs, surface)
-    if not len(block):
+    blocks = _blocks(pairs, surface)
+    if not len(blocks.block):
         return start
-    points, outward = surface.centres[place], surface.outward[place]
-    J = _derivative(points - start.centre, outward, rays_to(points, stations.positions[station]))
-    moves = _between(block, station, mean, variance, J, len(stations.names))
-    left = mean - np.einsum("nk,nk->n", J, moves[station])
-    component = surface.charts.component[chart_of_cells(surface)[place]]
-    used = ~np.isin(component, sorted(apart))
+    points, outward = surface.centres[blocks.cell], surface.outward[blocks.cell]
+    J = _derivative(points - start.centre, outward, rays_to(points, stations.positions[blocks.station]))
+    movements = _stations(blocks, J, len(stations.names))
+    residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
+    component = surface.charts.component[chart_of_cells(surface)[blocks.cell]]
+    used = ~np.isin(component, sorted(excluded))
     if len(np.unique(component[used])) < FEWEST_COMPONENTS:
-        return Alignment(start.centre, moves, start.whole, start.covariance, False)
-    whole, covariance = _whole(left[used], variance[used], J[used, :6], component[used])
-    return Alignment(start.centre, moves, whole, covariance, True)
+        return Alignment(start.centre, movements, start.whole, start.covariance, False)
+    whole, covariance = _whole(residual[used], J[used, :6], component[used])
+    return Alignment(start.centre, movements, whole, covariance, True)
+
+
+def corrected_pose(T_design_project: Floats, alignment: Alignment) -> Floats:
+    """Return the pose less the movement of the whole."""
+    R = rigid.rotation_from_vector(-alignment.whole[:3])
+    shift = alignment.centre - R @ alignment.centre - R @ alignment.whole[3:]
+    T: Floats = rigid.transform(R, shift) @ T_design_project
+    return T
 
 
 def chart_of_cells(surface: DesignSurface) -> Ints:
@@ -89,28 +112,27 @@ def chart_of_cells(surface: DesignSurface) -> Ints:
 
 
 def rays_to(points: Floats, positions: Floats) -> Floats:
-    """Return unit rays (n, 3) from scanners (n, 3) to points; zero where a scanner's place is unknown."""
+    """Return unit rays (n, 3) from scanners (n, 3) to points; zero where a scanner's position is unknown."""
     arm = points - positions
-    found: Floats = np.nan_to_num(arm / np.linalg.norm(arm, axis=1)[:, None])
-    return found
+    rays: Floats = np.nan_to_num(arm / np.linalg.norm(arm, axis=1)[:, None])
+    return rays
 
 
 def _derivative(arm: Floats, outward: Floats, rays: Floats) -> Floats:
-    """Return the derivative (n, 7) of deviations by a turn about the centre, a translation and a longer range."""
+    """Return the derivative (n, 7) of deviations by rotation about the centre, translation and range offset."""
     return np.hstack([np.cross(arm, outward), outward, np.einsum("ni,ni->n", rays, outward)[:, None]])
 
 
-def _blocks(pairs: Pairs, surface: DesignSurface) -> tuple[Ints, Ints, Floats, Floats, Ints]:
-    """Sum up pairs by blocks of cells: block, station, mean, its variance and the cell in the middle of the block."""
+def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
+    """Sum up pairs of cell and station by blocks of cells."""
     charts = surface.charts
     chart = chart_of_cells(surface)[pairs.cell]
     used = pairs.count > 0
-    at = pairs.cell - charts.first[chart]
+    u, v = np.divmod(pairs.cell - charts.first[chart], charts.shape[chart, 1])
     side = max(1, round(BLOCK_MM / charts.cell_mm))
-    row, column = at // charts.shape[chart, 1] // side, at % charts.shape[chart, 1] // side
     across = -(-charts.shape // side)
     first = np.concatenate([[0], np.cumsum(across.prod(axis=1))])[:-1]
-    block = first[chart] + row * across[chart, 1] + column
+    block = first[chart] + u // side * across[chart, 1] + v // side
     stations = int(pairs.station.max(initial=0)) + 1
     key, index = np.unique((block * stations + pairs.station)[used], return_inverse=True)
     index = index.reshape(-1)
@@ -119,82 +141,77 @@ def _blocks(pairs: Pairs, surface: DesignSurface) -> tuple[Ints, Ints, Floats, F
     mean = np.bincount(index, weight * pairs.mean[used]) / count
     freedom = np.maximum(np.bincount(index, np.maximum(weight - 1.0, 0.0)), 1.0)
     square = np.bincount(index, pairs.square[used]) / freedom
-    # The cell nearest to the middle of what was seen: a place on the face, where the mean of cells need not be one.
-    own = np.flatnonzero(used)
-    where = np.stack([np.bincount(index, weight * x[used]) / count for x in (at // charts.shape[chart, 1],
-                                                                             at % charts.shape[chart, 1])])  # fmt: skip
-    some = np.empty(len(key), np.int64)
-    some[index] = own
-    c = chart[some]
-    place = (
-        charts.first[c] + np.round(where[0]).astype(np.int64) * charts.shape[c, 1] + np.round(where[1]).astype(np.int64)
+    middle_u, middle_v = (np.round(np.bincount(index, weight * x[used]) / count).astype(np.int64) for x in (u, v))
+    last = np.empty(len(key), np.int64)
+    last[index] = np.flatnonzero(used)
+    c = chart[last]
+    cell = charts.first[c] + middle_u * charts.shape[c, 1] + middle_v
+    return StationBlocks(
+        block=key // stations,
+        station=key % stations,
+        mean=mean,
+        variance=square / count + FLOOR_MM**2,
+        cell=cell,
     )
-    return key // stations, key % stations, mean, square / count + FLOOR_MM**2, place
 
 
-def _between(block: Ints, station: Ints, mean: Floats, variance: Floats, J: Floats, stations: int) -> Floats:
-    """Movements (k, 7) by which stations agree, with Cauchy's weights; the place of each block is free."""
-    _, block = np.unique(block, return_inverse=True)
+def _stations(blocks: StationBlocks, J: Floats, stations: int) -> Floats:
+    """Return the movements (k, 7) by which stations agree, with Cauchy's weights; the deviation of a block is free."""
+    _, block = np.unique(blocks.block, return_inverse=True)
     block = block.reshape(-1)
-    blocks = int(block.max()) + 1
+    count = int(block.max()) + 1
     x = np.zeros((stations, 7))
-    weight = 1.0 / variance
+    if count * stations >= MOST_COUPLED:
+        return x
+    weight = 1.0 / blocks.variance
     for _ in range(ROUNDS):
-        left = mean - np.einsum("nk,nk->n", J, x[station])
-        total = np.bincount(block, weight, blocks)
-        middle = np.bincount(block, weight * left, blocks) / total
-        off = (left - middle[block]) / np.sqrt(variance)
-        weight = 1.0 / variance / (1.0 + (off / CAUCHY) ** 2)
-        # What a block says of stations is what is left when its own place is taken out.
-        total = np.bincount(block, weight, blocks)
+        residual = blocks.mean - np.einsum("nk,nk->n", J, x[blocks.station])
+        total = np.bincount(block, weight, count)
+        middle = np.bincount(block, weight * residual, count) / total
+        normalized = (residual - middle[block]) / np.sqrt(blocks.variance)
+        weight = 1.0 / blocks.variance / (1.0 + (normalized / CAUCHY) ** 2)
+        # Normal equations, reduced by the deviation of each block (Schur complement).
+        total = np.bincount(block, weight, count)
         A = np.diag(np.tile(1.0 / PRIOR**2, stations))
         right = np.zeros(7 * stations)
-        mixed = np.zeros((blocks, 7 * stations)) if blocks * stations < 3_000_000 else None
+        coupling = np.zeros((count, 7 * stations))
         for k in range(stations):
-            rows = station == k
+            rows = blocks.station == k
             wJ = weight[rows, None] * J[rows]
             here = slice(7 * k, 7 * k + 7)
             A[here, here] += wJ.T @ J[rows]
-            right[here] += wJ.T @ mean[rows]
-            if mixed is not None:
-                np.add.at(mixed[:, here], block[rows], wJ)
-        if mixed is None:
-            return x
-        A -= mixed.T @ (mixed / total[:, None])
-        right -= mixed.T @ (np.bincount(block, weight * mean, blocks) / total)
+            right[here] += wJ.T @ blocks.mean[rows]
+            np.add.at(coupling[:, here], block[rows], wJ)
+        A -= coupling.T @ (coupling / total[:, None])
+        right -= coupling.T @ (np.bincount(block, weight * blocks.mean, count) / total)
         x = np.asarray(np.linalg.solve(A, right), np.float64).reshape(stations, 7)
     return x
 
 
-def _whole(left: Floats, variance: Floats, J: Floats, component: Ints) -> tuple[Floats, Floats]:
-    """Movement (6,) of the whole and its covariance from how components differ; redescending weights."""
+def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Floats]:
+    """Return the movement (6,) of the whole, with redescending weights, and its covariance.
+
+    The covariance follows from the scatter between components (sandwich estimator), plus that of the fit itself.
+    """
     x = np.zeros(6)
     prior = np.diag(1.0 / WHOLE_PRIOR**2)
-    scale = max(1.4826 * float(np.median(np.abs(left))), FLOOR_MM)
-    weight = np.ones(len(left))
+    scale = max(1.4826 * float(np.median(np.abs(deviation))), FLOOR_MM)
+    weight = np.ones(len(deviation))
     for _ in range(4 * ROUNDS):
-        off = left - J @ x
-        weight = 1.0 / (1.0 + (off / (CAUCHY * scale)) ** 2) ** 2
+        residual = deviation - J @ x
+        weight = 1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2) ** 2
         A = J.T @ (weight[:, None] * J) / scale**2 + prior
-        step = np.linalg.solve(A, J.T @ (weight * left) / scale**2) - x
+        step = np.linalg.solve(A, J.T @ (weight * deviation) / scale**2) - x
         x = x + step
-        off = left - J @ x
-        scale = max(1.4826 * float(np.median(np.abs(off))), FLOOR_MM)
+        residual = deviation - J @ x
+        scale = max(1.4826 * float(np.median(np.abs(residual))), FLOOR_MM)
         if np.abs(J @ step).max() < 1e-4:
             break
-    off = left - J @ x
+    residual = deviation - J @ x
     A = J.T @ (weight[:, None] * J) / scale**2 + prior
-    pull = weight[:, None] * J * off[:, None] / scale**2
+    pull = weight[:, None] * J * residual[:, None] / scale**2
     groups = np.stack([np.bincount(component, pull[:, i], component.max() + 1) for i in range(6)], axis=1)
     inverse = np.linalg.inv(A)
     count = len(np.unique(component))
     covariance = inverse @ (groups.T @ groups) @ inverse * count / max(count - 6.0, 1.0) + inverse
     return x, covariance
-
-
-def moved(T_design_project: Floats, alignment: Alignment) -> Floats:
-    """Return the pose with the whole's movement taken off."""
-    R = rigid.rotation_from_vector(-alignment.whole[:3])
-    shift = alignment.centre - R @ alignment.centre - R @ alignment.whole[3:]
-    found: Floats = rigid.transform(R, shift) @ T_design_project
-    return found

@@ -1,7 +1,6 @@
-"""What a place that deviates or is missing is called, and how sure that is.
+"""The class of a defect and the confidence in it.
 
-Each rule is one number held against a border, and by how much it is beyond says how sure the answer is: a border that
-is reached just so is as good as a coin.
+Each rule compares one number with a limit; the distance from the limit gives the confidence, 0.5 at the limit itself.
 """
 
 from __future__ import annotations
@@ -10,60 +9,74 @@ from dataclasses import dataclass
 
 import numpy as np
 
-PIT_THICKNESSES = 5.0  # of the plate: steel that is bent in does so over more than that, a pit takes less
-CRACK_RATIO = 4.0  # of length to width
-CRACK_THICKNESSES = 3.0  # of width
-SOFT = 0.15  # of the logarithm of a number by its border: what a border is uncertain by
-UNKNOWN = 0.6  # confidence below which a class is not named
-LARGE_SHARE = 0.25  # of a face, from which on a hole within it is a missing part beyond doubt
+from processor.defects.result import DefectClass
+
+PIT_THICKNESSES = 5.0  # largest diameter of a pit by the plate's thickness: bent steel deviates over more than that
+CRACK_RATIO = 4.0  # least length of a crack by its width
+CRACK_THICKNESSES = 3.0  # largest width of a crack by the plate's thickness
+SOFTNESS = 0.15  # of the logarithm of a number by its limit: scale of the logistic function
+LEAST_CONFIDENCE = 0.6  # below it the class is unknown
+BORDER_CONFIDENCE = 0.95  # of edge loss and missing part, told apart by the borders that they reach
 
 
 @dataclass(frozen=True)
-class Named:
-    """A class, how sure it is (0.5 = a coin), and the class that it would be otherwise."""
+class Classification:
+    """A class, the confidence in it (0.5 = as good as a coin), and the second most probable class."""
 
-    kind: str
+    defect_class: DefectClass
     confidence: float
-    second: str
+    otherwise: DefectClass
 
 
-def of_deviation(sign: int, diameter: float, length: float, width: float, thickness: float, z: float) -> Named:
-    """Name a place that deviates, of sizes in mm; ``z`` = its deviation by its noise."""
-    slim = _beyond(length / max(width, 1e-9), CRACK_RATIO) * _beyond(CRACK_THICKNESSES * thickness, width)
-    small = _beyond(PIT_THICKNESSES * thickness, diameter)
-    sure = 1.0 - np.exp(-0.5 * max(z, 0.0))
+def of_deviation(sign: int, diameter: float, length: float, width: float, thickness: float, z: float) -> Classification:
+    """Classify a place that deviates inward (``sign`` -1) or outward, sizes in mm; ``z``: deviation by its sd."""
+    slim = _slim(length, width, thickness)
+    small = _above(PIT_THICKNESSES * thickness, diameter)
+    significance = 1.0 - np.exp(-0.5 * max(z, 0.0))
     if sign > 0:
-        ranks = {"bulge": 1.0 - slim, "unknown": slim}
+        ranks = {DefectClass.BULGE: 1.0 - slim, DefectClass.UNKNOWN: slim}
     else:
-        ranks = {"crack": slim, "pit": (1.0 - slim) * small, "dent": (1.0 - slim) * (1.0 - small)}
-    return _chosen({kind: rank * sure for kind, rank in ranks.items()})
+        ranks = {
+            DefectClass.CRACK: slim,
+            DefectClass.PIT: (1.0 - slim) * small,
+            DefectClass.DENT: (1.0 - slim) * (1.0 - small),
+        }
+    return _most_probable({kind: rank * significance for kind, rank in ranks.items()})
 
 
-def of_missing(borders: int, length: float, width: float, thickness: float, strength: float) -> Named:
-    """Name a place that is missing: by how many of its face's borders it reaches, and its sizes in mm."""
-    sure = 1.0 - np.exp(-0.5 * strength)
+def of_missing(borders: int, length: float, width: float, thickness: float, strength: float) -> Classification:
+    """Classify a missing place by the number of borders of its face that it reaches, and by its sizes in mm."""
+    significance = 1.0 - np.exp(-0.5 * strength)
     if borders == 0:
-        slim = _beyond(length / max(width, 1e-9), CRACK_RATIO) * _beyond(CRACK_THICKNESSES * thickness, width)
-        return _chosen({"crack": slim * sure, "missing-part": (1.0 - slim) * sure})
+        slim = _slim(length, width, thickness)
+        return _most_probable(
+            {DefectClass.CRACK: slim * significance, DefectClass.MISSING_PART: (1.0 - slim) * significance}
+        )
     if borders == 1:
-        return Named("edge-loss", 0.95 * sure, "missing-part")
-    return Named("missing-part", 0.95 * sure, "edge-loss")
+        return Classification(DefectClass.EDGE_LOSS, BORDER_CONFIDENCE * significance, DefectClass.MISSING_PART)
+    return Classification(DefectClass.MISSING_PART, BORDER_CONFIDENCE * significance, DefectClass.EDGE_LOSS)
 
 
-def of_shape(kind: str, margin: float) -> Named:
-    """Name the shape of a component; ``margin`` is how much more chi-square any other kind would leave."""
-    sure = float(1.0 - 0.5 * np.exp(-0.05 * max(margin, 0.0)))
-    return Named(kind if sure >= UNKNOWN else "unknown", sure, "unknown" if sure >= UNKNOWN else kind)
+def of_shape(kind: str, margin: float) -> Classification:
+    """Classify the shape of a component; ``margin``: chi-square of the best fit of another kind less this one's."""
+    confidence = float(1.0 - 0.5 * np.exp(-0.05 * max(margin, 0.0)))
+    if confidence >= LEAST_CONFIDENCE:
+        return Classification(DefectClass(kind), confidence, DefectClass.UNKNOWN)
+    return Classification(DefectClass.UNKNOWN, confidence, DefectClass(kind))
 
 
-def _beyond(value: float, border: float) -> float:
-    """Between 0 and 1: how surely a number is above a border."""
-    return float(1.0 / (1.0 + np.exp(-np.log(max(value, 1e-9) / border) / SOFT)))
+def _slim(length: float, width: float, thickness: float) -> float:
+    """Return between 0 and 1 how surely a place is long and narrow, as cracks are."""
+    return _above(length / max(width, 1e-9), CRACK_RATIO) * _above(CRACK_THICKNESSES * thickness, width)
 
 
-def _chosen(ranks: dict[str, float]) -> Named:
-    order = sorted(ranks, key=lambda kind: -ranks[kind])
-    kind, second = order[0], order[1] if len(order) > 1 else ""
-    if ranks[kind] < UNKNOWN and kind != "unknown":
-        return Named("unknown", float(ranks[kind]), kind)
-    return Named(kind, float(ranks[kind]), second)
+def _above(value: float, limit: float) -> float:
+    """Return between 0 and 1 how surely a number is above a limit."""
+    return float(1.0 / (1.0 + np.exp(-np.log(max(value, 1e-9) / limit) / SOFTNESS)))
+
+
+def _most_probable(ranks: dict[DefectClass, float]) -> Classification:
+    first, second, *_ = sorted(ranks, key=lambda kind: -ranks[kind])
+    if ranks[first] < LEAST_CONFIDENCE and first is not DefectClass.UNKNOWN:
+        return Classification(DefectClass.UNKNOWN, float(ranks[first]), first)
+    return Classification(first, float(ranks[first]), second)

@@ -1,4 +1,4 @@
-"""The shape of every component: what of its deviation is the component's as a whole."""
+"""Shapes of components: the part of a component's deviation that extends over the whole component."""
 
 from __future__ import annotations
 
@@ -16,15 +16,16 @@ from processor.defects.scan_statistic import Levels
 from processor.defects.surface_charts import DesignSurface
 from processor.model import NORMAL_95, Floats, Ints
 
-BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at the least
+BLOCKS_ALONG, BLOCKS_ACROSS = 36, 16  # of a component's largest face, at least
 MOST_BLOCKS = 3000
 FEWEST_BLOCKS = 24
 FINER = 3  # times smaller blocks for the last fit
 FLOOR_MM = 0.02
-APART_GAIN = 100.0  # of chi-square
+DEFORMED_GAIN = 100.0  # of chi-square, above which a component is deformed
 JUMP_CELLS = 1.5
-LEAST_Z = 4.5  # of a shape: what stations share is known from few of them
+LEAST_Z = 4.5  # of a shape: what stations have in common is known from few of them
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
+LARGE_SHARE = 0.9  # of the largest face's area, from which a face may be the front
 
 
 @dataclass(frozen=True)
@@ -37,12 +38,144 @@ class ComponentShape:
     fitted: shape_models.Fitted
 
 
-def frame_of(surface: DesignSurface, component: int) -> shape_models.Frame:
-    """Return a component's own frame, by its largest face."""
+@dataclass(frozen=True)
+class SignificantShape:
+    """A significant shape: its largest value (mm, outward positive), the half-width of its 95 % interval, its z."""
+
+    shape: shape_models.Shape
+    peak: float
+    ci95: float
+    z: float
+    chance: float  # expected number of false alarms as strong on one mm2
+    margin: float  # chi-square of the best fit of another kind less this one's
+
+
+def fit_all(field: Field, surface: DesignSurface) -> list[ComponentShape]:
+    """Fit the shapes of all components with enough observed blocks."""
+    component = component_of_cells(surface)
+    seen = np.flatnonzero(field.seen > 0)
+    order = np.argsort(component[seen], kind="stable")
+    shapes = []
+    for cells in np.split(seen[order], np.flatnonzero(np.diff(component[seen][order])) + 1):
+        if not len(cells):
+            continue
+        number = int(component[cells[0]])
+        frame = _frame_of(surface, number)
+        block_mm = min(2.0 * frame.half[0] / BLOCKS_ALONG, 2.0 * frame.half[1] / BLOCKS_ACROSS)
+        side = max(1, round(max(block_mm / surface.charts.cell_mm, np.sqrt(len(cells) / MOST_BLOCKS))))
+        blocks = _blocks_of(field, surface, cells, side)
+        if len(blocks.mean) >= FEWEST_BLOCKS:
+            fitted = shape_models.fit(blocks, frame)
+            if fitted.shapes and side > 1:
+                fine = _blocks_of(field, surface, cells, max(1, side // FINER))
+                fitted = shape_models.refitted(fitted, _masked(fine, fitted, blocks), frame)
+            shapes.append(ComponentShape(number, frame, blocks, fitted))
+    return shapes
+
+
+def deformed(shapes: list[ComponentShape]) -> frozenset[int]:
+    """Return the components that certainly have a shape of their own."""
+    return frozenset(fit.component for fit in shapes if any(gain > DEFORMED_GAIN for gain in fit.fitted.gain))
+
+
+def values(surface: DesignSurface, shapes: list[ComponentShape], chosen: dict[int, list[shape_models.Shape]]) -> Floats:
+    """Return the deviation (cells,) by the chosen shapes of each component, mm."""
+    total = np.zeros(len(surface.share))
+    component = component_of_cells(surface)
+    for fit in shapes:
+        if chosen.get(fit.component):
+            rows = np.flatnonzero(component == fit.component)
+            for shape in chosen[fit.component]:
+                total[rows] += shape.values(fit.frame, surface.centres[rows], surface.outward[rows])
+    return total
+
+
+def jumps(surface: DesignSurface, shapes: list[ComponentShape], chosen: dict[int, list[shape_models.Shape]]) -> Ints:
+    """Return the cells that the edge of a step runs through: their means mix both sides."""
+    cells = [np.empty(0, np.int64)]
+    component = component_of_cells(surface)
+    for fit in shapes:
+        for shape in chosen.get(fit.component, ()):
+            if shape.kind == "step":
+                axis = int(shape.at[0])
+                rows = np.flatnonzero(component == fit.component)
+                along = fit.frame.local(surface.centres[rows])[:, axis] - shape.at[1] * fit.frame.half[axis]
+                cells.append(rows[np.abs(along) <= JUMP_CELLS * surface.charts.cell_mm])
+    return np.concatenate(cells)
+
+
+def significant(
+    shapes: list[ComponentShape],
+    surface: DesignSurface,
+    field: Field,
+    alignment: Alignment,
+    levels: Levels,
+    alarms_per_mm2: float,
+) -> dict[int, list[SignificantShape]]:
+    """Return the shapes, by component, that are significant at the given rate of false alarms.
+
+    The largest value of a shape has three errors: noise, the common error of means of large places, and the pose of
+    the whole in the design's frame.
+    """
+    chosen: dict[int, list[SignificantShape]] = {}
+    for fit in shapes:
+        candidates = [(k, s) for k, s in enumerate(fit.fitted.shapes) if s.kind != "bump"]
+        if not candidates:
+            continue
+        rows = front_of(surface, fit.component, field)
+        rows = rows[surface.share[rows] > 0.5]
+        area = float(surface.share[rows].sum()) * surface.charts.cell_mm**2
+        threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shape_models.BASES)))))
+        # Noise of blocks; the common error of larger places is added below.
+        size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
+        inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
+        points, outward = _with_corners(surface, rows)
+        registration = alignment.sd(points, outward)
+        for k, shape in candidates:
+            value = shape.values(fit.frame, points, outward)
+            top = int(np.argmax(np.abs(value)))
+            formal = abs(value[top]) / max(np.sqrt(max(fit.fitted.gain[k], 1e-9)), 1e-9) * inflation
+            sd = float(np.sqrt(formal**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration[top] ** 2))
+            z = abs(float(value[top])) / sd
+            if z > threshold:
+                judged = SignificantShape(
+                    shape=shape,
+                    peak=float(value[top]),
+                    ci95=NORMAL_95 * sd,
+                    z=z,
+                    chance=2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area,
+                    margin=fit.fitted.margin / inflation**2,
+                )
+                chosen.setdefault(fit.component, []).append(judged)
+    return chosen
+
+
+def front_of(surface: DesignSurface, component: int, field: Field) -> Ints:
+    """Return the cells of the largest face and of those in its plane; of equal faces that with most cells observed."""
     charts = surface.charts
-    own = np.flatnonzero(charts.component == component)
-    areas = [float(surface.share[charts.cells(int(k))].sum()) for k in own]
-    main = own[int(np.argmax(areas))]
+    candidates = np.flatnonzero(charts.component == component)
+    areas = np.array([float(surface.share[charts.cells(int(k))].sum()) for k in candidates])
+    seen = np.array([float(field.seen[charts.cells(int(k))].sum()) for k in candidates])
+    large = areas > LARGE_SHARE * areas.max()
+    main = candidates[int(np.argmax(np.where(large, seen, -1.0)))]
+    out, at = charts.axes[main, 2], charts.origin[main]
+    flush = [
+        int(k)
+        for k in candidates
+        if charts.kind[k] == charts.kind[main]
+        and charts.axes[k, 2] @ out > FLUSH_COS
+        and abs((charts.origin[k] - at) @ out) < FLUSH_MM
+    ]
+    cells: Ints = np.concatenate([np.arange(charts.cells(k).start, charts.cells(k).stop) for k in flush])
+    return cells
+
+
+def _frame_of(surface: DesignSurface, component: int) -> shape_models.Frame:
+    """Return a component's frame, by its largest face."""
+    charts = surface.charts
+    faces = np.flatnonzero(charts.component == component)
+    areas = [float(surface.share[charts.cells(int(k))].sum()) for k in faces]
+    main = faces[int(np.argmax(areas))]
     axes = charts.axes[main]
     corners = surface.vertices[np.unique(surface.faces[surface.component_of == component])] @ axes.T
     low, high = corners.min(axis=0), corners.max(axis=0)
@@ -51,167 +184,35 @@ def frame_of(surface: DesignSurface, component: int) -> shape_models.Frame:
     return shape_models.Frame(0.5 * (low + high) @ axes, axes, half, max(0.5 * float(np.ptp(front)), 1.0))
 
 
-def blocks_of(field: Field, surface: DesignSurface, rows: Ints, side: int) -> shape_models.Blocks:
-    """Sum up the cells ``rows`` of one component by squares of ``side`` cells."""
+def _blocks_of(field: Field, surface: DesignSurface, cells: Ints, side: int) -> shape_models.Blocks:
+    """Sum up the cells of one component by squares of ``side`` cells."""
     charts = surface.charts
-    chart = chart_of_cells(surface)[rows]
-    at = rows - charts.first[chart]
-    block = np.stack([chart, at // charts.shape[chart, 1] // side, at % charts.shape[chart, 1] // side], axis=1)
-    _, index = np.unique(block, axis=0, return_inverse=True)
+    chart = chart_of_cells(surface)[cells]
+    u, v = np.divmod(cells - charts.first[chart], charts.shape[chart, 1])
+    _, index = np.unique(np.stack([chart, u // side, v // side], axis=1), axis=0, return_inverse=True)
     index = index.reshape(-1)
-    w = 1.0 / field.variance[rows]
+    w = 1.0 / field.variance[cells]
     total = np.bincount(index, w)
-    mean = np.bincount(index, w * field.deviation[rows]) / total
+    mean = np.bincount(index, w * field.deviation[cells]) / total
     points, outward = (
-        np.stack([np.bincount(index, w * x[rows, k]) / total for k in range(3)], axis=1)
+        np.stack([np.bincount(index, w * x[cells, k]) / total for k in range(3)], axis=1)
         for x in (surface.centres, surface.outward)
     )
     outward /= np.linalg.norm(outward, axis=1)[:, None]
     return shape_models.Blocks(points, outward, mean, 1.0 / (1.0 / total + FLOOR_MM**2), side * charts.cell_mm)
 
 
-def fit_all(field: Field, surface: DesignSurface, alignment: Alignment) -> list[ComponentShape]:
-    """Fit the shapes of all components that enough is seen of."""
-    component = component_of_cells(surface)
-    rows = np.flatnonzero(field.seen > 0)
-    order = np.argsort(component[rows], kind="stable")
-    found = []
-    for own in np.split(rows[order], np.flatnonzero(np.diff(component[rows][order])) + 1):
-        if not len(own):
-            continue
-        number = int(component[own[0]])
-        frame = frame_of(surface, number)
-        wanted = min(2.0 * frame.half[0] / BLOCKS_ALONG, 2.0 * frame.half[1] / BLOCKS_ACROSS)
-        most = np.sqrt(len(own) / MOST_BLOCKS)
-        side = max(1, round(max(wanted / surface.charts.cell_mm, most)))
-        blocks = blocks_of(field, surface, own, side)
-        if len(blocks.mean) >= FEWEST_BLOCKS:
-            fitted = shape_models.fit(blocks, frame)
-            if fitted.shapes and side > 1:
-                fitted = shape_models.refitted(fitted, _unmasked(fitted, blocks, field, surface, own, side), frame)
-            found.append(ComponentShape(number, frame, blocks, fitted))
-    return found
+def _masked(fine: shape_models.Blocks, fitted: shape_models.Fitted, blocks: shape_models.Blocks) -> shape_models.Blocks:
+    """Return finer blocks with the weights by which the fit left out blocks."""
+    if not (fitted.weight < blocks.weight).any():
+        return fine
+    nearest = cKDTree(blocks.points).query(fine.points)[1]
+    return dataclasses.replace(fine, weight=fine.weight * (fitted.weight / blocks.weight)[nearest])
 
 
-def shaped_ones(shaped: list[ComponentShape]) -> frozenset[int]:
-    """Return the components that have a shape of their own beyond doubt, as far as the whole's place is known."""
-    return frozenset(one.component for one in shaped if any(gain > APART_GAIN for gain in one.fitted.gain))
-
-
-def _unmasked(
-    fitted: shape_models.Fitted, blocks: shape_models.Blocks, field: Field, surface: DesignSurface, own: Ints, side: int
-) -> shape_models.Blocks:
-    """Return finer blocks, those that lie in blocks left out left out too."""
-    fine = blocks_of(field, surface, own, max(1, side // FINER))
-    if (fitted.weight < blocks.weight).any():
-        masked = cKDTree(blocks.points).query(fine.points)[1]
-        fine = dataclasses.replace(fine, weight=fine.weight * (fitted.weight / blocks.weight)[masked])
-    return fine
-
-
-def values(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int, list[shape_models.Shape]]) -> Floats:
-    """Return what kept shapes, by component, add to the deviation of every cell (cells,)."""
-    found = np.zeros(len(surface.share))
-    component = component_of_cells(surface)
-    for one in shaped:
-        if kept.get(one.component):
-            rows = np.flatnonzero(component == one.component)
-            for shape in kept[one.component]:
-                found[rows] += shape.values(one.frame, surface.centres[rows], surface.outward[rows])
-    return found
-
-
-def jumps(surface: DesignSurface, shaped: list[ComponentShape], kept: dict[int, list[shape_models.Shape]]) -> Ints:
-    """Return the cells that a step runs through: their means are of both of its sides."""
-    found = [np.empty(0, np.int64)]
-    component = component_of_cells(surface)
-    for one in shaped:
-        for shape in kept.get(one.component, ()):
-            if shape.kind == "step":
-                axis = int(shape.at[0])
-                rows = np.flatnonzero(component == one.component)
-                along = one.frame.local(surface.centres[rows])[:, axis] - shape.at[1] * one.frame.half[axis]
-                found.append(rows[np.abs(along) <= JUMP_CELLS * surface.charts.cell_mm])
-    return np.concatenate(found)
-
-
-@dataclass(frozen=True)
-class Judged:
-    """A shape that is more than chance: its largest value (mm, signed, outward) and the 95 % interval."""
-
-    shape: shape_models.Shape
-    peak: float
-    ci95: float
-    z: float
-    chance: float  # how many as strong chance brings on one mm2
-    margin: float  # how much more the best of other kinds leaves, in standard deviations squared
-
-
-def seen_front(surface: DesignSurface, component: int, field: Field) -> Ints:
-    """Return the cells of the largest face, seen from where most of it was seen: a plate has two of them."""
-    charts = surface.charts
-    own = np.flatnonzero(charts.component == component)
-    areas = np.array([float(surface.share[charts.cells(int(k))].sum()) for k in own])
-    seen = np.array([float(field.seen[charts.cells(int(k))].sum()) for k in own])
-    large = areas > 0.9 * areas.max()
-    main = own[int(np.argmax(np.where(large, seen, -1.0)))]
-    out, at = charts.axes[main, 2], charts.origin[main]
-    flush = [
-        int(k)
-        for k in own
-        if charts.kind[k] == charts.kind[main]
-        and charts.axes[k, 2] @ out > FLUSH_COS
-        and abs((charts.origin[k] - at) @ out) < FLUSH_MM
-    ]
-    found: Ints = np.concatenate([np.arange(charts.cells(k).start, charts.cells(k).stop) for k in flush])
-    return found
-
-
-def with_corners(surface: DesignSurface, rows: Ints) -> tuple[Floats, Floats]:
-    """Places (n, 3) and normals (n, 3) of a face's cells and of its corners, where many shapes are largest."""
-    chart = np.unique(chart_of_cells(surface)[rows])
-    own = np.isin(surface.chart_of, chart)
-    corners = surface.vertices[surface.faces[own]].reshape(-1, 3)
-    normals = np.repeat(surface.normals[own], 3, axis=0)
-    return np.concatenate([surface.centres[rows], corners]), np.concatenate([surface.outward[rows], normals])
-
-
-def significant(
-    shaped: list[ComponentShape],
-    surface: DesignSurface,
-    field: Field,
-    alignment: Alignment,
-    levels: Levels,
-    alarms_per_mm2: float,
-) -> dict[int, list[Judged]]:
-    """Keep the shapes that chance brings no more often than asked for, by component.
-
-    Of the largest deviation of a shape three things are uncertain: noise, what means of large places share, and where
-    the whole is in the design's frame.
-    """
-    found: dict[int, list[Judged]] = {}
-    for one in shaped:
-        real = [(k, s) for k, s in enumerate(one.fitted.shapes) if s.kind != "bump"]
-        if not real:
-            continue
-        rows = seen_front(surface, one.component, field)
-        rows = rows[surface.share[rows] > 0.5]
-        area = float(surface.share[rows].sum()) * surface.charts.cell_mm**2
-        threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shape_models.BASES)))))
-        # Of blocks: what larger places share beyond that stands beside it.
-        size = int(np.searchsorted(levels.sides, one.blocks.side_mm / surface.charts.cell_mm))
-        inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
-        points, outward = with_corners(surface, rows)
-        registration = alignment.sd(points, outward)
-        for k, shape in real:
-            value = shape.values(one.frame, points, outward)
-            top = int(np.argmax(np.abs(value)))
-            formal = abs(value[top]) / max(np.sqrt(max(one.fitted.gain[k], 1e-9)), 1e-9) * inflation
-            sd = float(np.sqrt(formal**2 + levels.common_mm**2 + levels.systematic_mm**2 + registration[top] ** 2))
-            z = abs(float(value[top])) / sd
-            if z > threshold:
-                chance = 2.0 * float(ndtr(-z)) * len(shape_models.BASES) / area
-                found.setdefault(one.component, []).append(
-                    Judged(shape, float(value[top]), NORMAL_95 * sd, z, chance, one.fitted.margin / inflation**2)
-                )
-    return found
+def _with_corners(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats]:
+    """Return places (n, 3) and normals (n, 3) of cells and of the corners of their faces, where shapes are largest."""
+    on_faces = np.isin(surface.chart_of, np.unique(chart_of_cells(surface)[cells]))
+    corners = surface.vertices[surface.faces[on_faces]].reshape(-1, 3)
+    normals = np.repeat(surface.normals[on_faces], 3, axis=0)
+    return np.concatenate([surface.centres[cells], corners]), np.concatenate([surface.outward[cells], normals])

@@ -1,8 +1,7 @@
-"""Where the scans are in the design's frame."""
+"""The pose of the scans in the design's frame."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -10,64 +9,54 @@ from typing import Any
 import numpy as np
 
 from processor.defects.params import Params
-from processor.deviation import cloud as deviation_cloud
-from processor.deviation import design_pose, measure
-from processor.deviation.attitude import AMBIGUOUS
-from processor.geometry import rigid
-from processor.geometry.merging import merged
-from processor.model import Floats, Scene
+from processor.geometry import merging, mesh_distance, rigid, surface_registration
+from processor.geometry.principal import AMBIGUOUS
+from processor.geometry.surface_registration import Registration
+from processor.model import Floats, Reason, Scene, Status, reason
 
-ADVICE = "run the steps stitch and deviation first, or give the scans poses in the design's frame"
-UNKNOWN_ERROR_MM = 1.0  # of scans that come in the design's frame, where nothing says what they are known to
+DEFAULT_ERROR_MM = 1.0  # registration error of scans in the design's frame, where none is known
 SAMPLE = 200_000
 
 
 @dataclass(frozen=True)
-class Placing:
-    """``T_design_project`` (4, 4), None where there is none; the sd of its place (mm), and what is to be said of it."""
+class DesignPose:
+    """``T_design_project`` (4, 4), None where it is not known; the standard deviation of its translation in mm."""
 
     T_design_project: Floats | None
     error_mm: float
-    said: str = ""
-    status: str = "ok"
+    reasons: tuple[Reason, ...] = ()
+    status: Status = Status.OK
 
 
-def stitched(scene: Scene, earlier: dict[str, Any]) -> Scene:
-    """Return the scene with the poses that step stitch found, where it ran."""
-    found = earlier.get("stitch")
-    if found is None:
-        return scene
-    return dataclasses.replace(scene, scans=deviation_cloud.posed(scene, found))
+def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
+    """Return the pose of step deviation where it ran, else a pose by the same rule.
 
-
-def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> Placing:
-    """Place the scans at the design: as step deviation did where that ran, else by the same rule.
-
-    Scans that lie at the design are left there; others are registered by principal axes and a best fit.
+    Scans that lie at the design stay there; others are registered by principal axes and a best fit.
     """
     before = earlier.get("deviation")
     if before is not None and before.T_design_scan.size:
-        own = before.registration_error
-        error = next((e for e in (params.registration_error_mm, own) if math.isfinite(e)), UNKNOWN_ERROR_MM)
-        status = "ambiguous" if before.status == "ambiguous" else "ok"
-        return Placing(before.T_design_scan, error, f"placed by step deviation ({before.registration})", status)
-    error = params.registration_error_mm if math.isfinite(params.registration_error_mm) else UNKNOWN_ERROR_MM
+        errors = (params.registration_error_mm, before.registration_error)
+        error = next((value for value in errors if math.isfinite(value)), DEFAULT_ERROR_MM)
+        status = Status.AMBIGUOUS if before.status == Status.AMBIGUOUS else Status.OK
+        source = reason("defects.placed-by-deviation", registration=before.registration)
+        return DesignPose(before.T_design_scan, error, (source,), status)
+    error = params.registration_error_mm if math.isfinite(params.registration_error_mm) else DEFAULT_ERROR_MM
     assert scene.structure is not None
-    cloud = merged(scene, with_scanner=False)
-    if len(cloud.points) < deviation_cloud.FEWEST_POINTS:
-        return Placing(None, error, "too few points to place the scans at the design")
-    vertices, origin = deviation_cloud.local_design(scene.structure)
+    cloud = merging.merged(scene, with_scanner=False)
+    if len(cloud.points) < merging.FEWEST_POINTS:
+        return DesignPose(None, error, (reason("defects.too-few-points"),))
+    vertices, origin = merging.local_design(scene.structure)
     few = cloud.points[:: max(1, len(cloud.points) // SAMPLE)]
-    thin = deviation_cloud.ScanCloud(few, cloud.origin, None, 1.0, len(cloud.points), len(few))
     given = rigid.transform(np.eye(3), cloud.origin - origin)
-    placed = design_pose.place(thin, measure.surface_of(vertices, scene.structure.faces), given, "auto")
-    if placed.registration == "as given":
-        return Placing(np.eye(4), error)
+    surface = mesh_distance.of_design(vertices, scene.structure.faces)
+    placed = surface_registration.place(few, surface, given, "auto")
+    if placed.registration is Registration.AS_GIVEN:
+        return DesignPose(np.eye(4), error)
     if not np.isfinite(placed.T_best_fit).all():
-        return Placing(None, error, f"the scans are not in the design's frame and could not be placed there; {ADVICE}")
-    shift = rigid.transform(np.eye(3), origin) @ placed.T @ rigid.transform(np.eye(3), -cloud.origin)
-    twice = placed.ambiguity < AMBIGUOUS
-    said = "placed by principal axes and a best fit, which takes up what the whole was moved by"
-    return Placing(
-        shift, error, said + ("; another attitude fits as well" if twice else ""), "ambiguous" if twice else "ok"
-    )
+        return DesignPose(None, error, (reason("defects.not-placed"),))
+    T = rigid.transform(np.eye(3), origin) @ placed.T @ rigid.transform(np.eye(3), -cloud.origin)
+    reasons, status = [reason("defects.best-fit")], Status.OK
+    if placed.ambiguity < AMBIGUOUS:
+        status = Status.AMBIGUOUS
+        reasons.append(reason("defects.ambiguous"))
+    return DesignPose(T, error, tuple(reasons), status)

@@ -1,8 +1,9 @@
-"""Method ``default``: from a scene to its defects."""
+"""Method ``default``: the defects of a scene."""
 
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,18 +21,35 @@ from processor.defects import (
     surface_charts,
     to_result,
 )
+from processor.defects.alignment import Alignment
+from processor.defects.component_shapes import ComponentShape
+from processor.defects.deviation_field import Field
+from processor.defects.observations import Observed, Pairs
 from processor.defects.params import Params
 from processor.defects.result import Result
-from processor.deviation import cloud
-from processor.geometry import rigid
-from processor.model import Floats, InputError, Scene
+from processor.defects.surface_charts import DesignSurface
+from processor.geometry import merging, mesh_distance, rigid
+from processor.model import Floats, InputError, Ints, Scene, Status, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
 CELL_BOUNDS_MM = (5.0, 60.0)
 FIRST_CELL_MM = 50.0
 MOST_CELLS = 4_000_000
-AGAIN_MM = 2.0  # a movement of the whole beyond which points are put to the design once more
+AGAIN_MM = 2.0  # movement of the whole beyond which points are assigned to the design's faces again
 ROUNDS = 3
+UNITE_CELLS, UNITE_MM = 3.0, 25.0  # distance within which places are one defect, the larger
+SD_SAMPLES = 20_000  # cells by which alignments are compared
+
+
+@dataclass(frozen=True)
+class Registered:
+    """Points on the cells of the design's surface, and the alignment of stations and whole by them."""
+
+    T_design_project: Floats
+    observed: Observed
+    surface: DesignSurface
+    pairs: Pairs
+    alignment: Alignment
 
 
 def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
@@ -39,86 +57,117 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     design = scene.structure
     if design is None or not len(design.faces):
         raise InputError(f"{scene.name}: defects need the structure's design (a mesh or STEP in project.toml)")
-    vertices, origin = cloud.local_design(design)
-    scene = design_pose.stitched(scene, earlier)
-    placed = design_pose.pose(scene, earlier, params)
-    if placed.T_design_project is None:
-        return Result("failed", params.method, placed.said)
-    T = rigid.transform(np.eye(3), -origin) @ placed.T_design_project
-    base = surface_charts.of_mesh(vertices, design.faces, _coarse(vertices, design.faces))
-    for _ in range(ROUNDS):
-        seen = observations.observe(scene, T, base, params.reach_mm)
-        if not len(seen.chart):
-            return Result("failed", params.method, "no point of the scans is near the design; " + design_pose.ADVICE)
-        cell = params.cell_mm or observations.fitting_cell(seen, base, CELL_POINTS, CELL_BOUNDS_MM)
-        cell = max(cell, float(np.sqrt(base.area_mm2 / MOST_CELLS)))
-        whole = surface_charts.gridded(base, cell)
-        pairs = observations.paired(seen, whole)
-        if not params.align:
-            fitted = alignment.none(whole, len(seen.stations.names), placed.error_mm)
-            break
-        fitted = alignment.align(pairs, whole, seen.stations, placed.error_mm)
-        if _largest(fitted, whole) < AGAIN_MM:
-            break
-        T = alignment.moved(T, fitted)
-    offered, near = seen.offered, len(seen.chart)
-    stations = seen.stations
-    field = deviation_field.of_pairs(pairs, whole, stations, fitted, params.edge_mm)
-    alarms = params.false_alarms / (1e6 * params.per_m2)
-    shaped = component_shapes.fit_all(field, whole, fitted)
-    apart = component_shapes.shaped_ones(shaped)
-    if fitted.fitted and apart:
-        again = alignment.align(pairs, whole, stations, placed.error_mm, apart)
-        # Components that are few, or all to one side, may tell less than many of which some moved.
-        if again.fitted and _typical_sd(again, whole) < _typical_sd(fitted, whole):
-            fitted = again
-            field = deviation_field.of_pairs(pairs, whole, stations, fitted, params.edge_mm)
-            shaped = component_shapes.fit_all(field, whole, fitted)
-    kept = {one.component: [s for s in one.fitted.shapes if s.kind != "bump"] for one in shaped}
-    left = field.less(component_shapes.values(whole, shaped, kept))
-    levels = scan_statistic.levels_of(left, whole, alarms, params.systematic_mm)
-    judged = component_shapes.significant(shaped, whole, field, fitted, levels, alarms)
-    kept = {number: [one.shape for one in own] for number, own in judged.items()}
-    shape_values = component_shapes.values(whole, shaped, kept)
-    left = field.less(shape_values).without(component_shapes.jumps(whole, shaped, kept))
-    finding = scan_statistic.search(left, whole, levels)
-    hoped = missing_material.expected(scene, T, pairs, whole, stations)
-    places = regions.united(
-        regions.missing(field, hoped, whole, alarms) + regions.of_finding(finding, whole), whole, max(3.0 * cell, 25.0)
-    )
-    found = to_result.Found(whole, field, left, fitted, levels, shaped, judged, places, hoped, shape_values,
-                         measures.near_of(seen, whole, fitted))  # fmt: skip
-    result = to_result.result_of(found, params, scene.name)
-    moved = rigid.transform(np.eye(3), origin) @ alignment.moved(T, fitted)
-    said = f"{placed.said}; {result.message}" if placed.said else result.message
+    vertices, origin = merging.local_design(design)
+    scene = merging.stitched(scene, earlier.get("stitch"))
+    pose = design_pose.pose(scene, earlier, params)
+    if pose.T_design_project is None:
+        return Result(status=Status.FAILED, method=params.method, reasons=pose.reasons)
+    T = rigid.transform(np.eye(3), -origin) @ pose.T_design_project
+    registered = _registered(scene, vertices, design.faces, T, pose.error_mm, params)
+    if registered is None:
+        return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.no-point"),))
+    search = _search(scene, registered, pose.error_mm, params)
+    result = to_result.result_of(search, params, origin)
+    T = alignment.corrected_pose(registered.T_design_project, search.alignment)
     return dataclasses.replace(
         result,
-        status=placed.status if result.status == "ok" else result.status,
-        T_design_project=moved,
-        centres=result.centres + origin,
-        surface_at=result.surface_at + origin,
-        points=offered,
-        used=near,
-        message=said,
+        status=pose.status if result.status is Status.OK else result.status,
+        reasons=(*pose.reasons, *result.reasons),
+        T_design_project=rigid.transform(np.eye(3), origin) @ T,
+        points=registered.observed.points,
+        points_used=len(registered.observed.chart),
     )
 
 
-def _coarse(vertices: Floats, faces: Any) -> float:
-    """Return a first size of cells that makes no more of them than memory likes."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    area = 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
-    return max(FIRST_CELL_MM, float(np.sqrt(area / (0.25 * MOST_CELLS))))
+def _registered(
+    scene: Scene, vertices: Floats, faces: Ints, T: Floats, error_mm: float, params: Params
+) -> Registered | None:
+    """Assign points to cells and align them, again after a large movement; None without points near the design."""
+    base = surface_charts.of_mesh(vertices, faces, _coarse_cell(vertices, faces))
+    for _ in range(ROUNDS):
+        observed = observations.observe(scene, T, base, params.reach_mm)
+        if not len(observed.chart):
+            return None
+        cell = params.cell_mm or observations.fitting_cell(observed, base, CELL_POINTS, CELL_BOUNDS_MM)
+        cell = max(cell, float(np.sqrt(base.area_mm2 / MOST_CELLS)))
+        surface = surface_charts.gridded(base, cell)
+        pairs = observations.paired(observed, surface)
+        if not params.align:
+            aligned = alignment.none(surface, len(observed.stations.names), error_mm)
+            break
+        aligned = alignment.align(pairs, surface, observed.stations, error_mm)
+        if _largest_movement(aligned, surface) < AGAIN_MM:
+            break
+        T = alignment.corrected_pose(T, aligned)
+    return Registered(T_design_project=T, observed=observed, surface=surface, pairs=pairs, alignment=aligned)
 
 
-def _typical_sd(fitted: alignment.Alignment, whole: surface_charts.DesignSurface) -> float:
-    """Return the median over the surface of what the fit of the whole leaves uncertain, mm."""
-    rows = slice(None, None, max(1, len(whole.centres) // 20_000))
-    return float(np.median(fitted.sd(whole.centres[rows], whole.outward[rows])))
+def _search(scene: Scene, registered: Registered, error_mm: float, params: Params) -> to_result.Search:
+    """Search for shapes of components, places that deviate and places that are missing."""
+    surface, observed, pairs = registered.surface, registered.observed, registered.pairs
+    alarms_per_mm2 = params.false_alarms / (1e6 * params.per_m2)
+    aligned, field, shapes = _fitted_shapes(registered, error_mm, params)
+    candidates = {fit.component: [s for s in fit.fitted.shapes if s.kind != "bump"] for fit in shapes}
+    residuals = field.less(component_shapes.values(surface, shapes, candidates))
+    levels = scan_statistic.levels_of(residuals, surface, alarms_per_mm2, params.systematic_mm)
+    significant = component_shapes.significant(shapes, surface, field, aligned, levels, alarms_per_mm2)
+    chosen = {number: [judged.shape for judged in of_one] for number, of_one in significant.items()}
+    shape_values = component_shapes.values(surface, shapes, chosen)
+    residuals = field.less(shape_values).without(component_shapes.jumps(surface, shapes, chosen))
+    finding = scan_statistic.search(residuals, surface, levels)
+    expected = missing_material.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
+    missing = regions.missing(field, expected, surface, alarms_per_mm2)
+    deviating = regions.of_finding(finding, surface)
+    near_mm = max(UNITE_CELLS * surface.charts.cell_mm, UNITE_MM)
+    return to_result.Search(
+        surface=surface,
+        field=field,
+        residuals=residuals,
+        alignment=aligned,
+        levels=levels,
+        shapes=shapes,
+        significant=significant,
+        places=regions.united(missing + deviating, surface, near_mm),
+        expected=expected,
+        shape_values=shape_values,
+        points=measures.points_by_cell(observed, surface, aligned),
+    )
 
 
-def _largest(fitted: alignment.Alignment, whole: surface_charts.DesignSurface) -> float:
-    """Return how far the whole was moved at most, mm, along the normals of cells."""
-    rows = slice(None, None, max(1, len(whole.centres) // 20_000))
-    points, outward = whole.centres[rows], whole.outward[rows]
-    J = np.hstack([np.cross(points - fitted.centre, outward), outward])
-    return float(np.abs(J @ fitted.whole).max())
+def _fitted_shapes(
+    registered: Registered, error_mm: float, params: Params
+) -> tuple[Alignment, Field, list[ComponentShape]]:
+    """Fit shapes of components; align the whole again without the components that have one, if that is more precise."""
+    surface, pairs, stations = registered.surface, registered.pairs, registered.observed.stations
+
+    def fitted(aligned: Alignment) -> tuple[Alignment, Field, list[ComponentShape]]:
+        field = deviation_field.of_pairs(pairs, surface, stations, aligned, params.edge_mm)
+        return aligned, field, component_shapes.fit_all(field, surface)
+
+    first = fitted(registered.alignment)
+    deformed = component_shapes.deformed(first[2])
+    if not (first[0].fitted and deformed):
+        return first
+    again = alignment.align(pairs, surface, stations, error_mm, deformed)
+    # The components left may be few, or all on one side: then the whole is known better by all.
+    better = again.fitted and _median_sd(again, surface) < _median_sd(first[0], surface)
+    return fitted(again) if better else first
+
+
+def _coarse_cell(vertices: Floats, faces: Ints) -> float:
+    """Return a first size of cells that keeps their number within MOST_CELLS."""
+    return max(FIRST_CELL_MM, float(np.sqrt(mesh_distance.area(vertices, faces) / (0.25 * MOST_CELLS))))
+
+
+def _median_sd(aligned: Alignment, surface: DesignSurface) -> float:
+    """Return the median over the surface of the standard deviation that the fit of the whole leaves, mm."""
+    rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
+    return float(np.median(aligned.sd(surface.centres[rows], surface.outward[rows])))
+
+
+def _largest_movement(aligned: Alignment, surface: DesignSurface) -> float:
+    """Return the largest movement of the whole along the normals of cells, mm."""
+    rows = slice(None, None, max(1, len(surface.centres) // SD_SAMPLES))
+    points, outward = surface.centres[rows], surface.outward[rows]
+    J = np.hstack([np.cross(points - aligned.centre, outward), outward])
+    return float(np.abs(J @ aligned.whole).max())

@@ -9,19 +9,21 @@ import numpy as np
 from scipy import ndimage
 
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to
-from processor.defects.observations import FEW, Pairs, Stations
+from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Floats, Ints
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
-FEWEST_FREE = 20.0  # degrees of freedom below which the noise of all is used
+FEWEST_FREE = 20.0  # degrees of freedom below which the noise of all points is used
+WHOLE_SHARE = 0.99  # of a cell that its face covers, from which the cell is whole
 
 
 @dataclass(frozen=True)
 class Field:
-    """Of each cell (cells,): deviation (mm, outward), its variance from noise, points, points that do not fit.
+    """Deviation (mm, outward positive) of each cell (cells,), its variance from noise, and numbers of points.
 
-    ``inner`` are the cells away from their face's border, ``seen`` those of them with enough points to count.
+    ``stray`` counts points that do not agree with the others of the cell. ``inner`` are cells away from their face's
+    border, ``seen`` those of them with enough points.
     """
 
     deviation: Floats
@@ -32,68 +34,73 @@ class Field:
     inner: Floats  # 0 or 1
     seen: Floats  # 0 or 1
 
-    def less(self, fitted: Floats) -> Field:
-        """Return the field with a shape (cells,) taken off."""
-        return dataclasses.replace(self, deviation=self.deviation - fitted)
+    def less(self, shape: Floats) -> Field:
+        """Return the field less a shape (cells,)."""
+        return dataclasses.replace(self, deviation=self.deviation - shape)
 
-    def without(self, rows: Ints) -> Field:
-        """Return the field with some cells not counted."""
+    def without(self, cells: Ints) -> Field:
+        """Return the field with some cells not seen."""
         seen = self.seen.copy()
-        seen[rows] = 0.0
+        seen[cells] = 0.0
         return dataclasses.replace(self, seen=seen)
 
 
 def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, edge_mm: float) -> Field:
-    """Put together what the stations say of each cell, after what they are off was taken off."""
+    """Combine the observations of all stations by cell, corrected by the alignment."""
     cells = len(surface.share)
     points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
-    off = alignment.corrections(points, outward, rays_to(points, stations.positions[pairs.station]), pairs.station)
+    rays = rays_to(points, stations.positions[pairs.station])
+    correction = alignment.corrections(points, outward, rays, pairs.station)
     count = np.bincount(pairs.cell, pairs.count, cells)
-    some = np.maximum(count, 1.0)
-    mean = np.bincount(pairs.cell, pairs.count * (pairs.mean - off), cells) / some
-    free = np.bincount(pairs.cell, np.maximum(pairs.count - 1, 0), cells)
-    square = np.bincount(pairs.cell, pairs.square, cells)
-    sums: tuple[Floats, Floats] = (square.astype(np.float64), free.astype(np.float64))
+    divisor = np.maximum(count, 1.0)
+    mean = np.bincount(pairs.cell, pairs.count * (pairs.mean - correction), cells) / divisor
+    freedom = np.bincount(pairs.cell, np.maximum(pairs.count - 1, 0), cells).astype(np.float64)
+    square = np.bincount(pairs.cell, pairs.square, cells).astype(np.float64)
     charts = surface.charts
     noise = np.zeros(cells)
-    overall = float(square.sum() / max(free.sum(), 1.0))
+    overall = float(square.sum() / max(freedom.sum(), 1.0))
     inner = np.zeros(cells)
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
-        pooled = [_box(charts.image(x, chart), charts, chart) for x in sums]
-        known = pooled[1] * POOLED_CELLS**2 > FEWEST_FREE
-        noise[rows] = np.where(known, pooled[0] / np.maximum(pooled[1], 1e-9), overall).ravel()
+        pooled_square, pooled_freedom = (_pooled(charts.image(x, chart), charts, chart) for x in (square, freedom))
+        known = pooled_freedom * POOLED_CELLS**2 > FEWEST_FREE
+        noise[rows] = np.where(known, pooled_square / np.maximum(pooled_freedom, 1e-9), overall).ravel()
         inner[rows] = _inner(charts.image(surface.share, chart), charts, chart, edge_mm).ravel()
     noise = np.sqrt(np.maximum(noise, 1e-6))
     stray = np.bincount(pairs.cell, pairs.stray, cells)
-    return Field(mean, noise**2 / some, count.astype(np.int64), stray.astype(np.int64), noise, inner,
-                 inner * (count + stray >= FEW))  # fmt: skip
-
-
-def _mode(charts: Charts, chart: int) -> tuple[str, str]:
-    return ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
-
-
-def _box(image: Floats, charts: Charts, chart: int) -> Floats:
-    found: Floats = ndimage.uniform_filter(image, POOLED_CELLS, mode=_mode(charts, chart))
-    return np.maximum(found, 0.0)
-
-
-def _inner(share: Floats, charts: Charts, chart: int, edge_mm: float) -> Floats:
-    """Mark cells that lie wholly on their face and ``edge_mm`` or more from its border."""
-    whole = np.pad(share > 0.99, 1)
-    if charts.kind[chart] == CYLINDER:  # no border at the seam
-        whole[:, 0], whole[:, -1] = whole[:, -2], whole[:, 1]
-        whole = np.concatenate([whole, whole, whole], axis=1)
-    away = ndimage.distance_transform_edt(whole, sampling=charts.cell_mm) - 0.5 * charts.cell_mm
-    if charts.kind[chart] == CYLINDER:
-        wide = share.shape[1] + 2
-        away = away[:, wide : 2 * wide]
-    found: Floats = (away[1:-1, 1:-1] >= edge_mm).astype(float)
-    return found
+    return Field(
+        deviation=mean,
+        variance=noise**2 / divisor,
+        count=count.astype(np.int64),
+        stray=stray.astype(np.int64),
+        noise=noise,
+        inner=inner,
+        seen=inner * (count + stray >= FEWEST_POINTS),
+    )
 
 
 def component_of_cells(surface: DesignSurface) -> Ints:
     """Return the component (cells,) of each cell."""
-    found: Ints = surface.charts.component[chart_of_cells(surface)]
-    return found
+    component: Ints = surface.charts.component[chart_of_cells(surface)]
+    return component
+
+
+def _pooled(image: Floats, charts: Charts, chart: int) -> Floats:
+    """Return the means of an image over squares of POOLED_CELLS."""
+    mode = ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
+    mean: Floats = ndimage.uniform_filter(image, POOLED_CELLS, mode=mode)
+    return np.maximum(mean, 0.0)
+
+
+def _inner(share: Floats, charts: Charts, chart: int, edge_mm: float) -> Floats:
+    """Mark cells that lie wholly on their face and ``edge_mm`` or more from its border."""
+    whole = np.pad(share > WHOLE_SHARE, 1)
+    if charts.kind[chart] == CYLINDER:  # no border at the seam
+        whole[:, 0], whole[:, -1] = whole[:, -2], whole[:, 1]
+        whole = np.concatenate([whole, whole, whole], axis=1)
+    distance = ndimage.distance_transform_edt(whole, sampling=charts.cell_mm) - 0.5 * charts.cell_mm
+    if charts.kind[chart] == CYLINDER:
+        wide = share.shape[1] + 2
+        distance = distance[:, wide : 2 * wide]
+    inner: Floats = (distance[1:-1, 1:-1] >= edge_mm).astype(float)
+    return inner

@@ -1,4 +1,4 @@
-"""How large and how deep a region is."""
+"""Size, depth, volume and curvature of a region."""
 
 from __future__ import annotations
 
@@ -13,20 +13,29 @@ from scipy.spatial import cKDTree
 from processor.defects.alignment import Alignment, rays_to
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
-from processor.defects.regions import Region, flat
+from processor.defects.regions import Region, unrolled
 from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.model import NORMAL_95, Floats, Ints
 
+SMOOTH_SHARE = 0.35  # of a region's radius, over which deviations are averaged to find the deepest place
 FIT_SHARE = 0.45  # of a region's radius, within which a paraboloid is fitted for its depth
 CURVE_SHARE = 0.65  # of a region's radius, for its curvature
 FEWEST_CELLS = 9
 BORDER_CELLS = 1.6
 VOLUME_BORDER = 0.25  # of a region's radius, that belongs to its volume
+DEEPEST_MM = 500.0  # of the design behind a place
+
+MARGIN_CELLS = 2  # about a region, of which points are used for a small bump
+FEWEST_POINTS = 12
+ROBUST_SDS = 2.0  # of a point, from which on its weight decreases
 
 
 @dataclass(frozen=True)
 class Measures:
-    """Of a region: see :class:`processor.defects.result.Result`; ``borders`` are the sides of its face it reaches."""
+    """Measures of a region, mm; see :class:`processor.defects.result.Defects`.
+
+    ``borders`` is the number of sides of its face that the region reaches.
+    """
 
     centre: Floats
     axes: Floats
@@ -44,68 +53,107 @@ class Measures:
     borders: int
 
 
+@dataclass(frozen=True)
+class Depth:
+    """Depth at the deepest place (inward positive, mm), its sd, the larger curvature (1/m), the sd of a mean there."""
+
+    depth: float
+    sd: float
+    curvature: float
+    mean_sd: float
+
+
+@dataclass(frozen=True)
+class CellPoints:
+    """The points of a scene sorted by cell: ``order`` (n,) are their rows, ``cell`` (n,) their cells."""
+
+    observed: Observed
+    surface: DesignSurface
+    alignment: Alignment
+    order: Ints
+    cell: Ints
+
+    def about(self, region: Region, shape_values: Floats) -> tuple[Floats, Floats]:
+        """Return places u, v (n, 2) about a region and deviations (n,), corrected and less shapes (cells,), mm."""
+        charts, chart = self.surface.charts, region.chart
+        wide = charts.shape[chart, 1]
+        i, j = np.divmod(region.cells - charts.first[chart], wide)
+        rows = np.arange(max(0, i.min() - MARGIN_CELLS), min(charts.shape[chart, 0], i.max() + MARGIN_CELLS + 1))
+        start = charts.first[chart] + rows * wide + max(0, j.min() - MARGIN_CELLS)
+        stop = charts.first[chart] + rows * wide + min(wide, j.max() + MARGIN_CELLS + 1)
+        first, last = np.searchsorted(self.cell, start), np.searchsorted(self.cell, stop)
+        index = np.concatenate([[], *(np.arange(a, b) for a, b in zip(first, last, strict=True))]).astype(np.int64)
+        points, cell = self.order[index], self.cell[index]
+        centres, outward = self.surface.centres[cell], self.surface.outward[cell]
+        station = self.observed.station[points]
+        rays = rays_to(centres, self.observed.stations.positions[station])
+        correction = self.alignment.corrections(centres, outward, rays, station)
+        return self.observed.uv[points], self.observed.deviation[points] - correction - shape_values[cell]
+
+
+def points_by_cell(observed: Observed, surface: DesignSurface, alignment: Alignment) -> CellPoints:
+    """Sort the points of a scene by their cells."""
+    cell = cells_of(observed, surface)
+    order = np.argsort(cell, kind="stable")
+    return CellPoints(observed, surface, alignment, order, cell[order])
+
+
 def measure(
     region: Region, field: Field, surface: DesignSurface, alignment: Alignment, inflation: float, thickness: float
 ) -> Measures:
-    """Measure a region on its face; what is missing is as deep as the plate is thick (mm)."""
-    charts, cell = surface.charts, surface.charts.cell_mm
-    uv = flat(surface, region)
-    rows = region.cells
+    """Measure a region on its face; the depth of a missing region is the ``thickness`` of the plate in mm."""
+    cell = surface.charts.cell_mm
+    uv, rows = unrolled(surface, region), region.cells
     area = surface.share[rows] * cell**2
+    total = float(area.sum())
     deviation, variance = field.deviation[rows], field.variance[rows]
     weight = area if region.sign == 0 else area * np.abs(deviation)
     middle = (uv * weight[:, None]).sum(axis=0) / max(weight.sum(), 1e-12)
     _, turn = np.linalg.eigh((uv - middle).T @ ((uv - middle) * area[:, None]) + 1e-9 * np.diag([1.0, 0.0]))
-    along = (uv - middle) @ turn[:, ::-1]
-    extent = np.ptp(along, axis=0) + cell
-    # Width by area: a slim region that is not quite straight is not as wide as its box.
-    extent[1] = min(extent[1], 4.0 / np.pi * area.sum() / extent[0] if len(rows) > FEWEST_CELLS else extent[1])
-    nearest = int(rows[np.argmin(np.linalg.norm(uv - middle, axis=1))])
-    axes = np.zeros((3, 3))
-    out = surface.outward[nearest]
-    frame = charts.axes[region.chart]
-    side = np.cross(out, frame[0])
-    axes[0] = turn[0, 1] * frame[0] + turn[1, 1] * side
-    axes[1], axes[2] = np.cross(out, axes[0]), out
-    registration = float(alignment.sd(surface.centres[nearest][None], out[None])[0])
-    lod = NORMAL_95 * float(np.hypot(inflation / np.sqrt(np.sum(1.0 / np.maximum(variance, 1e-12))), registration))
-    volume, volume_sd = _volume(region, field, surface)
-    volume_sd *= inflation
-    centre = surface.centres[nearest] + (middle - uv[np.argmin(np.linalg.norm(uv - middle, axis=1))]) @ np.stack(
-        [frame[0], side]
-    )
+    extent = np.ptp((uv - middle) @ turn[:, ::-1], axis=0) + cell
+    # Width by area: a slim region that is not quite straight is narrower than its bounding box.
+    extent[1] = min(extent[1], 4.0 / np.pi * total / extent[0] if len(rows) > FEWEST_CELLS else extent[1])
+    closest = int(np.argmin(np.linalg.norm(uv - middle, axis=1)))
+    place, outward = surface.centres[rows[closest]], surface.outward[rows[closest]]
+    along = surface.charts.axes[region.chart, 0]
+    across = np.cross(outward, along)
+    longest = turn[0, 1] * along + turn[1, 1] * across
+    registration = float(alignment.sd(place[None], outward[None])[0])
     edge, borders = _borders(region, surface, middle)
-    diameter = float(2.0 * np.sqrt(area.sum() / np.pi))
+    volume, volume_sd = _volume(region, field, surface)
     if region.sign == 0:
-        lost = float(area.sum())
-        ring = cell * np.sqrt(np.pi * lost)  # of cells that are missing in part
-        return Measures(centre, axes, extent, lost, thickness, 0.0, thickness, lost * thickness,
-                        NORMAL_95 * ring * thickness, edge, float("nan"), lod, diameter, borders)  # fmt: skip
-    depth, depth_sd, curvature, mean_sd = _deepest(region, field, surface, inflation)
-    lod = NORMAL_95 * float(np.hypot(mean_sd, registration))
+        # Missing: the uncertainty of the volume is that of the border's cells, which are missing in part.
+        mean_sd = inflation / np.sqrt(np.sum(1.0 / np.maximum(variance, 1e-12)))
+        border = cell * np.sqrt(np.pi * total)
+        depth = Depth(depth=thickness, sd=0.0, curvature=float("nan"), mean_sd=mean_sd)
+        depth_ci95, mean, volume, volume_ci95 = 0.0, thickness, total * thickness, NORMAL_95 * border * thickness
+    else:
+        depth = _deepest(region, field, surface, inflation)
+        depth_ci95 = NORMAL_95 * float(np.hypot(depth.sd, registration))
+        mean = -float((deviation * area).sum() / total)
+        volume_ci95 = NORMAL_95 * float(np.hypot(volume_sd * inflation, registration * total))
     return Measures(
-        centre, axes, extent, float(area.sum()), depth, NORMAL_95 * float(np.hypot(depth_sd, registration)),
-        -float((deviation * area).sum() / area.sum()), volume,
-        NORMAL_95 * float(np.hypot(volume_sd, registration * area.sum())), edge, curvature, lod, diameter, borders,
-    )  # fmt: skip
-
-
-def _curvature(at: Floats, value: Floats, w: Floats, inside: list[int], middle: Floats) -> float:
-    """Return the larger curvature (1/m) of a paraboloid fitted to places (n, 2) ``inside``."""
-    if len(inside) < 2 * FEWEST_CELLS:
-        return float("nan")
-    x, y = (at[inside] - middle).T
-    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
-    root = np.sqrt(w[inside])
-    c = np.linalg.lstsq(root[:, None] * columns, root * value[inside], rcond=None)[0]
-    H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
-    return float(np.abs(np.linalg.eigvalsh(H)).max()) * 1000.0
+        centre=place + (middle - uv[closest]) @ np.stack([along, across]),
+        axes=np.stack([longest, np.cross(outward, longest), outward]),
+        extent=extent,
+        area=total,
+        depth=depth.depth,
+        depth_ci95=depth_ci95,
+        mean=mean,
+        volume=volume,
+        volume_ci95=volume_ci95,
+        edge=edge,
+        curvature=depth.curvature,
+        lod95=NORMAL_95 * float(np.hypot(depth.mean_sd, registration)),
+        diameter=float(2.0 * np.sqrt(total / np.pi)),
+        borders=borders,
+    )
 
 
 def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float]:
-    """Volume inward and its standard deviation from noise, with a border about the region.
+    """Return the volume inward and its standard deviation from noise, with a border about the region.
 
-    What is too shallow there to be told from noise cell by cell still adds up.
+    Cells of the border are too shallow to be significant one by one, but add up.
     """
     charts, chart = surface.charts, region.chart
     mask = np.zeros(int(charts.shape[chart].prod()), bool)
@@ -118,162 +166,142 @@ def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float
     return -float(field.deviation[rows] @ area), float(np.sqrt((field.variance[rows] * area**2).sum()))
 
 
-def _deepest(
-    region: Region, field: Field, surface: DesignSurface, inflation: float
-) -> tuple[float, float, float, float]:
-    """Depth at the deepest place, inward positive, its sd, the larger curvature (1/m), and the sd of a mean there.
-
-    The vertex of a paraboloid fitted about it, with a term of the fourth order where there are cells enough.
-    """
-    uv, cell = flat(surface, region), surface.charts.cell_mm
-    d, variance = field.deviation[region.cells], field.variance[region.cells]
+def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: float) -> Depth:
+    """Return the depth at the deepest place: the vertex of a paraboloid fitted about it, or else the mean there."""
+    uv, cell = unrolled(surface, region), surface.charts.cell_mm
+    deviation, variance = field.deviation[region.cells], field.variance[region.cells]
     seen = field.seen[region.cells] > 0
     if seen.sum() < FEWEST_CELLS:
-        use = seen if seen.any() else np.ones(len(d), bool)
-        k = int(np.argmax(np.where(use, region.sign * d / np.sqrt(variance), -np.inf)))
-        alone = float(np.sqrt(variance[k])) * inflation
-        return -float(d[k]), alone, float("nan"), alone
-    radius = max(np.sqrt(len(d) / np.pi), 1.0) * cell
-    near = max(0.35 * radius, 1.01 * cell)
+        used = seen if seen.any() else np.ones(len(deviation), bool)
+        k = int(np.argmax(np.where(used, region.sign * deviation / np.sqrt(variance), -np.inf)))
+        sd = float(np.sqrt(variance[k])) * inflation
+        return Depth(depth=-float(deviation[k]), sd=sd, curvature=float("nan"), mean_sd=sd)
+    radius = max(np.sqrt(len(deviation) / np.pi), 1.0) * cell
     tree = cKDTree(uv[seen])
-    value, w, at = d[seen], 1.0 / variance[seen], uv[seen]
-    near_by = tree.query_ball_point(at, near)
-    smooth = np.array([np.sum(w[i] * value[i]) / np.sum(w[i]) for i in near_by])
+    value, weight, at = deviation[seen], 1.0 / variance[seen], uv[seen]
+    near = tree.query_ball_point(at, max(SMOOTH_SHARE * radius, 1.01 * cell))
+    smooth = np.array([np.sum(weight[i] * value[i]) / np.sum(weight[i]) for i in near])
     k = int(np.argmax(region.sign * smooth))
-    plain, plain_sd = float(smooth[k]), float(1.0 / np.sqrt(w[near_by[k]].sum())) * inflation
+    mean, mean_sd = float(smooth[k]), float(1.0 / np.sqrt(weight[near[k]].sum())) * inflation
     inside = tree.query_ball_point(at[k], max(FIT_SHARE * radius, 1.9 * cell))
     if len(inside) < FEWEST_CELLS:
         inside = tree.query(at[k], k=FEWEST_CELLS)[1].tolist()
-    x, y = (at[inside] - at[k]).T / radius
+    top, sd = _vertex((at[inside] - at[k]) / radius, value[inside], weight[inside], region.sign)
+    sd *= inflation
+    curvature = _curvature(at, value, weight, tree.query_ball_point(at[k], CURVE_SHARE * radius), at[k])
+    if not abs(top - mean) < max(0.3 * abs(mean), 4.0 * sd) or sd > abs(mean):
+        top, sd = mean, mean_sd
+    return Depth(depth=-top, sd=sd, curvature=curvature, mean_sd=mean_sd)
+
+
+def _vertex(at: Floats, value: Floats, weight: Floats, sign: int) -> tuple[float, float]:
+    """Return the value at the vertex of a paraboloid fitted to places (n, 2), and its sd from noise; NaN without one.
+
+    With enough places a term of the fourth order is added.
+    """
+    x, y = at.T
     columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
-    if len(inside) >= 4 * FEWEST_CELLS:
+    if len(at) >= 4 * FEWEST_CELLS:
         columns = np.hstack([columns, ((x * x + y * y) ** 2)[:, None]])
-    A = columns.T @ (w[inside, None] * columns)
-    inverse = np.linalg.pinv(A)
-    c = inverse @ (columns.T @ (w[inside] * value[inside]))
+    inverse = np.linalg.pinv(columns.T @ (weight[:, None] * columns))
+    c = inverse @ (columns.T @ (weight * value))
     H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
-    bend = _curvature(at, value, w, tree.query_ball_point(at[k], CURVE_SHARE * radius), at[k])
-    if (region.sign * np.linalg.eigvalsh(H) >= 0.0).any():
-        return -plain, plain_sd, bend, plain_sd  # no vertex
-    move = -np.linalg.solve(H, c[1:3])
-    move *= min(1.0, 0.5 * FIT_SHARE / max(float(np.linalg.norm(move)), 1e-12))
-    row = np.array([1.0, *move, move[0] ** 2, move[0] * move[1], move[1] ** 2, (move @ move) ** 2])[: len(c)]
-    top, sd = float(row @ c), float(np.sqrt(row @ inverse @ row)) * inflation
-    if not abs(top - plain) < max(0.3 * abs(plain), 4.0 * sd) or sd > abs(plain):
-        return -plain, plain_sd, bend, plain_sd
-    return -top, sd, bend, plain_sd
+    if (sign * np.linalg.eigvalsh(H) >= 0.0).any():
+        return float("nan"), float("nan")
+    step = -np.linalg.solve(H, c[1:3])
+    step *= min(1.0, 0.5 * FIT_SHARE / max(float(np.linalg.norm(step)), 1e-12))
+    row = np.array([1.0, *step, step[0] ** 2, step[0] * step[1], step[1] ** 2, (step @ step) ** 2])[: len(c)]
+    return float(row @ c), float(np.sqrt(row @ inverse @ row))
+
+
+def _curvature(at: Floats, value: Floats, weight: Floats, inside: list[int], middle: Floats) -> float:
+    """Return the larger curvature (1/m) of a paraboloid fitted to places (n, 2) ``inside``."""
+    if len(inside) < 2 * FEWEST_CELLS:
+        return float("nan")
+    x, y = (at[inside] - middle).T
+    columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
+    root = np.sqrt(weight[inside])
+    c = np.linalg.lstsq(root[:, None] * columns, root * value[inside], rcond=None)[0]
+    H = np.array([[2.0 * c[3], c[4]], [c[4], 2.0 * c[5]]])
+    return float(np.abs(np.linalg.eigvalsh(H)).max()) * 1000.0
 
 
 def _borders(region: Region, surface: DesignSurface, middle: Floats) -> tuple[float, int]:
-    """Distance of a place from its face's border, and how many sides of the face the region reaches."""
+    """Return the distance of a place (2,) from its face's border, and the number of sides that the region reaches."""
     charts, chart = surface.charts, region.chart
     cell = charts.cell_mm
     covered = charts.image(surface.share, chart) > 0.5
-    round_ = charts.kind[chart] == CYLINDER
-    pad = ((1, 1), (0, 0)) if round_ else ((1, 1), (1, 1))
-    away = ndimage.distance_transform_edt(np.pad(covered, pad), sampling=cell)
+    is_cylinder = charts.kind[chart] == CYLINDER
+    pad = ((1, 1), (0, 0)) if is_cylinder else ((1, 1), (1, 1))
+    distance = ndimage.distance_transform_edt(np.pad(covered, pad), sampling=cell)
     at = np.clip(((middle - charts.low[chart]) / cell).astype(np.int64), 0, charts.shape[chart] - 1)
-    edge = float(away[at[0] + 1, at[1] + (0 if round_ else 1)])
-    rows = region.cells - charts.first[chart]
-    i, j = rows // charts.shape[chart, 1], rows % charts.shape[chart, 1]
+    edge = float(distance[at[0] + 1, at[1] + (0 if is_cylinder else 1)])
+    i, j = np.divmod(region.cells - charts.first[chart], charts.shape[chart, 1])
     ij = np.argwhere(covered)
     low, high = ij.min(axis=0), ij.max(axis=0)
-    reach = BORDER_CELLS
-    sides = [i.min() < low[0] + reach, i.max() > high[0] - reach]
-    if not round_:
-        sides += [j.min() < low[1] + reach, j.max() > high[1] - reach]
+    sides = [i.min() < low[0] + BORDER_CELLS, i.max() > high[0] - BORDER_CELLS]
+    if not is_cylinder:
+        sides += [j.min() < low[1] + BORDER_CELLS, j.max() > high[1] - BORDER_CELLS]
     return edge, int(sum(sides))
 
 
-def thickness_at(surface: DesignSurface, point: Floats, outward: Floats, component: int, most: float = 500.0) -> float:
-    """Return how thick the design is behind a place (3,), mm; NaN where nothing lies behind within ``most``."""
+def thickness_at(
+    surface: DesignSurface, point: Floats, outward: Floats, component: int, most: float = DEEPEST_MM
+) -> float:
+    """Return the thickness of the design behind a place (3,), mm; NaN if there is no face within ``most``.
+
+    Intersection of a ray with triangles after Moeller and Trumbore (1997).
+    """
     rows: Ints = np.flatnonzero(surface.component_of == component)
     corners = surface.vertices[surface.faces[rows]]
     a, e1, e2 = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    way = -outward
-    cross = np.cross(np.broadcast_to(way, e2.shape), e2)
-    turn = np.einsum("ni,ni->n", e1, cross)
+    ray = -outward
+    cross = np.cross(np.broadcast_to(ray, e2.shape), e2)
+    determinant = np.einsum("ni,ni->n", e1, cross)
     with np.errstate(divide="ignore", invalid="ignore"):
         arm = point - a
-        u = np.einsum("ni,ni->n", arm, cross) / turn
+        u = np.einsum("ni,ni->n", arm, cross) / determinant
         q = np.cross(arm, e1)
-        v = (q @ way) / turn
-        t = np.einsum("ni,ni->n", e2, q) / turn
-        hit = (np.abs(turn) > 1e-9) & (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1.0 + 1e-6) & (t > 0.5) & (t < most)
+        v = (q @ ray) / determinant
+        t = np.einsum("ni,ni->n", e2, q) / determinant
+        inside = (u >= -1e-6) & (v >= -1e-6) & (u + v <= 1.0 + 1e-6)
+        hit = (np.abs(determinant) > 1e-9) & inside & (t > 0.5) & (t < most)
     return float(t[hit].min()) if hit.any() else float("nan")
 
 
-# --- Small dents and pits: a bump fitted to the points themselves, for cells are too coarse to tell their depth.
+def refined(measured: Measures, region: Region, points: CellPoints, field: Field, shape_values: Floats) -> Measures:
+    """Return measures with the depth of a bump d (1 - r^2 / R^2)^2 fitted to the points; unchanged without a fit.
 
-
-MARGIN_CELLS = 2
-FEWEST_POINTS = 12
-ROBUST = 2.0  # standard deviations of a point, from which on it counts less
-
-
-@dataclass(frozen=True)
-class Near:
-    """The points of a scene in the order of their cells, to be had by place."""
-
-    seen: Observed
-    surface: DesignSurface
-    alignment: Alignment
-    order: Ints
-    cell: Ints  # (n,) sorted
-
-    def of(self, region: Region, shape_values: Floats) -> tuple[Floats, Floats]:
-        """Places u, v (n, 2) about a region and deviations (n,), less what stations are off and shapes, mm."""
-        charts, chart = self.surface.charts, region.chart
-        wide = charts.shape[chart, 1]
-        at = region.cells - charts.first[chart]
-        i, j = at // wide, at % wide
-        rows = np.arange(max(0, i.min() - MARGIN_CELLS), min(charts.shape[chart, 0], i.max() + MARGIN_CELLS + 1))
-        start = charts.first[chart] + rows * wide + max(0, j.min() - MARGIN_CELLS)
-        stop = charts.first[chart] + rows * wide + min(wide, j.max() + MARGIN_CELLS + 1)
-        first, last = np.searchsorted(self.cell, start), np.searchsorted(self.cell, stop)
-        own = np.concatenate([[], *(np.arange(a, b) for a, b in zip(first, last, strict=True))]).astype(np.int64)
-        points, cell = self.order[own], self.cell[own]
-        centres, outward = self.surface.centres[cell], self.surface.outward[cell]
-        station = self.seen.station[points]
-        rays = rays_to(centres, self.seen.stations.positions[station])
-        off = self.alignment.corrections(centres, outward, rays, station)
-        return self.seen.uv[points], self.seen.deviation[points] - off - shape_values[cell]
-
-
-def near_of(seen: Observed, surface: DesignSurface, alignment: Alignment) -> Near:
-    """Sort the points of a scene by their cells."""
-    cell = cells_of(seen, surface)
-    order = np.argsort(cell, kind="stable")
-    return Near(seen, surface, alignment, order, cell[order])
-
-
-def refined(got: Measures, region: Region, near: Near, field: Field, shape_values: Floats) -> Measures:
-    """Return measures with the depth of a bump d (1 - r^2 / R^2)^2 fitted to points; as they were where none fits."""
-    uv, deviation = near.of(region, shape_values)
-    middle = flat(near.surface, region).mean(axis=0)
-    radius = max(0.5 * got.diameter, near.surface.charts.cell_mm)
+    For small dents and pits: cells average their depth.
+    """
+    uv, deviation = points.about(region, shape_values)
+    middle = unrolled(points.surface, region).mean(axis=0)
+    radius = max(0.5 * measured.diameter, points.surface.charts.cell_mm)
     noise = float(np.median(field.noise[region.cells]))
-    use = np.abs(deviation) < 3.0 * abs(got.depth) + 6.0 * noise
-    uv, deviation = (uv[use] - middle) / radius, deviation[use]
+    used = np.abs(deviation) < 3.0 * abs(measured.depth) + 6.0 * noise
+    uv, deviation = (uv[used] - middle) / radius, deviation[used]
     if len(deviation) < FEWEST_POINTS:
-        return got
+        return measured
 
     def bump(x: Floats) -> Floats:
-        away = ((uv[:, 0] - x[0]) ** 2 + (uv[:, 1] - x[1]) ** 2) / x[2] ** 2
-        found: Floats = -x[3] * np.maximum(1.0 - away, 0.0) ** 2
-        return found
+        square = ((uv[:, 0] - x[0]) ** 2 + (uv[:, 1] - x[1]) ** 2) / x[2] ** 2
+        height: Floats = -x[3] * np.maximum(1.0 - square, 0.0) ** 2
+        return height
 
-    low, high = [-1.5, -1.5, 0.3, -np.inf], [1.5, 1.5, 3.0, np.inf]
     fit = least_squares(
-        lambda x: (deviation - bump(x)) / noise, [0.0, 0.0, 1.3, got.depth], bounds=(low, high), loss="soft_l1",
-        f_scale=ROBUST,
-    )  # fmt: skip
+        lambda x: (deviation - bump(x)) / noise,
+        [0.0, 0.0, 1.3, measured.depth],
+        bounds=([-1.5, -1.5, 0.3, -np.inf], [1.5, 1.5, 3.0, np.inf]),
+        loss="soft_l1",
+        f_scale=ROBUST_SDS,
+    )
     try:
         sd = float(np.sqrt(np.linalg.inv(fit.jac.T @ fit.jac)[3, 3]))
     except np.linalg.LinAlgError:
-        return got
+        return measured
     depth = float(fit.x[3])
-    if not fit.success or depth * got.depth <= 0.0 or not sd < 0.5 * abs(depth) or abs(depth) > 4.0 * abs(got.depth):
-        return got
+    plausible = depth * measured.depth > 0.0 and abs(depth) <= 4.0 * abs(measured.depth)
+    if not (fit.success and plausible and sd < 0.5 * abs(depth)):
+        return measured
     curvature = 4.0 * abs(depth) / (fit.x[2] * radius) ** 2 * 1000.0
-    return dataclasses.replace(got, depth=depth, depth_ci95=NORMAL_95 * sd, curvature=curvature)
+    return dataclasses.replace(measured, depth=depth, depth_ci95=NORMAL_95 * sd, curvature=curvature)

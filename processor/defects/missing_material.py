@@ -1,14 +1,13 @@
-"""Places of the surface that a scanner should have seen and that are not there.
+"""Points that scanners should have on each cell of the design's surface.
 
-A cell is expected from a station that looks at it squarely enough, that saw other parts of the same face, and whose
-rays in this direction met nothing on their way. How many points to expect follows from the points by solid angle of
-that station. Where far fewer are there, the surface is missing. Where rays were stopped before, nothing is said.
+A station is expected to see a cell if the incidence is not too oblique, if it saw other parts of the same face, and if
+its rays in this direction met nothing before the cell. The number of points follows from the station's density of
+points by solid angle. Cells behind an obstacle are not expected.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -20,28 +19,22 @@ from processor.defects.surface_charts import DesignSurface
 from processor.geometry import rigid
 from processor.model import Floats, Ints, Scene
 
-SQUARE_COS = 0.34
-NEARER_MM = 100.0  # than the surface: something in the way
+LEAST_COS = 0.34  # of incidence
+NEARER_MM = 100.0  # than the surface: an obstacle
 LEAST_BIN_RAD = 0.003
-BIN_STEPS = 5.0  # of a scanner in a bin of directions
-SAME_FACE = 0.2  # share of a face's cells seen by a station, from which on the rest is expected
+BIN_STEPS = 5.0  # angular steps of a scanner in a bin of directions
+FACE_SHARE = 0.2  # of a face's cells seen by a station, from which on the rest is expected
+FEWEST_CELLS = 10  # with points, to estimate the density of points from
 FIELD_MARGIN_RAD = 0.02
-
-
-@dataclass(frozen=True)
-class Expected:
-    """Points (cells,) that should be there, and whether rays from any station went on behind the cell."""
-
-    points: Floats
-    passed: Floats
+GAP_RAD = 0.5  # of azimuth without returns, that is still within the field of view
 
 
 def expected(
     scene: Scene, T_design_project: Floats, pairs: Pairs, surface: DesignSurface, stations: Stations
-) -> Expected:
-    """Return how many points all stations together should have on every cell."""
+) -> Floats:
+    """Return the number of points (cells,) that all stations together should have on each cell."""
     cells = len(surface.share)
-    found, passed = np.zeros(cells), np.zeros(cells)
+    points = np.zeros(cells)
     chart = chart_of_cells(surface)
     charts = len(surface.charts.kind)
     area = surface.share * surface.charts.cell_mm**2
@@ -50,89 +43,90 @@ def expected(
     for k, position in enumerate(stations.positions):
         if not np.isfinite(position).all() or not len(rows_of[k]):
             continue
-        own = pairs.cell[rows_of[k]]
-        count = (pairs.count + pairs.stray)[rows_of[k]]
-        usual = np.bincount(chart[own], minlength=charts) >= SAME_FACE * np.maximum(whole, 1)
-        cell = np.flatnonzero(usual[chart] & (surface.share > 0.05))
+        observed = pairs.cell[rows_of[k]]
+        faces = np.bincount(chart[observed], minlength=charts) >= FACE_SHARE * np.maximum(whole, 1)
+        cell = np.flatnonzero(faces[chart] & (surface.share > 0.05))
         arm = surface.centres[cell] - position
-        away = np.linalg.norm(arm, axis=1)
-        cosine = -np.einsum("ni,ni->n", arm, surface.outward[cell]) / away
-        keep = cosine > SQUARE_COS
-        cell, arm, away, cosine = cell[keep], arm[keep], away[keep], cosine[keep]
+        distance = np.linalg.norm(arm, axis=1)
+        cosine = -np.einsum("ni,ni->n", arm, surface.outward[cell]) / distance
+        steep = cosine > LEAST_COS
+        cell, arm, distance, cosine = cell[steep], arm[steep], distance[steep], cosine[steep]
         if not len(cell):
             continue
-        angle = area[cell] * cosine / away**2
-        got = np.zeros(cells)
-        got[own] = count
-        there = got[cell] > 0
-        if there.sum() < 10:
+        angle = area[cell] * cosine / distance**2
+        count = np.zeros(cells)
+        count[observed] = (pairs.count + pairs.stray)[rows_of[k]]
+        occupied = count[cell] > 0
+        if occupied.sum() < FEWEST_CELLS:
             continue
-        density = float(np.median(got[cell][there] / angle[there]))
-        bin_ = max(LEAST_BIN_RAD, BIN_STEPS / np.sqrt(density))
-        nearest, farthest, inside = _ranges(scene, T_design_project, k, stations, bin_, arm)
-        slack = NEARER_MM + 3.0 * bin_ * away * np.sqrt(1.0 - cosine**2) / cosine
-        clear = inside & ~(nearest < away - slack)
-        found[cell[clear]] += density * angle[clear]
-        passed[cell[clear & (farthest > away + slack)]] = 1.0
-    return Expected(found, passed)
+        density = float(np.median(count[cell][occupied] / angle[occupied]))
+        bin_rad = max(LEAST_BIN_RAD, BIN_STEPS / np.sqrt(density))
+        nearest, inside = _nearest_ranges(scene, T_design_project, k, stations, bin_rad, arm)
+        slack = NEARER_MM + 3.0 * bin_rad * distance * np.sqrt(1.0 - cosine**2) / cosine
+        clear = inside & ~(nearest < distance - slack)
+        points[cell[clear]] += density * angle[clear]
+    return points
 
 
 def _rows(pairs: Pairs, stations: int) -> list[Ints]:
+    """Return the rows of each station's pairs."""
     order = np.argsort(pairs.station, kind="stable")
     at = np.searchsorted(pairs.station[order], np.arange(stations + 1))
     return [order[at[k] : at[k + 1]] for k in range(stations)]
 
 
-def directions(arm: Floats) -> tuple[Floats, Floats]:
-    """Azimuth and elevation (n,), rad."""
+def _nearest_ranges(
+    scene: Scene, T_design_project: Floats, station: int, stations: Stations, bin_rad: float, arm: Floats
+) -> tuple[Floats, npt.NDArray[np.bool_]]:
+    """Return the shortest range about directions arm (n, 3), and whether they are within the station's field of view.
+
+    Bins of azimuth without any return are outside it, except for gaps as wide as structures have.
+    """
+    wide, high = int(np.ceil(2.0 * np.pi / bin_rad)), int(np.ceil(np.pi / bin_rad))
+    nearest = np.full(wide * high, np.inf)
+    lowest, highest = np.inf, -np.inf
+    columns = np.zeros(wide, bool)
+
+    def bins(arm: Floats) -> tuple[Ints, Ints, Floats]:
+        azimuth, elevation = _directions(arm)
+        i = np.minimum((azimuth + np.pi) / bin_rad, wide - 1).astype(np.int64)
+        j = np.minimum((elevation + 0.5 * np.pi) / bin_rad, high - 1).astype(np.int64)
+        return i, j, elevation
+
+    for points in _points_of(scene, T_design_project, station):
+        local = points - stations.positions[station]
+        i, j, elevation = bins(local)
+        np.minimum.at(nearest, i * high + j, np.linalg.norm(local, axis=1))
+        columns[i] = True
+        lowest, highest = min(lowest, float(elevation.min())), max(highest, float(elevation.max()))
+    nearest = ndimage.minimum_filter(nearest.reshape(wide, high), 3, mode=("wrap", "nearest"))
+    closing = np.ones(max(1, int(GAP_RAD / bin_rad)))
+    columns |= ndimage.binary_closing(np.tile(columns, 3), closing)[wide : 2 * wide]
+    i, j, elevation = bins(arm)
+    inside = columns[i] & (elevation > lowest - FIELD_MARGIN_RAD) & (elevation < highest + FIELD_MARGIN_RAD)
+    return nearest[i, j], inside
+
+
+def _directions(arm: Floats) -> tuple[Floats, Floats]:
+    """Return azimuth and elevation (n,), rad."""
     return np.arctan2(arm[:, 1], arm[:, 0]), np.arctan2(arm[:, 2], np.hypot(arm[:, 0], arm[:, 1]))
 
 
-def _ranges(
-    scene: Scene, T_design_project: Floats, station: int, stations: Stations, bin_: float, arm: Floats
-) -> tuple[Floats, Floats, npt.NDArray[np.bool_]]:
-    """Return the nearest and farthest range about the directions arm (n, 3), and whether a station looked there."""
-    wide, high = int(np.ceil(2.0 * np.pi / bin_)), int(np.ceil(np.pi / bin_))
-    near, far = np.full(wide * high, np.inf), np.full(wide * high, -np.inf)
-    low_high = [np.inf, -np.inf]
-    columns = np.zeros(wide, bool)
-    for points in points_of(scene, T_design_project, station):
-        local = points - stations.positions[station]
-        azimuth, elevation = directions(local)
-        away = np.linalg.norm(local, axis=1)
-        i = np.minimum((azimuth + np.pi) / bin_, wide - 1).astype(np.int64)
-        j = np.minimum((elevation + 0.5 * np.pi) / bin_, high - 1).astype(np.int64)
-        np.minimum.at(near, i * high + j, away)
-        np.maximum.at(far, i * high + j, away)
-        columns[i] = True
-        low_high = [min(low_high[0], float(elevation.min())), max(low_high[1], float(elevation.max()))]
-    near = ndimage.minimum_filter(near.reshape(wide, high), 3, mode=("wrap", "nearest"))
-    far = ndimage.maximum_filter(far.reshape(wide, high), 3, mode=("wrap", "nearest"))
-    azimuth, elevation = directions(arm)
-    i = np.minimum((azimuth + np.pi) / bin_, wide - 1).astype(np.int64)
-    j = np.minimum((elevation + 0.5 * np.pi) / bin_, high - 1).astype(np.int64)
-    # Columns without any return are where it did not look, but for gaps no wider than structures leave between them.
-    gap = int(0.5 / bin_)
-    looked = ndimage.binary_closing(np.tile(columns, 3), np.ones(max(1, gap)))[wide : 2 * wide] | columns
-    inside = looked[i] & (elevation > low_high[0] - FIELD_MARGIN_RAD) & (elevation < low_high[1] + FIELD_MARGIN_RAD)
-    return near[i, j], far[i, j], inside
-
-
-def points_of(scene: Scene, T_design_project: Floats, station: int) -> Iterator[Floats]:
-    """Give the points of a station, in the design's frame, some at a time."""
+def _points_of(scene: Scene, T_design_project: Floats, station: int) -> Iterator[Floats]:
+    """Yield the points of a station in chunks, in the design's frame."""
     first = 0
     for scan in scene.scans:
         T = T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4))
         T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
-        many = 1
+        count = 1
         if not scan.position.size and scene.stations is not None and len(scan.point_station):
-            many = len(scene.stations.ids) + 1
-        if first <= station < first + many:
+            count = len(scene.stations.ids) + 1
+        if first <= station < first + count:
             for start in range(0, len(scan.points), CHUNK):
                 rows = slice(start, start + CHUNK)
                 points = scan.points[rows]
-                if many > 1:
+                if count > 1:
                     points = points[scan.point_station[rows] == station - first]
                 if len(points):
                     yield rigid.apply(T, points)
-        first += many
+        first += count

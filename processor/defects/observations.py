@@ -1,4 +1,4 @@
-"""What the scans say of each cell of the design's surface, station by station."""
+"""Observations of the design's surface: points on faces, and their means by cell and station."""
 
 from __future__ import annotations
 
@@ -8,38 +8,41 @@ import numpy as np
 from numba import njit
 
 from processor.defects.surface_charts import DesignSurface, layout
-from processor.geometry import rigid, visible_facets
+from processor.geometry import mesh_distance, rigid
 from processor.model import Floats, InputError, Ints, Scene
 
 CHUNK = 500_000
-LEAST_COS = 0.2  # of incidence: what is seen more from its edge is mostly beams that hit two things
+LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beams that hit two surfaces
+GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond which a point is stray
+LEAST_GATE_MM = 1.0
+FEWEST_POINTS = 4  # of a cell, for its median to identify stray points
 
 
 @dataclass(frozen=True)
 class Stations:
-    """Where the points of a scene were seen from, in the design's frame; NaN = unknown."""
+    """Names and positions (k, 3) of the scanners of a scene, in the design's frame; NaN = unknown."""
 
     names: tuple[str, ...]
-    positions: Floats  # (k, 3)
+    positions: Floats
 
 
 @dataclass(frozen=True)
 class Observed:
-    """Points on the design's faces: the chart, place on it, station and deviation (mm, outward) of each."""
+    """Points on the design's faces: the chart, place on it, station and deviation (mm, outward positive) of each."""
 
     chart: Ints
     uv: Floats  # (n, 2)
     station: Ints
     deviation: Floats
     stations: Stations
-    offered: int  # points of the scene
+    points: int  # of the scene
 
 
 @dataclass(frozen=True)
 class Pairs:
-    """What a station says of a cell: mean deviation of ``count`` points, and their sum of squares about it.
+    """Deviations by cell and station: mean over ``count`` points, and their sum of squares about it.
 
-    Points that do not fit to the others of their cell are left out; ``stray`` counts those.
+    Points that do not agree with the others of their cell are left out and counted by ``stray``.
     """
 
     cell: Ints
@@ -51,91 +54,89 @@ class Pairs:
 
 
 def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reach_mm: float) -> Observed:
-    """Put all points of a scene onto the faces of the design that they belong to.
+    """Assign the points of a scene to faces of the design within ``reach_mm`` that their station can see.
 
-    Raises InputError for a scene without scans.
+    Raises InputError for a scene without points.
     """
-    if not scene.scans or not any(len(scan.points) for scan in scene.scans):
+    if not any(len(scan.points) for scan in scene.scans):
         raise InputError(f"{scene.name}: expected scans of the structure, found no points")
-    grid = visible_facets.grid_of(surface.vertices, surface.faces, surface.normals, reach_mm)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach_mm)
     names: list[str] = []
     positions: list[Floats] = []
     parts: list[tuple[Ints, Floats, Ints, Floats]] = []
     for scan in scene.scans:
         T = T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4))
         T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
-        own = np.full(len(scan.points), len(names), np.int64)
+        station_of = np.full(len(scan.points), len(names), np.int64)
         if scan.position.size:
             names.append(scan.name)
             positions.append(rigid.apply(T, scan.position - scan.origin))
         elif scene.stations is not None and len(scan.point_station):
-            own = np.where(scan.point_station < 0, len(scene.stations.ids), scan.point_station) + len(names)
+            row = np.where(scan.point_station < 0, len(scene.stations.ids), scan.point_station)
+            station_of = row + len(names)
             names += [*scene.stations.ids, f"{scan.name}, unknown"]
             positions += [*rigid.apply(T_design_project, scene.stations.positions), np.full(3, np.nan)]
         else:
             names.append(scan.name)
             positions.append(np.full(3, np.nan))
         known = np.isfinite(np.array(positions).sum(axis=1))
-        for start in range(0, len(own), CHUNK):
+        scanners = np.nan_to_num(np.array(positions))
+        for start in range(0, len(station_of), CHUNK):
             rows = slice(start, start + CHUNK)
-            points = rigid.apply(T, scan.points[rows])
-            station = np.where(known[own[rows]], own[rows], -1)
-            facet, deviation = visible_facets.nearest(grid, points, np.nan_to_num(np.array(positions)), station)
+            points, of_point = rigid.apply(T, scan.points[rows]), station_of[rows]
+            station = np.where(known[of_point], of_point, -1)
+            facet, deviation = mesh_distance.nearest_visible(grid, points, scanners, station)
             near = np.flatnonzero(facet >= 0)
-            arm = np.nan_to_num(np.array(positions))[own[rows][near]] - points[near]
+            arm = scanners[of_point[near]] - points[near]
             cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[near]]) / np.linalg.norm(arm, axis=1)
             on = near[(station[near] < 0) | (cosine > LEAST_COS)]
             chart = surface.chart_of[facet[on]]
-            parts.append((chart, layout(surface.charts, chart, points[on]), own[rows][on], deviation[on]))
-    chart, uv, own, deviation = (np.concatenate(column) for column in zip(*parts, strict=True))
-    offered = sum(len(scan.points) for scan in scene.scans)
-    return Observed(chart, uv, own, deviation, Stations(tuple(names), np.array(positions)), offered)
+            parts.append((chart, layout(surface.charts, chart, points[on]), of_point[on], deviation[on]))
+    chart, uv, station, deviation = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return Observed(
+        chart=chart,
+        uv=uv,
+        station=station,
+        deviation=deviation,
+        stations=Stations(tuple(names), np.array(positions)),
+        points=sum(len(scan.points) for scan in scene.scans),
+    )
 
 
-def fitting_cell(seen: Observed, surface: DesignSurface, points: float, bounds: tuple[float, float]) -> float:
-    """Return the size of cells in mm that hold so many points on the median of what was seen."""
-    _, count = np.unique(cells_of(seen, surface), return_counts=True)
+def fitting_cell(observed: Observed, surface: DesignSurface, points: float, bounds: tuple[float, float]) -> float:
+    """Return the size of cells in mm that hold so many points on the median over the points."""
+    _, count = np.unique(cells_of(observed, surface), return_counts=True)
     if not len(count):
         return bounds[1]
-    dense = float(np.median(np.repeat(count, count))) / surface.charts.cell_mm**2
-    return float(np.clip(np.round(np.sqrt(points / dense), 1), *bounds))
+    density = float(np.median(np.repeat(count, count))) / surface.charts.cell_mm**2
+    return float(np.clip(np.round(np.sqrt(points / density), 1), *bounds))
 
 
-def cells_of(seen: Observed, surface: DesignSurface) -> Ints:
-    """Return the row (n,) of the cell that each point is in; those beyond their face's net are in the nearest."""
-    charts = surface.charts
-    at = np.floor((seen.uv - charts.low[seen.chart]) / charts.cell_mm).astype(np.int64)
-    at = np.clip(at, 0, charts.shape[seen.chart] - 1)
-    found: Ints = charts.first[seen.chart] + at[:, 0] * charts.shape[seen.chart, 1] + at[:, 1]
-    return found
+def cells_of(observed: Observed, surface: DesignSurface) -> Ints:
+    """Return the cell (n,) of each point; points beyond their face's grid are in the nearest cell."""
+    charts, chart = surface.charts, observed.chart
+    at = np.floor((observed.uv - charts.low[chart]) / charts.cell_mm).astype(np.int64)
+    at = np.clip(at, 0, charts.shape[chart] - 1)
+    cell: Ints = charts.first[chart] + at[:, 0] * charts.shape[chart, 1] + at[:, 1]
+    return cell
 
 
-def paired(seen: Observed, surface: DesignSurface) -> Pairs:
-    """Sum up the points by cell and station, without those that do not fit to the others of the cell."""
-    cell = cells_of(seen, surface)
-    stations = len(seen.stations.names)
-    order = np.argsort(cell * stations + seen.station, kind="stable")
-    columns = pairs(cell[order], seen.station[order], seen.deviation[order])
-    return Pairs(*columns)
-
-
-# --- Compiled: the points of a cell summed up station by station.
-
-
-GATE = 4.0  # robust standard deviations from the median of a cell
-LEAST_GATE_MM = 1.0
-FEW = 4  # points, from which on a median says what does not fit
+def paired(observed: Observed, surface: DesignSurface) -> Pairs:
+    """Sum up the points by cell and station."""
+    cell = cells_of(observed, surface)
+    order = np.argsort(cell * len(observed.stations.names) + observed.station, kind="stable")
+    return Pairs(*pairs(cell[order], observed.station[order], observed.deviation[order]))
 
 
 @njit(cache=True, nogil=True)
 def pairs(cell: Ints, station: Ints, deviation: Floats) -> tuple[Ints, Ints, Ints, Ints, Floats, Floats]:
-    """Columns of :class:`processor.defects.observations.Pairs`, of points sorted by cell and station."""
+    """Return the columns of :class:`Pairs` of points sorted by cell and station (Welford's algorithm)."""
     n = len(cell)
     total = 0
     for i in range(n):
         if i == 0 or cell[i] != cell[i - 1] or station[i] != station[i - 1]:
             total += 1
-    own, by = np.empty(total, np.int64), np.empty(total, np.int64)
+    cells, stations = np.empty(total, np.int64), np.empty(total, np.int64)
     count, stray = np.zeros(total, np.int64), np.zeros(total, np.int64)
     mean, square = np.zeros(total), np.zeros(total)
     at, start = -1, 0
@@ -144,20 +145,20 @@ def pairs(cell: Ints, station: Ints, deviation: Floats) -> tuple[Ints, Ints, Int
         while end < n and cell[end] == cell[start]:
             end += 1
         middle, gate = 0.0, np.inf
-        if end - start >= FEW:
+        if end - start >= FEWEST_POINTS:
             middle = np.median(deviation[start:end])
-            gate = max(LEAST_GATE_MM, GATE * 1.4826 * np.median(np.abs(deviation[start:end] - middle)))
+            gate = max(LEAST_GATE_MM, GATE_SDS * 1.4826 * np.median(np.abs(deviation[start:end] - middle)))
         for i in range(start, end):
             if i == start or station[i] != station[i - 1]:
                 at += 1
-                own[at], by[at] = cell[i], station[i]
-            off = deviation[i]
-            if abs(off - middle) > gate:
+                cells[at], stations[at] = cell[i], station[i]
+            value = deviation[i]
+            if abs(value - middle) > gate:
                 stray[at] += 1
                 continue
             count[at] += 1
-            step = off - mean[at]
+            step = value - mean[at]
             mean[at] += step / count[at]
-            square[at] += step * (off - mean[at])
+            square[at] += step * (value - mean[at])
         start = end
-    return own, by, count, stray, mean, square
+    return cells, stations, count, stray, mean, square

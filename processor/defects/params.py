@@ -1,4 +1,4 @@
-"""Parameters of the search for defects."""
+"""Parameters of step ``defects``."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ METHODS = ("default", "paper")
 
 @dataclass(frozen=True)
 class Paper:
-    """Parameters of method ``paper``, mm; the paper gives none, so these follow from the cloud's spacing where 0.
+    """Parameters of method ``paper``, mm; the paper gives none: 0 = a multiple of the cloud's spacing.
 
     ``defect_mm`` is the distance from the design above which a point belongs to a defect.
     """
 
-    voxel_mm: float = 0.0  # to which the cloud is thinned
-    points: int = 60_000  # the most points that are left
+    voxel_mm: float = 0.0  # size of the voxels that the cloud is thinned to
+    points: int = 60_000  # most points after thinning
     cluster_radius_mm: float = 0.0
     cluster_points: int = 4
     smallest_cluster_share: float = 0.01
@@ -33,8 +33,8 @@ class Paper:
 class Params:
     """Parameters of both methods.
 
-    ``reach_mm`` is how far from the design a point still belongs to it. ``false_alarms`` is the number of them that
-    chance may bring on ``per_m2`` of surface. ``cell_mm`` = 0: by the density of the points.
+    ``reach_mm`` is the distance from the design within which a point belongs to it. ``false_alarms`` is the number of
+    false alarms allowed on ``per_m2`` of surface. ``cell_mm`` = 0: by the density of the points.
     """
 
     method: str = METHODS[0]
@@ -43,15 +43,15 @@ class Params:
     cell_mm: float = 0.0
     false_alarms: float = 1.0
     per_m2: float = 100.0
-    systematic_mm: float = 0.02  # what scanners bend a surface by, one sd, however many points there are
-    edge_mm: float = 8.0  # a border of every face where a beam sees more than the face
-    align: bool = True  # fit stations and whole to the design before looking for defects
-    registration_error_mm: float = math.nan  # one standard deviation; without it from the fit to the design
-    pictures: int = 200
+    systematic_mm: float = 0.02  # systematic error of a surface by the scanner, one sd, however many points
+    edge_mm: float = 8.0  # border of every face that is left out: beams there hit other faces too
+    align: bool = True  # fit stations and whole to the design before the search
+    registration_error_mm: float = math.nan  # one standard deviation; nan = from the fit to the design
+    pictures: int = 200  # most defects with a picture
     paper: Paper = field(default_factory=Paper)
 
     def check(self) -> None:
-        """Raise UsageError for a number that makes no sense."""
+        """Raise UsageError for a number out of range."""
         for key in ("reach_mm", "false_alarms", "per_m2"):
             if not getattr(self, key) > 0.0:
                 raise UsageError(f"defects.{key}: expected a number above 0, got {getattr(self, key)!r}")

@@ -1,49 +1,54 @@
-"""The deviations about each defect on a small grid, for a picture, and over the whole surface, for a view in space."""
+"""Deviations about each defect on a small grid, over the whole surface thinned, and along bent members."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
 from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
+from processor.defects.result import Curve, Picture, SurfacePlaces
 from processor.defects.surface_charts import DesignSurface
 from processor.model import NORMAL_95, Floats, Ints
 
 MOST_SIDE = 120  # cells of a picture
-MARGIN = 0.6  # of a defect's extent that is shown beside it
-LEAST_CELLS = 12
-SAME_WAY = 0.5
+MARGIN = 0.6  # of a defect's extent, shown beside it
+LEAST_MARGIN_CELLS = 12
+SAME_SIDE_COS = 0.5  # between the defect's mean normal and that of a cell shown
+LEAST_SHARE = 0.3  # of a cell that the face covers
 MOST_PLACES = 50_000  # of the whole surface
 SMALL_PLACES, MOST_SMALL_PLACES = 400, 10_000  # of one defect that is not thinned, and of all such
 
 
-def of_surface(defects: list[Ints], field: Field, surface: DesignSurface, most: int = MOST_PLACES) -> dict[str, Any]:
-    """Return the columns of places all over the surface; ``defects`` are the cells of each.
+def of_surface(
+    defects: Sequence[Ints], field: Field, surface: DesignSurface, origin: Floats, most: int = MOST_PLACES
+) -> SurfacePlaces:
+    """Return places all over the surface, shifted by ``origin`` (3,); ``defects`` are the cells of each defect.
 
     Of every face each s-th row and column of cells is taken, s the same for all; of small defects every cell.
     """
     charts = surface.charts
     chart = chart_of_cells(surface)
-    own = np.full(len(chart), -1, np.int32)
-    for row in sorted(range(len(defects)), key=lambda row: -len(defects[row])):  # the small ones lie on the large ones
-        own[defects[row]] = row
-    seen = (field.count > 0) & (surface.share > 0.3)
+    defect_of = np.full(len(chart), -1, np.int32)
+    for row in sorted(range(len(defects)), key=lambda row: -len(defects[row])):  # small ones on top of large ones
+        defect_of[defects[row]] = row
+    measured = (field.count > 0) & (surface.share > LEAST_SHARE)
     along, across = np.divmod(np.arange(len(chart)) - charts.first[chart], charts.shape[chart, 1])
-    step = max(1, int(np.sqrt(seen.sum() / most)))
+    step = max(1, int(np.sqrt(measured.sum() / most)))
     while (
-        kept := seen & _each(along, charts.shape[chart, 0], step) & _each(across, charts.shape[chart, 1], step)
+        drawn := measured & _each(along, charts.shape[chart, 0], step) & _each(across, charts.shape[chart, 1], step)
     ).sum() > most:
         step += 1
     room = MOST_SMALL_PLACES
     for cells in defects:
         if len(cells) <= min(SMALL_PLACES, room):
             room -= len(cells)
-            kept[cells] = seen[cells]
-    return {
-        "surface_at": surface.centres[kept], "surface_mm": field.deviation[kept], "surface_defect": own[kept],
-    }  # fmt: skip
+            drawn[cells] = measured[cells]
+    return SurfacePlaces(
+        points=surface.centres[drawn] + origin, deviation=field.deviation[drawn], defect=defect_of[drawn]
+    )
 
 
 def _each(index: Ints, count: Ints, step: int) -> Any:
@@ -51,80 +56,79 @@ def _each(index: Ints, count: Ints, step: int) -> Any:
     return index % step == np.minimum(step, count) // 2
 
 
-def of_rows(rows: list[tuple[Floats, Ints, Field, int]], surface: DesignSurface, most: int) -> dict[str, Any]:
-    """Return the columns of pictures of the first ``most`` defects: centre, cells, field and component of each."""
-    shapes, lows, cells, values, parts = [], [], [], [], []
+def of_defects(defects: Sequence[tuple[Floats, Ints, Field, int]], surface: DesignSurface) -> tuple[Picture, ...]:
+    """Return a picture of each defect, given by its centre (3,), cells, deviations and component.
+
+    A picture is empty if no cell of the component faces the way that the defect's cells do on average.
+    """
     chart = chart_of_cells(surface)
     component = surface.charts.component[chart]
-    for centre, own, field, number in rows[:most]:
-        out = surface.outward[own].mean(axis=0)
-        near = np.flatnonzero((component == number) & (surface.outward @ out > SAME_WAY) & (surface.share > 0.3))
-        # Along the cells of the face that it lies on: a turned grid would leave gaps.
-        frame = surface.charts.axes[chart[own[len(own) // 2]]]
-        side = np.cross(out / np.linalg.norm(out), frame[0])
-        axes = np.stack([frame[0], side])
-        here = (surface.centres[own] - centre) @ axes.T
-        low, high = here.min(axis=0), here.max(axis=0)
-        margin = np.maximum(MARGIN * (high - low), LEAST_CELLS * surface.charts.cell_mm)
-        low, high = low - margin, high + margin
-        uv = (surface.centres[near] - centre) @ axes.T
-        shown = ((uv >= low) & (uv <= high)).all(axis=1)
-        near, uv = near[shown], uv[shown]
-        cell = surface.charts.cell_mm
-        low, high = np.maximum(low, uv.min(axis=0)), np.minimum(high, uv.max(axis=0))
-        size = cell * max(1.0, np.ceil(float((high - low).max()) / MOST_SIDE / cell))
-        low = uv.min(axis=0) - 0.5 * cell
-        shape = np.maximum(np.ceil((high - low) / size).astype(np.int64) + 1, 1)
-        at = np.clip(((uv - low) / size).astype(np.int64), 0, shape - 1)
-        flat = at[:, 0] * shape[1] + at[:, 1]
-        total = int(shape.prod())
-        weight = np.where(field.count[near] > 0, 1.0 / field.variance[near], 0.0)
-        sums = np.bincount(flat, weight, total)
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = np.bincount(flat, weight * field.deviation[near], total) / sums
-        part = np.zeros(total, np.int32)
-        part[flat[np.isin(near, own)]] = 1
-        shapes.append(shape)
-        lows.append(low)
-        cells.append(size)
-        values.append(mean)
-        parts.append(part)
-    return {
-        "picture_defect": np.arange(len(shapes)),
-        "picture_shape": np.array(shapes).reshape(-1, 2),
-        "picture_low": np.array(lows).reshape(-1, 2),
-        "picture_cell_mm": np.array(cells),
-        "picture_mm": np.concatenate([[], *values]),
-        "picture_part": np.concatenate([[], *parts]),
-    }
+    pictures = []
+    for centre, cells, field, number in defects:
+        outward = surface.outward[cells].mean(axis=0)
+        facing = (component == number) & (surface.outward @ outward > SAME_SIDE_COS) & (surface.share > LEAST_SHARE)
+        # Along the cells of the defect's face: a rotated grid would have gaps.
+        along = surface.charts.axes[chart[cells[len(cells) // 2]], 0]
+        shown = np.flatnonzero(facing)
+        pictures.append(_picture(centre, cells, shown, along, outward, field, surface) if len(shown) else Picture())
+    return tuple(pictures)
+
+
+def _picture(
+    centre: Floats, cells: Ints, facing: Ints, along: Floats, outward: Floats, field: Field, surface: DesignSurface
+) -> Picture:
+    axes = np.stack([along, np.cross(outward / np.linalg.norm(outward), along)])
+    extent = (surface.centres[cells] - centre) @ axes.T
+    low, high = extent.min(axis=0), extent.max(axis=0)
+    cell = surface.charts.cell_mm
+    margin = np.maximum(MARGIN * (high - low), LEAST_MARGIN_CELLS * cell)
+    low, high = low - margin, high + margin
+    uv = (surface.centres[facing] - centre) @ axes.T
+    inside = ((uv >= low) & (uv <= high)).all(axis=1)
+    if not inside.any():
+        return Picture()
+    facing, uv = facing[inside], uv[inside]
+    low, high = np.maximum(low, uv.min(axis=0)), np.minimum(high, uv.max(axis=0))
+    size = cell * max(1.0, np.ceil(float((high - low).max()) / MOST_SIDE / cell))
+    low = uv.min(axis=0) - 0.5 * cell
+    shape = np.maximum(np.ceil((high - low) / size).astype(np.int64) + 1, 1)
+    index = np.clip(((uv - low) / size).astype(np.int64), 0, shape - 1)
+    flat = index[:, 0] * shape[1] + index[:, 1]
+    total = int(shape.prod())
+    weight = np.where(field.count[facing] > 0, 1.0 / field.variance[facing], 0.0)
+    sums = np.bincount(flat, weight, total)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        mean = np.bincount(flat, weight * field.deviation[facing], total) / sums
+    part = np.zeros(total, np.uint8)
+    part[flat[np.isin(facing, cells)]] = 1
+    return Picture(low=low, cell=float(size), deviation=mean.reshape(shape), part=part.reshape(shape))
 
 
 # --- The deflection curve of a bent member: by strips along it, and by slopes of sub-regions as in paper 004.
 
 
-def by_strips(along: Floats, deviation: Floats, variance: Floats, strips: int) -> tuple[Floats, Floats, Floats]:
-    """Middles (s,), weighted means (s,) and 95 % half-widths (s,) of deviations by strips of places ``along`` (n,).
+def by_strips(along: Floats, deviation: Floats, variance: Floats, strips: int) -> Curve:
+    """Return the weighted means of deviations by strips of positions ``along`` (n,), mm, with 95 % half-widths.
 
     Strips without points are left out.
     """
-    edges = np.linspace(along.min(), along.max(), strips + 1)
-    index = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, strips - 1)
-    w = 1.0 / variance
-    total = np.bincount(index, w, strips)
+    index = _strip_of(along, strips)[1]
+    weight = 1.0 / variance
+    total = np.bincount(index, weight, strips)
     used = total > 0.0
-    some = np.where(used, total, 1.0)
-    at, mean = np.bincount(index, w * along, strips) / some, np.bincount(index, w * deviation, strips) / some
-    return at[used], mean[used], NORMAL_95 / np.sqrt(some[used])
+    divisor = np.where(used, total, 1.0)
+    middle = np.bincount(index, weight * along, strips) / divisor
+    mean = np.bincount(index, weight * deviation, strips) / divisor
+    return Curve(along=middle[used], displacement=mean[used], ci95=NORMAL_95 / np.sqrt(divisor[used]))
 
 
-def by_slopes(along: Floats, deviation: Floats, strips: int) -> tuple[Floats, Floats]:
-    """Return ends of sub-regions (s + 1,) and displacement there (s + 1,), zero at the first (paper 004).
+def by_slopes(along: Floats, deviation: Floats, strips: int) -> Curve:
+    """Return the displacement at the ends of sub-regions, zero at the first (paper 004); no intervals.
 
-    Of each sub-region s the slope tan(theta) of a line through its points is taken, and integrated over its length h:
-    mu_s(h) = int tan(theta) dh + mu_(s-1). A sub-region of fewer than two places keeps the slope before it.
+    The slope tan(theta) of a line through the points of each sub-region s is integrated over its length h:
+    mu_s(h) = int tan(theta) dh + mu_(s-1). A sub-region of fewer than two positions keeps the slope before it.
     """
-    edges = np.linspace(along.min(), along.max(), strips + 1)
-    index = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, strips - 1)
+    edges, index = _strip_of(along, strips)
     slopes = np.zeros(strips)
     for s in range(strips):
         x, y = along[index == s], deviation[index == s]
@@ -133,4 +137,12 @@ def by_slopes(along: Floats, deviation: Floats, strips: int) -> tuple[Floats, Fl
             slopes[s] = float(arm @ (y - y.mean()) / (arm @ arm))
         elif s:
             slopes[s] = slopes[s - 1]
-    return edges, np.concatenate([[0.0], np.cumsum(slopes * np.diff(edges))])
+    displacement = np.concatenate([[0.0], np.cumsum(slopes * np.diff(edges))])
+    return Curve(along=edges, displacement=displacement, ci95=np.full(len(edges), np.nan))
+
+
+def _strip_of(along: Floats, strips: int) -> tuple[Floats, Ints]:
+    """Return the edges (s + 1,) of strips of equal width, and the strip (n,) of each position."""
+    edges = np.linspace(along.min(), along.max(), strips + 1)
+    index: Ints = np.clip(np.searchsorted(edges, along, side="right") - 1, 0, strips - 1)
+    return edges, index

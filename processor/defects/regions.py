@@ -1,4 +1,4 @@
-"""Cells that belong together: places that deviate and places that are missing."""
+"""Regions: connected cells that deviate or are missing, and the grouping of regions to defects."""
 
 from __future__ import annotations
 
@@ -10,22 +10,22 @@ from scipy.spatial import cKDTree
 
 from processor.defects.classes import CRACK_RATIO
 from processor.defects.deviation_field import Field
-from processor.defects.missing_material import Expected
 from processor.defects.scan_statistic import Finding
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Floats, Ints
 
-ROUND = np.ones((3, 3))
-ABSENT_SHARE = 0.15  # of the points expected, below which a cell is empty
-IN_LINE_CELLS = 1.6  # that a piece of a crack may be off its line
-DOUBT = 0.5  # of the points expected that are counted on: scanners thin out where a surface reflects badly
+EIGHT_NEIGHBOURS = np.ones((3, 3))
+EMPTY_SHARE = 0.15  # of the points expected, up to which a cell is empty
+COUNTED_SHARE = 0.5  # of the points expected: scanners return fewer where a surface reflects badly
+LINE_CELLS = 1.6  # distance of a crack's piece from its line
+LINE_REACH = 3.0  # half lengths of a crack, within which further pieces lie
 
 
 @dataclass(frozen=True)
 class Region:
-    """Cells of one face; ``sign`` -1 inward, 1 outward, 0 missing; ``z`` the largest deviation by its noise.
+    """Cells of one face; ``sign`` -1 inward, 1 outward, 0 missing; ``z``: largest deviation by its sd.
 
-    ``chance`` is how many as strong chance brings on one mm2.
+    ``chance`` is the expected number of false alarms as strong on one mm2.
     """
 
     chart: int
@@ -38,70 +38,56 @@ class Region:
 def of_finding(finding: Finding, surface: DesignSurface) -> list[Region]:
     """Return connected cells that deviate to one side."""
     charts = surface.charts
-    found = []
+    regions = []
     for chart in range(len(charts.kind)):
         if not finding.sign[charts.cells(chart)].any():
             continue
-        sign, z, chance = (charts.image(x, chart) for x in (finding.sign.astype(float), finding.z, finding.chance))
-        for way in (-1, 1):
-            whole = ndimage.binary_closing(np.pad(sign == way, 2), ROUND)[2:-2, 2:-2] & (sign != -way)
-            for rows in _connected(whole, charts, chart):
-                own = rows - charts.first[chart]
-                found.append(Region(chart, rows, way, float(np.abs(z.flat[own]).max()), float(chance.flat[own].min())))
-    return found
+        signs, z, chance = (charts.image(x, chart) for x in (finding.sign.astype(float), finding.z, finding.chance))
+        for sign in (-1, 1):
+            closed = ndimage.binary_closing(np.pad(signs == sign, 2), EIGHT_NEIGHBOURS)[2:-2, 2:-2] & (signs != -sign)
+            for cells in _connected(closed, charts, chart):
+                rows = cells - charts.first[chart]
+                strongest = float(np.abs(z.flat[rows]).max()), float(chance.flat[rows].min())
+                regions.append(Region(chart, cells, sign, *strongest))
+    return regions
 
 
-def missing(field: Field, hoped: Expected, surface: DesignSurface, alarms_per_mm2: float) -> list[Region]:
-    """Return connected cells without points where points should be, unless chance or bad reflection may do it.
+def missing(field: Field, expected: Floats, surface: DesignSurface, alarms_per_mm2: float) -> list[Region]:
+    """Return connected cells with far fewer points than ``expected`` (cells,), at the given rate of false alarms.
 
-    Points expected count by half; that many must be improbable to be missing (Poisson) as often as alarms are allowed,
-    on a core of cells that are not at the face's border.
+    Of the points expected, COUNTED_SHARE are counted on; so many must be improbable to be missing by a Poisson
+    distribution, on the cells that are not at the face's border.
     """
     charts = surface.charts
     count = field.count + field.stray
-    # The border is told from cells that could be examined: those a beam sees the face alone from.
-    inner = field.inner > 0.0
-    empty = (hoped.points > 0.0) & (count <= ABSENT_SHARE * hoped.points)
-    needed = -np.log(alarms_per_mm2 * charts.cell_mm**2)
-    found = []
+    inner = field.inner > 0.0  # cells that could be examined: beams there hit the face alone
+    empty = (expected > 0.0) & (count <= EMPTY_SHARE * expected)
+    threshold = -np.log(alarms_per_mm2 * charts.cell_mm**2)
+    regions = []
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
         if not (empty[rows] & inner[rows]).any():
             continue
-        for own in _connected(charts.image(empty.astype(float), chart) > 0.0, charts, chart):
-            core = own[inner[own]]
-            lost = DOUBT * hoped.points[core].sum()
-            got = float(count[core].sum())
-            # Chernoff's bound of a Poisson number far below what is expected.
-            strength = lost - got + (got * np.log(got / lost) if got else 0.0) if lost > got else 0.0
-            if strength > needed:
+        for cells in _connected(charts.image(empty.astype(float), chart) > 0.0, charts, chart):
+            core = cells[inner[cells]]
+            mean = COUNTED_SHARE * expected[core].sum()
+            number = float(count[core].sum())
+            # Chernoff's bound of the probability that a Poisson number is so far below its mean.
+            strength = mean - number + (number * np.log(number / mean) if number else 0.0) if mean > number else 0.0
+            if strength > threshold:
                 chance = float(np.exp(-strength)) / charts.cell_mm**2
-                found.append(Region(chart, own, 0, float(np.sqrt(2.0 * strength)), chance))
-    return found
-
-
-def _connected(mask: np.ndarray, charts: Charts, chart: int) -> list[Ints]:
-    label, count = ndimage.label(mask, ROUND)
-    if charts.kind[chart] == CYLINDER and count:  # across the seam
-        for i in range(label.shape[0]):
-            one, two = label[i, 0], label[i, -1]
-            if one and two and one != two:
-                label[label == max(one, two)] = min(one, two)
-    flat = label.ravel()
-    order = np.argsort(flat, kind="stable")
-    at = np.searchsorted(flat[order], np.arange(1, count + 2))
-    rows = [order[at[k] : at[k + 1]] for k in range(count)]
-    return [charts.first[chart] + own.astype(np.int64) for own in rows if len(own)]
+                regions.append(Region(chart, cells, 0, float(np.sqrt(2.0 * strength)), chance))
+    return regions
 
 
 def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> list[list[Region]]:
-    """Put together the parts of one defect: of one component, near each other, and missing or to the same side.
+    """Group the parts of one defect: of one component, near each other, and missing or to the same side.
 
-    What deviates right beside something missing is part of that: beams that hit its edge.
+    Deviations right beside a missing region belong to it: beams that hit its edge.
     """
     groups: list[list[Region]] = []
     trees: list[cKDTree] = []
-    for region in sorted(regions, key=lambda one: (one.sign != 0, -len(one.cells), int(one.cells[0]))):
+    for region in sorted(regions, key=lambda region: (region.sign != 0, -len(region.cells), int(region.cells[0]))):
         places = surface.centres[region.cells]
         component = surface.charts.component[region.chart]
         for group, tree in zip(groups, trees, strict=True):
@@ -113,70 +99,90 @@ def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> lis
         else:
             groups.append([region])
             trees.append(cKDTree(places))
-    return _in_line([_joined(group) for group in groups], surface)
+    return _lines_united([_joined(group) for group in groups], surface)
 
 
-def _in_line(groups: list[list[Region]], surface: DesignSurface) -> list[list[Region]]:
-    """Put the pieces of a crack together, for a scan sees one as a dashed line.
+def unrolled(surface: DesignSurface, region: Region) -> Floats:
+    """Return u, v (n, 2) of the middles of a region's cells on its face; on a cylinder unrolled from the region."""
+    charts, chart = surface.charts, region.chart
+    grid = np.stack(np.divmod(region.cells - charts.first[chart], charts.shape[chart, 1]), axis=1) + 0.5
+    uv: Floats = charts.low[chart] + grid * charts.cell_mm
+    if charts.kind[chart] == CYLINDER:
+        turn = 2.0 * np.pi * charts.radius[chart]
+        uv[:, 1] -= turn * np.round((uv[:, 1] - uv[0, 1]) / turn)
+    return uv
 
-    A piece is what lies in line with a slim place, within it or as far from its end as that is long at most.
-    """
+
+def _connected(mask: np.ndarray, charts: Charts, chart: int) -> list[Ints]:
+    """Return the cells of each connected piece of a mask of a face."""
+    label, count = ndimage.label(mask, EIGHT_NEIGHBOURS)
+    if charts.kind[chart] == CYLINDER and count:  # across the seam
+        for i in range(label.shape[0]):
+            a, b = label[i, 0], label[i, -1]
+            if a and b and a != b:
+                label[label == max(a, b)] = min(a, b)
+    labels = label.ravel()
+    order = np.argsort(labels, kind="stable")
+    at = np.searchsorted(labels[order], np.arange(1, count + 2))
+    pieces = [order[at[k] : at[k + 1]] for k in range(count)]
+    return [charts.first[chart] + rows.astype(np.int64) for rows in pieces if len(rows)]
+
+
+def _joined(group: list[Region]) -> list[Region]:
+    """Join the regions on the first one's face and to its side; the others remain beside it."""
+    first = group[0]
+    alike = [region for region in group if region.chart == first.chart and region.sign == first.sign]
+    if len(alike) == 1:
+        return group
+    joined = Region(
+        chart=first.chart,
+        cells=np.unique(np.concatenate([region.cells for region in alike])),
+        sign=first.sign,
+        z=max(region.z for region in alike),
+        chance=min(region.chance for region in alike),
+    )
+    return [joined, *(region for region in group if region.chart != first.chart or region.sign != first.sign)]
+
+
+# --- Cracks, which scans show as dashed lines
+
+
+def _lines_united(groups: list[list[Region]], surface: DesignSurface) -> list[list[Region]]:
+    """Unite the pieces of each crack: regions in line with a slim region, within it or not far beyond its ends."""
     left = groups
-    found: list[list[Region]] = []
+    united_groups: list[list[Region]] = []
     while left:
         group, *left = left
         line = _line_of(group[0], surface)
-        others = left + found
-        piece = line and next((one for one in others if _is_on(line, one[0], group[0], surface)), None)
+        others = left + united_groups
+        piece = line and next((other for other in others if _is_on(line, other[0], group[0], surface)), None)
         if not piece:
-            found.append(group)
+            united_groups.append(group)
             continue
-        # A longer line may reach one that it did not reach before.
-        left, found = [_joined([*group, *piece]), *(one for one in others if one is not piece)], []
-    return found
+        # The longer line may reach a region that it did not reach before: start again.
+        left = [_joined([*group, *piece]), *(other for other in others if other is not piece)]
+        united_groups = []
+    return united_groups
 
 
 def _line_of(region: Region, surface: DesignSurface) -> tuple[Floats, Floats, float] | None:
-    """Return middle (2,), direction (2,) and half the length of a slim place on its face; None of any other."""
-    uv, cell = flat(surface, region), surface.charts.cell_mm
+    """Return middle (2,), direction (2,) and half length of a slim region on its face; None if it is not slim."""
+    uv, cell = unrolled(surface, region), surface.charts.cell_mm
     middle = uv.mean(axis=0)
     direction = np.linalg.eigh((uv - middle).T @ (uv - middle))[1][:, 1]
     along = (uv - middle) @ direction
     length = float(np.ptp(along)) + cell
     width = len(uv) * cell**2 / length
-    if region.sign > 0 or length < CRACK_RATIO * width or width > 2.0 * IN_LINE_CELLS * cell:
+    if region.sign > 0 or length < CRACK_RATIO * width or width > 2.0 * LINE_CELLS * cell:
         return None
     return middle + 0.5 * (along.min() + along.max()) * direction, direction, 0.5 * length
 
 
 def _is_on(line: tuple[Floats, Floats, float], region: Region, slim: Region, surface: DesignSurface) -> bool:
+    """Return whether a region lies on the line of a slim region, within LINE_REACH of its middle."""
     if region.chart != slim.chart or region.sign > 0:
         return False
     middle, direction, half = line
-    uv = flat(surface, region) - middle
+    uv = unrolled(surface, region) - middle
     along, across = np.abs(uv @ direction), np.abs(uv @ [-direction[1], direction[0]])
-    return bool(across.max() < IN_LINE_CELLS * surface.charts.cell_mm and along.min() < 3.0 * half)
-
-
-def _joined(group: list[Region]) -> list[Region]:
-    """Make one region of those on the first one's face and to its side; the others stay beside it."""
-    first = group[0]
-    alike = [one for one in group if one.chart == first.chart and one.sign == first.sign]
-    if len(alike) == 1:
-        return group
-    cells = np.unique(np.concatenate([one.cells for one in alike]))
-    strongest = max(one.z for one in alike), min(one.chance for one in alike)
-    whole = Region(first.chart, cells, first.sign, *strongest)
-    return [whole, *(one for one in group if not any(one is other for other in alike))]
-
-
-def flat(surface: DesignSurface, region: Region) -> Floats:
-    """Return u, v (n, 2) of the middles of a region's cells on its face; of a cylinder unrolled from the region."""
-    charts = surface.charts
-    at = region.cells - charts.first[region.chart]
-    grid = np.stack([at // charts.shape[region.chart, 1], at % charts.shape[region.chart, 1]], axis=1) + 0.5
-    uv: Floats = charts.low[region.chart] + grid * charts.cell_mm
-    if charts.kind[region.chart] == CYLINDER:
-        turn = 2.0 * np.pi * charts.radius[region.chart]
-        uv[:, 1] -= turn * np.round((uv[:, 1] - uv[0, 1]) / turn)
-    return uv
+    return bool(across.max() < LINE_CELLS * surface.charts.cell_mm and along.min() < LINE_REACH * half)

@@ -1,83 +1,157 @@
-"""The record that the search for defects answers with."""
+"""The result of step ``defects``."""
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Checked, Floats, Ints, Labels, Shorts, column, names, optional
+from processor.model import (
+    Checked,
+    Codes,
+    Floats,
+    Ints,
+    Labels,
+    Reason,
+    Rows,
+    Shorts,
+    Status,
+    Word,
+    column,
+    described,
+    names,
+    optional,
+    reasons,
+    words,
+)
 
-DOUBTFUL = 0.01  # places as strong that chance brings on 100 m2
-CLASSES = (
-    "dent", "bulge", "bend", "twist", "waviness", "edge-loss", "missing-part", "pit", "crack", "step", "misalignment",
-    "unknown",
-)  # fmt: skip
+NAN = float("nan")
+DOUBTFUL = 0.01  # false alarms as strong on 100 m2, above which a defect is doubtful
+
+
+class DefectClass(Word):
+    """What a defect is."""
+
+    DENT = "dent"
+    BULGE = "bulge"
+    BEND = "bend"
+    TWIST = "twist"
+    WAVINESS = "waviness"
+    EDGE_LOSS = "edge-loss"
+    MISSING_PART = "missing-part"
+    PIT = "pit"
+    CRACK = "crack"
+    STEP = "step"
+    MISALIGNMENT = "misalignment"
+    UNKNOWN = "unknown"
+
+
+@dataclass(frozen=True)
+class Curve(Checked):
+    """A deflection curve, mm: distance along the component, displacement outward, half-width of its 95 % interval."""
+
+    along: Floats = column("c", optional=True)
+    displacement: Floats = column("c", optional=True)
+    ci95: Floats = column("c", optional=True)
+
+
+@dataclass(frozen=True)
+class Picture(Checked):
+    """Deviations about a defect on a grid along the defect's face.
+
+    ``low`` (2,) is the corner of the first cell relative to the defect's centre. ``deviation`` is outward positive,
+    NaN without points; ``part`` is 1 where the cell belongs to the defect. Both are empty where no cell can be shown.
+    """
+
+    low: Floats = dataclasses.field(
+        default_factory=lambda: np.zeros(2), metadata={"shape": (2,), "dtype": np.float64, "unit": "mm"}
+    )
+    cell: float = described(NAN, unit="mm")
+    deviation: Shorts = column("u", "v", dtype=np.float32, unit="mm")
+    part: Codes = column("u", "v", dtype=np.uint8)
+
+
+@dataclass(frozen=True)
+class Windows(Rows):
+    """Sizes of search window: the least mean depth that is found, and how much window means scatter beyond noise."""
+
+    side: Floats = column("s", unit="mm")
+    depth: Floats = column("s", unit="mm")
+    noise_inflation: Floats = column("s")
+
+
+@dataclass(frozen=True)
+class SurfacePlaces(Rows):
+    """Places spread over the scanned surface, few enough to be drawn, and all places of small defects."""
+
+    points: Floats = column("t", 3, unit="mm")
+    deviation: Shorts = column("t", dtype=np.float32, unit="mm")  # outward positive
+    defect: Labels = column("t", dtype=np.int32)  # row of the defect, -1 = none
+
+
+@dataclass(frozen=True)
+class Defects(Rows):
+    """Defects in the design's frame; a depth inward is positive.
+
+    ``otherwise`` is the second most probable class. ``axes`` are unit directions of the largest extent, of the extent
+    across and outward; ``extent`` holds the full lengths along the first two. ``chance`` is the expected number of
+    false alarms as strong on 100 m2.
+    """
+
+    id: Ints = column("k", dtype=np.int64)
+    defect_class: tuple[DefectClass, ...] = words("k", DefectClass, json="class")
+    confidence: Floats = column("k")
+    otherwise: tuple[DefectClass, ...] = words("k", DefectClass)
+    component: tuple[str, ...] = names("k")
+    centre: Floats = column("k", 3, unit="mm")
+    area_mm2: Floats = column("k")
+    depth_max: Floats = column("k", unit="mm")
+    depth_ci95: Floats = column("k", unit="mm")
+    depth_mean: Floats = column("k", unit="mm")
+    volume_mm3: Floats = column("k")
+    volume_ci95: Floats = column("k", unit="mm3")
+    axes: Floats = column("k", 3, 3)
+    extent: Floats = column("k", 2, unit="mm")
+    edge_distance: Floats = column("k", unit="mm")  # from the centre to the border of the face
+    curvature_per_m: Floats = column("k")  # largest principal curvature of the deviation at the deepest place
+    lod95: Floats = column("k", unit="mm")  # of a mean over the defect
+    z: Floats = column("k")  # deviation by its standard deviation
+    chance: Floats = column("k", json="by_chance_on_100_m2")
+    doubtful: npt.NDArray[np.bool_] = column("k", dtype=np.bool_)  # chance above DOUBTFUL
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("k")
+    deflection: tuple[Curve, ...] = ()  # empty curves where a defect has none
+
+    @property
+    def depth_is_bound(self) -> npt.NDArray[np.bool_]:
+        """Return which depths (k,) are lower bounds."""
+        return np.array([any(reason.code == "defects.depth-bound" for reason in row) for row in self.reasons], np.bool_)
 
 
 @dataclass(frozen=True)
 class Result(Checked):
-    """Defects by columns, in the design's frame (mm); a depth inward is positive.
+    """Defects of a structure.
 
-    ``status``: ok | failed. ``second`` is the next best class. ``axes`` are unit directions of the largest extent, of
-    the one across and outward; ``extent`` the full lengths along the first two. ``examined_mm2`` is the surface that
-    deviations were looked for on, ``expected_mm2`` that which scanners should have seen. Curves and pictures are kept
-    one behind the other: ``curve_defect`` and ``picture_defect`` name the row of the defect.
+    ``T_design_project`` maps the frame of the scans as merged. ``registration_error``, ``noise`` of a point and
+    ``lod95`` of a cell are medians over the surface. ``examined_mm2`` is the area searched for deviations,
+    ``expected_mm2`` the area that scanners should have seen. ``points_used`` are within reach of the design.
+    ``pictures`` are of the first defects, in order.
     """
 
-    status: str
-    method: str
-    message: str = ""
+    status: Status = described(words=Status)
+    method: str = described()
+    reasons: tuple[Reason, ...] = reasons()
     T_design_project: Floats = optional(4, 4)
-    registration_error_mm: float = float("nan")  # standard deviation, median over the surface
-    cell_mm: float = float("nan")
-    noise_mm: float = float("nan")  # of one point, median
-    lod95_mm: float = float("nan")  # of one cell, median
-    examined_mm2: float = float("nan")
-    expected_mm2: float = float("nan")
-    points: int = 0  # of the cloud
-    used: int = 0  # within reach of the design
-    scale_mm: Floats = column("s")  # sides of windows, the depth that each finds, and how much its noise was inflated
-    scale_least_mm: Floats = column("s")
-    scale_inflation: Floats = column("s")
-    ids: Ints = column("k", dtype=np.int64)
-    classes: tuple[str, ...] = names("k")
-    confidence: Floats = column("k")
-    second: tuple[str, ...] = names("k")
-    components: tuple[str, ...] = names("k")
-    centres: Floats = column("k", 3)
-    axes: Floats = column("k", 3, 3)
-    extent: Floats = column("k", 2)
-    area_mm2: Floats = column("k")
-    depth_max: Floats = column("k")
-    depth_ci95: Floats = column("k")
-    depth_mean: Floats = column("k")
-    volume_mm3: Floats = column("k")
-    volume_ci95: Floats = column("k")
-    edge_mm: Floats = column("k")  # from the centre to the border of the face
-    curvature_per_m: Floats = column("k")  # largest principal curvature of the deviation at the deepest place
-    lod95: Floats = column("k")  # at the defect's own size
-    z: Floats = column("k")  # how many standard deviations it is beyond noise
-    chance: Floats = column("k")  # how many as strong chance brings on 100 m2
-    remarks: tuple[str, ...] = names("k")
-    curve_defect: Ints = column("c", dtype=np.int64)
-    curve_at_mm: Floats = column("c")
-    curve_mm: Floats = column("c")
-    curve_ci95: Floats = column("c")
-    picture_defect: Ints = column("p", dtype=np.int64)
-    picture_shape: Ints = column("p", 2, dtype=np.int64)
-    picture_low: Floats = column("p", 2)  # of the first cell's corner relative to the defect's centre, along its axes
-    picture_cell_mm: Floats = column("p")
-    picture_mm: Shorts = column("q", dtype=np.float32)  # deviations, u slowest; NaN = nothing seen
-    picture_part: Labels = column("q", dtype=np.int32)  # 1 = of the defect
-    # Places spread over the surface that was seen, so many that they can be drawn, and all of small defects.
-    surface_at: Floats = column("t", 3)
-    surface_mm: Shorts = column("t", dtype=np.float32)  # deviations, outward positive
-    surface_defect: Labels = column("t", dtype=np.int32)  # row of the defect, -1 = of none
-
-    @property
-    def doubtful(self) -> npt.NDArray[np.bool_]:
-        """Return which defects (k,) may be chance: one as strong comes on less than 10 000 m2."""
-        found: npt.NDArray[np.bool_] = self.chance > DOUBTFUL
-        return found
+    registration_error: float = described(NAN, unit="mm")  # one standard deviation
+    cell: float = described(NAN, unit="mm")
+    noise: float = described(NAN, unit="mm")  # one standard deviation
+    lod95: float = described(NAN, unit="mm")
+    examined_mm2: float = NAN
+    expected_mm2: float = NAN
+    points: int = 0
+    points_used: int = 0
+    least_depth: Windows = dataclasses.field(default_factory=Windows)
+    defects: Defects = dataclasses.field(default_factory=Defects)
+    pictures: tuple[Picture, ...] = described((), json="")
+    surface: SurfacePlaces = dataclasses.field(default_factory=SurfacePlaces, metadata={"json": ""})

@@ -1,8 +1,8 @@
-"""Defects of a structure against its design: found, measured, named.
+"""Step ``defects``: defects of a structure against its design, found, measured and classified.
 
-``default`` puts the points on cells of the design's surface, fits the stations to each other and the whole to the
-design, and then looks for shapes of whole components, for places that deviate at every size and for places that are
-missing, with a bound on false alarms. ``paper`` follows paper 004 as far as its one page tells.
+``default`` assigns points to cells of the design's surface, aligns the stations with each other and the whole with the
+design, and searches for shapes of whole components, for places of any size that deviate and for missing places, at a
+given rate of false alarms. ``paper`` follows paper 004 as far as its one available page describes the method.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ KIND = "structure"
 
 
 def applies(scene: Scene) -> bool:
-    """Whether the step runs by itself: a structure with a design, its scans in one frame."""
+    """Return whether the step runs by itself: a structure with a design, its scans in one frame."""
     one_frame = len(scene.scans) == 1 or all(scan.T_project_scan.size for scan in scene.scans)
     return scene.kind == KIND and scene.structure is not None and bool(scene.scans) and one_frame
 
@@ -31,7 +31,7 @@ def applies(scene: Scene) -> bool:
 def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) -> Result:
     """Find the defects of a scene's structure; ``earlier`` are results of steps in NEEDS that ran before.
 
-    Raises UsageError for parameters that make no sense, InputError without a design or points.
+    Raises UsageError for parameters out of range, InputError without a design or points.
     """
     if params.method not in METHODS:
         raise UsageError(f"defects: unknown method {params.method!r}; it has {', '.join(METHODS)}")

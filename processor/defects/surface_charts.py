@@ -1,7 +1,7 @@
 """The design's surface on grids: components, their faces, and cells on the faces.
 
-A face that is flat or a cylinder is laid out in a plane by its own chart; any other is cut into pieces that are nearly
-flat. A component is what hangs together: bodies that touch, or each body by itself where very many touch.
+A plane or cylindrical face is mapped to a plane by one chart; any other face is cut into pieces that are nearly flat. A
+component is a set of bodies that touch, or a single body where more than MOST_BODIES touch.
 """
 
 from __future__ import annotations
@@ -14,25 +14,26 @@ from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from processor.geometry import mesh_distance, visible_facets
+from processor.geometry import mesh_distance
 from processor.model import Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
 PIECE_COS = np.cos(np.radians(15.0))
-ROUND_SHARE = 0.02  # of its radius that a vertex of a cylinder may lie off it
+ROUND_SHARE = 0.02  # of the radius, the largest distance of a vertex from its cylinder
 WELD_MM = 0.01
 TOUCH_MM = 0.5
 MOST_BODIES = 12  # of a component
-MOST_SIDES = 60  # tried for the direction of a face
+MOST_SIDES = 60  # edges tried for the direction of a face
 PLANE, CYLINDER = 0, 1
+PER_SIDE = 4  # samples of a cell along each axis, for the share that its face covers
 
 
 @dataclass(frozen=True)
 class Charts:
-    """Faces laid out in planes: u, v of a point are along ``axes`` rows 0 and 1 from ``origin``.
+    """Maps of faces to planes: u, v of a point are along rows 0 and 1 of ``axes`` from ``origin``.
 
-    On a cylinder u runs along its axis, v around it, and ``origin`` lies on the axis. The cells of a chart, ``shape``
-    of them, are rows ``first`` onward of all cells, u slowest.
+    On a cylinder u runs along its axis, v around it, and ``origin`` lies on the axis. The cells of a chart, a grid of
+    ``shape``, are rows ``first`` onward of all cells, u slowest.
     """
 
     kind: Ints  # (c,)
@@ -52,16 +53,13 @@ class Charts:
 
     def image(self, values: Floats, chart: int) -> Floats:
         """Return values (cells,) of all cells as the image (nu, nv) of one chart."""
-        found: Floats = values[self.cells(chart)].reshape(tuple(self.shape[chart]))
-        return found
+        image: Floats = values[self.cells(chart)].reshape(tuple(self.shape[chart]))
+        return image
 
 
 @dataclass(frozen=True)
 class DesignSurface:
-    """A design's facets with their charts, and the cells on these.
-
-    ``share`` (cells,) is how much of a cell the face covers.
-    """
+    """A design's facets with their charts, and their cells; ``share`` is the part of a cell that its face covers."""
 
     vertices: Floats
     faces: Ints
@@ -69,7 +67,7 @@ class DesignSurface:
     chart_of: Ints  # (f,)
     component_of: Ints  # (f,)
     charts: Charts
-    share: Floats
+    share: Floats  # (cells,)
     centres: Floats  # (cells, 3)
     outward: Floats  # (cells, 3)
     components: int
@@ -81,15 +79,24 @@ class DesignSurface:
 
 
 def of_mesh(vertices: Floats, faces: Ints, cell_mm: float) -> DesignSurface:
-    """Lay out a mesh in charts with cells of ``cell_mm``."""
+    """Map a mesh to charts with cells of ``cell_mm``."""
     mesh = mesh_distance.of_mesh(*_welded(vertices, faces), spacing_mm=1e9)
     vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
     component = _components(vertices, faces)
     chart_of = _pieces(vertices, faces, normals, mesh.part_of)
-    blank = _charts(vertices, faces, normals, chart_of, component)
-    whole = DesignSurface(vertices, faces, normals, chart_of, component, blank, np.empty(0), np.empty((0, 3)),
-                          np.empty((0, 3)), int(component.max(initial=-1)) + 1)  # fmt: skip
-    return gridded(whole, cell_mm)
+    surface = DesignSurface(
+        vertices=vertices,
+        faces=faces,
+        normals=normals,
+        chart_of=chart_of,
+        component_of=component,
+        charts=_charts(vertices, faces, normals, chart_of, component),
+        share=np.empty(0),
+        centres=np.empty((0, 3)),
+        outward=np.empty((0, 3)),
+        components=int(component.max(initial=-1)) + 1,
+    )
+    return gridded(surface, cell_mm)
 
 
 def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
@@ -98,11 +105,10 @@ def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
     charts = _with_cells(surface, cell_mm)
     share = np.zeros(int(charts.shape.prod(axis=1).sum()))
     a, b, c = (layout(charts, chart_of, vertices[faces[:, k]]) for k in range(3))
-    turn = np.where(charts.kind == CYLINDER, 2.0 * np.pi * charts.radius, np.inf)[chart_of]
-    for other in (b, c):  # a facet that lies across the seam
-        other[:, 1] += np.where(np.isfinite(turn), np.round((a[:, 1] - other[:, 1]) / turn), 0.0) * np.where(
-            np.isfinite(turn), turn, 0.0
-        )
+    turn = 2.0 * np.pi * charts.radius[chart_of]
+    closed = charts.kind[chart_of] == CYLINDER
+    for corner in (b, c):  # of a facet that lies across the seam
+        corner[:, 1] += np.where(closed, np.round((a[:, 1] - corner[:, 1]) / turn), 0.0) * np.where(closed, turn, 0.0)
     rasterise(a, b, c, chart_of, charts.low, charts.shape, charts.first, cell_mm, share)
     centres, outward = _cell_places(charts)
     return dataclasses.replace(surface, charts=charts, share=np.minimum(share, 1.0), centres=centres, outward=outward)
@@ -117,7 +123,7 @@ def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
 
 
 def _welded(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Make one of vertices at one place."""
+    """Merge vertices at the same place."""
     key = np.round(vertices / WELD_MM).astype(np.int64)
     _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return vertices[first], inverse.reshape(-1)[faces]
@@ -128,14 +134,14 @@ def _components(vertices: Floats, faces: Ints) -> Ints:
     links = coo_array((np.ones(2 * len(faces), np.int8), (faces[:, :2].ravel(), faces[:, 1:].ravel())),
                       (len(vertices),) * 2)  # fmt: skip
     body = connected_components(links, directed=False)[1][faces[:, 0]].astype(np.int64)
-    one, two = visible_facets.touching(vertices, faces, TOUCH_MM)
-    own = np.full(len(vertices), -1, np.int64)
-    own[faces.ravel()] = np.repeat(body, 3)
+    vertex, facet = mesh_distance.touching(vertices, faces, TOUCH_MM)
+    body_of_vertex = np.full(len(vertices), -1, np.int64)
+    body_of_vertex[faces.ravel()] = np.repeat(body, 3)
     count = int(body.max(initial=-1)) + 1
-    pairs = coo_array((np.ones(len(one), np.int8), (own[one], body[two])), (count, count))
-    whole = connected_components(pairs, directed=False)[1].astype(np.int64)
-    many = np.bincount(whole) > MOST_BODIES
-    group = np.where(many[whole[body]], count + body, whole[body])
+    contacts = coo_array((np.ones(len(vertex), np.int8), (body_of_vertex[vertex], body[facet])), (count, count))
+    group = connected_components(contacts, directed=False)[1].astype(np.int64)
+    many = np.bincount(group) > MOST_BODIES
+    group = np.where(many[group[body]], count + body, group[body])
     _, first, inverse = np.unique(group, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
@@ -143,28 +149,28 @@ def _components(vertices: Floats, faces: Ints) -> Ints:
 
 
 def _pieces(vertices: Floats, faces: Ints, normals: Floats, part: Ints) -> Ints:
-    """Return the chart (f,) of each facet: a smooth face, or where that is neither flat nor round pieces of it."""
-    found = np.full(len(faces), -1, np.int64)
+    """Return the chart (f,) of each facet: a smooth face, or pieces of it if it is neither plane nor cylindrical."""
+    chart = np.full(len(faces), -1, np.int64)
     count = 0
     order = np.argsort(part, kind="stable")
     for rows in np.split(order, np.flatnonzero(np.diff(part[order])) + 1):
         n = normals[rows]
         flat = n @ n[0] > FLAT_COS
         if flat.all() or _cylinder(vertices[faces[rows]], n) is not None:
-            found[rows] = count
+            chart[rows] = count
             count += 1
             continue
         left = rows
         while len(left):
             near = normals[left] @ normals[left[0]] > PIECE_COS
-            found[left[near]] = count
+            chart[left[near]] = count
             count += 1
             left = left[~near]
-    return found
+    return chart
 
 
 def _cylinder(corners: Floats, normals: Floats) -> tuple[Floats, Floats, float] | None:
-    """Return a point of the axis (3,), its direction (3,) and the radius of facets (f, 3, 3); None where not round."""
+    """Return a point (3,) and direction (3,) of the axis, and the radius, of facets (f, 3, 3); None if no cylinder."""
     if len(corners) < 6:
         return None
     variances, axes = np.linalg.eigh(normals.T @ normals / len(normals))
@@ -181,20 +187,21 @@ def _cylinder(corners: Floats, normals: Floats) -> tuple[Floats, Floats, float] 
 
 
 def _charts(vertices: Floats, faces: Ints, normals: Floats, chart_of: Ints, component: Ints) -> Charts:
+    """Return the charts without cells."""
     count = int(chart_of.max(initial=-1)) + 1
-    kind, own = np.zeros(count, np.int64), np.zeros(count, np.int64)
+    kind, component_of = np.zeros(count, np.int64), np.zeros(count, np.int64)
     origin, axes, radius = np.zeros((count, 3)), np.zeros((count, 3, 3)), np.full(count, np.inf)
     order = np.argsort(chart_of, kind="stable")
     for chart, rows in enumerate(np.split(order, np.flatnonzero(np.diff(chart_of[order])) + 1)):
         corners = vertices[faces[rows]]
-        own[chart] = component[rows[0]]
+        component_of[chart] = component[rows[0]]
         size = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         normal = size @ normals[rows]
         flat = (normals[rows] @ normals[rows[0]] > FLAT_COS).all()
-        found = None if flat else _cylinder(corners, normals[rows])
-        if found is not None:
+        cylinder = None if flat else _cylinder(corners, normals[rows])
+        if cylinder is not None:
             kind[chart] = CYLINDER
-            origin[chart], along, radius[chart] = found
+            origin[chart], along, radius[chart] = cylinder
             side = normals[rows[0]] - (normals[rows[0]] @ along) * along
             out = side / np.linalg.norm(side)
         else:
@@ -202,45 +209,56 @@ def _charts(vertices: Floats, faces: Ints, normals: Floats, chart_of: Ints, comp
             out = normal / np.linalg.norm(normal)
             along = _longest(corners, out)
         axes[chart] = [along, np.cross(out, along), out]
-    return Charts(kind, own, origin, axes, np.where(kind == PLANE, 1.0, radius), np.zeros((count, 2)),
-                  np.ones((count, 2), np.int64), np.zeros(count, np.int64), 1.0)  # fmt: skip
+    return Charts(
+        kind=kind,
+        component=component_of,
+        origin=origin,
+        axes=axes,
+        radius=np.where(kind == PLANE, 1.0, radius),
+        low=np.zeros((count, 2)),
+        shape=np.ones((count, 2), np.int64),
+        first=np.zeros(count, np.int64),
+        cell_mm=1.0,
+    )
 
 
 def _with_cells(surface: DesignSurface, cell_mm: float) -> Charts:
-    blank, chart_of = surface.charts, surface.chart_of
-    count = len(blank.kind)
+    """Return the charts with grids of cells about the middles of their faces."""
+    charts, chart_of = surface.charts, surface.chart_of
+    count = len(charts.kind)
     low, high = np.full((count, 2), np.inf), np.full((count, 2), -np.inf)
     for k in range(3):
-        uv = layout(blank, chart_of, surface.vertices[surface.faces[:, k]])
+        uv = layout(charts, chart_of, surface.vertices[surface.faces[:, k]])
         np.minimum.at(low, chart_of, uv)
         np.maximum.at(high, chart_of, uv)
-    closed = blank.kind == CYLINDER
-    turn = np.pi * blank.radius
-    low[closed, 1], high[closed, 1] = -turn[closed], turn[closed]
+    closed = charts.kind == CYLINDER
+    half_turn = np.pi * charts.radius
+    low[closed, 1], high[closed, 1] = -half_turn[closed], half_turn[closed]
     shape = np.maximum(np.ceil((high - low) / cell_mm - 1e-6), 1).astype(np.int64)
-    low = 0.5 * (low + high) - 0.5 * shape * cell_mm  # the cells about the middle of the face
-    low[closed, 1] = -turn[closed]
+    low = 0.5 * (low + high) - 0.5 * shape * cell_mm
+    low[closed, 1] = -half_turn[closed]
     first = np.concatenate([[0], np.cumsum(shape.prod(axis=1))[:-1]]).astype(np.int64)
-    return dataclasses.replace(blank, low=low, shape=shape, first=first, cell_mm=cell_mm)
+    return dataclasses.replace(charts, low=low, shape=shape, first=first, cell_mm=cell_mm)
 
 
 def _longest(corners: Floats, out: Floats) -> Floats:
-    """Return the direction (3,) along the smallest rectangle about facets, across their normal."""
+    """Return the direction (3,) of the longer side of the smallest rectangle about facets, normal to ``out`` (3,)."""
     sides = (corners - np.roll(corners, 1, axis=1)).reshape(-1, 3)
     sides = sides - np.outer(sides @ out, out)
     lengths = np.linalg.norm(sides, axis=1)
     order = np.argsort(-lengths, kind="stable")[:MOST_SIDES]
     points = corners.reshape(-1, 3)
-    best, found = np.inf, sides[order[0]] / lengths[order[0]]
+    least_area, longest = np.inf, sides[order[0]] / lengths[order[0]]
     for row in order:
         along = sides[row] / max(lengths[row], 1e-12)
         wide, high = np.ptp(points @ np.stack([along, np.cross(out, along)], axis=1), axis=0)
-        if wide * high < best * (1.0 - 1e-6):
-            best = wide * high
-            found = along if wide >= high * (1.0 - 1e-6) else np.cross(out, along)
-    main = int(np.argmax(np.abs(found) > 0.7)) if (np.abs(found) > 0.7).any() else int(np.argmax(np.abs(found)))
-    result: Floats = found * np.sign(found[main])
-    return result
+        if wide * high < least_area * (1.0 - 1e-6):
+            least_area = wide * high
+            longest = along if wide >= high * (1.0 - 1e-6) else np.cross(out, along)
+    size = np.abs(longest)
+    main = int(np.argmax(size > 0.7)) if (size > 0.7).any() else int(np.argmax(size))
+    positive: Floats = longest * np.sign(longest[main])
+    return positive
 
 
 def _cell_places(charts: Charts) -> tuple[Floats, Floats]:
@@ -261,12 +279,6 @@ def _cell_places(charts: Charts) -> tuple[Floats, Floats]:
     return np.concatenate(centres), np.concatenate(outward)
 
 
-# --- Compiled: how much of each cell of a chart its facets cover.
-
-
-PER_SIDE = 4  # samples of a cell along each axis
-
-
 @njit(cache=True, nogil=True)
 def rasterise(
     a: Floats,
@@ -279,7 +291,7 @@ def rasterise(
     cell_mm: float,
     share: Floats,
 ) -> None:
-    """Add to ``share`` (cells,) what triangles with corners a, b, c (f, 2) cover of the cells of their charts."""
+    """Add to ``share`` (cells,) the part of the cells that triangles with corners a, b, c (f, 2) cover."""
     step = cell_mm / PER_SIDE
     for f in range(len(a)):
         k = chart_of[f]
@@ -296,7 +308,6 @@ def rasterise(
             u = i + 0.5
             for j in range(j0, j1 + 1):
                 v = j + 0.5
-                # Samples on a common side count for one triangle alone: half-open by a shift that no side has.
                 p = ((bu - u) * (cv - v) - (bv - v) * (cu - u)) / turn
                 q = ((cu - u) * (av - v) - (cv - v) * (au - u)) / turn
                 if p >= -1e-9 and q >= -1e-9 and p + q <= 1.0 + 1e-9:

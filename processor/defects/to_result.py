@@ -1,214 +1,260 @@
-"""Everything found of defects, put into the record that the step answers with."""
+"""The result of method ``default`` from the state of its search."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import dataclasses
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from processor.defects import classes, measures, pictures
-from processor.defects import pictures as defects_pictures
 from processor.defects.alignment import Alignment
-from processor.defects.classes import Named
-from processor.defects.component_shapes import ComponentShape, Judged, seen_front
+from processor.defects.classes import Classification
+from processor.defects.component_shapes import ComponentShape, SignificantShape, front_of
 from processor.defects.deviation_field import Field
-from processor.defects.measures import Near
-from processor.defects.missing_material import Expected
+from processor.defects.measures import CellPoints, Measures
 from processor.defects.params import Params
 from processor.defects.regions import Region
-from processor.defects.result import Result
+from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Result, Windows
 from processor.defects.scan_statistic import Levels
+from processor.defects.shape_models import Frame
 from processor.defects.surface_charts import DesignSurface
-from processor.model import NORMAL_95, Floats, Ints
+from processor.model import NORMAL_95, Floats, Ints, Reason, Status, reason
 
-CHANCE_MM2 = 1e8  # the surface that chance is counted on
+CHANCE_MM2 = 1e8  # the area that false alarms are counted on
 CURVE_STRIPS = 40
-SMALL_CELLS = 8.0  # of diameter, below which points are fitted and not cells
-SHALLOW_SHARE = 0.1  # of a component's shape that a model of it may be wrong by
+SMALL_CELLS = 8.0  # of diameter, below which a bump is fitted to points instead of cells
+SHALLOW_SHARE = 0.1  # of the amplitude of a component's shape, as the model may be wrong by
 THROUGH_SHARE = 0.7  # of the points expected on a crack, below which rays went through
+STEP_SHARE = 0.02  # of a step's height, above which a place belongs to it
 
 
 @dataclass(frozen=True)
-class Found:
-    """What the search left behind."""
+class Search:
+    """State of the search: ``residuals`` are the deviations less the ``significant`` shapes of components."""
 
     surface: DesignSurface
     field: Field
-    left: Field  # less the shapes of components
+    residuals: Field
     alignment: Alignment
     levels: Levels
-    shaped: list[ComponentShape]
-    judged: dict[int, list[Judged]]
+    shapes: list[ComponentShape]
+    significant: dict[int, list[SignificantShape]]
     places: list[list[Region]]
-    hoped: Expected
+    expected: Floats  # points (cells,)
     shape_values: Floats
-    near: Near
+    points: CellPoints
 
 
 @dataclass(frozen=True)
-class Row:
-    """One defect, as the record has it, and its cells."""
+class Defect:
+    """One defect: fields of its row in :class:`processor.defects.result.Defects`, and its cells."""
 
-    named: Named
+    values: dict[str, Any]
     component: int
-    columns: dict[str, Any]
     cells: Ints
     field: Field
-    remark: str = ""
-    curve: tuple[Floats, Floats, Floats] | None = None
 
 
-def result_of(found: Found, params: Params, name: str) -> Result:
-    """Put the answer together, the largest defects first."""
-    rows = [*_shapes(found), *_places(found)]
-    rows.sort(key=lambda row: (-abs(row.columns["volume_mm3"]), row.columns["centres"].tolist()))
-    surface, field = found.surface, found.field
+def result_of(search: Search, params: Params, origin: Floats) -> Result:
+    """Return the result, the largest defects first, in the design's frame; ``origin`` (3,) was subtracted from it."""
+    defects = [*_shape_defects(search), *_place_defects(search)]
+    defects.sort(key=lambda defect: (-abs(defect.values["volume_mm3"]), defect.values["centre"].tolist()))
+    surface, field = search.surface, search.field
     seen = field.seen > 0
     cell = surface.charts.cell_mm
-    registration = found.alignment.sd(surface.centres[seen], surface.outward[seen])
-    E = float(np.median(registration)) if seen.any() else float("nan")
-    noise = float(np.median(field.noise[seen])) if seen.any() else float("nan")
-    formal = np.sqrt(field.variance[seen]) * found.levels.inflation[0]
-    lod = NORMAL_95 * float(np.median(np.hypot(formal, registration))) if seen.any() else float("nan")
-    sides = np.array(found.levels.sides) * cell
-    points = float(np.median(field.count[seen])) if seen.any() else float("nan")
-    formal_sd = found.levels.inflation * noise / np.sqrt(points) / np.array(found.levels.sides)
-    least = found.levels.threshold * np.hypot(formal_sd, found.levels.systematic_mm)
-    columns: dict[str, Any] = {key: [row.columns[key] for row in rows] for key in (rows[0].columns if rows else ())}
-    curves = [(k, row.curve) for k, row in enumerate(rows) if row.curve is not None]
+    registration = search.alignment.sd(surface.centres[seen], surface.outward[seen])
+    noise = _median(field.noise[seen])
+    formal = np.sqrt(field.variance[seen]) * search.levels.inflation[0]
     examined = float(surface.share[seen].sum()) * cell**2
-    expected = float(surface.share[found.hoped.points > 0.0].sum()) * cell**2
-    said = f"{examined / 1e6:.1f} m2 examined of {surface.area_mm2 / 1e6:.1f} m2 of the design's surface"
-    if not found.alignment.fitted:
-        said += "; too few components to fit the whole to the design: its place is taken as it came"
+    reasons = [reason("defects.examined", examined=examined / 1e6, surface=surface.area_mm2 / 1e6)]
+    if not search.alignment.fitted:
+        reasons.append(reason("defects.not-fitted"))
+    drawn = [(d.values["centre"], d.cells, d.field, d.component) for d in defects[: params.pictures]]
     return Result(
-        "ok" if seen.any() else "failed",
-        params.method,
-        said,
-        registration_error_mm=E,
-        cell_mm=cell,
-        noise_mm=noise,
-        lod95_mm=lod,
+        status=Status.OK if seen.any() else Status.FAILED,
+        method=params.method,
+        reasons=tuple(reasons),
+        registration_error=_median(registration),
+        cell=cell,
+        noise=noise,
+        lod95=NORMAL_95 * _median(np.hypot(formal, registration)),
         examined_mm2=examined,
-        expected_mm2=expected,
-        scale_mm=sides,
-        scale_least_mm=least,
-        scale_inflation=found.levels.inflation,
-        ids=np.arange(len(rows)),
-        classes=tuple(row.named.kind for row in rows),
-        confidence=np.array([row.named.confidence for row in rows]),
-        second=tuple(row.named.second for row in rows),
-        components=tuple(f"component-{row.component + 1}" for row in rows),
-        remarks=tuple(row.remark for row in rows),
-        **columns,
-        curve_defect=np.concatenate([[], *(np.full(len(c[0]), k) for k, c in curves)]),
-        curve_at_mm=np.concatenate([[], *(c[0] for _, c in curves)]),
-        curve_mm=np.concatenate([[], *(c[1] for _, c in curves)]),
-        curve_ci95=np.concatenate([[], *(c[2] for _, c in curves)]),
-        **pictures.of_rows(
-            [(row.columns["centres"], row.cells, row.field, row.component) for row in rows],
-            surface, params.pictures,
-        ),
-        **pictures.of_surface([row.cells for row in rows], field, surface),
-    )  # fmt: skip
+        expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
+        least_depth=_least_depth(search.levels, cell, noise, _median(field.count[seen])),
+        defects=table([defect.values for defect in defects], origin),
+        pictures=pictures.of_defects(drawn, surface),
+        surface=pictures.of_surface([defect.cells for defect in defects], field, surface, origin),
+    )
 
 
-def _shapes(found: Found) -> Iterator[Row]:
-    """Give a row for every shape of a component."""
-    surface = found.surface
-    cell = surface.charts.cell_mm
-    frames = {one.component: one.frame for one in found.shaped}
-    for component, own in sorted(found.judged.items()):
-        frame = frames[component]
-        rows = seen_front(surface, component, found.field)
+def _median(values: Floats | Ints) -> float:
+    return float(np.median(values)) if len(values) else float("nan")
+
+
+def _least_depth(levels: Levels, cell: float, noise: float, points: float) -> Windows:
+    """Return the least mean depth that is found, by size of window, for cells of median noise and points."""
+    sides = np.array(levels.sides)
+    sd = levels.inflation * noise / np.sqrt(points) / sides
+    depth = levels.threshold * np.hypot(sd, levels.systematic_mm)
+    return Windows(side=sides * cell, depth=depth, noise_inflation=levels.inflation)
+
+
+def table(rows: Sequence[dict[str, Any]], origin: Floats) -> Defects:
+    """Return defects as a table, their centres shifted by ``origin`` (3,)."""
+    if not rows:
+        return Defects()
+    columns: dict[str, Any] = {key: tuple(row[key] for row in rows) for key in rows[0]}
+    columns["centre"] = np.array(columns["centre"]) + origin
+    columns["doubtful"] = np.array(columns["chance"]) > DOUBTFUL
+    return Defects(id=np.arange(len(rows)), **columns)
+
+
+def _row(classification: Classification, component: int, **values: Any) -> dict[str, Any]:
+    """Return the values of a row of the table of defects."""
+    row = {
+        "defect_class": classification.defect_class,
+        "confidence": classification.confidence,
+        "otherwise": classification.otherwise,
+        "component": f"component-{component + 1}",
+        "reasons": (),
+        "deflection": Curve(),
+    }
+    return row | values
+
+
+# --- Shapes of components
+
+
+def _shape_defects(search: Search) -> Iterator[Defect]:
+    """Yield a defect for each significant shape of a component."""
+    surface = search.surface
+    frames = {fit.component: fit.frame for fit in search.shapes}
+    for component, shapes in sorted(search.significant.items()):
+        rows = front_of(surface, component, search.field)
         rows = rows[surface.share[rows] > 0.5]
-        for judged in own:
-            value = judged.shape.values(frame, surface.centres[rows], surface.outward[rows])
-            part = np.abs(value) > max(judged.ci95, 0.02 * abs(judged.peak))
-            if judged.shape.kind != "step":
-                part |= True
-            area = surface.share[rows] * cell**2
-            both = judged.shape.kind in ("twist", "waviness")
-            volume = float((np.abs(value) if both else -value) @ area)
-            seen = rows[(found.field.seen[rows] > 0) & part]
-            centre = surface.centres[rows[part]].mean(axis=0)
-            depth = abs(judged.peak) if both else -judged.peak
-            extent = 2.0 * frame.half[:2]
-            if judged.shape.kind == "step":  # what lies beyond it, along the axis that it is across
-                extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
-            axes = frame.axes.copy()
-            named = classes.of_shape(judged.shape.kind, judged.margin)
-            lod = judged.ci95
-            curve = None
-            if judged.shape.kind == "bend" and len(seen):
-                axis = int(judged.shape.at[0])
-                along = frame.local(surface.centres[seen])[:, axis]
-                others = found.left.deviation[seen] + value[np.searchsorted(rows, seen)]
-                curve = defects_pictures.by_strips(along, others, found.field.variance[seen], CURVE_STRIPS)
-            columns = {
-                "centres": centre, "axes": axes, "extent": extent, "area_mm2": float(area[part].sum()),
-                "depth_max": depth, "depth_ci95": judged.ci95, "depth_mean": volume / float(area[part].sum()),
-                "volume_mm3": volume, "volume_ci95": judged.ci95 * float(area.sum()) / NORMAL_95,
-                "edge_mm": float(frame.half[:2].min()), "curvature_per_m": _curvature(judged, frame.half),
-                "lod95": lod, "z": judged.z, "chance": judged.chance * CHANCE_MM2,
-            }  # fmt: skip
-            yield Row(named, component, columns, rows[part], found.field, curve=curve)
+        for shape in shapes:
+            yield _shape_defect(search, component, rows, shape, frames[component])
 
 
-def _curvature(judged: Judged, half: Floats) -> float:
+def _shape_defect(search: Search, component: int, rows: Ints, judged: SignificantShape, frame: Frame) -> Defect:
+    """Measure a shape of a component on the cells ``rows`` of its largest face."""
+    surface, kind = search.surface, judged.shape.kind
+    value = judged.shape.values(frame, surface.centres[rows], surface.outward[rows])
+    extent = 2.0 * frame.half[:2]
+    part = np.ones(len(rows), bool)
+    if kind == "step":  # the part beyond the step
+        part = np.abs(value) > max(judged.ci95, STEP_SHARE * abs(judged.peak))
+        extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
+    area = surface.share[rows] * surface.charts.cell_mm**2
+    both_ways = kind in ("twist", "waviness")
+    volume = float((np.abs(value) if both_ways else -value) @ area)
+    values = _row(
+        classes.of_shape(kind, judged.margin),
+        component,
+        centre=surface.centres[rows[part]].mean(axis=0),
+        axes=frame.axes,
+        extent=extent,
+        area_mm2=float(area[part].sum()),
+        depth_max=abs(judged.peak) if both_ways else -judged.peak,
+        depth_ci95=judged.ci95,
+        depth_mean=volume / float(area[part].sum()),
+        volume_mm3=volume,
+        volume_ci95=judged.ci95 * float(area.sum()) / NORMAL_95,
+        edge_distance=float(frame.half[:2].min()),
+        curvature_per_m=_curvature(judged, frame.half),
+        lod95=judged.ci95,
+        z=judged.z,
+        chance=judged.chance * CHANCE_MM2,
+    )
+    seen = rows[(search.field.seen[rows] > 0) & part]
+    if kind == "bend" and len(seen):
+        along = frame.local(surface.centres[seen])[:, int(judged.shape.at[0])]
+        bent = search.residuals.deviation[seen] + value[np.searchsorted(rows, seen)]
+        values["deflection"] = pictures.by_strips(along, bent, search.field.variance[seen], CURVE_STRIPS)
+    return Defect(values=values, component=component, cells=rows[part], field=search.field)
+
+
+def _curvature(judged: SignificantShape, half: Floats) -> float:
+    """Return the largest curvature of a shape on a component of half sizes (3,), 1/m."""
     if judged.shape.kind == "bend":
         axis, order = int(judged.shape.at[0]), judged.shape.at[1]
-        high = abs(float(judged.shape.factors[0]))
-        return float(1000.0 * high * (2.0 if order == 2.0 else (0.5 * np.pi) ** 2) / half[axis] ** 2)
+        amplitude = abs(float(judged.shape.factors[0]))
+        return float(1000.0 * amplitude * (2.0 if order == 2.0 else (0.5 * np.pi) ** 2) / half[axis] ** 2)
     if judged.shape.kind == "waviness":
         return 1000.0 * abs(judged.peak) * (2.0 * np.pi / judged.shape.at[1]) ** 2
     return 0.0
 
 
-def _places(found: Found) -> Iterator[Row]:
-    """Give a row for every place that deviates or is missing."""
-    surface = found.surface
-    peaks = {number: max(abs(one.peak) for one in own) for number, own in found.judged.items()}
-    for group in found.places:
-        main = group[0]
-        component = int(surface.charts.component[main.chart])
-        middle = int(main.cells[len(main.cells) // 2])
-        thick = measures.thickness_at(surface, surface.centres[middle], surface.outward[middle], component)
-        known = thick if np.isfinite(thick) else float(np.sqrt(len(main.cells))) * surface.charts.cell_mm / 10.0
-        k = int(np.searchsorted(found.levels.sides, np.sqrt(len(main.cells)), side="right")) - 1
-        got = measures.measure(
-            main, found.left, surface, found.alignment, float(found.levels.inflation[max(k, 0)]), thick
-        )
-        length, width = float(got.extent[0]), float(got.extent[1])
-        if main.sign == 0:
-            named = classes.of_missing(got.borders, length, width, known, main.z)
-            depth, remark = got.depth, "" if np.isfinite(thick) else "the design says no thickness here"
-        else:
-            if abs(got.depth) < SHALLOW_SHARE * peaks.get(component, 0.0):
-                continue
-            named = classes.of_deviation(main.sign, got.diameter, length, width, known, main.z)
-            if got.diameter < SMALL_CELLS * surface.charts.cell_mm and named.kind != "crack":
-                got = measures.refined(got, main, found.near, found.field, found.shape_values)
-            if not abs(got.depth) > got.lod95:
-                continue  # crumbs about a defect, which only its nearness made significant
-            depth, remark = _depth_of_crack(found, main, got.depth, thick) if named.kind == "crack" else (got.depth, "")
-        columns = {
-            "centres": got.centre, "axes": got.axes, "extent": got.extent, "area_mm2": got.area,
-            "depth_max": depth, "depth_ci95": got.depth_ci95, "depth_mean": got.mean,
-            "volume_mm3": got.volume, "volume_ci95": got.volume_ci95, "edge_mm": got.edge,
-            "curvature_per_m": got.curvature, "lod95": got.lod95, "z": main.z, "chance": main.chance * CHANCE_MM2,
-        }  # fmt: skip
-        yield Row(
-            named, component, columns, np.unique(np.concatenate([one.cells for one in group])), found.left, remark
-        )
+# --- Places that deviate or are missing
 
 
-def _depth_of_crack(found: Found, main: Region, depth: float, thick: float) -> tuple[float, str]:
-    """Return how deep a crack is, mm, and what that rests on; ``depth`` is what beams saw of it."""
-    there = (found.field.count + found.field.stray)[main.cells].sum()
-    hoped = found.hoped.points[main.cells].sum()
-    if hoped > 0.0 and there < THROUGH_SHARE * hoped and np.isfinite(thick):
-        return thick, "rays went through: as deep as the plate is thick"
-    return depth, "at least so deep: too narrow for a beam to see its ground"
+def _place_defects(search: Search) -> Iterator[Defect]:
+    """Yield a defect for each place that deviates or is missing."""
+    amplitudes = {number: max(abs(shape.peak) for shape in shapes) for number, shapes in search.significant.items()}
+    for group in search.places:
+        component = int(search.surface.charts.component[group[0].chart])
+        values = _place_values(search, group[0], component, amplitudes.get(component, 0.0))
+        if values is not None:
+            cells = np.unique(np.concatenate([region.cells for region in group]))
+            yield Defect(values=values, component=component, cells=cells, field=search.residuals)
+
+
+def _place_values(search: Search, region: Region, component: int, amplitude: float) -> dict[str, Any] | None:
+    """Measure and classify a place on a component whose shape has an ``amplitude`` in mm; None if it is no defect."""
+    surface, cell = search.surface, search.surface.charts.cell_mm
+    middle = int(region.cells[len(region.cells) // 2])
+    thickness = measures.thickness_at(surface, surface.centres[middle], surface.outward[middle], component)
+    assumed = thickness if np.isfinite(thickness) else float(np.sqrt(len(region.cells))) * cell / 10.0
+    size = int(np.searchsorted(search.levels.sides, np.sqrt(len(region.cells)), side="right")) - 1
+    inflation = float(search.levels.inflation[max(size, 0)])
+    measured = measures.measure(region, search.residuals, surface, search.alignment, inflation, thickness)
+    length, width = float(measured.extent[0]), float(measured.extent[1])
+    reasons: tuple[Reason, ...] = ()
+    if region.sign == 0:
+        classification = classes.of_missing(measured.borders, length, width, assumed, region.z)
+        if not np.isfinite(thickness):
+            reasons = (reason("defects.no-thickness"),)
+    else:
+        if abs(measured.depth) < SHALLOW_SHARE * amplitude:
+            return None
+        classification = classes.of_deviation(region.sign, measured.diameter, length, width, assumed, region.z)
+        crack = classification.defect_class is DefectClass.CRACK
+        if measured.diameter < SMALL_CELLS * cell and not crack:
+            measured = measures.refined(measured, region, search.points, search.field, search.shape_values)
+        if not abs(measured.depth) > measured.lod95:
+            return None  # significant only together with the defect beside it
+        if crack:
+            measured, reasons = _crack_depth(search, region, measured, thickness)
+    return _row(
+        classification,
+        component,
+        reasons=reasons,
+        centre=measured.centre,
+        axes=measured.axes,
+        extent=measured.extent,
+        area_mm2=measured.area,
+        depth_max=measured.depth,
+        depth_ci95=measured.depth_ci95,
+        depth_mean=measured.mean,
+        volume_mm3=measured.volume,
+        volume_ci95=measured.volume_ci95,
+        edge_distance=measured.edge,
+        curvature_per_m=measured.curvature,
+        lod95=measured.lod95,
+        z=region.z,
+        chance=region.chance * CHANCE_MM2,
+    )
+
+
+def _crack_depth(
+    search: Search, region: Region, measured: Measures, thickness: float
+) -> tuple[Measures, tuple[Reason, ...]]:
+    """Return the depth of a crack: the plate's thickness if rays went through, else what was measured as a bound."""
+    points = (search.field.count + search.field.stray)[region.cells].sum()
+    expected = search.expected[region.cells].sum()
+    if expected > 0.0 and points < THROUGH_SHARE * expected and np.isfinite(thickness):
+        return dataclasses.replace(measured, depth=thickness), (reason("defects.through"),)
+    return measured, (reason("defects.depth-bound"),)

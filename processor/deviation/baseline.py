@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.deviation import attitude, cloud, scales, statistics, to_result
+from processor.deviation import cloud, to_result
 from processor.deviation import measure as deviation_measure
-from processor.deviation.attitude import AMBIGUOUS
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.params import Params
-from processor.deviation.result import ErrorSource, Registration, Result
-from processor.geometry import icp, m3c2, principal, rigid
+from processor.deviation.result import ErrorSource, Result
+from processor.geometry import icp, m3c2, mesh_distance, principal, rigid
 from processor.geometry.neighbors import thinned
+from processor.geometry.principal import AMBIGUOUS, CoarsePose
+from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Scene, Status, reason
 
 MOST_ICP_POINTS = 60_000
@@ -29,33 +30,20 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     """Deviations of a scan from a design with vertices (v, 3) less ``origin`` (3,), as in the paper."""
     assert scene.structure is not None
     preset = params.paper
-    design = cloud.sampled(vertices, scene.structure.faces, scan.spacing_mm)
+    design = mesh_distance.sampled(vertices, scene.structure.faces, scan.spacing_mm)
     group = cloud.adaptive_voxels(design.points, preset.voxel_mm, preset.voxel_points)
     core = cloud.group_means(design.points, group)
     towards = cloud.group_means(design.normals, group)
-    own_group = cloud.adaptive_voxels(scan.points, preset.voxel_mm, preset.voxel_points)
-    reduced = cloud.group_means(scan.points, own_group)
-    target = thinned(core, MOST_ICP_POINTS)
-    source = thinned(reduced, MOST_ICP_POINTS)
-    if params.register in ("none", "fine"):
-        start, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN
-    else:
-        start, ambiguity = coarse(source, target)
-    T, error = start, 0.0
-    if params.register != "none":
-        T = icp.point_to_point(source, target, start).T_target_source
-        error = clone_error(rigid.apply(T, source))
-    if np.isfinite(params.registration_error_mm):
-        error = params.registration_error_mm
-    moved = rigid.apply(T, scan.points)
+    T, error, ambiguity = _registered(scan, core, origin, params)
     grid = m3c2.grid(design.points, preset.projection_diameter_mm)
     normals = m3c2.oriented(m3c2.normals(grid, core, preset.normal_diameter_mm).normals, towards)
-    found = m3c2.distances(
-        grid, m3c2.grid(moved, preset.projection_diameter_mm), core, normals,
+    compared = m3c2.grid(rigid.apply(T, scan.points), preset.projection_diameter_mm)
+    distances = m3c2.distances(
+        grid, compared, core, normals,
         projection_diameter_mm=preset.projection_diameter_mm, max_depth_mm=preset.max_depth_mm,
         registration_error_mm=error,
     )  # fmt: skip
-    total = statistics.of_distances(found, core, normals, preset.projection_diameter_mm, scales.PAPER_POINTS_A_CYLINDER)
+    total = m3c2.summary(distances, core, normals, preset.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     status = Status.OK if total.core_points > total.without_lod else Status.FAILED
     reasons = [
         reason(
@@ -63,14 +51,14 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
             without=total.without_lod,
             core_points=total.core_points,
             few=total.few_points,
-            least=scales.PAPER_POINTS_A_CYLINDER,
+            least=m3c2.PAPER_POINTS_A_CYLINDER,
         )
     ]
     if ambiguity < AMBIGUOUS:
         status = Status.AMBIGUOUS if status is Status.OK else status
         reasons.append(reason("deviation.paper-ambiguous", ratio=ambiguity))
-    used = known if (known := found.std2[np.isfinite(found.lod95)]).size else np.array([NAN])
-    points = to_result.core_points(core, normals, found)
+    used = known if (known := distances.std2[np.isfinite(distances.lod95)]).size else np.array([NAN])
+    points = to_result.core_points(core, normals, distances)
     how = {"none": Registration.AS_GIVEN, "fine": Registration.FINE}.get(params.register, Registration.COARSE)
     return Result(
         status=status,
@@ -94,29 +82,37 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     )
 
 
-def coarse(source: Floats, target: Floats) -> tuple[Floats, float]:
-    """Lay principal axes on each other: the rotation with the least mean square distance (eq. 9) after a short ICP.
+def _registered(scan: ScanCloud, core: Floats, origin: Floats, params: Params) -> tuple[Floats, float, float]:
+    """Pose T (4, 4) of the scan in the design's local frame, registration error in mm, and ambiguity."""
+    preset = params.paper
+    reduced = cloud.group_means(scan.points, cloud.adaptive_voxels(scan.points, preset.voxel_mm, preset.voxel_points))
+    target, source = thinned(core, MOST_ICP_POINTS), thinned(reduced, MOST_ICP_POINTS)
+    if params.register in ("none", "fine"):
+        T, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN
+    else:
+        pose = coarse(source, target)
+        T, ambiguity = pose.T_target_source, pose.ambiguity
+    error = 0.0
+    if params.register != "none":
+        T = icp.point_to_point(source, target, T).T_target_source
+        error = clone_error(rigid.apply(T, source))
+    if np.isfinite(params.registration_error_mm):
+        error = params.registration_error_mm
+    return T, error, ambiguity
 
-    The paper compares its cases as the axes have them. These are a little off, by as much as cases of a structure that
-    is about symmetric differ: what is left then is chance. Axes that spread alike are swapped, too. Returns
-    T_target_source (4, 4) and the ratio of the rms of the next best pose, of those that differ, to the best one's.
-    """
-    own, other = principal.of_points(source), principal.of_points(target)
-    size = float(np.linalg.norm(np.ptp(target, axis=0)))
+
+def coarse(source: Floats, target: Floats) -> CoarsePose:
+    """Lay principal axes on each other: the pose with the least mean square distance (eq. 9) after a short ICP."""
     few = thinned(source, COARSE_POINTS)
-    found = []
-    for turn in attitude.rotations(other.variances, own.variances):
-        R = other.axes @ turn @ own.axes.T
-        start = rigid.transform(R, other.centre - R @ own.centre)
+
+    def refined(start: Floats) -> tuple[float, Floats]:
         T = icp.point_to_point(few, target, start, max_iterations=COARSE_ITERATIONS).T_target_source
-        found.append((icp.point_to_point(few, target, T, max_iterations=1).rms, T))
-    order = sorted(range(len(found)), key=lambda k: (found[k][0], k))
-    error, best = found[order[0]]
-    rivals = (found[k][0] for k in order[1:] if attitude.differ(found[k][1], best, own.centre, size))
-    return best, next(rivals, NAN) / max(error, 1e-9)
+        return icp.point_to_point(few, target, T, max_iterations=1).rms, T
+
+    size = float(np.linalg.norm(np.ptp(target, axis=0)))
+    return principal.coarse(principal.of_points(source), principal.of_points(target), size, refined)
 
 
 def clone_error(points: Floats) -> float:
     """Rms in mm that the same registration leaves between points (n, 3) and a clone of them."""
-    start, _ = coarse(points, points)
-    return icp.point_to_point(points, points, start).rms
+    return icp.point_to_point(points, points, coarse(points, points).T_target_source).rms

@@ -1,7 +1,7 @@
 """Method ``default``: how the scanned surface has moved from the design's, at points of the design's surface.
 
-M3C2 with the design's own surface in place of a cloud of it: each scanned point is held against the facet below it, so
-that a tube's curve is no roughness, and the two sides of a plate are told apart.
+M3C2 with the design's surface itself in place of a cloud of it: each scanned point is compared with the facet below it,
+so that the curvature of a tube does not count as roughness, and the two sides of a plate are kept separate.
 """
 
 from __future__ import annotations
@@ -12,70 +12,61 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import cloud, design_pose, scales, statistics, to_result
-from processor.deviation.attitude import AMBIGUOUS
-from processor.deviation.cloud import Samples, ScanCloud
-from processor.deviation.design_pose import Placed
+from processor.deviation import local_translation, to_result
+from processor.deviation.cloud import ScanCloud
+from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
-from processor.deviation.result import ErrorSource, Registration, Result
-from processor.geometry import local_translation, m3c2, mesh_distance, rigid
-from processor.geometry.local_translation import Movement
+from processor.deviation.result import ErrorSource, Result
+from processor.geometry import m3c2, mesh_distance, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
-from processor.geometry.mesh_distance import CurvedFacets, MeshSurface
-from processor.geometry.surface_registration import about_origin
+from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
+from processor.geometry.principal import AMBIGUOUS
+from processor.geometry.surface_registration import NEAR_MM, Placed, Registration
 from processor.model import Floats, Ints, Reason, Scene, Status, reason
 
-SURFACE_SAMPLES = 1_000_000
-SAMPLE_MM = (8.0, 40.0)  # least and greatest spacing of samples on the design
 MOST_CORE = 150_000
-POINTS_A_CORE = 40.0  # scanned points about a core point; fewer where a surface is narrow
-CORE_SHARE = 0.5  # of the projection diameter: the spacing of core points
-REACH_MM = 200.0  # farther from the design's surface nothing is of it
+POINTS_A_CORE = 40.0  # scanned points about a core point, fewer on narrow surfaces
+CORE_SHARE = 0.5  # spacing of core points, in projection diameters
+REACH_MM = 200.0  # points farther from the design's surface are not of the structure
 DEPTH_SHARE, DEPTH_TIMES, LEAST_DEPTH_MM = 0.98, 2.5, 20.0
-LEAST_COS = 0.5  # between a core point's normal and the surface's under a scanned point
-NEAR_CORE = 4  # core points among which a scanned point's movement is looked for
-BACK_COS = -0.2  # a facet that looks away from the scanner by more was not seen
-BACK_TRIES = 8  # nearest samples among which a facet that was seen is looked for
+LEAST_COS = 0.5  # between the normals at a core point and below a scanned point
+NEAR_CORE = 4  # nearest core points whose movement a scanned point may take
+BACK_COS = -0.2  # a facet that faces away from the scanner by more is not visible
+BACK_TRIES = 8  # nearest samples among which a visible facet is searched
 
 
 @dataclass(frozen=True)
 class OnSurface:
-    """Points of a scan as the design sees them: foot (n, 3), signed distance (n,) and facet (n,); mm, outward > 0."""
+    """Points of a scan on the design: foot (n, 3), signed distance (n,) and facet (n,); mm, outward > 0."""
 
     feet: Floats
     distance: Floats
     facet: Ints
 
 
-def surface_of(vertices: Floats, faces: Ints) -> MeshSurface:
-    """Prepare a design's mesh, with samples as dense as its area allows."""
-    spacing = np.sqrt(cloud.area(vertices, faces) / SURFACE_SAMPLES)
-    return mesh_distance.of_mesh(vertices, faces, float(np.clip(spacing, *SAMPLE_MM)))
-
-
 def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, params: Params) -> Result:
     """Deviations of a scan from a design with vertices (v, 3) less ``origin`` (3,)."""
     assert scene.structure is not None
-    surface = surface_of(vertices, scene.structure.faces)
+    surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
-    placed = design_pose.place(scan, surface, given, params.register)
-    diameter = params.projection_diameter_mm or scales.rounded(scales.diameter_for(POINTS_A_CORE, scan.spacing_mm))
-    area = cloud.area(vertices, surface.faces)
+    placed = surface_registration.place(scan.points, surface, given, params.register)
+    diameter = params.projection_diameter_mm or m3c2.rounded(m3c2.diameter_for(POINTS_A_CORE, scan.spacing_mm))
+    area = mesh_distance.area(vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
-    core = cloud.sampled(vertices, surface.faces, core_spacing)
+    core = mesh_distance.sampled(vertices, surface.faces, core_spacing)
     seen = on_surface(scan, curved, placed.T)
     depth = params.max_depth_mm or _depth(seen.distance)
     near = np.abs(seen.distance) <= depth
     moved = movement(core, curved, seen, near, diameter)
-    found, error, source = distances(core, moved, placed, params.registration_error_mm)
-    return _result(scan, placed, core, found, origin, params, (diameter, depth, error, source, float(near.mean())))
+    measured, error, source = distances(core, moved, placed, params.registration_error_mm)
+    return _result(scan, placed, core, measured, origin, params, (diameter, depth, error, source, float(near.mean())))
 
 
 def on_surface(scan: ScanCloud, curved: CurvedFacets, T: Floats, reach_mm: float = REACH_MM) -> OnSurface:
-    """Hold a scan's points, placed by T (4, 4), against a design; those off its faces have distance NaN, facet -1.
+    """Compare a scan's points, placed by T (4, 4), with a design; those off its faces have distance NaN, facet -1.
 
-    Where it is known from where a point was seen, it is held against a facet that could be seen from there.
+    If the position that a point was seen from is known, it is compared with a facet visible from there.
     """
     surface = curved.surface
     points = rigid.apply(T, scan.points)
@@ -94,16 +85,15 @@ def on_surface(scan: ScanCloud, curved: CurvedFacets, T: Floats, reach_mm: float
 
 
 def _facing(points: Floats, sight: Floats, surface: MeshSurface, reach: float) -> Ints:
-    """Return the facet (n,) of the nearest sample that looks along ``sight`` (n, 3), -1 where none of the nearest."""
+    """Return the facet (n,) of the nearest sample that faces along ``sight`` (n, 3); -1 if none of the nearest does."""
     k = min(BACK_TRIES, len(surface.sample_face))
     near, index = surface.tree.query(points, k=np.arange(1, k + 1), distance_upper_bound=reach, workers=-1)
     facet = surface.sample_face[np.minimum(index, len(surface.sample_face) - 1)]
-    looks = np.einsum("nki,ni->nk", surface.normals[facet], sight) >= BACK_COS
-    good = np.isfinite(near) & looks
-    first = np.argmax(good, axis=1)
+    facing = np.isfinite(near) & (np.einsum("nki,ni->nk", surface.normals[facet], sight) >= BACK_COS)
+    first = np.argmax(facing, axis=1)
     rows = np.arange(len(points))
-    found: Ints = np.where(good[rows, first], facet[rows, first], -1)
-    return found
+    nearest: Ints = np.where(facing[rows, first], facet[rows, first], -1)
+    return nearest
 
 
 def movement(
@@ -111,8 +101,8 @@ def movement(
 ) -> Movement:
     """Fit movements at core points to the scan's points in use (n,).
 
-    Twice: a point is held against the facet below where it was before it moved, so that a tube that moved sideways is
-    no smaller one.
+    The second of two fits compares each point with the facet below its place before the movement, so that a tube that
+    moved sideways does not appear smaller.
     """
     surface = curved.surface
     rows = np.flatnonzero(used)
@@ -133,7 +123,7 @@ def movement(
     on = mesh_distance.on_face(facet, beyond)
     before, facet, left, vector = before[on], facet[on], left[on], vector[on]
     normals = surface.normals[facet]
-    # What is left after the first movement, and the first movement itself along the facet's normal.
+    # The residual after the first movement, and the first movement itself along the facet's normal.
     feet = before - left[:, None] * normals
     distance = left - curved.heights(feet, facet) + np.einsum("ni,ni->n", normals, vector)
     return _fitted(core, surface, feet, distance, facet, diameter_mm)
@@ -152,44 +142,45 @@ def _fitted(
 def distances(
     core: Samples, moved: Movement, placed: Placed, stated_error_mm: float
 ) -> tuple[Distances, float, ErrorSource]:
-    """Distances at core points with LOD95, the registration error in it (one sd, mm), and where that is from."""
+    """Distances at core points with LOD95, the registration error in it (one sd, mm), and its source."""
     known = np.isfinite(moved.along)
     if np.isfinite(stated_error_mm):
         error, source = stated_error_mm, ErrorSource.GIVEN
     elif np.isfinite(placed.covariance).all() and known.any():
-        error = design_pose.error_along(placed.covariance, core.points[known], core.normals[known])
+        error = surface_registration.error_along(placed.covariance, core.points[known], core.normals[known])
         source = ErrorSource.COVARIANCE
     else:
         error, source = 0.0, ErrorSource.UNKNOWN
     lod95 = m3c2.Z95 * (moved.sd / np.sqrt(np.maximum(moved.count, 1)) + error)
-    return Distances(moved.along, lod95, moved.count, moved.count, np.zeros(len(lod95)), moved.sd), error, source
+    measured = Distances(
+        distance=moved.along, lod95=lod95, n1=moved.count, n2=moved.count, std1=np.zeros(len(lod95)), std2=moved.sd
+    )
+    return measured, error, source
 
 
 def _depth(distance: Floats) -> float:
     known = np.abs(distance[np.isfinite(distance)])
     if not len(known):
         return LEAST_DEPTH_MM
-    return float(
-        np.clip(scales.rounded(DEPTH_TIMES * float(np.quantile(known, DEPTH_SHARE))), LEAST_DEPTH_MM, REACH_MM)
-    )
+    return float(np.clip(m3c2.rounded(DEPTH_TIMES * float(np.quantile(known, DEPTH_SHARE))), LEAST_DEPTH_MM, REACH_MM))
 
 
 def _result(
     scan: ScanCloud,
     placed: Placed,
     core: Samples,
-    found: Distances,
+    measured: Distances,
     origin: Floats,
     params: Params,
     used: tuple[float, float, float, ErrorSource, float],
 ) -> Result:
     diameter, depth, error, source, share = used
-    total = statistics.of_distances(found, core.points, core.normals, diameter, scales.PAPER_POINTS_A_CYLINDER)
-    points = to_result.core_points(core.points, core.normals, found)
+    total = m3c2.summary(measured, core.points, core.normals, diameter, m3c2.PAPER_POINTS_A_CYLINDER)
+    points = to_result.core_points(core.points, core.normals, measured)
     status, reasons = _status(placed, total, params)
     if scan.unposed > 1:
         reasons.append(reason("deviation.unposed-scans", scans=scan.unposed))
-    known = found.std2[np.isfinite(found.lod95)]
+    known = measured.std2[np.isfinite(measured.lod95)]
     return Result(
         status=status,
         method=params.method,
@@ -199,7 +190,7 @@ def _result(
         registration_error=error,
         registration_error_from=source,
         T_best_fit=global_pose(placed.T_best_fit, scan.origin, origin),
-        covariance=about_origin(placed.covariance, origin),
+        covariance=rigid.about_origin(placed.covariance, origin),
         best_fit_shift=placed.shift,
         best_fit_turn=placed.turn,
         ambiguity=placed.ambiguity,
@@ -216,11 +207,11 @@ def _result(
     )
 
 
-def _status(placed: Placed, total: statistics.Summary, params: Params) -> tuple[Status, list[Reason]]:
+def _status(placed: Placed, total: m3c2.Summary, params: Params) -> tuple[Status, list[Reason]]:
     """Return the status, and its reasons: how the scan was registered."""
     if total.core_points == total.without_lod:
         share = 100.0 * placed.near_share
-        return Status.FAILED, [reason("deviation.no-core-point", share=share, near_mm=design_pose.NEAR_MM)]
+        return Status.FAILED, [reason("deviation.no-core-point", share=share, near_mm=NEAR_MM)]
     reasons: list[Reason] = []
     status = Status.OK
     if placed.registration is Registration.AS_GIVEN:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry.m3c2 import Distances
+from processor.geometry.surface_registration import Registration
 from processor.model import (
     Checked,
     Floats,
@@ -23,14 +24,6 @@ from processor.model import (
 )
 
 NAN = float("nan")
-
-
-class Registration(Word):
-    """How the scan was registered to the design."""
-
-    AS_GIVEN = "as given"
-    FINE = "fine"
-    COARSE = "coarse"
 
 
 class ErrorSource(Word):

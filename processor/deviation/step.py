@@ -12,6 +12,7 @@ from typing import Any
 from processor.deviation import baseline, cloud, measure
 from processor.deviation.params import METHODS, Params
 from processor.deviation.result import Result
+from processor.geometry import merging
 from processor.model import InputError, Scene, UsageError
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
@@ -27,7 +28,7 @@ def applies(scene: Scene) -> bool:
 
 
 def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) -> Result:
-    """Hold the scan of a scene against its design; scans that were stitched ``earlier`` are placed as found there.
+    """Compare the scan of a scene with its design; scans stitched ``earlier`` have the poses of that result.
 
     Raises InputError without a design or points, UsageError for parameters that make no sense.
     """
@@ -39,7 +40,7 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
             f"{scene.name}: deviation needs a design, a mesh named by 'design' in project.toml; without one, "
             "processor compare holds one scan against another"
         )
-    vertices, origin = cloud.local_design(scene.structure)
+    vertices, origin = merging.local_design(scene.structure)
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, (earlier or {}).get("stitch"))
     if params.method == "paper":
         return baseline.measure(scene, scan, vertices, origin, params)

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 
 from processor.deviation.result import NAN, CorePoints
-from processor.deviation.statistics import Summary
-from processor.geometry.m3c2 import Distances
+from processor.geometry.m3c2 import Distances, Summary
 from processor.model import Floats
 
 NEAR_MM = 10.0

@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.deviation import attitude
 from processor.deviation.result import Result
 from processor.evaluation.error_statistics import signed
-from processor.geometry import rigid
+from processor.geometry import principal, rigid
 from processor.model import Floats, Metric, Scene, Statistic, StructureTruth, Truth
 
 NEIGHBOURS = 24
@@ -64,7 +63,7 @@ def _otherwise(result: Result) -> float | None:
     T = result.T_design_scan
     centre = result.origin + result.core.points.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(result.core.points, axis=0)))
-    if not attitude.differ(T, np.eye(4), centre, size):
+    if not principal.differ(T, np.eye(4), centre, size):
         return None
     return float(np.degrees(rigid.rotation_angle(T[:3, :3])))
 

@@ -1,10 +1,10 @@
-"""A part's outer box from its design curves alone: the mesh of a part whose design has none.
+"""Mesh of a part's outer box from its design curves alone, for a part whose design has no mesh.
 
-The bottom runs between the two bottom edges. The webs stand on them as the sections at the joints say: their height is
-linear along the arc from joint to joint, upright to the soffit. A foot has one joint: how high it is elsewhere nobody
-said. Its webs are taken to grow as its width does, which misleads nothing since they go on as flat above; its top is
-left out but near the joint, and so is its base. The ends at joints are rings, somewhat thinner than ``plate_mm`` says.
-There are no inner walls: with plates of a thickness that is only taken they would be in the wrong place.
+The bottom lies between the two bottom edges. The webs are perpendicular to the soffit, and their height is linear along
+the arc between the sections at the two joints. A foot has one joint only, and its height elsewhere is unknown. Its webs
+are assumed to grow with its width, which has no effect since they are flat further up; its top is left out except near
+the joint, and so is its base. The ends at joints are rings, somewhat thinner than ``plate_mm``. There are no inner
+walls: with a plate thickness that is only assumed they would be in the wrong place.
 """
 
 from __future__ import annotations
@@ -21,21 +21,21 @@ from processor.model import ArchDesign, DesignPart, Floats, InputError, Ints
 
 SOURCE = "curves"
 PLATE_MM = 20.0
-RING_SHARE = 0.7  # of a plate's thickness: points on the inner wall must not count as of the ring
+RING_SHARE = 0.7  # of a plate's thickness, so that points on the inner wall are not taken for the ring
 MESH_ERROR_MM = 0.002  # along the curve
 LONGEST_STEP_MM, SHORTEST_STEP_MM = 250.0, 5.0
-SAME_WIDTH = 0.002  # a foot whose width changes by less keeps its height, too
-OFF_JOINT = 0.05  # of the width: edges that end farther from a joint's P1 and P2 belong to another one
-KINK_RATIO, KINK_RAD = 2.0, 0.002  # an edge that turns at a point by this much more than beside it has a kink there
+SAME_WIDTH = 0.002  # relative change of a foot's width below which its height is taken as constant
+OFF_JOINT = 0.05  # of the width: edges that end farther from a joint's P1 and P2 belong to another joint
+KINK_RATIO, KINK_RAD = 2.0, 0.002  # an edge has a kink where it turns by so much more than at adjacent points
 ALIKE_MM = 10.0  # parts whose edges differ by less are of one shape
 CORNERS = 4  # bottom left, bottom right, top right, top left
 
 
 @dataclass(frozen=True)
 class Edge:
-    """A curve through the points of an edge, by its share of the length (0 at the start, 1 at the end): smooth pieces.
+    """A curve through the points of an edge, of smooth pieces; its parameter is the share of the length from 0 to 1.
 
-    ``knots`` (n,) are the points' shares, ``starts`` (k,) those where a piece begins.
+    ``knots`` (n,) are the shares of the points, ``starts`` (k,) those where a piece begins.
     """
 
     length: float
@@ -45,11 +45,11 @@ class Edge:
 
     @staticmethod
     def through(points: Floats) -> Edge:
-        """Lay a curve through points (n, 3), n >= 2: smooth between kinks, straight where the points are."""
+        """Interpolate points (n, 3), n >= 2: smooth between kinks, straight between points on a line."""
         chords = np.diff(points, axis=0)
         sizes = np.linalg.norm(chords, axis=1)
         share = np.concatenate([[0.0], np.cumsum(sizes)])
-        share = share / share[-1]  # the last is 1 to the bit: beyond it the curve has no value
+        share = share / share[-1]  # the last is exactly 1: beyond it the curve has no value
         ways = chords / sizes[:, None]
         turn = np.concatenate([[0.0], np.linalg.norm(np.diff(ways, axis=0), axis=1), [0.0]])
         beside = np.maximum(np.append(turn[1:], 0.0), np.append(0.0, turn[:-1]))
@@ -66,10 +66,10 @@ class Edge:
     def at(self, share: Floats) -> Floats:
         """Points (n, 3) at shares (n,) of the length."""
         which = np.clip(np.searchsorted(self.starts, share, side="right") - 1, 0, len(self.pieces) - 1)
-        found = np.empty((len(share), 3))
+        points = np.empty((len(share), 3))
         for k, piece in enumerate(self.pieces):
-            found[which == k] = piece(share[which == k])
-        return found
+            points[which == k] = piece(share[which == k])
+        return points
 
 
 def mesh(
@@ -78,7 +78,7 @@ def mesh(
     """Vertices (v, 3) and triangles (f, 3), normals outward, of a part's outer box; mm.
 
     ``left`` and ``right`` (n, 3) are its bottom edges from start to end, ``start`` and ``end`` the key points (8, 3) of
-    the joints there; one of them may be missing. Raises InputError where edges and joints do not belong together.
+    the joints there; one of them may be missing. Raises InputError for edges that do not end at the joints.
     """
     edges = (Edge.through(left), Edge.through(right))
     joints = [(share, points) for share, points in ((0.0, start), (1.0, end)) if points is not None]
@@ -87,7 +87,7 @@ def mesh(
     for share, points in joints:
         _check(edges, share, points)
     length = 0.5 * (edges[0].length + edges[1].length)
-    at = _stations(edges, length, max(float(np.linalg.norm(points[3] - points[0])) for _, points in joints))
+    at = _chainages(edges, length, max(float(np.linalg.norm(points[3] - points[0])) for _, points in joints))
     sections = _sections(edges, at, joints)
     count = len(at)
     number = np.arange(CORNERS * count).reshape(-1, CORNERS)
@@ -108,34 +108,35 @@ def mesh(
 
 
 def alike(part: DesignPart, design: ArchDesign) -> tuple[str, ...]:
-    """Name the other parts whose edges are the same but for a motion: their scans pass for each other.
+    """Name the other parts with the same edges except for a motion: their scans are not distinguishable.
 
-    Sections are not compared: parts of one pair of edges and of different heights are named, too.
+    Sections are not compared, so that parts with equal edges and different heights are named, too.
     """
     return tuple(other.name for other in design.parts if other.name != part.name and motions(part, other))
 
 
 def motions(part: DesignPart, other: DesignPart) -> list[Floats]:
-    """Rigid T_part_other (4, 4), none of them a mirror image, that lay the other part's edges on this part's."""
+    """Rigid motions T_part_other (4, 4), no mirror images, that map the other part's edges to this part's."""
     share = np.linspace(0.0, 1.0, 9)
 
     def places(left: Floats, right: Floats) -> Floats:
         return np.vstack([Edge.through(edge).at(share) for edge in (left, right)])
 
-    own = places(part.bottom_edge_left, part.bottom_edge_right)
-    found = []
+    target = places(part.bottom_edge_left, part.bottom_edge_right)
+    poses = []
     for left, right in (
         (other.bottom_edge_left, other.bottom_edge_right),
         (other.bottom_edge_right[::-1], other.bottom_edge_left[::-1]),
     ):
-        theirs = places(left, right)
-        T = rigid.fit(theirs, own)
-        if np.linalg.norm(rigid.apply(T, theirs) - own, axis=1).max() < ALIKE_MM:
-            found.append(T)
-    return found
+        source = places(left, right)
+        T = rigid.fit(source, target)
+        if np.linalg.norm(rigid.apply(T, source) - target, axis=1).max() < ALIKE_MM:
+            poses.append(T)
+    return poses
 
 
 def _check(edges: tuple[Edge, Edge], share: float, points: Floats) -> None:
+    """Raise InputError unless the edges end at the key points (8, 3) of the joint at ``share``, 0 or 1."""
     ends = np.vstack([edge.at(np.array([share])) for edge in edges])
     width = float(np.linalg.norm(points[0] - points[1]))
     off = float(np.linalg.norm(ends - points[:2], axis=1).max())
@@ -155,7 +156,7 @@ def _check(edges: tuple[Edge, Edge], share: float, points: Floats) -> None:
 
 
 def _frames(edges: tuple[Edge, Edge], share: Floats) -> tuple[Floats, Floats]:
-    """Middles (n, 3) of the bottom, and frames (n, 3, 3) there: columns along, to the left, up."""
+    """Midpoints (n, 3) of the bottom, and frames (n, 3, 3) there: columns along, to the left, up."""
     step = 1e-4
     before, after = np.maximum(share - step, 0.0), np.minimum(share + step, 1.0)
     along = sum(edge.at(after) - edge.at(before) for edge in edges)
@@ -167,21 +168,18 @@ def _frames(edges: tuple[Edge, Edge], share: Floats) -> tuple[Floats, Floats]:
     return middle, np.stack([along, left, np.cross(along, left)], axis=2)
 
 
-def _stations(edges: tuple[Edge, Edge], length: float, height: float) -> Floats:
-    """Shares of the length between which a chord stays within MESH_ERROR_MM of the curve, on the top too."""
-    even = np.linspace(0.0, 1.0, 201)
-    along = _frames(edges, even)[1][:, :, 0]
+def _chainages(edges: tuple[Edge, Edge], length: float, height: float) -> Floats:
+    """Shares of the length between which chords are within MESH_ERROR_MM of the curve, at the bottom and at the top."""
+    along = _frames(edges, np.linspace(0.0, 1.0, 201))[1][:, :, 0]
     bend = np.linalg.norm(np.diff(along, axis=0), axis=1).max() / (length / 200.0)
     step = np.sqrt(8.0 * MESH_ERROR_MM / max(bend * (1.0 + bend * height), 1e-12))
     step = float(np.clip(step, SHORTEST_STEP_MM, LONGEST_STEP_MM))
-    # A station at every point of the edges: there they may have kinks.
-    own = [np.linspace(0.0, 1.0, int(np.ceil(length / step)) + 1)]
-    own += [edge.knots for edge in edges]
-    share = np.unique(np.concatenate(own))
-    kept = np.concatenate([[True], np.diff(share) * length > 0.5])
-    found: Floats = share[kept]
-    found[-1] = 1.0
-    return found
+    # Every point of the edges is included: there they may have kinks.
+    even = np.linspace(0.0, 1.0, int(np.ceil(length / step)) + 1)
+    share = np.unique(np.concatenate([even, *(edge.knots for edge in edges)]))
+    distinct: Floats = share[np.concatenate([[True], np.diff(share) * length > 0.5])]
+    distinct[-1] = 1.0
+    return distinct
 
 
 def _sections(edges: tuple[Edge, Edge], share: Floats, joints: list[tuple[float, Floats]]) -> Floats:
@@ -201,7 +199,7 @@ def _sections(edges: tuple[Edge, Edge], share: Floats, joints: list[tuple[float,
 
 
 def _widths(edges: tuple[Edge, Edge], share: Floats, joint: float) -> Floats:
-    """Widths (n,) by that at a joint."""
+    """Widths (n,) relative to the width at a joint."""
     at = np.append(share, joint)
     width: Floats = np.linalg.norm(edges[0].at(at) - edges[1].at(at), axis=1)
     by_joint: Floats = width[:-1] / width[-1]
@@ -223,7 +221,7 @@ def _top_known(
 
 
 def _ring(corners: Floats, plate_mm: float) -> tuple[Floats, Ints]:
-    """Vertices (8, 3) and triangles of the ring within corners (4, 3), looking to the part's start."""
+    """Vertices (8, 3) and triangles of the ring within corners (4, 3), normals towards the part's start."""
     after, before = np.roll(corners, -1, axis=0) - corners, np.roll(corners, 1, axis=0) - corners
     plate = np.minimum(RING_SHARE * plate_mm, 0.4 * min(np.linalg.norm(after, axis=1)))
     inward = [side / np.linalg.norm(side, axis=1)[:, None] for side in (after, before)]
@@ -234,6 +232,7 @@ def _ring(corners: Floats, plate_mm: float) -> tuple[Floats, Ints]:
 
 
 def _quads(a: Ints, b: Ints, c: Ints, d: Ints) -> Ints:
+    """Triangles (2n, 3) of quadrilaterals with corners a, b, c, d (n,)."""
     quads = np.stack([a, b, c, d], axis=-1).reshape(-1, 4)
     triangles: Ints = quads[:, [[0, 1, 2], [0, 2, 3]]].reshape(-1, 3)
     return triangles

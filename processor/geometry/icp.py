@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 
-MOST_WEIGHT = 100.0  # of a point, where few look along an axis
+MOST_WEIGHT = 100.0  # of a point on a face that few points lie on
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """What an alignment reached: the pose, the rms of the pairs' distances in mm and the share of points paired."""
+    """Pose reached, rms of the pairs' distances in mm, share of points paired, and number of iterations."""
 
     T_target_source: Floats
     rms: float
@@ -32,7 +32,7 @@ def point_to_point(
     max_iterations: int = 100,
     tolerance: float = 1e-6,
 ) -> Alignment:
-    """Align source (n, 3) to target (m, 3) from a start (4, 4): Besl and McKay, as in paper 000 eq. 5.
+    """Align source (n, 3) to target (m, 3) from a start (4, 4) (Besl and McKay; paper 000, eq. 5).
 
     Pairs farther apart than ``max_distance_mm`` are left out. Stops after ``max_iterations`` or when the rms changes
     by less than ``tolerance`` of itself.
@@ -41,8 +41,7 @@ def point_to_point(
     T, last, iteration = start, np.inf, 0
     rms, share = np.inf, 0.0
     for iteration in range(1, max_iterations + 1):
-        moved = rigid.apply(T, source)
-        distance, index = tree.query(moved, distance_upper_bound=max_distance_mm, workers=-1)
+        distance, index = tree.query(rigid.apply(T, source), distance_upper_bound=max_distance_mm, workers=-1)
         paired = np.isfinite(distance)
         share = float(paired.mean())
         if paired.sum() < 3:
@@ -68,30 +67,31 @@ def point_to_plane(
 ) -> Alignment:
     """Align source (n, 3) to a surface given by samples target (m, 3) with unit normals (m, 3).
 
-    Gauss-Newton on the distances along the normals, Huber-weighted by their median; pairs beyond the gate are left
-    out, gates in turn from wide to narrow. The rms is over the last gate's pairs. ``tree`` is of the target, if there
-    is one already; along each of the ``axes`` (3, 3, columns), where given, faces count the same: see :func:`balance`.
+    Gauss-Newton on the distances along the normals, Huber-weighted by their median. Pairs beyond the gate are left
+    out; the gates are used in turn, from wide to narrow. The rms is that of the last gate's pairs. ``tree`` is of the
+    target, if there is one already. With ``axes`` (3, 3, columns), faces along each axis have the same weight in sum:
+    see :func:`balance`.
     """
     tree = cKDTree(target) if tree is None else tree
-    T, rms, share, done = start, np.inf, 0.0, 0
+    T, rms, share, iterations = start, np.inf, 0.0, 0
     for gate in gates_mm:
         for _ in range(max_iterations):
-            done += 1
-            moved = rigid.apply(T, source)
-            # The nearest sample is up to a sample's spacing away along the surface; the gate is on the normal part.
-            distance, index = tree.query(moved, distance_upper_bound=3.0 * gate)
+            iterations += 1
+            placed = rigid.apply(T, source)
+            # The nearest sample may lie a sample spacing away along the surface; the gate limits the normal distance.
+            distance, index = tree.query(placed, distance_upper_bound=3.0 * gate)
             near = np.isfinite(distance)
-            p, at = moved[near], index[near]
+            p, at = placed[near], index[near]
             n = normals[at]
             r = np.einsum("ni,ni->n", p - target[at], n)
             keep = np.abs(r) <= gate
             p, n, r = p[keep], n[keep], r[keep]
             share = len(r) / len(source)
             if len(r) < 6:
-                return Alignment(T, np.inf, share, done)
+                return Alignment(T, np.inf, share, iterations)
             rms = float(np.sqrt(np.mean(r**2)))
-            # On a clean scan the median is next to nothing, and the few points of an end face, far off while the part
-            # still slides along its length, would lose all their weight: the gate sets a floor.
+            # On a clean scan the median is close to zero. The few points of an end face, far off while the part still
+            # slides along its length, would then lose all their weight: the gate sets a lower bound of the scale.
             scale = max(1.4826 * float(np.median(np.abs(r))), gate / 12.0)
             weight = np.minimum(1.0, 1.345 * scale / np.maximum(np.abs(r), 1e-12))
             if axes is not None:
@@ -104,20 +104,20 @@ def point_to_plane(
             reach = float(np.linalg.norm(p - centre, axis=1).max())
             if np.linalg.norm(step[:3]) * reach + np.linalg.norm(step[3:]) < 1e-3 * gate:
                 break
-    return Alignment(T, rms, share, done)
+    return Alignment(T, rms, share, iterations)
 
 
 def facing(normals: Floats, axes: Floats) -> Ints:
-    """Return along which of three axes (3, 3, columns) each of unit normals (n, 3) looks most."""
-    found: Ints = np.argmax(np.abs(normals @ axes), axis=1)
-    return found
+    """Return the index (n,) of the one of three axes (3, 3, columns) nearest to the line of each normal (n, 3)."""
+    axis: Ints = np.argmax(np.abs(normals @ axes), axis=1)
+    return axis
 
 
 def balance(group: Ints) -> Floats:
-    """Weights (n,) by which groups 0 to 2 of points (n,) count the same.
+    """Weights (n,) of points in groups (n,) 0 to 2 such that each group has the same weight in sum.
 
-    The two ends of a long part are a few points in a thousand, and alone hold it along its length: what its long faces
-    seem to say of that comes from how they are bent.
+    The two ends of a long part are a few points in a thousand, yet they alone fix it along its length. The long faces
+    are bent, and would otherwise dominate that direction by their form errors.
     """
     number = np.maximum(np.bincount(group, minlength=3), 1)
     weight: Floats = np.minimum(len(group) / (3.0 * number), MOST_WEIGHT)[group]

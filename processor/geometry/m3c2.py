@@ -1,29 +1,32 @@
 """M3C2: distances between two clouds along local normals, each with its level of detection.
 
-Lague, Brodu and Leroux (2013), "Accurate 3D comparison of complex topography with terrestrial laser scanner", as used
-in paper 002. Every name says whether it is a diameter; all lengths are in one unit, that of the coordinates. Callers
-take a local origin off coordinates that are far from it.
+Source: Lague, Brodu and Leroux (2013), "Accurate 3D comparison of complex topography with terrestrial laser scanner",
+as used in paper 002. Every name says whether it is a diameter; all lengths are in one unit, that of the coordinates.
+Callers subtract a local origin from coordinates that are far from it.
 """
+# Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 
-from processor.geometry import point_grid
+from processor.geometry import neighbors, point_grid
+from processor.geometry.linalg_small import eigen
 from processor.geometry.parallel import over_ranges
 from processor.geometry.point_grid import SIDE, PointGrid, block_at
-from processor.model import Floats, Ints
+from processor.model import Floats, InputError, Ints
 
 Bools = npt.NDArray[np.bool_]
 
 CELLS_PER_DIAMETER = 4.0
-FEWEST_FOR_LOD = 4  # points of either cloud; with fewer a level of detection says nothing
+FEWEST_FOR_LOD = 4  # points of either cloud, below which there is no level of detection
 Z95 = 1.96
-LEAST_RANGE = 256  # core points a thread takes at a time
+LEAST_RANGE = 256  # core points per task of a thread
 
 
 @dataclass(frozen=True)
@@ -37,7 +40,7 @@ class CloudNormals:
 
 @dataclass(frozen=True)
 class Distances:
-    """What M3C2 says at each core point, compared minus reference along the normal.
+    """M3C2 at each core point: compared minus reference, along the normal.
 
     ``distance`` (k,) is NaN where either cloud has no point in the cylinder, ``lod95`` where either has fewer than
     FEWEST_FOR_LOD. ``n1``, ``std1`` (population sd) are of the reference, ``n2``, ``std2`` of the compared cloud.
@@ -53,8 +56,8 @@ class Distances:
     @property
     def significant(self) -> Bools:
         """Where (k,) the distance is beyond its level of detection; never where there is no level."""
-        found: Bools = np.abs(self.distance) > self.lod95
-        return found
+        significant: Bools = np.abs(self.distance) > self.lod95
+        return significant
 
 
 def grid(points: Floats, diameter_mm: float) -> PointGrid:
@@ -68,19 +71,19 @@ def normals(reference: PointGrid, core: Floats, normal_diameter_mm: float, threa
     Their signs are arbitrary; see :func:`oriented`.
     """
     core = np.ascontiguousarray(core, np.float64)
-    found, roughness, count = np.empty((len(core), 3)), np.empty(len(core)), np.empty(len(core), np.int64)
+    fitted, roughness, count = np.empty((len(core), 3)), np.empty(len(core)), np.empty(len(core), np.int64)
     order, radius = reference.beside(core), 0.5 * normal_diameter_mm
     over_ranges(
-        lambda a, b: normals_at(reference.cells, core, order, a, b, radius, found, roughness, count),
+        lambda a, b: normals_at(reference.cells, core, order, a, b, radius, fitted, roughness, count),
         len(core), threads, LEAST_RANGE,
     )  # fmt: skip
-    return CloudNormals(found, roughness, count)
+    return CloudNormals(fitted, roughness, count)
 
 
 def oriented(normals: Floats, towards: Floats) -> Floats:
-    """Turn normals (k, 3) so that each looks along ``towards``: a direction (3,), or one a normal (k, 3).
+    """Turn normals (k, 3) so that each points along ``towards``: a direction (3,), or one per normal (k, 3).
 
-    One square to its direction looks along +z, else +y, else +x.
+    A normal square to its direction is turned along +z, else +y, else +x.
     """
     side = np.sign(np.sum(normals * towards, axis=1))
     for axis in (2, 1, 0):
@@ -103,8 +106,8 @@ def distances(
     """Measure from one cloud to another at core points (k, 3) with unit normals (k, 3).
 
     The cylinder has ``projection_diameter_mm`` and reaches ``max_depth_mm`` to either side of the core point.
-    LOD95 = 1.96 (sqrt(s1^2 / n1 + s2^2 / n2) + E), E the registration error, one for all or for each (paper 002
-    eq. 10).
+    LOD95 = 1.96 (sqrt(s1^2 / n1 + s2^2 / n2) + E), where E is the registration error, one for all or one per core point
+    (paper 002, eq. 10).
     """
     core = np.ascontiguousarray(core, np.float64)
     normals = np.ascontiguousarray(normals, np.float64)
@@ -113,7 +116,7 @@ def distances(
     known = (n1 >= FEWEST_FOR_LOD) & (n2 >= FEWEST_FOR_LOD)
     spread = np.sqrt(std1**2 / np.maximum(n1, 1) + std2**2 / np.maximum(n2, 1))
     lod95 = np.where(known, Z95 * (spread + registration_error_mm), np.nan)
-    return Distances(mean2 - mean1, lod95, n1, n2, std1, std2)
+    return Distances(distance=mean2 - mean1, lod95=lod95, n1=n1, n2=n2, std1=std1, std2=std2)
 
 
 def _along(
@@ -121,30 +124,199 @@ def _along(
 ) -> tuple[Ints, Floats, Floats]:
     """Return number, mean along the normal and population sd (k,) of the points in each cylinder."""
     count, mean, sd = np.empty(len(core), np.int64), np.empty(len(core)), np.empty(len(core))
-    order = cloud.beside(core)
+    order, cylinder = cloud.beside(core), (0.5 * float(diameter), float(depth))
     over_ranges(
-        lambda a, b: along_normals(
-            cloud.cells, core, normals, order, a, b, 0.5 * diameter, depth, count, mean, sd
-        ),
+        lambda a, b: along_normals(cloud.cells, core, normals, order, a, b, cylinder, count, mean, sd),
         len(core), threads, LEAST_RANGE,
     )  # fmt: skip
     return count, mean, sd
 
 
-# --- The loops of M3C2 and of normals, compiled: each place's answer is its own, whatever thread computes it.
+# --- Scales: the lengths that M3C2 needs, derived from the density of the clouds where they are not given
+
+
+# A cylinder holds this many points of the sparser cloud on average. Paper 002 asks for 20 at least; with 50 the
+# standard deviations are at most 1 % too small.
+POINTS_A_CYLINDER = 50.0
+PAPER_POINTS_A_CYLINDER = 20
+NORMAL_TO_ROUGHNESS = 25.0  # Lague et al. 2013: 20 to 25 times
+# Least and greatest, in projection diameters. As in the paper the normal's sphere is at least twice as wide as the
+# cylinder: a normal fitted to the cylinder's own points would absorb some of their noise.
+NORMAL_SHARE = (2.0, 4.0)
+DEEPEST = 10.0  # projection diameters
+DEPTH_TO_DISTANCE = 2.0
+FAR_QUANTILE = 0.95  # of the distances between the clouds, from which the depth is derived
+SCALE_SAMPLE = 5_000
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Diameters of the normals' spheres and of the cylinders, half length of the cylinders, spacings of the clouds."""
+
+    normal_diameter_mm: float
+    projection_diameter_mm: float
+    max_depth_mm: float
+    reference_spacing_mm: float
+    compared_spacing_mm: float
+
+
+def derive_scales(
+    reference: PointGrid,
+    compared: PointGrid,
+    core: Floats,
+    normal_diameter_mm: float = 0.0,
+    projection_diameter_mm: float = 0.0,
+    max_depth_mm: float = 0.0,
+) -> Scales:
+    """Derive the scales for core points (k, 3) that are 0, not given, from the spacings of the clouds.
+
+    Raises InputError for clouds without a density.
+    """
+    spacings = neighbors.spacing(reference), neighbors.spacing(compared)
+    projection = projection_diameter_mm or rounded(diameter_for(POINTS_A_CYLINDER, max(spacings)))
+    if not (projection > 0.0 and math.isfinite(projection)):
+        raise InputError(
+            f"clouds of {reference.count} and {compared.count} points have no density to make a projection diameter "
+            "from; expected several points at different places, or give the diameter"
+        )
+    return Scales(
+        normal_diameter_mm=normal_diameter_mm or rounded(_normal_diameter(reference, projection)),
+        projection_diameter_mm=projection,
+        max_depth_mm=max_depth_mm or rounded(_depth(compared, core, projection)),
+        reference_spacing_mm=spacings[0],
+        compared_spacing_mm=spacings[1],
+    )
+
+
+def diameter_for(points: float, spacing_mm: float) -> float:
+    """Diameter of the circle that holds a number of points, one per ``spacing_mm`` squared."""
+    return spacing_mm * math.sqrt(4.0 * points / math.pi)
+
+
+def rounded(value: float) -> float:
+    """Round up to three digits, so that the scale in a report is exactly the one used."""
+    if not (value > 0.0 and math.isfinite(value)):
+        return value
+    step = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return float(f"{math.ceil(value / step - 1e-9) * step:.12g}")
+
+
+def _normal_diameter(reference: PointGrid, projection: float) -> float:
+    """Take NORMAL_TO_ROUGHNESS times the roughness at the scale of the projection, within bounds."""
+    places = _scale_sample(reference.cells.points)
+    roughness = normals(reference, places, projection).roughness
+    known = roughness[np.isfinite(roughness)]
+    wanted = NORMAL_TO_ROUGHNESS * float(np.median(known)) if len(known) else 0.0
+    return float(np.clip(wanted, NORMAL_SHARE[0] * projection, NORMAL_SHARE[1] * projection))
+
+
+def _depth(compared: PointGrid, core: Floats, projection: float) -> float:
+    """Take twice the distance of most core points from the other cloud, within bounds; farther ones get no distance."""
+    near = neighbors.nearest(compared, _scale_sample(core))
+    far = float(np.quantile(near[np.isfinite(near)], FAR_QUANTILE)) if np.isfinite(near).any() else 0.0
+    return min(max(projection, DEPTH_TO_DISTANCE * far), DEEPEST * projection)
+
+
+def _scale_sample(points: Floats) -> Floats:
+    return points[:: max(1, len(points) // SCALE_SAMPLE)]
+
+
+# --- Statistics of all core points
+
+
+SHARE_CELL = 2.0  # projection diameters: core points nearer to each other share points
+
+
+@dataclass(frozen=True)
+class Share:
+    """A share of core points with its 95 % interval; NaN for no core points."""
+
+    share: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Numbers of core points, and statistics of those with a level of detection; NaN where there is none."""
+
+    core_points: int
+    without_normal: int
+    without_lod: int
+    few_points: int  # core points with a level of detection and few points of either cloud in the cylinder
+    significant: int
+    significant_share: Share
+    mean: float
+    median: float
+    sd: float
+    rms: float
+    min: float
+    max: float
+    lod95_median: float
+    min_lod95: float = float("nan")  # at the core point of the least distance
+    max_lod95: float = float("nan")  # at the core point of the greatest distance
+
+
+def summary(measured: Distances, core: Floats, normals: Floats, projection_diameter_mm: float, few: int) -> Summary:
+    """Summarise distances at core points (k, 3) with normals (k, 3); fewer than ``few`` points count as few."""
+    known = np.isfinite(measured.lod95)
+    distance = measured.distance[known]
+    significant = measured.significant[known]
+
+    def statistic(name: str) -> float:
+        return float(getattr(np, name)(distance)) if len(distance) else float("nan")
+
+    return Summary(
+        core_points=len(core),
+        without_normal=int((~np.isfinite(normals).all(axis=1)).sum()),
+        without_lod=int((~known).sum()),
+        few_points=int((np.minimum(measured.n1, measured.n2)[known] < few).sum()),
+        significant=int(significant.sum()),
+        significant_share=share(significant, core[known], SHARE_CELL * projection_diameter_mm),
+        mean=statistic("mean"),
+        median=statistic("median"),
+        sd=statistic("std"),
+        rms=float(np.sqrt(np.mean(distance**2))) if len(distance) else float("nan"),
+        min=statistic("min"),
+        max=statistic("max"),
+        lod95_median=float(np.median(measured.lod95[known])) if known.any() else float("nan"),
+        min_lod95=float(measured.lod95[known][np.argmin(distance)]) if len(distance) else float("nan"),
+        max_lod95=float(measured.lod95[known][np.argmax(distance)]) if len(distance) else float("nan"),
+    )
+
+
+def share(marked: Bools, places: Floats, cell: float) -> Share:
+    """Share of places (k, 3) that are ``marked`` (k,), with Wilson's interval for the effective number of places.
+
+    Neighbouring places share points and so agree. The effective number follows from how the marks vary between cells.
+    """
+    if not len(marked):
+        return Share(float("nan"), float("nan"), float("nan"))
+    p = float(marked.mean())
+    number = np.unique(np.floor((places - places.min(axis=0)) / cell).astype(np.int64), axis=0, return_inverse=True)[1]
+    sums = np.bincount(number.reshape(-1), marked - p)
+    cells = len(sums)
+    variance = float(sums @ sums) / len(marked) ** 2 * cells / max(cells - 1, 1)
+    count = min(max(p * (1.0 - p) / variance, 1.0), float(len(marked))) if variance > 0.0 else float(cells)
+    middle = (p + Z95**2 / (2.0 * count)) / (1.0 + Z95**2 / count)
+    half = Z95 / (1.0 + Z95**2 / count) * math.sqrt(p * (1.0 - p) / count + Z95**2 / (4.0 * count**2))
+    return Share(p, max(0.0, min(p, middle - half)), min(1.0, max(p, middle + half)))
+
+
+# --- The loops of M3C2 and of normals, compiled. Each place is independent, so that threads do not change results.
 
 
 HALF_DIAGONAL = 0.5 * SIDE * 3.0**0.5 * (1.0 + 1e-9)  # of a block, in cells
 FEWEST_OF_PLANE = 4
-SWEEPS = 12
 
 
 @njit(cache=True, nogil=True)
-def along_normals(cells, places, normals, order, first, last, radius, depth, count, mean, sd):  # type: ignore[no-untyped-def]
-    """Count, mean and population sd of the points in the cylinder about each normal, measured along it from its place.
+def along_normals(cells, places, normals, order, first, last, cylinder, count, mean, sd):  # type: ignore[no-untyped-def]
+    """Fill count, mean and population sd of the points in the cylinder about each normal, measured along it.
 
-    The cylinder has a ``radius`` and reaches ``depth`` to either side, rims included.
+    The ``cylinder`` is its radius and how far it reaches to either side of its place, both inclusive.
     """
+    radius, depth = cylinder
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
     tops = SIDE * cells.extent - 1
     points, starts = cells.points, cells.starts
@@ -192,7 +364,7 @@ def along_normals(cells, places, normals, order, first, last, radius, depth, cou
                                 if u * u + v * v + w * w > rim:
                                     continue
                                 if n == 0:
-                                    shift = t  # squares of what is left lose no digits
+                                    shift = t  # squares of small differences lose no digits
                                 t -= shift
                                 n += 1
                                 total += t
@@ -205,9 +377,9 @@ def along_normals(cells, places, normals, order, first, last, radius, depth, cou
 
 @njit(cache=True, nogil=True)
 def normals_at(cells, places, order, first, last, radius, normals, roughness, count):  # type: ignore[no-untyped-def]
-    """Fit a plane to the points within ``radius`` of each place: its normal, their sd from it, and their number.
+    """Fit a plane to the points within ``radius`` of each place: fill its normal, their sd from it and their number.
 
-    NaN where fewer than FEWEST_OF_PLANE are there or they lie on a line.
+    NaN for fewer than FEWEST_OF_PLANE points, and for points on a line.
     """
     size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
     tops = SIDE * cells.extent - 1
@@ -265,34 +437,3 @@ def normals_at(cells, places, order, first, last, radius, normals, roughness, co
         for k in range(3):
             normals[row, k] = V[k, least] / length
         roughness[row] = np.sqrt(max(0.0, A[least, least]))
-
-
-@njit(cache=True, nogil=True)
-def eigen(A, V):  # type: ignore[no-untyped-def]
-    """Turn a symmetric A (3, 3) into its eigenvalues on the diagonal, V into its vectors as columns (Jacobi)."""
-    for i in range(3):
-        for j in range(3):
-            V[i, j] = 1.0 if i == j else 0.0
-    for _ in range(SWEEPS):
-        off = abs(A[0, 1]) + abs(A[0, 2]) + abs(A[1, 2])
-        if off <= 1e-18 * (abs(A[0, 0]) + abs(A[1, 1]) + abs(A[2, 2])):
-            return
-        for p in range(2):
-            for q in range(p + 1, 3):
-                if A[p, q] == 0.0:
-                    continue
-                theta = 0.5 * (A[q, q] - A[p, p]) / A[p, q]
-                t = (1.0 if theta >= 0.0 else -1.0) / (abs(theta) + np.sqrt(theta * theta + 1.0))
-                c = 1.0 / np.sqrt(t * t + 1.0)
-                s = t * c
-                h = t * A[p, q]
-                A[p, p] -= h
-                A[q, q] += h
-                A[p, q] = A[q, p] = 0.0
-                r = 3 - p - q
-                g, h = A[r, p], A[r, q]
-                A[r, p] = A[p, r] = c * g - s * h
-                A[r, q] = A[q, r] = s * g + c * h
-                for k in range(3):
-                    g, h = V[k, p], V[k, q]
-                    V[k, p], V[k, q] = c * g - s * h, s * g + c * h

@@ -1,20 +1,25 @@
-"""The scans of a scene as one cloud in the project's frame."""
+"""The scans of a scene as one cloud in the project's frame, and the mesh of its design in a local frame."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from processor.geometry import rigid
-from processor.model import Floats, Scan, Scene
+from processor.geometry import mesh_distance, rigid
+from processor.model import Floats, InputError, Scan, Scene, StructureDesign
+
+ORIGIN_STEP_MM = 1000.0
+FEWEST_POINTS = 100  # of a scan that is compared with a design
 
 
 @dataclass(frozen=True)
 class MergedCloud:
     """Points (n, 3) in the project's frame less ``origin`` (3,), mm, in the order of the scans.
 
-    ``scanner`` (n, 3), less the origin too, is where each point was seen from; None where any is unknown or unasked.
+    ``scanner`` (n, 3), less the origin too, is the position each point was seen from; None where any is unknown, and
+    where positions were not requested.
     """
 
     points: Floats
@@ -29,7 +34,7 @@ def merged(scene: Scene, with_scanner: bool) -> MergedCloud:
     known = with_scanner
     for scan in scene.scans:
         T = _pose(scan)
-        # offset less offset first: added to the points either would cost them their digits
+        # Large offsets are subtracted from each other first: added to the points, either would cost them digits.
         shift = T[:3, :3] @ scan.origin + (T[:3, 3] - origin)
         points.append((scan.points @ T[:3, :3].T if scan.T_project_scan.size else scan.points) + shift)
         if not known:
@@ -46,3 +51,29 @@ def merged(scene: Scene, with_scanner: bool) -> MergedCloud:
 
 def _pose(scan: Scan) -> Floats:
     return scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
+
+
+def stitched(scene: Scene, result: Any) -> Scene:
+    """Give the scans the poses of a ``result`` of step stitch, if there is one; leave out those it did not place."""
+    if result is None:
+        return scene
+    T = dict(zip(result.scans.name, result.scans.T_project_scan, strict=True))
+    scans = tuple(
+        replace(scan, T_project_scan=T[scan.name]) if scan.name in T else scan
+        for scan in scene.scans
+        if scan.name not in T or np.isfinite(T[scan.name]).all()
+    )
+    return replace(scene, scans=scans)
+
+
+def local_design(design: StructureDesign) -> tuple[Floats, Floats]:
+    """Vertices (v, 3) of a design less an origin (3,) of whole metres near its middle, and that origin.
+
+    Raises InputError for a mesh without area.
+    """
+    middle = 0.5 * (design.vertices.min(axis=0) + design.vertices.max(axis=0)) if len(design.vertices) else np.zeros(3)
+    origin = np.floor(middle / ORIGIN_STEP_MM) * ORIGIN_STEP_MM
+    vertices = design.vertices - origin
+    if not len(design.faces) or not mesh_distance.area(vertices, design.faces) > 0.0:
+        raise InputError(f"design {design.name}: expected a mesh with a surface, found none")
+    return vertices, origin

@@ -1,9 +1,17 @@
-"""Distances to a mesh as to a smooth surface: each point against the facet that its foot lies on."""
+"""Distances between points and a triangle mesh, and points spread over a mesh.
+
+Two searches answer two questions. :class:`MeshSurface` takes the mesh for a smooth surface: it walks over smooth edges
+to the facet that a point's foot lies on, so that a curved face is not mistaken for the plane of one facet.
+:class:`FacetGrid` finds the nearest facet that a scanner could see, so that the two sides of a plate are not mixed up.
+"""
+# Numba infers the types of the kernels' arguments: most stay without annotations.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,11 +23,78 @@ from scipy.spatial import cKDTree
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
 
+Bools = npt.NDArray[np.bool_]
+
 SHARP_COS = 0.94  # facets that meet at more than 20 deg belong to different faces
 WALK_STEPS = 24
-OUTER_SPACING_MM = 40.0  # of samples where there is one face only to choose
-LEAST_RANGE = 5_000  # points a thread takes at once
-EDGE_MM = 1.0  # a foot beyond its face by no more is still on it
+OUTER_SPACING_MM = 40.0  # of samples, for the outer face of a plate alone
+LEAST_RANGE = 5_000  # points per task of a thread
+EDGE_MM = 1.0  # a foot up to this far outside the edge of its face still counts as on it
+MOST_BULGE_MM = 1.0  # facets with a larger bulge are meant to be flat: no mesh is that coarse
+DESIGN_SAMPLES, DESIGN_SPACING_MM = 1_000_000, (8.0, 40.0)  # samples on a whole design; least and greatest spacing
+MOST_VOXELS = 20_000_000
+GRAZING_COS = 0.02  # cosine of incidence below which a facet is seen edge-on
+
+
+# --- Points spread over a mesh
+
+
+@dataclass(frozen=True)
+class Samples:
+    """Points (m, 3) on a mesh with unit normals (m, 3), and the facet (m,) of each."""
+
+    points: Floats
+    normals: Floats
+    facet: Ints
+
+
+def area(vertices: Floats, faces: Ints) -> float:
+    """Area of a mesh, mm^2."""
+    return 0.5 * float(_double_areas(vertices, faces)[1].sum())
+
+
+def sampled(vertices: Floats, faces: Ints, spacing_mm: float) -> Samples:
+    """Spread points over a mesh, one per ``spacing_mm`` squared, in a fixed low-discrepancy pattern."""
+    return spread(vertices, faces, lambda area_mm2: max(1, round(area_mm2 / spacing_mm**2)))
+
+
+def spread(vertices: Floats, faces: Ints, count_of: Callable[[float], int]) -> Samples:
+    """Spread ``count_of(area in mm^2)`` points over a mesh in a fixed low-discrepancy pattern."""
+    cross, double = _double_areas(vertices, faces)
+    cumulative = np.cumsum(double)
+    count = count_of(0.5 * float(cumulative[-1]))
+    facet = np.searchsorted(cumulative, (np.arange(count) + 0.5) / count * cumulative[-1]).astype(np.int64)
+    return Samples(_placed(vertices, faces, facet), cross[facet] / double[facet, None], facet)
+
+
+def _double_areas(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
+    """Return the normals (f, 3) of facets, each as long as twice the facet's area, and these lengths (f,)."""
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    cross = np.cross(b - a, c - a)
+    return cross, np.linalg.norm(cross, axis=1)
+
+
+def _placed(vertices: Floats, faces: Ints, facet: Ints) -> Floats:
+    """Place a point (m, 3) on each of the facets (m,): R2 sequence (plastic number), folded onto the triangle."""
+    i = np.arange(len(facet))
+    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
+    fold = u + v > 1.0
+    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
+    a, b, c = (vertices[faces[facet, k]] for k in range(3))
+    points: Floats = a + u[:, None] * (b - a) + v[:, None] * (c - a)
+    return points
+
+
+# --- Distances to the smooth surface
+
+
+class Facets(NamedTuple):
+    """Arrays of a :class:`MeshSurface` that its kernel takes."""
+
+    vertices: Floats
+    faces: Ints
+    normals: Floats
+    neighbours: Ints
 
 
 @dataclass(frozen=True)
@@ -31,29 +106,30 @@ class MeshSurface:
     normals: Floats
     neighbours: Ints  # opposite to each of a facet's vertices
     part_of: Ints  # (f,) number of the smooth face that a facet belongs to
-    tree: cKDTree
-    sample_face: Ints
+    tree: cKDTree  # of samples on the mesh
+    sample_face: Ints  # facet of each sample
 
     def distances(self, points: Floats, reach: float, before: Ints | None = None) -> tuple[Ints, Floats, Floats]:
-        """Facet (n,), signed distance (n,) from it, and how far (n,) the foot lies beyond its face's edge; mm.
+        """Facet (n,), signed distance (n,) from it, and how far (n,) the foot lies outside its face's edge; mm.
 
         Facet -1 and NaN where no sample of the surface is within ``reach``. The search starts at the nearest sample and
-        walks over smooth edges to the facet that the foot is on, so that a curved face is not taken for a plane. Points
-        that have moved little start where they were ``before`` (n,) instead.
+        walks over smooth edges to the facet that the foot lies on. Points that moved little since an earlier search
+        start at the facet ``before`` (n,) of that search instead.
         """
         if before is None:
-            found, sample = self.tree.query(points, distance_upper_bound=reach, workers=-1)
-            start = np.where(np.isfinite(found), self.sample_face[np.minimum(sample, len(self.sample_face) - 1)], -1)
+            gap, sample = self.tree.query(points, distance_upper_bound=reach, workers=-1)
+            start = np.where(np.isfinite(gap), self.sample_face[np.minimum(sample, len(self.sample_face) - 1)], -1)
         else:
             start = before
         face = np.full(len(points), -1, np.int64)
         distance, beyond = np.full(len(points), np.nan), np.full(len(points), np.nan)
-        given = (np.ascontiguousarray(points, np.float64), start, self.vertices, self.faces, self.normals)
-        walk = partial(feet, *given, self.neighbours, WALK_STEPS, face, distance, beyond)
+        facets = Facets(self.vertices, self.faces, self.normals, self.neighbours)
+        points = np.ascontiguousarray(points, np.float64)
+        walk = partial(feet, facets, points, start, WALK_STEPS, face, distance, beyond)
         over_ranges(walk, len(points), least=LEAST_RANGE)
         return face, distance, beyond
 
-    def only(self, facets: npt.NDArray[np.bool_]) -> MeshSurface:
+    def only(self, facets: Bools) -> MeshSurface:
         """Return the surface of the marked facets (f,) alone, for points up to a plate's thickness and more away."""
         return of_mesh(self.vertices, self.faces[facets], OUTER_SPACING_MM)
 
@@ -69,37 +145,45 @@ class MeshSurface:
 
 
 def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurface:
-    """Prepare a mesh; samples for the first guess lie about ``spacing_mm`` apart: less than a plate is thick."""
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    cross = np.cross(b - a, c - a)
-    size = np.linalg.norm(cross, axis=1)
+    """Prepare a mesh; searches start from samples about ``spacing_mm`` apart, which is less than a plate is thick."""
+    cross, size = _double_areas(vertices, faces)
     used = size > 1e-9
-    faces, a, b, c, cross, size = faces[used], a[used], b[used], c[used], cross[used], size[used]
+    faces, cross, size = faces[used], cross[used], size[used]
     normals = cross / size[:, None]
     count = np.maximum(1, np.ceil(0.5 * size / spacing_mm**2)).astype(np.int64)
-    owner = np.repeat(np.arange(len(faces)), count)
-    i = np.arange(len(owner))
-    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
-    fold = u + v > 1.0
-    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
-    samples = a[owner] + u[:, None] * (b - a)[owner] + v[:, None] * (c - a)[owner]
+    sample_face = np.repeat(np.arange(len(faces)), count)
+    samples = _placed(vertices, faces, sample_face)
     neighbours = _neighbours(faces, normals)
     tree = cKDTree(samples, balanced_tree=False)
-    return MeshSurface(vertices, faces, normals, neighbours, _smooth_faces(neighbours), tree, owner)
+    return MeshSurface(
+        vertices=vertices,
+        faces=faces,
+        normals=normals,
+        neighbours=neighbours,
+        part_of=_smooth_faces(neighbours),
+        tree=tree,
+        sample_face=sample_face,
+    )
+
+
+def of_design(vertices: Floats, faces: Ints) -> MeshSurface:
+    """Prepare the mesh of a whole structure, with samples as dense as its area allows."""
+    spacing = np.sqrt(area(vertices, faces) / DESIGN_SAMPLES)
+    return of_mesh(vertices, faces, float(np.clip(spacing, *DESIGN_SPACING_MM)))
+
+
+def on_face(face: Ints, beyond: Floats) -> Bools:
+    """Mark the points (n,) that have a facet and their foot on its face, by :meth:`MeshSurface.distances`."""
+    marked: Bools = (face >= 0) & (beyond < EDGE_MM)
+    return marked
 
 
 def _smooth_faces(neighbours: Ints) -> Ints:
-    """Return a number for each facet (f,): one for all that smooth sides join."""
-    one, side = np.nonzero(neighbours >= 0)
-    links = coo_array((np.ones(len(one), np.int8), (one, neighbours[one, side])), (len(neighbours),) * 2)
+    """Return the number (f,) of the smooth face of each facet: facets joined by smooth edges have the same one."""
+    facet, side = np.nonzero(neighbours >= 0)
+    links = coo_array((np.ones(len(facet), np.int8), (facet, neighbours[facet, side])), (len(neighbours),) * 2)
     number: Ints = connected_components(links, directed=False)[1].astype(np.int64)
     return number
-
-
-def on_face(face: Ints, beyond: Floats) -> npt.NDArray[np.bool_]:
-    """Mark the points (n,) that have a face and their foot on it, by what :meth:`MeshSurface.distances` found."""
-    found: npt.NDArray[np.bool_] = (face >= 0) & (beyond < EDGE_MM)
-    return found
 
 
 def _neighbours(faces: Ints, normals: Floats) -> Ints:
@@ -107,73 +191,22 @@ def _neighbours(faces: Ints, normals: Floats) -> Ints:
     sides = np.sort(np.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], axis=1).reshape(-1, 2), axis=1)
     order = np.lexsort((sides[:, 1], sides[:, 0]))
     same = (sides[order][1:] == sides[order][:-1]).all(axis=1)
-    alone = np.concatenate([[False], same]).astype(int) + np.concatenate([same, [False]]).astype(int) == 1
-    pairs = np.flatnonzero(same & alone[1:] & alone[:-1])
-    found = np.full(len(sides), -1, np.int64)
-    one, two = order[pairs], order[pairs + 1]
-    smooth = np.einsum("ni,ni->n", normals[one // 3], normals[two // 3]) > SHARP_COS
-    found[one[smooth]], found[two[smooth]] = two[smooth] // 3, one[smooth] // 3
-    return found.reshape(-1, 3)
-
-
-# --- What a mesh leaves out of a curved surface: facets lie inside of a tube by up to their tolerance.
-
-
-MOST_MM = 1.0  # facets that would bulge by more are meant flat: no mesh is as coarse
-
-
-@dataclass(frozen=True)
-class CurvedFacets:
-    """Slopes (f, 3, 3) by corner: of the plane at each corner, over the facet's own, along the three axes."""
-
-    surface: MeshSurface
-    slopes: Floats
-
-    def heights(self, feet: Floats, facet: Ints) -> Floats:
-        """Height (n,) of the smooth surface over facets (n,) at feet (n, 3) on them; 0 where there is no facet."""
-        found = np.zeros(len(feet))
-        on = np.flatnonzero(facet >= 0)
-        at = facet[on]
-        share = np.clip(self.surface.barycentric(feet[on], at), 0.0, 1.0)
-        for k in range(3):
-            off = feet[on] - self.surface.vertices[self.surface.faces[at, k]]
-            found[on] += 0.5 * share[:, k] * np.einsum("ni,ni->n", off, self.slopes[at, k])
-        return found
-
-
-def of_surface(surface: MeshSurface) -> CurvedFacets:
-    """Find the slopes of a mesh's facets; 0 for those that are flat, or meant so."""
-    corners = surface.vertices[surface.faces]
-    # The normal at a corner: of the facets of the same smooth face about it, by the angle that each has there.
-    ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
-    length = np.linalg.norm(ahead, axis=2) * np.linalg.norm(behind, axis=2)
-    cosine = np.einsum("fki,fki->fk", ahead, behind) / np.maximum(length, 1e-300)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0)).ravel()
-    key = surface.faces * (int(surface.part_of.max()) + 1) + surface.part_of[:, None]
-    number = np.unique(key.ravel(), return_inverse=True)[1].reshape(-1)
-    each = np.repeat(surface.normals, 3, axis=0) * angle[:, None]
-    total = np.stack([np.bincount(number, each[:, i]) for i in range(3)], axis=1)
-    total = total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
-    normal = total[number].reshape(-1, 3, 3)
-    up = np.einsum("fki,fi->fk", normal, surface.normals)
-    # A plane with normal m, over a facet with normal n, rises by -(m . d) / (m . n) at d along the facet.
-    slopes = -normal / np.maximum(up, 0.5)[:, :, None]
-    slopes -= np.einsum("fki,fi->fk", slopes, surface.normals)[:, :, None] * surface.normals[:, None]
-    rise = np.abs(np.einsum("fki,fki->fk", slopes, ahead)), np.abs(np.einsum("fki,fki->fk", slopes, behind))
-    bulge = np.maximum(*rise).max(axis=1) / 4.0
-    slopes[bulge > MOST_MM] = 0.0
-    return CurvedFacets(surface, slopes)
-
-
-# --- Compiled: from a facet near each point over smooth edges to the facet that the point's foot is on.
+    single = np.concatenate([[False], same]).astype(int) + np.concatenate([same, [False]]).astype(int) == 1
+    pairs = np.flatnonzero(same & single[1:] & single[:-1])
+    across = np.full(len(sides), -1, np.int64)
+    first, second = order[pairs], order[pairs + 1]
+    smooth = np.einsum("ni,ni->n", normals[first // 3], normals[second // 3]) > SHARP_COS
+    across[first[smooth]], across[second[smooth]] = second[smooth] // 3, first[smooth] // 3
+    return across.reshape(-1, 3)
 
 
 @njit(cache=True, nogil=True)
-def feet(points, start, vertices, faces, normals, neighbours, steps, face, distance, beyond, first, last):  # type: ignore[no-untyped-def]
-    """Walk from facets ``start`` (n,), -1 = none, at most ``steps`` facets far; for points first..last.
+def feet(facets, points, start, steps, face, distance, beyond, first, last):  # type: ignore[no-untyped-def]
+    """Walk from facets ``start`` (n,), -1 = none, over at most ``steps`` facets; for points first to last - 1.
 
-    Writes the facet, the signed distance from it, and how far the foot lies beyond its face's edge, mm.
+    Writes the facet, the signed distance from it, and how far the foot lies outside its face's edge, mm.
     """
+    vertices, faces = facets.vertices, facets.faces
     share = np.empty(3)
     for i in range(first, last):
         at = start[i]
@@ -181,7 +214,7 @@ def feet(points, start, vertices, faces, normals, neighbours, steps, face, dista
             continue
         side = barycentric(points[i], vertices, faces[at], share)
         for _ in range(steps):
-            over = neighbours[at, side]
+            over = facets.neighbours[at, side]
             if not (share[side] < -1e-9 and over >= 0):
                 break
             at = over
@@ -189,14 +222,14 @@ def feet(points, start, vertices, faces, normals, neighbours, steps, face, dista
         a = vertices[faces[at, 0]]
         off = 0.0
         for k in range(3):
-            off += (points[i, k] - a[k]) * normals[at, k]
+            off += (points[i, k] - a[k]) * facets.normals[at, k]
         face[i], distance[i] = at, off
         beyond[i] = -min(share[side], 0.0) * height(vertices, faces[at], side)
 
 
 @njit(cache=True, nogil=True, inline="always")
 def barycentric(point, vertices, corners, share):  # type: ignore[no-untyped-def]
-    """Write the barycentric coordinates (3,) of a point's foot on a facet; returns the vertex with the least."""
+    """Write the barycentric coordinates (3,) of a point's foot on a facet; return the vertex with the smallest one."""
     a, b, c = vertices[corners[0]], vertices[corners[1]], vertices[corners[2]]
     b0, b1, b2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     c0, c1, c2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
@@ -215,10 +248,220 @@ def barycentric(point, vertices, corners, share):  # type: ignore[no-untyped-def
 
 @njit(cache=True, nogil=True, inline="always")
 def height(vertices, corners, side):  # type: ignore[no-untyped-def]
-    """Height of a facet over the side opposite to a vertex."""
+    """Return the height of a vertex over the opposite side of its facet."""
     a, b, c = vertices[corners[side]], vertices[corners[(side + 1) % 3]], vertices[corners[(side + 2) % 3]]
     b0, b1, b2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     c0, c1, c2 = c[0] - a[0], c[1] - a[1], c[2] - a[2]
     n0, n1, n2 = b1 * c2 - b2 * c1, b2 * c0 - b0 * c2, b0 * c1 - b1 * c0
     base = np.sqrt((c0 - b0) ** 2 + (c1 - b1) ** 2 + (c2 - b2) ** 2)
     return np.sqrt(n0 * n0 + n1 * n1 + n2 * n2) / max(base, 1e-12)
+
+
+# --- Height of the curved surface over its mesh: the facets of a tube lie inside it by up to the mesh's tolerance
+
+
+@dataclass(frozen=True)
+class CurvedFacets:
+    """Slopes (f, 3, 3) along x, y, z of the tangent plane at each corner of a facet, relative to the facet."""
+
+    surface: MeshSurface
+    slopes: Floats
+
+    def heights(self, feet: Floats, facet: Ints) -> Floats:
+        """Height (n,) of the smooth surface over facets (n,) at feet (n, 3) on them; 0 where there is no facet."""
+        height = np.zeros(len(feet))
+        rows = np.flatnonzero(facet >= 0)
+        at = facet[rows]
+        share = np.clip(self.surface.barycentric(feet[rows], at), 0.0, 1.0)
+        for k in range(3):
+            off = feet[rows] - self.surface.vertices[self.surface.faces[at, k]]
+            height[rows] += 0.5 * share[:, k] * np.einsum("ni,ni->n", off, self.slopes[at, k])
+        return height
+
+
+def of_surface(surface: MeshSurface) -> CurvedFacets:
+    """Derive the slopes of a mesh's facets; 0 for facets that are flat or meant to be."""
+    corners = surface.vertices[surface.faces]
+    # Normal at a corner: mean over the facets of the same smooth face about it, weighted by their angles there.
+    ahead, behind = np.roll(corners, -1, axis=1) - corners, np.roll(corners, 1, axis=1) - corners
+    length = np.linalg.norm(ahead, axis=2) * np.linalg.norm(behind, axis=2)
+    cosine = np.einsum("fki,fki->fk", ahead, behind) / np.maximum(length, 1e-300)
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0)).ravel()
+    key = surface.faces * (int(surface.part_of.max()) + 1) + surface.part_of[:, None]
+    number = np.unique(key.ravel(), return_inverse=True)[1].reshape(-1)
+    each = np.repeat(surface.normals, 3, axis=0) * angle[:, None]
+    total = np.stack([np.bincount(number, each[:, i]) for i in range(3)], axis=1)
+    total = total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
+    normal = total[number].reshape(-1, 3, 3)
+    up = np.einsum("fki,fi->fk", normal, surface.normals)
+    # A plane with normal m, over a facet with normal n, rises by -(m . d) / (m . n) at d along the facet.
+    slopes = -normal / np.maximum(up, 0.5)[:, :, None]
+    slopes -= np.einsum("fki,fi->fk", slopes, surface.normals)[:, :, None] * surface.normals[:, None]
+    rise = np.abs(np.einsum("fki,fki->fk", slopes, ahead)), np.abs(np.einsum("fki,fki->fk", slopes, behind))
+    bulge = np.maximum(*rise).max(axis=1) / 4.0
+    slopes[bulge > MOST_BULGE_MM] = 0.0
+    return CurvedFacets(surface, slopes)
+
+
+# --- Nearest facet that a scanner could see
+
+
+class FacetGrid(NamedTuple):
+    """Facets by the voxels of a dense grid that they come within ``reach`` of."""
+
+    low: Floats  # (3,) corner of the grid
+    size: float  # edge of a voxel
+    shape: Ints  # (3,)
+    start: Ints  # (voxels + 1,) of each voxel's facets
+    facet: Ints
+    corners: Floats  # (f, 3, 3)
+    normals: Floats
+    reach: float
+
+
+def facet_grid(vertices: Floats, faces: Ints, normals: Floats, reach: float) -> FacetGrid:
+    """Sort facets into voxels about as large as ``reach``, larger where the design is very large."""
+    corners = np.ascontiguousarray(vertices[faces])
+    low, high = corners.min(axis=(0, 1)) - reach, corners.max(axis=(0, 1)) + reach
+    size = max(float(reach), float(np.prod(high - low) / MOST_VOXELS) ** (1.0 / 3.0))
+    shape = np.maximum(np.ceil((high - low) / size), 1).astype(np.int64)
+    none = np.empty(0, np.int64)
+    count = _facets_of_voxels(corners, normals, low, size, shape, reach, none, none)
+    start = np.concatenate([[0], np.cumsum(count)])
+    facet = np.empty(start[-1], np.int64)
+    _facets_of_voxels(corners, normals, low, size, shape, reach, start, facet)
+    return FacetGrid(
+        low=low, size=size, shape=shape, start=start, facet=facet, corners=corners, normals=normals, reach=float(reach)
+    )
+
+
+def touching(vertices: Floats, faces: Ints, within: float) -> tuple[Ints, Ints]:
+    """Pairs of a vertex (k,) and a facet (k,) that come within a distance of each other."""
+    cross, double = _double_areas(vertices, faces)
+    normals = cross / np.maximum(double, 1e-12)[:, None]
+    span = float(np.median(np.ptp(vertices[faces], axis=1).max(axis=1)))
+    grid = facet_grid(vertices, faces, normals, max(within, 0.25 * span))
+    return _touching(grid, vertices, within)
+
+
+@njit(cache=True, nogil=True)
+def nearest_visible(grid: FacetGrid, points: Floats, scanners: Floats, station: Ints) -> tuple[Ints, Floats]:
+    """Facet (n,) of points (n, 3), -1 for none, and their signed distance (n,) along its normal, mm.
+
+    It is the nearest facet within reach that faces the scanner. ``station`` (n,) is the row of ``scanners`` (k, 3) that
+    a point was seen from; where it is -1, unknown, the nearest facet of all is taken.
+    """
+    low, size, shape = grid.low, grid.size, grid.shape
+    nearest = np.full(len(points), -1, np.int64)
+    distance = np.full(len(points), np.nan)
+    for row in range(len(points)):
+        p = points[row]
+        i, j, m = (p[0] - low[0]) / size, (p[1] - low[1]) / size, (p[2] - low[2]) / size
+        if not (0.0 <= i < shape[0] and 0.0 <= j < shape[1] and 0.0 <= m < shape[2]):
+            continue
+        voxel = (int(i) * shape[1] + int(j)) * shape[2] + int(m)
+        best = grid.reach * grid.reach
+        k = station[row]
+        for at in range(grid.start[voxel], grid.start[voxel + 1]):
+            f = grid.facet[at]
+            a, n = grid.corners[f, 0], grid.normals[f]
+            off = (p[0] - a[0]) * n[0] + (p[1] - a[1]) * n[1] + (p[2] - a[2]) * n[2]
+            if off * off >= best:
+                continue
+            if k >= 0:
+                x, y, z = scanners[k, 0] - p[0], scanners[k, 1] - p[1], scanners[k, 2] - p[2]
+                if x * n[0] + y * n[1] + z * n[2] < GRAZING_COS * np.sqrt(x * x + y * y + z * z):
+                    continue
+            square = square_to(grid.corners[f], p)
+            if square < best:
+                best, nearest[row], distance[row] = square, f, off
+    return nearest, distance
+
+
+@njit(cache=True, nogil=True)
+def _touching(grid: FacetGrid, points: Floats, within: float) -> tuple[Ints, Ints]:
+    """Pairs of points and facets that come within a distance of each other."""
+    low, size, shape = grid.low, grid.size, grid.shape
+    rows, facets = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    for row in range(len(points)):
+        p = points[row]
+        i, j, m = int((p[0] - low[0]) / size), int((p[1] - low[1]) / size), int((p[2] - low[2]) / size)
+        voxel = (i * shape[1] + j) * shape[2] + m
+        for at in range(grid.start[voxel], grid.start[voxel + 1]):
+            if square_to(grid.corners[grid.facet[at]], p) < within * within:
+                rows.append(row)
+                facets.append(grid.facet[at])
+    return np.array(rows), np.array(facets)
+
+
+@njit(cache=True, nogil=True)
+def _facets_of_voxels(
+    corners: Floats, normals: Floats, low: Floats, size: float, shape: Ints, reach: float, start: Ints, out: Ints
+) -> Ints:
+    """Count the facets of each voxel (voxels,); write them to ``out`` where ``start`` (voxels + 1,) is given.
+
+    A facet belongs to the voxels of its bounding box that its plane comes within ``reach`` of.
+    """
+    count = np.zeros(shape[0] * shape[1] * shape[2], np.int64)
+    half = 0.5 * size
+    for f in range(len(corners)):
+        lo, hi = np.empty(3, np.int64), np.empty(3, np.int64)
+        for k in range(3):
+            least, most = corners[f, :, k].min() - reach, corners[f, :, k].max() + reach
+            lo[k] = max(0, int((least - low[k]) / size))
+            hi[k] = min(shape[k] - 1, int((most - low[k]) / size))
+        n = normals[f]
+        span = half * (abs(n[0]) + abs(n[1]) + abs(n[2])) + reach
+        for i in range(lo[0], hi[0] + 1):
+            for j in range(lo[1], hi[1] + 1):
+                for m in range(lo[2], hi[2] + 1):
+                    off = (
+                        (low[0] + i * size + half - corners[f, 0, 0]) * n[0]
+                        + (low[1] + j * size + half - corners[f, 0, 1]) * n[1]
+                        + (low[2] + m * size + half - corners[f, 0, 2]) * n[2]
+                    )
+                    if abs(off) > span:
+                        continue
+                    voxel = (i * shape[1] + j) * shape[2] + m
+                    if len(start):
+                        out[start[voxel] + count[voxel]] = f
+                    count[voxel] += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def square_to(corner: Floats, p: Floats) -> Any:
+    """Return the squared distance of a point (3,) from a triangle (3, 3).
+
+    Source: Ericson, Real-Time Collision Detection, 5.1.5.
+    """
+    abx, aby, abz = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    acx, acy, acz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+    apx, apy, apz = p[0] - corner[0, 0], p[1] - corner[0, 1], p[2] - corner[0, 2]
+    d1, d2 = abx * apx + aby * apy + abz * apz, acx * apx + acy * apy + acz * apz
+    if d1 <= 0.0 and d2 <= 0.0:
+        return apx * apx + apy * apy + apz * apz
+    bpx, bpy, bpz = p[0] - corner[1, 0], p[1] - corner[1, 1], p[2] - corner[1, 2]
+    d3, d4 = abx * bpx + aby * bpy + abz * bpz, acx * bpx + acy * bpy + acz * bpz
+    if d3 >= 0.0 and d4 <= d3:
+        return bpx * bpx + bpy * bpy + bpz * bpz
+    vc = d1 * d4 - d3 * d2
+    if vc <= 0.0 and d1 >= 0.0 and d3 <= 0.0:
+        s, t = d1 / (d1 - d3), 0.0
+    else:
+        cpx, cpy, cpz = p[0] - corner[2, 0], p[1] - corner[2, 1], p[2] - corner[2, 2]
+        d5, d6 = abx * cpx + aby * cpy + abz * cpz, acx * cpx + acy * cpy + acz * cpz
+        if d6 >= 0.0 and d5 <= d6:
+            return cpx * cpx + cpy * cpy + cpz * cpz
+        vb = d5 * d2 - d1 * d6
+        va = d3 * d6 - d5 * d4
+        if vb <= 0.0 and d2 >= 0.0 and d6 <= 0.0:
+            s, t = 0.0, d2 / (d2 - d6)
+        elif va <= 0.0 and d4 - d3 >= 0.0 and d5 - d6 >= 0.0:
+            w = (d4 - d3) / ((d4 - d3) + (d5 - d6))
+            s, t = 1.0 - w, w
+        else:
+            whole = 1.0 / (va + vb + vc)
+            s, t = vb * whole, vc * whole
+    x, y, z = apx - s * abx - t * acx, apy - s * aby - t * acy, apz - s * abz - t * acz
+    return x * x + y * y + z * z

@@ -1,4 +1,5 @@
-"""Spacing of a cloud and its outliers, from distances between neighbours."""
+"""Nearest neighbours in a cloud: its spacing, its outliers, distances to another cloud, crops, even samples of it."""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
@@ -6,75 +7,226 @@ from typing import TypeVar
 
 import numpy as np
 import numpy.typing as npt
+from numba import njit
 from scipy.spatial import cKDTree
 
+from processor.geometry import point_grid
+from processor.geometry.parallel import over_ranges
+from processor.geometry.point_grid import SIDE, PointGrid, block_at
 from processor.model import Floats, Ints
 
 T = TypeVar("T", bound=np.generic)
+Bools = npt.NDArray[np.bool_]
 
-SLICES, SLICE_POINTS = 5, 40_000
+SPACING_NEIGHBOURS, SPACING_SAMPLE = 8, 20_000
+SLICES, SLICE_POINTS, SLICE_SAMPLE = 5, 40_000, 5_000
+CELLS_OF_POINTS = 2.0  # edge of a cell, in spacings
+LEAST_RANGE = 512  # places per task of a thread
+GROWTH = 1.5  # factor of the search radius where too few points were found
+CROP_CHUNK = 1 << 20
 
 
-def surface_spacing(points: Floats, neighbours: int = 8, sample: int = 5000) -> float:
-    """Spacing d in mm of points (n, 3) on a surface, such that there is one point in d^2.
+def of_spacing(points: Floats) -> PointGrid:
+    """Sort the points (n, 3) of a surface into cells that hold a few points each, whatever the spacing is."""
+    if len(points) == 0:
+        return point_grid.of_points(points, 1.0)
+    widest = float(np.linalg.norm(np.ptp(points, axis=0)))
+    coarse = point_grid.of_points(points, widest / np.sqrt(len(points)))
+    wanted = CELLS_OF_POINTS * spacing(coarse)
+    return point_grid.of_points(points, wanted) if wanted < 0.5 * coarse.cells.size else coarse
 
-    Median over a regular sample of the points: k neighbours within r cover pi r^2 = k d^2, on grids and random
-    samples alike. Of a large cloud only slices across its longest axis are looked at: a tree of all would take longer
-    than everything that needs the spacing.
+
+def spacing(grid: PointGrid, rows: Ints | None = None) -> float:
+    """Spacing d in mm of a cloud on a surface, such that there is one point in d^2; NaN for a single point.
+
+    k neighbours within r cover pi r^2 = k d^2, on regular grids and random samples alike. The median is taken over
+    ``rows`` of the grid, without them over an even sample of it.
     """
-    k = min(neighbours, len(points) - 1)
+    k = min(SPACING_NEIGHBOURS, grid.count - 1)
     if k < 1:
         return float("nan")
+    rows = np.arange(0, grid.count, max(1, grid.count // SPACING_SAMPLE)) if rows is None else rows
+    farthest = _distances(grid, grid.cells.points[rows], rows, k)[1]
+    return float(np.median(farthest) * np.sqrt(np.pi / k))
+
+
+def surface_spacing(points: Floats) -> float:
+    """Spacing in mm as :func:`spacing`, over a sample in the order of the points (n, 3).
+
+    Every k-th of up to 200,000 points is a sample; of more points, every k-th of five slices across the longest axis.
+    """
+    grid = of_spacing(points)
     if len(points) <= SLICES * SLICE_POINTS:
-        slices, margin = [points], 0
+        sample = np.arange(0, len(points), max(1, len(points) // SLICE_SAMPLE))
     else:
         order = np.argsort(points[:, np.argmax(np.ptp(points, axis=0))], kind="stable")
-        starts = (np.arange(SLICES) + 0.5) / SLICES * len(points) - 0.5 * SLICE_POINTS
-        slices = [points[order[start : start + SLICE_POINTS]] for start in starts.astype(np.int64)]
-        margin = SLICE_POINTS // 4  # at a slice's ends points lack neighbours
-    radii = []
-    for one in slices:
-        inner = one[margin : len(one) - margin]
-        query = inner[:: max(1, len(inner) * len(slices) // sample)]
-        radii.append(cKDTree(one).query(query, k=[k + 1])[0][:, 0])
-    return float(np.median(np.concatenate(radii)) * np.sqrt(np.pi / k))
+        starts = (np.arange(SLICES) + 0.5) / SLICES * len(points) - 0.25 * SLICE_POINTS
+        step = SLICES * SLICE_POINTS // 2 // SLICE_SAMPLE
+        sample = np.concatenate([order[s : s + SLICE_POINTS // 2 : step] for s in starts.astype(np.int64)])
+    row = np.empty(grid.count, np.int64)
+    row[grid.order] = np.arange(grid.count)
+    return spacing(grid, row[sample])
 
 
-def statistical_inliers(points: Floats, neighbours: int = 20, ratio: float = 3.0) -> npt.NDArray[np.bool_]:
-    """Mark (n,) the points whose mean distance to their neighbours is at most mean + ratio * sd of all.
+def nearest(grid: PointGrid, places: Floats) -> Floats:
+    """Distance (m,) from places (m, 3), all finite, to the nearest point of a grid; infinite for an empty grid."""
+    return _distances(grid, np.ascontiguousarray(places), np.full(len(places), -1), 1)[1]
 
-    Statistical outlier removal as in Open3D and PCL; the point itself is not among its neighbours.
-    """
-    k = min(neighbours, len(points) - 1)
+
+def mean_distances(grid: PointGrid, neighbours: int) -> Floats:
+    """Mean distance (n,) of each point of a grid, in the grid's order, to its neighbours, itself not among them."""
+    k = min(neighbours, grid.count - 1)
     if k < 1:
-        return np.ones(len(points), bool)
-    mean = cKDTree(points).query(points, k=k + 1, workers=-1)[0][:, 1:].mean(axis=1)
+        return np.zeros(grid.count)
+    return _distances(grid, grid.cells.points, np.arange(grid.count), k)[0]
+
+
+def statistical_inliers(grid: PointGrid, neighbours: int, ratio: float) -> Bools:
+    """Mark (n,), in the grid's order, the points that statistical outlier removal keeps.
+
+    The mean distance to their neighbours is at most mean + ratio * sd of all points, as in Open3D and PCL, and in
+    paper 002 with 20 neighbours and a ratio of 1.
+    """
+    mean = mean_distances(grid, neighbours)
+    if len(mean) == 0:
+        return np.ones(0, bool)
     return np.asarray(mean <= mean.mean() + ratio * mean.std(), bool)
 
 
+def without_outliers(points: Floats, neighbours: int, ratio: float) -> Floats:
+    """Return the points (k, 3) of (n, 3) that statistical outlier removal keeps, in their order."""
+    grid = of_spacing(points)
+    return points[np.sort(grid.order[statistical_inliers(grid, neighbours, ratio)])]
+
+
+def nearest_crops(points: Floats, centres: Floats, reaches: Floats) -> list[Ints]:
+    """Rows of points (n, 3) within ``reaches`` (k,) of each of centres (k, 3): k arrays in row order; lengths in mm.
+
+    A point within reach of several centres belongs to the nearest. The search tree holds the centres, not the points.
+    """
+    if len(centres) == 0:
+        return []
+    tree = cKDTree(centres)
+    # A little farther: the tree's upper bound is exclusive, the radius of a crop is inclusive.
+    bound = float(reaches.max()) * (1.0 + 1e-9) + 1e-9
+    rows, owners = [], []
+    for first in range(0, len(points), CROP_CHUNK):
+        chunk = points[first : first + CROP_CHUNK]
+        inside = np.flatnonzero(np.all((chunk >= tree.mins - bound) & (chunk <= tree.maxes + bound), axis=1))
+        distance, owner = tree.query(chunk[inside], distance_upper_bound=bound, workers=-1)
+        near = np.flatnonzero(np.isfinite(distance))
+        near = near[distance[near] <= reaches[owner[near]]]
+        rows.append(first + inside[near])
+        owners.append(owner[near])
+    row, owner = np.concatenate([np.empty(0, np.int64), *rows]), np.concatenate([np.empty(0, np.int64), *owners])
+    order = np.argsort(owner, kind="stable")
+    starts = np.searchsorted(owner[order], np.arange(1, len(centres)))
+    return [part.astype(np.int64) for part in np.split(row[order], starts)]
+
+
 def thinned(points: npt.NDArray[T], count: int) -> npt.NDArray[T]:
-    """Every k-th of points (n, ...), k as large as leaves ``count`` or more of them."""
+    """Every k-th of points (n, ...), with the largest k that leaves ``count`` points or more."""
     return points[:: max(1, len(points) // count)]
 
 
 def by_cell(points: Floats, size_mm: float) -> Ints:
-    """Rows (n,) of points (n, 3) cell by cell: neighbours one after the other, so that look-ups of them find the same.
+    """Rows (n,) of points (n, 3) sorted by cells of ``size_mm``.
 
-    A third of the time of a tree's queries, and every k-th of them lies evenly.
+    Queries of a tree for points in this order take a third of the time, and every k-th point is an even sample.
     """
     if not len(points):
         return np.empty(0, np.int64)
     cell = ((points - points.min(axis=0)) / size_mm).astype(np.int64)
-    extent = cell.max(axis=0) + 1
-    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    return np.argsort(key, kind="stable").astype(np.int64, copy=False)
+    return np.argsort(_cell_keys(cell), kind="stable").astype(np.int64, copy=False)
 
 
 def voxel_means(points: Floats, size_mm: float, least: int = 1) -> Floats:
     """Mean (k, 3) of the points in each occupied voxel that holds at least ``least`` points, in voxel order."""
     cell = np.floor((points - points.min(axis=0)) / size_mm).astype(np.int64)
-    extent = cell.max(axis=0) + 1
-    key = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
-    _, inverse, count = np.unique(key, return_inverse=True, return_counts=True)
+    _, inverse, count = np.unique(_cell_keys(cell), return_inverse=True, return_counts=True)
     total = np.stack([np.bincount(inverse, points[:, i], len(count)) for i in range(3)], axis=1)
     return (total / count[:, None])[count >= least]
+
+
+def _cell_keys(cell: Ints) -> Ints:
+    """Return the number (n,) of cells (n, 3), all indices 0 or more, in the order of x, y, z."""
+    extent = cell.max(axis=0) + 1
+    key: Ints = (cell[:, 0] * extent[1] + cell[:, 1]) * extent[2] + cell[:, 2]
+    return key
+
+
+def _distances(grid: PointGrid, places: Floats, own: Ints, k: int) -> tuple[Floats, Floats]:
+    """Return mean distance (m,) of the k nearest points, and that (m,) of the k-th; row ``own`` (m,) is left out."""
+    mean, farthest = np.full(len(places), np.inf), np.full(len(places), np.inf)
+    if grid.count >= k:
+        order = np.arange(len(places)) if (own >= 0).all() else grid.beside(places)
+        over_ranges(
+            lambda a, b: _nearest(grid.cells, places, own, order, a, b, k, mean, farthest),
+            len(places), least=LEAST_RANGE,
+        )  # fmt: skip
+    return mean, farthest
+
+
+@njit(cache=True, nogil=True)
+def _nearest(cells, places, own, order, first, last, k, mean, farthest):  # type: ignore[no-untyped-def]
+    """Fill mean distance of the k nearest points and that of the k-th, for places order[first] to order[last - 1]."""
+    size, (xl, yl, zl) = cells.size, (cells.lower[0], cells.lower[1], cells.lower[2])
+    tops = SIDE * cells.extent - 1
+    points, starts = cells.points, cells.starts
+    best = np.empty(k)
+    edge = SIDE * size
+    guess = size
+    for at in range(first, last):
+        row = order[at]
+        skipped = own[row]
+        x, y, z = places[row, 0], places[row, 1], places[row, 2]
+        # The search about a place outside the grid starts at its distance from the grid.
+        away = max(xl - x, yl - y, zl - z, x - xl - size * (tops[0] + 1), y - yl - size * (tops[1] + 1))
+        away = max(away, z - zl - size * (tops[2] + 1), 0.0)
+        reach = guess + away
+        while True:
+            i0, i1 = int(max((x - reach - xl) / size, 0.0)), int(min((x + reach - xl) / size, float(tops[0])))
+            j0, j1 = int(max((y - reach - yl) / size, 0.0)), int(min((y + reach - yl) / size, float(tops[1])))
+            k0, k1 = int(max((z - reach - zl) / size, 0.0)), int(min((z + reach - zl) / size, float(tops[2])))
+            n = 0
+            best[:] = np.inf
+            for bi in range(i0 // SIDE, i1 // SIDE + 1):
+                gx = max(xl + bi * edge - x, x - xl - (bi + 1) * edge, 0.0)
+                for bj in range(j0 // SIDE, j1 // SIDE + 1):
+                    gy = max(yl + bj * edge - y, y - yl - (bj + 1) * edge, 0.0)
+                    for bk in range(k0 // SIDE, k1 // SIDE + 1):
+                        gz = max(zl + bk * edge - z, z - zl - (bk + 1) * edge, 0.0)
+                        if gx * gx + gy * gy + gz * gz > best[k - 1] * (1.0 + 1e-9):
+                            continue
+                        block = block_at(cells, bi, bj, bk)
+                        if block < 0:
+                            continue
+                        low, high = max(k0 - SIDE * bk, 0), min(k1 - SIDE * bk, SIDE - 1)
+                        for i in range(max(i0, SIDE * bi), min(i1, SIDE * bi + SIDE - 1) + 1):
+                            for j in range(max(j0, SIDE * bj), min(j1, SIDE * bj + SIDE - 1) + 1):
+                                cell = ((i - SIDE * bi) * SIDE + (j - SIDE * bj)) * SIDE
+                                for p in range(starts[block, cell + low], starts[block, cell + high + 1]):
+                                    u, v, w = points[p, 0] - x, points[p, 1] - y, points[p, 2] - z
+                                    d = u * u + v * v + w * w
+                                    if d >= best[k - 1] or p == skipped:
+                                        continue
+                                    n += 1
+                                    m = k - 1
+                                    while m > 0 and best[m - 1] > d:
+                                        best[m] = best[m - 1]
+                                        m -= 1
+                                    best[m] = d
+            if best[k - 1] <= reach * reach:
+                break
+            whole = i0 == 0 and j0 == 0 and k0 == 0 and i1 == tops[0] and j1 == tops[1] and k1 == tops[2]
+            if whole:
+                break
+            # The k-th of any k points is an upper bound of the distance wanted: that search radius is sufficient.
+            reach = np.sqrt(best[k - 1]) * (1.0 + 1e-9) if n >= k else GROWTH * reach + size
+        total = 0.0
+        for m in range(k):
+            total += np.sqrt(best[m])
+        mean[row] = total / k
+        farthest[row] = np.sqrt(best[k - 1])
+        if np.isfinite(farthest[row]):
+            guess = max(1.2 * (farthest[row] - away), 0.05 * size)

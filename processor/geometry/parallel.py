@@ -1,6 +1,6 @@
-"""Compiled kernels over ranges of items on a few threads.
+"""Compiled kernels over ranges of items on several threads.
 
-Every item's answer is its own, so that neither the number of threads nor the ranges show in any result.
+The result of an item does not depend on other items, so that neither the number of threads nor the ranges matter.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import TypeVar
 
 A = TypeVar("A")
 B = TypeVar("B")
-PIECES = 32  # ranges, more than threads: they do not all take the same time
+PIECES = 32  # ranges; more than threads, since they do not all take the same time
 
 
 @cache
@@ -23,20 +23,20 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def usable() -> int:
-    """How many processors this process may use."""
+    """Return the number of processors this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def each(function: Callable[[A], B], items: Iterable[A]) -> list[B]:
-    """Call a function that lets other threads run for each of the items; the answers in the items' order."""
+    """Call a function that releases the interpreter lock for each item, on threads; return results in order."""
     with ThreadPoolExecutor(usable()) as pool:
         return list(pool.map(function, items))
 
 
 def over_ranges(kernel: Callable[[int, int], object], count: int, threads: int = 0, least: int = 1) -> None:
-    """Call ``kernel(first, last)`` for ranges that cover 0 to ``count``; 0 threads = as many as are usable.
+    """Call ``kernel(first, last)`` for ranges that cover 0 to ``count``; 0 threads = all usable ones.
 
-    ``least`` items make a range, where there are so many.
+    A range has ``least`` items or more, except where ``count`` is smaller.
     """
     threads = threads or usable()
     pieces = max(1, min(PIECES, count // max(least, 1)))
@@ -46,9 +46,3 @@ def over_ranges(kernel: Callable[[int, int], object], count: int, threads: int =
         return
     for done in [_pool(threads).submit(kernel, a, b) for a, b in pairwise(bounds)]:
         done.result()
-
-
-# --- Compiled kernels over ranges of items on a few threads; see :mod:`processor.geometry.parallel`.
-
-
-__all__ = ["over_ranges", "usable"]

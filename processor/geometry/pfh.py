@@ -1,4 +1,4 @@
-"""Point feature histograms and the coarse alignment that rests on them (paper 000, section 2.6)."""
+"""Point feature histograms and coarse alignment by them (paper 000, section 2.6)."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from processor.model import Floats, Ints
 
 
 def normals(points: Floats, radius_mm: float) -> Floats:
-    """Estimate unit normals (n, 3) of points (n, 3): least principal direction of the neighbours, away from the middle.
+    """Estimate unit normals (n, 3) of points (n, 3): least principal direction of the neighbours, away from the mean.
 
-    Along a straight line of points the normal is not defined; what comes out there is one of many, as in the paper.
+    Along a straight line of points the normal is not unique; one of the possible ones is returned, as in the paper.
     """
     tree = cKDTree(points)
     outward = points - points.mean(axis=0)
@@ -27,8 +27,8 @@ def normals(points: Floats, radius_mm: float) -> Floats:
 def pair_features(points: Floats, point_normals: Floats, i: Ints, j: Ints) -> Floats:
     """Angles alpha, beta (as cosines) and theta (rad) of point pairs (i, j), (k, 3); paper 000 eq. 3 and 4.
 
-    The source of a pair is the point whose normal makes the smaller angle with the line to the other (Rusu), so that
-    the result does not depend on the order of the points. NaN for coincident points.
+    The source of a pair is the point whose normal has the smaller angle to the line to the other (Rusu), so that the
+    result does not depend on the order of the points. NaN for coincident points.
     """
     line = points[j] - points[i]
     distance = np.linalg.norm(line, axis=1)
@@ -62,8 +62,8 @@ def histograms(points: Floats, point_normals: Floats, radius_mm: float, bins: in
     tree = cKDTree(points)
     result = np.zeros((len(points), bins**3))
     low, span = np.array([-1.0, -1.0, -np.pi]), np.array([2.0, 2.0, 2.0 * np.pi])
-    for query, found in enumerate(tree.query_ball_point(points, radius_mm)):
-        neighbours = np.array(sorted(found))
+    for query, rows in enumerate(tree.query_ball_point(points, radius_mm)):
+        neighbours = np.array(sorted(rows))
         first, second = np.triu_indices(len(neighbours), 1)
         features = pair_features(points, point_normals, neighbours[first], neighbours[second])
         features = features[np.isfinite(features).all(axis=1)]
@@ -85,10 +85,10 @@ def coarse_alignment(
     iterations: int,
     rng: np.random.Generator,
 ) -> Floats:
-    """T_target_source (4, 4) from the nearest histograms: three pairs at a time, the pose with most pairs wins.
+    """T_target_source (4, 4) from pairs of nearest histograms: poses by three pairs; the one with most pairs is taken.
 
-    A sample whose sides differ by more than the tolerance between the clouds is passed over. The winner is not
-    necessarily right: the share of pairs it explains says nothing about it on repeated or straight shapes.
+    A sample of three is skipped if its sides differ by more than the tolerance between the clouds. The result may be
+    wrong on repeated or straight shapes, whatever the share of pairs that agree.
     """
     match = cKDTree(target_histograms).query(source_histograms)[1]
     paired = target[match]

@@ -1,7 +1,7 @@
-"""A cloud sorted into the cells of a sparse grid: neighbours of any place lie in few runs of rows.
+"""A cloud sorted into the cells of a sparse grid: the neighbours of a place lie in few contiguous runs of rows.
 
-Cells are gathered in blocks of 4 x 4 x 4, found by a hash; within a block, cells along z are one run of rows. Rows are
-sorted by block, cell and coordinates, so that nothing computed from them depends on the order the points came in.
+Cells form blocks of 4 x 4 x 4, found by a hash table; within a block, cells along z are one run of rows. Rows are
+sorted by block, cell and coordinates, so that results computed from them do not depend on the order of the points.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -19,11 +19,11 @@ from processor.model import Floats, Ints
 SIDE = 4  # cells along a block's edge
 FIELD = 19  # bits of a block's number for each axis
 EMPTY = -1
-ROOM_SHARE = 8  # cells of the table for each point at most: where a grid is finer, its cells are made larger
+ROOM_SHARE = 8  # cells of the table per point at most: the cells of a finer grid are made larger
 
 
 class Cells(NamedTuple):
-    """What kernels take: points (n, 3) in the grid's order, and the table of its blocks.
+    """Arguments of kernels: points (n, 3) in the grid's order, and the table of its blocks.
 
     Cell c of block b, c = 16 i + 4 j + k, holds the rows ``starts[b, c]`` to ``starts[b, c + 1]``.
     """
@@ -39,20 +39,20 @@ class Cells(NamedTuple):
 
 @dataclass(frozen=True)
 class PointGrid:
-    """The cells, and the row (n,) that each of their points had in the cloud given."""
+    """The cells, and the row (n,) of each of their points in the original cloud."""
 
     cells: Cells
     order: Ints
 
     @property
     def count(self) -> int:
-        """Points in all."""
+        """Number of points."""
         return len(self.order)
 
     def beside(self, places: Floats) -> Ints:
-        """Sort places (m, 3): rows (m,) in the grid's own order, so that neighbours are looked for one after another.
+        """Sort places (m, 3): rows (m,) in the grid's order, so that successive searches use the same memory.
 
-        Places beyond the grid come at its rim; what is not finite comes first.
+        Places outside the grid are sorted as if at its border; places that are not finite come first.
         """
         cells = self.cells
         known = np.where(np.isfinite(places), places, cells.lower)
@@ -61,7 +61,7 @@ class PointGrid:
 
 
 def of_points(points: Floats, cell: float) -> PointGrid:
-    """Sort points (n, 3), all finite, into cells of the edge ``cell`` or as much larger as room for the table asks."""
+    """Sort points (n, 3), all finite, into cells of the edge ``cell``, or larger where the table would be too large."""
     if len(points) == 0:
         none = np.zeros((0, SIDE**3 + 1), np.int64)
         empty = np.full(2, EMPTY, np.int64)
@@ -95,16 +95,16 @@ def of_points(points: Floats, cell: float) -> PointGrid:
 
 
 def _keys(cell: Ints) -> Ints:
-    """Return a number for each cell (n, 3): its block's, then its own within the block."""
+    """Return a number for each cell (n, 3): that of its block, then that within the block."""
     block = (cell[:, 0] // SIDE << FIELD | cell[:, 1] // SIDE) << FIELD | cell[:, 2] // SIDE
     inner = (cell & (SIDE - 1)) @ np.array([16, 4, 1])
-    found: Ints = block << 6 | inner
-    return found
+    key: Ints = block << 6 | inner
+    return key
 
 
 @njit(cache=True, nogil=True, inline="always")
 def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
-    """Find the row of a block by its numbers along the axes, EMPTY where it holds no point."""
+    """Find the row of a block by its indices along the axes; EMPTY where it holds no point."""
     key = ((i << FIELD) | j) << FIELD | k
     mask = np.uint64(len(cells.keys) - 1)
     h = np.uint64(key) * np.uint64(0x9E3779B97F4A7C15)
@@ -115,20 +115,21 @@ def block_at(cells, i, j, k):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _fill(keys, blocks, found):  # type: ignore[no-untyped-def]
+def _fill(keys, blocks, block_keys):  # type: ignore[no-untyped-def]
+    """Enter the rows of blocks with ``block_keys`` (b,) into the hash table."""
     mask = np.uint64(len(keys) - 1)
-    for row in range(len(found)):
-        h = np.uint64(found[row]) * np.uint64(0x9E3779B97F4A7C15)
+    for row in range(len(block_keys)):
+        h = np.uint64(block_keys[row]) * np.uint64(0x9E3779B97F4A7C15)
         at = (h ^ (h >> np.uint64(32))) & mask
         while keys[at] != EMPTY:
             at = (at + np.uint64(1)) & mask
-        keys[at] = found[row]
+        keys[at] = block_keys[row]
         blocks[at] = row
 
 
 @njit(cache=True, nogil=True)
 def _sort_cells(points, order, starts, first, last):  # type: ignore[no-untyped-def]
-    """Sort the rows of each cell of some blocks by x, y, z (Shell's sort: cells are small)."""
+    """Sort the rows of each cell of blocks first to last - 1 by x, y, z (Shell's sort: cells are small)."""
     for block in range(first, last):
         for cell in range(starts.shape[1] - 1):
             a, b = starts[block, cell], starts[block, cell + 1]

@@ -35,9 +35,9 @@ def fit_line(points: Floats) -> Line:
 def ransac_line(
     points: Floats, threshold_mm: float, probability: float, max_iterations: int, rng: np.random.Generator
 ) -> Line | None:
-    """Line with the most points within the threshold, then fitted to them by least squares.
+    """Line with the most points within the threshold, fitted to them by least squares.
 
-    The number of two-point samples adapts to the best share of inliers found so far. None when no two points differ.
+    The number of two-point samples adapts to the largest share of inliers so far. None if all points coincide.
     """
     best: np.ndarray | None = None
     needed, tried = float(max_iterations), 0
@@ -56,7 +56,7 @@ def ransac_line(
 
 
 def crossing(a: Line, b: Line) -> Floats:
-    """Middle (3,) of the shortest segment between two lines; NaN where they are parallel."""
+    """Midpoint (3,) of the shortest segment between two lines; NaN for parallel lines."""
     normal = np.cross(a.direction, b.direction)
     square = float(normal @ normal)
     if square < 1e-12:
@@ -90,17 +90,17 @@ class Polyline:
         return np.stack([np.interp(s, self.arc, self.vertices[:, i]) for i in range(3)], axis=1)
 
     def nearest(self, points: Floats) -> tuple[Floats, Floats]:
-        """Arc lengths (n,) of, and vectors (n, 3) from, the nearest point of the polyline to each of points (n, 3)."""
+        """Arc length (n,) of the nearest point of the polyline to each of points (n, 3), and vector (n, 3) from it."""
         start, along = self.vertices[:-1], np.diff(self.vertices, axis=0)
         squared = np.einsum("mi,mi->m", along, along)
-        whole = squared > 0.0
-        start, along, squared, arc = start[whole], along[whole], squared[whole], self.arc[:-1][whole]
+        regular = squared > 0.0
+        start, along, squared, arc = start[regular], along[regular], squared[regular], self.arc[:-1][regular]
         s, offset = np.zeros(len(points)), np.zeros((len(points), 3))
         for rows in np.array_split(np.arange(len(points)), len(points) * len(start) // PAIRS_AT_ONCE + 1):
             off = points[rows, None] - start
             t = np.clip(np.einsum("nmi,mi->nm", off, along) / squared, 0.0, 1.0)
             off -= t[..., None] * along
-            one, best = np.arange(len(rows)), np.einsum("nmi,nmi->nm", off, off).argmin(axis=1)
-            offset[rows] = off[one, best]
-            s[rows] = arc[best] + t[one, best] * np.sqrt(squared[best])
+            row, best = np.arange(len(rows)), np.einsum("nmi,nmi->nm", off, off).argmin(axis=1)
+            offset[rows] = off[row, best]
+            s[rows] = arc[best] + t[row, best] * np.sqrt(squared[best])
         return s, offset

@@ -1,12 +1,22 @@
-"""Principal axes of point clouds and of meshes."""
+"""Principal axes of point clouds and of meshes, and the coarse registration that lays one set of axes on another.
+
+Paper 000, section 2.2, and paper 002, section 2.3, without the four of the eight sign choices that are mirror images.
+"""
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from processor.geometry import rigid
 from processor.model import Floats, Ints
+
+ALIKE = 1.25  # ratio of the variances along two axes below which these may be swapped
+SAME_TURN, SAME_SHIFT = 0.02, 0.01  # rad, and share of the size: poses that differ by less are one pose
+AMBIGUOUS = 1.3  # ratio of two poses' errors below which either may be right
 
 
 @dataclass(frozen=True)
@@ -16,6 +26,19 @@ class PrincipalAxes:
     centre: Floats
     axes: Floats
     variances: Floats
+
+
+@dataclass(frozen=True)
+class CoarsePose:
+    """``T_target_source`` (4, 4), the rms in mm that it leaves, and the ratio of the next best pose's rms to it.
+
+    ``T_rival`` (4, 4) is the next best pose, NaN where there is none.
+    """
+
+    T_target_source: Floats
+    rms_mm: float
+    ambiguity: float
+    T_rival: Floats
 
 
 def of_points(points: Floats) -> PrincipalAxes:
@@ -47,8 +70,54 @@ def _from_moments(centre: Floats, covariance: Floats) -> PrincipalAxes:
     return PrincipalAxes(centre, axes, variances[::-1].copy())
 
 
-def proper_sign_choices() -> tuple[Floats, ...]:
-    """Give the four of the eight sign choices of three axes that are rotations and not mirror images."""
-    return tuple(
-        np.array(signs) for signs in ((1.0, 1.0, 1.0), (1.0, -1.0, -1.0), (-1.0, 1.0, -1.0), (-1.0, -1.0, 1.0))
-    )
+def turns(orders: Sequence[tuple[int, ...]]) -> list[Floats]:
+    """Proper rotations (3, 3) that take axis ``order[i]`` to axis i, in either direction: four for each order."""
+    rotations = []
+    for order in orders:
+        for signs in itertools.product((1.0, -1.0), repeat=3):
+            turn = np.zeros((3, 3))
+            turn[range(3), order] = signs
+            if np.linalg.det(turn) > 0.0:
+                rotations.append(turn)
+    return rotations
+
+
+def possible_turns(target_variances: Floats, source_variances: Floats) -> list[Floats]:
+    """Proper rotations (3, 3) between two sets of axes with variances (3,): 4, up to 24 where variances are alike."""
+
+    def alike(variances: Floats, i: int, k: int) -> bool:
+        a, b = variances[i], variances[k]
+        return bool(max(a, b) <= ALIKE * min(a, b))
+
+    def possible(order: tuple[int, ...]) -> bool:
+        swaps = [(i, k) for i, k in enumerate(order) if i != k]
+        return all(alike(target_variances, i, k) or alike(source_variances, i, k) for i, k in swaps)
+
+    return turns([order for order in itertools.permutations(range(3)) if possible(order)])
+
+
+def coarse(
+    source: PrincipalAxes, target: PrincipalAxes, size: float, refined: Callable[[Floats], tuple[float, Floats]]
+) -> CoarsePose:
+    """Lay principal axes on each other in every possible way and take the pose that leaves the least error.
+
+    Paper 002 compares the poses as the axes give them. Axes are a little off, by as much as the poses of a nearly
+    symmetric structure differ; so ``refined`` first improves each pose T_target_source (4, 4): it returns the rms in mm
+    left, and the better pose. Poses that differ by less than a share of the target's ``size`` (mm) count as one.
+    """
+    fits = []
+    for turn in possible_turns(target.variances, source.variances):
+        R = target.axes @ turn @ source.axes.T
+        fits.append(refined(rigid.transform(R, target.centre - R @ source.centre)))
+    order = sorted(range(len(fits)), key=lambda k: (fits[k][0], k))
+    error, best = fits[order[0]]
+    rivals = (fits[k] for k in order[1:] if differ(fits[k][1], best, source.centre, size))
+    rival_error, rival = next(rivals, (float("nan"), np.full((4, 4), np.nan)))
+    return CoarsePose(best, error, rival_error / max(error, 1e-9), rival)
+
+
+def differ(T: Floats, other: Floats, centre: Floats, size: float) -> bool:
+    """Whether two poses (4, 4) of a body about ``centre`` (3,) and of a ``size`` (mm) are two and not one."""
+    turn = rigid.rotation_angle(T[:3, :3] @ other[:3, :3].T)
+    shift = float(np.linalg.norm(rigid.apply(T, centre) - rigid.apply(other, centre)))
+    return turn > SAME_TURN or shift > SAME_SHIFT * size

@@ -22,13 +22,13 @@ def apply(T: Floats, points: Floats) -> Floats:
 
 
 def invert(T: Floats) -> Floats:
-    """Invert a rigid T (4, 4) without loss: the rotation is transposed."""
+    """Invert a rigid T (4, 4) exactly: the rotation is transposed."""
     R = T[:3, :3]
     return transform(R.T, -R.T @ T[:3, 3])
 
 
 def with_origin(T: Floats, origin: Floats) -> Floats:
-    """T (4, 4) for coordinates that an ``origin`` (3,), taken off before, has been put back to."""
+    """T (4, 4) for coordinates to which an ``origin`` (3,), subtracted before, has been added again."""
     return transform(T[:3, :3], T[:3, 3] - T[:3, :3] @ origin)
 
 
@@ -43,35 +43,51 @@ def rotation_from_vector(w: Floats) -> Floats:
     angle = float(np.linalg.norm(w))
     if angle == 0.0:
         return np.eye(3)
-    x, y, z = np.asarray(w) / angle
-    K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    K = cross_matrix(np.asarray(w) / angle)
     R: Floats = np.eye(3) + np.sin(angle) * K + (1.0 - np.cos(angle)) * (K @ K)
     return R
 
 
 def vector_from_rotation(R: Floats) -> Floats:
-    """Return the axis (3,) of a rotation (3, 3), as long as its angle in rad; less than half a turn."""
+    """Return the rotation vector (3,) of R (3, 3): its axis times its angle in rad, less than half a turn."""
     skew = 0.5 * np.array([R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]])
     sine = float(np.linalg.norm(skew))
-    found: Floats = skew * (rotation_angle(R) / sine if sine > 0.0 else 1.0)
-    return found
+    vector: Floats = skew * (rotation_angle(R) / sine if sine > 0.0 else 1.0)
+    return vector
 
 
 def motion(points: Floats) -> Floats:
     """Return the derivative (n, 3, 6) of points (n, 3) by a small turn about the origin and a translation."""
-    found = np.zeros((len(points), 3, 6))
+    derivative = np.zeros((len(points), 3, 6))
     x, y, z = points.T
-    found[:, 0, 1], found[:, 0, 2] = z, -y
-    found[:, 1, 0], found[:, 1, 2] = -z, x
-    found[:, 2, 0], found[:, 2, 1] = y, -x
-    found[:, :, 3:] = np.eye(3)
-    return found
+    derivative[:, 0, 1], derivative[:, 0, 2] = z, -y
+    derivative[:, 1, 0], derivative[:, 1, 2] = -z, x
+    derivative[:, 2, 0], derivative[:, 2, 1] = y, -x
+    derivative[:, :, 3:] = np.eye(3)
+    return derivative
+
+
+def about_origin(covariance: Floats, position: Floats) -> Floats:
+    """Covariance (6, 6) of a motion about the frame's origin from that of the same motion about a ``position`` (3,).
+
+    A motion is a small turn (rad), then a translation (mm): t_origin = t_position + position x turn.
+    """
+    J = np.eye(6)
+    J[3:, :3] = cross_matrix(position)
+    at_origin: Floats = J @ covariance @ J.T
+    return at_origin
+
+
+def cross_matrix(v: Floats) -> Floats:
+    """Matrix (3, 3) of the cross product of ``v`` (3,) with another vector."""
+    x, y, z = v
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
 def fit(source: Floats, target: Floats) -> Floats:
-    """Rigid T_target_source that minimises the squared distances of paired points (n, 3), n >= 3.
+    """Rigid T_target_source (4, 4), no reflection, of least squared distances of paired points (n, 3), n >= 3.
 
-    Never a reflection. Source: Besl and McKay's objective (paper 000 eq. 5), solved by the SVD of the covariance.
+    Source: the objective of Besl and McKay (paper 000, eq. 5), solved by the SVD of the covariance.
     """
     centre_source, centre_target = source.mean(axis=0), target.mean(axis=0)
     U, _, Vt = np.linalg.svd((source - centre_source).T @ (target - centre_target))

@@ -1,4 +1,4 @@
-"""Where the rays of a scanner's grid went, those that did not come back too."""
+"""Directions of the rays of a scanner's grid, including those without a return."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from processor.model import Floats, Ints
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays by rows and columns: ``height`` (rows,) along the axis a scanner turns about, ``turn`` (columns,) about it.
+    """Rays by rows and columns: ``height`` (rows,) along the scanner's axis of rotation, ``turn`` (columns,) about it.
 
-    ``axes`` (3, 3) has two directions across and the axis as columns. A column without points has no turn: NaN. A row
-    without points has the angle between its neighbours'.
+    ``axes`` (3, 3) has two directions across and the axis as columns. The turn of a column without points is NaN. The
+    angle of a row without points is interpolated between its neighbours.
     """
 
     axes: Floats
@@ -23,20 +23,20 @@ class Rays:
     turn: Floats
 
     def of(self, row: Ints, column: Ints) -> Floats:
-        """Return unit vectors (n, 3) of places in the grid; NaN where nothing tells."""
+        """Return unit vectors (n, 3) of places in the grid; NaN where the direction is unknown."""
         inside = (row >= 0) & (row < len(self.height))
         height = np.where(inside, self.height[np.where(inside, row, 0)], np.nan)
         turn = self.turn[column % len(self.turn)]
         flat = np.sqrt(np.maximum(1.0 - height**2, 0.0))
-        own = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
-        found: Floats = own @ self.axes.T
-        return found
+        local = np.stack([flat * np.cos(turn), flat * np.sin(turn), height], axis=1)
+        direction: Floats = local @ self.axes.T
+        return direction
 
 
 def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
-    """Find a scanner's rays from points (n, 3) around it; None for too few, or where they lie in no such grid.
+    """Fit the rays of a scanner to points (n, 3) about it; None for too few points or rows.
 
-    The axis a scanner turns about is the one that points of a row keep their angle to.
+    The axis of rotation is the direction to which the points of a row have a constant angle.
     """
     on = np.flatnonzero((row >= 0) & (column >= 0))
     if len(on) < 100:
@@ -46,13 +46,13 @@ def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
     rows, columns = int(r.max()) + 1, int(c.max()) + 1
     number = np.bincount(r, minlength=rows)
     mean = np.stack([np.bincount(r, u[:, i], rows) for i in range(3)], axis=1) / np.maximum(number, 1)[:, None]
-    apart = u - mean[r]
-    axis = np.linalg.eigh(apart.T @ apart)[1][:, 0]
-    held = number > 0
-    if held.sum() < 2:
+    deviation = u - mean[r]
+    axis = np.linalg.eigh(deviation.T @ deviation)[1][:, 0]
+    occupied = number > 0
+    if occupied.sum() < 2:
         return None
-    angles = np.arcsin(np.clip((mean @ axis)[held], -1.0, 1.0))  # scanners step by equal angles
-    heights = np.sin(np.interp(np.arange(rows), np.flatnonzero(held), angles, left=np.nan, right=np.nan))
+    angles = np.arcsin(np.clip((mean @ axis)[occupied], -1.0, 1.0))  # scanners step by equal angles
+    heights = np.sin(np.interp(np.arange(rows), np.flatnonzero(occupied), angles, left=np.nan, right=np.nan))
     e1 = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     e1 /= np.linalg.norm(e1)
     e2 = np.cross(axis, e1)
@@ -62,7 +62,7 @@ def fitted(points: Floats, row: Ints, column: Ints) -> Rays | None:
 
 
 def unanswered(rays: Rays, row: Ints, column: Ints) -> Floats:
-    """Directions (m, 3) of the grid's places without a point, between others: rays that did not come back."""
+    """Directions (m, 3) of the grid's places without a point: rays without a return."""
     on = (row >= 0) & (column >= 0)
     empty: npt.NDArray[np.bool_] = np.ones((len(rays.height), len(rays.turn)), np.bool_)
     empty[row[on], column[on]] = False

@@ -1,7 +1,7 @@
 """Search for balls in a whole cloud, without a design or a crop.
 
-Four points drawn from one neighbourhood, of many sizes, propose spheres. What is accepted must stand out: the points
-within the noise of the surface must far outnumber those beside it, which no plane, edge, tube or volume achieves.
+Spheres are proposed by four points drawn from one neighbourhood, of many sizes. A ball is accepted if the points within
+the noise of its surface far outnumber those beside it, which no plane, edge, tube or volume achieves.
 """
 
 from __future__ import annotations
@@ -11,27 +11,35 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry.sphere import Sphere, algebraic, canonical_order, sphere_cells, through_four, visible_fraction
-from processor.geometry.sphere_robust import RobustFit, robust_fit
+from processor.geometry.sphere import (
+    RobustFit,
+    Sphere,
+    algebraic,
+    canonical_order,
+    robust_fit,
+    sphere_cells,
+    through_four,
+    visible_fraction,
+)
 from processor.model import Floats
 
-SUBSAMPLE = 8000  # points that propose and judge; more than these only refine
+SUBSAMPLE = 8000  # points for proposals and their scores; all points only for the final fit
 SEEDS = 300
 SETS_PER_SIZE = 2
 SIZES = 8  # of neighbourhoods, from 16 points to most of the cloud
-LEAST_POINTS = 40  # on a ball; of fewer, chance makes balls anywhere
-REFINED = 40  # proposals looked at closely
+LEAST_POINTS = 40  # on a ball; with fewer, balls occur anywhere by chance
+REFINED = 40  # best proposals, which are refined
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
-ROUGHEST = 0.05  # noise over radius: beyond it a ball cannot be told from a blob
+ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
 FACING = 0.975  # median cosine between the cloud's own normals and the ball's
 MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
 LEAST_VISIBLE = 0.08  # share of the sphere
-LARGEST_SD = 0.05  # of the radius or, where it is held, of the centre, in radii
-RADIUS_BAND = 0.15  # proposals within this share of a held radius
+LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
+RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
 
 
 @dataclass(frozen=True)
-class Found:
+class Ball:
     """A ball in the cloud, and the share of the points around it that lie on it."""
 
     fit: RobustFit
@@ -41,7 +49,7 @@ class Found:
 def local_noise(points: Floats, neighbours: int = 24, sample: int = 400) -> float:
     """Noise in mm across the surface of points (n, 3), n > 6, from quadrics fitted to neighbourhoods.
 
-    A low quantile of the standard deviations: edges and mixed pixels may spoil up to half of the neighbourhoods.
+    It is a low quantile of the standard deviations: up to half of the neighbourhoods may lie at edges or mixed pixels.
     """
     k = min(neighbours, len(points))
     if k <= 6:
@@ -67,12 +75,12 @@ def find_ball(
     least_points: int = LEAST_POINTS,
     radius_mm: float | None = None,
     scanner: Floats | None = None,
-) -> Found | None:
-    """Find the ball that stands out most among points (n, 3), mm, or None.
+) -> Ball | None:
+    """Find the clearest ball among points (n, 3), mm, or None.
 
-    ``radius_mm`` holds the radius; ``scanner`` (n, 3) is where each point was seen from. Work is bounded: proposals
-    come from at most SUBSAMPLE points, so a ball of a few points in millions is not found. Canonical order makes the
-    answer independent of the order of the points.
+    ``radius_mm`` fixes the radius; ``scanner`` (n, 3) is the position each point was seen from. Work is bounded:
+    proposals come from at most SUBSAMPLE points, so that a ball of a few points in millions is not found. Points are
+    put in canonical order, so that the result does not depend on theirs.
     """
     if len(points) < least_points:
         return None
@@ -101,7 +109,7 @@ def find_ball(
         if start is None:
             continue
         if few is not cloud:
-            # all points are looked at only for what already stands out among few of them
+            # All points are used only for a ball that is accepted among the subsample.
             trial = robust_fit(few, start, 2.0 * noise, radius_mm)
             if trial is None or not _stands_out(few, trial, noise, 8):
                 continue
@@ -114,7 +122,7 @@ def find_ball(
             inliers = np.zeros(len(points), bool)
             inliers[order[near]] = fit.inliers
             ball = Sphere(fit.sphere.centre + origin, fit.sphere.radius, fit.sphere.covariance)
-            return Found(RobustFit(ball, inliers, fit.scale, fit.converged), min(1.0, share))
+            return Ball(RobustFit(ball, inliers, fit.scale, fit.converged), min(1.0, share))
     return None
 
 
@@ -125,29 +133,29 @@ def find_balls(
     least_points: int = LEAST_POINTS,
     radius_mm: float | None = None,
     scanner: Floats | None = None,
-) -> list[Found]:
+) -> list[Ball]:
     """Find up to ``most`` balls one after another, as :func:`find_ball`; inliers are of all points (n,).
 
-    What lies within 1.5 radii of a ball is not searched again, and balls never overlap: what is left of mixed pixels
-    and mounts around a ball is no second one.
+    Points within 1.5 radii of a ball are not searched again, and balls never overlap, so that mixed pixels and mounts
+    around a ball do not make a second one.
     """
     left = np.arange(len(points))
-    balls: list[Found] = []
+    balls: list[Ball] = []
     for _ in range(2 * most):
         if len(balls) == most:
             break
-        found = find_ball(points[left], rng, least_points, radius_mm, None if scanner is None else scanner[left])
-        if found is None:
+        candidate = find_ball(points[left], rng, least_points, radius_mm, None if scanner is None else scanner[left])
+        if candidate is None:
             break
-        ball = found.fit.sphere
+        ball = candidate.fit.sphere
         inliers = np.zeros(len(points), bool)
-        inliers[left[found.fit.inliers]] = True
+        inliers[left[candidate.fit.inliers]] = True
         if all(
             np.linalg.norm(ball.centre - other.fit.sphere.centre) > 0.9 * (ball.radius + other.fit.sphere.radius)
             for other in balls
         ):
-            fit = RobustFit(ball, inliers, found.fit.scale, found.fit.converged)
-            balls.append(Found(fit, found.inlier_share))
+            fit = RobustFit(ball, inliers, candidate.fit.scale, candidate.fit.converged)
+            balls.append(Ball(fit, candidate.inlier_share))
             left = left[ball.residuals(points[left]) > 0.5 * ball.radius]
         else:
             left = left[~inliers[left]]
@@ -167,7 +175,7 @@ def _proposals(points: Floats, rng: np.random.Generator) -> tuple[Floats, Floats
 
 
 def _scores(points: Floats, centres: Floats, radii: Floats, tau: float) -> Floats:
-    """Points at the surface less half of those beside it, over a regular share of the points: 0 for a volume."""
+    """Score (m,): points at the surface less half of those beside it, over every k-th point; 0 for a volume."""
     some = points[:: max(1, len(points) // 3000)]
     squares = np.sum(some**2, axis=1)
     scores = np.empty(len(radii))
@@ -196,7 +204,7 @@ def _refined(points: Floats, ball: Sphere, tau: float) -> Sphere | None:
 
 
 def _stands_out(points: Floats, fit: RobustFit, noise: float, least_points: int) -> bool:
-    """Whether a fit is a ball: settled, enough of it seen, smooth, round, and far denser than what is beside it."""
+    """Whether a fit is a ball: converged, enough of it visible, smooth, round, and far denser than its surroundings."""
     ball = fit.sphere
     if not fit.converged or np.count_nonzero(fit.inliers) < least_points or noise > ROUGHEST * ball.radius:
         return False
@@ -209,7 +217,7 @@ def _stands_out(points: Floats, fit: RobustFit, noise: float, least_points: int)
         return False
     if _facing(points, fit) < FACING:
         return False
-    # judged at its own noise, in shells of equal width at, outside and inside the surface
+    # Density in shells of equal width at, outside and inside the surface, by the noise of this fit.
     width = 3.0 * max(fit.scale, noise)
     at = np.count_nonzero(np.abs(off) <= width)
     outside = np.count_nonzero((off > width) & (off <= 3.0 * width))
@@ -220,8 +228,8 @@ def _stands_out(points: Floats, fit: RobustFit, noise: float, least_points: int)
 def _facing(points: Floats, fit: RobustFit) -> float:
     """Median cosine between the normals of neighbourhoods of points (n, 3), on the ball or not, and its radii.
 
-    Tubes, edges and volumes that merely cross the surface have other normals. A neighbourhood is about a tenth of the
-    ball's points, so that it is wide against the noise at any density.
+    Tubes, edges and volumes that only cross the surface have other normals. A neighbourhood is about a tenth of the
+    ball's points, so that it is wide compared with the noise at any density.
     """
     stride = max(1, int(fit.inliers.sum()) // 2000)
     some, on = points[::stride], fit.inliers[::stride]
@@ -235,9 +243,9 @@ def _facing(points: Floats, fit: RobustFit) -> float:
 
 
 def _misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> float:
-    """Systematic part in mm of the residuals (n,): the mean by cell beyond what noise gives, median over the points.
+    """Systematic part in mm of the residuals (n,): means of cells beyond noise, median over the points.
 
-    The median, for at the limb a real scan of a good ball departs from the sphere.
+    The median is used because a real scan of a good ball departs from the sphere at the limb.
     """
     cell = np.unique(sphere_cells(points, ball.centre), return_inverse=True)[1]
     count = np.bincount(cell)

@@ -1,32 +1,37 @@
-"""Registration of a part's whole scan to its design's surface, fine: from an attitude that is right to a few mm."""
+"""Registration of a scan to the surface of its design: coarse by principal axes, then fine by least squares.
+
+The fine registration needs a pose that is right to a few millimetres; see :mod:`processor.geometry.principal` for the
+search from any pose. :func:`place` decides which of the two a scan needs.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
+from scipy.spatial import cKDTree
 
-from processor.geometry import icp, rigid
-from processor.geometry.mesh_distance import MeshSurface, on_face
-from processor.geometry.neighbors import thinned
+from processor.geometry import icp, mesh_distance, principal, rigid
+from processor.geometry.mesh_distance import Bools, MeshSurface, Samples, on_face
+from processor.geometry.neighbors import thinned, voxel_means
+from processor.geometry.principal import CoarsePose, PrincipalAxes
 from processor.model import NORMAL_95, Floats, Ints, Word
 
-Bools = npt.NDArray[np.bool_]
+# --- Fine registration
 
 POINTS, LAST_POINTS = 30_000, 250_000
-MOST_TURNS = 30
-STILL_MM = 3e-4  # a pose that moves the part by less stands still
-SMALL_MM = 0.3  # ... or by less leaves each point on its face
-NO_FORM = 2.0  # of the cells' means over what chance makes them
+MOST_ITERATIONS = 30
+CONVERGED_MM = 3e-4  # a step that moves the part by less is the last
+SMALL_MM = 0.3  # a step that moves the part by less leaves each point on its facet
+NO_FORM = 2.0  # ratio of the cells' mean squares to those of chance, below which a part has no form error of its own
 GATES_MM = (60.0, 30.0)
 CUT = 4.5  # standard deviations
-FLOOR_MM = 0.01  # of sigma, for scans without noise
+FLOOR_MM = 0.01  # least sigma, for scans without noise
 LEAST_SHARE = 0.5  # of the points that must lie within the last gate
-NO_FIT_MM = (10.0, 4.0)  # no noise and no form of a part is as large; the second where much lies beside the design
+NO_FIT_MM = (10.0, 4.0)  # sigma above which the scan is not of the design; the second where much clutter is beside it
 CLUTTER_SHARE = 0.15
-CELL_MM = 500.0  # residuals nearer to each other along the part, on one face, are taken as dependent
-WEAK_MM = 5.0  # a motion that may move a part's ends by more (95 %) is weak: they are looked for no further off
+CELL_MM = 500.0  # residuals on one face in one such length of the part are taken as dependent
+WEAK_MM = 5.0  # a motion that may move the part's ends by more (95 %) is weakly determined
 
 
 class Motion(Word):
@@ -41,98 +46,103 @@ class Motion(Word):
 
 
 @dataclass(frozen=True)
-class Registration:
-    """T_bridge_scan (4, 4), its covariance (6, 6: turn about the bridge's axes, translation), sigma and shares.
+class SurfaceFit:
+    """T_design_scan (4, 4), its covariance (6, 6: turn about the design frame's axes, translation), sigma and shares.
 
-    ``weak`` names the motions that what is seen of the part does not hold.
+    ``weak`` names the motions that the points seen do not determine. ``used_share`` is that of points on the surface.
     """
 
-    T_bridge_scan: Floats
+    T_design_scan: Floats
     covariance: Floats
     sigma_mm: float
     used_share: float
     weak: tuple[Motion, ...] = ()
 
 
-NOWHERE = Registration(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
+NOWHERE = SurfaceFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), 0.0)
 
 
-def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> Registration:
+def fine(points: Floats, surface: MeshSurface, axes: Floats, start: Floats) -> SurfaceFit:
     """Robust point-to-surface least squares of points (n, 3), scan frame, from ``start`` (4, 4).
 
-    Faces that look along each of the design's principal ``axes`` (3, 3, columns) count the same, so that its ends
-    hold the part along its length. Where the part shows no form of its own every point counts the same in the end,
-    which is then the best there is. The covariance is a sandwich over cells of neighbouring residuals: what they have
-    in common, form and all, counts once (Liang and Zeger 1986).
+    First, faces that look along each of the design's principal ``axes`` (3, 3, columns) have the same weight, so that
+    the ends of a long part fix it along its length. If the part then shows no form error of its own, a second run gives
+    every point the same weight, which is the best estimate. The covariance is a sandwich over cells of neighbouring
+    residuals, so that what they have in common, form error included, counts once (Liang and Zeger 1986). It is NaN
+    where the points seen do not determine the pose.
     """
-    held, form = _iterate(thinned(points, POINTS), surface, axes, start, GATES_MM[0], even=True)
+    balanced, form = _iterate(thinned(points, POINTS), surface, axes, start, GATES_MM[0], even=True)
     if not form < NO_FORM:
-        return held
-    return _iterate(thinned(points, LAST_POINTS), surface, axes, held.T_bridge_scan, GATES_MM[1], even=False)[0]
+        return balanced
+    return _iterate(thinned(points, LAST_POINTS), surface, axes, balanced.T_design_scan, GATES_MM[1], even=False)[0]
 
 
-def fits(found: Registration) -> bool:
-    """Tell whether the scan is of the design's part: what is not clutter lies on its surface."""
-    return found.sigma_mm < NO_FIT_MM[found.used_share < 1.0 - CLUTTER_SHARE]
+def fits(fitted: SurfaceFit) -> bool:
+    """Whether the scan is of the design's part: the points that are not clutter lie on its surface."""
+    return fitted.sigma_mm < NO_FIT_MM[fitted.used_share < 1.0 - CLUTTER_SHARE]
 
 
 def _iterate(
     points: Floats, surface: MeshSurface, axes: Floats, start: Floats, gate: float, *, even: bool
-) -> tuple[Registration, float]:
-    """Iterate until the pose stands still; also the variance of the cells' means against that of chance."""
+) -> tuple[SurfaceFit, float]:
+    """Iterate to convergence; also return the ratio of the cells' mean squares to those of chance."""
     T, sigma, covariance, share, form = start.copy(), float("nan"), np.full((6, 6), np.nan), 0.0, float("inf")
     weak: tuple[Motion, ...] = ()
     face: Ints | None = None
-    for turn in range(MOST_TURNS):
-        moved = rigid.apply(T, points)
-        face, residual, beyond = surface.distances(moved, gate + 60.0, face)
+    for iteration in range(MOST_ITERATIONS):
+        placed = rigid.apply(T, points)
+        face, residual, beyond = surface.distances(placed, gate + 60.0, face)
         used = on_face(face, beyond) & (np.abs(residual) < gate)
         if used.sum() < 100:
             break
         r, n = residual[used], surface.normals[face[used]]
-        middle = moved[used].mean(axis=0)
-        J = np.hstack([np.cross(moved[used] - middle, n), n])
-        looks = icp.facing(n, axes)
-        spread = np.array([_spread(r[looks == k]) for k in range(3)])
+        middle = placed[used].mean(axis=0)
+        J = np.hstack([np.cross(placed[used] - middle, n), n])
+        axis = icp.facing(n, axes)
+        spread = np.array([_spread(r[axis == k]) for k in range(3)])
         sigma = _spread(r)
-        weight = np.clip(1.0 - (r / (CUT * spread[looks])) ** 2, 0.0, 1.0) ** 2  # Tukey's
-        weight = weight * icp.balance(looks) if even else weight
+        weight = np.clip(1.0 - (r / (CUT * spread[axis])) ** 2, 0.0, 1.0) ** 2  # Tukey's
+        weight = weight * icp.balance(axis) if even else weight
         normal = J.T @ (J * weight[:, None])
         if np.linalg.cond(normal / np.sqrt(np.outer(np.diag(normal), np.diag(normal)) + 1e-300)) > 1e10:
-            break  # what is seen does not hold the part: no covariance, and so no answer
+            break  # the points seen do not determine the pose: the covariance stays NaN
         step = np.linalg.solve(normal, -J.T @ (weight * r))
         R = rigid.rotation_from_vector(step[:3])
         T = rigid.transform(R, middle - R @ middle + step[3:]) @ T
         share = float(used.mean())
-        if turn >= 3:
+        if iteration >= 3:
             gate = max(GATES_MM[1], 6.0 * sigma)
-        move = float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.ptp(moved[:, 0]))
-        if turn == MOST_TURNS - 1 or (move < STILL_MM and (turn > 4 or not even)):
-            cell = cells(moved[used] @ axes, looks, n @ axes)
+        move = float(np.linalg.norm(step[3:]) + np.linalg.norm(step[:3]) * np.ptp(placed[:, 0]))
+        if iteration == MOST_ITERATIONS - 1 or (move < CONVERGED_MM and (iteration > 4 or not even)):
+            cell = cells(placed[used] @ axes, axis, n @ axes)
             form = _form(r, weight > 0.0, cell)
             inverse = np.linalg.inv(normal)
             at_middle = inverse @ _scatter(J * (weight * r)[:, None], cell) @ inverse
-            weak = _weak(at_middle, axes, float(np.abs((moved[used] - middle) @ axes[:, 0]).max()))
-            covariance = about_origin(at_middle, middle)
+            weak = _weak(at_middle, axes, float(np.abs((placed[used] - middle) @ axes[:, 0]).max()))
+            covariance = rigid.about_origin(at_middle, middle)
             break
         face = face if move < SMALL_MM else None
-    return Registration(T, covariance, sigma, share, weak), form
+    return SurfaceFit(T, covariance, sigma, share, weak), form
 
 
 def _spread(residual: Floats) -> float:
     return max(1.4826 * float(np.median(np.abs(residual))), FLOOR_MM) if len(residual) else FLOOR_MM
 
 
-def cells(place: Floats, looks: Ints, normal: Floats) -> Ints:
-    """Return the number (n,) of the cell along the part, and of the side, that points at (n, 3) are in."""
+def cells(place: Floats, axis: Ints, normal: Floats) -> Ints:
+    """Return the number (n,) of the cell of points at ``place`` (n, 3), all along the design's principal axes.
+
+    A cell is a length of the part on one side of it: the ``axis`` (n,) that the ``normal`` (n, 3) looks along, and its
+    direction.
+    """
     cell = np.floor(place[:, 0] / CELL_MM).astype(np.int64)
-    side = normal[np.arange(len(looks)), looks] > 0.0
-    number: Ints = np.unique(6 * cell + 2 * looks + side, return_inverse=True)[1].reshape(-1)
+    side = normal[np.arange(len(axis)), axis] > 0.0
+    number: Ints = np.unique(6 * cell + 2 * axis + side, return_inverse=True)[1].reshape(-1)
     return number
 
 
 def _form(residual: Floats, counted: Bools, cell: Ints) -> float:
-    """Return the mean square of the cells' means over what chance makes it: 1 for a part without form of its own."""
+    """Ratio of the mean square of the cells' means to that of chance: 1 for a part without form error of its own."""
     number = np.bincount(cell, counted)
     full = number > 20
     mean = np.bincount(cell, residual * counted) / np.maximum(number, 1)
@@ -142,11 +152,11 @@ def _form(residual: Floats, counted: Bools, cell: Ints) -> float:
 
 
 def _scatter(gradient: Floats, cell: Ints) -> Floats:
-    """Sum (6, 6) of the outer products of gradients (n, 6), added up over each cell first."""
+    """Sum (6, 6) of the outer products of gradients (n, 6), summed within each cell first."""
     cells = int(cell.max()) + 1
     sums = np.stack([np.bincount(cell, gradient[:, k], cells) for k in range(6)], axis=1)
-    found: Floats = sums.T @ sums * (cells / max(cells - 6, 1))
-    return found
+    scatter: Floats = sums.T @ sums * (cells / max(cells - 6, 1))
+    return scatter
 
 
 def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion, ...]:
@@ -158,10 +168,122 @@ def _weak(covariance: Floats, axes: Floats, half_length: float) -> tuple[Motion,
     return tuple(name for name, k in zip(Motion, order, strict=True) if spread[k] * arms[k] > WEAK_MM)
 
 
-def about_origin(covariance: Floats, middle: Floats) -> Floats:
-    """Covariance of a turn and a translation about ``middle`` (3,) as one about the frame's origin."""
-    x, y, z = middle
-    move = np.eye(6)
-    move[3:, :3] = [[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]  # t_origin = t_middle - w x middle
-    found: Floats = move @ covariance @ move.T
-    return found
+# --- Coarse registration, and the choice between the two
+
+COARSE_POINTS, COARSE_ITERATIONS = 3_000, 12
+COARSE_SAMPLES = 40_000
+GATE_SHARES = (0.05, 0.015, 0.005)  # of the design's size
+EVEN_CELLS = 200.0  # voxels along the scan's extent, for points of even density
+NEAR_MM = 100.0  # of the design's surface
+NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
+FINE_POINTS = 30_000
+NAN = float("nan")
+
+
+class Registration(Word):
+    """How a scan was registered to its design."""
+
+    AS_GIVEN = "as given"
+    FINE = "fine"
+    COARSE = "coarse"
+
+
+@dataclass(frozen=True)
+class Placed:
+    """``T`` (4, 4) and ``T_best_fit`` (4, 4) map the scan's local frame to the design's; ``registration`` says how.
+
+    ``covariance`` (6, 6) is that of the best fit. ``shift`` (3,) and ``turn`` are what the best fit does to the scan's
+    middle relative to T.
+    """
+
+    T: Floats
+    registration: Registration
+    T_best_fit: Floats
+    covariance: Floats
+    ambiguity: float
+    near_share: float
+    shift: Floats
+    turn: float
+    weak: tuple[Motion, ...]
+    sigma_mm: float
+    T_rival: Floats  # (4, 4) of the next best coarse pose; NaN without one
+
+
+def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Placed:
+    """Place a scan's points (n, 3) at its design from ``given`` (4, 4); ``how``: auto, none, fine or coarse.
+
+    A best fit absorbs whatever a structure moved as a whole. A scan that lies at its design already is therefore left
+    where it is by ``auto``, and the best fit is only reported.
+    """
+    axes = principal.of_mesh(surface.vertices, surface.faces)
+    few = thinned(points, FINE_POINTS)
+    near, _ = surface.tree.query(rigid.apply(given, few), distance_upper_bound=NEAR_MM, workers=-1)
+    near_share = float(np.isfinite(near).mean())
+    start, ambiguity, registration = given, NAN, Registration.AS_GIVEN
+    rival = np.full((4, 4), NAN)
+    if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
+        spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
+        pose = coarse(even(points), mesh_distance.sampled(surface.vertices, surface.faces, spacing), axes)
+        start, ambiguity, registration = pose.T_target_source, pose.ambiguity, Registration.COARSE
+        rival = pose.T_rival
+    elif how == "fine":
+        registration = Registration.FINE
+    fitted = fine(few, surface, axes.axes, start)
+    determined = np.isfinite(fitted.covariance).all()
+    best = fitted.T_design_scan if determined else np.full((4, 4), NAN)
+    T = start if registration is Registration.AS_GIVEN or not determined else best
+    between = best @ rigid.invert(T) if determined else np.full((4, 4), NAN)
+    middle = rigid.apply(T, few.mean(axis=0))
+    return Placed(
+        T=T,
+        registration=registration,
+        T_best_fit=best,
+        covariance=fitted.covariance,
+        ambiguity=ambiguity,
+        near_share=near_share,
+        shift=rigid.apply(between, middle) - middle,
+        turn=rigid.rotation_angle(between[:3, :3]),
+        weak=fitted.weak,
+        sigma_mm=fitted.sigma_mm,
+        T_rival=rival,
+    )
+
+
+def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
+    """Register points (n, 3), even in density, from any pose to samples of a design with its principal axes."""
+    size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
+    tree = cKDTree(design.points)
+    few = thinned(points, COARSE_POINTS)
+    gates = tuple(share * size for share in GATE_SHARES)
+
+    def refined(start: Floats) -> tuple[float, Floats]:
+        T = icp.point_to_plane(
+            few, design.points, design.normals, start, gates_mm=gates, tree=tree, max_iterations=COARSE_ITERATIONS
+        ).T_target_source
+        return _rms(few, design, tree, T, gates[-1]), T
+
+    return principal.coarse(principal.of_points(points), axes, size, refined)
+
+
+def even(points: Floats) -> Floats:
+    """Thin points (n, 3) to an even density: the dense part near a scanner must not attract the principal axes."""
+    widest = float(np.ptp(points, axis=0).max())
+    return voxel_means(points, max(widest / EVEN_CELLS, 1e-6))
+
+
+def _rms(points: Floats, design: Samples, tree: cKDTree, T: Floats, most: float) -> float:
+    """Rms distance along the design's normals of points (n, 3) placed by T, each at most ``most``, mm."""
+    placed = rigid.apply(T, points)
+    distance, index = tree.query(placed, distance_upper_bound=3.0 * most)
+    near = np.isfinite(distance)
+    r = np.full(len(points), most)
+    off = np.einsum("ni,ni->n", placed[near] - design.points[index[near]], design.normals[index[near]])
+    r[near] = np.minimum(np.abs(off), most)
+    return float(np.sqrt(np.mean(r**2)))
+
+
+def error_along(covariance: Floats, places: Floats, normals: Floats) -> float:
+    """Rms over places (k, 3) of the standard deviation along normals (k, 3) that a pose's covariance causes, mm."""
+    J = np.hstack([np.cross(places, normals), normals])
+    variance = np.einsum("ki,ij,kj->k", J, covariance, J)
+    return float(np.sqrt(max(np.mean(variance), 0.0))) if len(J) else NAN

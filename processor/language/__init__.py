@@ -61,13 +61,16 @@ class Language:
             self.words = {key: text for section in sections for key, text in section.get("words", {}).items()}
             sentences = {key: text for section in sections for key, text in section.get("sentences", {}).items()}
             self.words |= {key: text for key, text in messages(code).texts.items() if "{" not in key}
-            self.words |= {key.split(".")[-1]: text for key, text in messages(code).words.items()}
+            # A word of a vocabulary may mean something else elsewhere: there the texts come first.
+            self.words = {key.split(".")[-1]: text for key, text in messages(code).words.items()} | self.words
             self._patterns = [(_pattern(key), text) for key, text in sentences.items()]
 
     def say(self, text: Any, within: str = "") -> str:
         """Write a message, or translate a text where it is known; ``within`` distinguishes words of two senses."""
-        if isinstance(text, Text) and text.values is None and text.template not in messages(self.code).texts:
-            text, within = text.template, within or "heading"
+        if isinstance(text, Text) and text.values is None:
+            special = self.words.get(f"heading|{text.template}")
+            if special is not None or text.template not in messages(self.code).texts:
+                text, within = text.template, within or "heading"
         if not isinstance(text, str) or isinstance(text, Word):
             return messages(self.code).text(text)
         if not self.words:

@@ -95,7 +95,7 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
         head, said = report_of.summary(run.result)
         title: Any = text("{step}: {head}", step=report_of.title, head=head)
         body: Any = text("Method {method}. {text}", method=run.method, text=said)
-        if isinstance(head, str):
+        if isinstance(head, str) and not isinstance(head, Word):
             title, body = f"{report_of.title}: {head}", f"Method {run.method}. {said}".strip()
         found.append({"tone": _tone(run), "head": title, "text": body})
         found += [{"tone": "", "head": head, "text": text} for head, text in report_of.further(run.result)]

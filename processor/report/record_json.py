@@ -14,7 +14,10 @@ from processor.store.codec import reason_object
 
 
 def as_object(record: Checked) -> dict[str, Any]:
-    """Write a record as the metadata of its fields have it; see :func:`processor.model.described`."""
+    """Write a record as the metadata of its fields have it; see :func:`processor.model.described`.
+
+    A record within it is null where all that it would hold is absent.
+    """
     found: dict[str, Any] = {}
     for field in dataclasses.fields(record):  # type: ignore[arg-type]
         value = getattr(record, field.name)
@@ -82,7 +85,7 @@ def _value(value: Any) -> Any:
     if isinstance(value, Rows):
         return as_rows(value)
     if isinstance(value, Checked):
-        return as_object(value)
+        return as_object(value) or None
     if isinstance(value, tuple):
         return [_value(item) for item in value]
     return value

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.language.messages import Message
+from processor.language.messages import Message, text
 from processor.model import Floats, Ints
 from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS, colour_limit
@@ -28,8 +28,8 @@ class Region:
     """
 
     name: str
-    brief: str
-    text: str
+    brief: Message
+    text: Message
     outline: Floats
     outward: Floats
 
@@ -89,7 +89,7 @@ def of_points(
         "spacing": spacing(points[known][::step]),
         "parts": drawn + lines,
         "marks": shown + spots,
-        "regions": [f"{region.name}: {region.brief}" for region in regions] if region_of is not None else [],
+        "regions": [_heading(region) for region in regions] if region_of is not None else [],
         "places": places,
     }
     made: dict[str, Any] = plain(found)
@@ -114,13 +114,17 @@ def _outlined(
     places: list[dict[str, Any]] = []
     for row, region in enumerate(regions[:MOST_REGIONS]):
         corners = np.round(region.outline - origin, 1)
-        brief = f"{region.name}: {region.brief}"
+        brief = _heading(region)
         if row <= MOST_TICKS:
-            text = brief if row < MOST_TICKS else "further ones"
-            lines.append({"text": text, "edges": [], "points": [], "residual": [], "bold": True})
+            tick = brief if row < MOST_TICKS else "further ones"
+            lines.append({"text": tick, "edges": [], "points": [], "residual": [], "bold": True})
         lines[-1]["edges"].append(np.vstack([corners, corners[:1]]))
         width = float(np.ptp(region.outline, axis=0).max())
         spot = {"name": region.name, "text": region.text, "at": np.round(corners.mean(axis=0), 1), "label": True}
         marks.append({**spot, "part": first + len(lines) - 1, "tone": 1, "radius": round(0.02 * width, 1)})
         places.append({"text": brief, "at": corners, "outward": np.round(region.outward, 4)})
     return lines, marks, places
+
+
+def _heading(region: Region) -> Message:
+    return text("{name}: {brief}", name=region.name, brief=region.brief)

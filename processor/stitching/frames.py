@@ -8,20 +8,6 @@ from processor.geometry import rigid
 from processor.model import Floats
 
 
-def about_origin(covariance: Floats, position: Floats) -> Floats:
-    """Convert a covariance (6, 6) of a rotation about ``position`` (3,) and a shift to a rotation about the origin."""
-    J = np.eye(6)
-    J[3:, :3] = cross_matrix(position)
-    converted: Floats = J @ covariance @ J.T
-    return converted
-
-
-def cross_matrix(v: Floats) -> Floats:
-    """Return the matrix (3, 3) of the cross product v x."""
-    x, y, z = v
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-
-
 def turned(covariance: Floats, R: Floats) -> Floats:
     """Rotate a covariance (6, 6) to other axes by R (3, 3)."""
     J = np.zeros((6, 6))

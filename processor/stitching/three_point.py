@@ -97,7 +97,7 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     J = rigid.motion(rotated).reshape(-1, 6)
     T = rigid.transform(R, middle_a - used * R @ middle_b)
     # From rotations about the centroid of the points to rotations about the origin of b, in a.
-    covariance = frames.about_origin(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
+    covariance = rigid.about_origin(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
     if scale_free:  # the error of the scale acts on the vector from the origin of b to the points
         arm = R @ middle_b
         covariance[3:, 3:] += (difference_sd**2 / float((rotated**2).sum())) * np.outer(arm, arm)
@@ -232,6 +232,6 @@ def _equation(pair: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
     A = np.zeros((6, 12))
     A[:3, :3], A[:3, 6:9] = -R.T, R.T
     A[3:, 3:6], A[3:, 9:] = -R.T, R.T
-    A[3:, :3] = R.T @ frames.cross_matrix(arm)
+    A[3:, :3] = R.T @ rigid.cross_matrix(arm)
     weight: Floats = np.asarray(np.linalg.pinv(pair.covariance, rcond=1e-14, hermitian=True), np.float64)
     return A, r, weight

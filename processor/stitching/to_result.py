@@ -122,7 +122,7 @@ def _scans(names: Sequence[str], network: Network, base: Floats, frame: ProjectF
         T[s] = rigid.with_origin(posed, network.origins[s])
         position[s] = posed[:3, 3]
         of_scan = frames.turned(network.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6], base[:3, :3])
-        covariance[s] = frames.about_origin(of_scan, position[s])
+        covariance[s] = rigid.about_origin(of_scan, position[s])
         rotation_sd[s], position_sd[s] = np.sqrt(np.diag(of_scan)[:3]), np.sqrt(np.diag(of_scan)[3:])
         if np.isfinite(network.T_rival[s]).all():
             T_rival[s] = rigid.with_origin(base @ network.T_rival[s], network.origins[s])
@@ -194,7 +194,7 @@ def _pairs(names: Sequence[str], network: Network) -> Pairs:
             ]
         ),
         covariance=np.array(
-            [frames.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a]) for pair in pairs]
+            [rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a]) for pair in pairs]
         ),
         scale=network.scale if len(network.scale) else unknown,
         scale_sd=network.scale_sd if len(network.scale_sd) else unknown,

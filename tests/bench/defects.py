@@ -51,24 +51,24 @@ def run_one(scanner: str, size: float, seed: int) -> dict[str, Any]:
     took = time.monotonic() - started
     found: dict[str, Any] = {
         "scanner": scanner, "size": size, "seed": seed, "seconds": took, "area_m2": result.examined_mm2 / 1e6,
-        "points": result.points, "noise": result.noise_mm,
+        "points": result.points, "noise": result.noise,
     }  # fmt: skip
     if truth.defects is None or not len(truth.defects.ids):
-        return {**found, "false": len(result.ids), "sure": int((~result.doubtful).sum()), "rows": []}
-    rows = evaluation_defects.matched(result, truth.defects)
-    error, allowed = evaluation_defects.depth_errors(result, truth.defects, rows)
-    other = ~np.isin(np.arange(len(result.ids)), rows)
-    found["false"], found["sure"] = int(other.sum()), int((other & ~result.doubtful).sum())
+        return {**found, "false": len(result.defects), "sure": int((~result.defects.doubtful).sum()), "rows": []}
+    rows = evaluation_defects.matched(result.defects, truth.defects)
+    error, allowed = evaluation_defects.depth_errors(result.defects, truth.defects, rows)
+    other = ~np.isin(np.arange(len(result.defects)), rows)
+    found["false"], found["sure"] = int(other.sum()), int((other & ~result.defects.doubtful).sum())
     found["rows"] = [
         {
             "class": kind,
             "found": bool(rows[k] >= 0),
-            "doubtful": bool(rows[k] >= 0 and result.doubtful[rows[k]]),
-            "named": result.classes[rows[k]] if rows[k] >= 0 else "",
+            "doubtful": bool(rows[k] >= 0 and result.defects.doubtful[rows[k]]),
+            "named": str(result.defects.defect_class[rows[k]]) if rows[k] >= 0 else "",
             "error": float(error[k]),
             "allowed": float(allowed[k]),
-            "bound": bool(rows[k] >= 0 and result.remarks[rows[k]].startswith("at least")),
-            "confidence": float(result.confidence[rows[k]]) if rows[k] >= 0 else 0.0,
+            "bound": bool(rows[k] >= 0 and result.defects.depth_is_bound[rows[k]]),
+            "confidence": float(result.defects.confidence[rows[k]]) if rows[k] >= 0 else 0.0,
         }
         for k, kind in enumerate(truth.defects.classes)
     ]

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from processor.defects.result import CLASSES
-from processor.defects.result import Result as Defects
+from processor.defects.result import Curve, DefectClass, Defects, Picture, SurfacePlaces, Windows
+from processor.defects.result import Result as DefectsResult
 from processor.model import Scan, Scene, StepRun, StructureDesign, reason
 from processor.pipeline import Execution
 from processor.stitching.common_points import UnitSlip
@@ -80,35 +80,65 @@ def stitching(names=("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9")):
     )  # fmt: skip
 
 
+CLASSES = tuple(DefectClass)
 ALL = len(CLASSES)
+EXAMINED = (reason("defects.examined", examined=1.2, surface=2.4),)
+REMARKS = tuple((reason(f"defects.{code}"),) for code in ("through", "depth-bound", "no-thickness"))
 
 
-def defects(count=ALL, message="1.2 m2 examined of 2.4 m2 of the design's surface", seed=1, places=288):
+def defects(count=ALL, reasons=EXAMINED, seed=1, places=288, method="default"):
     """Defects of every class, a picture of two and the curve of one."""
     rng = np.random.default_rng(seed)
-    side, shown = 5, min(count, 2)
-    kinds = tuple(CLASSES[i % len(CLASSES)] for i in range(count))
-    remarks = (
-        "rays went through: as deep as the plate is thick",
-        "at least so deep: too narrow for a beam to see its ground",
-        "the design says no thickness here",
+    side = 5
+    classes = tuple(CLASSES[i % len(CLASSES)] for i in range(count))
+    deviation = rng.normal(size=(2, side, side))
+    curve = Curve(along=np.linspace(-200.0, 200.0, 4), displacement=np.full(4, 1.5), ci95=np.full(4, 0.15))
+    columns = {
+        "confidence": 0.9, "area_mm2": 13.5e3, "depth_max": 1.5, "depth_ci95": 0.3, "depth_mean": 1.5,
+        "volume_mm3": 1.5e4, "volume_ci95": 1.5e3, "edge_distance": 75.0, "curvature_per_m": 1.5, "lod95": 0.3,
+        "z": 13.5, "chance": 1.5e-9,
+    }  # fmt: skip
+    return DefectsResult(
+        status="ok",
+        method=method,
+        reasons=reasons,
+        T_design_project=np.eye(4),
+        registration_error=0.1,
+        cell=10.0,
+        noise=0.5,
+        lod95=0.3,
+        examined_mm2=1.2e6,
+        expected_mm2=1.3e6,
+        points=288,
+        points_used=280,
+        least_depth=Windows(side=[10.0, 20.0], depth=[1.0, 0.5], noise_inflation=[1.0, 1.2]),
+        defects=Defects(
+            id=np.arange(count),
+            defect_class=classes,
+            otherwise=tuple(reversed(classes)),
+            component=tuple(f"component-{i + 1}" for i in range(count)),
+            centre=np.column_stack(
+                [rng.uniform(100.0, 1000.0, count), np.zeros(count), rng.uniform(50.0, 500.0, count)]
+            ),
+            axes=np.tile(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), (count, 1, 1)),
+            extent=np.full((count, 2), 120.0),
+            doubtful=np.zeros(count, bool),
+            reasons=tuple(REMARKS[i % 3] if i % 4 else () for i in range(count)),
+            deflection=tuple(Curve() if i else curve for i in range(count)),
+            **{name: np.full(count, value) for name, value in columns.items()},
+        ),
+        pictures=tuple(
+            Picture(low=[-30.0, -30.0], cell=12.0, deviation=one, part=np.arange(side**2).reshape(side, side) % 3 == 0)
+            for one in deviation[:count]
+        ),
+        surface=SurfacePlaces(
+            points=np.column_stack(
+                [rng.uniform(0.0, 1150.0, places), np.zeros(places), rng.uniform(0.0, 550.0, places)]
+            ),
+            deviation=np.sin(np.arange(places)),
+            defect=np.where(np.arange(places) % 4, -1, np.arange(places) % count),
+        ),
     )
-    one = np.full(count, 1.5)
-    return Defects(
-        "ok", "default", message, np.eye(4), 0.1, 10.0, 0.5, 0.3, 1.2e6, 1.3e6, 288, 280,
-        np.array([10.0, 20.0]), np.array([1.0, 0.5]), np.array([1.0, 1.2]),
-        np.arange(count), kinds, np.full(count, 0.9), tuple(reversed(kinds)),
-        tuple(f"component-{i + 1}" for i in range(count)),
-        np.column_stack([rng.uniform(100.0, 1000.0, count), np.zeros(count), rng.uniform(50.0, 500.0, count)]),
-        np.tile(np.array([[1.0, 0, 0], [0, 0, 1.0], [0, -1.0, 0]]), (count, 1, 1)), np.full((count, 2), 120.0),
-        9e3 * one, one, 0.2 * one, one, 1e4 * one, 1e3 * one, 50.0 * one, one, 0.2 * one, 9.0 * one, 1e-9 * one,
-        tuple(remarks[i % 3] if i % 4 else "" for i in range(count)),
-        np.zeros(4, np.int64), np.linspace(-200.0, 200.0, 4), one[:1].repeat(4), 0.1 * one[:1].repeat(4),
-        np.arange(shown), np.full((shown, 2), side), np.full((shown, 2), -30.0), np.full(shown, 12.0),
-        rng.normal(size=shown * side**2).astype(np.float32), (np.arange(shown * side**2) % 3 == 0).astype(np.int32),
-        np.column_stack([rng.uniform(0.0, 1150.0, places), np.zeros(places), rng.uniform(0.0, 550.0, places)]),
-        np.sin(np.arange(places)).astype(np.float32), np.where(np.arange(places) % 4, -1, np.arange(places) % count),
-    )  # fmt: skip
 
 
 def execution(*runs, names=("S1",)):

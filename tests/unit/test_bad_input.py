@@ -14,8 +14,8 @@ import pytest
 from processor import readers
 from processor.model import InputError, PointLabels, Scan, Scene, Truth
 from processor.store import store
-from tests.unit.test_readers import TURNED, las_bytes, pcd_header, ply_header
-from tests.unit.test_store import a_scene
+from tests.support.scan_bytes import TURNED, las_bytes, pcd_header, ply_header
+from tests.support.store_scenes import a_scene
 
 DATA = Path(__file__).resolve().parents[2] / "../shared/data"
 

@@ -87,7 +87,7 @@ def test_defects_in_space_react(searched, lang, width):
         turned = picture(shown)
         assert turned != first
         ticks = shown.locator(".live fieldset label")
-        assert ticks.count() == 1 + len(result.ids)
+        assert ticks.count() == 1 + len(result.defects)
         assert ticks.nth(1).text_content().strip() == ("0: dent" if lang == "en" else "0：凹坑")
         ticks.nth(3).locator("input").uncheck()
         assert picture(shown) != turned
@@ -102,11 +102,11 @@ def test_a_place_of_a_defect_is_read_with_its_deviation_and_region(searched):
         shown.locator("select").select_option(label="2: bend")
         assert picture(shown) != everything
         read = read_over(shown, 20, [down / 10 for down in range(1, 10)])
-        k = result.classes.index("bend")
+        k = result.defects.defect_class.index("bend")
         mark = [one for one in read if one.startswith("2: bend, depth")]
-        assert mark == [f"2: bend, depth 1.500 ± 0.300 mm, area 13500 mm2, {result.components[k]}"]
+        assert mark == [f"2: bend, depth 1.500 ± 0.300 mm, area 13500 mm2, {result.defects.component[k]}"]
         places = [one for one in read if one.startswith("surface: ") and "mm from the design at" in one]
-        values = {f"surface: {value:.3f} mm" for value in result.surface_mm.tolist()}
+        values = {f"surface: {value:.3f} mm" for value in result.surface.deviation.tolist()}
         assert len(places) > 3
         assert all(one.split(" from ")[0] in values for one in places)
         assert any("; " in one for one in places)

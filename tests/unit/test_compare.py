@@ -19,7 +19,7 @@ from processor.report import comparison
 from processor.report.deviation import csv as deviation_csv
 from processor.report.deviation.csv import COLUMNS
 from processor.store import store
-from tests.unit.test_m3c2 import brute, wavy
+from tests.support.m3c2_clouds import brute, wavy
 
 UTM = np.array([512_345.25, 5_412_678.5, 231.0])  # metres
 

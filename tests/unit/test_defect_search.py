@@ -10,10 +10,10 @@ import trimesh
 from processor.defects import baseline, deviation_field, pictures, regions, scan_statistic, shape_models, surface_charts
 from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
-from processor.geometry import visible_facets
+from processor.geometry import mesh_distance
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.pipeline import as_json
-from processor.report.defects import section
+from processor.report.defects import figures, section
 from processor.report.results_json import plain
 
 SIDE, THICK, GAP = 600.0, 12.0, 300.0
@@ -77,7 +77,7 @@ def bump(depth, radius, at):
 
 
 def found(result):
-    return [(kind, name) for kind, name in zip(result.classes, result.components, strict=True)]
+    return list(zip(result.defects.defect_class, result.defects.component, strict=True))
 
 
 # --- the whole step ------------------------------------------------------------------------------------------------
@@ -89,20 +89,20 @@ def test_an_undamaged_structure_has_no_defect(seed):
     assert result.status == "ok"
     assert found(result) == []
     inner = SIDE - 16.0  # less a border of 8 mm, and what a row of cells may take
-    assert 3 * (inner - 2.0 * result.cell_mm) ** 2 <= result.examined_mm2 <= 3 * inner**2
-    assert result.noise_mm == pytest.approx(0.4, rel=0.05)
+    assert 3 * (inner - 2.0 * result.cell) ** 2 <= result.examined_mm2 <= 3 * inner**2
+    assert result.noise == pytest.approx(0.4, rel=0.05)
 
 
 def test_what_chance_brings_is_called_doubtful():
     """Asked for 5000 false alarms on 100 m2 there are some on 1 m2, at most as many, and none passes for sure."""
     result = defects_step.run(scene_of(3, flat), defects_step.Params(false_alarms=5000.0))
     allowed = 5000.0 * result.examined_mm2 / 1e8
-    assert 0 < len(result.ids) < allowed
-    assert result.doubtful.all()
-    assert (result.chance <= 5000.0 * (1.0 + 1e-9)).all()
-    fewer = (result.chance < 500.0).sum()
+    assert 0 < len(result.defects) < allowed
+    assert result.defects.doubtful.all()
+    assert (result.defects.chance <= 5000.0 * (1.0 + 1e-9)).all()
+    fewer = (result.defects.chance < 500.0).sum()
     assert fewer < 0.1 * allowed + 3.0 * np.sqrt(0.1 * allowed)  # a tenth as often ten times as strong
-    assert "no defects found and" in section.REPORT.summary(result)[0]
+    assert "no defects found and" in str(section.REPORT.summary(result)[0])
 
 
 def test_a_dent_a_bulge_and_a_pit_are_measured():
@@ -114,23 +114,23 @@ def test_a_dent_a_bulge_and_a_pit_are_measured():
     scene = scene_of(3, lambda x, z: dent(x, z) + bulge(x, z) + pit(x, z), spacing=3.0)
     result = defects_step.run(scene, defects_step.Params())
     assert sorted(found(result)) == [("bulge", "component-2"), ("dent", "component-1"), ("pit", "component-3")]
-    assert not result.doubtful.any()
+    assert not result.defects.doubtful.any()
     for kind, depth, radius, at in (("dent", 3.0, 90.0, (250.0, 300.0)), ("bulge", -2.0, 80.0, (1250.0, 350.0)),
                                     ("pit", 4.0, 16.0, (2100.0, 200.0))):  # fmt: skip
-        k = result.classes.index(kind)
-        assert abs(result.depth_max[k] - depth) < max(0.1 * abs(depth), 2.0 * result.lod95[k])
-        assert abs(result.depth_max[k] - depth) < 2.5 * result.depth_ci95[k]
-        np.testing.assert_allclose(result.centres[k], [at[0], 0.0, at[1]], atol=0.1 * radius + 1.0)
-        assert result.confidence[k] > 0.9
-        deep = np.linalg.norm(result.surface_at - [at[0], 0.0, at[1]], axis=1) < 0.1 * radius + result.cell_mm
-        assert set(result.surface_defect[deep].tolist()) in ({k}, {-1, k})
+        k = result.defects.defect_class.index(kind)
+        assert abs(result.defects.depth_max[k] - depth) < max(0.1 * abs(depth), 2.0 * result.defects.lod95[k])
+        assert abs(result.defects.depth_max[k] - depth) < 2.5 * result.defects.depth_ci95[k]
+        np.testing.assert_allclose(result.defects.centre[k], [at[0], 0.0, at[1]], atol=0.1 * radius + 1.0)
+        assert result.defects.confidence[k] > 0.9
+        deep = np.linalg.norm(result.surface.points - [at[0], 0.0, at[1]], axis=1) < 0.1 * radius + result.cell
+        assert set(result.surface.defect[deep].tolist()) in ({k}, {-1, k})
         if kind != "pit":  # outward positive, and nearly as deep as its middle
-            assert np.median(result.surface_mm[deep]) == pytest.approx(-depth, rel=0.15)
+            assert np.median(result.surface.deviation[deep]) == pytest.approx(-depth, rel=0.15)
         # A third of the cylinder about a bump (1 - r^2 / R^2)^2.
         if kind != "pit":
-            assert result.volume_mm3[k] == pytest.approx(np.pi * radius**2 * depth / 3.0, rel=0.05)
+            assert result.defects.volume_mm3[k] == pytest.approx(np.pi * radius**2 * depth / 3.0, rel=0.05)
             curvature = 4.0 * abs(depth) / radius**2 * 1000.0
-            assert result.curvature_per_m[k] == pytest.approx(curvature, rel=0.35)
+            assert result.defects.curvature_per_m[k] == pytest.approx(curvature, rel=0.35)
 
 
 def test_missing_corners_edges_and_holes_are_named():
@@ -144,11 +144,30 @@ def test_missing_corners_edges_and_holes_are_named():
     assert sorted(found(result)) == [
         ("edge-loss", "component-2"), ("missing-part", "component-1"), ("missing-part", "component-3"),
     ]  # fmt: skip
-    np.testing.assert_allclose(result.depth_max, THICK)
-    area = dict(zip(result.components, result.area_mm2, strict=True))
+    np.testing.assert_allclose(result.defects.depth_max, THICK)
+    area = dict(zip(result.defects.component, result.defects.area_mm2, strict=True))
     assert area["component-1"] == pytest.approx(90.0**2, rel=0.15)
     assert area["component-2"] == pytest.approx(80.0 * 50.0, rel=0.2)
     assert area["component-3"] == pytest.approx(np.pi * 50.0**2, rel=0.15)
+
+
+def test_a_hole_seen_from_both_sides_is_one_missing_part_without_a_picture():
+    """Its cells face both ways, so that no face is the one to draw."""
+
+    def missing(x, z):
+        return np.hypot(x - 300.0, z - 300.0) < 60.0
+
+    scene = scene_of(3, flat, missing)
+    half_turn = np.diag([-1.0, -1.0, 1.0, 1.0])
+    half_turn[:3, 3] = [3 * (SIDE + GAP) - GAP, THICK, 0.0]
+    behind = scene_of(3, flat, lambda x, z: missing(3 * (SIDE + GAP) - GAP - x, z), seed=2)
+    backs = (dataclasses.replace(s, name=f"{s.name} behind", T_project_scan=half_turn) for s in behind.scans)
+    result = defects_step.run(dataclasses.replace(scene, scans=(*scene.scans, *backs)), defects_step.Params())
+    assert found(result) == [("missing-part", "component-1")]
+    assert result.pictures[0].deviation.size == 0
+    drawn = figures.of_result(result)
+    assert set(drawn) == {"defects-maps.png"}
+    assert figures.files(result)["defects.pdf"].startswith(b"%PDF")
 
 
 def test_what_something_hides_is_not_missing():
@@ -180,12 +199,12 @@ def test_shapes_of_whole_components(kind, inward, depth):
         scene_of(5, lambda x, z: np.where((x > 850.0) & (x < 1550.0), inward(x, z), 0.0)), defects_step.Params()
     )
     assert found(result) == [(kind, "component-2")]
-    assert abs(result.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
-    curve = result.curve_mm[result.curve_defect == 0]
-    assert len(curve) == (40 if kind == "bend" else 0)
+    assert abs(result.defects.depth_max[0]) == pytest.approx(depth, abs=0.05 + 0.02 * depth)
+    curve = result.defects.deflection[0]
+    assert len(curve.displacement) == (40 if kind == "bend" else 0)
     if kind == "bend":
-        at = result.curve_at_mm
-        np.testing.assert_allclose(curve, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)
+        at = curve.along
+        np.testing.assert_allclose(curve.displacement, -3.0 * np.cos(np.pi * at / SIDE), atol=0.06)
 
 
 def test_stations_that_are_off_are_no_defect():
@@ -206,8 +225,8 @@ def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
     mixed = [dataclasses.replace(s, points=np.random.default_rng(5).permutation(s.points)) for s in scene.scans]
     again = defects_step.run(dataclasses.replace(scene, scans=tuple(mixed)), defects_step.Params())
     assert found(again) == found(first)
-    np.testing.assert_allclose(again.depth_max, first.depth_max, atol=1e-6)
-    np.testing.assert_allclose(again.centres, first.centres, atol=1e-6)
+    np.testing.assert_allclose(again.defects.depth_max, first.defects.depth_max, atol=1e-6)
+    np.testing.assert_allclose(again.defects.centre, first.defects.centre, atol=1e-6)
     far = np.array([4.5e8, 3.2e9, 1e5])
     T = np.eye(4)
     T[:3, 3] = far
@@ -217,20 +236,20 @@ def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
     )  # fmt: skip
     there = defects_step.run(moved, defects_step.Params())
     assert found(there) == found(first)
-    np.testing.assert_allclose(there.depth_max, first.depth_max, atol=1e-3)
-    np.testing.assert_allclose(there.centres - far, first.centres, atol=1e-2)
+    np.testing.assert_allclose(there.defects.depth_max, first.defects.depth_max, atol=1e-3)
+    np.testing.assert_allclose(there.defects.centre - far, first.defects.centre, atol=1e-2)
 
 
 def test_the_papers_chain_finds_a_dent_and_is_seeded():
     scene = scene_of(2, bump(5.0, 120.0, (250.0, 300.0)), spacing=8.0)
     params = defects_step.Params(method="paper", paper=baseline.Paper(trials=60, feature_points=80))
     result = defects_step.run(scene, params)
-    assert set(result.classes) == {"unknown"}
-    np.testing.assert_allclose(result.centres[0], [250.0, 2.0, 300.0], atol=12.0)
-    assert result.depth_max[0] == pytest.approx(5.0, abs=1.2)
-    assert (result.curve_defect == 0).sum() > 5
+    assert set(result.defects.defect_class) == {"unknown"}
+    np.testing.assert_allclose(result.defects.centre[0], [250.0, 2.0, 300.0], atol=12.0)
+    assert result.defects.depth_max[0] == pytest.approx(5.0, abs=1.2)
+    assert len(result.defects.deflection[0].along) > 5
     again = defects_step.run(scene, params)
-    np.testing.assert_array_equal(again.depth_max, result.depth_max)
+    np.testing.assert_array_equal(again.defects.depth_max, result.defects.depth_max)
 
 
 def test_what_is_written():
@@ -281,8 +300,8 @@ def test_facets_are_the_nearest_that_a_scanner_can_see():
     normals = trimesh.Trimesh(vertices, faces, process=False).face_normals
     rng = np.random.default_rng(3)
     points = rng.uniform([-30.0, -30.0, -30.0], [330.0, 42.0, 230.0], (2000, 3))
-    grid = visible_facets.grid_of(vertices, faces, normals, 60.0)
-    facet, distance = visible_facets.nearest(grid, points, np.zeros((1, 3)), np.full(2000, -1))
+    grid = mesh_distance.facet_grid(vertices, faces, normals, 60.0)
+    facet, distance = mesh_distance.nearest_visible(grid, points, np.zeros((1, 3)), np.full(2000, -1))
     _, true, _ = trimesh.proximity.closest_point_naive(trimesh.Trimesh(vertices, faces, process=False), points)
     corner = vertices[faces[facet, 0]]
     np.testing.assert_allclose(distance, np.einsum("ni,ni->n", points - corner, normals[facet]), atol=1e-9)
@@ -291,7 +310,9 @@ def test_facets_are_the_nearest_that_a_scanner_can_see():
     np.testing.assert_allclose(np.linalg.norm(nearest - points, axis=1), true, atol=1e-9)
     # Deep in the plate, nearer to its back, but seen from the front.
     deep = np.array([[150.0, 9.0, 100.0]])
-    facet, distance = visible_facets.nearest(grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64))
+    facet, distance = mesh_distance.nearest_visible(
+        grid, deep, np.array([[150.0, -4000.0, 100.0]]), np.zeros(1, np.int64)
+    )
     assert distance[0] == pytest.approx(-9.0)
     np.testing.assert_allclose(normals[facet[0]], [0.0, -1.0, 0.0])
 
@@ -342,8 +363,8 @@ def test_numbers_by_hand():
     assert baseline.huber(np.array([1.0, 3.0]), 2.0) == pytest.approx(4.5)
     # A parabola of 1 mm at 100 mm: slopes of its chords add up to what it is at the end.
     x = np.linspace(0.0, 100.0, 2001)
-    at, mu = pictures.by_slopes(x, (x / 100.0) ** 2, 10)
-    np.testing.assert_allclose(mu, (at / 100.0) ** 2, atol=5e-4)
+    curve = pictures.by_slopes(x, (x / 100.0) ** 2, 10)
+    np.testing.assert_allclose(curve.displacement, (curve.along / 100.0) ** 2, atol=5e-4)
 
 
 @pytest.mark.parametrize(

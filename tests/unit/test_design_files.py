@@ -9,9 +9,7 @@ import pytest
 
 from processor.model import InputError
 from processor.scan_folder import folder
-from tests.unit.test_folder import BOX, TRIANGLES, arch_design, bridge, part, surface, write_ply, write_xyz
-
-__all__ = ["bridge"]  # a fixture
+from tests.support.scan_folders import BOX, TRIANGLES, arch_design, part, surface, write_ply, write_xyz
 
 
 def test_joints_come_in_the_order_of_the_parts(bridge):

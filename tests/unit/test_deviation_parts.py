@@ -5,53 +5,54 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
-from processor.deviation import attitude, scales, statistics
 from processor.deviation import cloud as deviation_cloud
-from processor.geometry import local_translation as moving
-from processor.geometry import m3c2, mesh_distance, neighbors, point_neighbors, principal, rigid
+from processor.deviation import local_translation as moving
+from processor.geometry import m3c2, mesh_distance, neighbors, principal, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError
-from tests.unit.test_m3c2 import wavy
+from tests.support.m3c2_clouds import wavy
+from tests.support.meshes import bracket
 
 UP = np.array([0.0, 0.0, 1.0])
 
 
 def test_neighbours_are_those_of_a_tree():
     points = np.vstack([wavy(4000, 1), np.random.default_rng(2).uniform(-500.0, 1500.0, (50, 3))])
-    grid = point_neighbors.of_spacing(points)
+    grid = neighbors.of_spacing(points)
     tree = cKDTree(points)
     expected = tree.query(points, k=21)[0][:, 1:].mean(axis=1)
-    np.testing.assert_allclose(point_neighbors.mean_distances(grid, 20), expected[grid.order], rtol=1e-12)
-    inliers = neighbors.statistical_inliers(points, 20, 1.0)
-    np.testing.assert_array_equal(point_neighbors.statistical_inliers(grid, 20, 1.0), inliers[grid.order])
+    np.testing.assert_allclose(neighbors.mean_distances(grid, 20), expected[grid.order], rtol=1e-12)
+    inliers = expected <= expected.mean() + expected.std()
+    np.testing.assert_array_equal(neighbors.statistical_inliers(grid, 20, 1.0), inliers[grid.order])
+    np.testing.assert_array_equal(neighbors.without_outliers(points, 20, 1.0), points[inliers])
     places = np.random.default_rng(3).uniform(-3000.0, 4000.0, (300, 3))
-    np.testing.assert_allclose(point_neighbors.nearest(grid, places), tree.query(places)[0], rtol=1e-12)
+    np.testing.assert_allclose(neighbors.nearest(grid, places), tree.query(places)[0], rtol=1e-12)
 
 
 def test_spacing_is_of_a_plane_with_one_point_a_square():
     rng = np.random.default_rng(4)
     x, y = rng.uniform(0.0, 2000.0, (2, 40_000))
-    spread = point_neighbors.of_spacing(np.column_stack([x, y, 0.0 * x]))
-    assert point_neighbors.spacing(spread) == pytest.approx(10.0, rel=0.02)
-    assert np.isnan(point_neighbors.spacing(point_neighbors.of_spacing(np.zeros((1, 3)))))
-    assert point_neighbors.spacing(point_neighbors.of_spacing(np.zeros((9, 3)))) == 0.0
+    spread = neighbors.of_spacing(np.column_stack([x, y, 0.0 * x]))
+    assert neighbors.spacing(spread) == pytest.approx(10.0, rel=0.02)
+    assert np.isnan(neighbors.spacing(neighbors.of_spacing(np.zeros((1, 3)))))
+    assert neighbors.spacing(neighbors.of_spacing(np.zeros((9, 3)))) == 0.0
 
 
 def test_scales_hold_the_points_they_promise():
-    assert scales.diameter_for(20, np.sqrt(1e6 / 500.0)) == pytest.approx(225.7, abs=0.1)  # 500 points/m2
-    assert [scales.rounded(x) for x in (0.12345, 225.7, 1e-7, 100.0)] == [0.124, 226.0, 1e-7, 100.0]
+    assert m3c2.diameter_for(20, np.sqrt(1e6 / 500.0)) == pytest.approx(225.7, abs=0.1)  # 500 points/m2
+    assert [m3c2.rounded(x) for x in (0.12345, 225.7, 1e-7, 100.0)] == [0.124, 226.0, 1e-7, 100.0]
     cloud, other = wavy(20_000, 5), wavy(5000, 6, 30.0)
-    grids = [point_neighbors.of_spacing(one) for one in (cloud, other)]
-    found = scales.derived(*grids, cloud)
+    grids = [neighbors.of_spacing(one) for one in (cloud, other)]
+    found = m3c2.derive_scales(*grids, cloud)
     assert found.compared_spacing_mm > 1.8 * found.reference_spacing_mm
     held = 5000 / 1e6 * np.pi / 4.0 * found.projection_diameter_mm**2
     assert 45.0 < held < 60.0  # of the sparser cloud
     assert 60.0 <= found.max_depth_mm <= 10.0 * found.projection_diameter_mm
-    given = scales.derived(*grids, cloud, 7.0, 8.0, 9.0)
+    given = m3c2.derive_scales(*grids, cloud, 7.0, 8.0, 9.0)
     assert (given.normal_diameter_mm, given.projection_diameter_mm, given.max_depth_mm) == (7.0, 8.0, 9.0)
-    same = point_neighbors.of_spacing(np.zeros((9, 3)))
+    same = neighbors.of_spacing(np.zeros((9, 3)))
     with pytest.raises(InputError, match="density"):
-        scales.derived(same, same, cloud)
+        m3c2.derive_scales(same, same, cloud)
 
 
 def test_a_share_of_independent_places_has_the_interval_of_its_count():
@@ -59,7 +60,7 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
     covered = 0
     for _ in range(200):
         marks = rng.random(400) < 0.05
-        found = statistics.share(marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0)
+        found = m3c2.share(marks, np.column_stack([np.arange(400) * 10.0, np.zeros(400), np.zeros(400)]), 5.0)
         assert found.low <= found.share <= found.high
         covered += found.low <= 0.05 <= found.high
     assert 0.9 <= covered / 200 <= 1.0
@@ -68,23 +69,23 @@ def test_a_share_of_independent_places_has_the_interval_of_its_count():
 def test_a_share_of_places_that_agree_counts_them_once():
     marks = np.repeat(np.random.default_rng(8).random(100) < 0.3, 50)
     places = np.repeat(np.arange(100.0), 50)[:, None] * [100.0, 0.0, 0.0]
-    found = statistics.share(marks, places, 60.0)
-    alone = statistics.share(marks[::50], places[::50], 60.0)
+    found = m3c2.share(marks, places, 60.0)
+    alone = m3c2.share(marks[::50], places[::50], 60.0)
     assert found.high - found.low == pytest.approx(alone.high - alone.low, rel=0.05)
-    none = statistics.share(np.zeros(5000, bool), places, 60.0)
+    none = m3c2.share(np.zeros(5000, bool), places, 60.0)
     assert none.low == 0.0
     assert 0.02 < none.high < 0.05  # rule of three for 100 cells
-    assert np.isnan(statistics.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
+    assert np.isnan(m3c2.share(np.zeros(0, bool), np.zeros((0, 3)), 1.0).share)
 
 
 def planes_compared(seed, off=0.0, error=0.0):
     """Share beyond LOD95 of two noisy scans of one plane, the second ``off`` by so much; scales by density."""
     rng = np.random.default_rng(seed)
     pair = [np.column_stack([*rng.uniform(0.0, 3000.0, (2, 60_000)), rng.normal(0.0, 2.0, 60_000)]) for _ in range(2)]
-    grids = [point_neighbors.of_spacing(one + k * off * UP) for k, one in enumerate(pair)]
+    grids = [neighbors.of_spacing(one + k * off * UP) for k, one in enumerate(pair)]
     x, y = (one.ravel() for one in np.meshgrid(*[np.arange(100.0, 2901.0, 40.0)] * 2))
     core = np.column_stack([x, y, 0.0 * x])
-    used = scales.derived(*grids, core)
+    used = m3c2.derive_scales(*grids, core)
     normals = m3c2.oriented(m3c2.normals(grids[0], core, used.normal_diameter_mm).normals, UP)
     return m3c2.distances(
         *grids, core, normals, projection_diameter_mm=used.projection_diameter_mm, max_depth_mm=used.max_depth_mm,
@@ -111,7 +112,7 @@ def test_the_summary_counts_what_has_no_level():
         np.array([30, 10, 30, 3]), np.ones(4), np.ones(4),
     )  # fmt: skip
     normals = np.array([UP, UP, [nan] * 3, UP])
-    total = statistics.of_distances(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
+    total = m3c2.summary(found, np.arange(12.0).reshape(4, 3), normals, 1.0, 20)
     assert (total.core_points, total.without_lod, total.without_normal) == (4, 2, 1)
     assert (total.few_points, total.significant) == (1, 1)
     assert (total.mean, total.min, total.max, total.rms) == (-1.0, -3.0, 1.0, pytest.approx(np.sqrt(5.0)))
@@ -120,20 +121,12 @@ def test_the_summary_counts_what_has_no_level():
 # --- attitude ------------------------------------------------------------------------------------------------------
 
 
-def bracket():
-    """A body without symmetry."""
-    boxes = [((4000, 300, 200), (0, 0, 0)), ((300, 1500, 200), (1500, 600, 0)), ((200, 200, 900), (-1700, 0, 500))]
-    return trimesh.util.concatenate(
-        [trimesh.creation.box(extents, trimesh.transformations.translation_matrix(at)) for extents, at in boxes]
-    )
-
-
 def coarse(mesh, T, seed):
     points = np.asarray(trimesh.sample.sample_surface(mesh, 20_000, seed=seed)[0])
     moved = rigid.apply(rigid.invert(T), points) + np.random.default_rng(seed).normal(0.0, 2.0, points.shape)
     vertices, faces = np.asarray(mesh.vertices), np.asarray(mesh.faces)
-    samples = deviation_cloud.sampled(vertices, faces, 30.0)
-    return attitude.coarse(moved, samples, principal.of_mesh(vertices, faces))
+    samples = mesh_distance.sampled(vertices, faces, 30.0)
+    return surface_registration.coarse(moved, samples, principal.of_mesh(vertices, faces))
 
 
 def test_any_attitude_is_found_and_never_a_mirror_image():
@@ -141,21 +134,21 @@ def test_any_attitude_is_found_and_never_a_mirror_image():
     for seed in range(3):
         T = rigid.transform(rigid.rotation_from_vector(rng.normal(size=3) * 2.0), rng.normal(size=3) * 1e4)
         found = coarse(bracket(), T, seed)
-        assert np.linalg.det(found.T_design_scan[:3, :3]) == pytest.approx(1.0)
-        assert rigid.rotation_angle(found.T_design_scan[:3, :3] @ T[:3, :3].T) < 2e-3
+        assert np.linalg.det(found.T_target_source[:3, :3]) == pytest.approx(1.0)
+        assert rigid.rotation_angle(found.T_target_source[:3, :3] @ T[:3, :3].T) < 2e-3
         assert found.ambiguity > 2.0
 
 
 def test_a_symmetric_body_is_ambiguous():
     found = coarse(trimesh.creation.box((3000.0, 900.0, 400.0)), np.eye(4), 1)
-    assert found.ambiguity < attitude.AMBIGUOUS
+    assert found.ambiguity < principal.AMBIGUOUS
 
 
 def test_axes_are_swapped_where_two_are_alike_alone():
     one = np.array([9.0, 4.0, 1.0])
-    assert len(attitude.rotations(one, one)) == 4
-    assert len(attitude.rotations(np.array([9.0, 4.0, 3.9]), one)) == 8
-    every = attitude.rotations(np.ones(3), np.ones(3))
+    assert len(principal.possible_turns(one, one)) == 4
+    assert len(principal.possible_turns(np.array([9.0, 4.0, 3.9]), one)) == 8
+    every = principal.possible_turns(np.ones(3), np.ones(3))
     assert len(every) == 24
     assert all(np.linalg.det(turn) == pytest.approx(1.0) for turn in every)
     assert len({tuple(turn.ravel()) for turn in every}) == 24
@@ -180,7 +173,7 @@ def test_adaptive_voxels_hold_their_points():
 
 def test_samples_of_a_mesh_are_even():
     mesh = trimesh.creation.box((2000.0, 1000.0, 500.0))
-    found = deviation_cloud.sampled(np.asarray(mesh.vertices), np.asarray(mesh.faces), 20.0)
+    found = mesh_distance.sampled(np.asarray(mesh.vertices), np.asarray(mesh.faces), 20.0)
     assert len(found.points) == pytest.approx(mesh.area / 400.0, rel=0.01)
     on_top = found.normals[:, 2] > 0.5
     assert on_top.mean() == pytest.approx(2e6 / mesh.area, rel=0.02)

@@ -45,8 +45,9 @@ def test_mesh_axes_of_a_box_surface():
 
 
 def test_the_sign_choices_are_rotations():
-    assert [np.prod(signs) for signs in principal.proper_sign_choices()] == [1.0] * 4
-    assert len({tuple(signs) for signs in principal.proper_sign_choices()}) == 4
+    turns = principal.turns(((0, 1, 2),))
+    assert [np.linalg.det(turn) for turn in turns] == [1.0] * 4
+    assert len({tuple(np.diag(turn)) for turn in turns}) == 4
 
 
 def test_line_distance_and_crossing_by_hand():
@@ -123,7 +124,9 @@ def test_outliers_are_those_of_open3d():
     points = np.vstack(
         [np.column_stack([rng.uniform(0, 500, (4000, 2)), np.zeros(4000)]), rng.uniform(0, 500, (40, 3))]
     )
-    ours = neighbors.statistical_inliers(points, 20, 2.0)
+    grid = neighbors.of_spacing(points)
+    ours = np.zeros(len(points), bool)
+    ours[grid.order] = neighbors.statistical_inliers(grid, 20, 2.0)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     # Open3D counts the point itself as its first neighbour, so its mean is 20/21 of ours; the rule is scale-free.
     theirs = np.zeros(len(points), bool)

@@ -13,10 +13,12 @@ from processor.batch import summary
 from processor.batch.job import Job
 from processor.batch.record import Record
 from processor.compare import compare
-from processor.defects.result import CLASSES
+from processor.defects.result import DefectClass
 from processor.defects.result import Result as Defects
+from processor.deviation.result import Registration
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.normal_orientation import Turned
+from processor.language.messages import label, messages
 from processor.model import reason
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import ControlPoints, ControlSightings
@@ -55,7 +57,7 @@ STITCH_CHECKS = (
     "station positions by control points, max",
 )  # fmt: skip
 DEFECT_CHECKS = (
-    *(f"{kind}: missed of 2" for kind in CLASSES), "paper: step: missed of 1", "false alarms", "surface examined",
+    *(f"missed: {kind}" for kind in DefectClass), "false alarms", "surface examined",
     "class wrong", "depths off by more than a tenth and 2 LOD95", "depth error, median", "depth error, max",
     "depths that are bounds alone",
 )  # fmt: skip
@@ -121,16 +123,20 @@ def given():
     return step_results.execution(("stitch", "automatic", "{}", result), names=scans.name), ErrorReport()
 
 
+PAPER = (
+    reason("defects.paper-clusters", points=2000, spacing=4.5),
+    reason("defects.paper-fit", rms=1.2, share=87.0),
+    reason("defects.paper-threshold", threshold=3.1),
+)
+
+
 def searched():
-    said = "placed by step deviation (as given); 1.2 m2 examined of 2.4 m2 of the design's surface"
-    paper = dataclasses.replace(
-        step_results.defects(3), method="paper",
-        message="2000 points 4.5 mm apart after density clustering; rms 1.20 mm of 87% paired; a defect is what is "
-        "farther than 3.10 mm from the design; the page names no classes",
-    )  # fmt: skip
-    first = step_results.defects(message=said)
+    placed = reason("defects.placed-by-deviation", registration=Registration.AS_GIVEN)
+    first = step_results.defects(reasons=(placed, *step_results.EXAMINED))
+    paper = step_results.defects(3, PAPER, method="paper")
     made = step_results.execution(("defects", "default", "{}", first), ("defects", "paper", "{}", paper))
-    return made, ErrorReport(checks_of("defects", *DEFECT_CHECKS))
+    of_paper = metric("missed: step", 1.0, step="defects", method="paper")
+    return made, ErrorReport((*checks_of("defects", *DEFECT_CHECKS), of_paper))
 
 
 @pytest.mark.parametrize("made", [stitched, controlled, given, searched])
@@ -141,43 +147,32 @@ def test_nothing_but_names_and_units_is_left_in_english(made):
 
 
 @pytest.mark.parametrize(
-    "message",
-    [
-        "no point of the scans is near the design; run the steps stitch and deviation first, or give the scans poses "
-        "in the design's frame",
-        "too few points to place the scans at the design",
-        "the scans are not in the design's frame and could not be placed there; run the steps stitch and deviation "
-        "first, or give the scans poses in the design's frame",
-        "too few points are left after the removal of noise",
-        "the scan could not be laid on the design",
-    ],
+    "code", ["no-point", "too-few-points", "not-placed", "paper-too-few-points", "paper-not-placed"]
 )
-def test_a_search_that_failed_says_so_in_chinese(message):
-    execution = step_results.execution(("defects", "default", "{}", Defects("failed", "default", message)))
+def test_a_search_that_failed_has_its_reason_in_chinese(code):
+    failed = Defects(status="failed", method="default", reasons=(reason(f"defects.{code}"),))
+    execution = step_results.execution(("defects", "default", "{}", failed))
     assert left_in_english(page.html(execution, ErrorReport(), {}, "zh")) == []
 
 
 @pytest.mark.parametrize(
-    "message",
+    "reasons",
     [
-        "1.2 m2 examined of 2.4 m2 of the design's surface; too few components to fit the whole to the design: its "
-        "place is taken as it came",
-        "placed by principal axes and a best fit, which takes up what the whole was moved by; another attitude fits as "
-        "well; 1.2 m2 examined of 2.4 m2 of the design's surface",
-        "placed by step deviation (coarse); 1.2 m2 examined of 2.4 m2 of the design's surface",
-        "The scan is taken to be in the design's frame (asked for): deviations hold what moved as a whole. 3 "
-        "scans have no pose: they were taken to be in one frame already.",
+        (*step_results.EXAMINED, reason("defects.not-fitted")),
+        (reason("defects.best-fit"), reason("defects.ambiguous"), *step_results.EXAMINED),
+        (reason("defects.placed-by-deviation", registration=Registration.COARSE), *step_results.EXAMINED),
+        PAPER,
     ],
 )
-def test_messages_of_the_search_are_known(message):
-    assert latin([language.language("zh").say(message)], STAYS | NAMES) == []
+def test_reasons_of_the_search_are_in_chinese(reasons):
+    assert latin([messages("zh").sentences(reasons)], STAYS | NAMES) == []
 
 
-def test_a_word_of_two_senses_has_that_of_its_column():
+def test_a_word_of_two_senses_has_that_of_its_vocabulary_or_column():
     say = language.language("zh").say
-    assert (say("step"), say("step", "class"), say("step: missed of 2")) == ("步骤", "错台", "错台：2 处中漏检")
-    assert (say("misalignment"), say("misalignment", "what")) == ("接口错边", "整体偏位")
-    assert (say("side"), say("side", "heading")) == ("立面", "边长")
+    assert (say("step"), say(DefectClass.STEP), say("missed: step")) == ("步骤", "错台", "漏检：错台")
+    assert (say("misalignment"), say(DefectClass.MISALIGNMENT)) == ("接口错边", "整体偏位")
+    assert (say("side"), say(label("side"))) == ("立面", "边长")
 
 
 # --- a batch --------------------------------------------------------------------------------------------------------

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from processor.geometry import m3c2, normal_orientation, point_neighbors
+from processor.geometry import m3c2, neighbors, normal_orientation
 from processor.geometry.m3c2 import oriented
 from processor.geometry.normal_orientation import UP
-from tests.unit.test_m3c2 import wavy
+from tests.support.m3c2_clouds import wavy
 
 ACROSS = 120.0  # normal diameter, mm
 
@@ -29,7 +29,7 @@ def tube(seed, count=12_000, radius=150.0):
 
 def turned(cloud, core=None, scanner=None, across=ACROSS):
     core = cloud if core is None else core
-    found = m3c2.normals(point_neighbors.of_spacing(cloud), core, across)
+    found = m3c2.normals(neighbors.of_spacing(cloud), core, across)
     return found, normal_orientation.turned(found, core, across, scanner)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import struct
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,9 +11,7 @@ from designgen.export import e57
 from processor import readers
 from processor.model import InputError, Scan
 from processor.readers.e57 import cartesian_from_spherical
-
-DATA = Path(__file__).resolve().parents[2] / "../shared/data"
-needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="the real scans are not on this machine")
+from tests.support.scan_bytes import DATA, TURNED, las_bytes, needs_data, pcd_header, ply_header, put
 
 POINTS = np.array([[1.5, -2.25, 3.0], [0.1, 0.2, 0.3], [-7.0, 8.0, 1e-3]])
 
@@ -25,17 +22,7 @@ def one(path):
     return scans[0]
 
 
-def put(path, content):
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
-
-
 # --- PLY -----------------------------------------------------------------------------------------------------------
-
-
-def ply_header(form, kind, more="", count=3):
-    axes = "".join(f"property {kind} {axis}\n" for axis in "xyz")
-    return f"ply\nformat {form} 1.0\ncomment c\nelement vertex {count}\n{axes}{more}end_header\n".encode()
 
 
 @pytest.mark.parametrize(
@@ -70,13 +57,6 @@ def test_far_points_keep_their_precision(tmp_path):
 # --- PCD -----------------------------------------------------------------------------------------------------------
 
 
-def pcd_header(data, count=3, width=3, height=1):
-    return (
-        "# .PCD v0.7\nVERSION 0.7\nFIELDS x y z intensity\nSIZE 4 4 4 4\nTYPE F F F F\nCOUNT 1 1 1 1\n"
-        f"WIDTH {width}\nHEIGHT {height}\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {count}\nDATA {data}\n"
-    ).encode()
-
-
 def test_pcd_ascii_with_any_blanks(tmp_path):
     scan = one(put(tmp_path / "a.pcd", pcd_header("ascii") + b"1.5  -2.25\t3 1\n0.5 0.25 nan 2\r\n-7 8 1 3"))
     assert scan.points.tolist() == [[1.5, -2.25, 3.0], [-7.0, 8.0, 1.0]]
@@ -102,10 +82,6 @@ def test_pcd_against_another_library(name):
 
 
 # --- PTX -----------------------------------------------------------------------------------------------------------
-
-# A quarter turn about z, then (10, 20, 30): as row vectors, so x maps to y in the first row.
-POSE_ROWS = "0 1 0 0\n-1 0 0 0\n0 0 1 0\n10 20 30 1\n"
-TURNED = "10 20 30\n0 1 0\n-1 0 0\n0 0 1\n" + POSE_ROWS
 
 
 def test_ptx_poses_and_no_returns(tmp_path):
@@ -182,19 +158,6 @@ def test_text_intensity_and_unit(tmp_path):
 
 
 # --- LAS and E57 ---------------------------------------------------------------------------------------------------
-
-
-def las_bytes(raw, scale, offset):
-    """LAS 1.2, point format 0, by the specification's table."""
-    count = len(raw)
-    low, high = np.min(raw, axis=0) * scale + offset, np.max(raw, axis=0) * scale + offset
-    header = struct.pack(
-        "<4sHH16sBB32s32sHHHIIBHI5I12d",
-        b"LASF", 0, 0, bytes(16), 1, 2, b"", b"", 1, 2026, 227, 227, 0, 0, 20, count, count, 0, 0, 0, 0,
-        *[scale] * 3, *offset, high[0], low[0], high[1], low[1], high[2], low[2],
-    )  # fmt: skip
-    rows = b"".join(struct.pack("<3iHBBbBH", *row, 100 + i, 0x11, 0, 0, 0, 0) for i, row in enumerate(raw))
-    return header + rows
 
 
 def test_las_by_the_specification(tmp_path):

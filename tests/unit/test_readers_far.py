@@ -15,8 +15,8 @@ from processor import readers
 from processor.model import InputError, Scan
 from processor.readers import ascii_rows
 from processor.scan_folder import folder
-from tests.unit.test_folder import BOX, arch_design, surface, write_ply, write_xyz
-from tests.unit.test_readers import las_bytes, ply_header, put
+from tests.support.scan_bytes import las_bytes, ply_header, put
+from tests.support.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
 
 BASE = np.array([512_000.0, 4_423_000.0, 1_000.0])  # whole numbers: differences from them are exact
 NEAR = np.random.default_rng(3).uniform(0.0, 60.0, (50, 3)).round(6)

@@ -11,8 +11,12 @@ from processor.defects import pictures, surface_charts
 from processor.defects.deviation_field import Field
 from processor.defects.result import Result
 from processor.evaluation.evaluate import ErrorReport
+from processor.model import StepRun
 from processor.report import page, surface_view
 from processor.report.defects import figures, view
+from processor.report.record_json import as_object
+from processor.report.results_json import plain
+from processor.store import store
 from tests.support import step_results
 from tests.unit.test_report_adjusted import Page
 
@@ -25,23 +29,24 @@ def test_the_view_holds_the_surface_and_an_outline_a_defect():
     result = step_results.defects()
     found = drawn(result)
     first, *outlines = found["parts"]
-    assert first["text"] == "surface"
+    assert str(first["text"]) == "surface"
     at = np.array(first["points"]).reshape(-1, 3) + found["origin"]
-    np.testing.assert_allclose(at, result.surface_at, atol=0.51)
-    np.testing.assert_allclose(first["residual"], result.surface_mm, atol=6e-4)
-    assert first["region"] == result.surface_defect.tolist()
-    assert [one["text"] for one in outlines] == [f"{i}: {kind}" for i, kind in enumerate(result.classes)]
+    np.testing.assert_allclose(at, result.surface.points, atol=0.51)
+    np.testing.assert_allclose(first["residual"], result.surface.deviation, atol=6e-4)
+    assert first["region"] == result.surface.defect.tolist()
+    classes = result.defects.defect_class
+    assert [str(one["text"]) for one in outlines] == [f"{i}: {kind}" for i, kind in enumerate(classes)]
     ring = np.array(outlines[2]["edges"][0]) + found["origin"]
     np.testing.assert_array_equal(ring[0], ring[-1])
-    np.testing.assert_allclose(ring[:-1].mean(axis=0), result.centres[2], atol=0.1)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(ring, axis=0), axis=1), result.extent[2, 0], atol=0.2)
+    np.testing.assert_allclose(ring[:-1].mean(axis=0), result.defects.centre[2], atol=0.1)
+    np.testing.assert_allclose(np.linalg.norm(np.diff(ring, axis=0), axis=1), result.defects.extent[2, 0], atol=0.2)
     assert [mark["part"] for mark in found["marks"]] == list(range(1, len(outlines) + 1))
-    assert found["marks"][0]["text"] == "dent, depth 1.500 ± 0.300 mm, area 13500 mm2, component-1"
+    assert str(found["marks"][0]["text"]) == "dent, depth 1.500 ± 0.300 mm, area 13500 mm2, component-1"
     assert found["places"][0]["outward"] == [0.0, -1.0, 0.0]
 
 
 def test_nothing_is_drawn_of_what_failed():
-    assert drawn(Result("failed", "default", "no point")) is None
+    assert drawn(Result(status="failed", method="default")) is None
 
 
 def test_many_defects_and_places_keep_the_page_small():
@@ -74,18 +79,19 @@ def plates():
 
 def test_all_places_are_drawn_where_there_are_few(plates):
     found, field = plates
-    made = pictures.of_surface([], field, found)
-    np.testing.assert_array_equal(made["surface_at"], found.centres)
-    assert (made["surface_defect"] == -1).all()
+    origin = np.array([1000.0, 2000.0, 0.0])
+    made = pictures.of_surface([], field, found, origin)
+    np.testing.assert_array_equal(made.points, found.centres + origin)
+    assert (made.defect == -1).all()
 
 
 @pytest.mark.parametrize("most", [2000, 500, 60])
 def test_many_are_thinned_alike_on_every_face(plates, most):
     found, field = plates
-    made = pictures.of_surface([], field, found, most)
-    at = made["surface_at"]
+    made = pictures.of_surface([], field, found, np.zeros(3), most)
+    at = made.points
     assert 0.3 * most < len(at) <= most
-    np.testing.assert_allclose(made["surface_mm"], 1e-3 * at[:, 0])
+    np.testing.assert_allclose(made.deviation, 1e-3 * at[:, 0])
     strip = at[at[:, 1] == 500.0]
     steps = np.diff(np.unique(at[at[:, 1] == 0.0][:, 0]))
     np.testing.assert_allclose(steps, steps[0])
@@ -96,18 +102,32 @@ def test_small_defects_are_drawn_whole_and_lie_on_large_ones(plates):
     found, field = plates
     away = np.linalg.norm(found.centres - [1000.0, 0.0, 500.0], axis=1)
     small, large = np.flatnonzero(away < 60.0), np.flatnonzero(found.centres[:, 1] == 0.0)
-    made = pictures.of_surface([large, small], field, found, 500)
-    count = np.bincount(made["surface_defect"] + 1, minlength=3)
+    made = pictures.of_surface([large, small], field, found, np.zeros(3), 500)
+    count = np.bincount(made.defect + 1, minlength=3)
     assert count[2] == len(small)
     assert 300 < count[1] < 500
     unseen = dataclasses.replace(field, count=np.where(away < 60.0, 0, 1))
-    assert (pictures.of_surface([small], unseen, found, 500)["surface_defect"] == -1).all()
+    assert (pictures.of_surface([small], unseen, found, np.zeros(3), 500).defect == -1).all()
+
+
+def test_results_are_stored_and_read_again(tmp_path):
+    result = step_results.defects()
+    result = dataclasses.replace(
+        result, defects=dataclasses.replace(result.defects, doubtful=np.arange(len(result.defects)) % 2 == 0)
+    )
+    store.write_results(tmp_path / "r.h5", [StepRun("defects", "default", "{}", result)], {})
+    (back,) = store.read_results(tmp_path / "r.h5", {"defects": Result})
+    assert plain(as_object(back.result)) == plain(as_object(result))
+    for name in ("pictures", "surface"):
+        np.testing.assert_equal(dataclasses.asdict(back.result)[name], dataclasses.asdict(result)[name])
+    first, second, *_ = as_object(result)["defects"]
+    assert (first["doubtful"], first["deflection"]["along"][0], second["deflection"]) == (True, -200.0, None)
 
 
 def test_every_defect_has_a_page():
     result = step_results.defects()
     (name, pdf), *none = figures.files(result).items()
     assert (name, none) == ("defects.pdf", [])
-    assert len(re.findall(rb"/Type /Page\b", pdf)) == len(result.picture_defect) > 0
+    assert len(re.findall(rb"/Type /Page\b", pdf)) == len(result.pictures) > 0
     assert pdf == figures.files(result)[name]
-    assert figures.files(Result("failed", "default", "no point")) == {}
+    assert figures.files(Result(status="failed", method="default")) == {}

@@ -18,8 +18,8 @@ from processor.stitching import step as stitching_step
 from processor.stitching.planes import scan_planes
 from processor.store import store
 from tests.support import stitch_clouds
-from tests.unit.test_readers import DATA, needs_data
-from tests.unit.test_scan_folder import exported, merged
+from tests.support.exported_scenes import exported, merged
+from tests.support.scan_bytes import DATA, needs_data
 
 PTX_POSE = "0 0 0\n1 0 0\n0 1 0\n0 0 1\n1 0 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"
 HOLE = "0 0 0 0.5\n"

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from processor.geometry.linalg_small import inverse_of
 from processor.space_frame import catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
@@ -12,7 +13,6 @@ from processor.space_frame.spheres.gauss_newton import (
     Observations,
     Prior,
     Unknowns,
-    inverse_of,
     residual,
     select,
     solve,

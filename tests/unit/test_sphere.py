@@ -4,9 +4,16 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-from processor.geometry.crops import nearest_crops
-from processor.geometry.sphere import Sphere, algebraic, ransac, through_four, trials_needed, visible_fraction
-from processor.geometry.sphere_robust import robust_fit
+from processor.geometry.neighbors import nearest_crops
+from processor.geometry.sphere import (
+    Sphere,
+    algebraic,
+    ransac,
+    robust_fit,
+    through_four,
+    trials_needed,
+    visible_fraction,
+)
 from processor.geometry.sphere_search import LEAST_POINTS, find_balls, local_noise
 
 NOWHERE = np.zeros((4, 4))

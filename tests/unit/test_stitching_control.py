@@ -17,8 +17,8 @@ from processor.model import Control, InputError, reason
 from processor.report.record_json import as_object
 from processor.stitching import step as stitching_step
 from processor.stitching.fine import control_points
+from tests.support.picked_networks import network
 from tests.support.stitch_clouds import four, pose
-from tests.unit.test_stitching_picks import network
 
 SITE = rigid.transform(Rotation.from_euler("zyx", [130.0, 1.0, -2.0], degrees=True).as_matrix(), [5e5, 4.2e6, 310.0])
 NAMES = tuple(f"S{i + 1}" for i in range(9))

@@ -120,7 +120,7 @@ def _as_designed(part: PartFeatures, design: DesignPart) -> _AsDesigned:
     fitted = surface_registration.fine(points, shape.mesh, shape.axes, part.attitude.T_surface)
     if not surface_registration.fits(fitted):
         return unchanged
-    on_design = rigid.apply(fitted.T_bridge_scan, points)
+    on_design = rigid.apply(fitted.T_design_scan, points)
     face, residual, _ = shape.mesh.distances(on_design, NEAR_MM + surface_registration.GATES_MM[0])
     rows = np.flatnonzero((face >= 0) & (np.abs(residual) < NEAR_MM))
     foot = _nearest(shape.mesh, on_design[rows], face[rows])
@@ -130,8 +130,8 @@ def _as_designed(part: PartFeatures, design: DesignPart) -> _AsDesigned:
     near[rows[projected]] = True
     # Neighbours share the part's form; their differences are noise.
     sigma = float(np.median(np.abs(np.diff(residual[near])))) / (QUARTILE * np.sqrt(2.0)) if near.sum() > 1 else 0.0
-    in_scan = rigid.apply(rigid.invert(fitted.T_bridge_scan), on_design)
-    return _AsDesigned(part, in_scan, near, sigma, fitted.T_bridge_scan)
+    in_scan = rigid.apply(rigid.invert(fitted.T_design_scan), on_design)
+    return _AsDesigned(part, in_scan, near, sigma, fitted.T_design_scan)
 
 
 def _nearest(mesh: MeshSurface, points: Floats, face: Ints) -> Floats:

@@ -14,7 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.geometry import principal, rigid
-from processor.geometry.neighbors import statistical_inliers
+from processor.geometry.neighbors import without_outliers
 from processor.geometry.polyline import Line, crossing, fit_line, ransac_line
 from processor.model import Floats
 from processor.preassembly.params import BoxParams, SliceParams
@@ -44,7 +44,7 @@ def cut_joint_end(points: Floats, T_joint_scan: Floats, outward: float, size: Fl
     # The last points along the axis are the end, but for a few outliers.
     end = np.quantile(outward * local[:, 0], 1.0 - min(0.5, 50.0 / len(local)))
     local = local[outward * local[:, 0] >= end - params.joint_zone_mm]
-    return local[statistical_inliers(local, params.denoise_neighbours, params.denoise_ratio)]
+    return without_outliers(local, params.denoise_neighbours, params.denoise_ratio)
 
 
 def reduced_boxes(

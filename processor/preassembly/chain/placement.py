@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from processor.geometry import rigid, surface_registration
+from processor.geometry import rigid
 from processor.model import ArchDesign, Floats
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.measure import MeasuredPart
@@ -67,7 +67,7 @@ def _covariances(parts: Sequence[MeasuredPart], adjusted: Adjusted, poses: Float
         if np.isfinite(poses[i]).all():
             rows = slice(6 * i, 6 * i + 6)
             of_motion = adjusted.motion_covariance[rows, rows]
-            covariances[i] = surface_registration.about_origin(of_motion, part.member.centre)
+            covariances[i] = rigid.about_origin(of_motion, part.member.centre)
     return covariances
 
 

@@ -75,22 +75,10 @@ class _Candidate:
 
 def samples_of(part: DesignPart) -> tuple[Floats, Floats]:
     """Sample the part's surface on a fixed low-discrepancy pattern: points (n, 3) with unit normals (n, 3)."""
-    a, b, c = (part.vertices[part.faces[:, i]] for i in range(3))
-    cross = np.cross(b - a, c - a)
-    double_area = np.linalg.norm(cross, axis=1)
-    used = double_area > 0.0
-    a, b, c, cross, double_area = a[used], b[used], c[used], cross[used], double_area[used]
-    cumulative = np.cumsum(double_area)
-    count = int(np.clip(0.5 * cumulative[-1] / SAMPLE_SPACING_MM**2, 2_000, 400_000))
-    i = np.arange(count)
-    triangle = np.searchsorted(cumulative, (i + 0.5) / count * cumulative[-1])
-    # The R2 sequence (plastic number), folded from the square onto the triangle.
-    u, v = (0.5 + i * 0.7548776662466927) % 1.0, (0.5 + i * 0.5698402909980532) % 1.0
-    fold = u + v > 1.0
-    u, v = np.where(fold, 1.0 - u, u), np.where(fold, 1.0 - v, v)
-    at = a[triangle]
-    points = at + u[:, None] * (b[triangle] - at) + v[:, None] * (c[triangle] - at)
-    return points, (cross / double_area[:, None])[triangle]
+    samples = mesh_distance.spread(
+        part.vertices, part.faces, lambda area_mm2: int(np.clip(area_mm2 / SAMPLE_SPACING_MM**2, 2_000, 400_000))
+    )
+    return samples.points, samples.normals
 
 
 def sample_surface(part: DesignPart) -> Surface:
@@ -134,12 +122,8 @@ def principal_hypotheses(points: Floats, part: DesignPart) -> list[Floats]:
 
 def _rotations(scan_axes: Floats, design_axes: Floats) -> list[Floats]:
     """Return the eight proper rotations (3, 3) that align the long axes, and the cross axes in either order."""
-    quarter_turn = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])
-    return [
-        design_axes @ np.diag(signs) @ turn @ scan_axes.T
-        for turn in (np.eye(3), quarter_turn)
-        for signs in principal.proper_sign_choices()
-    ]
+    turns = principal.turns(((0, 1, 2), (0, 2, 1)))
+    return [design_axes @ turn @ scan_axes.T for turn in turns]
 
 
 def piece_hypotheses(seeds: Floats, part: DesignPart) -> list[Floats]:
@@ -247,7 +231,7 @@ def _decide(points: Floats, box: Floats, seeds: Floats, surface: Surface, candid
     """Choose, of candidates that fit, the one that no other beats by the surface that the scan shows."""
     if len(candidates) > 1:
         # Evidence is counted at a scale of tens of millimetres: poses must be more accurate than that.
-        fine = [surface_registration.fine(seeds, surface.mesh, surface.axes, c.T).T_bridge_scan for c in candidates]
+        fine = [surface_registration.fine(seeds, surface.mesh, surface.axes, c.T).T_design_scan for c in candidates]
         candidates = _distinct([replace(c, T=T) for c, T in zip(candidates, fine, strict=True)], box)
 
     @cache

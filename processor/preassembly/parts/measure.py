@@ -30,6 +30,7 @@ SLICES, LEAST_OF_TYPICAL = (
 )  # of a part's length; of the median number of points on a slice's side: it is covered
 ACROSS = 0.7  # cosine to the part's axis, below which a normal is of the part's sides
 LEAST_COVERED = 0.7
+RIGHT_PART = (reason("preassemble.right-part"),)
 RESIDUALS = 4_000  # points of a part whose distances from the design are kept
 
 
@@ -71,7 +72,7 @@ class _PlacedScan:
     points: Floats
     station: Ints
     attitude: attitude.Attitude
-    registration: surface_registration.Registration = surface_registration.NOWHERE
+    registration: surface_registration.SurfaceFit = surface_registration.NOWHERE
     rejected: tuple[Reason, ...] = ()
     identity: identity.Identity = field(default_factory=identity.Identity)
     doubts: tuple[Reason, ...] = ()
@@ -126,7 +127,7 @@ def fit(
         scans=tuple(scan.scan for scan in used),
         status=status,
         reasons=(*_reasons(placed, used, part, doubtful_ends), *resemblance),
-        T_bridge_scan=first.registration.T_bridge_scan,
+        T_bridge_scan=first.registration.T_design_scan,
         member=Member((None, None), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
         T_rival=first.attitude.T_rival,
@@ -170,7 +171,7 @@ def _reasons(
 
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
     """Join the points of the scans used, on the design; ``joints`` are the key points (8, 3) of the part's joints."""
-    points = np.vstack([rigid.apply(scan.registration.T_bridge_scan, scan.points) for scan in used])
+    points = np.vstack([rigid.apply(scan.registration.T_design_scan, scan.points) for scan in used])
     station = _station_numbers([scan.station for scan in used])
     return RegisteredPart(
         points=points,
@@ -229,7 +230,7 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
     placed = replace(placed, registration=registration)
     misfit = _misfit(registration)
     if misfit:
-        return replace(placed, rejected=(*misfit, *(_resemblance(points, design, part) or _WHICH)))
+        return replace(placed, rejected=(*misfit, *(_resemblance(points, design, part) or RIGHT_PART)))
     # A part without a mesh has approximate surfaces: points of the right part lie off them, too.
     if registration.used_share < 1.0 - surface_registration.CLUTTER_SHARE and part.source != box_girder.SOURCE:
         # A part of another size fits the design as far as the two are alike; the rest looks like clutter.
@@ -237,20 +238,17 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
         resemblance = _resemblance(points, design, part)
         if resemblance:
             return replace(placed, rejected=(reason("preassemble.points-away", share=away), *resemblance))
-        covered = _covered(points, registration.T_bridge_scan, shape)
+        covered = _covered(points, registration.T_design_scan, shape)
         if covered < LEAST_COVERED:
             doubt = reason("preassemble.sides-not-covered", share=away, covered=covered)
-            placed = replace(placed, doubts=(doubt, *_WHICH))
-    others = identity.identify(points, registration.T_bridge_scan, shape, part, design)
+            placed = replace(placed, doubts=(doubt, *RIGHT_PART))
+    others = identity.identify(points, registration.T_design_scan, shape, part, design)
     # A part of another size may by chance have its mark where the other part of this shape has its own.
     wrong = (_resemblance(points, design, part) or others.contradiction) if others.contradiction else ()
     return replace(placed, identity=others, rejected=wrong)
 
 
-_WHICH = (reason("preassemble.right-part"),)
-
-
-def _misfit(registration: surface_registration.Registration) -> tuple[Reason, ...]:
+def _misfit(registration: surface_registration.SurfaceFit) -> tuple[Reason, ...]:
     """Why a registered scan is not of its design; empty where it is."""
     share = registration.used_share
     if not (share > surface_registration.LEAST_SHARE and np.isfinite(registration.covariance).all()):

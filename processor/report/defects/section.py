@@ -1,41 +1,44 @@
-"""How defects report."""
+"""The report of step ``defects``."""
 
 from __future__ import annotations
 
 import collections
 
-from processor.defects.result import CLASSES, Result
-from processor.report.defects import figures, results, tables, view
+from processor.defects.result import DefectClass, Result
+from processor.language.messages import Message, text
+from processor.model import Status
+from processor.report.defects import figures, tables, view
 from processor.report.section import StepReport
-from processor.report.table import shown
 
 
-def _summary(result: Result) -> tuple[str, str]:
-    if result.status == "failed":
-        return result.status, result.message
-    counts = collections.Counter(result.classes)
-    named = ", ".join(f"{counts[kind]} {kind}" for kind in CLASSES if counts[kind])
-    doubtful = int(result.doubtful.sum())
-    sure = len(result.ids) - doubtful
-    head = f"{result.status}, {sure or 'no'} defect{'' if sure == 1 else 's'} found"
-    head += f" and {doubtful} doubtful" if doubtful else ""
-    said = f"{named.capitalize()}. " if named else ""
-    said += f"{result.examined_mm2 / 1e6:.1f} m2 examined"
-    if len(result.scale_mm):
-        middle = len(result.scale_mm) // 2
-        said += (
-            f"; a place {result.scale_mm[middle]:.0f} mm wide is found from "
-            f"{shown(float(result.scale_least_mm[middle]))} mm of mean depth"
+def _summary(result: Result) -> tuple[Message, Message]:
+    if result.status is Status.FAILED:
+        return result.status, text("{reasons}", reasons=result.reasons)
+    doubtful = int(result.defects.doubtful.sum())
+    certain = len(result.defects) - doubtful
+    number = text("{count} {count:?defect|defects} found", count=certain) if certain else text("no defects found")
+    head = text("{status}, {found}", status=result.status, found=number)
+    if doubtful:
+        head = text("{status}, {found} and {doubtful} doubtful", status=result.status, found=number, doubtful=doubtful)
+    counts = collections.Counter(result.defects.defect_class)
+    classes = tuple(text("{count} {kind}", count=counts[kind], kind=kind) for kind in DefectClass if counts[kind])
+    body = text("{area:.1f} m2 examined", area=result.examined_mm2 / 1e6)
+    if len(result.least_depth):
+        middle = len(result.least_depth) // 2
+        body = text(
+            "{examined}; a place {side:.0f} mm wide is found from a mean depth of {depth} mm",
+            examined=body,
+            side=float(result.least_depth.side[middle]),
+            depth=float(result.least_depth.depth[middle]),
         )
-    return head, said + "."
+    return head, text("{classes}. {body}.", classes=classes, body=body) if classes else text("{body}.", body=body)
 
 
 REPORT = StepReport(
-    title="Defects",
+    title=text("Defects"),
     summary=_summary,
-    written=results.written,
     tables=tables.of_runs,
-    figures=lambda execution, runs, report: figures.of_runs(execution.scene, runs, report),
+    figures=lambda _, runs, __: figures.of_result(runs[0].result),
     files=lambda _, run: figures.files(run.result),
     live=view.of_runs,
 )

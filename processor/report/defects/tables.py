@@ -8,105 +8,112 @@ from typing import Any
 
 import numpy as np
 
-from processor.defects.result import CLASSES, Result
+from processor.defects.result import DefectClass, Result
 from processor.evaluation.evaluate import ErrorReport
+from processor.language.messages import text
 from processor.model import StepRun
 from processor.report.table import Table
 
-LIST_NOTE = (
-    "Centres in the design's frame; a depth inward is positive. ci95 is the half-width of the 95 % interval. What is "
-    "missing is as deep as the design is thick. Confidence 0.5 is a coin's; below 0.6 a class is unknown, and "
-    "otherwise says what it would be. lod95 is the level of detection of the means that a depth comes from. "
-    "Doubtful is what chance brings as strong on less than 10 000 m2."
+LIST_NOTE = text(
+    "Centres in the design's frame; a depth inward is positive. ci95 is the half-width of the 95 % interval. The depth "
+    "of a missing part is the design's thickness. Confidence 0.5 is as good as a coin; below 0.6 the class is unknown, "
+    "and the second class is the most probable. lod95 is the level of detection of the mean that the depth follows "
+    "from. A defect is doubtful if more than one false alarm as strong is expected on 10 000 m2."
 )
-LEAST_NOTE = (
-    "What a place of this size has to deviate by, on the median of the surface, to be found at the false alarms asked "
-    "for; noise by how much means of such places vary more than single points say."
+LEAST_NOTE = text(
+    "The mean deviation from which a place of this size is found, at the given rate of false alarms; median over the "
+    "surface. Noise: the scatter of means over such places, by that expected from single points."
 )
 
 
 def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
-    """Tables of the answer, in short and in full, and the defects of each method compared with it."""
-    first: Result = runs[0].result
-    tables = [_in_short(first, runs[0].method)]
-    tables += [_list(run, run is runs[0]) for run in runs]
-    if len(first.scale_mm):
-        tables.append(_least(first))
-    if len(first.curve_defect):
-        tables.append(_curves(first))
+    """Tables of the first run in short and in full, and the defects of the methods that it is compared with."""
+    result: Result = runs[0].result
+    tables = [_summary(result, runs[0].method), *(_list(run, run is runs[0]) for run in runs)]
+    if len(result.least_depth):
+        tables.append(_least_depth(result))
+    if any(len(curve.along) for curve in result.defects.deflection):
+        tables.append(_curves(result))
     return tables
 
 
-def _in_short(result: Result, method: str) -> Table:
-    counts = collections.Counter(result.classes)
-    rows: list[tuple[Any, ...]] = [("defects", len(result.ids), "")]
-    rows += [("doubtful", int(result.doubtful.sum()), "")]
-    rows += [(kind, counts[kind], "") for kind in CLASSES if counts[kind]]
-    rows += [
-        ("surface examined for deviations", result.examined_mm2 / 1e6, "m2"),
-        ("surface that should have been seen", result.expected_mm2 / 1e6, "m2"),
-        ("points", result.points, ""),
-        ("points within reach of the design", result.used, ""),
-        ("side of a cell", result.cell_mm, "mm"),
-        ("noise of a point, one sd, median", result.noise_mm, "mm"),
-        ("LOD95 of a cell, median", result.lod95_mm, "mm"),
-        ("registration error, one sd, median", result.registration_error_mm, "mm"),
+def _summary(result: Result, method: str) -> Table:
+    counts = collections.Counter(result.defects.defect_class)
+    rows: list[tuple[Any, ...]] = [
+        (text("defects"), len(result.defects), ""),
+        (text("doubtful"), int(result.defects.doubtful.sum()), ""),
+        *((kind, counts[kind], "") for kind in DefectClass if counts[kind]),
+        (text("surface examined for deviations"), result.examined_mm2 / 1e6, "m2"),
+        (text("surface that should have been seen"), result.expected_mm2 / 1e6, "m2"),
+        (text("points"), result.points, ""),
+        (text("points within reach of the design"), result.points_used, ""),
+        (text("side of a cell"), result.cell, "mm"),
+        (text("noise of a point, one sd, median"), result.noise, "mm"),
+        (text("LOD95 of a cell, median"), result.lod95, "mm"),
+        (text("registration error, one sd, median"), result.registration_error, "mm"),
     ]
-    return Table(f"Defects in short, method {method}", ("what", "value", "unit"), tuple(rows), "defects-summary")
+    title = text("Defects in short, method {method}", method=method)
+    return Table(title, ("what", "value", "unit"), tuple(rows), "defects-summary")
 
 
-def _list(run: StepRun, answer: bool) -> Table:
-    result: Result = run.result
-    rows = tuple(
-        (
-            id_,
-            result.classes[k],
-            float(result.confidence[k]),
-            result.second[k],
-            result.components[k],
-            *result.centres[k].tolist(),
-            float(result.area_mm2[k]),
-            *result.extent[k].tolist(),
-            float(result.depth_max[k]),
-            float(result.depth_ci95[k]),
-            float(result.depth_mean[k]),
-            float(result.volume_mm3[k]),
-            float(result.volume_ci95[k]),
-            float(result.edge_mm[k]),
-            float(result.curvature_per_m[k]),
-            float(result.lod95[k]),
-            float(result.chance[k]),
-            "yes" if result.doubtful[k] else "no",
-            result.remarks[k],
-        )
-        for k, id_ in enumerate(result.ids.tolist())
-    )
-    columns = (
-        "id", "class", "confidence", "otherwise", "component", "x_mm", "y_mm", "z_mm", "area_mm2", "length_mm",
-        "width_mm", "depth_max_mm", "depth_ci95_mm", "depth_mean_mm", "volume_mm3", "volume_ci95_mm3", "edge_mm",
-        "curvature_per_m", "lod95_mm", "by_chance_on_100_m2", "doubtful", "remark",
-    )  # fmt: skip
-    file = "defects" if answer else f"defects-{run.method}"
-    note = LIST_NOTE if answer else result.message
-    return Table(f"Defects, method {run.method} (mm)", columns, rows, file, note, on_terminal=answer)
+def _list(run: StepRun, is_first: bool) -> Table:
+    """List the defects of a run, for the page and the terminal if it is the first."""
+    defects = run.result.defects
+    columns = {
+        "id": defects.id,
+        "class": defects.defect_class,
+        "confidence": defects.confidence,
+        "otherwise": defects.otherwise,
+        "component": defects.component,
+        "x_mm": defects.centre[:, 0],
+        "y_mm": defects.centre[:, 1],
+        "z_mm": defects.centre[:, 2],
+        "area_mm2": defects.area_mm2,
+        "length_mm": defects.extent[:, 0],
+        "width_mm": defects.extent[:, 1],
+        "depth_max_mm": defects.depth_max,
+        "depth_ci95_mm": defects.depth_ci95,
+        "depth_mean_mm": defects.depth_mean,
+        "volume_mm3": defects.volume_mm3,
+        "volume_ci95_mm3": defects.volume_ci95,
+        "edge_mm": defects.edge_distance,
+        "curvature_per_m": defects.curvature_per_m,
+        "lod95_mm": defects.lod95,
+        "by_chance_on_100_m2": defects.chance,
+        "doubtful": tuple("yes" if doubtful else "no" for doubtful in defects.doubtful),
+        "remark": defects.reasons,
+    }
+    rows = zip(*(x.tolist() if isinstance(x, np.ndarray) else x for x in columns.values()), strict=True)
+    title = text("Defects, method {method} (mm)", method=run.method)
+    file = "defects" if is_first else f"defects-{run.method}"
+    note = LIST_NOTE if is_first else text("{reasons}", reasons=run.result.reasons)
+    return Table(title, tuple(columns), tuple(rows), file, note, on_terminal=is_first)
 
 
-def _least(result: Result) -> Table:
-    rows = tuple(
-        zip(*(x.tolist() for x in (result.scale_mm, result.scale_least_mm, result.scale_inflation)), strict=True)
-    )
+def _least_depth(result: Result) -> Table:
+    windows = result.least_depth
+    columns = (windows.side.tolist(), windows.depth.tolist(), windows.noise_inflation.tolist())
     return Table(
-        "Least depth found, by size of place (mm)", ("side_mm", "depth_mm", "noise"), rows, "defects-least", LEAST_NOTE,
+        title=text("Least depth found, by size of place (mm)"),
+        columns=("side_mm", "depth_mm", "noise"),
+        rows=tuple(zip(*columns, strict=True)),
+        file="defects-least",
+        note=LEAST_NOTE,
         on_terminal=False,
-    )  # fmt: skip
+    )
 
 
 def _curves(result: Result) -> Table:
-    ids = result.ids[result.curve_defect]
-    rows = tuple(zip(*(x.tolist() for x in (ids, result.curve_at_mm, result.curve_mm, result.curve_ci95)), strict=True))
-    known = np.isfinite(result.curve_ci95).all()
-    note = "From the middle of the component; displacement outward of its largest face." if known else ""
+    rows = tuple(
+        (id_, *row)
+        for id_, curve in zip(result.defects.id.tolist(), result.defects.deflection, strict=True)
+        for row in zip(curve.along.tolist(), curve.displacement.tolist(), curve.ci95.tolist(), strict=True)
+    )
     return Table(
-        "Deflection curves (mm)", ("id", "along_mm", "displacement_mm", "ci95_mm"), rows, "defects-curves", note,
-        on_page=False, on_terminal=False,
-    )  # fmt: skip
+        title="Deflection curves (mm)",
+        columns=("id", "along_mm", "displacement_mm", "ci95_mm"),
+        rows=rows,
+        file="defects-curves",
+        on_page=False,
+        on_terminal=False,
+    )

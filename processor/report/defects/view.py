@@ -1,4 +1,4 @@
-"""What the page's script draws of defects: the surface by its deviation, and every defect outlined."""
+"""The view of defects in space on the page: the surface coloured by its deviation, and an outline of each defect."""
 
 from __future__ import annotations
 
@@ -7,35 +7,43 @@ from typing import Any
 
 import numpy as np
 
-from processor.defects.result import Result
+from processor.defects.result import Defects, Result
+from processor.language.messages import text
 from processor.model import Ints, Scene, StepRun
 from processor.report import surface_view
 from processor.report.surface_view import Region
-from processor.report.table import shown
 
 
 def of_runs(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
-    """Return what the page draws of the answer, mm, in the design's frame; None where nothing was seen."""
+    """Return the data of the view of the first run, mm, design frame; None without points on the surface."""
     result: Result = runs[0].result
-    everything: Ints = np.arange(len(result.surface_at), dtype=np.int64)
+    everything: Ints = np.arange(len(result.surface), dtype=np.int64)
     return surface_view.of_points(
-        "Defects in space",
+        text("Defects in space"),
         runs[0].method,
-        result.surface_at,
-        np.asarray(result.surface_mm, np.float64),
+        result.surface.points,
+        np.asarray(result.surface.deviation, np.float64),
         [("surface", everything)],
-        regions=[_region(result, k) for k in range(len(result.ids))],
-        region_of=np.asarray(result.surface_defect, np.int64),
+        regions=[_region(result.defects, k) for k in range(len(result.defects))],
+        region_of=np.asarray(result.surface.defect, np.int64),
         named=False,
     )
 
 
-def _region(result: Result, k: int) -> Region:
+def _region(defects: Defects, k: int) -> Region:
     """Outline a defect by the rectangle of its extent about its centre."""
-    along, across, out = result.axes[k]
-    length, width = 0.5 * result.extent[k]
-    sides = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
-    corners = np.array([result.centres[k] + u * length * along + v * width * across for u, v in sides])
-    depth = f"{shown(float(result.depth_max[k]))} ± {shown(float(result.depth_ci95[k]))}"
-    text = f"{result.classes[k]}, depth {depth} mm, area {result.area_mm2[k]:.0f} mm2, {shown(result.components[k])}"
-    return Region(str(result.ids[k]), result.classes[k], text, corners, out)
+    along, across, outward = defects.axes[k]
+    length, width = 0.5 * defects.extent[k]
+    signs = ((-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0))
+    corners = np.array([defects.centre[k] + u * length * along + v * width * across for u, v in signs])
+    description = text(
+        "{kind}, depth {depth} ± {ci95} mm, area {area:.0f} mm2, {component}",
+        kind=defects.defect_class[k],
+        depth=float(defects.depth_max[k]),
+        ci95=float(defects.depth_ci95[k]),
+        area=float(defects.area_mm2[k]),
+        component=defects.component[k],
+    )
+    return Region(
+        name=str(defects.id[k]), brief=defects.defect_class[k], text=description, outline=corners, outward=outward
+    )

@@ -18,6 +18,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.geometry.linalg_small import DEFINITE, factorise, substitute
 from processor.model import Floats, Ints
 
 NP = 7  # a, b, c, d, r, e, f; mm
@@ -93,36 +94,18 @@ def residual(p, h, px, py, pz, ux, uy, uz, by_ray, J):  # type: ignore[no-untype
 def solve(A, y, n, x, inverse, want_inverse):  # type: ignore[no-untyped-def]
     """Cholesky solution x of the leading n by n block; False where it is not positive definite."""
     L = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            v = A[i, j]
-            for k in range(j):
-                v -= L[i, k] * L[j, k]
-            if i == j:
-                if not v > 1e-12 * A[i, i]:
-                    return False
-                L[i, i] = np.sqrt(v)
-            else:
-                L[i, j] = v / L[j, j]
-    for column in range(n + 1 if want_inverse else 1):
-        for i in range(n):
-            v = y[i] if column == 0 else (1.0 if i == column - 1 else 0.0)
-            for k in range(i):
-                v -= L[i, k] * x[k]
-            x[i] = v / L[i, i]
-        for i in range(n - 1, -1, -1):
-            v = x[i]
-            for k in range(i + 1, n):
-                v -= L[k, i] * x[k]
-            x[i] = v / L[i, i]
-        if column == 0:
+    if not factorise(A, n, DEFINITE, L):
+        return False
+    if want_inverse:
+        for column in range(n):
             for i in range(n):
-                y[i] = x[i]
-        else:
+                x[i] = 1.0 if i == column else 0.0
+            substitute(L, n, x)
             for i in range(n):
-                inverse[i, column - 1] = x[i]
+                inverse[i, column] = x[i]
     for i in range(n):
         x[i] = y[i]
+    substitute(L, n, x)
     return True
 
 

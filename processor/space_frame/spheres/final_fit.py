@@ -9,13 +9,13 @@ from functools import partial
 import numpy as np
 from numba import njit
 
+from processor.geometry.linalg_small import inverse_of
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import (
     NormalEquations,
     Prior,
     Unknowns,
-    inverse_of,
     normal_equations,
     residual,
     solve,

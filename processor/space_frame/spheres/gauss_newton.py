@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.geometry.linalg_small import inverse_of
 from processor.model import Floats, Labels
 
 LEAST_COSINE = 0.15
@@ -146,40 +147,6 @@ def select(points, rays, mask, state, gate, chosen):  # type: ignore[no-untyped-
 
 
 # --- normal equations and their solution -----------------------------------------------------------------------------
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def inverse_of(A, out):  # type: ignore[no-untyped-def]
-    """Invert a positive definite matrix by Cholesky's factors; returns False if it is not positive definite."""
-    n = len(A)
-    L = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                if not s > 1e-12 * A[i, i]:
-                    return False
-                L[i, i] = np.sqrt(s)
-            else:
-                L[i, j] = s / L[j, j]
-    M = np.zeros((n, n))  # inverse of L
-    for i in range(n):
-        M[i, i] = 1.0 / L[i, i]
-        for j in range(i):
-            s = 0.0
-            for k in range(j, i):
-                s -= L[i, k] * M[k, j]
-            M[i, j] = s / L[i, i]
-    for i in range(n):
-        for j in range(i + 1):
-            s = 0.0
-            for k in range(i, n):
-                s += M[k, i] * M[k, j]
-            out[i, j] = s
-            out[j, i] = s
-    return True
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -13,10 +13,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from processor.geometry import sphere_search
-from processor.geometry.crops import nearest_crops
 from processor.geometry.merging import MergedCloud
-from processor.geometry.sphere import Mask, Sphere, algebraic, ransac, visible_fraction
-from processor.geometry.sphere_robust import bound
+from processor.geometry.neighbors import nearest_crops
+from processor.geometry.sphere import Mask, Sphere, algebraic, bound, ransac, visible_fraction
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Tolerance
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import NAN, Params
@@ -187,7 +186,7 @@ def search(cloud: MergedCloud, params: Params) -> Result:
     return _with_bounds(result, rows) if params.method == "ray" else result
 
 
-def _searched(id_: int, candidate: sphere_search.Found, cloud: MergedCloud, params: Params) -> _Row:
+def _searched(id_: int, candidate: sphere_search.Ball, cloud: MergedCloud, params: Params) -> _Row:
     on = cloud.points[candidate.fit.inliers]
     sphere: Sphere | None = candidate.fit.sphere
     if params.method == "least-squares":

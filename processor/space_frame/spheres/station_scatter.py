@@ -13,9 +13,10 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.geometry.linalg_small import inverse_of, log_det
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats
-from processor.space_frame.spheres.gauss_newton import inverse_of, residual, variance
+from processor.space_frame.spheres.gauss_newton import residual, variance
 from processor.space_frame.spheres.records import AimedCrops, Priors
 
 # In mm. The others must beat the first by EVIDENCE in chi-square.
@@ -150,22 +151,3 @@ def _cost(A, b, count, sd, state, k, priors):  # type: ignore[no-untyped-def]
         for q in range(4):
             cost -= g[p] * inverse[p, q] * g[q]
     return cost + log_det(H)
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def log_det(A):  # type: ignore[no-untyped-def]
-    """Return the logarithm of the determinant of a positive definite matrix, by Cholesky's factor."""
-    n = len(A)
-    L = np.zeros((n, n))
-    total = 0.0
-    for i in range(n):
-        for j in range(i + 1):
-            s = A[i, j]
-            for k in range(j):
-                s -= L[i, k] * L[j, k]
-            if i == j:
-                L[i, i] = np.sqrt(s)
-                total += np.log(s)
-            else:
-                L[i, j] = s / L[j, j]
-    return total

@@ -12,6 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from processor.geometry.linalg_small import cholesky, solve
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats
 from processor.space_frame.stations.residual_kernels import LEAST, STATION, TUBE, Axes, Layout
@@ -38,56 +39,6 @@ class Geometry(NamedTuple):
     axes: Axes
     places: Floats
     prior: Floats
-
-
-@njit(cache=True, nogil=True)
-def cholesky(A):  # type: ignore[no-untyped-def]
-    """Lower factor of a positive definite matrix; NaN where it is not positive definite."""
-    n = len(A)
-    L = np.zeros((n, n))
-    for i in range(n):
-        for j in range(i + 1):
-            total = A[i, j]
-            for k in range(j):
-                total -= L[i, k] * L[j, k]
-            if i == j:
-                if not total > 0.0:
-                    return np.full((n, n), np.nan)
-                L[i, i] = np.sqrt(total)
-            else:
-                L[i, j] = total / L[j, j]
-    return L
-
-
-@njit(cache=True, nogil=True)
-def solve(L, B):  # type: ignore[no-untyped-def]
-    """Solve L L' X = B (n, m)."""
-    n, m = B.shape
-    X = B.copy()
-    for i in range(n):
-        for k in range(i):
-            for c in range(m):
-                X[i, c] -= L[i, k] * X[k, c]
-        for c in range(m):
-            X[i, c] /= L[i, i]
-    for i in range(n - 1, -1, -1):
-        for k in range(i + 1, n):
-            for c in range(m):
-                X[i, c] -= L[k, i] * X[k, c]
-        for c in range(m):
-            X[i, c] /= L[i, i]
-    return X
-
-
-@njit(cache=True, nogil=True)
-def product(A, B):  # type: ignore[no-untyped-def]
-    """Multiply A by B, summed in one order."""
-    C = np.zeros((A.shape[0], B.shape[1]))
-    for i in range(A.shape[0]):
-        for k in range(A.shape[1]):
-            for j in range(B.shape[1]):
-                C[i, j] += A[i, k] * B[k, j]
-    return C
 
 
 @njit(cache=True, nogil=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from processor.geometry import rigid
+from processor.geometry.linalg_small import cholesky, product, solve
 from processor.model import Floats
 from processor.space_frame.stations.control_points import ControlPoints, Doubt, doubted, motions
-from processor.space_frame.stations.normal_equations import cholesky, product, solve
 from processor.space_frame.stations.residual_kernels import STATION
 
 # of turn (rad), translation and offset of the ranges (mm)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
+from processor.geometry.linalg_small import product
 from processor.model import Checked, Floats, Ints, Labels, column, names
-from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
 from processor.space_frame.stations.posterior import common_motion, mean_gain
 
@@ -78,10 +78,8 @@ class Stations(Checked):
         covariance = self.covariance
         if relative and np.isfinite(self.before_mm):
             M = common_motion(self.places)
-            relative_part = np.eye(len(covariance)) - normals.product(M, mean_gain(M, self._precision()))
-            covariance = normals.product(
-                normals.product(relative_part, covariance), np.ascontiguousarray(relative_part.T)
-            )
+            relative_part = np.eye(len(covariance)) - product(M, mean_gain(M, self._precision()))
+            covariance = product(product(relative_part, covariance), np.ascontiguousarray(relative_part.T))
         return kernels.effect(np.ascontiguousarray(points), np.ascontiguousarray(influence), self.places, covariance)
 
     def common(self, place: Floats) -> Floats:
@@ -93,7 +91,7 @@ class Stations(Checked):
             first: Floats = self.covariance[:6, :6].copy()
             return first
         gain = mean_gain(common_motion(self.places - place), self._precision())
-        covariance: Floats = normals.product(normals.product(gain, self.covariance), np.ascontiguousarray(gain.T))
+        covariance: Floats = product(product(gain, self.covariance), np.ascontiguousarray(gain.T))
         return covariance
 
     def shared_offset_at(self, points: Floats) -> Floats:

@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
+from processor.geometry.linalg_small import product
 from processor.model import Floats, Ints
 from processor.space_frame.stations import normal_equations as normals
 from processor.space_frame.stations import residual_kernels as kernels
@@ -160,7 +161,7 @@ def _without_mean_offset(x: Floats, C: Floats) -> tuple[Floats, Floats, float]:
     count = len(x) // kernels.STATION
     shared = float(x[of_range > 0.0].mean())
     relative = np.eye(len(x)) - np.outer(of_range, of_range) / count
-    C = normals.product(normals.product(relative, C), np.ascontiguousarray(relative.T))
+    C = product(product(relative, C), np.ascontiguousarray(relative.T))
     return x - shared * of_range, C, shared
 
 
@@ -298,7 +299,7 @@ def _controlled(stations: Stations, x: Floats, control: ControlPoints, doubt: Do
     M = common_motion(stations.places)[:, 3:]
     shift = np.mean(x.reshape(-1, kernels.STATION)[:, 3:6], axis=0)
     shifted = f"all stations were moved to them by {np.linalg.norm(shift):.2g} mm (mean)"
-    C = stations.covariance + normals.product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
+    C = stations.covariance + product(M * doubt.off, np.ascontiguousarray((M * doubt.off).T))
     return replace(
         stations,
         status="weak" if doubt.off.any() else stations.status,

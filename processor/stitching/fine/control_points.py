@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve
 
-from processor.adjustment import data_snooping
+from processor.adjustment import control_points, data_snooping
 from processor.geometry import rigid
 from processor.model import Control, Floats, InputError, Ints, Reason, reason
 from processor.stitching import common_points
@@ -23,7 +23,6 @@ from processor.stitching.result import ControlPoints, ControlSightings
 
 Bools = npt.NDArray[np.bool_]
 
-LEAST_POINTS = 3
 CLEAR = 10.0  # least distance from a line in standard deviations; nearer points do not determine the rotation about it
 LEAST_SD_MM = 1e-3  # of a sighting; the covariance would be singular without
 ROUNDS, STILL = 12, 1e-10
@@ -53,9 +52,7 @@ class Sightings:
     @property
     def covariance(self) -> Floats:
         """Covariance (3m, 3m) of known less seen places, without that of the scans' poses; the same along all axes."""
-        shared = (self.point[:, None] == self.point) * np.outer(self.known_sd, self.known_sd)
-        found: Floats = np.kron(shared + np.diag(self.seen_sd**2), np.eye(3))
-        return found
+        return control_points.covariance(self.point, self.known_sd, self.seen_sd)
 
 
 @dataclass(frozen=True)
@@ -260,12 +257,10 @@ def _loosened(sightings: Sightings, T: Floats, prior: Floats) -> tuple[Fit, floa
 def _shortage(sightings: Sightings) -> Reason | None:
     """Return why sightings do not determine the frame, or None: fewer than three points, or nearly on a line."""
     first = np.unique(sightings.point, return_index=True)[1]
-    if len(first) < LEAST_POINTS:
+    if len(first) < control_points.LEAST_POINTS:
         return reason("stitch.control-few", points=len(first))
-    known = sightings.known[first]
-    widths = np.linalg.svd(known - known.mean(axis=0), compute_uv=False)
     sd = float(np.hypot(sightings.known_sd, sightings.seen_sd).max())
-    if widths[1] < max(common_points.LEAST_HEIGHT * widths[0], CLEAR * sd):
+    if not control_points.determine_motion(sightings.known[first], common_points.LEAST_HEIGHT, CLEAR * sd):
         return reason("stitch.control-on-a-line")
     return None
 

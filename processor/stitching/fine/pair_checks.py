@@ -108,7 +108,7 @@ def _loop(path: list[Pair], start: int) -> Loop:
     for pair in path:
         forward = pair.a == at
         # With rotations about the origin of a's frame the adjoint transforms the covariance.
-        covariance = frames.about_origin(pair.covariance, pair.T_a_b[:3, 3])
+        covariance = rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
             C = C + _transformed(covariance, T)
             T = T @ pair.T_a_b
@@ -126,6 +126,6 @@ def _transformed(covariance: Floats, T: Floats) -> Floats:
     """Transform the covariance (6, 6) of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
     J = np.zeros((6, 6))
     J[:3, :3] = J[3:, 3:] = T[:3, :3]
-    J[3:, :3] = frames.cross_matrix(T[:3, 3]) @ T[:3, :3]
+    J[3:, :3] = rigid.cross_matrix(T[:3, 3]) @ T[:3, :3]
     transformed: Floats = J @ covariance @ J.T
     return transformed

@@ -1,0 +1,19 @@
+"""Fixtures of several test files."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.support.scan_folders import BOX, arch_design, surface, write_ply, write_xyz
+
+
+@pytest.fixture
+def bridge(tmp_path):
+    """A folder of two scans in metres and a design in mm."""
+    place = tmp_path / "bridge"
+    for i, name in enumerate(("foot1", "rib1")):
+        write_xyz(place / f"scans/{name}.xyz", surface(i))
+        write_ply(place / f"design/{name}.ply", (BOX + np.array([4.0 * i, 0, 0])) * 1000.0)
+    (place / "design.json").write_text(json.dumps(arch_design()))
+    return place
