@@ -112,8 +112,10 @@ def described(default: Any = dataclasses.MISSING, **shown: Any) -> Any:
     ``words``: the vocabulary of a single word.
     ``unit``: of its numbers. ``heading``: its English name in tables; the field's name without one. ``json``: its key
     in results.json, "a.b" for a key b within a, "" where it is not written; the field's name without one. A star in
-    the key of a column stands for the names in ``keys``, which the column's second axis is for. ``optional``: not
-    written where it is empty. ``where``: a column is written in rows where the column of this name is finite.
+    the key stands for the names in ``keys``, which the items of an array (of a column: of its rows) are for. ``axes``:
+    names along several axes, written as nested objects. ``by``: the column of a nested table by which its rows are
+    named in an object. ``sentence``: the key of the English text of reasons. ``optional``: not written where it is
+    empty. ``where``: a column is written in rows where the column of this name is finite.
     """
     return dataclasses.field(default=default, metadata=shown)
 

@@ -1,8 +1,8 @@
-"""An assembly held against the truth of the parts that were scanned.
+"""Errors of an assembly against the truth of the scanned parts.
 
-The gaps of parts that are not perfect depend on the objective: they are held against those that the same objective has
-on the true key points and edges, found by a general minimiser that shares nothing with the adjustment. Joints and parts
-of which the answer knows nothing do not pull in it, so they do not pull in the truth either.
+The gaps of imperfect parts depend on the objective. They are compared with those that the same objective has for the
+true key points and edges, computed by a general minimiser that shares no code with the adjustment. Joints and parts
+without a result have no weight in the adjustment, and so none here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from scipy.optimize import least_squares
 from processor.evaluation.error_statistics import signed
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
-from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Truth
+from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Status, Truth
 from processor.preassembly import errors
 from processor.preassembly.chain.adjustment import HOLD
 from processor.preassembly.result import Result
@@ -26,50 +26,50 @@ TRUE_LINEAR = "linear error of the true edges"
 
 
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
-    """Hold an assembly against the truth of scanned parts.
+    """Compare an assembly with the truth of the scanned parts.
 
-    Limits: a pose given as ok must be the right one (a wrong answer without a flag is never accepted); the splicing of
-    perfect parts keeps within 5 mm at a spacing of 5 mm or less. All else informs.
+    Limits: a pose with status ok must be the right one; the splicing error of perfect parts is at most 5 mm at a
+    spacing of 5 mm or less. All other figures are for information.
     """
     if truth.arch is None or scene.arch is None:
         return []
     true = {name: i for i, name in enumerate(truth.arch.names)}
-    true_poses = [truth.arch.T_bridge_scan[true[name]] for name in result.components]
+    true_poses = [truth.arch.T_bridge_scan[true[name]] for name in result.components.name]
     key_error, turns, wrong = [], [], 0
-    for i, name in enumerate(result.components):
-        points = result.key_points_scan[i] - truth.arch.key_points_scan[true[name]]
+    for i, name in enumerate(result.components.name):
+        points = result.components.key_points_scan[i] - truth.arch.key_points_scan[true[name]]
         key_error.append(points[np.isfinite(points).all(axis=2)])
-        if np.isfinite(result.T_bridge_scan[i]).all():
-            turn = rigid.rotation_angle(result.T_bridge_scan[i][:3, :3] @ true_poses[i][:3, :3].T)
+        if np.isfinite(result.components.T_bridge_scan[i]).all():
+            turn = rigid.rotation_angle(result.components.T_bridge_scan[i][:3, :3] @ true_poses[i][:3, :3].T)
             turns.append(turn)
-            wrong += turn > WRONG_POSE_RAD and result.component_status[i] == "ok"
+            wrong += turn > WRONG_POSE_RAD and result.components.status[i] == Status.OK
     errors_at_points = np.vstack(key_error)
     mean, largest = _true_linear_error(scene.arch, result, truth.arch, true, true_poses)
     limit = 5.0 if truth.spacing_mm <= 5.0 else float("nan")
-    own = np.abs(_gaps_of_truth(result, truth.arch, true, true_poses))
+    true_gaps = np.abs(_gaps_of_truth(result, truth.arch, true, true_poses))
     return [
         Metric("preassemble", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
-        Metric("preassemble", "splicing error", result.splicing_mean, Statistic.MEAN, unit="mm", limit=limit),
-        Metric("preassemble", "splicing error", result.splicing_max, Statistic.MAX, unit="mm"),
-        Metric("preassemble", TRUE_SPLICING, _over(np.mean, own), Statistic.MEAN, unit="mm"),
-        Metric("preassemble", TRUE_SPLICING, _over(np.max, own), Statistic.MAX, unit="mm"),
+        Metric("preassemble", "splicing error", result.splicing.mean, Statistic.MEAN, unit="mm", limit=limit),
+        Metric("preassemble", "splicing error", result.splicing.max, Statistic.MAX, unit="mm"),
+        Metric("preassemble", TRUE_SPLICING, _over(np.mean, true_gaps), Statistic.MEAN, unit="mm"),
+        Metric("preassemble", TRUE_SPLICING, _over(np.max, true_gaps), Statistic.MAX, unit="mm"),
         Metric("preassemble", TRUE_LINEAR, mean, Statistic.MEAN, unit="mm"),
         Metric("preassemble", TRUE_LINEAR, largest, Statistic.MAX, unit="mm"),
         Metric("preassemble", "key points in the scan", _rms(errors_at_points), Statistic.RMS, unit="mm"),
         *_coverage(result, truth.arch, true),
         *signed("preassemble", "key points", errors_at_points),
-        *_gaps_as_they_should_be(scene.arch, result, truth.arch, true),
+        *_gaps_by_objective(scene.arch, result, truth.arch, true),
         Metric("preassemble", "pose, largest turn", 1000.0 * max(turns, default=float("nan")), unit="mrad"),
     ]
 
 
 def _coverage(result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
-    """How many of the key points' coordinates lie within their 95 % intervals, where a method states any."""
-    off = result.key_points_scan - truth.key_points_scan[[true[name] for name in result.components]]
-    known = np.isfinite(off) & np.isfinite(result.key_points_sd)
+    """Share of key point coordinates within their 95 % intervals, where a method states any."""
+    error = result.components.key_points_scan - truth.key_points_scan[[true[name] for name in result.components.name]]
+    known = np.isfinite(error) & np.isfinite(result.components.key_points_sd)
     if not known.any():
         return []
-    share = float((np.abs(off[known]) <= NORMAL_95 * result.key_points_sd[known]).mean())
+    share = float((np.abs(error[known]) <= NORMAL_95 * result.components.key_points_sd[known]).mean())
     return [Metric("preassemble", "key points", 100.0 * share, Statistic.COVERAGE, unit="%")]
 
 
@@ -83,44 +83,45 @@ def _over(what: Callable[[Floats], Floats], values: Floats) -> float:
 
 
 def _gaps_of_truth(result: Result, truth: ArchTruth, true: dict[str, int], true_poses: list[Floats]) -> Floats:
-    """Gaps (j, 8, 3) of the true key points at the poses found: the poses' own error where parts are perfect."""
-    moved = []
-    for name, pose, true_pose in zip(result.components, result.T_bridge_scan, true_poses, strict=True):
-        moved.append(rigid.apply(pose @ rigid.invert(true_pose), truth.key_points_bridge[true[name]]))
-    ends = np.array(moved)
-    found: Floats = ends[1:, 0] - ends[:-1, 1]
-    return found
+    """Gaps (j, 8, 3) of the true key points at the estimated poses: errors of the poses where parts are perfect."""
+    placed = []
+    for name, pose, true_pose in zip(result.components.name, result.components.T_bridge_scan, true_poses, strict=True):
+        placed.append(rigid.apply(pose @ rigid.invert(true_pose), truth.key_points_bridge[true[name]]))
+    ends = np.array(placed)
+    gaps: Floats = ends[1:, 0] - ends[:-1, 1]
+    return gaps
 
 
-def _gaps_as_they_should_be(design: ArchDesign, result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
-    """Hold the gaps of an adjustment against those of the truth under its objective."""
-    if not np.isfinite(result.weight):
+def _gaps_by_objective(design: ArchDesign, result: Result, truth: ArchTruth, true: dict[str, int]) -> list[Metric]:
+    """Compare the gaps of an adjustment with those of the truth under its objective."""
+    if result.adjustment is None:
         return []
-    known = np.isfinite(result.gaps) & np.isfinite(result.gap_ci95)
+    known = np.isfinite(result.joints.gaps) & np.isfinite(result.joints.gap_ci95)
     if not known.any():
         return []
-    rows = [true[name] for name in result.components]
+    rows = [true[name] for name in result.components.name]
     edges, ends = truth.edges_bridge[rows], truth.key_points_bridge[rows]
-    edges[~np.isfinite(result.T_bridge_scan[:, 0, 0])] = np.nan
+    edges[~np.isfinite(result.components.T_bridge_scan[:, 0, 0])] = np.nan
     for j, there in enumerate(known):
         if not there.all():
             ends[j, 1] = ends[j + 1, 0] = np.nan
-    gaps, linear = by_objective(design, ends, edges, result.weight)
-    off = (result.gaps - gaps)[known]
-    share = 100.0 * float((np.abs(off) <= result.gap_ci95[known]).mean())
+    gaps, linear = by_objective(design, ends, edges, result.adjustment.weight)
+    error = (result.joints.gaps - gaps)[known]
+    share = 100.0 * float((np.abs(error) <= result.joints.gap_ci95[known]).mean())
     return [
-        Metric("preassemble", "gaps against the truth's", float(np.sqrt(np.mean(off**2))), Statistic.RMS, unit="mm"),
+        Metric("preassemble", "gaps against the truth's", float(np.sqrt(np.mean(error**2))), Statistic.RMS, unit="mm"),
         Metric("preassemble", "gaps", share, Statistic.COVERAGE, unit="%"),
-        *_errors_held(result, gaps[known], linear),
-        *signed("preassemble", "gaps", off),
+        *_mean_max_coverage(result, gaps[known], linear),
+        *signed("preassemble", "gaps", error),
     ]
 
 
-def _errors_held(result: Result, gaps: Floats, linear: Floats) -> list[Metric]:
-    """How many of the mean and largest errors lie within their intervals; the truth has gaps (g,), departures (s,)."""
+def _mean_max_coverage(result: Result, gaps: Floats, linear: Floats) -> list[Metric]:
+    """Share of the mean and largest errors within their intervals; the truth has gaps (g,) and departures (s,)."""
     if not len(result.errors_ci95):
         return []
-    stated = np.array([result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max])
+    linear_error = result.linear.assembled.error
+    stated = np.array([result.splicing.mean, result.splicing.max, linear_error.mean, linear_error.max])
     size = np.abs(gaps)
     true = np.array([size.mean(), size.max(), _over(np.mean, linear), _over(np.max, linear)])
     share = float((np.abs(stated - true) <= result.errors_ci95[:4]).mean())
@@ -128,46 +129,45 @@ def _errors_held(result: Result, gaps: Floats, linear: Floats) -> list[Metric]:
 
 
 def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: float) -> tuple[Floats, Floats]:
-    """Gaps (j, 8, 3) where the sum of squared gaps and ``weight`` times that of the edges' departures is least.
+    """Minimise the sum of squared gaps plus ``weight`` times that of the edges' departures over the parts' motions.
 
-    Beside them the distances (s,) of the edges from the design's there, at all stations.
-
-    ``key_points`` (c, 2, 8, 3) and ``edges`` (c, 2, e, 3) of the parts, near where the design has them; bridge frame.
-    Joints with an end that is NaN do not pull, nor do edges that are; then parts are held along their chords as the
-    adjustment holds them.
+    Return the gaps (j, 8, 3) at the minimum, and the distances (s,) of the edges from the design's at all chainages.
+    ``key_points`` (c, 2, 8, 3) and ``edges`` (c, 2, e, 3) of the parts are near their places in the design, in the
+    bridge's frame. Joints and edges with NaN have no weight; parts are then constrained along their chords as in the
+    adjustment.
     """
     lines = [(Polyline.through(p.bottom_edge_left), Polyline.through(p.bottom_edge_right)) for p in design.parts]
     middles = [part.vertices.mean(axis=0) for part in design.parts]
     joined = np.isfinite(key_points[1:, 0] - key_points[:-1, 1]).all(axis=(1, 2))
     seen = [i for i in range(len(lines)) if np.isfinite(edges[i]).all()]
-    stations = {(i, k): _at_stations(edges[i, k], lines[i][k]) for i in seen for k in range(2)}
+    at_chainages = {(i, k): _at_chainages(edges[i, k], lines[i][k]) for i in seen for k in range(2)}
     chords = np.array([right.at(np.array([right.length]))[0] - left.at(np.array([0.0]))[0] for left, right in lines])
     chords /= np.linalg.norm(chords, axis=1)[:, None]
     hold = 0.0 if joined.all() else np.sqrt(HOLD)
 
     def placed(x: Floats, i: int, points: Floats) -> Floats:
         R = rigid.rotation_from_vector(1e-3 * x[6 * i : 6 * i + 3])
-        found: Floats = (points - middles[i]) @ R.T + middles[i] + x[6 * i + 3 : 6 * i + 6]
-        return found
+        at: Floats = (points - middles[i]) @ R.T + middles[i] + x[6 * i + 3 : 6 * i + 6]
+        return at
 
     def gaps(x: Floats) -> Floats:
         pairs = range(len(lines) - 1)
         return np.array([placed(x, i + 1, key_points[i + 1, 0]) - placed(x, i, key_points[i, 1]) for i in pairs])
 
     def departures(x: Floats) -> Floats:
-        off = (lines[i][k].nearest(placed(x, i, at))[1] for (i, k), at in stations.items())
-        return np.vstack([np.zeros((0, 3)), *off])
+        vectors = (lines[i][k].nearest(placed(x, i, at))[1] for (i, k), at in at_chainages.items())
+        return np.vstack([np.zeros((0, 3)), *vectors])
 
     def objective(x: Floats) -> Floats:
         along = np.einsum("ci,ci->c", chords, x.reshape(-1, 6)[:, 3:])
         return np.concatenate([gaps(x)[joined].ravel(), np.sqrt(weight) * departures(x).ravel(), hold * along])
 
-    found = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    return gaps(found.x), np.linalg.norm(departures(found.x), axis=1)
+    solution = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12)
+    return gaps(solution.x), np.linalg.norm(departures(solution.x), axis=1)
 
 
-def _at_stations(edge: Floats, line: Polyline) -> Floats:
-    """Points of an edge as built at the design's stations."""
+def _at_chainages(edge: Floats, line: Polyline) -> Floats:
+    """Points of an edge as built at the design's chainages."""
     arc = line.nearest(edge)[0]
     count = max(1, int(line.length / errors.INTERVAL_MM))
     at = errors.INTERVAL_MM * (np.arange(count) + 0.5)
@@ -177,12 +177,12 @@ def _at_stations(edge: Floats, line: Polyline) -> Floats:
 def _true_linear_error(
     design: ArchDesign, result: Result, truth: ArchTruth, true: dict[str, int], true_poses: list[Floats]
 ) -> tuple[float, float]:
-    """Mean and maximum distance to the design of the bottom edges as built, at the poses found, at all stations."""
+    """Mean and maximum distance of the bottom edges as built from the design, at the estimated poses."""
     distances = []
-    for part, pose, true_pose in zip(design.parts, result.T_bridge_scan, true_poses, strict=True):
+    for part, pose, true_pose in zip(design.parts, result.components.T_bridge_scan, true_poses, strict=True):
         lines = (Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right))
         for line, edge in zip(lines, truth.edges_bridge[true[part.name]], strict=True):
-            moved = rigid.apply(pose @ rigid.invert(true_pose), _at_stations(edge, line))
-            distances.append(np.linalg.norm(line.nearest(moved)[1], axis=1))
+            placed = rigid.apply(pose @ rigid.invert(true_pose), _at_chainages(edge, line))
+            distances.append(np.linalg.norm(line.nearest(placed)[1], axis=1))
     joined = np.concatenate(distances)
     return _over(np.mean, joined), _over(np.max, joined)

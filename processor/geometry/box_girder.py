@@ -20,11 +20,6 @@ from processor.geometry import rigid
 from processor.model import ArchDesign, DesignPart, Floats, InputError, Ints
 
 SOURCE = "curves"
-COST = (
-    "no design mesh, only joints and bottom edges: where the part is as designed key points are about 1.2 times less "
-    "sure along the bridge, 1.6 times across it, and the tilt of its ends 1.3 times; where its own departures are "
-    "larger than noise nothing is lost; no mark tells its ends, or parts of one shape, apart"
-)
 PLATE_MM = 20.0
 RING_SHARE = 0.7  # of a plate's thickness, so that points on the inner wall are not taken for the ring
 MESH_ERROR_MM = 0.002  # along the curve
@@ -110,14 +105,6 @@ def mesh(
         faces.append((triangles[:, ::-1] if share == 1.0 else triangles) + sum(map(len, vertices)))
         vertices.append(ring)
     return np.vstack(vertices), np.vstack(faces).astype(np.int64)
-
-
-def cost(part: DesignPart) -> str:
-    """Message on the loss of accuracy of a part whose design is known by its curves alone; empty for one with a mesh.
-
-    The figures are those of recipe arch-s1, sigma 1 mm, spacing 10 mm, over three seeds as designed and as built.
-    """
-    return COST if part.source == SOURCE else ""
 
 
 def alike(part: DesignPart, design: ArchDesign) -> tuple[str, ...]:

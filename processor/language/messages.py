@@ -8,7 +8,7 @@ The catalogue of a language is the TOML files CODE-PART.toml beside this file, i
 
 Templates have the syntax of :meth:`str.format` with named fields. Fields without a format have three decimals where
 they are numbers. ``{n:?scan|scans}`` is the first word for n = 1 and the second otherwise. Values that are messages or
-words are translated; lists are joined, those of reasons with semicolons.
+words are translated; lists are joined by commas, those of reasons and ``{list:;}`` by semicolons; ``{list:.}`` are sentences.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import importlib.resources
 import math
 import string
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
@@ -31,7 +31,7 @@ else:
 
 CODES = ("en", "zh")
 LIST = {"en": ", ", "zh": "、"}
-REASONS = {"en": "; ", "zh": "；"}
+SEMICOLON = {"en": "; ", "zh": "；"}
 NO_NUMBER = "–"
 
 
@@ -93,7 +93,7 @@ class Messages(string.Formatter):
             word = str(message)
             return self.words.get(f"{type(message).__name__}.{word}", self.words.get(word, word))
         if isinstance(message, list | tuple):
-            separators = REASONS if any(isinstance(item, Reason) for item in message) else LIST
+            separators = SEMICOLON if any(isinstance(item, Reason) for item in message) else LIST
             return separators[self.code].join(map(self.text, message))
         return self.format_field(message, "")
 
@@ -104,17 +104,39 @@ class Messages(string.Formatter):
             return one if value == 1 else many
         if isinstance(value, float) and not math.isfinite(value):
             return NO_NUMBER
+        if format_spec == ".":
+            return self.sentences(value)
+        if format_spec == ";":
+            return SEMICOLON[self.code].join(map(self.text, value))
         if isinstance(value, Text | Reason | Word | list | tuple):
             return self.text(value)
         if isinstance(value, float) and not format_spec:
             return f"{value:.3f}"
         return format(value, format_spec)
 
-    def sentences(self, reasons: tuple[Reason, ...]) -> str:
-        """Write reasons one after the other, as sentences."""
+    def sentences(self, messages: Iterable[Message]) -> str:
+        """Write messages one after the other, as sentences; names keep their case."""
         stop, space = ("。", "") if self.code == "zh" else (".", " ")
-        written = (self.text(one) for one in reasons)
-        return space.join(one[:1].upper() + one[1:] + ("" if one.endswith((stop, "?")) else stop) for one in written)
+        sentences = []
+        for message in messages:
+            written = self.text(message)
+            if not self._starts_with_name(message):
+                written = written[:1].upper() + written[1:]
+            sentences.append(written + ("" if written.endswith((stop, "?")) else stop))
+        return space.join(sentences)
+
+    def _starts_with_name(self, message: Any) -> bool:
+        """Tell whether a message starts with a value that is a name from the input."""
+        if isinstance(message, list | tuple):
+            return bool(message) and self._starts_with_name(message[0])
+        if not isinstance(message, Text | Reason):
+            return isinstance(message, str) and not isinstance(message, Word)
+        if isinstance(message, Text):
+            template = self.texts.get(message.template, message.template)
+        else:
+            template = self.reasons.get(message.code, message.code)
+        literal, name, *_ = next(iter(self.parse(template)), ("", None))
+        return not literal and bool(name) and self._starts_with_name((message.values or {}).get(name or ""))
 
     def of_scripts(self, scripts: str) -> dict[str, str]:
         """Return the texts that the page's own scripts show: those that stand there between quotation marks."""

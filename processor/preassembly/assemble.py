@@ -25,7 +25,7 @@ from processor.preassembly.result import Result
 from processor.preassembly.to_result import Assembly, JudgedJoint
 from processor.preassembly.verdicts import chain as chain_verdicts
 from processor.preassembly.verdicts import joint_measures, joints, reasons, trim_and_shim
-from processor.preassembly.verdicts.joints import Verdict
+from processor.preassembly.verdicts.joints import Conformity
 from processor.progress import tracked
 
 REFERENCE_C = 20.0
@@ -82,10 +82,10 @@ def _judge_joints(
     judged = []
     for j, (left, right) in enumerate(pairwise(parts)):
         measures = joint_measures.measure(gaps[j], adjusted.gap_covariance[j], frames[j], design.joint_points[j])
-        unsure, weak = reasons.of_joint(left, right), reasons.weak_parts(left, right)
-        verdict = joints.left_open(joints.judge(measures, limits), unsure)
-        proposal = trim_and_shim.propose(design.joint_names[j], measures, limits, trim, unsure=unsure, rests_on=weak)
-        judged.append(JudgedJoint(measures, verdict, proposal))
+        doubts, weak = reasons.of_joint(left, right), reasons.weak_parts(left, right)
+        conformity = joints.left_open(joints.judge(measures, limits), doubts)
+        proposal = trim_and_shim.propose(measures, limits, trim, doubts=doubts, weak_parts=weak)
+        judged.append(JudgedJoint(measures, conformity, proposal))
     return judged
 
 
@@ -95,9 +95,9 @@ def _judge_chain(
     figures: span_and_closure.Figures,
     design: ArchDesign,
     limits: Tolerance,
-) -> Verdict:
+) -> Conformity:
     """Compare span and edges with the limits of the whole chain."""
     members = [part.member for part in parts]
     quantities = chain_verdicts.quantities(members, adjusted, figures.span_departure, figures.span_ci95)
-    unsure = reasons.of_chain(parts, design.joint_names, adjusted.gaps)
-    return chain_verdicts.judge(quantities, limits, span_and_closure.design_span(design), unsure)
+    doubts = reasons.of_chain(parts, design.joint_names, adjusted.gaps)
+    return chain_verdicts.judge(quantities, limits, span_and_closure.design_span(design), doubts)

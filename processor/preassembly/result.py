@@ -1,82 +1,228 @@
-"""What preassembly answers."""
+"""The result of step ``preassemble``."""
 
 from __future__ import annotations
 
+import dataclasses
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from processor.model import Checked, Floats, Labels, column, names
+from processor.model import (
+    ENDS,
+    KEY_POINTS,
+    Checked,
+    Floats,
+    Labels,
+    Reason,
+    Rows,
+    Status,
+    Verdict,
+    Word,
+    column,
+    described,
+    names,
+    optional,
+    reasons,
+    words,
+    worst,
+)
+from processor.preassembly.parts.systematic_errors import BudgetSource
 from processor.preassembly.verdicts.joint_measures import Measures
-from processor.preassembly.verdicts.joints import Verdict
+from processor.preassembly.verdicts.joints import Conformity
 from processor.preassembly.verdicts.trim_and_shim import Proposal
+
+NAN = float("nan")
+MEAN_MAX = ("mean", "max")
+
+
+class Gauge(Word):
+    """What fixes the assembled chain in the bridge's frame."""
+
+    UNKNOWN = ""
+    ALL = "all joints and the design's curve at once"
+    PRINCIPAL_AXES = "Foot 1 at its principal-axes attitude, its joint corners on the design's"
+    LINES = "Foot 1 aligned to the design's lines"
+
+
+class EdgeSide(Word):
+    """A bottom edge of the bridge."""
+
+    LEFT = "left"
+    RIGHT = "right"
+
+
+@dataclass(frozen=True)
+class Components(Rows):
+    """The components in assembly order. Axis of length 2: start and end of a component. NaN = not known.
+
+    ``scans`` names those used; poses and key points P1..P8 are in the frame of the first. The paper's methods state no
+    covariance.
+    """
+
+    name: tuple[str, ...] = names("c")
+    status: tuple[Status, ...] = words("c", Status)
+    reasons: tuple[tuple[Reason, ...], ...] = reasons("c")
+    scans: tuple[str, ...] = names("c")
+    T_bridge_scan: Floats = column("c", 4, 4)
+    covariance: Floats = column("c", 6, 6)
+    key_points_scan: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS))
+    key_points_sd: Floats = column("c", 2, 8, 3, axes=(ENDS, KEY_POINTS))
+
+
+@dataclass(frozen=True)
+class Joints(Rows):
+    """The joints: gaps are right part minus left part at the assembled pose, bridge axes, mm."""
+
+    name: tuple[str, ...] = names("j")
+    left: tuple[str, ...] = names("j")
+    right: tuple[str, ...] = names("j")
+    gaps: Floats = column("j", 8, 3, json="points.*.gap", keys=KEY_POINTS, unit="mm")
+    gap_ci95: Floats = column("j", 8, 3, json="points.*.ci95", keys=KEY_POINTS, unit="mm")
+    verdict: tuple[Verdict, ...] = words("j", Verdict)
+
+
+@dataclass(frozen=True)
+class MeanMax(Checked):
+    """Mean and largest error, mm, with half-widths that cover both with 95 % or more, where a method states them."""
+
+    mean: float = described(NAN, unit="mm")
+    max: float = described(NAN, unit="mm")
+    ci95: Floats = optional(2, json="*_ci95", keys=MEAN_MAX, unit="mm")
+
+
+@dataclass(frozen=True)
+class Deviations(Checked):
+    """Distances of the bottom edges from the design's, at the chainages of the linear error, mm."""
+
+    error: MeanMax = dataclasses.field(default_factory=MeanMax, metadata={"json": "."})
+    deviation: Floats = column("s", unit="mm")
+    ci95: Floats = column("b", unit="mm")  # half-width that holds 95 % or more; of some methods empty
+
+
+@dataclass(frozen=True)
+class Linear(Checked):
+    """Linear error as assembled, and with Foot 1 best-fit to the design.
+
+    ``chainage`` is the arc length from the start of the design's bottom edge.
+    """
+
+    gauge: Gauge = described(Gauge.UNKNOWN, words=Gauge)
+    chainage: Floats = column("s", json="stations", unit="mm")
+    edge: tuple[EdgeSide, ...] = words("s", EdgeSide)
+    assembled: Deviations = dataclasses.field(default_factory=Deviations, metadata={"json": "."})
+    best_fit: Deviations = dataclasses.field(default_factory=Deviations, metadata={"json": "foot1_best_fit"})
+
+
+@dataclass(frozen=True)
+class TradeOff(Rows):
+    """Errors over the weight lambda of the design's curve, mm."""
+
+    weight: Floats = column("t", json="lambda")
+    splicing_mean: Floats = column("t", unit="mm")
+    splicing_max: Floats = column("t", unit="mm")
+    linear_mean: Floats = column("t", unit="mm")
+    linear_max: Floats = column("t", unit="mm")
+
+    @property
+    def figures(self) -> Floats:
+        """All four errors (t, 4)."""
+        return np.column_stack([self.splicing_mean, self.splicing_max, self.linear_mean, self.linear_max])
+
+
+@dataclass(frozen=True)
+class JudgedJoints(Rows):
+    """Each joint: its measures, the comparison with the limits, and the proposal."""
+
+    name: tuple[str, ...] = names("j")
+    measures: tuple[Measures, ...] = described((), json=".")
+    conformity: tuple[Conformity, ...] = described((), json=".")
+    proposal: tuple[Proposal, ...] = described(())
+
+
+@dataclass(frozen=True)
+class Rivals(Rows):
+    """The other pose of each ambiguous component."""
+
+    component: tuple[str, ...] = names("r")
+    T_rival_scan: Floats = column("r", 4, 4)
+
+
+@dataclass(frozen=True)
+class Residuals(Rows):
+    """Points of all components, thinned, on the design, bridge frame, and their distances from its surface, mm."""
+
+    points: Floats = column("p", 3, unit="mm")
+    distance: Floats = column("p", unit="mm")
+    component: Labels = column("p", dtype=np.int32)  # row of the components
+
+
+@dataclass(frozen=True)
+class Adjustment(Checked):
+    """What the adjustment alone states.
+
+    ``linear_offset`` is from the design's bottom edges to the left and up, as assembled.
+    ``chain`` has the comparison of span and edges with the limits of the whole chain, ``unused_limits`` those that a
+    project gives and nothing is compared with. ``closure`` is of the joints alone: along the bridge's axes (mm) and
+    about them (mrad). ``budget_sd`` are standard deviations of an end of the longest part.
+    """
+
+    weight: float = described(NAN, json="lambda")
+    joints: JudgedJoints = dataclasses.field(default_factory=JudgedJoints, metadata={"json": "joint_measures"})
+    chain: tuple[Conformity, ...] = described((), json="chain_limits")
+    unused_limits: tuple[str, ...] = names("u", json="limits_not_held")
+    unused_limits_what: tuple[str, ...] = names("u", json="")
+    span_departure: float = described(NAN, json="span.departure", unit="mm")
+    span_ci95: float = described(NAN, json="span.ci95", unit="mm")
+    linear_offset: Floats = column("o", 2, json="linear_offset.left_up", unit="mm")
+    linear_offset_ci95: Floats = column("o", 2, json="linear_offset.ci95", unit="mm")
+    closure: Floats = optional(2, 3, json="closure.*", keys=("mm", "mrad"))
+    closure_ci95: Floats = optional(2, 3, json="closure.ci95_*", keys=("mm", "mrad"))
+    rivals: Rivals = dataclasses.field(default_factory=Rivals, metadata={"json": "ambiguous", "by": "component"})
+    limiting: tuple[Reason, ...] = reasons()
+    advice: tuple[Reason, ...] = reasons()
+    budget_sd: Floats = optional(len(BudgetSource), json="budget_sd.*", keys=tuple(BudgetSource), unit="mm")
+    residuals: Residuals = dataclasses.field(default_factory=Residuals, metadata={"json": ""})
 
 
 @dataclass(frozen=True)
 class Result(Checked):
-    """The assembled bridge. Axis of length 2: the start and the end of a component. NaN = no answer."""
+    """The assembled bridge; NaN = not known."""
 
-    status: str  # ok | partial | failed
-    method: str
-    message: str = ""
-    # a row a component, in assembly order
-    components: tuple[str, ...] = names("c")
-    component_status: tuple[str, ...] = names("c")  # ok | ambiguous | weak | failed
-    component_message: tuple[str, ...] = names("c")
-    component_scans: tuple[str, ...] = names("used")  # names; poses and key points are in the frame of the first
-    T_bridge_scan: Floats = column("c", 4, 4)
-    covariance: Floats = column("c", 6, 6)  # NaN: the paper's methods state none
-    T_rival_scan: Floats = column("r", 4, 4)  # of the adjustment: the other pose of an ambiguous part; NaN of others
-    key_points_scan: Floats = column("c", 2, 8, 3)  # P1..P8 of the start and the end, in the scan's frame
-    key_points_sd: Floats = column("c", 2, 8, 3)
-    # a row a joint
-    joints: tuple[str, ...] = names("j")
-    joint_left: tuple[str, ...] = names("j")
-    joint_right: tuple[str, ...] = names("j")
-    gaps: Floats = column("j", 8, 3)  # right minus left at the assembled pose, bridge axes
-    gap_ci95: Floats = column("j", 8, 3)
-    verdict: tuple[str, ...] = names("j")  # pass | fail | indeterminate
-    splicing_mean: float = float("nan")
-    splicing_max: float = float("nan")
-    # linear error as assembled (`gauge` says what holds the chain) and with Foot 1 best-fit to the design
-    gauge: str = ""
-    linear_mean: float = float("nan")
-    linear_max: float = float("nan")
-    best_fit_linear_mean: float = float("nan")
-    best_fit_linear_max: float = float("nan")
-    linear_station: Floats = column("s")  # arc length from the start of the design's bottom edge
-    linear_edge: tuple[str, ...] = names("s")  # left | right
-    linear_deviation: Floats = column("s")  # as assembled
-    best_fit_linear_deviation: Floats = column("s")
-    # of the adjustment alone, so empty or NaN for other methods, but for three bands: see ``bands_as_designed``
-    measures: tuple[Measures, ...] = ()  # a record a joint
-    judged: tuple[Verdict, ...] = ()
-    proposals: tuple[Proposal, ...] = ()
-    chain_judged: tuple[Verdict, ...] = ()  # one: span and edges against the limits of the whole chain
-    not_held: tuple[str, ...] = names("n")  # keys of limits that the project states and nothing is held against
-    not_held_what: tuple[str, ...] = names("n")
-    linear_offset: Floats = column("o", 2)  # at each station: to the left and up, as assembled
-    linear_offset_ci95: Floats = column("o", 2)
-    linear_ci95: Floats = column("o")  # of linear_deviation: holds 95 % or more
-    best_fit_linear_ci95: Floats = column("o")
-    errors_ci95: Floats = column("e")  # of splicing mean, max; linear mean, max; the same with Foot 1: 95 % or more
-    span_departure: float = float("nan")  # of the outer ends' distance from the design's, mm
-    span_ci95: float = float("nan")
-    closure: Floats = column("k")  # of the joints alone: mm along the bridge's axes, mrad about them
-    closure_ci95: Floats = column("k")
-    limiting: str = ""  # the joint and what was measured there that limit the accuracy
-    advice: str = ""  # the further scan that would help most
-    budget_source: tuple[str, ...] = names("b")
-    budget_sd: Floats = column("b")  # mm, of an end of the longest part
-    residual_points: Floats = column("p", 3)  # of all parts, thinned, on the design; bridge frame
-    residual: Floats = column("p")  # distance from the design's surface
-    residual_component: Labels = column("p", dtype=np.int32)
-    weight: float = float("nan")  # lambda of the adjustment
-    # of the adjustment: over the weight lambda, splicing mean and max, linear mean and max
-    trade_lambda: Floats = column("t")
-    trade_figures: Floats = column("t", 4)
+    status: Status = described(words=Status)
+    method: str = described()
+    reasons: tuple[Reason, ...] = reasons()
+    components: Components = dataclasses.field(default_factory=Components)
+    joints: Joints = dataclasses.field(default_factory=Joints)
+    splicing: MeanMax = dataclasses.field(default_factory=MeanMax, metadata={"json": "splicing_error"})
+    linear: Linear = dataclasses.field(default_factory=Linear, metadata={"json": "linear_error"})
+    trade_off: TradeOff = dataclasses.field(default_factory=TradeOff)
+    adjustment: Adjustment | None = described(None, json=".")
+
+    @property
+    def overall(self) -> Verdict:
+        """The worst verdict on the joints and on the limits of the whole chain."""
+        chain = () if self.adjustment is None else self.adjustment.chain
+        return worst([*self.joints.verdict, *(one.verdict for one in chain if len(one.limits))])
+
+    @property
+    def errors(self) -> tuple[MeanMax, MeanMax, MeanMax]:
+        """Splicing error, linear error as assembled and with Foot 1 best-fit to the design."""
+        return self.splicing, self.linear.assembled.error, self.linear.best_fit.error
+
+    @property
+    def errors_ci95(self) -> Floats:
+        """95 % half-widths (6,) of mean and largest of :attr:`errors`; (0,) of a method that states none."""
+        return np.concatenate([error.ci95 for error in self.errors])
 
     @property
     def bands_as_designed(self) -> bool:
-        """Whether the bands say what the method makes of parts exactly as designed, not where the truth lies."""
-        return bool(np.isfinite(self.errors_ci95).any() and not np.isfinite(self.weight))
+        """Whether the bands are the method's errors of parts exactly as designed, and not about the truth."""
+        return self.adjustment is None and bool(np.isfinite(self.errors_ci95).any())
+
+
+def overall_status(statuses: Sequence[Status]) -> Status:
+    """Return the status of a step by those of its parts."""
+    if all(status == Status.OK for status in statuses):
+        return Status.OK
+    return Status.FAILED if all(status == Status.FAILED for status in statuses) else Status.PARTIAL

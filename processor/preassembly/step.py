@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import ArchDesign, InputError, Scan, Scene, UsageError
+from processor.model import ArchDesign, InputError, Scan, Scene, UsageError, reason
 from processor.preassembly import assemble
 from processor.preassembly.baselines import bootstrap_bands, methods
 from processor.preassembly.params import METHODS, Params
@@ -50,8 +50,8 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
     result = methods.assemble(kept["parts"], design, params)
     result = bootstrap_bands.with_bands(result, kept["scanned again"], design, params)
     if np.isfinite(scene.temperature_C) and scene.temperature_C != assemble.REFERENCE_C:
-        remark = f"the steel's temperature ({scene.temperature_C:g} C) is not corrected for by this method"
-        result = replace(result, message=f"{result.message}; {remark}")
+        remark = reason("preassemble.temperature-not-corrected", temperature=scene.temperature_C)
+        result = replace(result, reasons=(*result.reasons, remark))
     return result
 
 

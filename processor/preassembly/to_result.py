@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from processor.geometry.polyline import Polyline
-from processor.model import NORMAL_95, ArchDesign, Floats, Tolerance
+from processor.model import NORMAL_95, ArchDesign, Floats, Reason, Tolerance, reason
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.chain.edge_errors import EdgeErrors
 from processor.preassembly.chain.placement import Placement
@@ -18,18 +18,33 @@ from processor.preassembly.errors import mean_max, splicing_error
 from processor.preassembly.params import Params, SystematicParams
 from processor.preassembly.parts import systematic_errors
 from processor.preassembly.parts.measure import MeasuredPart
-from processor.preassembly.result import Result
+from processor.preassembly.result import (
+    Adjustment,
+    Components,
+    Deviations,
+    EdgeSide,
+    Gauge,
+    Joints,
+    JudgedJoints,
+    Linear,
+    MeanMax,
+    Residuals,
+    Result,
+    Rivals,
+    TradeOff,
+    overall_status,
+)
 from processor.preassembly.verdicts.chain import unused_limits
 from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
-from processor.preassembly.verdicts.joints import Verdict
+from processor.preassembly.verdicts.joints import Conformity, LimitOrigin
 from processor.preassembly.verdicts.trim_and_shim import Proposal
 
 
 class JudgedJoint(NamedTuple):
-    """One joint: its measures, verdict and proposal."""
+    """One joint: its measures, its conformity with the limits, and the proposal."""
 
     measures: Measures
-    verdict: Verdict
+    conformity: Conformity
     proposal: Proposal
 
 
@@ -48,94 +63,108 @@ class Assembly:
     edges: EdgeErrors
     figures: Figures
     joints: Sequence[JudgedJoint]
-    chain: Verdict
+    chain: Conformity
 
 
 def to_result(assembly: Assembly) -> Result:
     """Make the result record of an assembly."""
-    parts, params = assembly.parts, assembly.params
-    statuses = [part.status for part in parts]
-    sources, budget = _budget(parts, assembly.design, params.systematic)
-    result = Result(
-        status=_overall(statuses),
-        method="adjustment",
-        message=_message(assembly),
-        components=tuple(part.name for part in parts),
-        component_status=tuple(statuses),
-        component_message=tuple(part.message for part in parts),
-        component_scans=tuple(", ".join(scan.name for scan in part.scans) for part in parts),
-        T_bridge_scan=assembly.placement.T_bridge_scan,
-        covariance=assembly.placement.covariance,
-        T_rival_scan=assembly.placement.T_rival_scan,
-        key_points_scan=assembly.placement.key_points_scan,
-        key_points_sd=assembly.placement.key_points_sd,
-        gauge=f"all joints and the design's curve at once, lambda {params.adjust.weight:g}",
-        weight=params.adjust.weight,
-        trade_lambda=np.array(list(assembly.trade_off)),
-        trade_figures=np.array([_trade_figures(adjusted) for adjusted in assembly.trade_off.values()]),
-        **assembly.figures._asdict(),
-        budget_source=sources,
-        budget_sd=budget,
-        residual_points=np.vstack([part.residual_points for part in parts]),
-        residual=np.concatenate([part.residuals for part in parts]),
-        residual_component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
+    parts, placement = assembly.parts, assembly.placement
+    components = Components(
+        name=tuple(part.name for part in parts),
+        status=tuple(part.status for part in parts),
+        reasons=tuple(part.reasons for part in parts),
+        scans=tuple(", ".join(scan.name for scan in part.scans) for part in parts),
+        T_bridge_scan=placement.T_bridge_scan,
+        covariance=placement.covariance,
+        key_points_scan=placement.key_points_scan,
+        key_points_sd=placement.key_points_sd,
     )
-    return _with_edges(_with_joints(result, assembly), assembly)
+    joints, splicing = _joints(assembly)
+    return Result(
+        status=overall_status(components.status),
+        method="adjustment",
+        reasons=tuple(_reasons(assembly)),
+        components=components,
+        joints=joints,
+        splicing=splicing,
+        linear=_linear(assembly.edges),
+        trade_off=_trade_off(assembly.trade_off),
+        adjustment=_adjustment(assembly),
+    )
 
 
-def _with_joints(result: Result, assembly: Assembly) -> Result:
-    """Add the joints, their verdicts and the verdict on the chain."""
+def _joints(assembly: Assembly) -> tuple[Joints, MeanMax]:
+    """Return the joints and their splicing error."""
     gaps, design = assembly.placement.gaps, assembly.design
     sd = _gap_sd(assembly.adjusted)
     mean, largest = splicing_error(gaps)
-    unused = unused_limits(assembly.limits)
-    return replace(
-        result,
-        joints=design.joint_names,
-        joint_left=design.joint_left,
-        joint_right=design.joint_right,
+    joints = Joints(
+        name=design.joint_names,
+        left=design.joint_left,
+        right=design.joint_right,
         gaps=gaps,
         gap_ci95=NORMAL_95 * sd,
-        verdict=tuple(joint.verdict.verdict for joint in assembly.joints),
-        splicing_mean=mean,
-        splicing_max=largest,
-        measures=tuple(joint.measures for joint in assembly.joints),
-        judged=tuple(joint.verdict for joint in assembly.joints),
-        proposals=tuple(joint.proposal for joint in assembly.joints),
-        chain_judged=(assembly.chain,),
-        not_held=tuple(limit.key for limit in unused),
-        not_held_what=tuple(limit.what for limit in unused),
+        verdict=tuple(joint.conformity.verdict for joint in assembly.joints),
+    )
+    ci95 = np.array(mean_max_ci95(gaps.reshape(-1, 1), np.square(sd).reshape(-1, 1)))
+    return joints, MeanMax(mean=mean, max=largest, ci95=ci95)
+
+
+def _linear(edges: EdgeErrors) -> Linear:
+    return Linear(
+        gauge=Gauge.ALL,
+        chainage=edges.chainage,
+        edge=tuple(map(EdgeSide, edges.edge)),
+        assembled=_deviations(edges.assembled, edges.assembled_variance),
+        best_fit=_deviations(edges.at_rest, edges.at_rest_variance),
     )
 
 
-def _with_edges(result: Result, assembly: Assembly) -> Result:
-    """Add the linear error, and the intervals of mean and largest errors."""
-    edges, gaps = assembly.edges, assembly.placement.gaps
-    deviation, best_fit = np.linalg.norm(edges.assembled, axis=1), np.linalg.norm(edges.at_rest, axis=1)
+def _deviations(vectors: Floats, variance: Floats) -> Deviations:
+    """Return the lengths of departures (s, 2) with variances (s, 2)."""
+    deviation = np.linalg.norm(vectors, axis=1)
     mean, largest = mean_max(deviation)
-    best_fit_mean, best_fit_largest = mean_max(best_fit)
-    gap_variance = np.square(_gap_sd(assembly.adjusted)).reshape(-1, 1)
-    return replace(
-        result,
-        linear_mean=mean,
-        linear_max=largest,
-        best_fit_linear_mean=best_fit_mean,
-        best_fit_linear_max=best_fit_largest,
-        linear_station=edges.chainage,
-        linear_edge=edges.edge,
-        linear_deviation=deviation,
-        best_fit_linear_deviation=best_fit,
+    error = MeanMax(mean=mean, max=largest, ci95=np.array(mean_max_ci95(vectors, variance)))
+    return Deviations(error=error, deviation=deviation, ci95=_band(variance))
+
+
+def _trade_off(by_weight: Mapping[float, Adjusted]) -> TradeOff:
+    figures = np.array([_trade_figures(adjusted) for adjusted in by_weight.values()])
+    return TradeOff(
+        weight=np.array(list(by_weight)),
+        splicing_mean=figures[:, 0],
+        splicing_max=figures[:, 1],
+        linear_mean=figures[:, 2],
+        linear_max=figures[:, 3],
+    )
+
+
+def _adjustment(assembly: Assembly) -> Adjustment:
+    parts, edges, figures = assembly.parts, assembly.edges, assembly.figures
+    T_rival = assembly.placement.T_rival_scan
+    ambiguous = [i for i in range(len(parts)) if np.isfinite(T_rival[i]).all()]
+    unused = unused_limits(assembly.limits)
+    return Adjustment(
+        weight=assembly.params.adjust.weight,
+        joints=JudgedJoints(
+            name=assembly.design.joint_names,
+            measures=tuple(joint.measures for joint in assembly.joints),
+            conformity=tuple(joint.conformity for joint in assembly.joints),
+            proposal=tuple(joint.proposal for joint in assembly.joints),
+        ),
+        chain=(assembly.chain,),
+        unused_limits=tuple(limit.key for limit in unused),
+        unused_limits_what=tuple(limit.what for limit in unused),
         linear_offset=edges.assembled,
         linear_offset_ci95=NORMAL_95 * np.sqrt(np.maximum(edges.assembled_variance, 0.0)),
-        linear_ci95=_band(edges.assembled_variance),
-        best_fit_linear_ci95=_band(edges.at_rest_variance),
-        errors_ci95=np.array(
-            [
-                *mean_max_ci95(gaps.reshape(-1, 1), gap_variance),
-                *mean_max_ci95(edges.assembled, edges.assembled_variance),
-                *mean_max_ci95(edges.at_rest, edges.at_rest_variance),
-            ]
+        rivals=Rivals(component=tuple(parts[i].name for i in ambiguous), T_rival_scan=T_rival[ambiguous]),
+        budget_sd=_budget(parts, assembly.design, assembly.params.systematic),
+        residuals=Residuals(
+            points=np.vstack([part.residual_points for part in parts]),
+            distance=np.concatenate([part.residuals for part in parts]),
+            component=np.repeat(np.arange(len(parts), dtype=np.int32), [len(p.residuals) for p in parts]),
         ),
+        **figures._asdict(),
     )
 
 
@@ -151,22 +180,14 @@ def _band(variance: Floats) -> Floats:
     return band
 
 
-def _overall(statuses: Sequence[str]) -> str:
-    if all(status == "ok" for status in statuses):
-        return "ok"
-    return "failed" if all(status == "failed" for status in statuses) else "partial"
-
-
 def _trade_figures(adjusted: Adjusted) -> tuple[float, float, float, float]:
     """Splicing mean and maximum, linear mean and maximum."""
     sizes = np.concatenate([np.linalg.norm(departure, axis=1) for departure in adjusted.departures])
     return (*splicing_error(adjusted.gaps), *mean_max(sizes))
 
 
-def _budget(
-    parts: Sequence[MeasuredPart], design: ArchDesign, systematic: SystematicParams
-) -> tuple[tuple[str, ...], Floats]:
-    """Return the sources of error of an end of the longest part, and their standard deviations, mm.
+def _budget(parts: Sequence[MeasuredPart], design: ArchDesign, systematic: SystematicParams) -> Floats:
+    """Return the standard deviations, mm, of an end of the longest part by source, in the order of BudgetSource.
 
     The first is the median over the coordinates of the ends as measured: noise, form and differences of stations.
     """
@@ -180,21 +201,25 @@ def _budget(
     stated = systematic_errors.budget(
         systematic, max(Polyline.through(part.bottom_edge_left).length for part in design.parts)
     )
-    return ("ends as measured, median", *stated), np.array([median_sd, *stated.values()])
+    return np.array([median_sd, *stated.values()])
 
 
-def _message(assembly: Assembly) -> str:
+def _reasons(assembly: Assembly) -> Iterator[Reason]:
+    """Yield the remarks on the whole assembly."""
     limits = assembly.limits
-    remarks = [f"lambda {assembly.params.adjust.weight:g}"]
-    remarks.append(
-        "temperature corrected" if assembly.temperature_corrected else "no temperature given: taken as the reference"
-    )
-    verdicts = [*(joint.verdict for joint in assembly.joints), assembly.chain]
-    unverified = any(not verified for verdict in verdicts for verified in verdict.verified)
-    remarks.append(f"limits of {limits.standard or 'the project'}{', not verified' if unverified else ''}")
+    yield reason("preassemble.weight", weight=assembly.params.adjust.weight)
+    if assembly.temperature_corrected:
+        yield reason("preassemble.temperature-corrected")
+    else:
+        yield reason("preassemble.reference-temperature")
+    compared = [*(joint.conformity for joint in assembly.joints), assembly.chain]
+    standard = limits.standard or LimitOrigin.PROJECT
+    if all(conformity.limits.verified.all() for conformity in compared):
+        yield reason("preassemble.limits", standard=standard)
+    else:
+        yield reason("preassemble.limits-not-verified", standard=standard)
     unused = unused_limits(limits)
     if unused:
-        remarks.append(f"limits that nothing is held against: {', '.join(limit.key for limit in unused)}")
+        yield reason("preassemble.unused-limits", limits=tuple(limit.key for limit in unused))
     if not assembly.params.systematic.known:
-        remarks.append("intervals hold noise and what stations differ by: state what they share, offset and scale")
-    return "; ".join(remarks)
+        yield reason("preassemble.systematic-errors-unknown")

@@ -13,7 +13,7 @@ import numpy as np
 from processor.evaluation.evaluate import ErrorReport
 from processor.language import language
 from processor.language.messages import Text, label, messages, text
-from processor.model import Scene, StepRun, Word
+from processor.model import Scene, StepRun, Verdict, Word
 from processor.pipeline import Execution
 from processor.report import all_tables, section, templates, view
 from processor.report.style import Drawn
@@ -118,11 +118,10 @@ def _truth(report: ErrorReport) -> dict[str, Any]:
 
 
 def _tone(run: StepRun) -> str:
-    chain = (one.verdict for one in getattr(run.result, "chain_judged", ()) if one.key)
-    verdicts = (*getattr(run.result, "verdict", ()), *chain)
-    if run.result.status != GOOD or "fail" in verdicts:
+    overall = getattr(run.result, "overall", Verdict.NONE)
+    if run.result.status != GOOD or overall is Verdict.FAIL:
         return "bad"
-    return "" if getattr(run.result, "judged", ()) and "indeterminate" in verdicts else "good"
+    return "" if overall is Verdict.INDETERMINATE else "good"
 
 
 def _message(result: Any, lang: str) -> str:

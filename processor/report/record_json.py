@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,11 @@ def as_object(record: Checked) -> dict[str, Any]:
     """
     found: dict[str, Any] = {}
     for field in dataclasses.fields(record):  # type: ignore[arg-type]
-        key, value = field.metadata.get("json", field.name), getattr(record, field.name)
-        if key and not _absent(value, field.metadata):
-            _put(found, key, _value(value))
+        value = getattr(record, field.name)
+        if not _absent(value, field.metadata):
+            _put_field(found, field, value)
+        if "sentence" in field.metadata:
+            _put(found, field.metadata["sentence"], messages("en").sentences(value))
     return found
 
 
@@ -30,20 +32,42 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
     """Write a table as a list of its rows; a column without values is left out."""
     rows: list[dict[str, Any]] = [{} for _ in range(len(table))]
     for field in dataclasses.fields(table):  # type: ignore[arg-type]
-        key, column = field.metadata.get("json", field.name), getattr(table, field.name)
-        if not key or not len(column):
-            continue
-        keys, present = field.metadata.get("keys", ()), _present(table, field.metadata)
-        for row, value in ((rows[i], column[i]) for i in present):
-            for name, item in zip(keys, value, strict=True) if keys else [("", value)]:
-                null = field.metadata.get("nullable") and np.isnan(item).all()
-                _put(row, key.replace("*", name), None if null else _value(item))
+        column = getattr(table, field.name)
+        if len(column):
+            for i in _present(table, field.metadata):
+                _put_field(rows[i], field, column[i])
     return rows
 
 
 def reason_json(reason: Reason) -> dict[str, Any]:
     """Write a reason with its English text."""
     return {**reason_object(reason), "text": messages("en").text(reason)}
+
+
+def _put_field(target: dict[str, Any], field: dataclasses.Field[Any], value: Any) -> None:
+    """Set the value of a field, or its value in one row, by the metadata of the field."""
+    key, metadata = field.metadata.get("json", field.name), field.metadata
+    if not key:
+        return
+    if "keys" in metadata:
+        for name, item in zip(metadata["keys"], value, strict=True):
+            null = metadata.get("nullable") and np.isnan(item).all()
+            _put(target, key.replace("*", str(name)), None if null else _value(item))
+    elif "axes" in metadata:
+        _put(target, key, _by_name(value, *metadata["axes"]))
+    elif "by" in metadata:
+        _put(target, key, {str(row.pop(metadata["by"])): row for row in as_rows(value)})
+    else:
+        null = metadata.get("nullable") and np.isnan(value).all()
+        _put(target, key, None if null else _value(value))
+
+
+def _by_name(values: Any, names: Sequence[str], *further: Sequence[str]) -> dict[str, Any]:
+    """Name the items along each axis of an array; a part of it without any number is an empty object."""
+    found = dict(zip(names, values, strict=True))
+    if further:
+        found = {name: _by_name(item, *further) if np.isfinite(item).any() else {} for name, item in found.items()}
+    return found
 
 
 def _absent(value: Any, metadata: Mapping[str, Any]) -> bool:

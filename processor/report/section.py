@@ -25,7 +25,7 @@ class StepReport:
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
     figures: Callable[[Execution, Sequence[StepRun], ErrorReport], Drawn]  # file names are the step's own
     written: Callable[[Any], dict[str, Any]] = as_object  # of a result: its object in results.json
-    further: Callable[[Any], list[tuple[str, str]]] = lambda _: []  # heads and texts beside the verdict
+    further: Callable[[Any], list[tuple[Any, Any]]] = lambda _: []  # heads and texts beside the verdict
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     live: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None  # what the page's script draws
 

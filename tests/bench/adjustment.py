@@ -45,8 +45,11 @@ def figures(recipe, settings, seed):
     found = {"seconds": time.monotonic() - started, "points": sum(len(scan.points) for scan in scene.scans)}
     checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
     found |= {name: checks[said].value if said in checks else float("nan") for name, said in CHECKED.items()}
-    found["measured splicing mean"], found["measured linear mean"] = result.splicing_mean, result.linear_mean
-    found["not ok"] = sum(status != "ok" for status in result.component_status)
+    found["measured splicing mean"], found["measured linear mean"] = (
+        result.splicing.mean,
+        result.linear.assembled.error.mean,
+    )
+    found["not ok"] = sum(status != "ok" for status in result.components.status)
     found["wrong"] = checks["wrong poses called ok"].value
     off = key_point_errors(scene.arch, result, truth.arch)
     found["key s"] = float(np.sqrt(np.mean(off[:, 0] ** 2)))
@@ -61,7 +64,7 @@ def key_point_errors(design, result, truth):
     for i in range(len(result.components)):
         turn = truth.T_bridge_scan[i][:3, :3]
         for end, joint in enumerate((i - 1, i)):
-            off = result.key_points_scan[i, end] - truth.key_points_scan[i, end]
+            off = result.components.key_points_scan[i, end] - truth.key_points_scan[i, end]
             if 0 <= joint < len(frames) and np.isfinite(off).all():
                 found.append(rigid.apply(rigid.transform(frames[joint].T @ turn, np.zeros(3)), off))
     return np.vstack(found)

@@ -48,16 +48,13 @@ def bridges(sets, seeds, sigmas, spacing, methods):
                     checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
                     found[method].append(
                         [
-                            result.splicing_mean,
-                            result.splicing_max,
-                            result.linear_mean,
-                            result.linear_max,
-                            result.best_fit_linear_mean,
+                            *(value for error in result.errors[:2] for value in (error.mean, error.max)),
+                            result.linear.best_fit.error.mean,
                             checks["linear error of the true edges, mean"].value,
                         ]
                     )
                     if result.status != "ok" or not checks["wrong poses called ok"].passed:
-                        print(f"{name} seed {seed} {method}: {result.status} {result.component_status}", flush=True)
+                        print(f"{name} seed {seed} {method}: {result.status} {result.components.status}", flush=True)
                 print(f"{name} sigma {sigma} seed {seed}: {time.monotonic() - started:.0f} s", flush=True)
             for method, values in found.items():
                 table = np.array(values)

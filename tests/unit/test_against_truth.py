@@ -13,7 +13,7 @@ from processor.preassembly.chain import adjustment
 from processor.preassembly.ends import bottom_edges, joint_end
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.parts.member import Member
-from processor.preassembly.result import Result
+from processor.preassembly.result import Adjustment, Components, Joints, Result
 from tests.support import arch_clouds
 
 DESIGN = arch_clouds.design()
@@ -51,15 +51,15 @@ def member(i, ends, edges, unseen, without):
         if not 0 <= joint < 4:
             own.append(None)
         elif (i, e) in unseen or i in without:
-            own.append(joint_end.unknown("too few points on the end face"))
+            own.append(joint_end.unknown())
         else:
             moved = (ends[i, e] - DESIGN.joint_points[joint]) @ FRAMES[joint][:3, :3]
-            own.append(joint_end.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6)), ""))
+            own.append(joint_end.JointEnd(moved, 1e-4 * np.eye(24), np.zeros((24, 6))))
     middle = part.vertices.mean(axis=0)
     if i in without:
         return Member((own[0], own[1]), stations, middle, np.zeros((6, 6)))
     count = len(stations.chainage) // 2
-    at = np.vstack([preassembly._at_stations(edges[i, k], lines[k]) for k in range(2)])
+    at = np.vstack([preassembly._at_chainages(edges[i, k], lines[k]) for k in range(2)])
     departure = np.einsum("kai,ki->ka", stations.axes, at - stations.points)
     measured = dataclasses.replace(
         stations,
@@ -79,11 +79,15 @@ def checked(unseen, without):
     pose[list(without)] = np.nan
     result = Result(
         "ok", "adjustment",
-        components=arch_clouds.NAMES, component_status=("ok",) * 5, component_message=("",) * 5,
-        component_scans=arch_clouds.NAMES, T_bridge_scan=pose, covariance=np.zeros((5, 6, 6)),
-        key_points_scan=ends, key_points_sd=np.full(ends.shape, 0.1), joints=DESIGN.joint_names,
-        gaps=adjusted.gaps, gap_ci95=np.where(np.isfinite(adjusted.gaps), 0.05, np.nan), weight=WEIGHT,
-        joint_left=DESIGN.joint_left, joint_right=DESIGN.joint_right, verdict=("indeterminate",) * 4,
+        components=Components(
+            name=arch_clouds.NAMES, status=("ok",) * 5, reasons=((),) * 5, scans=arch_clouds.NAMES, T_bridge_scan=pose,
+            covariance=np.zeros((5, 6, 6)), key_points_scan=ends, key_points_sd=np.full(ends.shape, 0.1),
+        ),
+        joints=Joints(
+            name=DESIGN.joint_names, left=DESIGN.joint_left, right=DESIGN.joint_right, gaps=adjusted.gaps,
+            gap_ci95=np.where(np.isfinite(adjusted.gaps), 0.05, np.nan), verdict=("indeterminate",) * 4,
+        ),
+        adjustment=Adjustment(weight=WEIGHT),
     )  # fmt: skip
     truth = ArchTruth(arch_clouds.NAMES, np.tile(np.eye(4), (5, 1, 1)), ends, ends, edges)
     scene = Scene("b", "arch-bridge", arch=DESIGN)

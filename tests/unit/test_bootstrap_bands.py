@@ -67,9 +67,9 @@ def test_a_part_as_built_is_laid_on_its_design():
     strays = middle + rng.uniform(1_500.0, 3_000.0, (50, 3))
     T = arch_clouds.random_pose(rng)
     scan = Scan("rib2", rigid.apply(T, np.vstack([built, strays])), component="rib2")
-    found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok", "")
+    found = attitude.Attitude(rigid.invert(T), rigid.invert(T), "ok")
     part = methods.PartFeatures(
-        name="rib2", scan=scan, attitude=found, ends=(None, None), lines=np.empty((0, 3)), edges=None, trouble=""
+        name="rib2", scan=scan, attitude=found, ends=(None, None), lines=np.empty((0, 3)), edges=None, reasons=()
     )
     laid = bootstrap_bands._as_designed(part, design)
     assert laid.sigma_mm == pytest.approx(0.5, rel=0.2)
@@ -91,17 +91,16 @@ def test_a_band_holds_the_errors_of_a_bridge_as_designed(bridge, method):
     joints = np.cumsum([part.edges.design_left.length for part in bridge[1]])[:-1]
     assert result.bands_as_designed
     for said, band in (
-        (result.linear_deviation, result.linear_ci95),
-        (result.best_fit_linear_deviation, result.best_fit_linear_ci95),
+        (result.linear.assembled.deviation, result.linear.assembled.ci95),
+        (result.linear.best_fit.deviation, result.linear.best_fit.ci95),
     ):
         # The last interval of a part may have points in some repetitions only.
         apart = np.isfinite(band) != np.isfinite(said)
         assert apart.sum() <= 1
-        assert (np.abs(joints[:, None] - result.linear_station[apart]) < errors.INTERVAL_MM).any(axis=0).all()
+        assert (np.abs(joints[:, None] - result.linear.chainage[apart]) < errors.INTERVAL_MM).any(axis=0).all()
         known = np.isfinite(said) & np.isfinite(band)
         assert (said <= band)[known].mean() > 0.9
-    figures = [result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max]
-    figures += [result.best_fit_linear_mean, result.best_fit_linear_max]
+    figures = [value for error in result.errors for value in (error.mean, error.max)]
     assert (figures <= result.errors_ci95).sum() >= 5
 
 
@@ -113,8 +112,9 @@ def test_over_bridges_the_bands_hold_what_they_say():
         parts = extracted(scene, truth)
         for method, own in held.items():
             result = banded(scene.arch, parts, method, seed=seed)
-            known = np.isfinite(result.linear_ci95) & np.isfinite(result.linear_deviation)
-            own.append((result.linear_deviation <= result.linear_ci95)[known].mean())
+            of = result.linear.assembled
+            known = np.isfinite(of.ci95) & np.isfinite(of.deviation)
+            own.append((of.deviation <= of.ci95)[known].mean())
     # Errors along one bridge are correlated: 8 bridges determine the mean share to some per cent.
     for own in held.values():
         assert np.mean(own) > 0.9
@@ -124,17 +124,18 @@ def test_where_the_chain_is_broken_there_is_no_band(bridge):
     design, parts = bridge
     ball = np.random.default_rng(0).normal(size=(5_000, 3))
     scan = dataclasses.replace(parts[2].scan, points=3_000.0 * ball / np.linalg.norm(ball, axis=1)[:, None])
-    found = attitude.Attitude(np.eye(4), np.eye(4), "failed", "no attitude fits the design")
+    found = attitude.Attitude(np.eye(4), np.eye(4), "failed")
     broken = methods.features_of(scan, 2, found, design, preassembly_step.Params())
     given = (design, [*parts[:2], broken, *parts[3:]], "corner")
     result = banded(*given, repetitions=3)
-    assert result.component_status[2:] == ("failed",) * 3
-    assert np.isfinite(result.linear_ci95).any()
-    assert (np.isfinite(result.linear_ci95) <= np.isfinite(result.linear_deviation)).all()
-    assert banded(*given, repetitions=3).linear_ci95.tobytes() == result.linear_ci95.tobytes()
+    assert result.components.status[2:] == ("failed",) * 3
+    of = result.linear.assembled
+    assert np.isfinite(of.ci95).any()
+    assert (np.isfinite(of.ci95) <= np.isfinite(of.deviation)).all()
+    assert banded(*given, repetitions=3).linear.assembled.ci95.tobytes() == of.ci95.tobytes()
 
 
 def test_without_repetitions_nothing_is_said_of_uncertainty(bridge):
     result = banded(*bridge, "corner", repetitions=0)
     assert not result.bands_as_designed
-    assert result.message.startswith("no uncertainty is stated")
+    assert [one.code for one in result.reasons] == ["preassemble.no-uncertainty", "preassemble.inner-edges"]

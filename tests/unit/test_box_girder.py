@@ -154,8 +154,7 @@ def test_a_folder_without_meshes_comes_back(tmp_path):
         low, high = ours.vertices.min(axis=0), ours.vertices.max(axis=0)
         assert (theirs.vertices > low - 50.0).all()
         assert (theirs.vertices < high + 50.0).all()
-        assert box_girder.cost(theirs)
-        assert not box_girder.cost(ours)
+        assert (theirs.source, ours.source) == (box_girder.SOURCE, "mesh")
     store.write_scene(tmp_path / "again.h5", back, None, {})
     assert [part.source for part in store.read_scene(tmp_path / "again.h5").arch.parts] == ["curves"] * 5
 
@@ -204,14 +203,14 @@ def test_ends_are_measured_as_with_meshes(without_meshes):
     result = preassembly_step.run(scene, preassembly_step.Params(seed=1))
     checks = {metric.name: metric.value for metric in preassembly_evaluation.check(scene, result, truth)}
     assert checks["wrong poses called ok"] == 0.0
-    status = dict(zip(result.components, result.component_status, strict=True))
-    assert all(status[name] == "ok" for name in ("foot1", "rib1", "rib3", "foot2")), result.component_message
+    status = dict(zip(result.components.name, result.components.status, strict=True))
+    assert all(status[name] == "ok" for name in ("foot1", "rib1", "rib3", "foot2")), result.components.reasons
     assert status["rib2"] == "ambiguous"  # the mark is not in the curves
-    error = result.key_points_scan - truth.arch.key_points_scan
+    error = result.components.key_points_scan - truth.arch.key_points_scan
     for i in (0, 1, 3, 4):
         known = error[i][np.isfinite(error[i])]
         assert np.sqrt(np.mean(known**2)) < 0.25
-        spread = result.key_points_sd[i][np.isfinite(error[i])]
+        spread = result.components.key_points_sd[i][np.isfinite(error[i])]
         assert np.mean(np.abs(known) < 3.5 * spread) > 0.97
 
 
@@ -235,7 +234,7 @@ def test_a_wrong_part_is_not_called_ok(without_meshes):
     scans = {scan.component: scan for scan in scene.scans}
     for asked, came in ((1, "rib2"), (2, "rib1"), (0, "rib3")):
         found = measured(scans[came], asked, scene.arch)
-        assert found.status != "ok", (asked, came, found.message)
+        assert found.status != "ok", (asked, came, found.reasons)
 
 
 @pytest.mark.slow

@@ -7,7 +7,7 @@ import pytest
 
 from processor.adjustment import extremes
 from processor.limits import standards
-from processor.model import ArchDesign, DesignPart, Tolerance
+from processor.model import ArchDesign, DesignPart, Tolerance, reason
 from processor.preassembly import to_result
 from processor.preassembly.chain import span_and_closure
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
@@ -38,23 +38,23 @@ def chord(value, sd):
 )
 def test_a_span_is_held_against_the_projects_limit(value, sd, verdict):
     found = chain.judge(chord(value, sd), own(span_mm=[-1.0, 1.0]), 24_000.0)
-    assert (found.verdict, found.each) == (verdict, (verdict,))
-    assert (found.key, found.clause, found.source, found.edition) == (
+    assert (found.verdict, found.limits.verdict) == (verdict, (verdict,))
+    limits = found.limits
+    assert (limits.key, limits.clause, limits.source, limits.edition) == (
         ("span_mm",), ("project.toml",), ("project.toml",), ("",),
     )  # fmt: skip
-    np.testing.assert_allclose([found.value[0], found.ci95[0]], [value, 1.959964 * sd], rtol=1e-5)
-    np.testing.assert_allclose([found.low[0], found.high[0]], [-1.0, 1.0])
+    np.testing.assert_allclose([limits.value[0], limits.ci95[0]], [value, 1.959964 * sd], rtol=1e-5)
+    np.testing.assert_allclose([limits.low[0], limits.high[0]], [-1.0, 1.0])
     draws = np.random.default_rng(1).normal(value, sd, 400_000)
-    assert found.each_probability[0] == pytest.approx((np.abs(draws) <= 1.0).mean(), abs=0.003)
+    assert limits.probability[0] == pytest.approx((np.abs(draws) <= 1.0).mean(), abs=0.003)
 
 
 def test_a_standard_is_cited():
-    found = chain.judge(chord(-30.0, 0.5), GB, 24_000.0)
+    found = chain.judge(chord(-30.0, 0.5), GB, 24_000.0).limits
     assert found.key == ("unit_length_mm", "span_mm")
-    assert found.each == ("fail", "fail")
+    assert found.verdict == ("fail", "fail")
     assert set(found.clause) == {"GB 50205-2020 table 9.2.3"}
-    assert (set(found.edition), set(found.source), set(found.verified)) == ({"2020"}, {"from memory"}, {0})
-    assert "not verified" in found.said
+    assert (set(found.edition), set(found.source), set(found.verified)) == ({"2020"}, {"from memory"}, {False})
 
 
 def test_edges_are_held_all_along_and_limits_hang_on_the_span():
@@ -62,16 +62,16 @@ def test_edges_are_held_all_along_and_limits_hang_on_the_span():
     values, sd = rng.uniform(-2.0, 2.0, 300), np.full(300, 0.1)
     values[17] = 4.5  # 30 m / 6000 = 5 mm
     quantities = dict.fromkeys(("inner_arc", "lateral_axis", "elevation"), (values, sd))
-    found = chain.judge(quantities, JTG, 30_000.0)
-    by_key = dict(zip(found.key, found.each, strict=True))
+    found = chain.judge(quantities, JTG, 30_000.0).limits
+    by_key = dict(zip(found.key, found.verdict, strict=True))
     assert by_key == {"inner_arc_mm": "pass", "lateral_axis_mm": "pass", "elevation_mm": "pass"}
     np.testing.assert_allclose(found.high, [8.0, 5.0, 10.0])
     np.testing.assert_allclose(found.value, 4.5)
     np.testing.assert_allclose(found.ci95, 1.96 * 0.1, rtol=1e-3)  # no other place can be the extreme
     values[17] = 4.9
-    assert chain.judge(quantities, JTG, 30_000.0).each[1] == "indeterminate"
+    assert chain.judge(quantities, JTG, 30_000.0).limits.verdict[1] == "indeterminate"
     values[17] = -5.4
-    assert chain.judge(quantities, JTG, 30_000.0).each[1] == "fail"
+    assert chain.judge(quantities, JTG, 30_000.0).limits.verdict[1] == "fail"
     # Where many can be the extreme, the band covers all of them.
     low, high = [], []
     for _ in range(400):
@@ -112,19 +112,20 @@ def test_a_limit_that_nothing_is_held_against_is_said():
     assert [limit.key for limit in chain.unused_limits(mixed)] == ["bow_mm"]
     params = SimpleNamespace(adjust=SimpleNamespace(weight=0.1), systematic=SimpleNamespace(known=True))
     assembly = SimpleNamespace(
-        params=params, limits=mixed, temperature_corrected=False, joints=[], chain=joints.Verdict()
+        params=params, limits=mixed, temperature_corrected=False, joints=[], chain=joints.Conformity()
     )
-    assert "limits that nothing is held against: bow_mm" in to_result._message(assembly)
+    assert reason("preassemble.unused-limits", limits=("bow_mm",)) in to_result._reasons(assembly)
 
 
 def test_an_unsure_chain_is_left_open():
-    found = chain.judge(chord(-30.0, 0.5), GB, 24_000.0, "J4 has no answer")
-    assert (found.verdict, found.each) == ("indeterminate", ("indeterminate", "indeterminate"))
-    assert np.isnan(found.each_probability).all()
-    assert found.said.startswith("J4 has no answer")
+    doubt = reason("preassemble.joint-unknown", joint="J4")
+    found = chain.judge(chord(-30.0, 0.5), GB, 24_000.0, (doubt,))
+    assert (found.verdict, found.limits.verdict) == ("indeterminate", ("indeterminate", "indeterminate"))
+    assert np.isnan(found.limits.probability).all()
+    assert found.reasons == (doubt,)
     none = chain.judge(chord(0.0, 0.1), own(misalignment_mm=[2.0]), 24_000.0)
-    assert (none.verdict, none.key) == ("indeterminate", ())
-    assert "no limit for the whole chain" in none.said
+    assert (none.verdict, len(none.limits)) == ("indeterminate", 0)
+    assert [one.code for one in none.reasons] == ["preassemble.no-chain-limit"]
 
 
 def test_the_span_is_not_known_where_a_joint_is_not():
@@ -137,27 +138,26 @@ def test_the_span_is_not_known_where_a_joint_is_not():
 
 
 def test_a_joint_left_open_has_no_limit_that_is_sure():
-    verdict = joints.Verdict(
-        verdict="fail",
-        probability=0.0,
+    limits = joints.ComparedLimits(
         key=("a",),
         what=("b",),
         value=np.ones(1),
         ci95=np.ones(1),
         low=np.zeros(1),
         high=np.zeros(1),
-        each=("fail",),
-        each_probability=np.zeros(1),
+        verdict=("fail",),
+        probability=np.zeros(1),
         clause=("c",),
         edition=("",),
         source=("s",),
-        verified=np.zeros(1, np.uint8),
-        said="x",
+        verified=np.zeros(1, bool),
     )
-    opened = joints.left_open(verdict, "rib1 is ambiguous")
-    assert (opened.verdict, opened.each) == ("indeterminate", ("indeterminate",))
-    assert np.isnan([opened.probability, opened.each_probability[0]]).all()
-    assert joints.left_open(verdict, "") is verdict
+    verdict = joints.Conformity(verdict="fail", probability=0.0, limits=limits)
+    doubt = reason("preassemble.ambiguous-part", part="rib1")
+    opened = joints.left_open(verdict, (doubt,))
+    assert (opened.verdict, opened.limits.verdict, opened.reasons) == ("indeterminate", ("indeterminate",), (doubt,))
+    assert np.isnan([opened.probability, opened.limits.probability[0]]).all()
+    assert joints.left_open(verdict, ()) is verdict
 
 
 def test_mean_and_largest_of_many_alike_are_as_unsure_as_one():

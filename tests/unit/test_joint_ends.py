@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from processor.geometry import mesh_distance, rigid
+from processor.model import reason
 from processor.preassembly.chain import adjustment, span_and_closure
 from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import joint_end, plate_sides
@@ -94,7 +95,7 @@ def test_corners_centimetres_off_are_found_within_their_intervals(seed):
     rng = np.random.default_rng(seed)
     corners = rng.uniform(-20.0, 20.0, (4, 3))
     end = fitted(built(cloud(rng, 8.0), corners), rng)
-    assert end.trouble == ""
+    assert end.doubts == ()
     truth = np.vstack([corners, *(0.5 * (corners[a] + corners[b]) for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)))])
     off = end.departure - truth
     sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
@@ -113,7 +114,7 @@ def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     shares = np.ones(4)
     shares[side] = 0.2
     end = fitted(built(cloud(rng, 8.0, shares), corners), rng)
-    assert end.trouble == ""
+    assert end.doubts == ()
     assert np.abs(end.departure[list(on_side)] - corners[list(on_side)]).max() < 1.0
 
 
@@ -122,7 +123,7 @@ def test_a_face_of_which_one_side_alone_was_seen_may_be_the_inner_one():
     end = fitted(
         built(cloud(rng, 8.0, (1.0, 1.0, 0.0, 1.0)), np.zeros((4, 3))), rng
     )  # no points on the outside of the top
-    assert end.trouble == "the top face may be the plate's inner side"
+    assert end.doubts == (reason("preassemble.inner-side", faces=("top",)),)
 
 
 def test_the_outermost_layer_of_a_tilted_plate():

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from processor.limits import standards
-from processor.model import Limit, Tolerance
+from processor.model import Limit, Tolerance, reason
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.verdicts import joint_measures, joints
 from processor.preassembly.verdicts.joint_measures import measure
@@ -81,9 +81,10 @@ def test_a_turn_about_y_by_hand():
         "offset_y": 0.0,
         "offset_z": 0.0,
     }
-    assert found.name == tuple(expected)
-    np.testing.assert_allclose(found.value, list(expected.values()), atol=1e-9)
-    assert set(zip(found.name, found.unit, strict=True)) >= {("rotation_y", "mrad"), ("offset_x", "mm")}
+    rows = found.quantities
+    assert rows.name == tuple(expected)
+    np.testing.assert_allclose(rows.value, list(expected.values()), atol=1e-9)
+    assert set(zip(map(str, rows.name), rows.unit, strict=True)) >= {("rotation_y", "mrad"), ("offset_x", "mm")}
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -209,11 +210,11 @@ def lone(value, sd, point=5, axis=1):
 )
 def test_misalignment_against_its_limit(value, verdict, probability):
     found = judge(lone(value, 0.5), only(misalignment_mm=2.0))
-    assert (found.verdict, found.each) == (verdict, (verdict,))
+    assert (found.verdict, found.limits.verdict) == (verdict, (verdict,))
     assert found.probability == pytest.approx(probability, abs=0.008)
-    assert found.each_probability[0] == found.probability
-    assert found.value[0] == abs(value)
-    assert found.ci95[0] == pytest.approx(1.959964 * 0.5)
+    assert found.limits.probability[0] == found.probability
+    assert found.limits.value[0] == abs(value)
+    assert found.limits.ci95[0] == pytest.approx(1.959964 * 0.5)
 
 
 def test_a_value_on_the_limit_conforms_in_just_half_of_the_draws():
@@ -226,12 +227,15 @@ def test_two_limits_and_the_root_gap():
     held = only(misalignment_mm=2.0, groove_gap_mm=(-1.0, 2.0))
     wide = judge(at_rest(gaps), held)
     assert wide.verdict == "fail"
-    assert dict(zip(wide.key, wide.each, strict=True)) == {"misalignment_mm": "pass", "groove_gap_mm": "fail"}
-    assert wide.value[wide.key.index("groove_gap_mm")] == 6.5
+    assert dict(zip(wide.limits.key, wide.limits.verdict, strict=True)) == {
+        "misalignment_mm": "pass",
+        "groove_gap_mm": "fail",
+    }
+    assert wide.limits.value[wide.limits.key.index("groove_gap_mm")] == 6.5
     as_designed = dataclasses.replace(held, root_gap_mm=6.0)
     found = judge(at_rest(gaps), as_designed)
     assert (found.verdict, found.probability) == ("pass", 1.0)
-    assert found.value[found.key.index("groove_gap_mm")] == 0.5
+    assert found.limits.value[found.limits.key.index("groove_gap_mm")] == 0.5
     # Independent errors of 1 mm at one x and one y, each on its limit: a quarter keeps both.
     covariance = np.zeros((24, 24))
     covariance[0, 0] = covariance[16, 16] = 1.0
@@ -244,38 +248,43 @@ def test_two_limits_and_the_root_gap():
 def test_what_a_verdict_says_of_its_limit():
     found = judge(lone(0.5, 0.1), GB)
     assert found.verdict == "pass"
-    assert found.key == ("misalignment_mm", "groove_gap_mm")
-    assert found.clause == ("GB 50205-2020 table 9.2.3",) * 2
-    assert found.verified.tolist() == [0, 0]
-    assert found.said.count("not verified") == 2
-    assert "0.50 +- 0.20 mm, at most 2: pass (100% conforms)" in found.said
+    assert found.limits.key == ("misalignment_mm", "groove_gap_mm")
+    assert found.limits.clause == ("GB 50205-2020 table 9.2.3",) * 2
+    assert found.limits.verified.tolist() == [False, False]
+    first = (found.limits.value[0], found.limits.high[0], found.limits.verdict[0], found.limits.probability[0])
+    assert first == (0.5, 2.0, "pass", 1.0)
+    assert found.limits.ci95[0] == pytest.approx(0.196, abs=1e-3)
+    assert found.reasons == ()
 
 
 def test_unknown_gaps_and_unknown_sizes_are_indeterminate():
     found = judge(at_rest(np.full((8, 3), np.nan), np.full((24, 24), np.nan)), GB)
     assert found.verdict == "indeterminate"
-    assert found.each == ("indeterminate",) * 2
+    assert found.limits.verdict == ("indeterminate",) * 2
     assert np.isnan(found.probability)
     jtg = standards.load("JTG arch rib")
     assert judge(lone(0.5, 0.1), jtg).verdict == "indeterminate"
-    assert "thickness, which is not known" in judge(lone(0.5, 0.1), jtg).said
-    assert judge(lone(0.5, 0.1), jtg, {"thickness": 24.0}).verdict == "pass"
-    assert judge(lone(1.7, 0.01), jtg, {"thickness": 8.0}).verdict == "fail"  # 0.2 x 8 = 1.6
+    assert not judge(lone(0.5, 0.1), jtg).limits.bounds_known.any()
+    # A project that knows the thickness gives the number: 0.2 x 24 = 4.8 but 2 at most, and 0.2 x 8 = 1.6.
+    (key,) = (limit.key for limit in jtg.limits if limit.measure == "misalignment")
+    assert judge(lone(0.5, 0.1), standards.override(jtg, {key: np.array([2.0])}, "x")).verdict == "pass"
+    assert judge(lone(1.7, 0.01), standards.override(jtg, {key: np.array([1.6])}, "x")).verdict == "fail"
     nothing = judge(lone(0.5, 0.1), standards.load("JGJ 7-2010"))
-    assert (nothing.verdict, nothing.key) == ("indeterminate", ())
-    assert nothing.said == "JGJ 7-2010 has no limit for joints"
+    assert (nothing.verdict, len(nothing.limits)) == ("indeterminate", 0)
+    assert nothing.reasons == (reason("preassemble.no-joint-limit", standard="JGJ 7-2010"),)
 
 
 def test_gaps_without_a_covariance_are_measured_and_not_judged():
     gaps = np.zeros((8, 3))
     gaps[:, 0], gaps[5, 1] = np.arange(8.0), -9.0
     found = at_rest(gaps, np.full((24, 24), np.nan))
-    assert found.value[:4].tolist() == [3.5, 0.0, 7.0, 9.0]
-    assert np.isfinite(found.value).all()
-    assert np.isnan(found.ci95).all()
+    assert found.quantities.value[:4].tolist() == [3.5, 0.0, 7.0, 9.0]
+    assert np.isfinite(found.quantities.value).all()
+    assert np.isnan(found.quantities.ci95).all()
     verdict = judge(found, GB)
-    assert (verdict.verdict, verdict.each) == ("indeterminate", ("indeterminate",) * 2)
-    assert "9.00 mm, its interval not known, at most 2: indeterminate" in verdict.said
+    assert (verdict.verdict, verdict.limits.verdict) == ("indeterminate", ("indeterminate",) * 2)
+    assert (verdict.limits.value[0], verdict.limits.high[0]) == (9.0, 2.0)
+    assert np.isnan(verdict.limits.ci95[0])
 
 
 def test_eccentricity():

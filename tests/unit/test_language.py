@@ -9,15 +9,18 @@ import pytest
 
 from processor import language
 from processor.evaluation.evaluate import ErrorReport
+from processor.geometry.surface_registration import Motion
 from processor.language.messages import messages
 from processor.language.messages import text as message
 from processor.model import Status, reason
+from processor.preassembly.ends.faces import PlateFace
+from processor.preassembly.result import Gauge
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, view
 from processor.space_frame.design.matching import FrameRelation
 from tests.support.metrics import metric
 from tests.support.pages import Visible, latin
-from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
+from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge, with_band
 from tests.unit.test_report_balls import of_frame, whole, with_truth
 
 
@@ -115,30 +118,45 @@ def chinese_page(execution, report):
 
 
 def a_bridge():
-    """Return the bridge of the report's tests, saying what the adjustment says."""
+    """Return the bridge of the report's tests, with remarks of every kind."""
     execution = of_bridge()
     first, *others = execution.runs
+    scan_both, at_joint = (
+        reason("preassemble.scan-both-ends", joints=("J2",)),
+        reason("preassemble.inner-side", faces=(PlateFace.BOTTOM, PlateFace.RIGHT)),
+    )
     result = dataclasses.replace(
         first.result,
-        component_message=(
-            "the part fits its design as well when turned by 180 deg; a mark on it would tell",
-            "J1: the bottom and the right face may be the plate's inner side",
-            "what the scan shows does not hold a shift along its length and a turn sideways",
+        reasons=(
+            reason("preassemble.weight", weight=0.1),
+            reason("preassemble.reference-temperature"),
+            reason("preassemble.limits-not-verified", standard="GB 50205-2020"),
         ),
-        component_status=("ambiguous", "weak", "ok"),
-        limiting="J1 P1: +-0.087 mm (95 %), 69% of the variance from the end face at the end of rib1",
-        advice="no answer at J2: scan both ends there; a scan of rib1 that shows more of the end face at its end: "
-        "four times the points halve its part",
-        budget_source=("ends as measured, median", "scanner offset"),
-        message="lambda 0.1; no temperature given: taken as the reference; limits of GB 50205-2020, not verified",
-        gauge="all joints and the design's curve at once, lambda 0.1",
+        components=dataclasses.replace(
+            first.result.components,
+            reasons=(
+                (reason("preassemble.rival-rotation", degrees=180.0),),
+                (reason("preassemble.at", place="J1", reasons=(at_joint,)),),
+                (reason("preassemble.weak", motions=(Motion.ALONG, Motion.YAW)),),
+            ),
+            status=("ambiguous", "weak", "ok"),
+        ),
+        adjustment=dataclasses.replace(first.result.adjustment, advice=(scan_both, *first.result.adjustment.advice)),
+        linear=dataclasses.replace(first.result.linear, gauge=Gauge.ALL),
     )
+    other = others[0].result
     other = dataclasses.replace(
-        others[0].result,
-        gauge="Foot 1 at its principal-axes attitude, its joint corners on the design's",
-        message="bands are what this method makes of parts as designed; key points lie on the plates' inner edges",
-        errors_ci95=np.full(6, 9.0),
-        linear_ci95=np.full(len(others[0].result.linear_station), 9.0),
+        other,
+        reasons=(reason("preassemble.bands-as-designed"), reason("preassemble.inner-edges")),
+        splicing=dataclasses.replace(other.splicing, ci95=[9.0, 9.0]),
+        linear=dataclasses.replace(
+            other.linear,
+            gauge=Gauge.PRINCIPAL_AXES,
+            assembled=with_band(other.linear.assembled, 9.0, [9.0, 9.0]),
+            best_fit=dataclasses.replace(
+                other.linear.best_fit, error=dataclasses.replace(other.linear.best_fit.error, ci95=[9.0, 9.0])
+            ),
+        ),
     )
     runs = (dataclasses.replace(first, result=result), dataclasses.replace(others[0], result=other))
     return dataclasses.replace(
@@ -187,14 +205,14 @@ def test_nothing_but_names_and_units_is_left_in_english(made):
 
 @pytest.mark.parametrize("size_mm", [0.2, 1.0, 4.0])
 def test_no_proposal_keeps_a_word_of_english(size_mm):
-    say = language.language("zh").say
+    chinese = messages("zh")
     rng = np.random.default_rng(int(10 * size_mm))
     said = set()
     for sd in np.repeat([0.05, 0.6], 5):
         tilt = np.outer(SECTION[:, 1] / 450.0, rng.normal(0.0, [size_mm, 0.0, 0.0]))
         gaps = rng.normal(0.0, size_mm, 3) + tilt + rng.normal(0.0, 0.3, (8, 3))
         found = joint_measures.measure(gaps, sd**2 * np.eye(24), np.eye(4), SECTION)
-        said.add(say(trim_and_shim.propose("J1", found, LIMITS).sentence))
+        said.add(chinese.sentences(trim_and_shim.propose(found, LIMITS).reasons))
     assert len(said) > 1
     assert latin(said) == []
 

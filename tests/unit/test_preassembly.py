@@ -8,7 +8,7 @@ import pytest
 from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import pfh, rigid
 from processor.geometry.polyline import Polyline
-from processor.model import InputError, Scene, UsageError
+from processor.model import InputError, Scene, UsageError, Verdict, reason
 from processor.preassembly import errors
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.baselines import edge_features, joint_alignment, methods
@@ -52,7 +52,8 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous():
     points = arch_clouds.scan_points(2, 12.0, 1.0, rng)
     found = attitude.find(rigid.apply(arch_clouds.random_pose(rng), points), bare)
     assert found.status == "ambiguous"
-    assert "turned by 180 deg" in found.message
+    assert [one.code for one in found.reasons] == ["preassemble.rival-rotation"]
+    assert found.reasons[0].values["degrees"] == pytest.approx(180.0, abs=0.5)
 
 
 @pytest.mark.slow
@@ -162,8 +163,8 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
     scene, truth = bridge
     result = runs[method]
     assert result.status == "ok"
-    assert result.components == arch_clouds.NAMES
-    assert result.splicing_mean < 10.0  # one spacing
+    assert result.components.name == arch_clouds.NAMES
+    assert result.splicing.mean < 10.0  # one spacing
     checks = {metric.name: metric for metric in preassembly_evaluation.check(scene, result, truth)}
     assert checks["wrong poses called ok"].passed
     if method in PAPER_METHODS:
@@ -172,11 +173,11 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
     else:
         assert checks["key points in the scan, rms"].value < 0.5
     for left, right, gap, T_left, T_right in zip(
-        result.key_points_scan[:-1, 1],
-        result.key_points_scan[1:, 0],
-        result.gaps,
-        result.T_bridge_scan[:-1],
-        result.T_bridge_scan[1:],
+        result.components.key_points_scan[:-1, 1],
+        result.components.key_points_scan[1:, 0],
+        result.joints.gaps,
+        result.components.T_bridge_scan[:-1],
+        result.components.T_bridge_scan[1:],
         strict=True,
     ):
         np.testing.assert_allclose(rigid.apply(T_right, right) - rigid.apply(T_left, left), gap, atol=1e-9)
@@ -185,20 +186,21 @@ def test_every_method_assembles_the_bridge(bridge, runs, method):
 def test_the_adjustment_states_intervals_that_hold(bridge, runs):
     _, truth = bridge
     result = runs["adjustment"]
-    off = result.key_points_scan - truth.arch.key_points_scan
-    known = np.isfinite(result.key_points_sd)
+    components, joints, trade_off = result.components, result.joints, result.trade_off
+    off = components.key_points_scan - truth.arch.key_points_scan
+    known = np.isfinite(components.key_points_sd)
     assert known.sum() == 8 * 8 * 3
-    pull = (off / result.key_points_sd)[known]
+    pull = (off / components.key_points_sd)[known]
     # An end has 19 independent coordinates of 24: 8 ends determine the ratio to a tenth.
     assert 0.7 < np.sqrt((pull**2).mean()) < 1.3
-    for size in (off[known], result.key_points_sd[known]):
+    for size in (off[known], components.key_points_sd[known]):
         assert np.sqrt((size**2).mean()) < 0.12
-    np.testing.assert_array_less(np.abs(result.gaps), 2.0 * result.gap_ci95)  # perfect parts: no gap but noise
-    assert result.splicing_mean < 0.1
-    assert set(result.verdict) == {"pass"}
+    np.testing.assert_array_less(np.abs(joints.gaps), 2.0 * joints.gap_ci95)  # perfect parts: no gap but noise
+    assert result.splicing.mean < 0.1
+    assert set(joints.verdict) == {result.overall} == {Verdict.PASS}
     # A larger weight of the design moves the edges closer to it and widens the gaps.
-    splicing, linear = result.trade_figures[:, 0], result.trade_figures[:, 2]
-    assert (np.diff(result.trade_lambda) < 0.0).all()
+    splicing, linear = trade_off.splicing_mean, trade_off.linear_mean
+    assert (np.diff(trade_off.weight) < 0.0).all()
     assert (np.diff(splicing) <= 1e-6).all()
     assert (np.diff(linear) >= -1e-6).all()
 
@@ -217,12 +219,12 @@ def test_the_adjustment_measures_what_was_built_otherwise(bridge):
     cut = dataclasses.replace(rib, points=rigid.apply(rigid.invert(T), points))
     scans = (*scene.scans[:2], cut, *scene.scans[3:])
     result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params())
-    moved = rigid.apply(T, result.key_points_scan[2, 0]) - truth.arch.key_points_bridge[2, 0]
+    moved = rigid.apply(T, result.components.key_points_scan[2, 0]) - truth.arch.key_points_bridge[2, 0]
     np.testing.assert_allclose(moved @ (ahead - here), 3.0, atol=0.35)
     # Edges do not constrain a part along its length: the gap closes, and the span is shorter by as much.
-    assert np.abs(result.gaps[1] @ (ahead - here)).max() < 0.6
+    assert np.abs(result.joints.gaps[1] @ (ahead - here)).max() < 0.6
     shift = [
-        rigid.apply(result.T_bridge_scan[i] @ rigid.invert(truth.arch.T_bridge_scan[i]), points.mean(axis=0))
+        rigid.apply(result.components.T_bridge_scan[i] @ rigid.invert(truth.arch.T_bridge_scan[i]), points.mean(axis=0))
         - points.mean(axis=0)
         for i in (0, 4)
     ]
@@ -235,10 +237,10 @@ def test_a_warm_bridge_is_assembled_at_the_reference_temperature(bridge):
     grown = 1.0 + 12e-6 * 30.0
     warm = tuple(dataclasses.replace(s, points=s.points * grown) for s in scene.scans)
     result = preassembly_step.run(dataclasses.replace(scene, scans=warm, temperature_C=50.0), preassembly_step.Params())
-    off = result.key_points_scan / grown - truth.arch.key_points_scan
+    off = result.components.key_points_scan / grown - truth.arch.key_points_scan
     assert np.sqrt(np.nanmean(off**2)) < 0.12
-    assert np.abs(result.gaps).max() < 1.0
-    assert "temperature corrected" in result.message
+    assert np.abs(result.joints.gaps).max() < 1.0
+    assert reason("preassemble.temperature-corrected") in result.reasons
 
 
 @pytest.mark.slow
@@ -252,14 +254,15 @@ def test_a_part_of_another_place_is_not_assembled(bridge):
     )
     result = preassembly_step.run(dataclasses.replace(scene, scans=tuple(swapped)), preassembly_step.Params())
     assert result.status == "partial"
-    assert "ok" not in (result.component_status[0], result.component_status[2])
-    assert np.isnan(result.gaps[[0, 1, 2]]).all()
+    assert "ok" not in (result.components.status[0], result.components.status[2])
+    assert np.isnan(result.joints.gaps[[0, 1, 2]]).all()
 
 
 def test_the_design_keeps_the_line(runs):
     # As found by the source paper: chained by joints alone, the bridge turns with Foot 1's attitude.
-    assert runs["design-aided"].linear_mean < 0.5 * runs["line"].linear_mean
-    assert runs["design-aided"].linear_mean < 0.5 * runs["corner"].linear_mean
+    mean = {method: run.linear.assembled.error.mean for method, run in runs.items()}
+    assert mean["design-aided"] < 0.5 * mean["line"]
+    assert mean["design-aided"] < 0.5 * mean["corner"]
 
 
 @pytest.mark.parametrize(("slide", "believed"), [(300.0, True), (1500.0, False)])
@@ -271,20 +274,22 @@ def test_a_coarse_pose_slid_along_the_bridge_is_not_believed(slide, believed, mo
     monkeypatch.setattr(pfh, "coarse_alignment", slid)
     x = np.linspace(0.0, 5000.0, 400)
     lines = np.vstack([np.column_stack([x, np.full_like(x, y), np.zeros_like(x)]) for y in (-450.0, 450.0)])
-    T, message = joint_alignment._coarse(lines, lines, np.eye(4), MatchParams(), np.random.default_rng(0))
-    assert (T[0, 3], message == "") == ((slide, True) if believed else (0.0, False))
-    assert believed or "1500 mm from where the joint puts the part" in message
+    T, reasons = joint_alignment._coarse(lines, lines, np.eye(4), MatchParams(), np.random.default_rng(0))
+    assert (T[0, 3], reasons == ()) == ((slide, True) if believed else (0.0, False))
+    if not believed:
+        assert [one.code for one in reasons] == ["preassemble.coarse-pose-shifted"]
+        assert reasons[0].values["shift"] == pytest.approx(1500.0, abs=0.5)
 
 
 @pytest.mark.slow
 def test_a_part_that_leaves_a_wide_gap_is_called_weak(bridge, runs):
     scene, _ = bridge
-    widest = np.abs(runs["corner"].gaps).max(axis=(1, 2))
+    widest = np.abs(runs["corner"].joints.gaps).max(axis=(1, 2))
     limit = float(np.sort(widest)[1:3].mean())  # two of the four joints gape wider
     found = preassembly_step.run(scene, preassembly_step.Params(method="corner", gap_limit_mm=limit))
-    assert [one == "weak" for one in found.component_status] == [False, *(widest > limit)]
+    assert [one == "weak" for one in found.components.status] == [False, *(widest > limit)]
     assert found.status == "partial"
-    assert sum("gapes by" in one for one in found.component_message) == 2
+    assert [one.code for row in found.components.reasons for one in row].count("preassemble.wide-gap") == 2
 
 
 @pytest.mark.slow
@@ -293,10 +298,11 @@ def test_an_origin_taken_off_changes_nothing(bridge, runs):
     far = np.array([5.0e8, 4.3e9, 1.0e5])
     moved = dataclasses.replace(scene, scans=tuple(dataclasses.replace(s, origin=far) for s in scene.scans))
     found = preassembly_step.run(moved, preassembly_step.Params(method="corner"))
-    np.testing.assert_array_equal(found.gaps, runs["corner"].gaps)
-    np.testing.assert_allclose(found.key_points_scan - far, runs["corner"].key_points_scan, atol=1e-5)
-    again = rigid.apply(found.T_bridge_scan[1], found.key_points_scan[1, 0])
-    expected = rigid.apply(runs["corner"].T_bridge_scan[1], runs["corner"].key_points_scan[1, 0])
+    np.testing.assert_array_equal(found.joints.gaps, runs["corner"].joints.gaps)
+    again, before = found.components, runs["corner"].components
+    np.testing.assert_allclose(again.key_points_scan - far, before.key_points_scan, atol=1e-5)
+    again = rigid.apply(again.T_bridge_scan[1], again.key_points_scan[1, 0])
+    expected = rigid.apply(before.T_bridge_scan[1], before.key_points_scan[1, 0])
     np.testing.assert_allclose(again, expected, atol=1e-5)
 
 
@@ -312,18 +318,19 @@ def test_a_missing_joint_end_breaks_the_chain_aloud(bridge):
     scans = (*scene.scans[:2], cut, *scene.scans[3:])
     result = preassembly_step.run(dataclasses.replace(scene, scans=scans), preassembly_step.Params(method="line"))
     assert result.status == "partial"
-    assert result.component_status == ("ok", "ok", "failed", "failed", "failed")
-    assert "from where the design has it" in result.component_message[2]
-    assert np.isnan(result.gaps[1:]).all()
+    assert result.components.status == ("ok", "ok", "failed", "failed", "failed")
+    (at_joint,) = (one for one in result.components.reasons[2] if one.code == "preassemble.at")
+    assert [one.code for one in at_joint.values["reasons"]] == ["preassemble.joint-end-misplaced"]
+    assert np.isnan(result.joints.gaps[1:]).all()
 
 
 def test_a_temperature_that_is_not_corrected_is_said(bridge, monkeypatch):
     scene, _ = bridge
-    monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner", "assembled"))
+    monkeypatch.setattr(methods, "assemble", lambda *_: preassembly_step.Result("ok", "corner"))
     params = preassembly_step.Params(method="corner")
     kept = {"parts": [], "scanned again": []}
     result = preassembly_step.run(dataclasses.replace(scene, temperature_C=31.5), params, kept)
-    assert result.message.startswith("assembled; the steel's temperature (31.5 C) is not corrected")
+    assert result.reasons == (reason("preassemble.temperature-not-corrected", temperature=31.5),)
 
 
 def test_what_cannot_be_assembled_is_refused(bridge):

@@ -12,7 +12,7 @@ from designgen.scanning import sampler
 from designgen.scenes.make import make
 from processor.geometry import principal, rigid
 from processor.geometry.neighbors import by_cell
-from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene
+from processor.model import ArchDesign, DesignPart, InputError, Scan, Scene, reason
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import SystematicParams
@@ -126,6 +126,15 @@ def test_outliers_all_about_do_not_pull(share):
     assert_found_right(parts, design, np.vstack([points, stray]))
 
 
+def codes(reasons):
+    return [one.code for one in reasons]
+
+
+def nested(reasons):
+    """All reasons, and those that are values of others."""
+    return [one for outer in reasons for one in (outer, *nested(outer.values.get("reasons", ())))]
+
+
 def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
     parts, design = bridge()
     part = parts[RIB]
@@ -137,7 +146,7 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
     scan, T = scanned(bare)
     found = measured(design, RIB, scan)
     assert found.status == "ambiguous"
-    assert "a mark on it would tell" in found.message
+    assert "preassemble.rival-rotation" in codes(found.reasons)
     turns = [
         np.degrees(rigid.rotation_angle(one[:3, :3] @ T[:3, :3].T)) for one in (found.T_bridge_scan, found.T_rival)
     ]
@@ -150,9 +159,9 @@ def test_parts_of_one_shape_are_told_apart_by_their_mark():
     for asked, came in ((1, 3), (0, 4)):
         found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
         assert found.status == "failed"
-        assert found.message == f"by its mark it is rather {parts[came].name}"
+        assert found.reasons == (reason("preassemble.mark-of-other", parts=(parts[came].name,)),)
         found = measured(design, came, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
-        assert (found.status, found.message) == ("ok", "")
+        assert (found.status, found.reasons) == ("ok", ())
 
 
 def without_the_marks_places(part, points):
@@ -166,9 +175,7 @@ def test_a_part_of_which_no_mark_was_seen_says_which_other_it_may_be():
     parts, design = bridge()
     scan, _ = scanned(without_the_marks_places(parts[1], cloud(parts[1], spacing_mm=14.0)))
     found = measured(design, 1, scan)
-    assert (found.status, found.message) == (
-        "ok", "of the same shape as rib3: no mark was seen that tells them apart",
-    )  # fmt: skip
+    assert (found.status, found.reasons) == ("ok", (reason("preassemble.mark-not-seen", parts=("rib3",)),))
 
 
 def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_own():
@@ -187,9 +194,9 @@ def test_marks_on_a_plate_that_bulges_by_as_much_as_they_are_high_are_the_parts_
 @pytest.mark.parametrize(
     ("asked", "came", "said"),
     [
-        (2, 1, "rib1 or rib3"),
-        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, 2, "rib2"), (3, 0, "foot1 or foot2"))),
-        pytest.param(0, 3, "rib1 or rib3", marks=pytest.mark.slow),
+        (2, 1, ("rib1", "rib3")),
+        *(pytest.param(*one, marks=pytest.mark.slow) for one in ((1, 2, ("rib2",)), (3, 0, ("foot1", "foot2")))),
+        pytest.param(0, 3, ("rib1", "rib3"), marks=pytest.mark.slow),
     ],
 )
 def test_neighbours_swapped_are_named(asked, came, said):
@@ -197,7 +204,7 @@ def test_neighbours_swapped_are_named(asked, came, said):
     parts, design = bridge()
     found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=20.0))[0])
     assert found.status != "ok"
-    assert found.message.endswith(f"by its size it is rather {said}")
+    assert found.reasons[-1] == reason("preassemble.size-of-other", parts=said)
 
 
 def placed(design, index, points):
@@ -223,15 +230,16 @@ def test_what_lies_on_a_part_of_another_size_by_half_is_not_taken_for_it(on_foot
     clutter = np.random.default_rng(1).normal(0.0, 100.0, (40 * strays, 3)) + 9e3
     scan = dataclasses.replace(scan, points=np.vstack([scan.points, clutter]))
     shape = attitude.sample_surface(design.parts[0])
-    stated = attitude.Attitude(np.eye(4), np.eye(4), "ok", "")
+    stated = attitude.Attitude(np.eye(4), np.eye(4), "ok")
     monkeypatch.setattr(attitude, "find", lambda *_: stated)
     found = measure._place(scan, design.parts[0], design, shape, 1.0)
     assert 0.5 < found.registration.used_share < 0.7
     if strays:
-        assert found.doubt.endswith("of its sides; is this the right part, and whole?")
+        assert codes(found.doubts) == ["preassemble.sides-not-covered", "preassemble.right-part"]
         assert not found.sure[1]
     else:
-        assert found.trouble.endswith("of the points are away from the design's surface; by its size it is rather rib2")
+        assert codes(found.rejected) == ["preassemble.points-away", "preassemble.size-of-other"]
+        assert found.rejected[1].values == {"parts": ("rib2",)}
 
 
 @pytest.mark.slow
@@ -242,8 +250,8 @@ def test_another_part_is_not_taken_for_a_foot(clutter, index):
     floor = np.random.default_rng(1).uniform([-9e3, -9e3, -5e3], [9e3, 9e3, -4.9e3], (int(clutter * len(points)), 3))
     every = np.vstack([points, floor + points.mean(axis=0)])
     wrong, right = placed(scene.arch, index, every), placed(scene.arch, 2, every)
-    assert wrong.trouble or wrong.doubt or wrong.attitude.status != "ok"
-    assert (right.attitude.status, right.trouble, right.doubt) == ("ok", "", "")
+    assert wrong.rejected or wrong.doubts or wrong.attitude.status != "ok"
+    assert (right.attitude.status, right.rejected, right.doubts) == ("ok", (), ())
 
 
 def test_how_much_of_a_part_its_points_lie_on():
@@ -261,9 +269,8 @@ def test_a_rival_farther_along_is_not_called_a_turn():
     _, design = bridge()
     surface = attitude.sample_surface(design.parts[1])
     along = rigid.transform(np.eye(3), 240.0 * surface.axes[:, 0])
-    assert attitude._rival_message(np.eye(4), along, surface) == (
-        "the part fits its design as well when shifted by 240 mm along itself; an end seen would tell"
-    )
+    rival = attitude._rival_reason(np.eye(4), along, surface)
+    assert (rival.code, rival.values) == ("preassemble.rival-shift", {"shift": pytest.approx(240.0)})
 
 
 @pytest.mark.parametrize("seed", [0, *(pytest.param(s, marks=pytest.mark.slow) for s in range(1, 8))])
@@ -288,7 +295,7 @@ def test_a_scan_of_one_end_only_says_so():
     scan, T = scanned(points[points[:, 0] < cut])
     found = measured(design, RIB, scan)
     assert found.status in ("weak", "ambiguous", "failed")
-    assert found.message
+    assert found.reasons
     if found.status == "weak":
         assert_right(found, design, RIB, part, T, ("start",))
 
@@ -306,7 +313,7 @@ def test_two_scans_of_one_part_make_one():
     assert_right(both, design, RIB, part, T if both.scans[0].name == "left" else _back(2))
     alone = measured(design, RIB, one)
     assert alone.status == "weak"
-    assert "too few points on the right face" in alone.message
+    assert reason("preassemble.few-points-on-face", face="right") in nested(alone.reasons)
 
 
 def _back(seed):
@@ -320,9 +327,9 @@ def test_unequal_plates_meet_at_their_outer_faces():
     design = design_of(parts)
     scans = tuple(scanned(cloud(part, 7, spacing_mm=16.0), i, part.name, part.name)[0] for i, part in enumerate(parts))
     result = preassembly_step.run(Scene("b", "arch-bridge", scans, arch=design), preassembly_step.Params())
-    assert result.component_status == ("ok",) * 5
-    assert np.abs(result.gaps).max() < 0.5
-    assert (np.abs(result.gaps) < 1.5 * result.gap_ci95 + 0.02).all()
+    assert result.components.status == ("ok",) * 5
+    assert np.abs(result.joints.gaps).max() < 0.5
+    assert (np.abs(result.joints.gaps) < 1.5 * result.joints.gap_ci95 + 0.02).all()
     twice = Scene("b", "arch-bridge", (*scans, dataclasses.replace(scans[1], name="again")), arch=design)
     with pytest.raises(InputError, match=r"takes one scan a part, rib1 has several"):
         preassembly_step.run(twice, preassembly_step.Params(method="line"))
@@ -351,7 +358,7 @@ def test_a_floor_beside_a_part_does_not_turn_it_round(seed, index, share):
     shape = attitude.sample_surface(scene.arch.parts[index])
     points = with_a_floor(rigid.apply(T, scene.scans[index].points), shape.axes, share, rng)
     found = attitude.find(rigid.apply(rigid.invert(T), points), scene.arch.parts[index], shape)
-    assert (found.status, found.message) == ("ok", "")
+    assert (found.status, found.reasons) == ("ok", ())
     turn = found.T_surface[:3, :3] @ T[:3, :3].T
     assert np.degrees(rigid.rotation_angle(turn)) < 0.1
 

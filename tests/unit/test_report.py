@@ -26,12 +26,13 @@ from processor.model import (
     reason,
 )
 from processor.pipeline import Execution
-from processor.preassembly import step as preassembly_step
+from processor.preassembly.result import Components, Deviations, Gauge, Joints, Linear, MeanMax, Result
 from processor.report import all_figures, all_tables, page, results_folder, results_json
 from processor.report import table as report_table
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
 from processor.store import store
+from tests.support import records
 from tests.support.metrics import metric
 
 NAN = float("nan")
@@ -57,33 +58,37 @@ def assembled(method="design-aided", names=("foot1", "rib1", "foot2"), joints=("
     key_points = np.full((3, 2, 8, 3), NAN)
     key_points[0, 1] = np.arange(24.0).reshape(8, 3)
     station = np.tile(np.arange(0.0, 12000.0, 200.0), 2)
-    return preassembly_step.Result(
+    missing = reason("preassemble.at", place="J2", reasons=(reason("preassemble.no-joint-edges"),))
+    deviation = scale * (1.0 + station / 1000.0)
+    return Result(
         status="partial",
         method=method,
-        components=names,
-        component_status=("ok", "ok", "failed"),
-        component_message=("", "", "J2: no joint edges found"),
-        T_bridge_scan=np.array([np.eye(4), np.eye(4), np.full((4, 4), NAN)]),
-        covariance=np.full((3, 6, 6), NAN),
-        key_points_scan=key_points,
-        key_points_sd=np.full((3, 2, 8, 3), NAN),
-        joints=joints,
-        joint_left=names[:-1],
-        joint_right=names[1:],
-        gaps=gaps,
-        gap_ci95=np.full((2, 8, 3), NAN),
-        verdict=("indeterminate", "indeterminate"),
-        splicing_mean=4.6,
-        splicing_max=8.2,
-        gauge="Foot 1 aligned",
-        linear_mean=2.0,
-        linear_max=3.0,
-        best_fit_linear_mean=4.0,
-        best_fit_linear_max=5.0,
-        linear_station=station,
-        linear_edge=("left",) * 60 + ("right",) * 60,
-        linear_deviation=scale * (1.0 + station / 1000.0),
-        best_fit_linear_deviation=scale * (2.0 + station / 1000.0),
+        components=Components(
+            name=names,
+            status=("ok", "ok", "failed"),
+            reasons=((), (), (missing,)),
+            scans=names,
+            T_bridge_scan=np.array([np.eye(4), np.eye(4), np.full((4, 4), NAN)]),
+            covariance=np.full((3, 6, 6), NAN),
+            key_points_scan=key_points,
+            key_points_sd=np.full((3, 2, 8, 3), NAN),
+        ),
+        joints=Joints(
+            name=joints,
+            left=names[:-1],
+            right=names[1:],
+            gaps=gaps,
+            gap_ci95=np.full((2, 8, 3), NAN),
+            verdict=("indeterminate", "indeterminate"),
+        ),
+        splicing=MeanMax(mean=4.6, max=8.2),
+        linear=Linear(
+            gauge=Gauge.LINES,
+            chainage=station,
+            edge=("left",) * 60 + ("right",) * 60,
+            assembled=Deviations(error=MeanMax(mean=2.0, max=3.0), deviation=deviation),
+            best_fit=Deviations(error=MeanMax(mean=4.0, max=5.0), deviation=deviation + scale),
+        ),
     )
 
 
@@ -330,11 +335,12 @@ def test_any_name_can_be_drawn_and_shown(name):
 
 
 def test_a_run_without_any_answer_is_drawn_too():
+    given = assembled()
+    unknown = Deviations(deviation=np.full(120, NAN))
     nothing = dataclasses.replace(
-        assembled(),
-        gaps=np.full((2, 8, 3), NAN),
-        linear_deviation=np.full(120, NAN),
-        best_fit_linear_deviation=np.full(120, NAN),
+        given,
+        joints=dataclasses.replace(given.joints, gaps=np.full((2, 8, 3), NAN)),
+        linear=dataclasses.replace(given.linear, assembled=unknown, best_fit=unknown),
     )
     bridge = Execution(arch_scene(), (StepRun("preassemble", "line", "{}", nothing),), PROVENANCE)
     assert "Preassembly: partial" in render(bridge, ErrorReport())
@@ -452,8 +458,7 @@ def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
 
 @pytest.mark.parametrize("made", [assembled(), balls()], ids=["preassemble", "spheres"])
 def test_results_go_through_the_store_unchanged(made, tmp_path):
-    step = "preassemble" if isinstance(made, preassembly_step.Result) else "spheres"
+    step = "preassemble" if isinstance(made, Result) else "spheres"
     store.write_results(tmp_path / "r.h5", [StepRun(step, made.method, "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {step: type(made)})
-    for field in dataclasses.fields(made):
-        np.testing.assert_array_equal(getattr(back.result, field.name), getattr(made, field.name))
+    records.assert_equal(back.result, made)

@@ -13,8 +13,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
-from processor.model import Limit, StepRun, Tolerance
+from processor.model import Limit, StepRun, Tolerance, reason
 from processor.pipeline import Execution
+from processor.preassembly.chain.span_and_closure import EndSurface, PartEnd
+from processor.preassembly.result import Adjustment, Deviations, JudgedJoints, Residuals, Rivals, TradeOff
 from processor.preassembly.verdicts import chain as verdicts_chain
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.preassembly.verdicts import joints as verdicts_joints
@@ -38,6 +40,11 @@ LIMITS = Tolerance(
 )
 
 
+LIMITING = reason(
+    "preassemble.limiting",
+    joint="J1", point="P1", ci95=0.087, share=0.69, surface=EndSurface.END_FACE, end=PartEnd.END, part="rib1",
+)  # fmt: skip
+ADVICE = reason("preassemble.scan-more", part="rib1", surface=EndSurface.END_FACE, end=PartEnd.END)
 SPAN = Tolerance("own", "1", (Limit("span_mm", "span", low=-1.0, high=1.0, measure="span", source="project.toml"),))
 
 
@@ -46,7 +53,6 @@ def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600
     base = assembled("adjustment", names, joints)
     gaps = np.stack([np.outer(np.arange(8.0), [0.5, 0.2, -0.3]), np.outer(np.arange(8.0), [-0.25, 0.1, 0.2])])
     records = [joint_measures.measure(gap, 0.01 * np.eye(24), np.eye(4), SECTION) for gap in gaps]
-    judged = [verdicts_joints.judge(one, LIMITS) for one in records]
     rng = np.random.default_rng(3)
     points, residual, component = [], [], []
     for i in range(len(names)):
@@ -56,38 +62,69 @@ def adjusted(names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), per_part=600
         points.append(np.column_stack([rng.uniform(0.0, 4000.0, per_part) + 4000.0 * i, y, z]))
         residual.append(rng.normal(0.0, 1.0, per_part))
         component.append(np.full(per_part, i, np.int32))
-    return dataclasses.replace(
-        base,
-        component_status=("ok",) * len(names),
-        gaps=gaps,
-        gap_ci95=np.full((2, 8, 3), 0.196),
-        verdict=tuple(one.verdict for one in judged),
-        measures=tuple(records),
-        judged=tuple(judged),
-        proposals=tuple(trim_and_shim.propose(j, one, LIMITS) for j, one in zip(joints, records, strict=True)),
-        chain_judged=(verdicts_chain.judge({"span": (np.array([-1.25]), np.array([0.25]))}, SPAN, 12_000.0),),
-        not_held=("bow_mm",),
-        not_held_what=("bow of a unit preassembled",),
-        T_rival_scan=np.stack([rigid.transform(np.diag([-1.0, -1.0, 1.0]), [5.0, 0, 0]), *np.full((2, 4, 4), NAN)]),
-        linear_offset=np.column_stack([base.linear_deviation, np.zeros(120)]),
+    linear = base.linear
+    adjustment = Adjustment(
+        weight=0.1,
+        joints=judged_joints(joints, records),
+        chain=(verdicts_chain.judge({"span": (np.array([-1.25]), np.array([0.25]))}, SPAN, 12_000.0),),
+        unused_limits=("bow_mm",),
+        unused_limits_what=("bow of a unit preassembled",),
+        linear_offset=np.column_stack([linear.assembled.deviation, np.zeros(120)]),
         linear_offset_ci95=np.full((120, 2), 0.3),
-        linear_ci95=np.full(120, 0.37),
-        best_fit_linear_ci95=np.full(120, 0.5),
-        errors_ci95=np.linspace(0.1, 0.6, 6),
+        rivals=Rivals(component=names[:1], T_rival_scan=[rigid.transform(np.diag([-1.0, -1.0, 1.0]), [5.0, 0, 0])]),
         span_departure=-1.25,
         span_ci95=0.5,
-        closure=np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3]),
-        closure_ci95=np.full(6, 0.25),
-        limiting="J1 P1: the end face",
-        advice="a scan of rib1",
-        budget_source=("noise", "scanner offset"),
-        budget_sd=np.array([0.05, 0.2]),
-        residual_points=np.concatenate(points),
-        residual=np.concatenate(residual),
-        residual_component=np.concatenate(component),
-        weight=0.1,
-        trade_lambda=np.array([1.0, 0.1, 0.01]),
-        trade_figures=np.array([[2.0, 5.0, 1.0, 2.0], [1.0, 3.0, 1.5, 3.0], [0.5, 1.0, 4.0, 9.0]]),
+        closure=np.array([[1.0, 2.0, 3.0], [0.1, 0.2, 0.3]]),
+        closure_ci95=np.full((2, 3), 0.25),
+        limiting=(LIMITING,),
+        advice=(ADVICE,),
+        budget_sd=np.array([0.05, 0.0, 0.2, 0.0, 0.0]),
+        residuals=Residuals(
+            points=np.concatenate(points), distance=np.concatenate(residual), component=np.concatenate(component)
+        ),
+    )
+    return dataclasses.replace(
+        base,
+        components=dataclasses.replace(base.components, status=("ok",) * len(names)),
+        joints=dataclasses.replace(
+            base.joints, gaps=gaps, gap_ci95=np.full((2, 8, 3), 0.196), verdict=verdicts(adjustment)
+        ),
+        splicing=dataclasses.replace(base.splicing, ci95=[0.1, 0.2]),
+        linear=dataclasses.replace(
+            linear,
+            assembled=with_band(linear.assembled, 0.37, [0.3, 0.4]),
+            best_fit=with_band(linear.best_fit, 0.5, [0.5, 0.6]),
+        ),
+        trade_off=trade_off(np.array([[2.0, 5.0, 1.0, 2.0], [1.0, 3.0, 1.5, 3.0], [0.5, 1.0, 4.0, 9.0]])),
+        adjustment=adjustment,
+    )
+
+
+def judged_joints(names, records):
+    return JudgedJoints(
+        name=names,
+        measures=tuple(records),
+        conformity=tuple(verdicts_joints.judge(one, LIMITS) for one in records),
+        proposal=tuple(trim_and_shim.propose(one, LIMITS) for one in records),
+    )
+
+
+def verdicts(adjustment):
+    return tuple(one.verdict for one in adjustment.joints.conformity)
+
+
+def with_band(deviations, band, ci95):
+    error = dataclasses.replace(deviations.error, ci95=ci95)
+    return dataclasses.replace(deviations, error=error, ci95=np.full(len(deviations.deviation), band))
+
+
+def trade_off(figures):
+    return TradeOff(
+        weight=np.array([1.0, 0.1, 0.01]),
+        splicing_mean=figures[:, 0],
+        splicing_max=figures[:, 1],
+        linear_mean=figures[:, 2],
+        linear_max=figures[:, 3],
     )
 
 
@@ -213,8 +250,8 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
     # What was stated and is held against nothing is said.
     assert step["limits_not_held"] == ["bow_mm"]
     assert of_file(execution, "limits-not-held") == [{"key": "bow_mm", "limit": "bow of a unit preassembled"}]
-    on_terminal = [table.title for table in all_tables.all_of(execution, ErrorReport()) if table.on_terminal]
-    assert {"Limits of the whole chain, method adjustment (mm)", "Limits that nothing is held against"} <= set(
+    on_terminal = [str(table.title) for table in all_tables.all_of(execution, ErrorReport()) if table.on_terminal]
+    assert {"Limits of the whole chain, method adjustment (mm)", "Limits that nothing is compared with"} <= set(
         on_terminal
     )
 
@@ -247,7 +284,8 @@ def test_both_poses_of_an_ambiguous_part_and_what_would_tell():
 
 def test_what_limits_the_accuracy_has_a_file_and_stands_on_the_terminal():
     rows = of_file(of_bridge(), "accuracy")
-    assert [row["answer"] for row in rows] == ["J1 P1: the end face", "a scan of rib1"]
+    assert rows[0]["answer"].startswith("J1 P1: ± 0.087 mm (95 %), 69% of the variance from the end face")
+    assert rows[1]["answer"].startswith("a scan of rib1 that shows more of the end face")
     assert any(
         table.file == "accuracy" and table.on_terminal for table in all_tables.all_of(of_bridge(), ErrorReport())
     )
@@ -258,22 +296,29 @@ def test_why_a_method_failed_is_said_and_it_is_not_drawn():
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
     answered = all_figures.of_run(execution, ErrorReport())["preassemble"]["linear-error.png"]
-    assert "without a band, for they state no uncertainty: line" in answered[0]
+    assert "without a band, for they state no uncertainty: line" in str(answered[0])
     line = execution.runs[1]
+    linear = line.result.linear
     own = dataclasses.replace(
-        line.result, linear_ci95=np.full(120, 9.0), best_fit_linear_ci95=np.full(120, 9.0), errors_ci95=np.full(6, 9.0)
+        line.result,
+        splicing=dataclasses.replace(line.result.splicing, ci95=[9.0, 9.0]),
+        linear=dataclasses.replace(
+            linear,
+            assembled=with_band(linear.assembled, 9.0, [9.0, 9.0]),
+            best_fit=with_band(linear.best_fit, 9.0, [9.0, 9.0]),
+        ),
     )
     alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
     caption, picture = all_figures.of_run(alone, ErrorReport())["preassemble"]["linear-error.png"]
-    assert "what these state of parts exactly as designed, scanned alike: line" in caption
+    assert "the error of these methods for parts exactly as designed, scanned alike: line" in str(caption)
     assert picture != answered[1]
     (summary,) = (table for table in all_tables.all_of(alone, ErrorReport()) if table.file == "summary")
-    assert "Of a bridge exactly as designed, scanned alike, line states up to 9.000" in summary.note
-    nothing = np.full(120, NAN)
-    result = dataclasses.replace(line.result, linear_deviation=nothing, best_fit_linear_deviation=nothing)
+    assert "Of a bridge exactly as designed, scanned alike, line states up to 9.000" in str(summary.note)
+    nothing = Deviations(deviation=np.full(120, NAN))
+    result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
     caption, picture = all_figures.of_run(silent, ErrorReport())["preassemble"]["linear-error.png"]
-    assert "without an answer, so not drawn: line" in caption
+    assert "without a result, so not drawn: line" in str(caption)
     assert picture != answered[1]
     data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
     assert [one["method"] for one in data["linear"]] == ["adjustment"]
@@ -286,7 +331,7 @@ def test_span_closure_budget_and_trade_off_as_tables():
     assert (along["departure"], along["ci95"], along["unit"]) == ("1.0", "0.25", "mm")
     assert [row["unit"] for row in rest] == ["mm", "mm", "mrad", "mrad", "mrad"]
     assert [row["beyond_its_interval"] for row in rest] == ["yes", "yes", "no", "no", "yes"]
-    assert of_file(execution, "budget")[1] == {"source": "scanner offset", "sd_mm": "0.2"}
+    assert of_file(execution, "budget")[2] == {"source": "scanner offset", "sd_mm": "0.2"}
     assert [row["linear_max_mm"] for row in of_file(execution, "trade-off")] == ["2.0", "3.0", "9.0"]
     measures = of_file(execution, "measures")
     assert len(measures) == 22
@@ -307,7 +352,7 @@ def test_the_verdict_stands_before_all_else_and_what_to_do_before_the_pictures()
     text = rendered(of_bridge())
     places = [
         text.index(one)
-        for one in ("joints 2 fail", "NOT VERIFIED", "-1.250 ± 0.500", "J1 P1: the end face", "a scan of rib1", "<h2>")
+        for one in ("joints 2 fail", "NOT VERIFIED", "-1.250 ± 0.500", "J1 P1: ±", "A scan of rib1", "<h2>")
     ]
     assert places == sorted(places)
     assert text.index("Joints: what to do") < text.index("data:image/png")
@@ -316,25 +361,26 @@ def test_the_verdict_stands_before_all_else_and_what_to_do_before_the_pictures()
 
 def unknown(result, joints, parts):
     """Take away what is known of these joints and parts."""
-    gaps, residual = result.gaps.copy(), result.residual.copy()
-    gaps[joints], residual[np.isin(result.residual_component, parts)] = NAN, NAN
-    records = list(result.measures)
+    before = result.adjustment
+    gaps, distance = result.joints.gaps.copy(), before.residuals.distance.copy()
+    gaps[joints], distance[np.isin(before.residuals.component, parts)] = NAN, NAN
+    records = list(before.joints.measures)
     for j in joints:
         records[j] = joint_measures.measure(np.full((8, 3), NAN), np.full((24, 24), NAN), np.eye(4), SECTION)
-    judged = [verdicts_joints.judge(one, LIMITS) for one in records]
-    return dataclasses.replace(
-        result,
-        gaps=gaps,
-        residual=residual,
-        measures=tuple(records),
-        judged=tuple(judged),
-        verdict=tuple(one.verdict for one in judged),
-        proposals=tuple(trim_and_shim.propose(j, one, LIMITS) for j, one in zip(result.joints, records, strict=True)),
+    adjustment = dataclasses.replace(
+        before,
+        joints=judged_joints(result.joints.name, records),
+        residuals=dataclasses.replace(before.residuals, distance=distance),
         span_departure=NAN,
         span_ci95=NAN,
-        closure=np.full(6, NAN),
-        closure_ci95=np.full(6, NAN),
-        trade_figures=np.full((3, 4), NAN),
+        closure=np.full((2, 3), NAN),
+        closure_ci95=np.full((2, 3), NAN),
+    )
+    return dataclasses.replace(
+        result,
+        joints=dataclasses.replace(result.joints, gaps=gaps, verdict=verdicts(adjustment)),
+        trade_off=trade_off(np.full((3, 4), NAN)),
+        adjustment=adjustment,
     )
 
 
@@ -366,7 +412,7 @@ def test_every_picture_shows_something():
         dark = (pixels.min(axis=2) < 0.9).mean()
         assert 0.005 < dark < 0.9, name
         assert caption
-    assert "95 %" in found["linear-error.png"][0]
+    assert "95 %" in str(found["linear-error.png"][0])
 
 
 def test_pictures_follow_what_they_show():
@@ -374,7 +420,9 @@ def test_pictures_follow_what_they_show():
     before = all_figures.of_run(of_bridge(), ErrorReport())["preassemble"]
     execution = of_bridge()
     run = execution.runs[0]
-    other = dataclasses.replace(run.result, residual=-3.0 * np.abs(run.result.residual), weight=1.0)
+    before_of = run.result.adjustment
+    residuals = dataclasses.replace(before_of.residuals, distance=-3.0 * np.abs(before_of.residuals.distance))
+    other = dataclasses.replace(run.result, adjustment=dataclasses.replace(before_of, residuals=residuals, weight=1.0))
     after = all_figures.of_run(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
     )["preassemble"]
@@ -410,7 +458,10 @@ def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps
     monkeypatch.setattr(joint_figures, "png", kept)
     result = unknown(adjusted(), [1], ())
     wide = joint_measures.measure(np.outer(np.arange(8.0), [-6.6, 3.0, 3.0]), 0.2 * np.eye(24), np.eye(4), SECTION)
-    joint_figures.gap_vectors(dataclasses.replace(result, measures=(wide, result.measures[1])))
+    records = (wide, result.adjustment.joints.measures[1])
+    judged = dataclasses.replace(result.adjustment.joints, measures=records)
+    adjustment = dataclasses.replace(result.adjustment, joints=judged)
+    joint_figures.gap_vectors(dataclasses.replace(result, adjustment=adjustment))
     shown, silent = drawn[0].axes
     numbers = [one for one in shown.texts if one.get_text().startswith("P")]
     assert len(numbers) == 8

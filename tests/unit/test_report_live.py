@@ -10,6 +10,7 @@ import pytest
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.report import results_json, view
+from processor.report.preassembly import view as preassembly_view
 from tests.unit.test_report_adjusted import BAD, Page, of_bridge, rendered
 
 
@@ -54,7 +55,7 @@ def test_many_points_keep_the_page_small():
     text = rendered(of_bridge(per_part=100_000))
     assert len(text.encode()) < 3_000_000
     data = json.loads(Page(text).scripts[0][1])["steps"]["preassemble"]
-    assert sum(len(part["residual"]) for part in data["parts"]) <= view.MOST_POINTS
+    assert sum(len(part["residual"]) for part in data["parts"]) <= preassembly_view.MOST_POINTS
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")

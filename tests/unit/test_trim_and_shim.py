@@ -9,8 +9,9 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
 
+from processor.language.messages import messages
 from processor.limits import standards
-from processor.model import Checked, StepRun, Tolerance, UsageError
+from processor.model import Checked, StepRun, Tolerance, UsageError, reason
 from processor.preassembly.params import TrimParams
 from processor.preassembly.verdicts import joint_measures, joints, trim_and_shim
 from processor.preassembly.verdicts.trim_and_shim import propose
@@ -30,9 +31,19 @@ def along(x):
     return gaps
 
 
-def proposed(gaps, covariance=None, limits=GB, params=EXACT, name="J1"):
+def codes(found):
+    return [one.code.removeprefix("preassemble.") for one in found.reasons]
+
+
+def values(found, code):
+    """The values of a reason, numbers rounded to 0.1."""
+    (one,) = (one for one in found.reasons if one.code == f"preassemble.{code}")
+    return {key: round(value, 1) if isinstance(value, float) else value for key, value in one.values.items()}
+
+
+def proposed(gaps, covariance=None, limits=GB, params=EXACT):
     covariance = np.zeros((24, 24)) if covariance is None else covariance
-    return propose(name, joint_measures.measure(gaps, covariance, np.eye(4), POINTS), limits, params)
+    return propose(joint_measures.measure(gaps, covariance, np.eye(4), POINTS), limits, params)
 
 
 def test_a_joint_that_fits_is_left_alone():
@@ -40,7 +51,8 @@ def test_a_joint_that_fits_is_left_alone():
     assert (found.action, found.probability, found.probability_as_is) == ("nothing", 1.0, 1.0)
     assert not found.cut.any()
     assert not found.build_up.any()
-    assert found.sentence == "J1: nothing to do; all limits hold with 100%."
+    assert codes(found) == ["nothing-to-do", "all-limits"]
+    assert messages("en").sentences(found.reasons) == "Nothing to do. All limits hold with 100%."
 
 
 @pytest.mark.parametrize("root", [0.0, 4.0])
@@ -52,8 +64,8 @@ def test_an_overlap_is_cut_by_itself_and_the_root_gap(root):
     np.testing.assert_allclose(found.gap_after, root, atol=1e-9)
     assert not found.build_up.any()
     assert (found.probability, found.probability_as_is) == (1.0, 0.0)
-    assert found.sentence == (
-        f"J1: cut the right part's end by {3.0 + root:.1f} mm all round; done to 0 mm (one sd), all limits then hold "
+    assert messages("en").sentences(found.reasons) == (
+        f"Cut the right part's end by {3.0 + root:.1f} mm all round. Done to 0 mm (one sd), all limits then hold "
         "with 100% (groove gap 100%), as it is with 0%."
     )
 
@@ -63,7 +75,7 @@ def test_a_gap_too_wide_is_filled():
     assert found.action == "build up"
     np.testing.assert_allclose(found.build_up, 5.0)
     assert not found.cut.any()
-    assert "fill by shims or weld build-up 5.0 mm all round" in found.sentence
+    assert values(found, "amount-even") == {"work": "fill by shims or weld build-up", "amount": 5.0}
 
 
 def test_a_tilted_end_is_cut_parallel():
@@ -72,7 +84,10 @@ def test_a_tilted_end_is_cut_parallel():
     np.testing.assert_allclose(found.cut, [5.8, 5.8, 2.2, 2.2, 5.8, 4.0, 2.2, 4.0], atol=1e-9)
     np.testing.assert_allclose(found.plane, [4.0, 0.0, -2.0], atol=1e-9)
     np.testing.assert_allclose(found.gap_after, 0.0, atol=1e-9)
-    assert "5.8 mm at P1 bottom left down to 2.2 mm at P3 top right" in found.sentence
+    assert values(found, "amount-plane") == {
+        "work": "cut the right part's end by", "most": 5.8, "most_at": "P1 bottom left", "least": 2.2,
+        "least_at": "P3 top right",
+    }  # fmt: skip
     # And about z: 1 mm per m more to the right (y < 0).
     turned = proposed(along(-4.0 + 1e-3 * POINTS[:, 1]))
     np.testing.assert_allclose(turned.plane, [4.0, -1.0, 0.0], atol=1e-9)
@@ -148,9 +163,8 @@ def test_as_it_is_half_of_the_draws_keep_a_limit_that_a_value_is_on():
     found = proposed(gaps, covariance)
     assert (found.probability, found.probability_as_is, found.misalignment_probability) == (0.5, 0.5, 0.5)
     assert found.groove_probability == 1.0
-    assert found.sentence == (
-        "J1: nothing to cut; all limits hold with 50%; no trim changes the misalignment, which is near its limit."
-    )
+    assert codes(found) == ["nothing-to-cut", "all-limits", "misalignment-near-limit"]
+    assert values(found, "all-limits") == {"probability": 0.5}
     gaps[6, 2] = 1.5
     assert proposed(gaps, covariance).probability == pytest.approx(norm.cdf(1.0), abs=0.01)
 
@@ -164,10 +178,11 @@ def test_nothing_is_cut_in_order_to_be_filled_again():
     assert np.isnan(found.plane).all()
     assert found.build_up[2] == 0.0
     np.testing.assert_allclose(found.gap_after, 0.0, atol=1e-9)
-    assert "cut the right part's end by 0.0 / 0.0 / 45.9 / 0.0 mm at P1 / P2 / P3 / P4, straight between them" in (
-        found.sentence
+    sentences = messages("en").sentences(found.reasons)
+    assert (
+        "ut the right part's end by 0.0 / 0.0 / 45.9 / 0.0 mm at P1 / P2 / P3 / P4, straight between them" in sentences
     )
-    assert "fill by shims or weld build-up 13.0 / 10.3 / 0.0 / 16.0 mm at P1 / P2 / P3 / P4" in found.sentence
+    assert "ill by shims or weld build-up 13.0 / 10.3 / 0.0 / 16.0 mm at P1 / P2 / P3 / P4" in sentences
 
 
 def _between(corners):
@@ -181,38 +196,41 @@ def test_what_no_cut_makes_hold_is_said():
     x[4:] += [20.0, -20.0, 20.0, -20.0]
     found = proposed(along(x), 0.01 * np.eye(24), params=TrimParams(cut_sd_mm=3.0))
     assert found.action == "nothing"
-    assert "no cut or build-up makes the groove gap hold" in found.sentence
-    assert "as it is not all limits hold" in found.sentence
-    assert "0%" not in found.sentence
+    assert codes(found)[:2] == ["no-work-holds", "as-is-not-all-limits"]
+    assert "0%" not in messages("en").sentences(found.reasons)
 
 
 def test_a_joint_of_unsure_parts_gets_no_proposal_and_one_of_weak_parts_says_so():
     gaps = joint_measures.measure(along(-3.0), np.zeros((24, 24)), np.eye(4), POINTS)
-    unsure = propose("J1", gaps, GB, EXACT, unsure="rib1 is ambiguous")
+    doubt = reason("preassemble.ambiguous-part", part="rib1")
+    unsure = propose(gaps, GB, EXACT, doubts=(doubt,))
     assert unsure.action == "unknown"
     assert np.isnan(unsure.cut).all()
     assert np.isnan(unsure.probability_as_is)
-    assert unsure.sentence == "J1: nothing proposed until this is settled: rib1 is ambiguous."
-    weak = propose("J1", gaps, GB, EXACT, rests_on="rib1 (half of it was seen)")
+    assert unsure.reasons == (reason("preassemble.doubtful-gaps", reasons=(doubt,)),)
+    part = reason("preassemble.at", place="rib1", reasons=())
+    weak = propose(gaps, GB, EXACT, weak_parts=(part,))
     assert weak.action == "trim"
-    assert weak.sentence.startswith("J1: rests on a weak part: rib1 (half of it was seen); cut the right part's end")
+    assert codes(weak)[:2] == ["weak-parts", "amount-even"]
+    assert weak.reasons[0].values["parts"] == (part,)
 
 
 def test_no_trim_mends_what_is_misaligned():
     gaps = along(-2.0)
     gaps[6, 2], gaps[5, 1] = 3.1, -2.4
-    found = proposed(gaps, name="J3")
+    found = proposed(gaps)
     assert found.action == "trim"
     assert (found.probability, found.groove_probability, found.misalignment_probability) == (0.0, 1.0, 0.0)
     np.testing.assert_allclose(found.misaligned_by, [0, 0, 0, 0, 0, 0.4, 1.1, 0], atol=1e-9)
-    assert found.sentence.endswith(
-        "no trim mends the misalignment, 2 mm at most, of the right part at P7 top 3.1 mm up (1.1 too much), "
+    sentences = messages("en").sentences(found.reasons)
+    assert sentences.endswith(
+        "No trim removes the misalignment, 2 mm at most, of the right part at P7 top 3.1 mm up (1.1 too much), "
         "P6 right 2.4 mm to the right (0.4 too much)."
     )
     # A work that holds with 0 % is not proposed.
-    assert "no cut or build-up makes all limits hold; for the groove gap alone, cut" in found.sentence
-    assert "the groove gap then holds with 100%" in found.sentence
-    assert " 0%" not in found.sentence
+    assert codes(found) == ["not-all-limits", "groove-gap-alone", "then-groove-gap", "misaligned"]
+    assert values(found, "then-groove-gap")["probability"] == 1.0
+    assert " 0%" not in sentences
 
 
 def test_a_cut_that_gains_too_little_is_not_proposed():
@@ -224,23 +242,23 @@ def test_a_cut_that_gains_too_little_is_not_proposed():
     found = proposed(gaps, covariance, params=TrimParams(cut_sd_mm=2.0))
     assert found.action == "nothing"
     assert found.probability == pytest.approx(norm.cdf(1.0), abs=0.01)
-    assert "nothing proposed, for no cut or build-up makes the groove gap much surer" in found.sentence
+    assert codes(found)[0] == "no-work-gains"
 
 
 def test_what_is_not_known_is_said():
     unknown = proposed(np.full((8, 3), np.nan), np.full((24, 24), np.nan))
     assert unknown.action == "unknown"
     assert np.isnan(unknown.cut).all()
-    assert unknown.sentence.startswith("J1: the gaps are not known")
+    assert codes(unknown) == ["gaps-unknown"]
     no_groove = proposed(along(-3.0), limits=standards.override(Tolerance(), {"misalignment_mm": np.array([2.0])}, "x"))
     assert (no_groove.action, no_groove.probability) == ("nothing", 1.0)
-    assert "groove_gap_mm" in no_groove.sentence
+    assert codes(no_groove)[0] == "no-groove-limit"
     by_thickness = proposed(along(-3.0), limits=standards.load("JTG arch rib"))
     assert np.isnan(by_thickness.probability)
     assert np.isnan(by_thickness.misaligned_by).all()
     bare = proposed(along(-3.0), limits=Tolerance())
     assert np.isnan(bare.probability)
-    assert "not known" in bare.sentence
+    assert "probability-unknown" in codes(bare)
 
 
 def test_parameters_that_make_no_sense():
@@ -258,7 +276,7 @@ def test_the_same_proposal_every_time():
 @dataclasses.dataclass(frozen=True)
 class Judged(Checked):
     measures: tuple[joint_measures.Measures, ...]
-    verdicts: tuple[joints.Verdict, ...]
+    verdicts: tuple[joints.Conformity, ...]
     trim_and_shim: tuple[trim_and_shim.Proposal, ...]
 
 
@@ -266,7 +284,7 @@ def test_the_records_go_through_the_store(tmp_path):
     gaps = (along(-3.0), np.full((8, 3), np.nan))
     measured = tuple(joint_measures.measure(one, one[:1, 0] * np.eye(24) * 0.0, np.eye(4), POINTS) for one in gaps)
     verdicts = tuple(joints.judge(one, GB) for one in measured)
-    result = Judged(measured, verdicts, tuple(propose("J", one, GB) for one in measured))
+    result = Judged(measured, verdicts, tuple(propose(one, GB) for one in measured))
     store.write_results(tmp_path / "r.h5", [StepRun("x", "m", "{}", result)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {"x": Judged})
     assert repr(back.result) == repr(result)

@@ -19,13 +19,13 @@ from processor.geometry import rigid, surface_registration
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import by_cell
 from processor.geometry.parallel import each
-from processor.model import ArchDesign, DesignPart, Floats, Ints
+from processor.model import ArchDesign, DesignPart, Floats, Ints, Status, reason
 from processor.preassembly import errors
 from processor.preassembly.baselines import methods
 from processor.preassembly.baselines.methods import PartFeatures
 from processor.preassembly.params import Params
 from processor.preassembly.parts import attitude
-from processor.preassembly.result import Result
+from processor.preassembly.result import Deviations, Result
 
 Bools = npt.NDArray[np.bool_]
 
@@ -69,16 +69,27 @@ def with_bands(result: Result, repeated: list[list[PartFeatures]], design: ArchD
     if not repeated:
         return result
     assemblies = [methods.place(parts, design, params) for parts in repeated]
-    figures = [
-        (*errors.splicing_error(a.gaps), a.linear.mean, a.linear.max, a.best_fit.mean, a.best_fit.max)
-        for a in assemblies
-    ]
+    linear = [assembly.linear for assembly in assemblies]
+    best_fit = [assembly.best_fit for assembly in assemblies]
+    splicing = np.array([errors.splicing_error(assembly.gaps) for assembly in assemblies])
     return replace(
         result,
-        message=f"bands are what this method makes of parts as designed; {methods.INNER_EDGES}",
-        linear_ci95=bound(np.array([assembly.linear.vector for assembly in assemblies])),
-        best_fit_linear_ci95=bound(np.array([assembly.best_fit.vector for assembly in assemblies])),
-        errors_ci95=bound(np.array(figures)[:, :, None]),
+        reasons=(reason("preassemble.bands-as-designed"), reason("preassemble.inner-edges")),
+        splicing=replace(result.splicing, ci95=bound(splicing[:, :, None])),
+        linear=replace(
+            result.linear,
+            assembled=_with_band(result.linear.assembled, linear),
+            best_fit=_with_band(result.linear.best_fit, best_fit),
+        ),
+    )
+
+
+def _with_band(deviations: Deviations, repeated: list[errors.LinearError]) -> Deviations:
+    figures = np.array([(error.mean, error.max) for error in repeated])
+    return replace(
+        deviations,
+        error=replace(deviations.error, ci95=bound(figures[:, :, None])),
+        ci95=bound(np.array([error.vector for error in repeated])),
     )
 
 
@@ -103,7 +114,7 @@ def _as_designed(part: PartFeatures, design: DesignPart) -> _AsDesigned:
     """Project the points near the design onto it; unchanged where the part's pose is not known."""
     points = part.scan.points[by_cell(part.scan.points, CELL_MM)]
     unchanged = _AsDesigned(part, points, np.zeros(len(points), bool), 0.0, part.attitude.T_surface)
-    if part.attitude.status == "failed":
+    if part.attitude.status == Status.FAILED:
         return unchanged
     shape = attitude.sample_surface(design)
     fitted = surface_registration.fine(points, shape.mesh, shape.axes, part.attitude.T_surface)

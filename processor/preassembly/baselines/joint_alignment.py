@@ -12,16 +12,16 @@ import numpy as np
 
 from processor.geometry import icp, pfh, rigid
 from processor.geometry.neighbors import voxel_means
-from processor.model import Floats
+from processor.model import Floats, Reason, reason
 from processor.preassembly.params import MatchParams
 
 
 @dataclass(frozen=True)
 class Alignment:
-    """The pose of a part in the bridge's frame, and a message of the coarse alignment."""
+    """The pose of a part in the bridge's frame, and remarks on the alignment."""
 
     T_bridge_scan: Floats
-    message: str
+    reasons: tuple[Reason, ...] = ()
 
 
 def by_lines(source: Floats, target: Floats, start: Floats, params: MatchParams, rng: np.random.Generator) -> Alignment:
@@ -30,7 +30,7 @@ def by_lines(source: Floats, target: Floats, start: Floats, params: MatchParams,
     ``start`` (4, 4) is the attitude from the principal axes. The coarse pose from histograms is used only where it is
     near that attitude: on straight lines it is often turned over with a perfect score.
     """
-    coarse, message = _coarse(source, target, start, params, rng)
+    coarse, reasons = _coarse(source, target, start, params, rng)
     fine = icp.point_to_point(
         source,
         target,
@@ -39,16 +39,17 @@ def by_lines(source: Floats, target: Floats, start: Floats, params: MatchParams,
         max_iterations=params.icp_iterations,
         tolerance=params.icp_tolerance,
     )
-    return Alignment(fine.T_target_source, message)
+    return Alignment(fine.T_target_source, reasons)
 
 
 def _coarse(
     source: Floats, target: Floats, start: Floats, params: MatchParams, rng: np.random.Generator
-) -> tuple[Floats, str]:
+) -> tuple[Floats, tuple[Reason, ...]]:
+    """Return the coarse pose, and why it is not the one from histograms."""
     thin_source = voxel_means(source, params.pfh_voxel_mm)
     thin_target = voxel_means(target, params.pfh_voxel_mm)
     if min(len(thin_source), len(thin_target)) < 4:
-        return start, "too few feature points for histograms"
+        return start, (reason("preassemble.few-feature-points"),)
     histograms = [
         pfh.histograms(cloud, pfh.normals(cloud, params.pfh_radius_mm), params.pfh_radius_mm, params.pfh_bins)
         for cloud in (thin_source, thin_target)
@@ -63,8 +64,8 @@ def _coarse(
     )
     turn = np.degrees(rigid.rotation_angle(T[:3, :3] @ start[:3, :3].T))
     if turn > params.pfh_limit_deg:
-        return start, f"coarse pose from histograms not believed: turned by {turn:.0f} deg from the principal axes"
+        return start, (reason("preassemble.coarse-pose-rotated", degrees=float(turn)),)
     shift = float(np.linalg.norm(rigid.apply(T, thin_source) - rigid.apply(start, thin_source), axis=1).max())
     if shift > params.pfh_limit_mm:
-        return start, f"coarse pose from histograms not believed: {shift:.0f} mm from where the joint puts the part"
-    return T, ""
+        return start, (reason("preassemble.coarse-pose-shifted", shift=shift),)
+    return T, ()

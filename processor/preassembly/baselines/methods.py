@@ -18,7 +18,7 @@ import numpy as np
 from processor.geometry import rigid
 from processor.geometry.neighbors import surface_spacing
 from processor.geometry.polyline import Polyline
-from processor.model import ArchDesign, Floats, Scan
+from processor.model import ArchDesign, Floats, Reason, Scan, Status, Verdict, reason
 from processor.preassembly import errors
 from processor.preassembly.baselines import edge_features, joint_alignment
 from processor.preassembly.baselines.edge_features import JointEdges
@@ -26,16 +26,21 @@ from processor.preassembly.baselines.joint_alignment import Alignment
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import Params
 from processor.preassembly.parts import attitude
-from processor.preassembly.result import Result
+from processor.preassembly.result import (
+    Components,
+    Deviations,
+    EdgeSide,
+    Gauge,
+    Joints,
+    Linear,
+    MeanMax,
+    Result,
+    overall_status,
+)
 
-INNER_EDGES = "key points lie on the plates' inner edges"
 NOWHERE = np.full((4, 4), np.nan)
 LINE_SPACING_MM = 5.0  # of points along the design's lines
-GAUGES = {
-    "corner": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
-    "line": "Foot 1 at its principal-axes attitude, its joint corners on the design's",
-    "design-aided": "Foot 1 aligned to the design's lines",
-}
+GAUGES = {"corner": Gauge.PRINCIPAL_AXES, "line": Gauge.PRINCIPAL_AXES, "design-aided": Gauge.LINES}
 
 
 @dataclass(frozen=True)
@@ -48,16 +53,16 @@ class PartFeatures:
     ends: tuple[JointEdges | None, JointEdges | None]  # start, end
     lines: Floats  # (n, 3) along both bottom edges, for the alignment
     edges: errors.BottomEdges  # the same from thicker slices, for the linear error
-    trouble: str
+    reasons: tuple[Reason, ...]  # why a joint end was not found
 
 
 @dataclass(frozen=True)
 class Assembly:
-    """The parts as placed: T_bridge_scan (4, 4), status and message of each, gaps (j, 8, 3), errors by both gauges."""
+    """The parts as placed: T_bridge_scan (4, 4), status and remarks of each, gaps (j, 8, 3), errors by both gauges."""
 
     poses: list[Floats]
-    status: list[str]
-    messages: list[str]
+    status: list[Status]
+    reasons: list[tuple[Reason, ...]]
     gaps: Floats
     linear: errors.LinearError
     best_fit: errors.LinearError
@@ -87,15 +92,16 @@ def features_of(scan: Scan, index: int, pose: attitude.Attitude, design: ArchDes
     points = scan.points
     spacing = surface_spacing(points)
     ends: list[JointEdges | None] = []
-    troubles: list[str] = []
+    reasons: list[Reason] = []
     for outward, joint in ((-1.0, index - 1), (1.0, index)):
         if not 0 <= joint < len(design.joint_names):
             ends.append(None)
             continue
         rng = generator(params, f"{part.name} {outward}")
-        edges, trouble = _joint_end(points, pose, design.joint_points[joint], outward, spacing, params, rng)
+        edges, missing = _joint_end(points, pose, design.joint_points[joint], outward, spacing, params, rng)
         ends.append(edges)
-        troubles += [f"{design.joint_names[joint]}: {trouble}"] if trouble else []
+        if missing is not None:
+            reasons.append(reason("preassemble.at", place=design.joint_names[joint], reasons=(missing,)))
     slices = params.slices
     lines, checked = (
         edge_features.slice_edges(points, pose.T_principal, spacing, thickness, slices)
@@ -111,29 +117,30 @@ def features_of(scan: Scan, index: int, pose: attitude.Attitude, design: ArchDes
         ends=(ends[0], ends[1]),
         lines=np.vstack(lines),
         edges=bottom,
-        trouble="; ".join(troubles),
+        reasons=tuple(reasons),
     )
 
 
 def place(parts: list[PartFeatures], design: ArchDesign, params: Params) -> Assembly:
     """Chain parts by the method of the parameters, with their gaps and errors."""
-    poses, messages = _chain(parts, design, params)
+    poses, remarks = _chain(parts, design, params)
     gaps = np.full((len(parts) - 1, 8, 3), np.nan)
     status = [_status(part, pose) for part, pose in zip(parts, poses, strict=True)]
     for j, (left, right) in enumerate(pairwise(range(len(parts)))):
         a, b = parts[left].ends[1], parts[right].ends[0]
-        if a is not None and b is not None and "failed" not in (status[left], status[right]):
+        if a is not None and b is not None and Status.FAILED not in (status[left], status[right]):
             gaps[j] = rigid.apply(poses[right], b.key_points) - rigid.apply(poses[left], a.key_points)
             widest = float(np.abs(gaps[j]).max())
             if widest > params.gap_limit_mm:
-                messages[right] += f"; {design.joint_names[j]} gapes by {widest:.0f} mm: the alignment may have failed"
-                status[right] = "weak" if status[right] == "ok" else status[right]
+                wide = reason("preassemble.wide-gap", joint=design.joint_names[j], gap=widest)
+                remarks[right] = (*remarks[right], wide)
+                status[right] = Status.WEAK if status[right] == Status.OK else status[right]
     edges = [part.edges for part in parts]
     to_design = parts[0].attitude.T_surface @ (rigid.invert(poses[0]) if np.isfinite(poses[0]).all() else NOWHERE)
     return Assembly(
         poses=poses,
         status=status,
-        messages=messages,
+        reasons=remarks,
         gaps=gaps,
         linear=errors.linear_error(edges, poses),
         best_fit=errors.linear_error(edges, [to_design @ pose for pose in poses]),
@@ -148,33 +155,35 @@ def _joint_end(
     spacing: float,
     params: Params,
     rng: np.random.Generator,
-) -> tuple[JointEdges | None, str]:
-    """Edges of one joint end in the scan's frame, or None and the reason."""
+) -> tuple[JointEdges | None, Reason | None]:
+    """Edges of one joint end in the scan's frame, or the reason why there are none."""
     T_joint_scan = rigid.invert(joint_frame(design_points)) @ pose.T_principal
     corners = design_points[:4]
     size = np.array([np.linalg.norm(corners[0] - corners[1]), np.linalg.norm(corners[3] - corners[0])])
     cut = edge_features.cut_joint_end(points, T_joint_scan, outward, size, params.boxes)
     edges = edge_features.reduced_boxes(cut, outward, spacing, params.boxes, rng)
     if edges is None:
-        return None, "no joint edges found"
+        return None, reason("preassemble.no-joint-edges")
     T_scan_joint = rigid.invert(T_joint_scan)
     edges = JointEdges(rigid.apply(T_scan_joint, edges.points), rigid.apply(T_scan_joint, edges.key_points))
     off = rigid.apply(pose.T_surface, edges.key_points[:4]).mean(axis=0) - corners.mean(axis=0)
     distance = float(np.linalg.norm(off))
     if not distance <= params.end_limit_mm:
-        return None, f"what was taken for the joint's end lies {distance:.0f} mm from where the design has it"
-    return edges, ""
+        return None, reason("preassemble.joint-end-misplaced", distance=distance)
+    return edges, None
 
 
-def _chain(parts: list[PartFeatures], design: ArchDesign, params: Params) -> tuple[list[Floats], list[str]]:
-    """Chain the parts from the first: T_bridge_scan of each (NaN where the chain is broken) and a message each."""
+def _chain(
+    parts: list[PartFeatures], design: ArchDesign, params: Params
+) -> tuple[list[Floats], list[tuple[Reason, ...]]]:
+    """Chain the parts from the first: T_bridge_scan of each (NaN where the chain is broken), and remarks on each."""
     poses = [_place_first(parts[0], design, params)]
-    messages = [""]
+    reasons: list[tuple[Reason, ...]] = [()]
     for before, part in pairwise(parts):
         alignment = _place_next(before, poses[-1], part, params)
         poses.append(alignment.T_bridge_scan)
-        messages.append(alignment.message)
-    return poses, messages
+        reasons.append(alignment.reasons)
+    return poses, reasons
 
 
 def _place_first(part: PartFeatures, design: ArchDesign, params: Params) -> Floats:
@@ -195,10 +204,10 @@ def _place_first(part: PartFeatures, design: ArchDesign, params: Params) -> Floa
 def _place_next(before: PartFeatures, T_before: Floats, part: PartFeatures, params: Params) -> Alignment:
     end_before, end = before.ends[1], part.ends[0]
     if end_before is None or end is None or not np.isfinite(T_before).all():
-        return Alignment(NOWHERE, "not placed: the chain is broken before it")
+        return Alignment(NOWHERE, (reason("preassemble.chain-broken"),))
     corners = rigid.apply(T_before, end_before.key_points[:4])
     if params.method == "corner":
-        return Alignment(rigid.fit(end.key_points[:4], corners), "")
+        return Alignment(rigid.fit(end.key_points[:4], corners))
     start = _at_corners(part.attitude.T_principal, end, corners)
     source, target = end.points, rigid.apply(T_before, end_before.points)
     if params.method == "design-aided":
@@ -219,51 +228,55 @@ def _design_lines(part: PartFeatures) -> Floats:
     return np.vstack([line.at(np.arange(0.0, line.length, LINE_SPACING_MM)) for line in lines])
 
 
-def _status(part: PartFeatures, pose: Floats) -> str:
-    if part.trouble or part.attitude.status == "failed" or not np.isfinite(pose).all():
-        return "failed"
+def _status(part: PartFeatures, pose: Floats) -> Status:
+    if part.reasons or part.attitude.status == Status.FAILED or not np.isfinite(pose).all():
+        return Status.FAILED
     return part.attitude.status
 
 
 def _result(parts: list[PartFeatures], assembly: Assembly, design: ArchDesign, params: Params) -> Result:
     splicing_mean, splicing_max = errors.splicing_error(assembly.gaps)
-    messages = [
-        "; ".join(filter(None, (part.attitude.message, part.trouble, message.lstrip("; "))))
-        for part, message in zip(parts, assembly.messages, strict=True)
-    ]
-    partial = any(status != "failed" for status in assembly.status)
-    return Result(
-        status="ok" if all(status == "ok" for status in assembly.status) else "partial" if partial else "failed",
-        method=params.method,
-        message=f"no uncertainty is stated by this method; {INNER_EDGES}",
-        components=tuple(part.name for part in parts),
-        component_status=tuple(assembly.status),
-        component_message=tuple(messages),
-        component_scans=tuple(part.scan.name for part in parts),
+    components = Components(
+        name=tuple(part.name for part in parts),
+        status=tuple(assembly.status),
+        reasons=tuple(
+            (*part.attitude.reasons, *part.reasons, *remarks)
+            for part, remarks in zip(parts, assembly.reasons, strict=True)
+        ),
+        scans=tuple(part.scan.name for part in parts),
         T_bridge_scan=np.array(
             [rigid.with_origin(pose, part.scan.origin) for pose, part in zip(assembly.poses, parts, strict=True)]
         ),
         covariance=np.full((len(parts), 6, 6), np.nan),
         key_points_scan=np.array([[_key_points(part, end) for end in part.ends] for part in parts]),
         key_points_sd=np.full((len(parts), 2, 8, 3), np.nan),
-        joints=design.joint_names,
-        joint_left=design.joint_left,
-        joint_right=design.joint_right,
-        gaps=assembly.gaps,
-        gap_ci95=np.full_like(assembly.gaps, np.nan),
-        verdict=("indeterminate",) * len(assembly.gaps),
-        splicing_mean=splicing_mean,
-        splicing_max=splicing_max,
-        gauge=GAUGES[params.method],
-        linear_mean=assembly.linear.mean,
-        linear_max=assembly.linear.max,
-        best_fit_linear_mean=assembly.best_fit.mean,
-        best_fit_linear_max=assembly.best_fit.max,
-        linear_station=assembly.linear.chainage,
-        linear_edge=assembly.linear.edge,
-        linear_deviation=assembly.linear.deviation,
-        best_fit_linear_deviation=assembly.best_fit.deviation,
     )
+    return Result(
+        status=overall_status(components.status),
+        method=params.method,
+        reasons=(reason("preassemble.no-uncertainty"), reason("preassemble.inner-edges")),
+        components=components,
+        joints=Joints(
+            name=design.joint_names,
+            left=design.joint_left,
+            right=design.joint_right,
+            gaps=assembly.gaps,
+            gap_ci95=np.full_like(assembly.gaps, np.nan),
+            verdict=(Verdict.INDETERMINATE,) * len(assembly.gaps),
+        ),
+        splicing=MeanMax(mean=splicing_mean, max=splicing_max),
+        linear=Linear(
+            gauge=GAUGES[params.method],
+            chainage=assembly.linear.chainage,
+            edge=tuple(map(EdgeSide, assembly.linear.edge)),
+            assembled=_deviations(assembly.linear),
+            best_fit=_deviations(assembly.best_fit),
+        ),
+    )
+
+
+def _deviations(error: errors.LinearError) -> Deviations:
+    return Deviations(error=MeanMax(mean=error.mean, max=error.max), deviation=error.deviation)
 
 
 def _key_points(part: PartFeatures, end: JointEdges | None) -> Floats:

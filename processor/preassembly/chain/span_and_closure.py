@@ -10,13 +10,27 @@ from scipy.linalg import block_diag
 
 from processor.adjustment import extremes
 from processor.geometry import rigid
-from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats
+from processor.model import KEY_POINTS, NORMAL_95, ArchDesign, Floats, Reason, Status, Word, reason
 from processor.preassembly.chain import adjustment
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.measure import MeasuredPart
 
 JOINTS_ALONE = 1e-9  # lambda with which the design's curve only fixes the position of the bridge
-AXES = ("end face", "webs", "bottom and top")  # the surfaces that place a joint end along its x, y and z
+
+
+class EndSurface(Word):
+    """The surfaces that place a joint end along its x, y and z axes."""
+
+    END_FACE = "end face"
+    WEBS = "webs"
+    BOTTOM_AND_TOP = "bottom and top"
+
+
+class PartEnd(Word):
+    """An end of a part along the bridge."""
+
+    START = "start"
+    END = "end"
 
 
 class Figures(NamedTuple):
@@ -26,8 +40,8 @@ class Figures(NamedTuple):
     span_ci95: float
     closure: Floats
     closure_ci95: Floats
-    limiting: str
-    advice: str
+    limiting: tuple[Reason, ...]
+    advice: tuple[Reason, ...]
 
 
 def measure(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> Figures:
@@ -64,12 +78,12 @@ def design_span(design: ArchDesign) -> float:
 def closure(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats) -> tuple[Floats, Floats]:
     """Closure of the chain: departure of its outer end when the joints alone place all parts after the first.
 
-    Departure (6,) from the design, mm along the bridge's axes and mrad about them, with 95 % half-widths (6,); NaN
+    Departure (2, 3) from the design, mm along the bridge's axes and mrad about them, with 95 % half-widths (2, 3); NaN
     where a joint has no answer. The first part rests on its design.
     """
     alone = adjustment.adjust([part.member for part in parts], design.joint_points, frames, JOINTS_ALONE)
     if not np.isfinite(alone.gaps).all():
-        return np.full(6, np.nan), np.full(6, np.nan)
+        return np.full((2, 3), np.nan), np.full((2, 3), np.nan)
     at = _outer_ends(design)[1]
     T = rigid.invert(alone.motions[0]) @ alone.motions[-1]
     shift, turn = rigid.apply(T, at[None])[0] - at, rigid.vector_from_rotation(T[:3, :3])
@@ -80,11 +94,13 @@ def closure(parts: Sequence[MeasuredPart], design: ArchDesign, frames: Floats) -
         for derivative in (by_motion, by_pose):
             derivative[3:, 6 * i : 6 * i + 3] += sign * np.eye(3)
     covariance = _covariance(parts, alone, by_motion, by_pose)
-    unit = np.array([1.0, 1.0, 1.0, 1e3, 1e3, 1e3])
-    return np.concatenate([shift, turn]) * unit, NORMAL_95 * np.sqrt(np.diag(covariance)) * unit
+    unit = np.array([[1.0], [1e3]])
+    return np.stack([shift, turn]) * unit, NORMAL_95 * np.sqrt(np.diag(covariance)).reshape(2, 3) * unit
 
 
-def limiting(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats) -> tuple[str, str]:
+def limiting(
+    parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign, frames: Floats
+) -> tuple[tuple[Reason, ...], tuple[Reason, ...]]:
     """Return the joint and the measured face that limit the gaps' accuracy, and the further scan that would help."""
     worst, where = 0.0, (0, 0, 0)
     for j, (covariance, frame) in enumerate(zip(adjusted.gap_covariance, frames, strict=True)):
@@ -97,20 +113,27 @@ def limiting(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesi
     if worst == 0.0:
         return missing, missing
     j, point, axis = where
-    variance = {}
-    for side, part, end in (("end", parts[j], 1), ("start", parts[j + 1], 0)):
+    variance: dict[PartEnd, float] = {}
+    for side, part, end in ((PartEnd.END, parts[j], 1), (PartEnd.START, parts[j + 1], 0)):
         joint_end = part.member.ends[end]
         if joint_end is not None:
             # An end's error by its part's registration is common to both ends: it cancels, so it limits nothing.
             covariance = adjustment.without_pose(joint_end, part.member.pose)
             variance[side] = float(np.diag(covariance)[3 * point + axis])
     side = max(variance, key=lambda side: variance[side])
-    name = parts[j].name if side == "end" else parts[j + 1].name
-    share = variance[side] / sum(variance.values())
-    limit = f"{design.joint_names[j]} {KEY_POINTS[point]}: +-{NORMAL_95 * worst:.3f} mm (95 %), {share:.0%} of the "
-    limit += f"variance from the {AXES[axis]} at the {side} of {name}"
-    advice = f"a scan of {name} that shows more of the {AXES[axis]} at its {side}: four times the points halve its part"
-    return limit, "; ".join(filter(None, (missing, advice)))
+    name = parts[j].name if side is PartEnd.END else parts[j + 1].name
+    surface = tuple(EndSurface)[axis]
+    limit = reason(
+        "preassemble.limiting",
+        joint=design.joint_names[j],
+        point=KEY_POINTS[point],
+        ci95=NORMAL_95 * worst,
+        share=variance[side] / sum(variance.values()),
+        surface=surface,
+        end=side,
+        part=name,
+    )
+    return (limit,), (*missing, reason("preassemble.scan-more", part=name, surface=surface, end=side))
 
 
 def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
@@ -130,15 +153,19 @@ def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
     return NORMAL_95 * float(np.sqrt(variance.sum(axis=1).mean())), max(high - largest, largest - low)
 
 
-def _missing(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign) -> str:
-    """Return what to scan where joints have no answer."""
-    joints: dict[str, list[str]] = {}
+def _missing(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign) -> tuple[Reason, ...]:
+    """Return what to scan where joints have no result."""
+    joints: dict[tuple[str, ...], list[str]] = {}
     for name, gaps, *beside in zip(design.joint_names, adjusted.gaps, parts, parts[1:], strict=False):
         if not np.isfinite(gaps).all():
-            failed = " and ".join(part.name for part in beside if part.status == "failed")
-            what = f"{failed} has no scan that fits" if failed else "scan both ends there"
-            joints.setdefault(what, []).append(name)
-    return "; ".join(f"no answer at {', '.join(names)}: {what}" for what, names in joints.items())
+            failed = tuple(part.name for part in beside if part.status == Status.FAILED)
+            joints.setdefault(failed, []).append(name)
+    return tuple(
+        reason("preassemble.scan-failed-parts", joints=tuple(names), parts=failed)
+        if failed
+        else reason("preassemble.scan-both-ends", joints=tuple(names))
+        for failed, names in joints.items()
+    )
 
 
 def _covariance(parts: Sequence[MeasuredPart], adjusted: Adjusted, by_motion: Floats, by_pose: Floats) -> Floats:

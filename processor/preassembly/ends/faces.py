@@ -13,12 +13,27 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
-from processor.model import Floats, Ints
+from processor.model import Floats, Ints, Reason, Word, reason
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends.joint_frame import EndPlace, end_place
 from processor.preassembly.ends.plate_sides import Bools
 
-FACES = (("bottom", 2, -1.0), ("right", 1, -1.0), ("top", 2, 1.0), ("left", 1, 1.0))  # axis and sense of the normal
+
+class PlateFace(Word):
+    """An outer face of a part."""
+
+    BOTTOM = "bottom"
+    RIGHT = "right"
+    TOP = "top"
+    LEFT = "left"
+
+
+FACES = (  # axis and sense of the normal
+    (PlateFace.BOTTOM, 2, -1.0),
+    (PlateFace.RIGHT, 1, -1.0),
+    (PlateFace.TOP, 2, 1.0),
+    (PlateFace.LEFT, 1, 1.0),
+)
 FACE = 8  # coefficients of a face
 ALONG = 0.9  # cosine between a facet's normal and an axis, above which the facet is of a face across that axis
 NEAR_MM = 500.0  # of a joint, beyond the facet nearest to it
@@ -96,7 +111,7 @@ def outer_faces(surface: MeshSurface, joints: Sequence[Floats]) -> MeshSurface:
     return surface.only(chosen) if chosen.any() else surface
 
 
-def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] | str:
+def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] | Reason:
     """Fit the four faces to the points of the joint's zone, ``local`` (n, 3) in its frame; or the reason why not."""
     faces = _on_faces(part, local, place)
     centred = [out - np.median(out) for _, out, _, _ in faces if len(out)]
@@ -110,7 +125,7 @@ def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] |
         columns = basis(local[rows, 0], local[rows, across] / place.half[across])
         coefficients, covariance, residual, inliers = _least_squares(columns, out[clear])
         if not len(coefficients):
-            return f"too few points on the {name} face"
+            return reason("preassemble.few-points-on-face", face=name)
         used = UsedPoints(columns[inliers], residual, part.station[rows][inliers], cell[clear][inliers])
         fits.append(FaceFit(coefficients, covariance, used, single_layer))
     return fits

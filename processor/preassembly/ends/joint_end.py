@@ -23,7 +23,7 @@ from processor.adjustment import model_averaging, variance_components
 from processor.adjustment.model_averaging import SIZES_MM, Bools, Estimate
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import Floats, Ints
+from processor.model import Floats, Ints, Reason, reason
 from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends import ring as ends_ring
@@ -66,7 +66,7 @@ class JointEnd:
     departure: Floats
     covariance: Floats
     by_pose: Floats
-    trouble: str
+    doubts: tuple[Reason, ...] = ()  # why the end is not known, or may be that of another plate side
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class FittedEnd:
     pose: Floats
     place: EndPlace
     third_order: Floats  # (8, 2) of the four faces, see variance_components.third_order
-    trouble: str
+    doubts: tuple[Reason, ...] = ()
 
 
 class _Block(NamedTuple):
@@ -93,9 +93,9 @@ class _Block(NamedTuple):
     priors: list[Floats]
 
 
-def unknown(trouble: str) -> JointEnd:
-    """Return an end without an answer, and the reason."""
-    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), np.full((24, 6), np.nan), trouble)
+def unknown(*why: Reason) -> JointEnd:
+    """Return an end without a result, with the reasons."""
+    return JointEnd(np.full((8, 3), np.nan), np.full((24, 24), np.nan), np.full((24, 6), np.nan), why)
 
 
 def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
@@ -108,17 +108,17 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
     beside = np.abs(local[:, 1:]) < place.half[1:] + REACH_MM
     zone = (depth < ZONE_MM) & (depth > -REACH_MM) & beside.all(axis=1)
     if zone.sum() < 5 * LEAST_POINTS:
-        return unknown("too few points near the joint")
+        return unknown(reason("preassemble.few-points-at-joint"))
     part, local = part.only(zone), local[zone]
     faces = ends_faces.fit(part, local, place)
-    if isinstance(faces, str):
+    if isinstance(faces, Reason):
         return unknown(faces)
     residual = np.concatenate([face.used.residual for face in faces])
     sigma = float(np.sqrt(residual @ residual / max(len(residual) - FACE * len(faces), 1)))
     thickness = _design_thickness(part.surface, place)
     ring, on_ring = _fit_ring(local, part.station, faces, place, thickness, sigma)
     if not len(ring.coefficients):
-        return unknown("too few points on the end face")
+        return unknown(reason("preassemble.few-points-on-end-face"))
     blocks = _full_covariances([(f.covariance, f.used) for f in faces], part.between_stations)
     blocks += _full_covariances([(ring.covariance, on_ring)], part.between_stations)
     return FittedEnd(
@@ -128,7 +128,7 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
         pose=part.pose,
         place=place,
         third_order=np.vstack([variance_components.third_order(f.used.basis, f.used.residual) for f in faces]),
-        trouble=_inner_side(faces, thickness),
+        doubts=_inner_side(faces, thickness),
     )
 
 
@@ -140,14 +140,14 @@ def estimate(ends: Sequence[FittedEnd]) -> list[JointEnd]:
     return [_corners_of(end, averaged, bending) for end, averaged in zip(ends, _averaged(ends), strict=True)]
 
 
-def _inner_side(faces: Sequence[FaceFit], thickness: Floats) -> str:
-    """Reason for doubt where a face lies further in than half its plate and no second layer was found."""
-    doubtful = [
+def _inner_side(faces: Sequence[FaceFit], thickness: Floats) -> tuple[Reason, ...]:
+    """Return a doubt where a face lies further in than half its plate and no second layer was found."""
+    doubtful = tuple(
         name
         for (name, axis, _), face in zip(FACES, faces, strict=True)
         if face.single_layer and face.coefficients[0] < -0.5 * thickness[axis - 1] < 0.0
-    ]
-    return f"the {' and the '.join(doubtful)} face may be the plate's inner side" if doubtful else ""
+    )
+    return (reason("preassemble.inner-side", faces=doubtful),) if doubtful else ()
 
 
 def _full_covariances(fits: Sequence[tuple[Floats, UsedPoints]], between_stations: float) -> list[Floats]:
@@ -171,7 +171,7 @@ def _corners_of(end: FittedEnd, averaged: Estimate, bending: float) -> JointEnd:
     at_joint = derivative[:, AT_JOINT]
     covariance += bending * at_joint @ at_joint.T
     by_pose = derivative @ averaged.not_followed(end.motion)
-    return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.trouble)
+    return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.doubts)
 
 
 def _design_thickness(surface: MeshSurface, place: EndPlace) -> Floats:

@@ -17,7 +17,7 @@ from processor.geometry import icp, mesh_distance, principal, rigid, surface_reg
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.parallel import each
-from processor.model import DesignPart, Floats
+from processor.model import DesignPart, Floats, Reason, Status, reason
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
@@ -46,8 +46,8 @@ class Attitude:
 
     T_principal: Floats
     T_surface: Floats
-    status: str  # ok | ambiguous | failed
-    message: str
+    status: Status  # ok | ambiguous | failed
+    reasons: tuple[Reason, ...] = ()
     T_rival: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))  # of an ambiguous part: the other pose
 
 
@@ -179,8 +179,8 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     candidates = _distinct(candidates + each(align, turned), box)
     best = candidates[0]
     if best.misfit > NO_FIT_MM:
-        message = f"no attitude fits the design (typical distance {best.misfit:.0f} mm)"
-        return Attitude(best.start, best.T, "failed", message)
+        why = reason("preassemble.no-attitude", distance=best.misfit)
+        return Attitude(best.start, best.T, Status.FAILED, (why,))
     rivals = [c for c in candidates if c.misfit <= RIVAL_RATIO * best.misfit + 0.5]
     return _decide(points, box, seeds, surface, rivals)
 
@@ -248,20 +248,20 @@ def _decide(points: Floats, box: Floats, seeds: Floats, surface: Surface, candid
     rivals = [other for other in range(len(candidates)) if other != best and compare(best, other) <= 0]
     T, start = candidates[best].T, candidates[best].start
     if not rivals:
-        return Attitude(start, T, "ok", "")
+        return Attitude(start, T, Status.OK)
     T_rival = candidates[rivals[0]].T
-    return Attitude(start, T, "ambiguous", _rival_message(T, T_rival, surface), T_rival)
+    return Attitude(start, T, Status.AMBIGUOUS, (_rival_reason(T, T_rival, surface),), T_rival)
 
 
-def _rival_message(best: Floats, rival: Floats, surface: Surface) -> str:
+def _rival_reason(best: Floats, rival: Floats, surface: Surface) -> Reason:
     """Describe a rival pose relative to the best, T_bridge_scan (4, 4) each, and what would distinguish them."""
     between = rival @ rigid.invert(best)
     middle = surface.points.mean(axis=0)
     turn = rigid.rotation_angle(between[:3, :3])
     if turn >= SLIDE_RAD:
-        return f"the part fits its design as well when turned by {np.degrees(turn):.0f} deg; a mark on it would tell"
+        return reason("preassemble.rival-rotation", degrees=float(np.degrees(turn)))
     shift = abs(float((rigid.apply(between, middle) - middle) @ surface.axes[:, 0]))
-    return f"the part fits its design as well when shifted by {shift:.0f} mm along itself; an end seen would tell"
+    return reason("preassemble.rival-shift", shift=shift)
 
 
 def _align(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:

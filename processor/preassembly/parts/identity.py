@@ -8,6 +8,7 @@ Scans differ only where the designs do: at the marks that distinguish a part's e
 from __future__ import annotations
 
 from dataclasses import dataclass
+from enum import Enum
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import box_girder, rigid
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.neighbors import thinned
-from processor.model import ArchDesign, DesignPart, Floats
+from processor.model import ArchDesign, DesignPart, Floats, Reason, reason
 from processor.preassembly.parts import attitude
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, SAMPLE_SPACING_MM
 
@@ -40,21 +41,24 @@ class Identity:
     same: tuple[str, ...] = ()
 
     @property
-    def contradiction(self) -> str:
+    def contradiction(self) -> tuple[Reason, ...]:
         """Why the scan is of another part; empty where it is not."""
-        return f"by its mark it is rather {' or '.join(self.rather)}" if self.rather else ""
+        return (reason("preassemble.mark-of-other", parts=self.rather),) if self.rather else ()
 
     @property
-    def open_questions(self) -> list[str]:
+    def open_questions(self) -> tuple[Reason, ...]:
         """Parts that the scan may be of as well."""
-        questions = []
-        if self.unseen:
-            questions.append(
-                f"of the same shape as {' and '.join(self.unseen)}: no mark was seen that tells them apart"
-            )
-        if self.same:
-            questions.append(f"of the same shape as {' and '.join(self.same)}: the scan may be of either")
-        return questions
+        unseen = (reason("preassemble.mark-not-seen", parts=self.unseen),) if self.unseen else ()
+        return (*unseen, reason("preassemble.same-shape", parts=self.same)) if self.same else unseen
+
+
+class _Outcome(Enum):
+    """Which part's mark a scan shows; UNSEEN: neither's, SAME: the designs do not differ."""
+
+    PART = 1
+    OTHER = 2
+    UNSEEN = 3
+    SAME = 4
 
 
 class _Surroundings(NamedTuple):
@@ -75,25 +79,25 @@ def identify(points: Floats, T: Floats, surface: attitude.Surface, part: DesignP
         other_surface = attitude.sample_surface(other)
         # A part that is symmetric but for its mark lies on the other in two ways. Where the marks agree in one of them
         # the two parts are the same; a mark that agrees in the other way is the part's own, turned round.
-        answers = {_compare(points, T, surface, other_surface, motion) for motion in motions}
-        if "same" in answers:
+        outcomes = {_compare(points, T, surface, other_surface, motion) for motion in motions}
+        if _Outcome.SAME in outcomes:
             same.append(other.name)
-        elif "other" in answers:
+        elif _Outcome.OTHER in outcomes:
             rather.append(other.name)
-        elif "unseen" in answers:
+        elif _Outcome.UNSEEN in outcomes:
             unseen.append(other.name)
     return Identity(tuple(rather), tuple(unseen), tuple(same))
 
 
 def _compare(
     points: Floats, T: Floats, surface: attitude.Surface, other_surface: attitude.Surface, T_part_other: Floats
-) -> str:
-    """Compare with another part laid on this one in one way: part | other | unseen | same."""
+) -> _Outcome:
+    """Compare with another part laid on this one in one way."""
     T_other = rigid.invert(T_part_other) @ T
     of_part = attitude.only_in(surface, T, other_surface, T_other)
     of_other = attitude.only_in(other_surface, T_other, surface, T)
     if len(of_part[0]) + len(of_other[0]) < LEAST_EVIDENCE:
-        return "same"
+        return _Outcome.SAME
     of_other = rigid.apply(T_part_other, of_other[0]), of_other[1] @ T_part_other[:3, :3].T
     marks = np.vstack([of_part[0], of_other[0]])  # both in the frame of the part's design
     around = _around(rigid.apply(T, thinned(points, AROUND)), surface, marks)
@@ -102,8 +106,8 @@ def _compare(
     )
     more, fewer = max(part_count, other_count), min(part_count, other_count)
     if more < LEAST_EVIDENCE or more < 2 * fewer:
-        return "unseen"
-    return "part" if part_count > other_count else "other"
+        return _Outcome.UNSEEN
+    return _Outcome.PART if part_count > other_count else _Outcome.OTHER
 
 
 def _around(points: Floats, surface: attitude.Surface, marks: Floats) -> _Surroundings:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ from processor.geometry import box_girder, icp, principal, rigid, surface_regist
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import by_cell, thinned, voxel_means
 from processor.geometry.polyline import Polyline
-from processor.model import ArchDesign, DesignPart, Floats, Ints, Scan
+from processor.model import ArchDesign, DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly.ends import bottom_edges, faces, joint_end
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.faces import RegisteredPart
@@ -30,7 +30,7 @@ SLICES, LEAST_OF_TYPICAL = (
 )  # of a part's length; of the median number of points on a slice's side: it is covered
 ACROSS = 0.7  # cosine to the part's axis, below which a normal is of the part's sides
 LEAST_COVERED = 0.7
-WHICH = "is this the right part, and whole?"
+RIGHT_PART = (reason("preassemble.right-part"),)
 RESIDUALS = 4_000  # points of a part whose distances from the design are kept
 
 
@@ -40,8 +40,8 @@ class MeasuredPart:
 
     name: str
     scans: tuple[Scan, ...]  # those used; poses and key points are in the frame of the first
-    status: str  # ok | ambiguous | weak | failed
-    message: str
+    status: Status  # ok | ambiguous | weak | failed
+    reasons: tuple[Reason, ...]
     T_bridge_scan: Floats
     member: Member
     shrink: float  # lengths at the reference temperature by lengths as scanned
@@ -61,8 +61,9 @@ class FittedPart:
 
 @dataclass(frozen=True, eq=False)
 class _PlacedScan:
-    """One scan registered to the design; ``trouble`` is the reason where it is not.
+    """One scan registered to the design; ``rejected`` are the reasons where it is not.
 
+    ``doubts`` are reasons why it may be of another part.
     ``points`` (n, 3) are the scan's at the reference temperature, cell by cell; ``station`` (n,) numbers the station of
     each.
     """
@@ -72,19 +73,19 @@ class _PlacedScan:
     station: Ints
     attitude: attitude.Attitude
     registration: surface_registration.SurfaceFit = surface_registration.NOWHERE
-    trouble: str = ""
+    rejected: tuple[Reason, ...] = ()
     identity: identity.Identity = field(default_factory=identity.Identity)
-    doubt: str = ""  # why it may be of another part
+    doubts: tuple[Reason, ...] = ()
 
     @property
     def sure(self) -> tuple[bool, bool]:
-        """Whether it is distinguished from its rival poses, and held in all directions."""
-        return self.attitude.status == "ok", not self.registration.weak and not self.doubt
+        """Whether it is distinguished from its rival poses, and all motions of the part are determined."""
+        return self.attitude.status == Status.OK, not self.registration.weak and not self.doubts
 
     @property
-    def not_held(self) -> str:
-        """The directions in which the scan does not hold the part."""
-        return f"what the scan shows does not hold {' and '.join(self.registration.weak)}"
+    def weak(self) -> tuple[Reason, ...]:
+        """State the motions of the part that the scan does not determine."""
+        return (reason("preassemble.weak", motions=self.registration.weak),) if self.registration.weak else ()
 
 
 def fit(
@@ -100,7 +101,7 @@ def fit(
     shape = attitude.sample_surface(part)
     joints = [j if 0 <= j < len(design.joint_names) else None for j in (index - 1, index)]
     placed = [_place(scan, part, design, shape, shrink) for scan in scans]
-    usable = [scan for scan in placed if not scan.trouble]
+    usable = [scan for scan in placed if not scan.rejected]
     if not usable:
         return _failed(part, joints, placed, shrink)
     usable.sort(key=lambda scan: (scan.sure, len(scan.scan.points)), reverse=True)
@@ -112,20 +113,20 @@ def fit(
         for outward, joint in zip((-1.0, 1.0), joints, strict=True)
     )
     edges = _edges(registered, part, first.registration.sigma_mm, systematic)
-    troubles = [
-        f"{design.joint_names[joint]}: {end.trouble}"
+    doubtful_ends = tuple(
+        reason("preassemble.at", place=design.joint_names[joint], reasons=end.doubts)
         for end, joint in zip(ends, joints, strict=True)
-        if end is not None and joint is not None and end.trouble
-    ]
-    weak = bool(first.registration.weak or first.doubt or troubles)
-    status = "ambiguous" if first.attitude.status == "ambiguous" else "weak" if weak else "ok"
-    resemblance = _resemblance(first.points, design, part) if status != "ok" else ""
+        if end is not None and joint is not None and end.doubts
+    )
+    status = Status.WEAK if first.registration.weak or first.doubts or doubtful_ends else Status.OK
+    status = Status.AMBIGUOUS if first.attitude.status == Status.AMBIGUOUS else status
+    resemblance = _resemblance(first.points, design, part) if status != Status.OK else ()
     residual_points, residuals = _residuals(registered.points, shape.mesh)
     measured = MeasuredPart(
         name=part.name,
         scans=tuple(scan.scan for scan in used),
         status=status,
-        message="; ".join(filter(None, (*_messages(placed, used, part, troubles), resemblance))),
+        reasons=(*_reasons(placed, used, part, doubtful_ends), *resemblance),
         T_bridge_scan=first.registration.T_design_scan,
         member=Member((None, None), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
@@ -150,21 +151,22 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
     return measured
 
 
-def _messages(
-    placed: Sequence[_PlacedScan], used: Sequence[_PlacedScan], part: DesignPart, troubles: Sequence[str]
-) -> list[str]:
-    """Remarks on a part, in the order in which they are shown; some may be empty."""
+def _reasons(
+    placed: Sequence[_PlacedScan], used: Sequence[_PlacedScan], part: DesignPart, doubtful_ends: Sequence[Reason]
+) -> Iterator[Reason]:
+    """Yield the remarks on a part, in the order in which they are shown."""
     first = used[0]
-    messages = [first.attitude.message]
+    yield from first.attitude.reasons
     for scan in placed:
         if scan not in used:
-            why = scan.trouble or scan.attitude.message or scan.doubt or scan.not_held
-            messages.append(f"scan {scan.scan.name} is not used: {why}")
-    messages += [*troubles, first.not_held if first.registration.weak else "", first.doubt, box_girder.cost(part)]
+            why = scan.rejected or scan.attitude.reasons or scan.doubts or scan.weak
+            yield reason("preassemble.scan-not-used", scan=scan.scan.name, reasons=why)
+    yield from (*doubtful_ends, *first.weak, *first.doubts)
+    if part.source == box_girder.SOURCE:
+        yield reason("preassemble.no-mesh")
     # One scan that shows the part's mark is enough.
     if all(scan.identity.open_questions for scan in used):
-        messages += first.identity.open_questions
-    return messages
+        yield from first.identity.open_questions
 
 
 def _registered(used: Sequence[_PlacedScan], shape: attitude.Surface, joints: Sequence[Floats]) -> RegisteredPart:
@@ -222,41 +224,39 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
     station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
     pose = attitude.find(points, part, shape)
     placed = _PlacedScan(scan, points, station, pose)
-    if pose.status == "failed":
-        return replace(placed, trouble=pose.message)
+    if pose.status == Status.FAILED:
+        return replace(placed, rejected=pose.reasons)
     registration = surface_registration.fine(points, shape.mesh, shape.axes, pose.T_surface)
     placed = replace(placed, registration=registration)
     misfit = _misfit(registration)
     if misfit:
-        return replace(placed, trouble=f"{misfit}; {_resemblance(points, design, part) or WHICH}")
+        return replace(placed, rejected=(*misfit, *(_resemblance(points, design, part) or RIGHT_PART)))
     # A part without a mesh has approximate surfaces: points of the right part lie off them, too.
     if registration.used_share < 1.0 - surface_registration.CLUTTER_SHARE and part.source != box_girder.SOURCE:
         # A part of another size fits the design as far as the two are alike; the rest looks like clutter.
-        away = f"{1.0 - registration.used_share:.0%} of the points are away from the design's surface"
+        away = 1.0 - registration.used_share
         resemblance = _resemblance(points, design, part)
         if resemblance:
-            return replace(placed, trouble=f"{away}; {resemblance}")
+            return replace(placed, rejected=(reason("preassemble.points-away", share=away), *resemblance))
         covered = _covered(points, registration.T_design_scan, shape)
         if covered < LEAST_COVERED:
-            doubt = f"{away} and the others cover {covered:.0%} of its sides; {WHICH}"
-            placed = replace(placed, doubt=doubt)
+            doubt = reason("preassemble.sides-not-covered", share=away, covered=covered)
+            placed = replace(placed, doubts=(doubt, *RIGHT_PART))
     others = identity.identify(points, registration.T_design_scan, shape, part, design)
     # A part of another size may by chance have its mark where the other part of this shape has its own.
-    wrong = others.contradiction and (_resemblance(points, design, part) or others.contradiction)
-    return replace(placed, identity=others, trouble=wrong)
+    wrong = (_resemblance(points, design, part) or others.contradiction) if others.contradiction else ()
+    return replace(placed, identity=others, rejected=wrong)
 
 
-def _misfit(registration: surface_registration.SurfaceFit) -> str:
+def _misfit(registration: surface_registration.SurfaceFit) -> tuple[Reason, ...]:
     """Why a registered scan is not of its design; empty where it is."""
     share = registration.used_share
     if not (share > surface_registration.LEAST_SHARE and np.isfinite(registration.covariance).all()):
-        return f"only {share:.0%} of the points lie near the design's surface"
+        return (reason("preassemble.few-points-near", share=share),)
     if not surface_registration.fits(registration):
-        return (
-            f"{1.0 - share:.0%} of the points are away from the design's surface, "
-            f"the others typically {registration.sigma_mm / 1.4826:.0f} mm"
-        )
-    return ""
+        distance = registration.sigma_mm / 1.4826
+        return (reason("preassemble.misfit", share=1.0 - share, distance=distance),)
+    return ()
 
 
 def _covered(points: Floats, T: Floats, shape: attitude.Surface) -> float:
@@ -292,12 +292,12 @@ def _residuals(points: Floats, surface: MeshSurface) -> tuple[Floats, Floats]:
     return points[near], distance[near]
 
 
-def _resemblance(points: Floats, design: ArchDesign, part: DesignPart) -> str:
-    """Names of the design's parts that have the size of the scan, unless the part itself is one; or nothing."""
+def _resemblance(points: Floats, design: ArchDesign, part: DesignPart) -> tuple[Reason, ...]:
+    """State which parts of the design have the size of the scan, unless the part itself is one."""
     size = _size_of(points)
     limit = SIZE_SHARE * float(size.max())
     alike = [p.name for p in design.parts if np.abs(_size_of(attitude.samples_of(p)[0]) - size).max() < limit]
-    return f"by its size it is rather {' or '.join(alike)}" if alike and part.name not in alike else ""
+    return (reason("preassemble.size-of-other", parts=tuple(alike)),) if alike and part.name not in alike else ()
 
 
 def _size_of(points: Floats) -> Floats:
@@ -310,15 +310,16 @@ def _size_of(points: Floats) -> Floats:
 
 
 def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_PlacedScan], shrink: float) -> FittedPart:
-    several = len(placed) > 1
-    message = "; ".join(f"scan {scan.scan.name}: {scan.trouble}" if several else scan.trouble for scan in placed)
+    why = placed[0].rejected
+    if len(placed) > 1:
+        why = tuple(reason("preassemble.of-scan", scan=scan.scan.name, reasons=scan.rejected) for scan in placed)
     edges = bottom_edges.unknown(*_design_edges(part))
     nowhere = np.full((4, 4), np.nan)
     measured = MeasuredPart(
         name=part.name,
         scans=(placed[0].scan,),
-        status="failed",
-        message=message,
+        status=Status.FAILED,
+        reasons=why,
         T_bridge_scan=nowhere,
         member=Member((None, None), edges, part.vertices.mean(axis=0), np.zeros((6, 6))),
         shrink=shrink,
@@ -326,4 +327,4 @@ def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_Pl
         residual_points=np.empty((0, 3)),
         residuals=np.empty(0),
     )
-    return FittedPart(part, measured, tuple(None if joint is None else joint_end.unknown(message) for joint in joints))
+    return FittedPart(part, measured, tuple(None if joint is None else joint_end.unknown(*why) for joint in joints))

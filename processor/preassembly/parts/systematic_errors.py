@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from processor.model import DesignPart, Floats
+from processor.model import DesignPart, Floats, Word
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.params import SystematicParams
@@ -18,14 +18,24 @@ from processor.preassembly.params import SystematicParams
 EXPANSION_PER_K = 12e-6
 
 
-def budget(params: SystematicParams, length_mm: float) -> dict[str, float]:
-    """Return the standard deviation (mm) of an end along a part of a given length, by source."""
+class BudgetSource(Word):
+    """A source of error of an end of a part."""
+
+    MEASURED = "ends as measured, median"
+    REGISTRATION = "registration of stations"
+    OFFSET = "scanner offset"
+    SCALE = "scanner scale"
+    TEMPERATURE = "temperature of the steel"
+
+
+def budget(params: SystematicParams, length_mm: float) -> dict[BudgetSource, float]:
+    """Return the standard deviation (mm) of an end along a part of a given length, by systematic source."""
     half = 0.5 * length_mm
     return {
-        "registration of stations": params.registration_mm,
-        "scanner offset": params.offset_mm,
-        "scanner scale": 1e-6 * params.scale_ppm * half,
-        "temperature of the steel": EXPANSION_PER_K * params.temperature_C * half,
+        BudgetSource.REGISTRATION: params.registration_mm,
+        BudgetSource.OFFSET: params.offset_mm,
+        BudgetSource.SCALE: 1e-6 * params.scale_ppm * half,
+        BudgetSource.TEMPERATURE: EXPANSION_PER_K * params.temperature_C * half,
     }
 
 
@@ -39,8 +49,8 @@ def end_variances(params: SystematicParams, part: DesignPart) -> Floats:
     """Systematic variances (24,) of an end's coordinates, mm^2; all points of the end share their errors."""
     ends: Floats = part.bottom_edge_left[[0, -1]]
     terms = budget(params, float(np.linalg.norm(ends[1] - ends[0])))
-    any_axis = terms["registration of stations"] ** 2 + terms["scanner offset"] ** 2
-    along = terms["scanner scale"] ** 2 + terms["temperature of the steel"] ** 2
+    any_axis = terms[BudgetSource.REGISTRATION] ** 2 + terms[BudgetSource.OFFSET] ** 2
+    along = terms[BudgetSource.SCALE] ** 2 + terms[BudgetSource.TEMPERATURE] ** 2
     return np.tile([any_axis + along, any_axis, any_axis], 8)
 
 

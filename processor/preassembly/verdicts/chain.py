@@ -14,18 +14,17 @@ from scipy.stats import norm
 
 from processor.adjustment import extremes
 from processor.limits import standards as limits_of
-from processor.model import NORMAL_95, Floats, Limit, Tolerance
+from processor.model import NORMAL_95, Floats, Limit, Reason, Tolerance, Verdict, reason, worst
 from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.parts.member import Member
 from processor.preassembly.verdicts.joints import MEASURES as OF_JOINTS
 from processor.preassembly.verdicts.joints import (
     Comparison,
-    Verdict,
+    Conformity,
+    LimitOrigin,
     compose,
     guard_band,
-    in_words,
     of_project,
-    worst,
 )
 
 MEASURES = ("span", "unit_length", "inner_arc", "lateral_axis", "elevation")
@@ -64,18 +63,18 @@ def quantities(members: Sequence[Member], adjusted: Adjusted, span: float, span_
     }
 
 
-def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, unsure: str = "") -> Verdict:
+def judge(measured: Quantities, tolerance: Tolerance, span_mm: float, doubts: tuple[Reason, ...] = ()) -> Conformity:
     """Compare the chain with the limits of ``tolerance``; ``span_mm`` is the design's, for limits that depend on it.
 
-    ``unsure`` is a reason why no verdict is possible (an ambiguous part, a joint without an answer): then all is
+    ``doubts`` are reasons why no verdict is possible (an ambiguous part, a joint without a result): then all is
     indeterminate.
     """
     limits = [limit for limit in tolerance.limits if limit.measure in MEASURES]
     if not limits:
-        return Verdict(said=f"{tolerance.standard or 'the project'} has no limit for the whole chain")
-    comparisons = [_compare(measured[limit.measure], limit, span_mm, bool(unsure)) for limit in limits]
-    words = "; ".join(filter(None, (unsure, in_words(limits, comparisons))))
-    return compose(limits, comparisons, tolerance, float("nan"), words)
+        standard = tolerance.standard or LimitOrigin.PROJECT
+        return Conformity(reasons=(reason("preassemble.no-chain-limit", standard=standard),))
+    comparisons = [_compare(measured[limit.measure], limit, span_mm, bool(doubts)) for limit in limits]
+    return compose(limits, comparisons, tolerance, float("nan"), doubts)
 
 
 def unused_limits(tolerance: Tolerance) -> list[Limit]:
@@ -83,7 +82,7 @@ def unused_limits(tolerance: Tolerance) -> list[Limit]:
     return [limit for limit in tolerance.limits if of_project(limit) and limit.measure not in (*OF_JOINTS, *MEASURES)]
 
 
-def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, unsure: bool) -> Comparison:
+def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doubtful: bool) -> Comparison:
     """Compare the value nearer to its limit; the probability is of single values only."""
     nan = float("nan")
     low, high = limits_of.bounds(limit, {"length": span_mm})
@@ -91,7 +90,7 @@ def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, unsu
     known = np.isfinite(values) & np.isfinite(sd)
     values, sd = values[known], sd[known]
     if not len(values) or math.isnan(low) or math.isnan(high):
-        return Comparison(value=nan, ci95=nan, low=low, high=high, verdict="indeterminate", probability=nan)
+        return Comparison(value=nan, ci95=nan, low=low, high=high, verdict=Verdict.INDETERMINATE, probability=nan)
     sides = []
     for sign, bound in ((-1.0, -low), (1.0, high)):
         value, bottom, top = extremes.of_independent(sign * values, sd)
@@ -99,8 +98,8 @@ def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, unsu
     verdict = worst([side[3] for side in sides])
     _, value, half_width, _ = min(sides, key=lambda side: side[0])
     probability = nan
-    if len(values) == 1 and not unsure:
+    if len(values) == 1 and not doubtful:
         spread = max(float(sd[0]), extremes.EXACT_MM)
         probability = float(norm.cdf((high - value) / spread) - norm.cdf((low - value) / spread))
-    verdict = "indeterminate" if unsure else verdict
+    verdict = Verdict.INDETERMINATE if doubtful else verdict
     return Comparison(value=value, ci95=half_width, low=low, high=high, verdict=verdict, probability=probability)

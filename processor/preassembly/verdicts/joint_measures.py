@@ -9,14 +9,14 @@ have intervals by :mod:`processor.adjustment.extremes`.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
 
 from processor.adjustment import extremes
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Checked, Floats, Ints, column, names
+from processor.model import KEY_POINTS, NORMAL_95, Checked, Floats, Ints, Rows, Word, column, names, words
 
 RAYLEIGH_95 = 2.447747  # radius that holds 95 % of a round normal distribution in the plane, in standard deviations
 
@@ -26,28 +26,54 @@ _ROWS: Ints = np.array([3 * point + axis for point, axis in ACROSS])
 _ALONG: Ints = np.arange(0, 24, 3)
 
 
-@dataclass(frozen=True)
-class Measures(Checked):
-    """Measures of one joint, a row each, NaN where the gaps are not known; ``ci95`` is the wider side of low..high.
+class JointQuantity(Word):
+    """A measure of a joint.
 
-    Rows: groove_gap_mean, groove_gap_least, groove_gap_greatest, misalignment (greatest across any plate, at least 0),
-    eccentricity (of the offset across the bridge), rotation_x, _y, _z of the right part against the left,
-    offset_x, _y, _z at the joint's middle.
+    The misalignment is the greatest across any plate, at least 0; the eccentricity is of the offset across the bridge;
+    rotation and offset are of the right part against the left, the offset at the joint's middle.
     """
 
-    name: tuple[str, ...] = names("m")
+    GROOVE_GAP_MEAN = "groove_gap_mean"
+    GROOVE_GAP_LEAST = "groove_gap_least"
+    GROOVE_GAP_GREATEST = "groove_gap_greatest"
+    MISALIGNMENT = "misalignment"
+    ECCENTRICITY = "eccentricity"
+    ROTATION_X = "rotation_x"
+    ROTATION_Y = "rotation_y"
+    ROTATION_Z = "rotation_z"
+    OFFSET_X = "offset_x"
+    OFFSET_Y = "offset_y"
+    OFFSET_Z = "offset_z"
+
+
+@dataclass(frozen=True)
+class MeasuredQuantities(Rows):
+    """Values with their 95 % intervals ``low`` to ``high``, NaN where the gaps are not known."""
+
+    name: tuple[JointQuantity, ...] = words("m", JointQuantity)
     value: Floats = column("m")
-    ci95: Floats = column("m")
-    low: Floats = column("m")  # of the 95 % interval
+    ci95: Floats = column("m")  # the wider side of low..high
+    low: Floats = column("m")
     high: Floats = column("m")
     unit: tuple[str, ...] = names("m")  # mm | mrad
-    # in joint axes
-    points: Floats = column(8, 3)
-    gaps: Floats = column(8, 3)
-    covariance: Floats = column(24, 24)
-    # per point: root of the sum of squares of what counts as misalignment there
-    misalignment_at: Floats = column(8)
-    misalignment_at_ci95: Floats = column(8)
+
+
+@dataclass(frozen=True)
+class Measures(Checked):
+    """Measures of one joint, and its gaps with their covariance, in joint axes, mm.
+
+    ``misalignment_at`` is, per point, the root of the sum of squares of what counts as misalignment there.
+    """
+
+    quantities: MeasuredQuantities = field(
+        default_factory=MeasuredQuantities, metadata={"json": "measures", "by": "name"}
+    )
+    points: Floats = column(8, 3, json="")
+    gaps: Floats = column(8, 3, json="gaps_joint_axes.*", keys=KEY_POINTS)
+    gaps_ci95: Floats = column(8, 3, json="gaps_joint_axes_ci95.*", keys=KEY_POINTS)
+    covariance: Floats = column(24, 24, json="")
+    misalignment_at: Floats = column(8, json="")
+    misalignment_at_ci95: Floats = column(8, json="")
 
     @property
     def known(self) -> bool:
@@ -55,20 +81,20 @@ class Measures(Checked):
         return bool(np.isfinite(self.gaps).all() and np.isfinite(self.covariance).all())
 
     def of(self, name: str) -> tuple[float, float]:
-        """Value and 95 % half-width of a row. Raises ValueError for an unknown name."""
-        row = self.name.index(name)
-        return float(self.value[row]), float(self.ci95[row])
+        """Value and 95 % half-width of a quantity. Raises ValueError for an unknown name."""
+        row = self.quantities.name.index(JointQuantity(name))
+        return float(self.quantities.value[row]), float(self.quantities.ci95[row])
 
     def interval(self, name: str) -> tuple[float, float]:
-        """95 % interval of a row. Raises ValueError for an unknown name."""
-        row = self.name.index(name)
-        return float(self.low[row]), float(self.high[row])
+        """95 % interval of a quantity. Raises ValueError for an unknown name."""
+        row = self.quantities.name.index(JointQuantity(name))
+        return float(self.quantities.low[row]), float(self.quantities.high[row])
 
 
 class _Row(NamedTuple):
     """One measure with its 95 % interval."""
 
-    name: str
+    name: JointQuantity
     value: float
     unit: str
     low: float
@@ -90,15 +116,19 @@ def measure(gaps: Floats, covariance: Floats, T_bridge_joint: Floats, points: Fl
     low, high = np.array([row.low for row in rows]), np.array([row.high for row in rows])
     value = np.array([row.value for row in rows])
     misalignment, half_width = _misalignment_at(local, spread)
-    return Measures(
+    quantities = MeasuredQuantities(
         name=tuple(row.name for row in rows),
         value=value,
         ci95=np.maximum(high - value, value - low),
         low=low,
         high=high,
         unit=tuple(row.unit for row in rows),
+    )
+    return Measures(
+        quantities=quantities,
         points=at,
         gaps=local,
+        gaps_ci95=NORMAL_95 * np.sqrt(np.maximum(np.diag(spread), 0.0)).reshape(8, 3),
         covariance=spread,
         misalignment_at=misalignment,
         misalignment_at_ci95=half_width,
@@ -116,7 +146,7 @@ def motion_of(points: Floats) -> Floats:
     return solve
 
 
-def _row(name: str, value: float, unit: str, half_width: float) -> _Row:
+def _row(name: JointQuantity, value: float, unit: str, half_width: float) -> _Row:
     return _Row(name, value, unit, value - half_width, value + half_width)
 
 
@@ -126,9 +156,9 @@ def _groove_rows(gaps: Floats, covariance: Floats) -> list[_Row]:
     negative, below, above = extremes.of_correlated(-x, spread)
     greatest, low, high = extremes.of_correlated(x, spread)
     return [
-        _row("groove_gap_mean", float(x.mean()), "mm", NORMAL_95 * mean_sd),
-        _Row("groove_gap_least", -negative, "mm", -above, -below),
-        _Row("groove_gap_greatest", greatest, "mm", low, high),
+        _row(JointQuantity.GROOVE_GAP_MEAN, float(x.mean()), "mm", NORMAL_95 * mean_sd),
+        _Row(JointQuantity.GROOVE_GAP_LEAST, -negative, "mm", -above, -below),
+        _Row(JointQuantity.GROOVE_GAP_GREATEST, greatest, "mm", low, high),
     ]
 
 
@@ -136,7 +166,7 @@ def _misalignment_row(gaps: Floats, covariance: Floats) -> _Row:
     across, spread = gaps.ravel()[_ROWS], covariance[np.ix_(_ROWS, _ROWS)]
     sign = np.where(across < 0.0, -1.0, 1.0)
     greatest, low, high = extremes.of_correlated(sign * across, spread * np.outer(sign, sign), folded=True)
-    return _Row("misalignment", greatest, "mm", low, high)
+    return _Row(JointQuantity.MISALIGNMENT, greatest, "mm", low, high)
 
 
 def _motion_rows(gaps: Floats, covariance: Floats, points: Floats) -> list[_Row]:
@@ -147,11 +177,11 @@ def _motion_rows(gaps: Floats, covariance: Floats, points: Floats) -> list[_Row]
     offset = float(np.hypot(motion[4], motion[5]))
     reach = RAYLEIGH_95 * _largest_sd(spread[4:, 4:])
     low = max(offset - reach, 0.0) if np.isfinite(offset) else offset
-    rows = [_Row("eccentricity", offset, "mm", low, offset + reach)]
+    rows = [_Row(JointQuantity.ECCENTRICITY, offset, "mm", low, offset + reach)]
     for k, axis in enumerate("xyz"):
-        rows.append(_row(f"rotation_{axis}", 1e3 * float(motion[k]), "mrad", 1e3 * float(half_width[k])))
+        rows.append(_row(JointQuantity(f"rotation_{axis}"), 1e3 * float(motion[k]), "mrad", 1e3 * float(half_width[k])))
     for k, axis in enumerate("xyz"):
-        rows.append(_row(f"offset_{axis}", float(motion[3 + k]), "mm", float(half_width[3 + k])))
+        rows.append(_row(JointQuantity(f"offset_{axis}"), float(motion[3 + k]), "mm", float(half_width[3 + k])))
     return rows
 
 

@@ -8,9 +8,8 @@ the limit.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -18,33 +17,79 @@ import numpy.typing as npt
 
 from processor.adjustment.extremes import draws
 from processor.limits import standards as limits_of
-from processor.model import Checked, Codes, Floats, Limit, Tolerance, column, names
+from processor.model import (
+    Checked,
+    Flags,
+    Floats,
+    Limit,
+    Reason,
+    Rows,
+    Tolerance,
+    Verdict,
+    Word,
+    column,
+    described,
+    names,
+    reason,
+    reasons,
+    words,
+    worst,
+)
 from processor.preassembly.verdicts.joint_measures import ACROSS, Measures, motion_of
 
 Bools = npt.NDArray[np.bool_]
-NO_SIZES: Mapping[str, float] = MappingProxyType({})
 MEASURES = ("misalignment", "groove_gap", "eccentricity")
 
 
-@dataclass(frozen=True)
-class Verdict(Checked):
-    """Verdict on a joint, and a row for every limit it is compared with."""
+class LimitOrigin(Word):
+    """Where limits are from, if from no standard."""
 
-    verdict: str = "indeterminate"  # pass | fail | indeterminate
-    probability: float = float("nan")  # that all limits are kept
-    key: tuple[str, ...] = names("v")
+    PROJECT = "the project"
+
+
+class LimitStanding(Word):
+    """Whether a limit was compared with the standard's published text."""
+
+    VERIFIED = "verified"
+    NOT_VERIFIED = "NOT VERIFIED"
+
+
+@dataclass(frozen=True)
+class ComparedLimits(Rows):
+    """Values compared with limits, a row a limit.
+
+    Of the groove gap the value is the extreme nearer to its limit, less the design's root gap. ``low`` and ``high`` are
+    allowed, -inf and inf without a bound; NaN: they depend on an unknown size. ``clause`` is of the standard, or the
+    source where there is none.
+    """
+
+    key: tuple[str, ...] = names("v", json="limit")
     what: tuple[str, ...] = names("v")
-    value: Floats = column("v")  # of the groove gap: the extreme nearer to its limit, the design's root gap taken off
+    value: Floats = column("v")
     ci95: Floats = column("v")
-    low: Floats = column("v")  # allowed, -inf and inf without a bound; NaN: depends on an unknown size
+    low: Floats = column("v")
     high: Floats = column("v")
-    each: tuple[str, ...] = names("v")  # pass | fail | indeterminate
-    each_probability: Floats = column("v")
-    clause: tuple[str, ...] = names("v")  # of its standard; where there is none, the source
+    verdict: tuple[Verdict, ...] = words("v", Verdict)
+    probability: Floats = column("v")
+    clause: tuple[str, ...] = names("v")
     edition: tuple[str, ...] = names("v")
     source: tuple[str, ...] = names("v")
-    verified: Codes = column("v", dtype=np.uint8)
-    said: str = ""  # one line, in words
+    verified: Flags = column("v", dtype=np.bool_)
+
+    @property
+    def bounds_known(self) -> Flags:
+        """Mark the limits (v,) that do not depend on an unknown size."""
+        return ~(np.isnan(self.low) | np.isnan(self.high))
+
+
+@dataclass(frozen=True)
+class Conformity(Checked):
+    """Verdict on a joint or the chain, its comparison with each limit, and why a verdict is not possible."""
+
+    verdict: Verdict = described(Verdict.INDETERMINATE, words=Verdict)
+    probability: float = float("nan")  # that all limits are kept
+    limits: ComparedLimits = field(default_factory=ComparedLimits)
+    reasons: tuple[Reason, ...] = reasons()
 
 
 class Comparison(NamedTuple):
@@ -54,7 +99,7 @@ class Comparison(NamedTuple):
     ci95: float
     low: float
     high: float
-    verdict: str
+    verdict: Verdict
     probability: float
 
 
@@ -77,27 +122,31 @@ def joint_limits(tolerance: Tolerance) -> list[Limit]:
     return [limit for limit in tolerance.limits if limit.measure in MEASURES]
 
 
-def allowed(limit: Limit, tolerance: Tolerance, sizes_mm: Mapping[str, float]) -> Allowed:
-    """Return the bounds of a limit; NaN where they depend on a size that is not among ``sizes_mm``."""
-    low, high = limits_of.bounds(limit, sizes_mm)
+def allowed(limit: Limit, tolerance: Tolerance) -> Allowed:
+    """Return the bounds of a limit; NaN where they depend on a size (thickness), which a joint's design does not state.
+
+    A project that knows the size gives the limit as a number.
+    """
+    low, high = limits_of.bounds(limit, {})
     return Allowed(limit, low, high, tolerance.root_gap_mm)
 
 
-def judge(measures: Measures, tolerance: Tolerance, sizes_mm: Mapping[str, float] = NO_SIZES) -> Verdict:
-    """Compare a joint with the limits of ``tolerance``; ``sizes_mm`` (thickness) are for limits that depend on them.
+def judge(measures: Measures, tolerance: Tolerance) -> Conformity:
+    """Compare a joint with the limits of ``tolerance``.
 
     Unknown gaps are indeterminate, and so is a joint without any limit. The joint fails if any limit does, and passes
     if all do.
     """
     limits = joint_limits(tolerance)
     if not limits:
-        return Verdict(said=f"{tolerance.standard or 'the project'} has no limit for joints")
+        standard = tolerance.standard or LimitOrigin.PROJECT
+        return Conformity(reasons=(reason("preassemble.no-joint-limit", standard=standard),))
     drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3) if measures.known else None
     comparisons = []
     all_kept: Bools = np.ones(0 if drawn is None else len(drawn), bool)
     complete = drawn is not None
     for limit in limits:
-        bounds = allowed(limit, tolerance, sizes_mm)
+        bounds = allowed(limit, tolerance)
         value, half_width, verdict = _compare(measures, bounds)
         probability = float("nan")
         if drawn is not None and bounds.known:
@@ -116,50 +165,50 @@ def judge(measures: Measures, tolerance: Tolerance, sizes_mm: Mapping[str, float
             )
         )
     probability = float(all_kept.mean()) if complete else float("nan")
-    return compose(limits, comparisons, tolerance, probability, in_words(limits, comparisons))
+    return compose(limits, comparisons, tolerance, probability)
 
 
 def compose(
-    limits: Sequence[Limit], comparisons: Sequence[Comparison], tolerance: Tolerance, probability: float, words: str
-) -> Verdict:
+    limits: Sequence[Limit],
+    comparisons: Sequence[Comparison],
+    tolerance: Tolerance,
+    probability: float,
+    doubts: tuple[Reason, ...] = (),
+) -> Conformity:
     """Compose the verdict on all limits from the comparison with each, with the clause that each limit is from."""
-    each = tuple(comparison.verdict for comparison in comparisons)
-    return Verdict(
-        verdict=worst(each),
-        probability=probability,
+    compared = ComparedLimits(
         key=tuple(limit.key for limit in limits),
         what=tuple(limit.what for limit in limits),
         value=np.array([comparison.value for comparison in comparisons]),
         ci95=np.array([comparison.ci95 for comparison in comparisons]),
         low=np.array([comparison.low for comparison in comparisons]),
         high=np.array([comparison.high for comparison in comparisons]),
-        each=each,
-        each_probability=np.array([comparison.probability for comparison in comparisons]),
+        verdict=tuple(comparison.verdict for comparison in comparisons),
+        probability=np.array([comparison.probability for comparison in comparisons]),
         clause=tuple(f"{tolerance.standard} {limit.clause}" if limit.clause else limit.source for limit in limits),
         edition=tuple("" if of_project(limit) else tolerance.edition for limit in limits),
         source=tuple(limit.source for limit in limits),
-        verified=np.array([limit.verified for limit in limits], np.uint8),
-        said=words,
+        verified=np.array([limit.verified for limit in limits], np.bool_),
     )
+    return Conformity(verdict=worst(compared.verdict), probability=probability, limits=compared, reasons=doubts)
 
 
-def left_open(verdict: Verdict, reason: str) -> Verdict:
-    """Make a verdict on a joint, and each of its rows, indeterminate where there is a ``reason`` to doubt its gaps."""
-    if not reason:
-        return verdict
+def left_open(conformity: Conformity, doubts: tuple[Reason, ...]) -> Conformity:
+    """Make a verdict on a joint, and each of its rows, indeterminate where there are reasons to doubt its gaps."""
+    if not doubts:
+        return conformity
+    limits = conformity.limits
     return replace(
-        verdict,
-        verdict="indeterminate",
+        conformity,
+        verdict=Verdict.INDETERMINATE,
         probability=float("nan"),
-        each=("indeterminate",) * len(verdict.each),
-        each_probability=np.full_like(verdict.each_probability, np.nan),
-        said=reason,
+        limits=replace(
+            limits,
+            verdict=(Verdict.INDETERMINATE,) * len(limits),
+            probability=np.full_like(limits.probability, np.nan),
+        ),
+        reasons=doubts,
     )
-
-
-def worst(verdicts: Sequence[str]) -> str:
-    """Return the verdict on all: fail before indeterminate before pass."""
-    return next((verdict for verdict in ("fail", "indeterminate") if verdict in verdicts), "pass")
 
 
 def of_project(limit: Limit) -> bool:
@@ -167,11 +216,11 @@ def of_project(limit: Limit) -> bool:
     return limit.verified and not limit.clause
 
 
-def guard_band(interval: tuple[float, float], low: float, high: float) -> str:
+def guard_band(interval: tuple[float, float], low: float, high: float) -> Verdict:
     """Judge a 95 % interval against bounds: pass wholly within, fail wholly beyond one, else indeterminate."""
     if interval[0] >= low and interval[1] <= high:
-        return "pass"
-    return "fail" if interval[1] < low or interval[0] > high else "indeterminate"
+        return Verdict.PASS
+    return Verdict.FAIL if interval[1] < low or interval[0] > high else Verdict.INDETERMINATE
 
 
 def conforms(gaps: Floats, points: Floats, allowed: Allowed) -> Bools:
@@ -188,21 +237,7 @@ def conforms(gaps: Floats, points: Floats, allowed: Allowed) -> Bools:
     return np.asarray(conforming, bool)
 
 
-def in_words(limits: Sequence[Limit], comparisons: Sequence[Comparison]) -> str:
-    """Describe the comparison with each limit: value, half-width, bounds, verdict and probability."""
-    parts = []
-    for limit, (value, half_width, low, high, verdict, probability) in zip(limits, comparisons, strict=True):
-        within = f"{low:g} to {high:g}" if math.isfinite(low) else f"at most {high:g}"
-        if math.isnan(low) or math.isnan(high):
-            within = f"a limit by the {limit.of}, which is not known"
-        spread = f"+- {half_width:.2f} mm" if math.isfinite(half_width) else "mm, its interval not known"
-        text = f"{limit.what}: {value:.2f} {spread}, {within}: {verdict}"
-        text += f" ({probability:.0%} conforms)" if math.isfinite(probability) else ""
-        parts.append(text + ("" if limit.verified else "; limit not verified"))
-    return "; ".join(parts)
-
-
-def _compare(measures: Measures, allowed: Allowed) -> tuple[float, float, str]:
+def _compare(measures: Measures, allowed: Allowed) -> tuple[float, float, Verdict]:
     """Value and half-width that decide, and the verdict."""
     low, high = allowed.low, allowed.high
     if allowed.limit.measure != "groove_gap":

@@ -2,29 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from processor.model import Floats
+from processor.model import Floats, Reason, Status, reason
 from processor.preassembly.parts.measure import MeasuredPart
 
 
-def of_joint(left: MeasuredPart, right: MeasuredPart) -> str:
-    """Why a joint's gaps may be wrong: an ambiguous part, an end taken for another plate side; or nothing."""
-    reasons = [f"{part.name} is ambiguous" for part in (left, right) if part.status == "ambiguous"]
-    for part, end in ((left, left.member.ends[1]), (right, right.member.ends[0])):
-        reasons += [f"{part.name}: {end.trouble}"] if end is not None and end.trouble else []
-    return "; ".join(reasons)
+def of_joint(left: MeasuredPart, right: MeasuredPart) -> tuple[Reason, ...]:
+    """Why a joint's gaps may be wrong: an ambiguous part, an end that may be that of another plate side."""
+    ends = ((left, left.member.ends[1]), (right, right.member.ends[0]))
+    doubts = (reason("preassemble.at", place=part.name, reasons=end.doubts) for part, end in ends if end and end.doubts)
+    return (*_ambiguous((left, right)), *doubts)
 
 
-def of_chain(parts: Sequence[MeasuredPart], joints: Sequence[str], gaps: Floats) -> str:
-    """Why the chain as a whole cannot be judged, by its joints' names and gaps (j, 8, 3); or nothing."""
-    reasons = [f"{part.name} is ambiguous" for part in parts if part.status == "ambiguous"]
-    reasons += [f"{name} has no answer" for name, gap in zip(joints, gaps, strict=True) if not np.isfinite(gap).all()]
-    return "; ".join(reasons)
+def of_chain(parts: Sequence[MeasuredPart], joints: Sequence[str], gaps: Floats) -> tuple[Reason, ...]:
+    """Why the chain as a whole cannot be judged, by its joints' names and gaps (j, 8, 3)."""
+    unknown = (name for name, gap in zip(joints, gaps, strict=True) if not np.isfinite(gap).all())
+    return (*_ambiguous(parts), *(reason("preassemble.joint-unknown", joint=name) for name in unknown))
 
 
-def weak_parts(left: MeasuredPart, right: MeasuredPart) -> str:
-    """Name the weak parts beside a joint, with the reason of each."""
-    return ", ".join(f"{part.name} ({part.message})" for part in (left, right) if part.status == "weak")
+def weak_parts(left: MeasuredPart, right: MeasuredPart) -> tuple[Reason, ...]:
+    """Name the weak parts beside a joint, with the reasons of each."""
+    weak = (part for part in (left, right) if part.status == Status.WEAK)
+    return tuple(reason("preassemble.at", place=part.name, reasons=part.reasons) for part in weak)
+
+
+def _ambiguous(parts: Sequence[MeasuredPart]) -> Iterator[Reason]:
+    for part in parts:
+        if part.status == Status.AMBIGUOUS:
+            yield reason("preassemble.ambiguous-part", part=part.name)

@@ -12,14 +12,14 @@ Planes that would cut a corner wider than the groove's limit are left out: nothi
 two are also tried with shims or weld build-up where the gap is wider than wanted, and these without a cut. Proposed is
 the candidate that most probably keeps the groove gap, if its probability is at least LEAST_PROBABILITY; of equal
 candidates the smaller. A cut must raise the probability by CUT_GAIN, build-up by BUILD_UP_GAIN. No cut changes the
-misalignment across the joint, which the sentence states. Nothing is proposed where a part's pose is ambiguous or an end
+misalignment across the joint, which the reasons state. Nothing is proposed where a part's pose is ambiguous or an end
 may be that of another plate side.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -28,18 +28,77 @@ from scipy.optimize import linprog
 
 from processor.adjustment.extremes import SEED, draws
 from processor.limits import standards as limits_of
-from processor.model import KEY_POINTS, Checked, Floats, Limit, Tolerance, column
+from processor.model import (
+    KEY_POINTS,
+    Checked,
+    Floats,
+    Limit,
+    Reason,
+    Tolerance,
+    Verdict,
+    Word,
+    column,
+    described,
+    reason,
+    reasons,
+)
 from processor.preassembly.params import TrimParams
 from processor.preassembly.verdicts.joint_measures import ACROSS, Measures
-from processor.preassembly.verdicts.joints import NO_SIZES, Bools, allowed, conforms, joint_limits, judge
+from processor.preassembly.verdicts.joints import Bools, allowed, conforms, joint_limits, judge
 
-PLACES = ("bottom left", "bottom right", "top right", "top left", "bottom", "right", "top", "left")
-SHOWN_MM = 0.1  # resolution of amounts in the sentence
+SHOWN_MM = 0.1  # resolution of amounts in the reasons
 ALIKE = 0.01  # difference of probabilities that does not count
 CUT_GAIN, BUILD_UP_GAIN = 0.05, 0.1
 LEAST_PROBABILITY = 0.1  # of the groove gap
 SURELY_NOT = 0.005  # a probability that would print as 0 %
-SIDES = {(1, False): "to the left", (1, True): "to the right", (2, False): "up", (2, True): "down"}
+
+
+class Work(Word):
+    """What a proposal is to do to the right part's end."""
+
+    UNKNOWN = "unknown"
+    NOTHING = "nothing"
+    TRIM = "trim"
+    BUILD_UP = "build up"
+    TRIM_AND_BUILD_UP = "trim and build up"
+
+
+class EndWork(Word):
+    """A work on the right part's end, followed by its amount."""
+
+    CUT = "cut the right part's end by"
+    FILL = "fill by shims or weld build-up"
+
+
+class JointPoint(Word):
+    """A key point of a joint, and where it is."""
+
+    P1 = "P1 bottom left"
+    P2 = "P2 bottom right"
+    P3 = "P3 top right"
+    P4 = "P4 top left"
+    P5 = "P5 bottom"
+    P6 = "P6 right"
+    P7 = "P7 top"
+    P8 = "P8 left"
+
+
+class OffsetDirection(Word):
+    """To where the right part is off."""
+
+    LEFT = "to the left"
+    RIGHT = "to the right"
+    UP = "up"
+    DOWN = "down"
+
+
+POINTS = tuple(JointPoint)
+DIRECTIONS = {  # by axis, and whether the gap is negative
+    (1, False): OffsetDirection.LEFT,
+    (1, True): OffsetDirection.RIGHT,
+    (2, False): OffsetDirection.UP,
+    (2, True): OffsetDirection.DOWN,
+}
 
 
 @dataclass(frozen=True)
@@ -47,22 +106,25 @@ class Proposal(Checked):
     """What to do at one joint. NaN where the gaps are not known. Lengths mm, amounts at P1..P8 of the right part's end.
 
     ``plane`` of the cut: depth at the joint's middle (mm), and by how much it grows to the left and upward (mm per m);
-    NaN of a cut that goes from corner to corner and is no plane.
+    NaN of a cut that goes from corner to corner and is no plane. ``gap_before`` and ``gap_after`` are along the bridge.
+    Probabilities: that all limits hold after the work and as it is; that the groove gap holds after it; that the
+    misalignment does, with or without it. ``misaligned_by`` is the greatest |across| at P1..P8 beyond its limit; 0
+    within, NaN without a limit.
     """
 
-    action: str = "unknown"  # nothing | trim | build up | trim and build up | unknown
-    cut: Floats = column(8)
-    build_up: Floats = column(8)
-    plane: Floats = column(3)
-    gap_before: Floats = column(8)  # along the bridge
-    gap_after: Floats = column(8)
-    wanted_gap: float = float("nan")
-    probability: float = float("nan")  # that all limits hold after it
-    probability_as_is: float = float("nan")  # that they hold when nothing is done
-    groove_probability: float = float("nan")  # after it, of the groove gap alone
-    misalignment_probability: float = float("nan")  # with or without it: a cut does not change it
-    misaligned_by: Floats = column(8)  # greatest |across| at P1..P8 beyond its limit; 0 within, NaN without a limit
-    sentence: str = ""
+    action: Work = described(Work.UNKNOWN, words=Work)
+    cut: Floats = column(8, json="cut.*", keys=KEY_POINTS)
+    build_up: Floats = column(8, json="build_up.*", keys=KEY_POINTS)
+    plane: Floats = column(3, json="")
+    gap_before: Floats = column(8, json="")
+    gap_after: Floats = column(8, json="")
+    wanted_gap: float = described(float("nan"), json="")
+    probability: float = float("nan")
+    probability_as_is: float = float("nan")
+    groove_probability: float = described(float("nan"), json="")
+    misalignment_probability: float = described(float("nan"), json="")
+    misaligned_by: Floats = column(8, json="")
+    reasons: tuple[Reason, ...] = reasons(sentence="sentence")
 
 
 @dataclass(frozen=True)
@@ -87,38 +149,39 @@ class _Work:
         return float(self.cut.sum() + self.build_up.sum())
 
     @property
-    def action(self) -> str:
+    def action(self) -> Work:
         """Name of the work."""
-        names = [name for name, by in (("trim", self.cut), ("build up", self.build_up)) if by.max() > 0.0]
-        return " and ".join(names) or "nothing"
+        if self.cut.max() > 0.0:
+            return Work.TRIM_AND_BUILD_UP if self.build_up.max() > 0.0 else Work.TRIM
+        return Work.BUILD_UP if self.build_up.max() > 0.0 else Work.NOTHING
 
 
 NO_WORK = _Work(np.zeros(3), np.zeros(8), np.zeros(8))
 
 
 def propose(
-    joint: str,
     measures: Measures,
     tolerance: Tolerance,
     params: TrimParams | None = None,
-    sizes_mm: Mapping[str, float] = NO_SIZES,
-    unsure: str = "",
-    rests_on: str = "",
+    doubts: tuple[Reason, ...] = (),
+    weak_parts: tuple[Reason, ...] = (),
 ) -> Proposal:
-    """Propose work on a joint, by its name, after which it keeps the limits of ``tolerance``.
+    """Propose work on a joint after which it keeps the limits of ``tolerance``.
 
-    ``unsure`` is a reason why the gaps may be wrong altogether: then nothing is proposed. ``rests_on`` names a weak
-    part beside the joint, for the sentence. Probabilities are shares of draws of the gaps and of the cut's errors, NaN
-    where a limit depends on a size that is not among ``sizes_mm``. Without a limit of the groove gap nothing is cut.
+    ``doubts`` are reasons why the gaps may be wrong altogether: then nothing is proposed. ``weak_parts`` are stated
+    with the proposal. Probabilities are shares of draws of the gaps and of the cut's errors, NaN where a limit depends
+    on an unknown size. Without a limit of the groove gap nothing is cut.
     """
     params = params or TrimParams()
-    if unsure or not measures.known:
-        return _nothing_known(joint, unsure if measures.known else "")
+    if not measures.known:
+        return _no_proposal(reason("preassemble.gaps-unknown"))
+    if doubts:
+        return _no_proposal(reason("preassemble.doubtful-gaps", reasons=doubts))
     limits = {limit.measure: limit for limit in reversed(joint_limits(tolerance))}
     drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
 
     def conforming(limit: Limit, gaps: Floats) -> Bools | None:
-        bounds = allowed(limit, tolerance, sizes_mm)
+        bounds = allowed(limit, tolerance)
         return conforms(gaps, measures.points, bounds) if bounds.known else None
 
     across = [conforming(limit, drawn) for limit in joint_limits(tolerance) if limit.measure != "groove_gap"]
@@ -127,14 +190,7 @@ def propose(
     after: list[Bools | None] = []
     wanted = tolerance.root_gap_mm + params.aim_mm
     if groove is not None:
-        error = _cut_errors(measures.points, params.cut_sd_mm, len(drawn))
-        works = [NO_WORK]
-        if judge(measures, replace(tolerance, limits=(groove,)), sizes_mm).verdict != "pass":
-            room = limits_of.bounds(groove, sizes_mm)[1] - params.aim_mm
-            works += _works(measures, wanted, max(params.least_mm, SHOWN_MM), room)
-        marks = [conforming(groove, work.on(drawn, error)) for work in works]
-        chosen = _choice(works, [_share([mark]) for mark in marks])
-        best, before, after = works[chosen], marks[:1], [marks[chosen]]
+        best, before, after = _best_work(measures, replace(tolerance, limits=(groove,)), params, drawn, conforming)
     proposal = Proposal(
         action=best.action,
         cut=best.cut,
@@ -147,27 +203,42 @@ def propose(
         probability_as_is=_share([*across, *before]),
         groove_probability=_share(after),
         misalignment_probability=_share(across),
-        misaligned_by=_misaligned_by(measures, limits.get("misalignment"), sizes_mm).max(axis=1),
+        misaligned_by=_misaligned_by(measures, limits.get("misalignment")).max(axis=1),
     )
     return replace(
-        proposal, sentence=_sentence(joint, proposal, measures, limits, sizes_mm, params.cut_sd_mm, rests_on)
+        proposal,
+        reasons=(
+            *((reason("preassemble.weak-parts", parts=weak_parts),) if weak_parts else ()),
+            *_work_reasons(proposal, "groove_gap" in limits),
+            _probability_reason(proposal, params.cut_sd_mm),
+            *_misalignment_reasons(proposal, measures, limits.get("misalignment")),
+        ),
     )
 
 
-def _nothing_known(joint: str, unsure: str) -> Proposal:
-    """Return no proposal, with the reason: gaps that may be wrong, or are not known."""
+def _best_work(
+    measures: Measures,
+    groove: Tolerance,
+    params: TrimParams,
+    drawn: Floats,
+    conforming: Callable[[Limit, Floats], Bools | None],
+) -> tuple[_Work, list[Bools | None], list[Bools | None]]:
+    """Choose the work by the groove gap's limit alone, and mark the draws that keep it before and after the work."""
+    limit = groove.limits[0]
+    error = _cut_errors(measures.points, params.cut_sd_mm, len(drawn))
+    works = [NO_WORK]
+    if judge(measures, groove).verdict is not Verdict.PASS:
+        room = limits_of.bounds(limit, {})[1] - params.aim_mm
+        works += _works(measures, groove.root_gap_mm + params.aim_mm, max(params.least_mm, SHOWN_MM), room)
+    marks = [conforming(limit, work.on(drawn, error)) for work in works]
+    chosen = _choice(works, [_share([mark]) for mark in marks])
+    return works[chosen], marks[:1], [marks[chosen]]
+
+
+def _no_proposal(why: Reason) -> Proposal:
     nan = np.full(8, np.nan)
-    reason = "the gaps are not known, so nothing is proposed: scan both ends of the joint"
-    if unsure:
-        reason = f"nothing proposed until this is settled: {unsure}"
     return Proposal(
-        cut=nan,
-        build_up=nan,
-        plane=nan[:3],
-        gap_before=nan,
-        gap_after=nan,
-        misaligned_by=nan,
-        sentence=f"{joint}: {reason}.",
+        cut=nan, build_up=nan, plane=nan[:3], gap_before=nan, gap_after=nan, misaligned_by=nan, reasons=(why,)
     )
 
 
@@ -269,86 +340,88 @@ def _nearest(A: Floats, lacking: Floats) -> Floats:
     return unscaled
 
 
-def _misaligned_by(measures: Measures, limit: Limit | None, sizes_mm: Mapping[str, float]) -> Floats:
+def _misaligned_by(measures: Measures, limit: Limit | None) -> Floats:
     """Excess (8, 3) over the limit of misalignment at each point along each axis that counts there."""
     excess = np.full((8, 3), np.nan if limit is None else 0.0)
     if limit is not None:
-        high = limits_of.bounds(limit, sizes_mm)[1]
+        high = limits_of.bounds(limit, {})[1]
         for point, axis in ACROSS:
             excess[point, axis] = max(abs(measures.gaps[point, axis]) - high, 0.0) if not math.isnan(high) else np.nan
     return excess
 
 
-def _sentence(
-    joint: str,
-    proposal: Proposal,
-    measures: Measures,
-    limits: Mapping[str, Limit],
-    sizes_mm: Mapping[str, float],
-    cut_sd_mm: float,
-    rests_on: str,
-) -> str:
-    parts = [f"rests on a weak part: {rests_on}"] if rests_on else []
-    if "groove_gap" not in limits:
-        parts.append("nothing proposed, for the limits name no groove gap (groove_gap_mm)")
-    elif proposal.action == "nothing":
-        fits = "nothing to cut" if proposal.misalignment_probability < 0.95 else "nothing to do"
-        unsure = "nothing proposed, for no cut or build-up makes the groove gap much surer"
+def _work_reasons(proposal: Proposal, has_groove_limit: bool) -> Iterator[Reason]:
+    """State the proposed work, or why none is proposed."""
+    if not has_groove_limit:
+        yield reason("preassemble.no-groove-limit")
+    elif proposal.action is Work.NOTHING:
         if proposal.groove_probability < LEAST_PROBABILITY:
-            unsure = "nothing proposed, for no cut or build-up makes the groove gap hold"
-        parts.append(unsure if proposal.groove_probability < 0.95 else fits)
+            yield reason("preassemble.no-work-holds")
+        elif proposal.groove_probability < 0.95:
+            yield reason("preassemble.no-work-gains")
+        elif proposal.misalignment_probability < 0.95:
+            yield reason("preassemble.nothing-to-cut")
+        else:
+            yield reason("preassemble.nothing-to-do")
     else:
-        works = " and ".join(_works_in_words(proposal))
+        works = tuple(_amounts(proposal))
         if proposal.probability < SURELY_NOT:
-            parts.append("no cut or build-up makes all limits hold")
-            works = f"for the groove gap alone, {works}"
-        parts.append(works)
-    parts.append(_chances(proposal, cut_sd_mm))
-    high = limits_of.bounds(limits["misalignment"], sizes_mm)[1] if "misalignment" in limits else math.nan
-    off = _misaligned_by(measures, limits.get("misalignment"), sizes_mm)
-    beyond = sorted(((off[p, a], p, a) for p, a in ACROSS if off[p, a] > 0.0), reverse=True)
-    if beyond:
-        edges = ", ".join(
-            f"{KEY_POINTS[p]} {PLACES[p]} {abs(measures.gaps[p, a]):.1f} mm {SIDES[a, measures.gaps[p, a] < 0.0]}"
-            f" ({by:.1f} too much)"
+            yield reason("preassemble.not-all-limits")
+            yield reason("preassemble.groove-gap-alone", works=works)
+        else:
+            yield from works
+
+
+def _amounts(proposal: Proposal) -> Iterator[Reason]:
+    """State the amounts (8,) cut and built up: even all round, along a plane by its extremes, or at each corner."""
+    for work, by in ((EndWork.CUT, proposal.cut), (EndWork.FILL, proposal.build_up)):
+        least, most = int(np.argmin(by)), int(np.argmax(by))
+        if by[most] <= 0.0:
+            continue
+        if by[most] - by[least] < SHOWN_MM:
+            yield reason("preassemble.amount-even", work=work, amount=by.mean())
+        elif abs(by[0] - by[1] + by[2] - by[3]) < SHOWN_MM:  # corners in a plane
+            yield reason(
+                "preassemble.amount-plane",
+                work=work, most=by[most], most_at=POINTS[most], least=by[least], least_at=POINTS[least],
+            )  # fmt: skip
+        else:
+            yield reason("preassemble.amount-corners", work=work, p1=by[0], p2=by[1], p3=by[2], p4=by[3])
+
+
+def _probability_reason(proposal: Proposal, cut_sd_mm: float) -> Reason:
+    if math.isnan(proposal.probability):
+        return reason("preassemble.probability-unknown")
+    if proposal.action is Work.NOTHING:
+        if proposal.probability < SURELY_NOT:
+            return reason("preassemble.as-is-not-all-limits")
+        return reason("preassemble.all-limits", probability=proposal.probability)
+    if proposal.probability < SURELY_NOT:
+        return reason("preassemble.then-groove-gap", sd=cut_sd_mm, probability=proposal.groove_probability)
+    return reason(
+        "preassemble.then-all-limits",
+        sd=cut_sd_mm,
+        probability=proposal.probability,
+        groove=proposal.groove_probability,
+        as_is=proposal.probability_as_is,
+    )
+
+
+def _misalignment_reasons(proposal: Proposal, measures: Measures, limit: Limit | None) -> Iterator[Reason]:
+    """State where the misalignment is beyond its limit or near it."""
+    excess = _misaligned_by(measures, limit)
+    beyond = sorted(((excess[p, a], p, a) for p, a in ACROSS if excess[p, a] > 0.0), reverse=True)
+    if limit is not None and beyond:
+        edges = tuple(
+            reason(
+                "preassemble.misaligned-edge",
+                point=POINTS[p],
+                offset=abs(measures.gaps[p, a]),
+                direction=DIRECTIONS[a, bool(measures.gaps[p, a] < 0.0)],
+                excess=by,
+            )
             for by, p, a in beyond
         )
-        parts.append(f"no trim mends the misalignment, {high:g} mm at most, of the right part at {edges}")
+        yield reason("preassemble.misaligned", limit=limits_of.bounds(limit, {})[1], edges=edges)
     elif proposal.misalignment_probability < 0.95:
-        parts.append("no trim changes the misalignment, which is near its limit")
-    return f"{joint}: {'; '.join(parts)}."
-
-
-def _works_in_words(proposal: Proposal) -> Iterator[str]:
-    for what, by in (
-        ("cut the right part's end by", proposal.cut),
-        ("fill by shims or weld build-up", proposal.build_up),
-    ):
-        if by.max() <= 0.0:
-            continue
-        least, most = int(np.argmin(by)), int(np.argmax(by))
-        if by[most] - by[least] < SHOWN_MM:
-            yield f"{what} {by.mean():.1f} mm all round"
-        elif abs(by[0] - by[1] + by[2] - by[3]) < SHOWN_MM:  # corners in a plane
-            yield (
-                f"{what} {by[most]:.1f} mm at {KEY_POINTS[most]} {PLACES[most]} down to {by[least]:.1f} mm at "
-                f"{KEY_POINTS[least]} {PLACES[least]}"
-            )
-        else:
-            amounts = " / ".join(f"{amount:.1f}" for amount in by[:4])
-            yield f"{what} {amounts} mm at P1 / P2 / P3 / P4, straight between them"
-
-
-def _chances(proposal: Proposal, cut_sd_mm: float) -> str:
-    if math.isnan(proposal.probability):
-        return "the probability that all limits hold is not known, for a limit is missing or hangs on an unknown size"
-    if proposal.action == "nothing":
-        known = f"all limits hold with {proposal.probability:.0%}"
-        return known if proposal.probability >= SURELY_NOT else "as it is not all limits hold"
-    if proposal.probability < SURELY_NOT:
-        return f"done to {cut_sd_mm:g} mm (one sd), the groove gap then holds with {proposal.groove_probability:.0%}"
-    return (
-        f"done to {cut_sd_mm:g} mm (one sd), all limits then hold with {proposal.probability:.0%} "
-        f"(groove gap {proposal.groove_probability:.0%}), "
-        f"as it is with {proposal.probability_as_is:.0%}"
-    )
+        yield reason("preassemble.misalignment-near-limit")

@@ -1,4 +1,4 @@
-"""Figures of an assembled bridge: its gaps, its linear error, and what only the adjustment knows."""
+"""Figures of an assembled bridge: its gaps, its linear error, and what only the adjustment states."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullFormatter
 
+from processor.language.messages import Message, text
 from processor.model import Floats, Scene, StepRun
-from processor.preassembly import step as preassembly_step
+from processor.preassembly.result import Deviations, EdgeSide, Joints, Result
 from processor.report.preassembly import residual_map
 from processor.report.preassembly.joint_figures import by_axis, gap_vectors
 from processor.report.style import (
@@ -27,24 +28,25 @@ from processor.report.style import (
     rounded,
 )
 
-OWN_ERROR_ALPHA = 0.4  # of the lines of how far a method errs by itself
+AS_DESIGNED_ALPHA = 0.4  # of the lines of a method's error for parts exactly as designed
 GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
 TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest |d|", 1, 3, "largest"))
 
 
 def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
-    """Draw the first run's bridge beside the linear error of all; what a result does not hold is left out."""
-    result: preassembly_step.Result = runs[0].result
+    """Draw the first run's bridge and the linear error of all; what a result does not have is left out."""
+    result: Result = runs[0].result
     found: Drawn = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
-    if np.isfinite(result.linear_offset_ci95).any():
+    adjustment = result.adjustment
+    if adjustment is not None and np.isfinite(adjustment.linear_offset_ci95).any():
         found["linear-offset.png"] = _linear_offset(scene, runs[0])
-    if any(np.isfinite(one.gaps).all() for one in result.measures):
+    if adjustment is not None and any(np.isfinite(one.gaps).all() for one in adjustment.joints.measures):
         found["gap-vectors.png"] = gap_vectors(result)
     if len(runs) > 1:
         found["gaps-by-axis.png"] = by_axis(runs)
-    if np.isfinite(result.trade_figures).all(axis=1).any():
-        found["trade-off.png"] = _trade_off(result)
-    residuals = residual_map.residuals(scene, result)
+    if adjustment is not None and np.isfinite(result.trade_off.figures).all(axis=1).any():
+        found["trade-off.png"] = _trade_off(result, adjustment.weight)
+    residuals = residual_map.draw(scene, result)
     if residuals is not None:
         found["residuals.png"] = residuals
     return found
@@ -53,29 +55,29 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
 # --- bridge --------------------------------------------------------------------------------------------------------
 
 
-def _bridge(scene: Scene, run: StepRun) -> tuple[str, bytes]:
+def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     """Side view and plan with the gaps drawn to a scale of their own, and every gap of every joint."""
     figure = Figure(figsize=(9.0, 10.4), layout="constrained")
     side, plan, gaps = figure.subplots(3, 1, height_ratios=(1.5, 0.7, 1.0))
     assert scene.arch is not None
-    result = run.result
-    times = _times(scene, result)
+    joints = run.result.joints
+    times = _times(scene, joints)
     for axes, up, ends in ((side, 2, (4, 6)), (plan, 1, (5, 7))):
         for i, part in enumerate(scene.arch.parts):
             for edge in (part.bottom_edge_left, part.bottom_edge_right):
                 axes.plot(edge[:, 0] / 1e3, edge[:, up] / 1e3, color="0.35" if i % 2 else "0.6", linewidth=2.0)
-        for j in range(len(result.joints)):
-            _joint_drawn(axes, scene.arch.joint_points[j], result.gaps[j], up, ends, times)
+        for j in range(len(joints)):
+            _joint_drawn(axes, scene.arch.joint_points[j], joints.gaps[j], up, ends, times)
         axes.set_aspect("equal", adjustable="datalim")
         axes.set_xlabel("along the span, m")
     for i, part in enumerate(scene.arch.parts):
         x, _, z = part.bottom_edge_left.T / 1e3
         middle = (x[len(x) // 2], z[len(z) // 2]) if len(x) else (0.0, 0.0)
         _write(side, label(part.name, i), middle, -20)
-    labels = [label(name, j) for j, name in enumerate(result.joints)]
+    labels = [label(name, j) for j, name in enumerate(joints.name)]
     for j, name in enumerate(labels):
         x, _, z = scene.arch.joint_points[j].mean(axis=0) / 1e3
-        size = np.abs(result.gaps[j])
+        size = np.abs(joints.gaps[j])
         known = bool(np.isfinite(size).any())
         _write(side, f"{name}\n{np.nanmax(size):.2f} mm" if known else f"{name}\nno answer", (x, z), 30)
     drawn = f"gaps drawn {times:,.0f} times their size" if times else "no gap is known"
@@ -89,18 +91,18 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[str, bytes]:
         Patch(facecolor="none", edgecolor=COLOURS[1], linestyle="--", label="start of the right part"),
     ]
     plan.legend(handles=handles, fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.28))
-    _all_gaps(gaps, result, labels)
+    _all_gaps(gaps, joints, labels)
     for axes in (side, plan, gaps):
         axes.grid(alpha=0.3)
-    return f"Joints of the bridge, method {run.method}", png(figure)
+    return text("Joints of the bridge, method {method}", method=run.method), png(figure)
 
 
-def _times(scene: Scene, result: preassembly_step.Result) -> float:
+def _times(scene: Scene, joints: Joints) -> float:
     """By how much gaps are enlarged, 1, 2 or 5 times a power of ten; intervals count, lest noise look like a gap."""
     assert scene.arch is not None
-    sizes = np.concatenate([np.abs(result.gaps).ravel(), result.gap_ci95.ravel()])
+    sizes = np.concatenate([np.abs(joints.gaps).ravel(), joints.gap_ci95.ravel()])
     largest = float(sizes[np.isfinite(sizes)].max(initial=0.0))
-    if not np.isfinite(result.gaps).any():
+    if not np.isfinite(joints.gaps).any():
         return 0.0
     points = np.concatenate([scene.arch.joint_points.reshape(-1, 3), *[p.bottom_edge_left for p in scene.arch.parts]])
     wanted = GAP_SHARE * float(np.ptp(points[:, 0])) / max(largest, LEAST_SHOWN_MM)
@@ -140,13 +142,13 @@ def _write(axes: Axes, text: str, at: tuple[float, float], up: int) -> None:
     )  # fmt: skip
 
 
-def _all_gaps(axes: Axes, result: preassembly_step.Result, labels: Sequence[str]) -> None:
+def _all_gaps(axes: Axes, joints: Joints, labels: Sequence[str]) -> None:
     for axis, name in enumerate(("dx, along the span", "dy, across", "dz, up")):
         place = np.arange(len(labels))[:, None] + 0.22 * (axis - 1) + np.linspace(-0.07, 0.07, 8)
-        width = result.gap_ci95[:, :, axis]
+        width = joints.gap_ci95[:, :, axis]
         axes.errorbar(
             place.ravel(),
-            result.gaps[:, :, axis].ravel(),
+            joints.gaps[:, :, axis].ravel(),
             yerr=width.ravel() if np.isfinite(width).any() else None,
             fmt=MARKERS[axis],
             color=COLOURS[axis],
@@ -156,7 +158,7 @@ def _all_gaps(axes: Axes, result: preassembly_step.Result, labels: Sequence[str]
         )
     axes.axhline(0.0, color="0.3", linewidth=0.8)
     axes.set_xticks(np.arange(len(labels)), list(labels))
-    intervals = ", with 95 % intervals" if np.isfinite(result.gap_ci95).any() else ""
+    intervals = ", with 95 % intervals" if np.isfinite(joints.gap_ci95).any() else ""
     axes.set(xlabel="joint, P1 to P8 from left to right", ylabel="gap, mm", title=f"right part minus left{intervals}")
     axes.legend(fontsize=8, ncols=3, loc="upper center", bbox_to_anchor=(0.5, -0.2))
 
@@ -164,45 +166,23 @@ def _all_gaps(axes: Axes, result: preassembly_step.Result, labels: Sequence[str]
 # --- linear error --------------------------------------------------------------------------------------------------
 
 
-def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
-    """Linear error of all methods that have an answer along both bottom edges, by both gauges."""
-    silent = [run.method for run in runs if not np.isfinite(run.result.linear_deviation).any()]
-    styled = [(k, run) for k, run in enumerate(runs) if run.method not in silent]
+def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[Message, bytes]:
+    """Linear error of all methods that have a result along both bottom edges, by both gauges."""
+    styled = [(k, run) for k, run in enumerate(runs) if np.isfinite(run.result.linear.assembled.deviation).any()]
     figure = Figure(figsize=(9.0, 6.4), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, sharey=True)
     means: list[float] = []
-    banded = False
-    for axes, (values, title) in zip(
+    for axes, best_fit, title in zip(
         panels,
-        (
-            ("linear", "as assembled"),
-            ("best_fit_linear", "the whole bridge moved so that Foot 1 lies best on its design"),
-        ),
+        (False, True),
+        ("as assembled", "the whole bridge moved so that Foot 1 lies best on its design"),
         strict=True,
     ):
         for k, run in styled:
-            deviation: Floats = getattr(run.result, f"{values}_deviation")
-            means += [float(np.median(deviation[np.isfinite(deviation)]))] if np.isfinite(deviation).any() else []
-            band: Floats = getattr(run.result, f"{values}_ci95")
-            for edge, width in (("left", 1.6), ("right", 0.8)):
-                on = np.array(run.result.linear_edge, dtype=object) == edge
-                station = run.result.linear_station[on] / 1000.0
-                axes.plot(
-                    station,
-                    np.maximum(deviation[on], LEAST_SHOWN_MM),
-                    DASHES[k % 4],
-                    color=COLOURS[k % 4],
-                    linewidth=width,
-                    label=f"{run.method}, {edge} edge",
-                )
-                if not np.isfinite(band).any():
-                    continue
-                if run.result.bands_as_designed:
-                    axes.plot(station, band[on], color=COLOURS[k % 4], linewidth=width, alpha=OWN_ERROR_ALPHA)
-                else:
-                    low, high = (np.maximum(deviation[on] + s * band[on], LEAST_SHOWN_MM) for s in (-1.0, 1.0))
-                    axes.fill_between(station, low, high, color=COLOURS[k % 4], alpha=0.2, linewidth=0.0)
-                    banded = True
+            deviations: Deviations = run.result.linear.best_fit if best_fit else run.result.linear.assembled
+            known = deviations.deviation[np.isfinite(deviations.deviation)]
+            means += [float(np.median(known))] if len(known) else []
+            _draw_deviations(axes, run, deviations, k)
         axes.set(ylabel="linear error, mm", title=title)
         axes.grid(alpha=0.3, which="both")
     if means and max(means) > DECADES_APART * max(min(means), LEAST_SHOWN_MM):
@@ -213,41 +193,88 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[str, bytes]:
     else:
         panels[0].set_ylim(bottom=0.0)
     for axes in panels:
-        _mark_joints(axes, scene, runs[0].result.joints)
+        _mark_joints(axes, scene, runs[0].result.joints.name)
     panels[1].set_xlabel("station along the bottom edge, m")
     if styled:
         panels[1].legend(fontsize=8, ncols=max(len(styled), 2), loc="upper center", bbox_to_anchor=(0.5, -0.2))
-    caption = "Linear error: distance of the assembled bottom edges from the design's; dotted lines are joints"
-    if banded:
-        caption += "; the shaded band holds 95 % or more"
-    own = [run.method for _, run in styled if run.result.bands_as_designed]
-    own_said = "pale: below it lie 95 % or more of what these state of parts exactly as designed, scanned alike"
-    caption += f"; {own_said}: {', '.join(own)}" if own else ""
-    bare = [run.method for _, run in styled if not np.isfinite(run.result.linear_ci95).any()]
-    caption += f"; without a band, for they state no uncertainty: {', '.join(bare)}" if banded and bare else ""
-    caption += f"; without an answer, so not drawn: {', '.join(silent)}" if silent else ""
-    return caption, png(figure)
+    return _linear_caption(runs, [run for _, run in styled]), png(figure)
 
 
-def _linear_offset(scene: Scene, run: StepRun) -> tuple[str, bytes]:
+def _draw_deviations(axes: Axes, run: StepRun, deviations: Deviations, k: int) -> None:
+    """Draw the deviations of both edges by the k-th method, with their band or the method's own error."""
+    linear = run.result.linear
+    colour = COLOURS[k % 4]
+    for edge, width in ((EdgeSide.LEFT, 1.6), (EdgeSide.RIGHT, 0.8)):
+        on = np.array(linear.edge, dtype=object) == edge
+        station, deviation = linear.chainage[on] / 1000.0, deviations.deviation[on]
+        axes.plot(
+            station,
+            np.maximum(deviation, LEAST_SHOWN_MM),
+            DASHES[k % 4],
+            color=colour,
+            linewidth=width,
+            label=f"{run.method}, {edge} edge",
+        )
+        if not np.isfinite(deviations.ci95).any():
+            continue
+        band = deviations.ci95[on]
+        if run.result.bands_as_designed:
+            axes.plot(station, band, color=colour, linewidth=width, alpha=AS_DESIGNED_ALPHA)
+        else:
+            low, high = (np.maximum(deviation + sign * band, LEAST_SHOWN_MM) for sign in (-1.0, 1.0))
+            axes.fill_between(station, low, high, color=colour, alpha=0.2, linewidth=0.0)
+
+
+def _linear_caption(runs: Sequence[StepRun], drawn: Sequence[StepRun]) -> Message:
+    """State what the curves and bands are, and which methods have none."""
+    has_band = {run.method: bool(np.isfinite(run.result.linear.assembled.ci95).any()) for run in drawn}
+    as_designed = [run.method for run in drawn if run.result.bands_as_designed]
+    shaded = any(has_band[run.method] and not run.result.bands_as_designed for run in drawn)
+    bare = [method for method, known in has_band.items() if not known]
+    missing = [run.method for run in runs if run.method not in has_band]
+    caption = [
+        text("Linear error: distance of the assembled bottom edges from the design's"),
+        text("dotted lines are joints"),
+    ]
+    if shaded:
+        caption.append(text("the shaded band holds 95 % or more"))
+    if as_designed:
+        caption.append(
+            text(
+                "pale: upper bound (95 % or more) of the error of these methods for parts exactly as designed, scanned "
+                "alike: {methods}",
+                methods=as_designed,
+            )
+        )
+    if shaded and bare:
+        caption.append(text("without a band, for they state no uncertainty: {methods}", methods=bare))
+    if missing:
+        caption.append(text("without a result, so not drawn: {methods}", methods=missing))
+    return text("{parts:;}", parts=caption)
+
+
+def _linear_offset(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     """Offset of the bottom edges from the design's, to the left and up, with its band."""
     figure = Figure(figsize=(9.0, 5.6), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True)
-    result = run.result
+    linear, adjustment = run.result.linear, run.result.adjustment
     for axis, (axes, title) in enumerate(zip(panels, ("to the left", "up"), strict=True)):
-        for k, edge in enumerate(("left", "right")):
-            on = np.array(result.linear_edge, dtype=object) == edge
-            station = result.linear_station[on] / 1e3
-            offset, width = result.linear_offset[on, axis], result.linear_offset_ci95[on, axis]
+        for k, edge in enumerate(EdgeSide):
+            on = np.array(linear.edge, dtype=object) == edge
+            station = linear.chainage[on] / 1e3
+            offset, width = adjustment.linear_offset[on, axis], adjustment.linear_offset_ci95[on, axis]
             axes.fill_between(station, offset - width, offset + width, color=COLOURS[k], alpha=0.22, linewidth=0.0)
             axes.plot(station, offset, DASHES[k], color=COLOURS[k], linewidth=1.4, label=f"{edge} edge, 95 % band")
         axes.axhline(0.0, color="0.3", linewidth=0.8)
         axes.set(ylabel="offset, mm", title=f"{title}, as assembled")
         axes.grid(alpha=0.3)
-        _mark_joints(axes, scene, result.joints)
+        _mark_joints(axes, scene, run.result.joints.name)
     panels[1].set_xlabel("station along the bottom edge, m")
     panels[1].legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.22))
-    return f"Offset of the bottom edges from the design's, method {run.method}; dotted lines are joints", png(figure)
+    caption = text(
+        "Offset of the bottom edges from the design's, method {method}; dotted lines are joints", method=run.method
+    )
+    return caption, png(figure)
 
 
 def _mark_joints(axes: Axes, scene: Scene, joints: Sequence[str]) -> None:
@@ -269,26 +296,28 @@ def _mark_joints(axes: Axes, scene: Scene, joints: Sequence[str]) -> None:
 # --- the weight ----------------------------------------------------------------------------------------------------
 
 
-def own_figures(result: preassembly_step.Result) -> Floats:
-    """Return splicing mean and max, linear mean and max (4,) of the weight that the answer was made with."""
-    same = np.flatnonzero(np.isclose(result.trade_lambda, result.weight))
+def figures_of_weight(result: Result, weight: float) -> Floats:
+    """Return splicing mean and max, linear mean and max (4,) of the weight that the result was made with."""
+    same = np.flatnonzero(np.isclose(result.trade_off.weight, weight))
     if len(same):
-        found: Floats = result.trade_figures[same[0]]
-        return found
-    return np.array([result.splicing_mean, result.splicing_max, result.linear_mean, result.linear_max])
+        figures: Floats = result.trade_off.figures[same[0]]
+        return figures
+    return np.array([value for error in result.errors[:2] for value in (error.mean, error.max)])
 
 
-def _trade_off(result: preassembly_step.Result) -> tuple[str, bytes]:
+def _trade_off(result: Result, chosen: float) -> tuple[Message, bytes]:
     """Splicing error against linear error, a point for each weight."""
     figure = Figure(figsize=(9.0, 4.2), layout="constrained")
     for axes, (name, x, y, which) in zip(figure.subplots(1, 2), TRADED, strict=True):
-        figures = np.maximum(result.trade_figures, LEAST_SHOWN_MM)
+        figures = np.maximum(result.trade_off.figures, LEAST_SHOWN_MM)
         axes.plot(figures[:, x], figures[:, y], "o-", color=COLOURS[0], markersize=5, linewidth=1.4)
-        own = np.maximum(own_figures(result), LEAST_SHOWN_MM)
-        marked = f"as answered, lambda {result.weight:g}"
-        axes.plot(own[x], own[y], "s", color=COLOURS[1], markersize=12, fillstyle="none", mew=2.0, label=marked)
+        at_chosen = np.maximum(figures_of_weight(result, chosen), LEAST_SHOWN_MM)
+        marked = f"as answered, lambda {chosen:g}"
+        axes.plot(
+            at_chosen[x], at_chosen[y], "s", color=COLOURS[1], markersize=12, fillstyle="none", mew=2.0, label=marked
+        )
         known = np.isfinite(figures).all(axis=1)
-        for weight, at in zip(result.trade_lambda[known], figures[known], strict=True):
+        for weight, at in zip(result.trade_off.weight[known], figures[known], strict=True):
             axes.annotate(
                 f"{weight:g}", (at[x], at[y]), xytext=(8, 6), textcoords="offset points", fontsize=9, bbox=BEHIND_TEXT
             )
@@ -300,5 +329,7 @@ def _trade_off(result: preassembly_step.Result) -> tuple[str, bytes]:
         axes.margins(0.18)
         axes.grid(alpha=0.3, which="both")
         axes.legend(fontsize=8, loc="upper right")
-    caption = "What closing the joints costs along the design's curve: the numbers at the points are the weight lambda"
+    caption = text(
+        "What closing the joints costs along the design's curve: the numbers at the points are the weight lambda"
+    )
     return caption, png(figure)

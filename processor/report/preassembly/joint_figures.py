@@ -11,8 +11,9 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Ellipse, Polygon
 
+from processor.language.messages import Message, text
 from processor.model import KEY_POINTS, NORMAL_95, Floats, StepRun
-from processor.preassembly import step as preassembly_step
+from processor.preassembly.result import Result
 from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
 from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, label, png, rounded
 
@@ -23,22 +24,23 @@ OUTWARD = ((-1, -1), (1, -1), (1, 1), (-1, 1), (0, -1), (1, 0), (0, 1), (-1, 0))
 ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
 
 
-def gap_vectors(result: preassembly_step.Result) -> tuple[str, bytes]:
-    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without an answer says so."""
-    shown = range(len(result.measures))[:MOST_JOINTS]
-    known = [j for j in shown if np.isfinite(result.measures[j].gaps).all()]
+def gap_vectors(result: Result) -> tuple[Message, bytes]:
+    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without a result says so."""
+    measures = () if result.adjustment is None else result.adjustment.joints.measures
+    shown = range(len(measures))[:MOST_JOINTS]
+    known = [j for j in shown if np.isfinite(measures[j].gaps).all()]
     across = min(2, len(shown))
     down = math.ceil(len(shown) / across)
     figure = Figure(figsize=(4.6 * across, 4.3 * down + 0.5), layout="constrained")
     panels = np.atleast_1d(figure.subplots(down, across, squeeze=False).ravel())
-    times = _times([result.measures[j] for j in known])
+    times = _times([measures[j] for j in known])
     for axes, j in zip(panels, shown, strict=False):
         if j in known:
-            _section(axes, result.measures[j], times)
+            _section(axes, measures[j], times)
         else:
             axes.set(xticks=[], yticks=[])
             axes.text(0.5, 0.5, "no answer: the gaps are not known", ha="center", transform=axes.transAxes, fontsize=9)
-        axes.set_title(f"{label(result.joints[j], j)}: {result.verdict[j]}", fontsize=11)
+        axes.set_title(f"{label(result.joints.name[j], j)}: {result.joints.verdict[j]}", fontsize=11)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     handles = [
@@ -48,27 +50,27 @@ def gap_vectors(result: preassembly_step.Result) -> tuple[str, bytes]:
         Line2D([], [], color="black", marker="s", linestyle="", label="dx −: overlap"),
     ]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=9)
-    count = len(result.measures)
-    more = f"; the first {len(shown)} of {count} joints" if len(shown) < count else ""
-    return (
-        "Gaps at the joints, right part minus left, in the joint's axes, seen along the bridge; numbers are dx with "
-        f"its 95 % interval, mm{more}",
-        png(figure),
-    )
+    caption = [
+        text("Gaps at the joints, right part minus left, in the joint's axes, seen along the bridge"),
+        text("numbers are dx with its 95 % interval, mm"),
+    ]
+    if len(shown) < len(measures):
+        caption.append(text("the first {shown} of {count} joints", shown=len(shown), count=len(measures)))
+    return text("{parts:;}", parts=caption), png(figure)
 
 
-def by_axis(runs: Sequence[StepRun]) -> tuple[str, bytes]:
+def by_axis(runs: Sequence[StepRun]) -> tuple[Message, bytes]:
     """Draw the gaps of all methods along each axis, point pair by point pair (paper 000, figures 19 to 21)."""
-    joints = runs[0].result.joints[:MOST_JOINTS]
+    joints = runs[0].result.joints.name[:MOST_JOINTS]
     figure = Figure(figsize=(max(8.0, 1.8 * len(joints)), 8.2), layout="constrained")
     panels = figure.subplots(3, 1, sharex=True)
     place = np.arange(len(joints))[:, None] + np.linspace(-0.38, 0.38, 8)
     for axis, (axes, name) in enumerate(zip(panels, ("dx, along the span", "dy, across", "dz, up"), strict=True)):
         for k, run in enumerate(runs):
-            width = run.result.gap_ci95[: len(joints), :, axis]
+            width = run.result.joints.gap_ci95[: len(joints), :, axis]
             axes.errorbar(
                 (place + 0.022 * (k - 0.5 * (len(runs) - 1))).ravel(),
-                run.result.gaps[: len(joints), :, axis].ravel(),
+                run.result.joints.gaps[: len(joints), :, axis].ravel(),
                 yerr=width.ravel() if np.isfinite(width).any() else None,
                 fmt=MARKERS[k % len(MARKERS)],
                 color=COLOURS[k % len(COLOURS)],
@@ -83,7 +85,7 @@ def by_axis(runs: Sequence[StepRun]) -> tuple[str, bytes]:
     panels[2].set_xticks(np.arange(len(joints)), [label(joint, j) for j, joint in enumerate(joints)])
     panels[2].set(xlabel="joint, P1 to P8 from left to right")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
-    return "Gaps by every method along each axis, right part minus left", png(figure)
+    return text("Gaps by every method along each axis, right part minus left"), png(figure)
 
 
 def _times(measures: Sequence[Measures]) -> float:

@@ -9,8 +9,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from processor.language.messages import Message, text
 from processor.model import DesignPart, Floats, Scene
-from processor.preassembly import step as preassembly_step
+from processor.preassembly.result import Residuals, Result
 from processor.report.style import DIVERGING, LEAST_SHOWN_MM, label, png
 
 FACES = ("bottom", "right", "top", "left")
@@ -95,16 +96,19 @@ def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
     return found, x, y
 
 
-def _can_show(part: DesignPart, result: preassembly_step.Result, i: int) -> bool:
-    known = (result.residual_component == i) & np.isfinite(result.residual)
+def _can_show(part: DesignPart, residuals: Residuals, i: int) -> bool:
+    known = (residuals.component == i) & np.isfinite(residuals.distance)
     return bool(known.any()) and min(len(part.bottom_edge_left), len(part.bottom_edge_right)) > 1
 
 
-def residuals(scene: Scene, result: preassembly_step.Result) -> tuple[str, bytes] | None:
+def draw(scene: Scene, result: Result) -> tuple[Message, bytes] | None:
     """Draw the distances from the design's surface, a panel a part, up to MOST_PARTS of them; None without any."""
     assert scene.arch is not None
+    if result.adjustment is None:
+        return None
+    residuals, names = result.adjustment.residuals, result.components.name
     parts = {part.name: part for part in scene.arch.parts}
-    with_points = [i for i, name in enumerate(result.components) if name in parts and _can_show(parts[name], result, i)]
+    with_points = [i for i, name in enumerate(names) if name in parts and _can_show(parts[name], residuals, i)]
     shown = with_points[:MOST_PARTS]
     if not shown:
         return None
@@ -113,21 +117,23 @@ def residuals(scene: Scene, result: preassembly_step.Result) -> tuple[str, bytes
     panels = figure.subplots(down, ACROSS, squeeze=False).ravel()
     drawn = []
     for i in shown:
-        own = (result.residual_component == i) & np.isfinite(result.residual)
-        flat = unroll(parts[result.components[i]], result.residual_points[own])
-        drawn.append((i, flat, *cells(flat, result.residual[own])))
+        of_part = (residuals.component == i) & np.isfinite(residuals.distance)
+        flat = unroll(parts[names[i]], residuals.points[of_part])
+        drawn.append((i, flat, *cells(flat, residuals.distance[of_part])))
     everything = np.concatenate([np.abs(values[np.isfinite(values)]) for _, _, values, _, _ in drawn])
     limit = max(float(np.quantile(everything, 0.99)), LEAST_SHOWN_MM)
     for axes, (i, flat, values, x, y) in zip(panels, drawn, strict=False):
         _panel(axes, flat)
         mesh = axes.pcolormesh(x, y, np.ma.masked_invalid(values), cmap=DIVERGING, vmin=-limit, vmax=limit)
-        axes.set_title(label(result.components[i], i), fontsize=11)
+        axes.set_title(label(names[i], i), fontsize=11)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     bar = figure.colorbar(mesh, ax=panels.tolist(), location="bottom", shrink=0.6, aspect=40, extend="both", pad=0.02)
     bar.set_label("distance from the design's surface, outward positive, median of a cell, mm")
-    more = f"; the first {len(shown)} of {len(with_points)} parts" if len(shown) < len(with_points) else ""
-    return f"Residuals of each part, its four faces unrolled; hatched: no points{more}", png(figure)
+    caption = [text("Residuals of each part, its four faces unrolled"), text("hatched: no points")]
+    if len(shown) < len(with_points):
+        caption.append(text("the first {shown} of {count} parts", shown=len(shown), count=len(with_points)))
+    return text("{parts:;}", parts=caption), png(figure)
 
 
 def _panel(axes: Axes, flat: Unrolled) -> None:

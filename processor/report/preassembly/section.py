@@ -1,66 +1,97 @@
-"""How preassembly reports."""
+"""The report of step ``preassemble``."""
 
 from __future__ import annotations
 
 import collections
-from collections.abc import Sequence
 
 import numpy as np
 
-from processor.preassembly import step as preassembly_step
-from processor.report import view
-from processor.report.preassembly import figures, results, tables
+from processor.language.messages import Message, Text, text
+from processor.model import Floats, Status, Verdict
+from processor.preassembly.result import MeanMax, Result
+from processor.report.preassembly import figures, tables, view
 from processor.report.section import StepReport
-from processor.report.table import shown
+
+VERDICTS = {
+    Verdict.PASS: text("{count} pass"),
+    Verdict.FAIL: text("{count} fail"),
+    Verdict.INDETERMINATE: text("{count} indeterminate"),
+}
 
 
-def _summary(result: preassembly_step.Result) -> tuple[str, str]:
-    placed = sum(status != "failed" for status in result.component_status)
-    verdicts = collections.Counter(result.verdict)
-    judged = ", ".join(f"{verdicts[name]} {name}" for name in ("pass", "fail", "indeterminate") if verdicts[name])
-    halves = result.errors_ci95.tolist() or [float("nan")] * 4
-    splicing = _mean_max(result.splicing_mean, result.splicing_max, halves[:2])
-    linear = _mean_max(result.linear_mean, result.linear_max, halves[2:4])
-    head = f"{result.status}, {placed} of {len(result.components)} parts placed"
-    if result.judged:
-        head = f"of {len(result.joints)} joints {judged}; assembly {head}"
-    unverified = any((one.verified == 0).any() for one in (*result.judged, *result.chain_judged))
-    said = f"Splicing error {splicing}. Linear error {linear}. Joints: {judged or 'none'}."
-    said += "".join(f" Whole chain: {one.verdict}." for one in result.chain_judged if one.key)
-    return head, said + (" The limits are NOT VERIFIED against the standard's text." if unverified else "")
-
-
-def _mean_max(mean: float, largest: float, halves: Sequence[float]) -> str:
-    shown_of = [
-        f"{shown(value)} ± {shown(half)}" if np.isfinite(half) else shown(value)
-        for value, half in zip((mean, largest), halves, strict=True)
+def _summary(result: Result) -> tuple[Message, Message]:
+    placed = sum(status != Status.FAILED for status in result.components.status)
+    counts = collections.Counter(result.joints.verdict)
+    verdicts = [Text(known.template, {"count": counts[name]}) for name, known in VERDICTS.items() if counts[name]]
+    head = text(
+        "{status}, {placed} of {parts} parts placed",
+        status=result.status,
+        placed=placed,
+        parts=len(result.components),
+    )
+    linear = result.linear.assembled.error
+    body = [
+        text("Splicing error {errors}.", errors=_mean_max(result.splicing)),
+        text("Linear error {errors}.", errors=_mean_max(linear)),
+        text("Joints: {verdicts}.", verdicts=verdicts or text("none")),
     ]
-    return f"{shown_of[0]} mm mean, {shown_of[1]} mm at most"
+    if result.adjustment is not None:
+        head = text(
+            "of {joints} joints {verdicts}; assembly {head}", joints=len(result.joints), verdicts=verdicts, head=head
+        )
+        chain = [one for one in result.adjustment.chain if len(one.limits)]
+        body += [text("Whole chain: {verdict}.", verdict=one.verdict) for one in chain]
+        compared = (*result.adjustment.joints.conformity, *chain)
+        if not all(one.limits.verified.all() for one in compared):
+            body.append(text("The limits are NOT VERIFIED against the standard's text."))
+    return head, text("{sentences:.}", sentences=body)
 
 
-def _further(result: preassembly_step.Result) -> list[tuple[str, str]]:
-    """Say beside the verdict what the adjustment knows of the whole bridge."""
-    if not result.measures:
+def _mean_max(error: MeanMax) -> Text:
+    if not np.isfinite(error.ci95).any():
+        return text("{mean} mm mean, {largest} mm at most", mean=error.mean, largest=error.max)
+    mean_ci95, largest_ci95 = error.ci95.tolist()
+    return text(
+        "{mean} ± {mean_ci95} mm mean, {largest} ± {largest_ci95} mm at most",
+        mean=error.mean, mean_ci95=mean_ci95, largest=error.max, largest_ci95=largest_ci95,
+    )  # fmt: skip
+
+
+def _further(result: Result) -> list[tuple[Message, Message]]:
+    """Return what the adjustment states of the whole bridge, beside the verdict."""
+    found = result.adjustment
+    if found is None:
         return []
-    span = f"{shown(result.span_departure)} ± {shown(result.span_ci95)} mm against the design"
-    shift = " / ".join(
-        f"{shown(value)} ± {shown(half)}"
-        for value, half in zip(result.closure[:3].tolist(), result.closure_ci95[:3].tolist(), strict=True)
+    rows: list[tuple[Message, Message]] = []
+    if np.isfinite(found.span_departure):
+        sentences = [text("{span} mm against the design", span=_with_ci95(found.span_departure, found.span_ci95))]
+        if np.isfinite(found.closure).any():
+            sentences.append(_closure(found.closure[0], found.closure_ci95[0]))
+        rows.append((text("Span"), text("{sentences:.}", sentences=sentences)))
+    if found.limiting:
+        rows.append((text("What limits the accuracy"), text("{reasons:.}", reasons=found.limiting)))
+    if found.advice:
+        rows.append((text("Which scan would help"), text("{reasons:.}", reasons=found.advice)))
+    return rows
+
+
+def _closure(shift: Floats, ci95: Floats) -> Text:
+    along, across, up = (_with_ci95(value, half) for value, half in zip(shift.tolist(), ci95.tolist(), strict=True))
+    return text(
+        "Closure by the joints alone, along / across / up: {along} / {across} / {up} mm",
+        along=along,
+        across=across,
+        up=up,
     )
-    known = np.isfinite(result.closure).any()
-    closure = f" Closure by the joints alone, along / across / up: {shift} mm." if known else ""
-    rows = (
-        ("Span", f"{span}.{closure}" if np.isfinite(result.span_departure) else ""),
-        ("What limits the accuracy", result.limiting),
-        ("Which scan would help", result.advice),
-    )
-    return [(head, text) for head, text in rows if text]
+
+
+def _with_ci95(value: float, ci95: float) -> Text:
+    return text("{value} ± {ci95}", value=value, ci95=ci95)
 
 
 REPORT = StepReport(
-    title="Preassembly",
+    title=text("Preassembly"),
     summary=_summary,
-    written=results.written,
     tables=tables.of_runs,
     figures=lambda execution, runs, _: figures.of_runs(execution.scene, runs),
     further=_further,

@@ -1,0 +1,107 @@
+"""Live figures of an assembled bridge: parts, gaps and residuals in space, linear error and trade-off, as JSON."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from processor.language.messages import text
+from processor.model import KEY_POINTS, Floats, Scene, StepRun
+from processor.preassembly.result import Residuals, Result
+from processor.report.results_json import plain
+from processor.report.style import DIVERGING_STOPS, colour_limit
+from processor.report.table import shown
+
+MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page
+MOST_ON_AN_EDGE = 80
+MOST_STATIONS = 3_000
+
+
+def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+    """Return what the page draws of an assembled bridge, mm; None where there is no design to draw."""
+    if scene.arch is None or not scene.arch.parts:
+        return None
+    result: Result = runs[0].result
+    residuals = Residuals() if result.adjustment is None else result.adjustment.residuals
+    trade = result.trade_off
+    found = {
+        "title": text("Gaps and residuals in space") if len(residuals) else text("Gaps in space"),
+        "arrows": text("gaps as arrows"),
+        "values": text("residuals"),
+        "method": runs[0].method,
+        "keys": KEY_POINTS,
+        "stops": DIVERGING_STOPS,
+        "parts": [_part(scene, result, residuals, i) for i in range(len(scene.arch.parts))],
+        "joints": [
+            {
+                "name": shown(name),
+                "verdict": result.joints.verdict[j],
+                "at": np.round(scene.arch.joint_points[j], 2),
+                "gap": np.round(result.joints.gaps[j], 6),
+                "ci95": np.round(result.joints.gap_ci95[j], 6),
+            }
+            for j, name in enumerate(result.joints.name)
+        ],
+        "limit": colour_limit(residuals.distance) if np.isfinite(residuals.distance).any() else 1.0,
+        "linear": [
+            _linear(run)
+            for k, run in enumerate(runs)
+            if not k or np.isfinite(run.result.linear.assembled.deviation).any()
+        ],
+        "trade": {
+            "weight": float("nan") if result.adjustment is None else result.adjustment.weight,
+            "lambda": trade.weight,
+            "splicing_mean": np.round(trade.splicing_mean, 6),
+            "splicing_max": np.round(trade.splicing_max, 6),
+            "linear_mean": np.round(trade.linear_mean, 6),
+            "linear_max": np.round(trade.linear_max, 6),
+        },
+    }
+    made: dict[str, Any] = plain(found)
+    return made
+
+
+def _part(scene: Scene, result: Result, residuals: Residuals, i: int) -> dict[str, Any]:
+    assert scene.arch is not None
+    part = scene.arch.parts[i]
+    step = max(1, -(-len(residuals) // MOST_POINTS))
+    rows = np.flatnonzero(_of_component(result, residuals, part.name))[::step]
+    return {
+        "name": shown(part.name),
+        "edges": [np.round(_thinned(edge), 1) for edge in (part.bottom_edge_left, part.bottom_edge_right)],
+        "points": np.rint(residuals.points[rows]).astype(int).ravel(),
+        "residual": np.round(residuals.distance[rows], 3),
+    }
+
+
+def _of_component(result: Result, residuals: Residuals, name: str) -> npt.NDArray[np.bool_]:
+    """Mark (p,) the residuals of a part."""
+    if name not in result.components.name:
+        return np.zeros(len(residuals), bool)
+    of_part = residuals.component == result.components.name.index(name)
+    return np.asarray(of_part & np.isfinite(residuals.distance), bool)
+
+
+def _thinned(edge: Floats) -> Floats:
+    """Return at most MOST_ON_AN_EDGE points of a polyline, both ends among them."""
+    if len(edge) <= MOST_ON_AN_EDGE:
+        return edge
+    chosen: Floats = edge[np.linspace(0, len(edge) - 1, MOST_ON_AN_EDGE).astype(int)]
+    return chosen
+
+
+def _linear(run: StepRun) -> dict[str, Any]:
+    linear = run.result.linear
+    step = max(1, -(-len(linear.chainage) // MOST_STATIONS))
+    return {
+        "method": run.method,
+        "edge": list(linear.edge[::step]),
+        "station": np.round(linear.chainage[::step], 1),
+        "deviation": np.round(linear.assembled.deviation[::step], 6),
+        "band": np.round(linear.assembled.ci95[::step], 6),
+        "best_fit": np.round(linear.best_fit.deviation[::step], 6),
+        "best_fit_band": np.round(linear.best_fit.ci95[::step], 6),
+    }
