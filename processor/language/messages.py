@@ -8,7 +8,8 @@ The catalogue of a language is the TOML files CODE-PART.toml beside this file, i
 
 Templates have the syntax of :meth:`str.format` with named fields. Fields without a format have three decimals where
 they are numbers. ``{n:?scan|scans}`` is the first word for n = 1 and the second otherwise. Values that are messages or
-words are translated; lists are joined by commas, those of reasons and ``{list:;}`` by semicolons; ``{list:.}`` are sentences.
+words are translated. Lists are joined by commas, lists of reasons and ``{list:;}`` by semicolons; ``{list:.}`` writes
+sentences.
 """
 
 from __future__ import annotations
@@ -75,11 +76,6 @@ class Messages(string.Formatter):
             self.reasons |= sections.get("reasons", {})
             self.texts |= sections.get("texts", {})
             self.words |= sections.get("words", {})
-        for sections in catalogue(code).values():  # sections of steps that are not converted yet
-            for section in sections.values():
-                known: Any = section.get("words", {})
-                for key, value in (known if isinstance(known, dict) else {}).items():
-                    self.texts.setdefault(key.split("|")[-1], value)
 
     def text(self, message: Any) -> str:
         """Write a message, a list of messages, a number, or a name, which stays as it is."""

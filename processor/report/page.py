@@ -1,4 +1,4 @@
-"""The HTML page of a run: one file, nothing loaded from anywhere."""
+"""The HTML page of a run: one file that loads nothing."""
 
 from __future__ import annotations
 
@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.language import language
 from processor.language.messages import Text, label, messages, text
 from processor.model import Scene, StepRun, Verdict, Word
 from processor.pipeline import Execution
@@ -44,7 +43,7 @@ MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 1
 def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], lang: str = "en") -> str:
     """Render the page, with the figures of each step, in a language of CODES; every text is escaped."""
     environment = templates.environment("report", lang)
-    environment.filters["say"] = language(lang).say
+    environment.filters["say"] = messages(lang).text
     scene = execution.scene
     live = {
         run.step: data
@@ -56,10 +55,10 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         title=scene.name,
         about=_about(scene),
         lang=lang,
-        live=view.embedded({"words": messages(lang).of_scripts(script), "steps": language(lang).in_figures(live)}),
+        live=view.embedded({"words": messages(lang).of_scripts(script), "steps": messages(lang).rendered(live)}),
         script=script,
         digest=digest,
-        verdicts=_verdicts(execution, report, lang),
+        verdicts=_verdicts(execution, report),
         sections=_sections(execution, report, figures, set(live), lang),
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
@@ -69,29 +68,32 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
 def _about(scene: Scene) -> Text:
     """State the kind of a scene, its size, and how its coordinates were read."""
     points = sum(len(scan.points) for scan in scene.scans)
-    template = (
-        "{kind}, {scans} {scans:?scan|scans}, {points:,} points. "
-        if points
-        else ("{kind}, {scans} {scans:?scan|scans}, points left in the file. ")
-    )
+    values = {
+        "kind": label(scene.kind),
+        "scans": len(scene.scans),
+        "points": points,
+        "units": scene.units,
+        "reason": label(scene.units_reason),
+    }
+    if points:
+        return text(
+            "{kind}, {scans} {scans:?scan|scans}, {points:,} points. Coordinates read as {units} ({reason}). "
+            "All lengths in mm.",
+            **values,
+        )
     return text(
-        template + "Coordinates read as {units} ({reason}). All lengths in mm.",
-        kind=label(scene.kind),
-        scans=len(scene.scans),
-        points=points,
-        units=scene.units,
-        reason=label(scene.units_reason),
+        "{kind}, {scans} {scans:?scan|scans}, points left in the file. Coordinates read as {units} ({reason}). "
+        "All lengths in mm.",
+        **values,
     )
 
 
-def _verdicts(execution: Execution, report: ErrorReport, lang: str) -> list[dict[str, Any]]:
+def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
     verdicts: list[dict[str, Any]] = []
     for run, _ in all_tables.grouped(execution.runs):
         report_of = section.of(run.step)
         head, body = report_of.summary(run.result)
-        title: Any = text("{step}: {head}", step=report_of.title, head=head)
-        if isinstance(head, str) and not isinstance(head, Word):
-            title, body = f"{report_of.title}: {head}", language(lang).say(body)
+        title = text("{step}: {head}", step=report_of.title, head=head)
         method = text("Method {method}.", method=run.method)
         if body:
             method = text("Method {method}. {text}", method=run.method, text=body)
@@ -171,8 +173,14 @@ def _cell(cell: Any, column: str, lang: str) -> tuple[str, str]:
     if not isinstance(cell, str) or isinstance(cell, Word):
         written = shown(messages(lang).text(cell))
     else:
-        written = shown(cell) if column in NAMES else language(lang).say(shown(cell), column)
+        written = shown(cell) if column in NAMES else shown(messages(lang).text(label(cell)))
     return "long" if len(shown(cell)) > LONG_CELL else "text", written
+
+
+def heading(name: str, lang: str) -> str:
+    """Write the heading of a column; a catalogue may have ``heading|name`` beside another sense of the name."""
+    catalogue = messages(lang)
+    return catalogue.texts.get(f"heading|{name}", catalogue.text(label(name)))
 
 
 def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
@@ -185,11 +193,14 @@ def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
             rows=len(table.rows),
             file=table.file,
         )
+    written = [heading(name, lang) for name in headings(table)]
     return {
         "title": table.title,
         "note": note,
         "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
-        "columns": list(zip(table.columns, map(label, headings(table)), numeric(table), strict=True)),
+        "columns": list(
+            zip(table.columns, (heading(name, lang) for name in headings(table)), numeric(table), strict=True)
+        ),
         "rows": [
             [_cell(cell, column, lang) for cell, column in zip(row, table.columns, strict=True)]
             for row in table.rows[:MOST_ROWS]

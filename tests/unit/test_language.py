@@ -7,9 +7,9 @@ import string
 import numpy as np
 import pytest
 
-from processor import language
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.surface_registration import Motion
+from processor.language import messages as messages_
 from processor.language.messages import messages
 from processor.language.messages import text as message
 from processor.model import Status, reason
@@ -23,69 +23,7 @@ from tests.support.pages import Visible, latin
 from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge, with_band
 from tests.unit.test_report_balls import of_frame, whole, with_truth
 
-
-@pytest.fixture
-def spoken(monkeypatch):
-    found = language.Language("en")
-    found.words = {"pass": "合格", "fail": "不合格", "gap": "间隙", "a turn": "转动", "a shift": "平移"}
-    found._patterns = [
-        (language._pattern(key), text)
-        for key, text in {
-            "{} of {} parts": "{1}件中{0}件",
-            "{#} mm": "{0}毫米",
-            "all of: {;}": "全部{0}",
-            "joint {}: {}": "接头{0}：{1}",
-        }.items()
-    ]
-    return found
-
-
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("pass", "合格"),
-        ("3 of 5 parts", "5件中3件"),
-        ("joint J1: pass", "接头J1：合格"),
-        ("joint fail", "joint fail"),
-        ("pass; 3 of 5 parts", "合格；5件中3件"),
-        ("pass, gap.", "合格，间隙。"),
-        ("rib1, x", "rib1, x"),
-        ("<b>3</b> of {0} parts", "{0}件中<b>3</b>件"),
-        ("", ""),
-        ("-1.5e+02 mm.", "-1.5e+02毫米。"),
-        ("– mm", "–毫米"),
-        ("some mm", "some mm"),
-        ("all of: fail; b: gap", "全部不合格；b：间隙"),
-        ("J1: all of: pass; fail", "J1：全部合格；不合格"),
-        ("a turn and a shift", "转动、平移"),
-        ("rib1 and gap", "rib1 and gap"),
-    ],
-)
-def test_texts_are_looked_up_matched_or_taken_apart(spoken, text, said):
-    assert spoken.say(text) == said
-
-
-def test_english_says_what_it_is_given():
-    assert language.language("en").say("pass; fail.") == "pass; fail."
-    assert language.language("en").of_scripts("pass") == {}
-
-
-CODES = [code for code in language.CODES if code != "en"]
-
-
-@pytest.mark.parametrize("code", CODES)
-def test_a_catalogue_fills_all_its_places(code):
-    found = language.Language(code)
-    for pattern, template in found._patterns:
-        template.format(*range(pattern.groups))
-        assert all(f"{{{i}}}" in template for i in range(pattern.groups)), template
-
-
-@pytest.mark.parametrize("code", CODES)
-def test_a_text_stands_in_one_section_only(code):
-    for kind in ("words", "sentences"):
-        keys = [key for section in language.catalogue(code).values() for key in section.get(kind, {})]
-        assert len(keys) == len(set(keys))
+CODES = [code for code in messages_.CODES if code != "en"]
 
 
 @pytest.mark.parametrize("code", CODES)

@@ -2,12 +2,10 @@
 
 import dataclasses
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from processor import language
 from processor.compare import compare
 from processor.defects.result import DefectClass
 from processor.defects.result import Result as Defects
@@ -37,7 +35,6 @@ from tests.support.pages import (
     two_nights,
 )
 
-SOURCES = Path(language.__file__).parents[1]
 # --- steps ----------------------------------------------------------------------------------------------------------
 
 
@@ -131,10 +128,10 @@ def test_reasons_of_the_search_are_in_chinese(reasons):
 
 
 def test_a_word_of_two_senses_has_that_of_its_vocabulary_or_column():
-    say = language.language("zh").say
-    assert (say("step"), say(DefectClass.STEP), say("missed: step")) == ("步骤", "错台", "漏检：错台")
-    assert (say("misalignment"), say(DefectClass.MISALIGNMENT)) == ("接口错边", "整体偏位")
-    assert (say("side"), say(label("side"))) == ("立面", "边长")
+    say = messages("zh").text
+    assert (say(label("step")), say(DefectClass.STEP), say(label("missed: step"))) == ("步骤", "错台", "漏检：错台")
+    assert (say(label("misalignment")), say(DefectClass.MISALIGNMENT)) == ("接口错边", "整体偏位")
+    assert (say(label("side")), page.heading("side", "zh")) == ("立面", "边长")
 
 
 # --- a batch --------------------------------------------------------------------------------------------------------

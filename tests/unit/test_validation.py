@@ -13,8 +13,9 @@ from xml.etree import ElementTree as ET
 import numpy as np
 import pytest
 
+from processor.language.messages import text
 from processor.model import InputError, UsageError
-from processor.validation import cells, certificate, matrix, night, software
+from processor.validation import cells, certificate, history, matrix, night, software
 from processor.validation.cells import Outcome
 from processor.validation.history import History
 from tests.support import validation_nights
@@ -245,6 +246,20 @@ def test_folders_and_files_that_are_something_else(tmp_path):
         History(tmp_path / "later")
     with pytest.raises(UsageError, match="expected a date"):
         night.number_of("tomorrow")
+
+
+def test_a_history_of_version_1_keeps_its_lines(tmp_path):
+    path, line = tmp_path / "history.sqlite", text("{night} {verdict}", night="2026-01-01", verdict=text("ok"))
+    with closing(History(path)) as opened:
+        opened.begin("2026-01-01", validation_nights.SOFTWARE, "made", "0", "")
+        opened.end("2026-01-01", [], line, "now")
+        assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", line)]
+    with closing(sqlite3.connect(path)) as db:
+        for column in history.ADDED:
+            db.execute("ALTER TABLE {} DROP COLUMN {}".format(*column.split(".")))
+        db.execute("PRAGMA user_version = 1")
+    with closing(History(path)) as opened:
+        assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", None)]
 
 
 KILLED = """
