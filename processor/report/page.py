@@ -198,9 +198,7 @@ def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
         "title": table.title,
         "note": note,
         "groups": [(name, len(list(members))) for name, members in itertools.groupby(table.groups)],
-        "columns": list(
-            zip(table.columns, (heading(name, lang) for name in headings(table)), numeric(table), strict=True)
-        ),
+        "columns": list(zip(table.columns, written, numeric(table), strict=True)),
         "rows": [
             [_cell(cell, column, lang) for cell, column in zip(row, table.columns, strict=True)]
             for row in table.rows[:MOST_ROWS]
