@@ -33,6 +33,7 @@ from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
 from processor.store import store
 from tests.support.metrics import metric
+from tests.support.records import assert_equal
 
 NAN = float("nan")
 KEYS = [f"P{i}" for i in range(1, 9)]
@@ -455,5 +456,4 @@ def test_results_go_through_the_store_unchanged(made, tmp_path):
     step = "preassemble" if isinstance(made, preassembly_step.Result) else "spheres"
     store.write_results(tmp_path / "r.h5", [StepRun(step, made.method, "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {step: type(made)})
-    for field in dataclasses.fields(made):
-        np.testing.assert_array_equal(getattr(back.result, field.name), getattr(made, field.name))
+    assert_equal(back.result, made)
