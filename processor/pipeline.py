@@ -311,6 +311,22 @@ def read_execution(results: Path, path: Path, units: str | None) -> Execution:
     return Execution(scene, runs, provenance, path if piecewise else None)
 
 
+def find_input(results: Path) -> Path:
+    """Return the input that results were made from: the file of its name beside their folder, or in the current one.
+
+    Raises UsageError where there is none.
+    """
+    from processor import store
+
+    name = str(store.read_provenance(results).get("input", ""))
+    folders = (results.absolute().parent.parent, Path.cwd())
+    found = next((folder / name for folder in folders if name and (folder / name).exists()), None)
+    if found is None:
+        where = " or ".join(map(str, dict.fromkeys(folders)))
+        raise UsageError(f"{results}: expected its input {name!r} in {where}, found none; name INPUT")
+    return found
+
+
 def software() -> dict[str, str]:
     """Versions of what made a result."""
     python = ".".join(str(part) for part in sys.version_info[:3])

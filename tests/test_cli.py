@@ -162,6 +162,13 @@ def test_a_report_is_made_again_without_running_the_steps(frame, tmp_path):
     done = processor("report", tmp_path / "out", tmp_path / "s.h5")
     assert done.returncode == 0, done.stderr
     assert {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()} == before
+    (tmp_path / "out" / "report.html").unlink()
+    assert processor("report", tmp_path / "out").returncode == 0  # the input lies beside
+    assert {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()} == before
+    (tmp_path / "s.h5").rename(tmp_path / "moved.h5")
+    done = processor("report", tmp_path / "out")
+    assert done.returncode == 2
+    assert "expected its input 's.h5'" in done.stderr
     store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, name="another"), truth, {})
     done = processor("report", tmp_path / "out", tmp_path / "s.h5")
     assert done.returncode == 3

@@ -1,6 +1,6 @@
-"""All inputs below a folder: found, processed, and summarised; run again, it takes up where it was.
+"""Finds, processes and summarises all inputs below a folder; run again, it continues where it stopped.
 
-The state is files alone, each put in place by one renaming, so that it is whole whenever the batch is killed.
+The state is in files only, each moved into place by one renaming, so that it is whole whenever the batch is killed.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from processor.batch import job as batch_job
 from processor.batch import record, summary
 from processor.batch.finding import STATE, Input, Inputs, find
 from processor.batch.job import Job, OutputGoneError
-from processor.batch.record import FAILED, Record
+from processor.batch.record import JobStatus, Record
 from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.runner import StoppedError
-from processor.model import InputError, UsageError
+from processor.language.messages import messages
+from processor.model import InputError, UsageError, reason
 
 LOGS = "logs"
 LONGEST_NAME = 240  # bytes of a file's name, with room for prefix and suffix
 MEMORY_SHARE, LEAST_MEMORY_MB = 0.8, 1024  # of the machine, for all jobs together; for a job
-DIED = "every worker that did it died (out of memory?); run again, with fewer jobs at a time"
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a batch does; ``arguments`` go to every ``processor run``, ``units`` to those of scans."""
+    """Settings of a batch; ``arguments`` are passed to every ``processor run``, ``units`` to those of scans."""
 
     root: Path
     out: Path
@@ -69,10 +69,10 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
         raise UsageError(f"{settings.out}: holds the inputs; name another folder for the results")
     inputs = find(root, out)
     for name in [each.name for each in inputs.inputs if each.name.split("/", 1)[0] in (*summary.FILES, LOGS)]:
-        inputs.left_out[name] = "has the name of one of the batch's own files; rename it"
+        inputs.left_out[name] = reason("batch.reserved-name")
     inputs.inputs = [each for each in inputs.inputs if each.name not in inputs.left_out]
-    for name, reason in sorted(inputs.left_out.items()):
-        say(f"{name}: left out: {reason}")
+    for name, why in sorted(inputs.left_out.items()):
+        say(f"{name}: left out: {messages('en').text(why)}")
     if not inputs.inputs:
         raise InputError(f"{settings.root}: expected scan folders, scenes or scans in it, found none")
     with (
@@ -117,15 +117,15 @@ def _records(
 
 
 def _checked(job: Job, result: Record | Lost) -> Record:
-    """Return a job's record; a failure if no worker could run it, or if its worker wrote to a disk of its own."""
+    """Return a job's record; a failure if no worker could run it, or if its worker wrote to another disk."""
     if isinstance(result, Lost):
         died = result.loss is Loss.DIED
-        reason = DIED if died else f"a worker of the cluster could not run it ({result.error})"
-    elif result.status == FAILED or (job.place / record.RECORD).is_file():
+        why = reason("batch.workers-died") if died else reason("batch.worker-failed", error=str(result.error))
+    elif result.status == JobStatus.FAILED or (job.place / record.RECORD).is_file():
         return result
     else:
-        reason = "done, but not in this folder: all workers must share it, and the inputs, under the same path"
-    return Record(input=job.name, identity="", status=FAILED, reason=reason, lasting=False)
+        why = reason("batch.not-shared")
+    return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why, lasting=False)
 
 
 def _token_file(state: Path) -> Path:
@@ -191,9 +191,9 @@ def _memory_mb(at_once: int) -> int:
 
 @contextmanager
 def _alone_in(out: Path) -> Iterator[Path]:
-    """Make and lock the folder of results; gives that of the batch's state."""
+    """Make and lock the folder of results; yield the folder of the batch's state."""
     state = out / STATE
-    busy = f"{out}: another batch is at work here; wait for it or stop it"
+    busy = f"{out}: another batch is running here; wait for it or stop it"
     with ExitStack() as stack:
         try:
             state.mkdir(parents=True, exist_ok=True)

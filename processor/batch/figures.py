@@ -6,6 +6,8 @@ from collections import Counter
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from processor.model import Status
+
 Figures = dict[str, Any]
 VERDICTS = ("fail", "indeterminate", "pass")  # the worst first
 COLUMNS = {
@@ -34,7 +36,7 @@ COLUMNS = {
 def of_results(results: Mapping[str, Any]) -> Figures:
     """Return the figures of a results.json by the names of COLUMNS; absent are those of steps not run and of nulls."""
     steps: Mapping[str, Mapping[str, Any]] = results["steps"]
-    figures: Figures = {"steps": ", ".join(_with_status(name, step) for name, step in steps.items())}
+    figures: Figures = {"steps": ", ".join(_with_status(*each) for each in step_status(results).items())}
     verdicts: Counter[str] = Counter()
     if "preassemble" in steps:
         verdicts += _add_preassembly(steps["preassemble"], figures)
@@ -56,9 +58,13 @@ def of_results(results: Mapping[str, Any]) -> Figures:
     return {name: figures[name] for name in COLUMNS if figures.get(name) is not None}
 
 
-def _with_status(name: str, step: Mapping[str, Any]) -> str:
-    status = step.get("status", "ok")
-    return name if status == "ok" else f"{name} ({status})"
+def step_status(results: Mapping[str, Any]) -> dict[str, str]:
+    """Return the status of each step of a results.json."""
+    return {name: step.get("status", Status.OK.value) for name, step in results["steps"].items()}
+
+
+def _with_status(name: str, status: str) -> str:
+    return name if status == Status.OK else f"{name} ({status})"
 
 
 def _add_preassembly(step: Mapping[str, Any], figures: Figures) -> Counter[str]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from processor import readers
+from processor.model import Reason, reason
 
 PROJECT, SCANS = "project.toml", "scans"
 MARKS = (PROJECT, "design.json", "design.csv")
@@ -30,10 +31,10 @@ class Input:
 
 @dataclass
 class Inputs:
-    """The inputs, and the reasons by name of what looks like one and is left out."""
+    """The inputs, and by name the reasons why other files and folders are left out."""
 
     inputs: list[Input] = field(default_factory=list)
-    left_out: dict[str, str] = field(default_factory=dict)
+    left_out: dict[str, Reason] = field(default_factory=dict)
 
 
 def find(root: Path, out: Path) -> Inputs:
@@ -43,22 +44,22 @@ def find(root: Path, out: Path) -> Inputs:
     with scans, in itself or in scans/, and no further inputs. If it has further inputs, each of its scan files is an
     input, as are those of ``root``.
     """
-    left_out: dict[str, str] = {}
+    left_out: dict[str, Reason] = {}
     inputs = sorted(_search(root, "", out, left_out), key=lambda each: os.fsencode(each.name))
     return Inputs(inputs, left_out)
 
 
-def _search(folder: Path, name: str, out: Path, left_out: dict[str, str]) -> list[Input]:
+def _search(folder: Path, name: str, out: Path, left_out: dict[str, Reason]) -> list[Input]:
     if folder == out:
         return []
     try:
         entries = sorted(os.scandir(folder), key=lambda entry: os.fsencode(entry.name))
     except OSError as error:
-        left_out[name or "."] = f"cannot be read ({error.strerror or error})"
+        left_out[name or "."] = reason("batch.unreadable", error=error.strerror or str(error))
         return []
     names = {entry.name for entry in entries}
     if STATE in names or names.issuperset(RESULTS):
-        left_out[name or "."] = "holds results of an earlier run"
+        left_out[name or "."] = reason("batch.holds-results")
         return []
     if names.intersection(MARKS):
         _leave_out_inner(folder, name, left_out)
@@ -73,7 +74,7 @@ def _search(folder: Path, name: str, out: Path, left_out: dict[str, str]) -> lis
             continue
         if entry.is_symlink():
             if entry.is_dir() or _is_scan(path) or _is_scene(path):
-                left_out[inner] = "a link; the batch follows none"
+                left_out[inner] = reason("batch.link")
         elif readers.is_closed(path):
             scans.append(Input(inner, path))
         elif entry.is_dir():
@@ -84,8 +85,8 @@ def _search(folder: Path, name: str, out: Path, left_out: dict[str, str]) -> lis
         elif _is_scan(path):
             scans.append(Input(inner, path))
         elif path.suffix.lower() in readers.SUFFIXES and entry.name not in NOT_INPUTS:
-            left_out[inner] = "holds no rows of coordinates, so it is taken for no scan"
-    # scans/ belongs to this folder unless something else in it would be an input of its own.
+            left_out[inner] = reason("batch.no-coordinates")
+    # scans/ belongs to this folder unless something else in it would be a separate input.
     only_scans = in_scans and [each.name for each in below] == [f"{name}/{SCANS}".lstrip("/")]
     if not scenes and ((only_scans and (name or not scans)) or (name and scans and not below)):
         return [Input(name or ".", folder)]
@@ -117,10 +118,10 @@ def _holds_scans(folder: Path) -> bool:
         return False
 
 
-def _leave_out_inner(folder: Path, name: str, left_out: dict[str, str]) -> None:
+def _leave_out_inner(folder: Path, name: str, left_out: dict[str, Reason]) -> None:
     """List projects within a scan folder, which are parts of it, as left out."""
     for place, folders, files in os.walk(folder):
         folders[:] = sorted(each for each in folders if not each.startswith("."))
         if PROJECT in files and Path(place) != folder:
             inner = Path(name, Path(place).relative_to(folder))
-            left_out[str(inner)] = f"lies within the scan folder {name or '.'}"
+            left_out[str(inner)] = reason("batch.in-scan-folder", folder=name or ".")

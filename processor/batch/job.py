@@ -20,11 +20,12 @@ from pathlib import Path
 from typing import Any
 
 from processor.batch import figures, record
-from processor.batch.record import FAILED, Record
+from processor.batch.record import JobStatus, Record
 from processor.jobs import process
 from processor.jobs.process import Cause
-from processor.jobs.software import check_same, versions
-from processor.model import InputError
+from processor.jobs.software import OtherSoftwareError, check_same, versions
+from processor.language.messages import messages
+from processor.model import InputError, Reason, reason
 from processor.scan_folder import fingerprint
 from processor.store.store import sync
 from processor.version import __version__
@@ -42,10 +43,12 @@ PACKAGES = (
     "scipy",
     "trimesh",
 )
-STATUS = {0: "done", 1: "in-part", 4: "limit-missed"}  # by the exit code of `processor run`
+# By the exit code of `processor run`.
+STATUS = {0: JobStatus.DONE, 1: JobStatus.IN_PART, 4: JobStatus.LIMIT_MISSED}
+WITH_RESULTS = tuple(STATUS.values())
 # Errors of the output folder, not of an input.
 OUTPUT_GONE = tuple(os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT, errno.EROFS))
-STOPPED = "stopped before it ended"
+STOPPED = reason("batch.stopped")
 
 
 class OutputGoneError(InputError):
@@ -108,16 +111,18 @@ def do(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
         return _processed(job, input_sha256, identity, over)
     except OutputGoneError:
         raise
+    except OtherSoftwareError as error:
+        return _passing(job, reason("batch.other-software", difference=error.args[0]))
     except (InputError, OSError) as error:
         text = str(error)
         if any(sign in text for sign in OUTPUT_GONE):
             raise OutputGoneError(text) from error
-        return _passing(job, text)
+        return _passing(job, reason("batch.error", message=_plain(job, text)))
 
 
-def _passing(job: Job, reason: str) -> Record:
+def _passing(job: Job, why: Reason) -> Record:
     """Record a failure that is tried again in the next run."""
-    return Record(input=job.name, identity="", status=FAILED, reason=_plain(job, reason), lasting=False)
+    return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why, lasting=False)
 
 
 def _token(job: Job) -> str:
@@ -130,12 +135,12 @@ def _token(job: Job) -> str:
 def _earlier(job: Job, identity: str) -> Record | None:
     """Return the record of an earlier run, if it still holds."""
     done = record.read(job.place / record.RECORD)
-    if done is not None and done.identity == identity and done.status in record.WITH_RESULTS:
+    if done is not None and done.identity == identity and done.status in WITH_RESULTS:
         whole = (job.place / "report.html").is_file() and (job.place / "results.h5").is_file()
         if whole and record.sha256_of(job.place / record.RESULTS) == done.results_sha256:
             return done
     failed = record.read(job.failed)
-    if failed is None or failed.identity != identity or failed.status != FAILED or job.retry:
+    if failed is None or failed.identity != identity or failed.status != JobStatus.FAILED or job.retry:
         return None
     now = {"timeout_s": job.timeout_s, "memory_mb": float(job.memory_mb)}
     more = any(now.get(name, 0.0) > limit for name, limit in failed.limits.items())
@@ -152,19 +157,18 @@ def _processed(job: Job, input_sha256: str, identity: str, over: Callable[[], bo
         ended = _run(job, identity, made, over)
         if ended.cause is Cause.STOPPED:
             return _passing(job, STOPPED)
-        status, reason, limits, results = _assessed(job, ended, made)
-        if status == FAILED and any(sign in ended.last_line for sign in OUTPUT_GONE):
-            raise OutputGoneError(reason)
+        status, why, limits, results = _assessed(job, ended, made)
+        if why is not None and any(sign in ended.last_line for sign in OUTPUT_GONE):
+            raise OutputGoneError(messages("en").text(why))
         if fingerprint.content_hash(job.source, job.out) != input_sha256:
-            text = "the input changed while it was processed, so nothing is kept; run again when it is complete"
-            return _passing(job, text)
+            return _passing(job, reason("batch.input-changed"))
         if over():
             return _passing(job, STOPPED)
         ending = Record(
             input=job.name,
             identity=identity,
             status=status,
-            reason=reason,
+            reason=why,
             input_sha256=input_sha256,
             limits=limits,
             seconds=round(ended.seconds, 3),
@@ -175,7 +179,9 @@ def _processed(job: Job, input_sha256: str, identity: str, over: Callable[[], bo
             record.write(job.failed, ending)
             return ending
         digest = record.sha256_of(made / record.RESULTS)
-        ending = dataclasses.replace(ending, results_sha256=digest, figures=figures.of_results(results))
+        ending = dataclasses.replace(
+            ending, results_sha256=digest, figures=figures.of_results(results), steps=figures.step_status(results)
+        )
         record.write(made / record.RECORD, ending)
         _publish(job, made)
         job.failed.unlink(missing_ok=True)
@@ -197,33 +203,42 @@ def _run(job: Job, identity: str, made: Path, over: Callable[[], bool]) -> proce
     )
 
 
-def _assessed(job: Job, ended: process.Ended, made: Path) -> tuple[str, str, dict[str, float], dict[str, Any] | None]:
+_Assessed = tuple[JobStatus, Reason | None, dict[str, float], dict[str, Any] | None]
+
+
+def _assessed(job: Job, ended: process.Ended, made: Path) -> _Assessed:
     """Return the status of a process that ended, the reason, the limits that ended it, and its results."""
     if ended.cause is Cause.TIME:
-        return FAILED, f"took longer than {job.timeout_s:g} s (--timeout-s)", {"timeout_s": job.timeout_s}, None
+        return _failure(reason("batch.timeout", limit=job.timeout_s), timeout_s=job.timeout_s)
     last = _plain(job, ended.last_line.replace(str(made), record.RESULTS), 500)
     if ended.cause is Cause.MEMORY or "MemoryError" in last or "Unable to allocate" in last:
-        limits = {"memory_mb": float(job.memory_mb)}
-        return FAILED, f"needs more memory than {job.memory_mb} MB (--memory-mb)", limits, None
+        return _failure(reason("batch.memory", limit=job.memory_mb), memory_mb=float(job.memory_mb))
     if ended.cause is Cause.SIGNAL:
         with suppress(ValueError):
-            return FAILED, f"crashed: {signal.Signals(ended.code).name} (signal {ended.code})", {}, None
-        return FAILED, f"crashed: signal {ended.code}", {}, None
+            name = signal.Signals(ended.code).name
+            return _failure(reason("batch.crashed", signal=name, number=ended.code))
+        return _failure(reason("batch.crashed-unnamed", number=ended.code))
     if ended.code in STATUS:
         try:
             results = json.loads((made / record.RESULTS).read_text("utf-8"))
             if results["format"] != "processor-results" or not (made / "report.html").is_file():
                 raise ValueError(results["format"])
-            return STATUS[ended.code], "", {}, results
+            return STATUS[ended.code], None, {}, results
         except (OSError, ValueError, TypeError, KeyError):
             pass
     elif last.startswith("error: "):
-        return FAILED, last.removeprefix("error: "), {}, None
-    return FAILED, f"ended with exit code {ended.code} and without results{': ' if last else ''}{last}", {}, None
+        return _failure(reason("batch.error", message=last.removeprefix("error: ")))
+    if last:
+        return _failure(reason("batch.no-results-but", exit_code=ended.code, last=last))
+    return _failure(reason("batch.no-results", exit_code=ended.code))
+
+
+def _failure(why: Reason, **limits: float) -> _Assessed:
+    return JobStatus.FAILED, why, limits, None
 
 
 def _plain(job: Job, text: str, most: int = 2000) -> str:
-    """Return a text on one line, its paths relative: the summary is the same wherever the folders are."""
+    """Return a text on one line with relative paths: the summary does not depend on where the folders are."""
     for folder in (job.root, job.out):
         text = text.replace(f"{folder}/", "") if str(folder) != "/" else text
     text = " ".join(text.replace(str(job.source), job.source.name).split())

@@ -1,7 +1,7 @@
-"""The record of a job: one small file with hashes of what the results were made from, and figures for the summary.
+"""The record of a job: a small file with hashes of what the results depend on, and figures for the summary.
 
-The record of a job with results lies among them, so that one renaming puts both in place. Records of failed jobs lie
-together in a folder of the batch's state.
+The record of a job with results lies in their folder, so that one renaming puts both in place. Records of failed jobs
+lie together in a folder of the batch's state.
 """
 
 from __future__ import annotations
@@ -9,29 +9,39 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from processor.language.messages import messages
+from processor.model import Reason, Word
 from processor.store.store import replacing
 
 FORMAT, FORMAT_VERSION = "processor-batch-job", "1.0"
 RECORD, RESULTS = "job.json", "results.json"
-WITH_RESULTS = ("done", "in-part", "limit-missed")
-FAILED = "failed"
+
+
+class JobStatus(Word):
+    """How a job ended."""
+
+    DONE = "done"
+    IN_PART = "in-part"
+    LIMIT_MISSED = "limit-missed"
+    FAILED = "failed"  # without results
 
 
 @dataclass(frozen=True)
 class Record:
-    """How a job ended. ``status``: done | in-part | limit-missed | failed; ``identity``: hash of what it depends on."""
+    """How a job ended. ``identity`` is the hash of all that it depends on; ``reason`` that of a failure."""
 
     input: str
     identity: str
-    status: str
-    reason: str = ""
+    status: JobStatus
+    reason: Reason | None = None
     input_sha256: str = ""
     results_sha256: str = ""
     figures: dict[str, Any] = field(default_factory=dict)
+    steps: dict[str, str] = field(default_factory=dict)  # status by step
     limits: dict[str, float] = field(default_factory=dict)  # by name, of those that ended it
     lasting: bool = True  # False: the failure is not the input's, and the job is tried again
     kept: bool = False  # from an earlier run of the batch
@@ -51,15 +61,32 @@ def read(path: Path) -> Record | None:
         stored = json.loads(path.read_text("utf-8"))
         if (stored.pop("format"), stored.pop("format_version")) != (FORMAT, FORMAT_VERSION):
             return None
+        code, values = stored.pop("reason_code"), stored.pop("reason_values")
         names = {each.name for each in fields(Record)}
-        return Record(**{name: value for name, value in stored.items() if name in names})
+        stored = {name: value for name, value in stored.items() if name in names}
+        stored |= {"status": JobStatus(stored["status"]), "reason": Reason(code, values) if code else None}
+        return Record(**stored)
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 
 
+def as_object(record: Record) -> dict[str, Any]:
+    """Return a record as an object for JSON, its reason as text and as code with values."""
+    stored = {each.name: getattr(record, each.name) for each in fields(Record)}
+    reason = record.reason
+    if reason is None:
+        return stored | {"reason": "", "reason_code": "", "reason_values": {}}
+    return stored | {
+        "reason": messages("en").text(reason),
+        "reason_code": reason.code,
+        "reason_values": dict(reason.values),
+    }
+
+
 def write(path: Path, record: Record) -> None:
     """Write a record. Raises InputError if it cannot be written."""
-    text = json.dumps({"format": FORMAT, "format_version": FORMAT_VERSION, **asdict(record)}, indent=1, allow_nan=False)
+    content = {"format": FORMAT, "format_version": FORMAT_VERSION, **as_object(record)}
+    text = json.dumps(content, indent=1, allow_nan=False)
     write_text(path, text + "\n")
 
 

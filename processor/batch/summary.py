@@ -1,6 +1,6 @@
 """The summary of a batch: summary.csv, summary.json and index.html, the same bytes for the same inputs.
 
-What differs from run to run, times and memory, is in timings.csv.
+Times and memory, which differ from run to run, are in timings.csv.
 """
 
 from __future__ import annotations
@@ -20,23 +20,31 @@ from urllib.parse import quote
 from processor.batch import record
 from processor.batch.figures import COLUMNS
 from processor.batch.job import Job
-from processor.batch.record import FAILED, Record
-from processor.language import language
-from processor.model import InputError
+from processor.batch.record import JobStatus, Record
+from processor.language.messages import Text, label, messages, text
+from processor.model import InputError, Reason, Status, Verdict
+from processor.report import templates
 
 CSV, JSON, PAGE, TIMINGS = "summary.csv", "summary.json", "index.html", "timings.csv"
 FILES = (CSV, JSON, PAGE, TIMINGS)
 FORMAT, FORMAT_VERSION = "processor-batch", "1.0"
-STATES = ("done", "in-part", "limit-missed", FAILED)
 ENDS = ("report", "log", "input_sha256")  # of a row, after the reason
 FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
-TONES = {"done": "good", "in-part": "between", "limit-missed": "bad", FAILED: "bad"}
-VERDICT_TONES = {"pass": "good", "fail": "bad", "indeterminate": "between"}
+TONES = {
+    JobStatus.DONE: "good",
+    JobStatus.IN_PART: "between",
+    JobStatus.LIMIT_MISSED: "bad",
+    JobStatus.FAILED: "bad",
+    Verdict.PASS: "good",
+    Verdict.INDETERMINATE: "between",
+    Verdict.FAIL: "bad",
+}
+ERROR = "batch.error"  # code of an error of the command line, whose text is English
 
 
 @dataclass(frozen=True)
 class Summary:
-    """How many inputs came to each state, the page that lists them, and those that failed."""
+    """The number of inputs of each status, the page that lists them, and those that failed."""
 
     counts: Mapping[str, int]
     page: Path
@@ -49,30 +57,37 @@ def remove(out: Path) -> None:
         (out / name).unlink(missing_ok=True)
 
 
-def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, str], lang: str = "en") -> Summary:
+def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, Reason], lang: str = "en") -> Summary:
     """Write the summary of all jobs into ``out``, its page in the language ``lang``.
 
     Raises InputError if it cannot be written.
     """
     rows = [_row(out, job, ending) for job, ending in done]
-    states = Counter(ending.status for _, ending in done)
-    counts = {name: states[name] for name in STATES}
-    left = sorted((readable(name), readable(reason)) for name, reason in left_out.items())
+    statuses = Counter(ending.status for _, ending in done)
+    counts = {str(status): statuses[status] for status in JobStatus}
+    left = [
+        {"input": readable(name), "reason": _written(why, "en"), "reason_code": why.code}
+        for name, why in sorted(left_out.items())
+    ]
     columns = ["input", "status", "verdict", *(name for name in COLUMNS if name != "verdict"), "reason", *ENDS]
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, "units": "mm", "counts": counts}
-    named = [{"input": name, "reason": reason} for name, reason in left]
-    content = head | {"inputs": rows, "left_out": named}
+    content = head | {"inputs": rows, "left_out": left}
     record.write_text(out / CSV, _csv(columns, ([row.get(name) for name in columns] for row in rows)))
     record.write_text(out / JSON, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     times = ([readable(r.input), r.status, r.seconds, r.peak_mb, "yes" if r.kept else ""] for _, r in done)
     record.write_text(out / TIMINGS, _csv(["input", "status", "seconds", "peak_mb", "kept"], times))
     try:
-        record.write_text(out / PAGE, _html(rows, counts, left, lang))  # last: it is there only if all are
+        page = _html(rows, [ending for _, ending in done], statuses, left_out, lang)
+        record.write_text(out / PAGE, page)  # last: it is there only if all are
     except InputError:
         remove(out)
         raise
-    failed = tuple((row["input"], row["reason"]) for row in rows if row["status"] == FAILED)
+    failed = tuple((row["input"], row["reason"]) for row in rows if row["status"] == JobStatus.FAILED)
     return Summary(counts, out / PAGE, failed)
+
+
+def _written(why: Reason | None, lang: str) -> str:
+    return "" if why is None else readable(messages(lang).text(why))
 
 
 def readable(text: str) -> str:
@@ -82,10 +97,10 @@ def readable(text: str) -> str:
 
 
 def _row(out: Path, job: Job, ending: Record) -> dict[str, Any]:
-    with_results = ending.status != FAILED
-    row: dict[str, Any] = {"input": readable(ending.input), "status": ending.status}
-    row |= {"verdict": None, "reason": readable(ending.reason), **ending.figures}
-    row["report"] = _link(out, job.place / "report.html") if with_results else ""
+    why = ending.reason
+    row: dict[str, Any] = {"input": readable(ending.input), "status": ending.status, "verdict": None}
+    row |= {"reason": _written(why, "en"), "reason_code": "" if why is None else why.code, **ending.figures}
+    row["report"] = "" if ending.status == JobStatus.FAILED else _link(out, job.place / "report.html")
     row["log"] = _link(out, job.log) if job.log.is_file() else ""
     return row | {"input_sha256": ending.input_sha256}
 
@@ -111,40 +126,54 @@ def _cell(cell: Any) -> Any:
 
 
 def _html(
-    rows: Sequence[dict[str, Any]], counts: Mapping[str, int], left_out: Sequence[tuple[str, str]], lang: str
+    rows: Sequence[dict[str, Any]],
+    records: Sequence[Record],
+    statuses: Counter[JobStatus],
+    left_out: Mapping[str, Reason],
+    lang: str,
 ) -> str:
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("processor", "batch"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    say = language(lang).say
-    environment.filters["say"] = say
-    columns = [name for name in COLUMNS if name != "verdict" and any(row.get(name) is not None for row in rows)]
+    names = [name for name in COLUMNS if name != "verdict" and any(row.get(name) is not None for row in rows)]
+    counted = [
+        text("{count} {status}", count=statuses[status], status=status) for status in JobStatus if statuses[status]
+    ]
+    verdicts = [Verdict(row["verdict"] or "none") for row in rows]
     shown = [
         {
-            **{name: row[name] or "" for name in ("input", "status", "verdict", "reason", "report", "log")},
+            **{name: row[name] for name in ("input", "status", "report", "log")},
             "tone": TONES[row["status"]],
-            "verdict_tone": VERDICT_TONES.get(row["verdict"] or "", ""),
-            "cells": [_shown(row.get(name)) for name in columns],
-            "english": bool(row["reason"]) and say(row["reason"]) == row["reason"],
+            "verdict": verdict if row["verdict"] else "",
+            "verdict_tone": TONES.get(verdict, ""),
+            "reason": _written(ending.reason, lang),
+            "english": row["reason_code"] == ERROR and lang != "en",
+            "cells": [_cell_shown(_steps(ending) if name == "steps" else row.get(name), lang) for name in names],
         }
-        for row in rows
+        for row, ending, verdict in zip(rows, records, verdicts, strict=True)
     ]
-    text: str = environment.get_template("summary.html").render(
-        lang=lang,
-        title=f"{len(rows)} inputs",
-        counted=", ".join(f"{count} {name}" for name, count in counts.items() if count) + ".",
-        columns=[
-            (name.replace("_", " "), any(cell["number"] for cell in cells))
-            for name, cells in zip(columns, zip(*(row["cells"] for row in shown), strict=True), strict=False)
-        ],
-        rows=shown,
-        left_out=left_out,
+    columns = [
+        (label(name.replace("_", " ")), any(row["cells"][i]["number"] for row in shown)) for i, name in enumerate(names)
+    ]
+    page: str = (
+        templates.environment("batch", lang)
+        .get_template("summary.html")
+        .render(
+            lang=lang,
+            title=text("{count} {count:?input|inputs}", count=len(rows)),
+            counted=text("{counts}.", counts=counted),
+            columns=columns,
+            rows=shown,
+            left_out=[(readable(name), _written(why, lang)) for name, why in sorted(left_out.items())],
+        )
     )
-    return text
+    return page
 
 
-def _shown(cell: Any) -> dict[str, Any]:
-    number = isinstance(cell, int | float)
-    return {"number": number, "text": "" if cell is None else f"{cell:.3f}" if isinstance(cell, float) else str(cell)}
+def _steps(ending: Record) -> list[Text]:
+    """List the steps, with the status of those that did not end well."""
+    return [
+        label(step) if status == Status.OK else text("{step} ({status})", step=label(step), status=Status(status))
+        for step, status in ending.steps.items()
+    ]
+
+
+def _cell_shown(cell: Any, lang: str) -> dict[str, Any]:
+    return {"number": isinstance(cell, int | float), "text": "" if cell is None else messages(lang).text(cell)}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from dataclasses import dataclass
 from pathlib import Path
@@ -115,7 +114,10 @@ def _settings(root: Path, options: BatchOptions) -> Settings:
 
 
 def _report_input(record: Record, as_json: bool) -> None:
+    from processor.batch.record import as_object
+    from processor.language.messages import messages
+
     if as_json:
-        click.echo(json.dumps({"event": "input", **dataclasses.asdict(record)}))
-    elif record.status == "failed":
-        say(f"{record.input}: failed: {record.reason}")
+        click.echo(json.dumps({"event": "input", **as_object(record)}))
+    elif record.reason is not None:
+        say(f"{record.input}: failed: {messages('en').text(record.reason)}")

@@ -50,14 +50,16 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
     All lengths are in the unit of the clouds; those not given are derived from their density.
     """
     from processor.compare import compare as comparing
+    from processor.language.messages import messages
     from processor.report import comparison
 
     comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
     given = {name: value for name, value in options.items() if value is not None}
-    record = comparison.write(output, comparing.compare(comparing.Request(reference, compared, **given), say), lang)
+    result = comparing.compare(comparing.Request(reference, compared, **given), say)
+    record = comparison.write(output, result, lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))
         return
-    for line in comparison.lines(record):
-        click.echo(line)
+    for line in comparison.lines(result):
+        click.echo(messages("en").text(line))
     click.echo(f"report: {output / comparison.PAGE}")

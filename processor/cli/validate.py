@@ -42,7 +42,7 @@ class ValidateOptions:
 @click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
 @click.pass_context
 def validate(context: click.Context, /, matrix: Path | None, **options: Any) -> None:
-    """Make, run and check a matrix of scenes, and say what changed since the nights before.
+    """Make, run and check a matrix of scenes, and report what changed since the nights before.
 
     Without MATRIX.toml the default one, which covers every step. Run again, it goes on where it was.
     Exit codes: 0 done, 1 some cells failed, 4 a limit was missed or a figure got worse.
@@ -66,5 +66,5 @@ def validate(context: click.Context, /, matrix: Path | None, **options: Any) -> 
         again=chosen.again,
         lang=chosen.lang,
     )
-    click.echo(json.dumps(summary.as_object(), ensure_ascii=False) if chosen.as_json else summary.line)
+    click.echo(json.dumps(summary.as_object(), ensure_ascii=False) if chosen.as_json else str(summary.line))
     context.exit(LIMIT_MISSED if not summary.passed else IN_PART if summary.failed else DONE)

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -17,7 +16,8 @@ from processor.geometry import m3c2, neighbors, normal_orientation
 from processor.geometry.m3c2 import CloudNormals, Distances, Scales, Summary
 from processor.geometry.normal_orientation import Turned
 from processor.geometry.point_grid import PointGrid
-from processor.model import Floats, InputError, UsageError
+from processor.language.messages import messages
+from processor.model import Floats, InputError, Reason, UsageError, reason
 from processor.readers import RawScan
 from processor.readers.common import FAR, ORIGIN_STEP
 from processor.scan_folder import normals as scan_folder_normals
@@ -60,8 +60,39 @@ class Comparison:
     units: dict[str, str]  # of each file, "" = not given
     points: dict[str, int]
     hashes: dict[str, str]
-    normals_from: str
+    normals_from: Reason
     turned: Turned | None  # None: the normals were given with their signs
+
+    @property
+    def notes(self) -> tuple[Reason, ...]:
+        """Notes on the unit, then on the normals."""
+        return self.normals_notes if self.unit_note is None else (self.unit_note, *self.normals_notes)
+
+    @property
+    def unit_note(self) -> Reason | None:
+        """Which files give the unit, if some do and some do not."""
+        files = {name: getattr(self.request, name).name for name in self.units}
+        with_unit = tuple(name for name, unit in self.units.items() if unit)
+        without = tuple(files[name] for name, unit in self.units.items() if not unit)
+        if not (with_unit and without):
+            return None
+        given_by = tuple(files[name] for name in with_unit)
+        return reason("compare.unit", unit=self.units[with_unit[0]], given_by=given_by, without=without)
+
+    @property
+    def normals_notes(self) -> tuple[Reason, ...]:
+        """How normals of upright surfaces were oriented; nothing where +z decided all signs."""
+        turned = self.turned
+        if turned is None or not turned.upright:
+            return ()
+        notes = [reason("compare.upright", count=turned.upright, total=turned.up + turned.upright)]
+        if turned.scanner:
+            notes.append(reason("compare.towards-scanner", count=turned.scanner))
+        if turned.neighbours:
+            notes.append(reason("compare.as-adjacent", count=turned.neighbours))
+        if turned.convention:
+            notes.append(reason("compare.by-convention", count=turned.convention, surfaces=turned.surfaces))
+        return tuple(notes)
 
 
 @dataclass(frozen=True)
@@ -126,17 +157,16 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     used = m3c2.derive_scales(
         first, second, core, request.normal_diameter, request.projection_diameter, request.max_depth
     )
-    if reason := diagnosis.other_unit(first.cells.points, second.cells.points, used):
-        raise InputError(f"{request.reference} and {request.compared}: {reason}")
-    units = {name: cloud.unit for name, cloud in clouds.items()}
-    _log_scales(request, used, unit, units, log)
+    if why := diagnosis.other_unit(first.cells.points, second.cells.points, used):
+        raise InputError(f"{request.reference} and {request.compared}: {why}")
+    _log_scales(request, used, unit, log)
     if request.normals is not None:
-        turned, source = None, f"file {request.normals.name}"
+        turned, source = None, reason("compare.normals-of-file", file=request.normals.name)
         normals = scan_folder_normals.read(request.normals, core, origin, used.projection_diameter_mm)
     else:
         turned = _fitted_normals(reference, first, core, origin, used.normal_diameter_mm)
         normals = turned.normals
-        source = "planes of the reference, turned towards +z" + (", upright ones otherwise" if turned.upright else "")
+        source = reason("compare.normals-of-planes-upright") if turned.upright else reason("compare.normals-of-planes")
     distances = m3c2.distances(
         _sorted(first, used.projection_diameter_mm),
         _sorted(second, used.projection_diameter_mm),
@@ -148,14 +178,11 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
     )
     summary = m3c2.summary(distances, core, normals, used.projection_diameter_mm, m3c2.PAPER_POINTS_A_CYLINDER)
     if not np.isfinite(distances.distance).any():
-        reason = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
-        raise InputError(f"{request.reference} and {request.compared}: no core point has a distance: {reason}")
-    if turned is not None and (note := turned_note(turned)):
-        log(note)
-    _log_warnings(summary, used, log)
+        why = diagnosis.no_distance(first.cells.points, second.cells.points, core, summary.without_normal, used)
+        raise InputError(f"{request.reference} and {request.compared}: no core point has a distance: {why}")
     given = {} if request.normals is None else {"normals": _sha256(request.normals)}
-    return Comparison(
-        request,
+    comparison = Comparison(
+        request=request,
         origin=origin,
         core=core,
         normals=normals,
@@ -163,12 +190,14 @@ def compare(request: Request, log: Callable[[str], None] = lambda _: None) -> Co
         scales=used,
         summary=summary,
         unit=unit,
-        units=units,
+        units={name: cloud.unit for name, cloud in clouds.items()},
         points={name: cloud.count for name, cloud in clouds.items()},
         hashes={name: cloud.sha256 for name, cloud in clouds.items()} | given,
         normals_from=source,
         turned=turned,
     )
+    _log_warnings(comparison, log)
+    return comparison
 
 
 def _read_clouds(request: Request) -> dict[str, _Cloud]:
@@ -259,7 +288,7 @@ def _origin(reference: _Cloud) -> Floats:
     return origin
 
 
-def _log_scales(request: Request, used: Scales, unit: str, units: dict[str, str], log: Callable[[str], None]) -> None:
+def _log_scales(request: Request, used: Scales, unit: str, log: Callable[[str], None]) -> None:
     def source(given: float, derived_from: str) -> str:
         return "given" if given else f"derived from {derived_from}"
 
@@ -268,8 +297,6 @@ def _log_scales(request: Request, used: Scales, unit: str, units: dict[str, str]
         f"lengths are in the unit of the files{f' ({unit})' if unit else ', which they do not give'}; "
         f"spacing {used.reference_spacing_mm:.4g} (reference), {used.compared_spacing_mm:.4g} (compared)"
     )
-    if note := unit_note(units, {"reference": request.reference, "compared": request.compared, "core": request.core}):
-        log(note)
     if request.normals is not None:
         unused = "; --normal-diameter is not used" if request.normal_diameter else ""
         log(f"normals of file {request.normals.name}{unused}")
@@ -281,34 +308,10 @@ def _log_scales(request: Request, used: Scales, unit: str, units: dict[str, str]
     log(f"a cylinder holds about {points:.3g} points of the sparser cloud")
 
 
-def turned_note(turned: Turned) -> str:
-    """Return how normals of upright surfaces were oriented; "" where +z decided all signs."""
-    if not turned.upright:
-        return ""
-    parts = [
-        f"{turned.upright} of {turned.up + turned.upright} normals are of upright surfaces, not oriented by +z",
-        f"{turned.scanner} point towards the scanner" if turned.scanner else "",
-        f"{turned.neighbours} are oriented as the adjacent surface" if turned.neighbours else "",
-        f"{turned.convention}, of {turned.surfaces} connected surfaces, by convention: {normal_orientation.CONVENTION}"
-        if turned.convention
-        else "",
-    ]
-    return "; ".join(filter(None, parts))
-
-
-def unit_note(units: Mapping[str, str], files: Mapping[str, Any]) -> str:
-    """Return which files give the unit if some do and some do not; "" otherwise."""
-    with_unit = [name for name, unit in units.items() if unit]
-    without = [name for name, unit in units.items() if not unit]
-    if not (with_unit and without):
-        return ""
-    return (
-        f"the unit {units[with_unit[0]]} is given by {', '.join(str(files[name]) for name in with_unit)} only; not by "
-        f"{', '.join(str(files[name]) for name in without)}, whose coordinates must have the same unit"
-    )
-
-
-def _log_warnings(summary: Summary, used: Scales, log: Callable[[str], None]) -> None:
+def _log_warnings(comparison: Comparison, log: Callable[[str], None]) -> None:
+    summary, used = comparison.summary, comparison.scales
+    for note in comparison.notes:
+        log(messages("en").text(note))
     if summary.without_lod:
         log(
             f"{summary.without_lod} of {summary.core_points} core points have no level of detection: fewer than "

@@ -18,9 +18,20 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
     return installed
 
 
+class OtherSoftwareError(InputError):
+    """A worker has other versions than the machine that submitted the job; the first argument lists them."""
+
+    def __str__(self) -> str:
+        """Return the message."""
+        return f"a worker has other software: {self.args[0]}; install the same everywhere"
+
+
 def check_same(here: Mapping[str, str], expected: Mapping[str, str]) -> None:
-    """Raise InputError if the versions on this worker differ from those of the machine that submitted the job."""
+    """Compare the versions on this worker with those of the machine that submitted the job.
+
+    Raises OtherSoftwareError if they differ.
+    """
     different = sorted(name for name in {*here, *expected} if here.get(name) != expected.get(name))
     if different:
         pairs = ", ".join(f"{name} {here.get(name, 'none')}, not {expected.get(name, 'none')}" for name in different)
-        raise InputError(f"a worker has other software: {pairs}; install the same everywhere")
+        raise OtherSoftwareError(pairs)

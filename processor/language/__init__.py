@@ -27,8 +27,8 @@ else:
     import tomli as tomllib
 
 CODES = ("en", "zh")
-# Files of a catalogue, in the order in which sentences are tried; the last holds what anything else may end in.
-PARTS = ("page", "preassemble", "spheres", "deviation", "stitch", "defects", "batch", "validate", "live", "endings")
+# Files of a catalogue, in the order in which sentences are tried.
+PARTS = ("preassemble", "spheres", "stitch", "defects")
 SEPARATORS = (" | ", ". ", "; ", ": ", ", ", " and ")
 FULL_WIDTH = {" | ": " | ", ". ": "。", "; ": "；", ": ": "：", ", ": "，", " and ": "、"}
 PLACES = {

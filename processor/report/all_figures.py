@@ -15,7 +15,7 @@ def of_run(execution: Execution, report: ErrorReport) -> dict[str, Drawn]:
     """Draw all figures of a run, by step: file name -> (caption, PNG)."""
     with mpl.rc_context():
         mpl.rcdefaults()
-        mpl.rcParams["text.parse_math"] = False  # a name from outside may hold dollar signs
+        mpl.rcParams["text.parse_math"] = False  # names from input may contain dollar signs
         return {
             run.step: section.of(run.step).figures(execution, [run, *others], report)
             for run, others in grouped(execution.runs)

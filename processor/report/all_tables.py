@@ -1,4 +1,4 @@
-"""Tables of a run, for the page, for CSV files and for the terminal."""
+"""Tables of a run for the page, CSV files and the terminal."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, text
-from processor.model import METRIC_NAMES, Metric, StepRun
+from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
 from processor.report import section
 from processor.report.table import Table
@@ -16,7 +16,7 @@ __all__ = ["Table", "all_of", "grouped", "of_checks", "of_step"]
 
 
 def of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
-    """Tables of a step's answer, beside other methods on the same scene."""
+    """Tables of a step's result, with those of other methods on the same scene."""
     return section.of(run.step).tables((run, *others), report)
 
 
@@ -31,9 +31,14 @@ def of_checks(report: ErrorReport) -> Table:
 
 def metric_name(metric: Metric) -> Text:
     """Return the name of a figure as a text."""
-    template = METRIC_NAMES.get(metric.statistic, "{quantity}, {statistic}")
-    name = text(template, quantity=label(metric.quantity), statistic=metric.statistic)
+    name = figure_name(metric.quantity, metric.statistic)
     return text("{method}: {figure}", method=metric.method, figure=name) if metric.method else name
+
+
+def figure_name(quantity: str, statistic: Statistic) -> Text:
+    """Return the name of a figure without its method."""
+    template = METRIC_NAMES.get(statistic, "{quantity}, {statistic}")
+    return text(template, quantity=label(quantity), statistic=statistic)
 
 
 def _outcome(limit: float, passed: bool) -> Text:
@@ -51,11 +56,10 @@ def all_of(execution: Execution, report: ErrorReport) -> list[Table]:
 
 
 def grouped(runs: Sequence[StepRun]) -> list[tuple[StepRun, list[StepRun]]]:
-    """Pair each step's answer with the runs of other methods made for comparison."""
-    answers: dict[str, tuple[StepRun, list[StepRun]]] = {}
+    """Pair the first run of each step, its result, with the runs of other methods for comparison."""
+    by_step: dict[str, tuple[StepRun, list[StepRun]]] = {}
     for run in runs:
-        if run.step in answers:
-            answers[run.step][1].append(run)
-        else:
-            answers[run.step] = (run, [])
-    return list(answers.values())
+        by_step.setdefault(run.step, (run, []))
+        if by_step[run.step][0] is not run:
+            by_step[run.step][1].append(run)
+    return list(by_step.values())

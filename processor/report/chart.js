@@ -1,4 +1,4 @@
-// A chart of lines with bands: names switch lines off and on, pointing at it reads the nearest values.
+// A chart of lines with bands: names switch lines off and on, pointing at a line shows its nearest values.
 function lineChart(host, wanted) {
   const { xLabel, yLabel, series, logX, note } = wanted;
   let logY = wanted.logY;

@@ -5,20 +5,21 @@ from __future__ import annotations
 import base64
 import dataclasses
 import json
+import math
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
 
 from processor import pipeline
-from processor.compare.compare import Comparison, turned_note, unit_note
+from processor.compare.compare import Comparison
 from processor.geometry.m3c2 import FEWEST_FOR_LOD
 from processor.geometry.normal_orientation import CONVENTION, Turned
-from processor.language import language
-from processor.language.messages import Message
-from processor.report import results_folder
+from processor.language.messages import NO_NUMBER, Message, messages, text
+from processor.report import results_folder, templates
 from processor.report.deviation import csv
 from processor.report.deviation import figures as deviation_figures
+from processor.report.record_json import reason_json
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
 OWN_NAMES = (TABLE, *FIGURES, RECORD, PAGE)
@@ -29,42 +30,35 @@ DEFINITION = (
 )
 
 
-def check_output(out: Path, found: tuple[Path | None, ...]) -> None:
-    """Refuse a folder that holds anything but an earlier comparison, or one of the inputs: UsageError."""
-    for path in found:
+def check_output(out: Path, inputs: tuple[Path | None, ...]) -> None:
+    """Raise UsageError for a folder that holds an input, or anything but an earlier comparison."""
+    for path in inputs:
         if path is not None:
             results_folder.check_output(out, path, RECORD, OWN_NAMES)
 
 
-def as_json(found: Comparison) -> dict[str, Any]:
+def as_json(result: Comparison) -> dict[str, Any]:
     """Build the object of compare.json; lengths in the clouds' unit."""
-    request, scales, summary = found.request, found.scales, found.summary
-    files = {"reference": request.reference, "compared": request.compared, "core": request.core}
-    files["normals"] = request.normals
-    share = summary.significant_share
-    figures = {
-        field.name: getattr(summary, field.name)
-        for field in dataclasses.fields(summary)
-        if field.name not in ("significant_share", "min_lod95", "max_lod95")
-    }
-    for end, half in (("min", summary.min_lod95), ("max", summary.max_lod95)):
-        figures[f"{end}_ci95"] = [figures[end] - half, figures[end] + half]
+    request, scales, notes = result.request, result.scales, result.normals_notes
+    names = ("reference", "compared", "core", "normals")
+    files = {name: path for name in names if (path := getattr(request, name)) is not None}
+    english = messages("en")
     written: dict[str, Any] = json.loads(
         pipeline.as_json(
             {
                 "format": "processor-comparison",
                 "format_version": "1.0",
                 "inputs": {
-                    name: {"file": path.name, "sha256": found.hashes[name], "points": found.points.get(name)}
+                    name: {"file": path.name, "sha256": result.hashes[name], "points": result.points.get(name)}
                     for name, path in files.items()
-                    if path is not None
                 },
-                "unit": found.unit or "that of the files, which do not say it",
-                "unit_note": unit_note(found.units, {name: path.name for name, path in files.items() if path}) or None,
+                "unit": result.unit or "that of the files, which do not give it",
+                "unit_note": result.unit_note and english.text(result.unit_note),
                 "definition": DEFINITION,
-                "normals": found.normals_from,
-                "normals_note": None if found.turned is None else turned_note(found.turned) or None,
-                "normals_turned": None if found.turned is None else _turned(found.turned),
+                "normals": english.text(result.normals_from),
+                "normals_note": english.sentences(notes) if notes else None,
+                "notes": [reason_json(note) for note in result.notes],
+                "normals_turned": None if result.turned is None else _turned(result.turned),
                 "parameters": {
                     "normal_diameter": None if request.normals else scales.normal_diameter_mm,
                     "projection_diameter": scales.projection_diameter_mm,
@@ -77,16 +71,25 @@ def as_json(found: Comparison) -> dict[str, Any]:
                     ],
                 },
                 "spacing": {"reference": scales.reference_spacing_mm, "compared": scales.compared_spacing_mm},
-                "summary": {
-                    **figures,
-                    "significant_share": share.share,
-                    "significant_share_ci95": [share.low, share.high],
-                },
+                "summary": _summary(result),
                 "software": pipeline.software(),
             }
         )
     )
     return written
+
+
+def _summary(result: Comparison) -> dict[str, Any]:
+    summary = result.summary
+    share = summary.significant_share
+    figures = {
+        field.name: getattr(summary, field.name)
+        for field in dataclasses.fields(summary)
+        if field.name not in ("significant_share", "min_lod95", "max_lod95")
+    }
+    for end, half in (("min", summary.min_lod95), ("max", summary.max_lod95)):
+        figures[f"{end}_ci95"] = [figures[end] - half, figures[end] + half]
+    return figures | {"significant_share": share.share, "significant_share_ci95": [share.low, share.high]}
 
 
 def _turned(turned: Turned) -> dict[str, Any]:
@@ -100,64 +103,75 @@ def _turned(turned: Turned) -> dict[str, Any]:
     }
 
 
-def write(out: Path, found: Comparison, lang: str = "en") -> dict[str, Any]:
-    """Write the folder, in place of an earlier one, its page in ``lang``; returns what compare.json holds."""
-    record = as_json(found)
+def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
+    """Write the folder in place of an earlier one, its page in ``lang``; returns the object of compare.json."""
+    record = as_json(result)
     with mpl.rc_context():
         mpl.rcdefaults()
         mpl.rcParams["text.parse_math"] = False
         drawn = [
-            deviation_figures.deviation_map(found.core + found.origin, found.normals, found.distances, found.unit),
-            deviation_figures.histogram(found.distances, found.unit),
+            deviation_figures.deviation_map(result.core + result.origin, result.normals, result.distances, result.unit),
+            deviation_figures.histogram(result.distances, result.unit),
         ]
     with results_folder.whole(out) as making:
-        text = csv.csv_text(found.origin, found.core, found.distances, found.normals)
-        results_folder.write_text(making / TABLE, text)
+        table = csv.csv_text(result.origin, result.core, result.distances, result.normals)
+        results_folder.write_text(making / TABLE, table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
         results_folder.write_text(making / RECORD, record_text + "\n")
         for name, (_, data) in zip(FIGURES, drawn, strict=True):
             results_folder.write_bytes(making / name, data)
-        results_folder.write_text(making / PAGE, _page(record, drawn, lang))
+        results_folder.write_text(making / PAGE, _page(result, record, drawn, lang))
     return record
 
 
-def lines(record: dict[str, Any]) -> list[str]:
-    """Say the outcome in words, for the terminal and the page."""
-    summary = record["summary"]
-    unit = f" {record['unit']}" if len(record["unit"]) < 8 else ""
+def lines(result: Comparison) -> list[Message]:
+    """Summarise the outcome, for the terminal and the page."""
+    summary = result.summary
+    unit = f" {result.unit}" if result.unit else ""
 
-    def number(key: str) -> str:
-        return "–" if summary[key] is None else f"{summary[key]:.6g}{unit}"
+    def number(value: float, half: float = math.nan) -> str:
+        if not math.isfinite(value):
+            return NO_NUMBER
+        interval = f" ± {half:.3g}" if math.isfinite(half) else ""
+        return f"{value:.6g}{interval}{unit}"
 
-    def end(key: str) -> str:
-        low, high = summary.get(f"{key}_ci95") or (None, None)
-        return number(key) if low is None else f"{summary[key]:.6g} ± {0.5 * (high - low):.3g}{unit}"
-
-    known = summary["core_points"] - summary["without_lod"]
-    found = [f"{summary['core_points']} core points, {known} with a level of detection"]
-    if known:
-        low, high = (f"{100.0 * one:.1f}" for one in summary["significant_share_ci95"])
-        found += [
-            f"beyond it: {summary['significant']}, {100.0 * summary['significant_share']:.1f} % (95 %: {low}-{high})",
-            f"distance: mean {number('mean')}, median {number('median')}, sd {number('sd')}, "
-            f"from {end('min')} to {end('max')}",
-            f"median level of detection {number('lod95_median')}",
-        ]
-    return found + [note for note in (record.get("unit_note"), record.get("normals_note")) if note]
-
-
-def _page(record: dict[str, Any], drawn: list[tuple[Message, bytes]], lang: str) -> str:
-    import jinja2
-
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("processor", "report"), autoescape=True, undefined=jinja2.StrictUndefined
+    known = summary.core_points - summary.without_lod
+    total = text("{count} core points, {known} with a level of detection", count=summary.core_points, known=known)
+    if not known:
+        return [total, *result.notes]
+    share = summary.significant_share
+    beyond = text(
+        "beyond it: {count}, {share:.1f} % (95 %: {low:.1f}-{high:.1f})",
+        count=summary.significant,
+        share=100.0 * share.share,
+        low=100.0 * share.low,
+        high=100.0 * share.high,
     )
-    environment.filters["say"] = language(lang).say
-    text: str = environment.get_template("comparison.html").render(
-        lang=lang,
-        title=f"From {record['inputs']['reference']['file']} to {record['inputs']['compared']['file']}",
-        lines=lines(record),
-        figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
-        provenance=json.dumps(record, indent=2, ensure_ascii=False),
+    distance = text(
+        "distance: mean {mean}, median {median}, sd {sd}, from {least} to {greatest}",
+        mean=number(summary.mean),
+        median=number(summary.median),
+        sd=number(summary.sd),
+        least=number(summary.min, summary.min_lod95),
+        greatest=number(summary.max, summary.max_lod95),
     )
-    return text
+    lod95 = text("median level of detection {lod95}", lod95=number(summary.lod95_median))
+    return [total, beyond, distance, lod95, *result.notes]
+
+
+def _page(result: Comparison, record: dict[str, Any], drawn: list[tuple[Message, bytes]], lang: str) -> str:
+    request = result.request
+    page: str = (
+        templates.environment("report", lang)
+        .get_template("comparison.html")
+        .render(
+            lang=lang,
+            title=text(
+                "From {reference} to {compared}", reference=request.reference.name, compared=request.compared.name
+            ),
+            lines=lines(result),
+            figures=[(caption, base64.b64encode(data).decode("ascii")) for caption, data in drawn],
+            provenance=json.dumps(record, indent=2, ensure_ascii=False),
+        )
+    )
+    return page

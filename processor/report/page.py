@@ -8,7 +8,6 @@ import json
 from collections.abc import Container, Mapping
 from typing import Any
 
-import jinja2
 import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
@@ -16,7 +15,7 @@ from processor.language import language
 from processor.language.messages import Text, label, messages, text
 from processor.model import Scene, StepRun, Word
 from processor.pipeline import Execution
-from processor.report import all_tables, section, view
+from processor.report import all_tables, section, templates, view
 from processor.report.style import Drawn
 from processor.report.table import headings, numeric, shown
 
@@ -44,10 +43,7 @@ MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 1
 
 def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], lang: str = "en") -> str:
     """Render the page, with the figures of each step, in a language of CODES; every text is escaped."""
-    environment = jinja2.Environment(
-        loader=jinja2.PackageLoader("processor", "report"), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters["shown"] = shown
+    environment = templates.environment("report", lang)
     environment.filters["say"] = language(lang).say
     scene = execution.scene
     live = {
@@ -63,7 +59,7 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
         live=view.embedded({"words": messages(lang).of_scripts(script), "steps": language(lang).in_figures(live)}),
         script=script,
         digest=digest,
-        verdicts=_verdicts(execution, report),
+        verdicts=_verdicts(execution, report, lang),
         sections=_sections(execution, report, figures, set(live), lang),
         provenance=json.dumps({key: execution.provenance[key] for key in PROVENANCE}, indent=2, ensure_ascii=False),
     )
@@ -88,18 +84,20 @@ def _about(scene: Scene) -> Text:
     )
 
 
-def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
-    found: list[dict[str, Any]] = []
+def _verdicts(execution: Execution, report: ErrorReport, lang: str) -> list[dict[str, Any]]:
+    verdicts: list[dict[str, Any]] = []
     for run, _ in all_tables.grouped(execution.runs):
         report_of = section.of(run.step)
-        head, said = report_of.summary(run.result)
+        head, body = report_of.summary(run.result)
         title: Any = text("{step}: {head}", step=report_of.title, head=head)
-        body: Any = text("Method {method}. {text}", method=run.method, text=said)
         if isinstance(head, str) and not isinstance(head, Word):
-            title, body = f"{report_of.title}: {head}", f"Method {run.method}. {said}".strip()
-        found.append({"tone": _tone(run), "head": title, "text": body})
-        found += [{"tone": "", "head": head, "text": text} for head, text in report_of.further(run.result)]
-    return [*found, _truth(report)]
+            title, body = f"{report_of.title}: {head}", language(lang).say(body)
+        method = text("Method {method}.", method=run.method)
+        if body:
+            method = text("Method {method}. {text}", method=run.method, text=body)
+        verdicts.append({"tone": _tone(run), "head": title, "text": method})
+        verdicts += [{"tone": "", "head": head, "text": body} for head, body in report_of.further(run.result)]
+    return [*verdicts, _truth(report)]
 
 
 def _truth(report: ErrorReport) -> dict[str, Any]:
@@ -136,13 +134,13 @@ def _sections(
 ) -> list[dict[str, Any]]:
     sections = []
     for run, others in all_tables.grouped(execution.runs):
-        shown_tables = [one for one in all_tables.of_step(run, others, report) if one.on_page]
+        tables = [table for table in all_tables.of_step(run, others, report) if table.on_page]
         sections.append(
             {
                 "title": section.of(run.step).title,
                 "message": _message(run.result, lang),
-                "lead": [_table(one, lang) for one in shown_tables if one.file in LEAD],
-                "tables": [_table(one, lang) for one in shown_tables if one.file not in LEAD],
+                "lead": [_table(table, lang) for table in tables if table.file in LEAD],
+                "tables": [_table(table, lang) for table in tables if table.file not in LEAD],
                 "step": run.step,
                 "live": run.step in live,
                 "figures": [

@@ -41,6 +41,11 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
     return rows
 
 
+def reason_json(reason: Reason) -> dict[str, Any]:
+    """Write a reason with its English text."""
+    return {**reason_object(reason), "text": messages("en").text(reason)}
+
+
 def _absent(value: Any, metadata: Mapping[str, Any]) -> bool:
     return value is None or bool(metadata.get("optional") and not len(value))
 
@@ -66,7 +71,7 @@ def _put(target: dict[str, Any], key: str, value: Any) -> None:
 
 def _value(value: Any) -> Any:
     if isinstance(value, Reason):
-        return {**reason_object(value), "text": messages("en").text(value)}
+        return reason_json(value)
     if isinstance(value, Rows):
         return as_rows(value)
     if isinstance(value, Checked):

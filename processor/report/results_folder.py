@@ -18,14 +18,20 @@ from processor.report import table as report_table
 from processor.store import store
 
 RESULTS, RUNS = "results.json", "results.h5"
-OWN_NAMES = (RESULTS, RUNS, "report.html", "figures", "job.json")  # the last is a batch's; gone, it does the job again
+OWN_NAMES = (
+    RESULTS,
+    RUNS,
+    "report.html",
+    "figures",
+    "job.json",
+)  # the last is a batch's, which repeats the job without
 OWN_ENDINGS = (".csv", ".dxf", ".pdf")
 
 
-def check_output(out: Path, source: Path | None, mark: str = RESULTS, own: Collection[str] = OWN_NAMES) -> None:
-    """Refuse a folder that holds anything but earlier results, for it will be replaced as a whole: UsageError.
+def check_output(out: Path, source: Path | None, mark: str = RESULTS, names: Collection[str] = OWN_NAMES) -> None:
+    """Raise UsageError for a folder with anything but earlier results, as it will be replaced as a whole.
 
-    Earlier results are known by the file ``mark`` among files of their ``own`` names.
+    Earlier results are recognised by the file ``mark`` among files of the ``names`` of results.
     """
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; name a folder for the results")
@@ -34,7 +40,7 @@ def check_output(out: Path, source: Path | None, mark: str = RESULTS, own: Colle
     inside = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
     if inside and mark not in inside:
         raise UsageError(f"{out}: is not empty and holds no earlier results; name another folder")
-    others = [name for name in inside if name not in own and not name.endswith(OWN_ENDINGS)]
+    others = [name for name in inside if name not in names and not name.endswith(OWN_ENDINGS)]
     if others:
         raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
 
@@ -42,13 +48,13 @@ def check_output(out: Path, source: Path | None, mark: str = RESULTS, own: Colle
 def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
     """Write results.h5, results.json, CSV tables, figures, drawings and report.html into ``out``, in place of others.
 
-    The page alone is in the language ``lang``; tables and numbers for other programs are not. Raises InputError where
-    they cannot be written; then ``out`` is as it was.
+    Only the page is in the language ``lang``. Raises InputError where they cannot be written, and leaves ``out`` as it
+    was.
     """
     with whole(out) as making:
         store.write_results(making / RUNS, execution.runs, execution.provenance)
-        found = results_json.results_json(execution, report)
-        write_text(making / RESULTS, json.dumps(found, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+        content = results_json.results_json(execution, report)
+        write_text(making / RESULTS, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
         for table in all_tables.all_of(execution, report):
             if table.file:
                 write_text(making / f"{table.file}.csv", report_table.csv_text(table))
@@ -66,7 +72,7 @@ def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en"
 
 @contextmanager
 def whole(out: Path) -> Iterator[Path]:
-    """Give a folder to write into that takes the place of ``out`` when all is written, and is gone on any error.
+    """Yield a folder to write into, which replaces ``out`` when all is written and is removed on any error.
 
     Raises InputError where it cannot be written.
     """
@@ -84,7 +90,7 @@ def whole(out: Path) -> Iterator[Path]:
         shutil.rmtree(making, ignore_errors=True)
         if isinstance(error, OSError):
             raise _unwritable(out, error) from error
-        if isinstance(error, InputError):  # of a file in the folder that is gone
+        if isinstance(error, InputError):  # of a file in the folder that was removed
             raise InputError(str(error).replace(str(making), str(out))) from error
         raise
 
@@ -107,7 +113,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def _replace(made: Path, out: Path) -> None:
-    """Move a folder into the place of another; the old one is gone only when the new one is there."""
+    """Move a folder into the place of another, which is removed only after that."""
     if not out.exists():
         os.replace(made, out)
         return

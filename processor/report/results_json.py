@@ -1,4 +1,4 @@
-"""results.json: the interface that other people's scripts rely on. Lengths mm, angles rad, NaN as null."""
+"""results.json, the interface for other programs. Lengths in mm, angles in rad, NaN as null."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FORMAT, FORMAT_VERSION = "processor-results", "1.0"
 
 
 def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
-    """Build the object of results.json; further methods of a step stand under ``comparison``."""
+    """Build the object of results.json; further methods of a step are under ``comparison``."""
     answers: dict[str, Any] = {}
     comparison: dict[str, list[Any]] = {}
     for run in execution.runs:
@@ -25,7 +25,7 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
         else:
             answers[run.step] = step_json(run)
     made = execution.provenance
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
         "input": made["input"],
@@ -52,7 +52,7 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
             for metric in report.metrics
         ],
     }
-    written: dict[str, Any] = plain(found)
+    written: dict[str, Any] = plain(content)
     return written
 
 

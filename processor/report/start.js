@@ -1,4 +1,4 @@
-// Fills the page's live figures and lets tables be copied. Without this script the pictures and tables say the same.
+// Fills the page's live figures and lets tables be copied. Pictures and tables without this script have the same content.
 function start(box, data) {
   const colours = ["#0072B2", "#D55E00", "#009E73", "#CC79A7"];
   const mm = (value) => (value === null ? "–" : value.toFixed(3));
@@ -31,33 +31,33 @@ function start(box, data) {
     if (!known(values)) continue;
     const series = lines(values, band);
     lineChart(panel(say(title)), {
-      xLabel: say("station along the bottom edge, m"), yLabel: say("linear error, mm"), series, logY: data.linear.length > 1,
+      xLabel: say("chainage along the bottom edge, m"), yLabel: say("linear error, mm"), series, logY: data.linear.length > 1,
       note: series.some((one) => one.high) ? say("The shaded band holds 95 % or more.") : "",
     });
   }
   const trade = data.trade;
   if (!trade.lambda.length) return;
-  const own = trade.lambda.findIndex((value) => Math.abs(value / trade.weight - 1) < 1e-6);
+  const chosen = trade.lambda.findIndex((value) => Math.abs(value / trade.weight - 1) < 1e-6);
   lineChart(panel(say("Splicing against linear error over the weight lambda")), {
     xLabel: say("splicing error, mm"), yLabel: say("linear error, mm"), logX: true, logY: true,
     series: ["mean", "max"].map((which, k) => ({
-      name: say(which === "mean" ? "mean" : "largest"), colour: colours[k], style: k, own, labels: trade.lambda.map(String),
+      name: say(which === "mean" ? "mean" : "largest"), colour: colours[k], style: k, own: chosen, labels: trade.lambda.map(String),
       x: trade[`splicing_${which}`], y: trade[`linear_${which}`],
       read: (i) => `lambda ${trade.lambda[i]}: ${say("splicing")} ${mm(trade[`splicing_${which}`][i])} mm, ${say("linear")} ${mm(trade[`linear_${which}`][i])} mm`,
     })),
-    note: own < 0 ? "" : `${say("The numbers at the points are lambda; the answer's is framed:")} ${trade.weight}`,
+    note: chosen < 0 ? "" : `${say("The numbers at the points are lambda; that of the result is framed:")} ${trade.weight}`,
   });
 }
 
-function copying(scroll) { // into a spreadsheet, as the table stands
+function copying(scroll) { // to paste it into a spreadsheet
   const button = make("button", { type: "button", className: "copy" }, say("copy table"));
   button.addEventListener("click", () => {
-    const range = document.createRange(), chosen = getSelection();
+    const range = document.createRange(), selection = getSelection();
     range.selectNode(scroll.querySelector("table"));
-    chosen.removeAllRanges();
-    chosen.addRange(range);
+    selection.removeAllRanges();
+    selection.addRange(range);
     document.execCommand("copy");
-    chosen.removeAllRanges();
+    selection.removeAllRanges();
     button.textContent = say("copied");
   });
   scroll.before(button);

@@ -1,7 +1,7 @@
-"""What all figures share: colours, dashes and marks, names as a figure can show them, PNG and PDF bytes.
+"""Common style of all figures: colours, dashes and markers, printable names, PNG and PDF bytes.
 
-Lines and bars are told apart by dash, marker or hatch as well as by colour (Okabe and Ito's, safe without colour
-vision). The same run gives the same bytes: no dates, and none of the user's own settings.
+Lines and bars differ in dash, marker or hatch as well as in colour (those of Okabe and Ito, safe for colour-blind
+readers). The same run gives the same bytes: no dates, and no settings of the user.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7")
 DASHES = ("-", "--", ":", "-.")
 HATCHES = ("", "///", "...", "xxx")
 MARKERS = ("o", "^", "s", "D")
-# Orange through grey to blue: told apart without colour vision, both ends darker than the middle. The page has it too.
+# Orange through grey to blue: safe for colour-blind readers, both ends darker than the middle. The page uses it too.
 DIVERGING_STOPS = ("#7a3300", "#D55E00", "#e4e4e4", "#0072B2", "#00304d")
 DIVERGING = LinearSegmentedColormap.from_list("residual", DIVERGING_STOPS)
-DECADES_APART = 20.0  # ratio between methods from which a linear axis would flatten the better one
+DECADES_APART = 20.0  # ratio between methods above which the axis is logarithmic
 LEAST_SHOWN_MM = 1e-3
 BEHIND_TEXT = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 LONGEST_LABEL = 24
@@ -59,7 +59,7 @@ def _font() -> FT2Font:
 
 
 def write_beside(axes: Axes, rows: Sequence[tuple[str, str]], line: float, size: float) -> None:
-    """Write what and value, a row each, a share ``line`` of the panel's height apart; "–" for a number not known."""
+    """Write rows of a name and a value at spacing ``line``, a share of the panel's height; "–" for no number."""
     axes.axis("off")
     for row, (what, value) in enumerate(rows):
         known = value if not re.search(r"\bnan\b", value) else "–"
@@ -69,13 +69,13 @@ def write_beside(axes: Axes, rows: Sequence[tuple[str, str]], line: float, size:
 
 def label(name: str, place: int) -> str:
     """Return a name as a figure can show it, or its place in the tables where the font lacks its characters."""
-    if not all(one.isprintable() and _font().get_char_index(ord(one)) for one in name):
+    if not all(character.isprintable() and _font().get_char_index(ord(character)) for character in name):
         return f"#{place + 1}"
     return name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
 
 
 def colour_limit(values: Floats) -> float:
-    """Return the size at which the colours of values (n,) end: 98 % of those that are known are within."""
+    """Return the magnitude at which the colours of values (n,) end: 98 % of the finite ones are within."""
     known = np.abs(values[np.isfinite(values)])
     return max(float(np.quantile(known, 0.98)), LEAST_SHOWN_MM) if len(known) else LEAST_SHOWN_MM
 

@@ -1,4 +1,4 @@
-"""What the page's script draws of a surface held against its design: core points by their deviation, and marks."""
+"""What the page's script draws of a surface compared with its design: core points by their deviation, and marks."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS, colour_limit
 
 MOST_POINTS = 60_000  # about 1.4 MB of the page
-LEAST_POINTS, SAMPLE = 20, 2_000  # to tell the spacing from
+LEAST_POINTS, SAMPLE = 20, 2_000  # that the spacing is estimated from
 TONES = ("#0072B2", "#000000")
-MOST_REGIONS, MOST_TICKS = 400, 40  # outlines drawn, and those of them with a tick of their own
+MOST_REGIONS, MOST_TICKS = 400, 40  # outlines drawn, and those of them with a separate tick
 
 
 @dataclass(frozen=True)
 class Region:
-    """A part of the surface to be outlined: its name and what is said of it, briefly and in full.
+    """A part of the surface to be outlined, with its name, a short and a full description.
 
-    ``outline`` (m, 3) are the corners of a closed line, ``outward`` (3,) where it is looked at from; both mm.
+    ``outline`` (m, 3) are the corners of a closed line in mm, ``outward`` (3,) the direction towards the viewer.
     """
 
     name: str
@@ -47,10 +47,10 @@ def of_points(
 ) -> dict[str, Any] | None:
     """Return what the page draws of points (n, 3) with values (n,), mm; None where there are no values.
 
-    ``parts`` are names with the rows of their points; each can be switched off; where they are not ``named`` by files
-    the page translates them. ``marks`` stand on the last part, a dict each with name, at (3,), radius and text.
-    ``regions`` are the first ones outlined, with a mark in each and a tick to switch it; ``region_of`` (n,) is the row
-    of the region a point is of, -1 = of none.
+    ``parts`` are names with the rows of their points, which can be switched off; if not ``named`` by files, the names
+    are translated. ``marks`` belong to the last part: dicts with name, at (3,), radius and text. Of ``regions`` the
+    first are outlined, each with a mark and a tick to switch it; ``region_of`` (n,) is the row of each point's region,
+    -1 = none.
     """
     known = np.isfinite(values)
     if not known.any():
@@ -59,28 +59,28 @@ def of_points(
     step = max(1, -(-int(known.sum()) // MOST_POINTS))
     drawn = []
     for name, rows in parts:
-        own = rows[known[rows]][::step]
-        near = points[own] - origin
+        drawn_rows = rows[known[rows]][::step]
+        near = points[drawn_rows] - origin
         drawn.append(
             {
                 "name" if named else "text": name,
                 "edges": [],
                 "points": np.rint(near).astype(int).ravel(),
-                "residual": np.round(values[own], 3),
-                **({} if region_of is None else {"region": region_of[own]}),
+                "residual": np.round(values[drawn_rows], 3),
+                **({} if region_of is None else {"region": region_of[drawn_rows]}),
             }
         )
     if marks:
-        drawn.append({"text": "defects", "edges": [], "points": [], "residual": []})
+        drawn.append({"text": text("defects"), "edges": [], "points": [], "residual": []})
     shown = [
         {**mark, "part": len(drawn) - 1, "tone": 1, "at": np.round(np.asarray(mark["at"]) - origin, 1)}
         for mark in marks
     ]
     lines, spots, places = _outlined(regions, origin, len(drawn))
-    found = {
+    data = {
         "title": title,
         "arrows": "",
-        "values": "deviations",
+        "values": text("deviations"),
         "method": method,
         "origin": origin,
         "stops": DIVERGING_STOPS,
@@ -92,17 +92,17 @@ def of_points(
         "regions": [_heading(region) for region in regions] if region_of is not None else [],
         "places": places,
     }
-    made: dict[str, Any] = plain(found)
+    made: dict[str, Any] = plain(data)
     return made
 
 
 def spacing(points: Floats) -> float:
-    """Return how far points (n, 3) are apart, by the median of the distances to the nearest ones."""
+    """Return the median distance of points (n, 3) to their nearest neighbours."""
     if len(points) < LEAST_POINTS:
         return 0.0
-    middle = points - points.mean(axis=0)
-    some = middle[:: max(1, len(points) // SAMPLE)]
-    return round(float(np.median(cKDTree(middle).query(some, k=2)[0][:, 1])), 2)
+    centred = points - points.mean(axis=0)
+    sample = centred[:: max(1, len(points) // SAMPLE)]
+    return round(float(np.median(cKDTree(centred).query(sample, k=2)[0][:, 1])), 2)
 
 
 def _outlined(

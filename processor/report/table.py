@@ -1,4 +1,4 @@
-"""A table, for the page, for a CSV file and for the terminal."""
+"""A table for the page, a CSV file and the terminal."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAN = float("nan")
 class Table:
     """A titled table: in a CSV file of the name ``file`` where that is not empty, on the page and on the terminal.
 
-    ``groups`` are headings above the columns, one each, equal neighbours taken together; CSV files have none.
+    ``groups`` are headings above the columns, one each, of which equal neighbours are merged; CSV files have none.
     """
 
     title: str | Message
@@ -62,11 +62,11 @@ def _figures(result: Checked) -> Iterator[tuple[Message, Any, str]]:
             yield label(heading), 100.0 * value if percent else value, unit
 
 
-FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # how a cell begins that a spreadsheet would execute
+FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
 
 
 def csv_text(table: Table) -> str:
-    """Write a table as CSV; text that a spreadsheet would take for a formula gets a leading apostrophe."""
+    """Write a table as CSV; a leading apostrophe protects text that a spreadsheet would execute as a formula."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(table.columns)
@@ -89,7 +89,7 @@ def shown(cell: Any) -> str:
         cell = messages("en").text(cell)
     if isinstance(cell, float | np.floating):
         return "–" if not math.isfinite(cell) else f"{cell:.3f}"
-    return "".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in str(cell))
+    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in str(cell))
 
 
 def plain_text(table: Table, most: int = 40) -> str:
@@ -108,7 +108,7 @@ def plain_text(table: Table, most: int = 40) -> str:
 
 
 def headings(table: Table) -> tuple[str, ...]:
-    """Return the columns' names as people read them: the title tells the unit, groups what a column belongs to."""
+    """Return the columns' names for display, without unit (in the title) and without the part in their group."""
     names = [column.removesuffix("_mm").removesuffix("_mrad").replace("_", " ") for column in table.columns]
     if table.groups:
         names = [name.split(" ")[-1] if group else name for name, group in zip(names, table.groups, strict=True)]
@@ -116,7 +116,7 @@ def headings(table: Table) -> tuple[str, ...]:
 
 
 def _group_line(table: Table, widths: list[int]) -> str:
-    """Put each group's heading above its columns; those widen where it is longer than they are."""
+    """Put each group's heading above its columns, which widen where it is longer."""
     line = "  "
     start = 0
     for group, members in itertools.groupby(table.groups):
@@ -129,7 +129,7 @@ def _group_line(table: Table, widths: list[int]) -> str:
 
 
 def numeric(table: Table) -> tuple[bool, ...]:
-    """Tell which columns hold numbers; these are aligned to the right."""
+    """Mark the columns of numbers, which are aligned to the right."""
     return tuple(
         any(isinstance(row[i], int | float | np.number) for row in table.rows) for i in range(len(table.columns))
     )
@@ -141,5 +141,5 @@ def _aligned(cell: str, width: int, right: bool) -> str:
 
 
 def _width(text: str) -> int:
-    """Columns that a text takes on a terminal: Chinese characters take two."""
-    return sum(2 if unicodedata.east_asian_width(one) in "WF" else 1 for one in text)
+    """Return the width of a text on a terminal, where Chinese characters take two columns."""
+    return sum(2 if unicodedata.east_asian_width(character) in "WF" else 1 for character in text)

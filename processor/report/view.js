@@ -1,7 +1,8 @@
 "use strict";
-// A view in space, drawn on a canvas: points by a depth buffer, lines, circles and arrows over them. Right-handed, z up,
-// mm. Parts can be switched off: each has lines, points with a value, and marks that are its own (balls, defects). Joints
-// have a section and gaps at its points; regions of points have an outline, each a part of its own. What is shown is less `origin`; what is read out has it put back.
+// A view in space on a canvas: points by a depth buffer, lines, circles and arrows over them. Right-handed, z up, mm.
+// Parts can be switched off: each has lines, points with a value, and marks of its own (balls, defects). Joints have a
+// section and gaps at its points. Regions of points have an outline, each a part of its own. Coordinates drawn are
+// relative to `origin`, which is added to those shown as text.
 function make(tag, attributes, ...children) {
   const element = document.createElement(tag);
   for (const [key, value] of Object.entries(attributes || {})) {
@@ -11,7 +12,7 @@ function make(tag, attributes, ...children) {
   return element;
 }
 
-let words = {}; // of the page's language; what is not among them is said as it is
+let words = {}; // texts in the page's language; others stay as they are
 function say(text) { return words[text] || text; }
 
 function colourTable(stops, size) {

@@ -72,28 +72,30 @@ def write_texts(group: Any, name: str, texts: Sequence[str]) -> None:
 
 def reason_object(item: Reason) -> dict[str, Any]:
     """Return a reason as JSON objects, its words and reasons within as well."""
-    return {"code": item.code, "values": {name: _value_object(value) for name, value in item.values.items()}}
+    return {"code": item.code, "values": {name: value_object(value) for name, value in item.values.items()}}
 
 
-def _value_object(value: Any) -> Any:
+def value_object(value: Any) -> Any:
+    """Return a value of a message as JSON holds it; :func:`value_of` reads it."""
     if isinstance(value, Reason):
         return reason_object(value)
     if isinstance(value, Word):
         return {"word": str(value), "of": type(value).__name__}
-    return [_value_object(item) for item in value] if isinstance(value, list | tuple) else value
+    return [value_object(item) for item in value] if isinstance(value, list | tuple) else value
 
 
 def _reason(found: Any) -> Reason:
     """Return the reason that an object of :func:`reason_object` holds. Raises KeyError and TypeError for another."""
-    return Reason(str(found["code"]), {str(name): _value(value) for name, value in dict(found["values"]).items()})
+    return Reason(str(found["code"]), {str(name): value_of(value) for name, value in dict(found["values"]).items()})
 
 
-def _value(found: Any) -> Any:
+def value_of(found: Any) -> Any:
+    """Return the value that an object of :func:`value_object` holds."""
     if isinstance(found, dict):
         if "word" not in found:
             return _reason(found)
         return VOCABULARIES[found["of"]](found["word"])
-    return tuple(_value(item) for item in found) if isinstance(found, list) else found
+    return tuple(value_of(item) for item in found) if isinstance(found, list) else found
 
 
 def _encoded(text: str) -> bytes:

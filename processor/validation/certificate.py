@@ -16,14 +16,12 @@ import statistics
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
+from dataclasses import asdict, dataclass
 from typing import Any
 
-import jinja2
-
-from processor.language import language
+from processor.language.messages import NO_NUMBER, text
 from processor.model import Statistic
+from processor.report import templates
 from processor.validation.cells import Case
 from processor.validation.history import Row
 from processor.validation.matrix import Matrix
@@ -37,26 +35,36 @@ else:
 FORMAT, FORMAT_VERSION = "processor-certificate", "1.0"
 COVERAGE_FACTOR = 2.0
 LEAST_SCENES = 3  # for a scatter between scenes
-METHOD = (
+METHOD = text(
     "After ISO 15530-3 (uncertainty from repeated measurement of a calibrated workpiece): the simulated structure is "
     "the workpiece, its truth the calibration (u_cal = 0). u_p: standard deviation of all errors. b: their mean, u_b "
     "its standard uncertainty from the scatter between scenes. Results are not corrected by b, so U = k sqrt(u_cal^2 "
     "+ u_p^2 + u_b^2) + |b| with k = 2. u_w (material and make of workpieces) is not included. Coverage: share of "
-    "errors within the 95 % intervals that the program states itself. Efficiency: 1 / rms(error / least possible "
-    "standard deviation), 1 where no unbiased estimator can do better (Cramer-Rao). Of errors, those of answers "
-    "without a flag count for balls, those of all key points for bridges."
+    "errors within the 95 % intervals of the results. Efficiency: 1 / rms(error / least possible standard deviation); "
+    "no unbiased estimator exceeds 1 (Cramer-Rao). Errors are those of balls without a flag, and of all key points of "
+    "bridges."
 )
 NOT_SHOWN = (
-    "The scans are simulated. No instrument took part, and the scanner classes are rounded from data sheets, not "
-    "calibrated against instruments: this is no calibration certificate and is not traceable.",
-    "Not simulated, so not covered: reflections between surfaces, movement during a scan, refraction, wet, oily or "
-    "painted surfaces other than by their brightness.",
-    "Structures, damage and surroundings are those of the recipes named. A row holds for its recipe, noise and "
-    "density; nothing is said between or beyond them.",
-    "Truth and scans come from one generator: what its model of steel or scanner leaves out, no row can show. It "
-    "shares no geometry with the processor.",
-    "u_p pools errors within scenes, which may have a part in common; where scenes differ more than errors within "
-    "them, u_b shows it, once there are three scenes.",
+    text(
+        "The scans are simulated, without an instrument. The scanner classes are rounded from data sheets, not "
+        "calibrated against instruments: this is no calibration certificate and is not traceable."
+    ),
+    text(
+        "Not simulated and so not covered: reflections between surfaces, movement during a scan, refraction; wet, "
+        "oily or painted surfaces except for their brightness."
+    ),
+    text(
+        "Structures, damage and surroundings are those of the recipes named. A row holds for its recipe, noise and "
+        "density, and not for values between or beyond them."
+    ),
+    text(
+        "Truth and scans come from one generator: effects that its models of steel and scanner lack are in no row. It "
+        "shares no geometry with the processor."
+    ),
+    text(
+        "u_p pools errors within scenes, which may have a common part; where scenes differ by more than the errors "
+        "within them, u_b contains it, from three scenes on."
+    ),
 )
 
 
@@ -99,8 +107,6 @@ class Certificate:
     matrix_sha256: str
     recipes: Mapping[str, str]  # name -> hash of the recipe's text
     lines: tuple[Line, ...] = ()
-    method: str = METHOD
-    not_shown: tuple[str, ...] = field(default=NOT_SHOWN)
 
 
 def make(
@@ -219,18 +225,19 @@ def as_json(certificate: Certificate) -> str:
         {key: None if isinstance(value, float) and not math.isfinite(value) else value for key, value in line.items()}
         for line in content["lines"]
     ]
+    content |= {"method": str(METHOD), "not_shown": list(map(str, NOT_SHOWN))}
     return json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def as_html(certificate: Certificate, lang: str = "en") -> str:
     """Return the certificate as a page in the language ``lang``."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
-    )
+    environment = templates.environment("validation", lang)
     environment.filters["shown"] = _shown
-    environment.filters["say"] = language(lang).say
-    return environment.get_template("certificate.html").render(certificate=certificate, lang=lang) + "\n"
+    page: str = environment.get_template("certificate.html").render(
+        certificate=certificate, method=METHOD, not_shown=NOT_SHOWN, lang=lang
+    )
+    return page + "\n"
 
 
 def _shown(value: float, digits: int = 3) -> str:
-    return f"{value:.{digits}g}" if math.isfinite(value) else "–"
+    return f"{value:.{digits}g}" if math.isfinite(value) else NO_NUMBER

@@ -1,27 +1,26 @@
-"""What changed in a night that the scatter from night to night does not explain.
+"""What changed in a night, beyond the scatter from night to night.
 
 Two tests a figure (step, method, name), each over all cases together, each for worse and for better:
 
-``paired``: on the fixed seeds. While the software is as it was, their figures are what they were to the last bits, so
-there is no scatter and no false alarm. Where they moved (by more than 1e-6 of themselves), the differences from the
-last night that was not worse are put to one-sided t tests of their mean against a margin of 2 % (1 point for shares):
-by their own scatter, and by that from seed to seed in the history, where it is the larger (two values drawn anew
-differ by no more than sqrt(2) of it, and few scenes say little of their own); the smaller p counts, doubled.
-Differences of one recipe and seed are averaged first, as settings share the scene. It takes three such pairs. Scenes
-that are not the same any more are left out: the generator has changed, not the estimator.
+``paired``: on the fixed seeds. With unchanged software their figures repeat to the last bits: there is no scatter and
+no false alarm. Where they changed (relatively by more than 1e-6), the differences from the last night that was not
+worse are put to one-sided t tests of their mean against a margin of 2 % (1 point for shares). One test uses the
+scatter of the differences, the other that from seed to seed in the history, where it is larger: two values drawn anew
+differ by no more than sqrt(2) of it, and the scatter of few scenes is uncertain. The smaller p counts, doubled.
+Differences of one recipe and seed are averaged first, as settings share the scene. At least three such pairs are
+needed. Cells whose scene has changed are left out: there the generator changed, not the estimator.
 
 ``fresh``: on the seeds of this night alone. In every case this night's value is ranked among those of the earlier
 nights (at least 5, at most 120), the ranks are turned into normal scores (van der Waerden) and summed over the cases.
-On an undisturbed night every order is as likely as every other, so the sum's distribution is known exactly, whatever
-the tails of the errors; it is computed by convolution. It also sees slow drift, and what the fixed seeds do not
-touch.
+On an undisturbed night every order is equally likely, so the distribution of the sum is known exactly, whatever the
+tails of the errors; it is computed by convolution. This test also detects slow drift, and changes that the fixed seeds
+do not show.
 
 Over all tests of a night together Holm's procedure keeps the chance of any false alarm at ALARM_RATE, however the
-figures depend on each other: one night in 200 for worse, and one in 200 for better. For ``fresh`` that is exact at
-most, for ``paired`` as good as the normal distribution of the differences, and it counts only in nights in which
-figures moved.
+figures depend on each other: one night in 200 for worse, and one in 200 for better. For ``fresh`` that is an upper
+bound; for ``paired`` it holds as far as the differences are normally distributed, in nights in which figures changed.
 
-Before there are 5 nights ``paired`` and the limits alone watch; with one night, the limits.
+With fewer than 5 nights only ``paired`` and the limits are effective; with one night, the limits.
 """
 
 from __future__ import annotations
@@ -34,7 +33,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy import special, stats
 
-from processor.model import Better
+from processor.language.messages import Text, text
+from processor.model import Better, Word
 from processor.validation.aims import Badness, badness
 from processor.validation.history import Name, Row
 
@@ -44,9 +44,26 @@ LEAST_PAIRS = 3
 LEAST_FREEDOM = 5  # of the scatter from seed to seed
 LEAST_NIGHTS, MOST_NIGHTS = 5, 120
 GRID = 64  # steps of normal scores in 1
-LEAST_SPREAD = 1e-9  # of differences: those that agree to the last bit still have rounding
-REGRESSION, IMPROVEMENT, CHANGED, LOST = "regression", "improvement", "changed", "lost"
-ALARMS = (REGRESSION, LOST)
+LEAST_SPREAD = 1e-9  # of differences: rounding remains where they agree to the last bit
+
+
+class ChangeKind(Word):
+    """How a figure changed."""
+
+    REGRESSION = "regression"
+    IMPROVEMENT = "improvement"
+    CHANGED = "changed"  # without a test that calls it worse or better
+    LOST = "lost"  # no longer measured
+
+
+class Direction(Word):
+    """Which way a figure changed."""
+
+    WORSE = "worse"
+    BETTER = "better"
+
+
+ALARMS = (ChangeKind.REGRESSION, ChangeKind.LOST)
 
 
 @dataclass(frozen=True)
@@ -54,29 +71,34 @@ class Change:
     """A figure that changed. ``size``: of its badness, in the median over the cases; ``p`` as the test gave it."""
 
     name: Name
-    kind: str  # regression | improvement | changed | lost
+    kind: ChangeKind
     test: str  # paired | fresh | ""
     size: float
     is_ratio: bool
     unit: str
     p: float
     cases: int  # pairs, or cases, that the test rests on
+    quantity: str = ""  # "" = of a history without it
+    statistic: str = ""
 
     @property
-    def said(self) -> str:
-        """Say the change in a few words."""
-        if self.kind == LOST:
-            return f"no longer measured in {self.cases} cell{'' if self.cases == 1 else 's'}"
-        worse = "worse" if self.size > 0.0 else "better"
+    def message(self) -> Text:
+        """Size and direction of the change."""
+        if self.kind == ChangeKind.LOST:
+            return text("no longer measured in {cells} {cells:?cell|cells}", cells=self.cases)
+        direction = Direction.WORSE if self.size > 0.0 else Direction.BETTER
         if self.is_ratio:
-            return f"{100.0 * math.expm1(abs(self.size)):.3g} % {worse}"
-        unit = "points" if self.unit == "%" else self.unit
-        return f"{abs(self.size):.3g} {unit} {worse}".replace("  ", " ")
+            return text("{size:.3g} % {direction}", size=100.0 * math.expm1(abs(self.size)), direction=direction)
+        if self.unit == "%":
+            return text("{size:.3g} points {direction}", size=abs(self.size), direction=direction)
+        if self.unit:
+            return text("{size:.3g} {unit} {direction}", size=abs(self.size), unit=self.unit, direction=direction)
+        return text("{size:.3g} {direction}", size=abs(self.size), direction=direction)
 
 
 @dataclass(frozen=True)
-class Found:
-    """What the tests found: changes, and what they rest on."""
+class Detected:
+    """Outcome of the tests: changes, and what they rest on."""
 
     changes: tuple[Change, ...] = ()
     figures: int = 0
@@ -85,9 +107,10 @@ class Found:
     moved_scenes: int = 0  # fixed cells whose scene is another than before
     first: bool = False  # there is nothing to compare with
 
-    def of(self, *kinds: str) -> list[Change]:
-        """Return the changes of these kinds, the surest first."""
-        return sorted((one for one in self.changes if one.kind in kinds), key=lambda one: (one.p, one.name))
+    def of(self, *kinds: ChangeKind) -> list[Change]:
+        """Return the changes of these kinds, those of the least p first."""
+        chosen = (change for change in self.changes if change.kind in kinds)
+        return sorted(chosen, key=lambda change: (change.p, change.name))
 
 
 @dataclass(frozen=True)
@@ -96,8 +119,8 @@ class _Test:
     test: str
     size: float
     p_worse: float
-    p_better: float
-    cases: int
+    p_better: float = math.nan
+    cases: int = 0
 
 
 _ByCase = dict[str, dict[str, list[float]]]  # values of the seeds of a night, by case and night
@@ -108,6 +131,8 @@ class _Series:
     """All rows of one figure: fixed cells of this night and the last before it, seeds of this night and the earlier."""
 
     unit: str = ""
+    quantity: str = ""
+    statistic: str = ""
     better: str = ""
     last: dict[tuple[str, int], Row] = field(default_factory=dict)
     mine: dict[tuple[str, int], Row] = field(default_factory=dict)
@@ -116,6 +141,8 @@ class _Series:
 
     def add(self, row: Row, tonight: bool) -> None:
         self.unit = row.unit
+        self.quantity = row.quantity or self.quantity
+        self.statistic = row.statistic or self.statistic
         self.better = row.better or self.better
         if row.fixed:
             (self.mine if tonight else self.last)[row.case, row.seed] = row
@@ -126,54 +153,79 @@ class _Series:
 
 def find(
     rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]], aims: Mapping[str, str | float] | None = None
-) -> Found:
+) -> Detected:
     """Find what changed in ``night``; ``rows`` hold it and earlier nights.
 
-    ``worse`` names the nights in which a figure was worse and not accepted: they are no level to go by. So an alarm is
-    raised every night until the figure is back or accepted.
+    ``worse`` names the nights in which a figure was worse and not accepted: these are no level to compare with. So an
+    alarm is raised every night until the figure is back or accepted.
     """
+    series, present = _by_figure(rows, night, worse)
+    measures = {
+        name: badness(name[2], figure.unit, Better(figure.better or Better.LOW), aims or {})
+        for name, figure in series.items()
+    }
+    tests: list[_Test] = []
+    changes: list[Change] = []
+    moved: dict[Name, _Test] = {}
+    other_scenes: set[tuple[str, int]] = set()
+
+    def change(kind: ChangeKind, test: _Test, p: float, test_name: str = "") -> Change:
+        figure = series[test.name]
+        return Change(
+            name=test.name,
+            kind=kind,
+            test=test_name,
+            size=test.size,
+            is_ratio=kind != ChangeKind.LOST and measures[test.name].is_ratio,
+            unit=figure.unit,
+            p=p,
+            cases=test.cases,
+            quantity=figure.quantity,
+            statistic=figure.statistic,
+        )
+
+    for name, figure in series.items():
+        pairs, lost, scenes = _pairs(figure, present, name, measures[name])
+        other_scenes |= scenes
+        if lost:
+            changes.append(change(ChangeKind.LOST, _Test(name, "", math.inf, math.nan, cases=lost), 0.0))
+        if any(difference != 0.0 for _, difference, _ in pairs):
+            moved[name] = _paired(name, pairs, figure, measures[name])
+            tests += [moved[name]] if moved[name].p_worse == moved[name].p_worse else []
+        fresh = _fresh(name, figure.fresh, figure.earlier, measures[name])
+        tests += [] if fresh is None else [fresh]
+    for kind, side in ((ChangeKind.REGRESSION, "p_worse"), (ChangeKind.IMPROVEMENT, "p_better")):
+        for test in _holm(tests, side):
+            if all(known.name != test.name for known in changes):
+                changes.append(change(kind, test, getattr(test, side), test.test))
+    known_names = {known.name for known in changes}
+    changes += [change(ChangeKind.CHANGED, test, 1.0) for name, test in moved.items() if name not in known_names]
+    paired = sum(test.test == "paired" for test in tests)
+    return Detected(
+        changes=tuple(changes),
+        figures=sum(bool(figure.mine or figure.fresh) for figure in series.values()),
+        paired=paired,
+        fresh=len(tests) - paired,
+        moved_scenes=len(other_scenes),
+        first=not any(figure.last or figure.earlier for figure in series.values()),
+    )
+
+
+_Present = set[tuple[str, int, tuple[str, str]]]  # case, seed, and step with method
+
+
+def _by_figure(rows: Sequence[Row], night: str, worse: Mapping[Name, set[str]]) -> tuple[dict[Name, _Series], _Present]:
+    """Sort rows by figure, without later nights and those that are no level; also what was measured this night."""
     series: dict[Name, _Series] = defaultdict(_Series)
-    there: set[tuple[str, int, tuple[str, str]]] = set()
+    present: _Present = set()
     for row in rows:  # by night, the earliest first
         tonight = row.night == night
         if not tonight and (row.night > night or row.night in worse.get(row.name, ())):
             continue
         series[row.name].add(row, tonight)
         if tonight:
-            there.add((row.case, row.seed, row.name[:2]))
-    tests: list[_Test] = []
-    changes: list[Change] = []
-    moved: dict[Name, _Test] = {}
-    other_scenes: set[tuple[str, int]] = set()
-    judged: dict[Name, tuple[Badness, str]] = {}
-    for name, own in series.items():
-        measure = badness(name[2], own.unit, Better(own.better or Better.LOW), aims or {})
-        judged[name] = measure, own.unit
-        pairs, lost, scenes = _pairs(own, there, name, measure)
-        other_scenes |= scenes
-        if lost:
-            changes.append(Change(name, LOST, "", math.inf, False, own.unit, 0.0, lost))
-        if any(difference != 0.0 for _, difference, _ in pairs):
-            moved[name] = _paired(name, pairs, own, measure)
-            tests += [moved[name]] if moved[name].p_worse == moved[name].p_worse else []
-        fresh = _fresh(name, own.fresh, own.earlier, measure)
-        tests += [] if fresh is None else [fresh]
-    for kind, side in ((REGRESSION, "p_worse"), (IMPROVEMENT, "p_better")):
-        for test in _holm(tests, side):
-            measure, unit = judged[test.name]
-            p = getattr(test, side)
-            if not any(one.name == test.name for one in changes):
-                changes.append(Change(test.name, kind, test.test, test.size, measure.is_ratio, unit, p, test.cases))
-    told = {one.name for one in changes}
-    changes += [
-        Change(name, CHANGED, "", test.size, judged[name][0].is_ratio, judged[name][1], 1.0, test.cases)
-        for name, test in moved.items()
-        if name not in told
-    ]
-    count = sum(one.test == "paired" for one in tests)
-    figures = sum(bool(own.mine or own.fresh) for own in series.values())
-    first = not any(own.last or own.earlier for own in series.values())
-    return Found(tuple(changes), figures, count, len(tests) - count, len(other_scenes), first)
+            present.add((row.case, row.seed, row.name[:2]))
+    return series, present
 
 
 # --- on the fixed seeds ---------------------------------------------------------------------------------------------
@@ -182,16 +234,16 @@ _Pair = tuple[tuple[str, int], float, float]  # recipe and seed, the difference 
 
 
 def _pairs(
-    own: _Series, there: set[tuple[str, int, tuple[str, str]]], name: Name, measure: Badness
+    figure: _Series, present: _Present, name: Name, measure: Badness
 ) -> tuple[list[_Pair], int, set[tuple[str, int]]]:
-    """Pair fixed cells with the last night's; also how many lost their figure, and whose scene is another."""
+    """Pair fixed cells with the last night's; also how many lost their figure, and those whose scene has changed."""
     pairs: list[_Pair] = []
     lost = 0
     scenes: set[tuple[str, int]] = set()
-    for key, before in own.last.items():
-        row = own.mine.get(key)
+    for key, before in figure.last.items():
+        row = figure.mine.get(key)
         if row is None:
-            lost += (*key, name[:2]) in there
+            lost += (*key, name[:2]) in present
         elif row.input_sha256 != before.input_sha256:
             scenes.add(key)
         elif math.isnan(row.value) != math.isnan(before.value):
@@ -203,7 +255,7 @@ def _pairs(
     return pairs, lost, scenes
 
 
-def _paired(name: Name, pairs: Sequence[_Pair], own: _Series, measure: Badness) -> _Test:
+def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Badness) -> _Test:
     """Test the differences; p is NaN where there are too few."""
     groups: dict[tuple[str, int], list[float]] = defaultdict(list)
     for key, difference, _ in pairs:
@@ -212,11 +264,11 @@ def _paired(name: Name, pairs: Sequence[_Pair], own: _Series, measure: Badness) 
     size = float(np.median([difference for _, difference, _ in pairs if difference != 0.0]))
     count = len(means)
     if count < LEAST_PAIRS:
-        return _Test(name, "paired", size, math.nan, math.nan, count)
+        return _Test(name, "paired", size, math.nan, cases=count)
     margin = measure.margin + measure.share * float(np.sqrt(np.mean([before**2 for *_, before in pairs])))
     spread = max(float(np.std(means, ddof=1)), LEAST_SPREAD)
     scales = [(spread, count - 1)]
-    seeds, freedom = _between_seeds(own, measure)
+    seeds, freedom = _between_seeds(figure, measure)
     if freedom >= LEAST_FREEDOM and math.sqrt(2.0) * seeds > spread:
         scales.append((math.sqrt(2.0) * seeds, freedom))
     mean, root = float(np.mean(means)), math.sqrt(count)
@@ -224,19 +276,19 @@ def _paired(name: Name, pairs: Sequence[_Pair], own: _Series, measure: Badness) 
         min(1.0, 2.0 * min(float(stats.t.sf((sign * mean - margin) * root / scale, dof)) for scale, dof in scales))
         for sign in (1.0, -1.0)
     )
-    return _Test(name, "paired", size, worse, better, count)
+    return _Test(name, "paired", size, worse, p_better=better, cases=count)
 
 
-def _between_seeds(own: _Series, measure: Badness) -> tuple[float, int]:
-    """Return the standard deviation of a case's figures from seed to seed, before this night, and its freedom."""
+def _between_seeds(figure: _Series, measure: Badness) -> tuple[float, int]:
+    """Return the standard deviation of a case's figures from seed to seed before this night; its degrees of freedom."""
     of_case: dict[str, list[float]] = defaultdict(list)
-    for (case, _), row in own.last.items():
+    for (case, _), row in figure.last.items():
         of_case[case].append(measure.of(row.value))
-    for case, earlier in own.earlier.items():
-        of_case[case] += [measure.of(value) for values in earlier.values() for value in values]
+    for case, earlier in figure.earlier.items():
+        of_case[case] += [measure.of(value) for night in earlier.values() for value in night]
     squares, freedom = 0.0, 0
-    for found in of_case.values():
-        levels = np.array([level for level in found if math.isfinite(level)])
+    for values in of_case.values():
+        levels = np.array([level for level in values if math.isfinite(level)])
         if len(levels) > 1:
             squares += float(np.sum((levels - levels.mean()) ** 2))
             freedom += len(levels) - 1
@@ -253,12 +305,11 @@ def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Badness) -> _Test
     sizes = []
     for case, tonight in now.items():
         ((_, values),) = tonight.items()
-        earlier = sorted((night, found) for night, found in before.get(case, {}).items() if len(found) == len(values))[
-            -MOST_NIGHTS:
-        ]
+        same_size = (each for each in before.get(case, {}).items() if len(each[1]) == len(values))
+        earlier = sorted(same_size)[-MOST_NIGHTS:]
         if len(earlier) < LEAST_NIGHTS:
             continue
-        levels = np.array([_mean(measure, found) for found in [values, *(found for _, found in earlier)]])
+        levels = np.array([_mean(measure, seeds) for seeds in [values, *(seeds for _, seeds in earlier)]])
         scores = np.rint(GRID * special.ndtri(stats.rankdata(levels) / (len(levels) + 1))).astype(np.int64)
         if (scores == scores[0]).all():
             continue
@@ -274,21 +325,21 @@ def _fresh(name: Name, now: _ByCase, before: _ByCase, measure: Badness) -> _Test
     at = total - offset
     enough = abs(size) > measure.margin
     worse, better = (float(part.sum()) if enough else 1.0 for part in (null[at:], null[: at + 1]))
-    return _Test(name, "fresh", size, worse, better, len(sizes))
+    return _Test(name, "fresh", size, worse, p_better=better, cases=len(sizes))
 
 
 def _mean(measure: Badness, values: Sequence[float]) -> float:
-    """Mean badness of a night's seeds; what could not be measured is worse than all else."""
+    """Mean badness of a night's seeds; infinite where a figure could not be measured."""
     mean = sum(map(measure.of, values)) / len(values)
     return mean if math.isfinite(mean) else math.inf
 
 
 def _holm(tests: Sequence[_Test], side: str) -> list[_Test]:
-    """Return the tests that Holm's procedure calls at ALARM_RATE, the surest first."""
+    """Return the tests that Holm's procedure rejects at ALARM_RATE, those of the least p first."""
     ranked = sorted(tests, key=lambda test: (getattr(test, side), test.name))
-    called = []
+    rejected = []
     for i, test in enumerate(ranked):
         if getattr(test, side) > ALARM_RATE / (len(ranked) - i):
             break
-        called.append(test)
-    return called
+        rejected.append(test)
+    return rejected

@@ -12,20 +12,23 @@ from __future__ import annotations
 import json
 import math
 import sqlite3
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from processor.language.messages import Text
 from processor.model import InputError
+from processor.store.codec import value_object, value_of
 from processor.validation.cells import Cell, Figure, Outcome, figures_of
 from processor.validation.software import Software
 
 VERSION = 2
-# What a file of an earlier version lacks. Earlier figures have no statistic: certificates are of the present software.
-ADDED = ("quantity", "statistic", "better")
-UPGRADES = {1: tuple(f"ALTER TABLE figures ADD COLUMN {name} TEXT NOT NULL DEFAULT ''" for name in ADDED)}
+# Columns added since. Earlier figures have no statistic: certificates are of the present software.
+ADDED = ("figures.quantity", "figures.statistic", "figures.better", "nights.message")
+ADD = "ALTER TABLE {} ADD COLUMN {} TEXT NOT NULL DEFAULT ''"
+UPGRADES = {1: tuple(ADD.format(*name.split(".")) for name in ADDED)}
 BUSY_S = 60.0
 SCHEMA = """
 CREATE TABLE nights (
@@ -36,7 +39,8 @@ CREATE TABLE nights (
   matrix TEXT NOT NULL, matrix_sha256 TEXT NOT NULL,
   begun TEXT NOT NULL,                -- UTC
   ended TEXT,                         -- NULL until all of it is done
-  line TEXT NOT NULL DEFAULT ''
+  line TEXT NOT NULL DEFAULT '',
+  message TEXT NOT NULL DEFAULT ''    -- JSON, the line as a text with values
 ) WITHOUT ROWID;
 CREATE TABLE cells (
   night TEXT NOT NULL REFERENCES nights ON DELETE CASCADE, cell TEXT NOT NULL, case_ TEXT NOT NULL,
@@ -92,6 +96,7 @@ class Night:
     software: dict[str, str]
     ended: str
     line: str
+    message: Text | None = None  # the line; None of a history without it
 
 
 class History:
@@ -196,16 +201,19 @@ class History:
                     ],
                 )
 
-    def end(self, night: str, changes: Iterable[tuple[Name, str, dict[str, Any]]], line: str, now: str) -> None:
+    def end(self, night: str, changes: Iterable[tuple[Name, str, dict[str, Any]]], line: Text, now: str) -> None:
         """End a night with its changes: the name of the figure, the kind of change, and the change as an object."""
         with self._transaction():
             accepted = set(self._names("SELECT step, method, name FROM changes WHERE night = ? AND accepted", night))
             self.db.execute("DELETE FROM changes WHERE night = ?", [night])
             self.db.executemany(
                 "INSERT INTO changes VALUES (?, ?, ?, ?, ?, ?, ?)",
-                [[night, *name, kind, _json(change), int(name in accepted)] for name, kind, change in changes],
+                [[night, *name, str(kind), _json(change), int(name in accepted)] for name, kind, change in changes],
             )
-            self.db.execute("UPDATE nights SET line = ?, ended = ? WHERE night = ?", [line, now, night])
+            self.db.execute(
+                "UPDATE nights SET line = ?, message = ?, ended = ? WHERE night = ?",
+                [str(line), _json(_text_object(line)), now, night],
+            )
 
     def accept(self, night: str) -> int:
         """Accept what got worse in a night as the new level; returns the number of figures."""
@@ -220,9 +228,17 @@ class History:
     def nights(self) -> list[Night]:
         """Return all nights, the earliest first."""
         return [
-            Night(night=night, code=code, commit=commit, software=json.loads(software), ended=ended or "", line=line)
-            for night, code, commit, software, ended, line in self.db.execute(
-                "SELECT night, code, commit_, software, ended, line FROM nights ORDER BY night"
+            Night(
+                night=night,
+                code=code,
+                commit=commit,
+                software=json.loads(software),
+                ended=ended or "",
+                line=line,
+                message=_text_of(json.loads(message)) if message else None,
+            )
+            for night, code, commit, software, ended, line, message in self.db.execute(
+                "SELECT night, code, commit_, software, ended, line, message FROM nights ORDER BY night"
             )
         ]
 
@@ -287,5 +303,20 @@ def _number(value: float | None) -> float:
     return float("nan") if value is None else float(value)
 
 
-def _json(value: dict[str, Any] | Sequence[str]) -> str:
+def _json(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False, sort_keys=True)
+
+
+def _text_object(message: Any) -> Any:
+    """Return a text as JSON holds it, with the texts and words among its values."""
+    if not isinstance(message, Text):
+        return value_object(message)
+    values = None if message.values is None else {key: _text_object(value) for key, value in message.values.items()}
+    return {"template": message.template, "values": values}
+
+
+def _text_of(stored: Any) -> Any:
+    if not isinstance(stored, dict) or "template" not in stored:
+        return value_of(stored)
+    values = stored["values"]
+    return Text(stored["template"], values and {key: _text_of(value) for key, value in values.items()})

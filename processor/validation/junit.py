@@ -1,4 +1,4 @@
-"""JUnit XML of a night, for CI servers: a test case for every cell, and one for every figure that changed."""
+"""JUnit XML of a night, for CI servers: a test case for every cell, and one for every figure that got worse."""
 
 from __future__ import annotations
 
@@ -7,10 +7,12 @@ from typing import Any
 from xml.etree import ElementTree as ET
 
 from processor.validation.cells import Figure
-from processor.validation.changes import ALARMS, Found
+from processor.validation.changes import ALARMS, Detected
 
 
-def xml(night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Sequence[Figure]], found: Found) -> bytes:
+def xml(
+    night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Sequence[Figure]], detected: Detected
+) -> bytes:
     """Write cells (failed ones as errors, figures beyond their limits as failures) and regressions."""
     root = ET.Element("testsuites", name="processor validate")
     suite = ET.SubElement(root, "testsuite", name=f"accuracy.{night}")
@@ -27,14 +29,14 @@ def xml(night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Seq
             ET.SubElement(case, "failure", message=_clean(lines[0])).text = _clean("\n".join(lines))
     _counts(suite, len(cells), failures, errors, sum(cell["seconds"] for cell in cells))
     suite = ET.SubElement(root, "testsuite", name=f"changes.{night}")
-    alarms = found.of(*ALARMS)
+    alarms = detected.of(*ALARMS)
     for change in alarms:
         step, method, name = change.name
         case = _case(suite, f"changes.{step}.{method}", name, 0.0)
-        text = f"{change.kind}: {change.said} ({change.test} test, p {change.p:.2g}, {change.cases} cases)"
+        text = f"{change.kind}: {change.message} ({change.test} test, p {change.p:.2g}, {change.cases} cases)"
         ET.SubElement(case, "failure", message=_clean(text))
     if not alarms:
-        _case(suite, "changes", f"{found.figures} figures, none worse", 0.0)
+        _case(suite, "changes", f"{detected.figures} figures, none worse", 0.0)
     _counts(suite, max(1, len(alarms)), len(alarms), 0, 0.0)
     ET.indent(root)
     data: bytes = ET.tostring(root, encoding="utf-8", xml_declaration=True)

@@ -120,7 +120,7 @@ def _report(
     detected = changes.find(rows, night, history.worse(night), matrix.aim)
     done = tuple(cell for cell in history.cells(night) if cell["cell"] in wanted)
     missed = {key: figures for key, figures in history.missed(night).items() if key in wanted}
-    report = Summary(night=night, software=present, cells=done, missed=missed, found=detected)
+    report = Summary(night=night, software=present, cells=done, missed=missed, detected=detected)
     same = [each.night for each in nights if each.code == present.code]
     cases = list({entry.case.key: entry.case for entry in matrix.entries}.values())
     certified = certificate.make(night, rows, same, cases, present, matrix)

@@ -6,41 +6,44 @@ import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 
-from processor.language import language
+from processor.language.messages import NO_NUMBER, Text, label, text
+from processor.model import Statistic
+from processor.report import templates
+from processor.report.all_tables import figure_name
 from processor.validation import changes
 from processor.validation.cells import Figure
-from processor.validation.changes import ALARMS, CHANGED, IMPROVEMENT, Change, Found
+from processor.validation.changes import ALARMS, Change, ChangeKind, Detected, Direction
 from processor.validation.history import Name, Night, Row
 from processor.validation.software import Software
 
 FORMAT, FORMAT_VERSION = "processor-validation", "1.0"
 MOST_NAMED = 2  # changes that the line names
 SPARK_NIGHTS, SPARK_WIDTH, SPARK_HEIGHT = 60, 120, 22
-TEST = (
-    "Fixed seeds: the same scenes every night, whose figures move only when the software does; where they moved, "
-    "paired one-sided t tests over the scenes against a margin of 2 % (1 point for shares), by the differences' own "
-    "scatter and by that from seed to seed, the smaller p doubled. Seeds of the night: an exact stratified rank "
-    f"test (normal scores) against {changes.LEAST_NIGHTS} to {changes.MOST_NIGHTS} earlier nights. Holm's correction "
-    "over all tests of a night: on a night when nothing got worse, the chance of any alarm is at most "
-    f"{100.0 * changes.ALARM_RATE:g} %; the same for improvements."
+TEST = text(
+    "Fixed seeds: the same scenes every night; their figures change only with the software. Changed figures: paired "
+    "one-sided t tests over the scenes against a margin of 2 % (1 point for shares), with the scatter of the "
+    "differences and with that from seed to seed, the smaller p doubled. Seeds of the night: an exact stratified rank "
+    "test (normal scores) against {least} to {most} earlier nights. Holm's correction over all tests of a night: if "
+    "nothing got worse, the chance of any alarm is at most {rate:g} %; the same for improvements.",
+    least=changes.LEAST_NIGHTS,
+    most=changes.MOST_NIGHTS,
+    rate=100.0 * changes.ALARM_RATE,
 )
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Cells of a night, figures beyond their limits by cell (``missed``), and changes (``found``)."""
+    """Cells of a night, figures beyond their limits by cell (``missed``), and changes (``detected``)."""
 
     night: str
     software: Software
     cells: tuple[Mapping[str, Any], ...]
     missed: Mapping[str, Sequence[Figure]]
-    found: Found
+    detected: Detected
 
     @property
     def failed(self) -> list[Mapping[str, Any]]:
@@ -50,35 +53,40 @@ class Summary:
     @property
     def passed(self) -> bool:
         """Whether no limit was missed and nothing got worse."""
-        return not self.missed and not self.found.of(*ALARMS)
+        return not self.missed and not self.detected.of(*ALARMS)
 
     @property
-    def line(self) -> str:
+    def line(self) -> Text:
         """The night on one line, for a chat channel."""
         misses = sum(map(len, self.missed.values()))
-        verdict = "ok" if self.passed and not self.failed else "NOT OK"
-        parts = [f"{self.night} {verdict}", self._version()]
-        parts.append(f"{_count(len(self.cells) - len(self.failed), 'cell')}, {_count(self.found.figures, 'figure')}")
-        parts += [f"{_count(len(self.failed), 'cell')} failed"] if self.failed else []
-        parts.append(f"{_count(misses, 'limit')} missed" if misses else "limits kept")
-        for kinds, word in ((ALARMS, "worse"), ((IMPROVEMENT,), "better")):
-            changed = self.found.of(*kinds)
-            if changed:
-                more = f"; {len(changed) - MOST_NAMED} more" if len(changed) > MOST_NAMED else ""
-                parts.append(f"{len(changed)} {word}: {'; '.join(map(_named, changed[:MOST_NAMED]))}{more}")
-        neither = len(self.found.of(CHANGED))
-        parts += [f"{neither} moved, neither worse nor better"] if neither else []
-        if self.found.first:
-            parts.append("nothing to compare with yet")
-        elif not self.found.changes:
-            parts.append("nothing changed")
-        parts += [f"scenes of {self.found.moved_scenes} cells are others"] if self.found.moved_scenes else []
-        return " | ".join(parts)
+        failed, detected = len(self.failed), self.detected
+        verdict = text("ok") if self.passed and not failed else text("NOT OK")
+        parts = [text("{night} {verdict}", night=self.night, verdict=verdict), self._version()]
+        counts = {"cells": len(self.cells) - failed, "figures": detected.figures}
+        parts.append(text("{cells} {cells:?cell|cells}, {figures} {figures:?figure|figures}", **counts))
+        parts += [text("{cells} {cells:?cell|cells} failed", cells=failed)] if failed else []
+        parts.append(text("{count} {count:?limit|limits} missed", count=misses) if misses else text("limits kept"))
+        parts += [
+            text("{count} {direction}: {changes}", count=len(changed), direction=direction, changes=_listed(changed))
+            for kinds, direction in ((ALARMS, Direction.WORSE), ((ChangeKind.IMPROVEMENT,), Direction.BETTER))
+            if (changed := detected.of(*kinds))
+        ]
+        neither = len(detected.of(ChangeKind.CHANGED))
+        parts += [text("{count} changed, neither worse nor better", count=neither)] if neither else []
+        if detected.first:
+            parts.append(text("nothing to compare with yet"))
+        elif not detected.changes:
+            parts.append(text("nothing changed"))
+        if detected.moved_scenes:
+            parts.append(text("changed scenes in {count} {count:?cell|cells}", count=detected.moved_scenes))
+        names = [f"part{i}" for i in range(len(parts))]
+        return Text(" | ".join(f"{{{name}}}" for name in names), dict(zip(names, parts, strict=True)))
 
-    def _version(self) -> str:
+    def _version(self) -> Text:
         commit = self.software.commit
         short = commit[:8] + ("+" if commit.endswith("+") else "")
-        return " ".join([self.software.versions.get("steel-scan-check", ""), short]).strip() or "no version"
+        version = " ".join([self.software.versions.get("steel-scan-check", ""), short]).strip()
+        return text("{version}", version=version) if version else text("no version")
 
     def as_object(self) -> dict[str, Any]:
         """Return what summary.json holds."""
@@ -87,7 +95,7 @@ class Summary:
             "format_version": FORMAT_VERSION,
             "night": self.night,
             "passed": self.passed,
-            "line": self.line,
+            "line": str(self.line),
             "commit": self.software.commit,
             "code": self.software.code,
             "software": self.software.versions,
@@ -98,13 +106,13 @@ class Summary:
                 for cell, figures in self.missed.items()
                 for f in figures
             ],
-            "changes": [change_object(change) for change in self.found.of(*ALARMS, IMPROVEMENT, CHANGED)],
+            "changes": [change_object(change) for change in self.detected.of(*ChangeKind)],
             "test": {
-                "about": TEST,
+                "about": str(TEST),
                 "alarm_rate": changes.ALARM_RATE,
-                "figures": self.found.figures,
-                "paired": self.found.paired,
-                "fresh": self.found.fresh,
+                "figures": self.detected.figures,
+                "paired": self.detected.paired,
+                "fresh": self.detected.fresh,
             },
         }
 
@@ -118,7 +126,7 @@ def change_object(change: Change) -> dict[str, Any]:
         "method": method,
         "name": name,
         "kind": change.kind,
-        "said": change.said,
+        "said": str(change.message),
         "test": change.test,
         "p": change.p,
         "cases": change.cases,
@@ -127,13 +135,29 @@ def change_object(change: Change) -> dict[str, Any]:
     }
 
 
-def _named(change: Change) -> str:
-    step, method, name = change.name
-    return f"{step} ({method}) {name} {change.said}"
+def _listed(changed: Sequence[Change]) -> Text:
+    """Name the first changes with their sizes, and count the others."""
+    parts = [
+        text(
+            "{step} ({method}) {figure} {change}",
+            step=label(change.name[0]),
+            method=change.name[1],
+            figure=_figure(change.name, change.quantity, change.statistic),
+            change=change.message,
+        )
+        for change in changed[:MOST_NAMED]
+    ]
+    if len(changed) > MOST_NAMED:
+        parts.append(text("{count} more", count=len(changed) - MOST_NAMED))
+    listed = parts[-1]
+    for part in reversed(parts[:-1]):
+        listed = text("{first}; {others}", first=part, others=listed)
+    return listed
 
 
-def _count(number: int, word: str) -> str:
-    return f"{number} {word}{'' if number == 1 else 's'}"
+def _figure(name: Name, quantity: str, statistic: str) -> Text:
+    """Return the name of a figure; that in files where the history has no quantity and statistic of it."""
+    return figure_name(quantity, Statistic(statistic)) if statistic else label(name[2])
 
 
 def _finite(value: float) -> float | None:
@@ -145,43 +169,45 @@ def _finite(value: float) -> float | None:
 
 def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], lang: str = "en") -> str:
     """Return the page in a language: the nights, the latest first, and every figure over the nights."""
-    environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent), autoescape=True, undefined=jinja2.StrictUndefined
-    )
-    environment.filters["say"] = language(lang).say
     shown = [night.night for night in nights][-SPARK_NIGHTS:]
     course: dict[Name, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    units: dict[Name, str] = {}
+    last: dict[Name, Row] = {}
     for row in rows:
         course[row.name][row.night].append(row.value)
-        units[row.name] = row.unit
-    change_of = {change.name: change for change in summary.found.changes}
+        last[row.name] = row
+    change_of = {change.name: change for change in summary.detected.changes}
     figures = []
     for name in sorted(course):
         if summary.night not in course[name]:
             continue
         levels = [_middle(course[name].get(night, [])) for night in shown]
-        change = change_of.get(name)
+        change, row = change_of.get(name), last[name]
         figures.append(
             {
-                "name": name,
-                "unit": units[name],
-                "value": f"{levels[-1]:.3g}" if math.isfinite(levels[-1]) else "–",
+                "step": label(name[0]),
+                "method": name[1],
+                "name": _figure(name, row.quantity, row.statistic),
+                "unit": row.unit,
+                "value": f"{levels[-1]:.3g}" if math.isfinite(levels[-1]) else NO_NUMBER,
                 "spark": _spark(levels),
                 "kind": change.kind if change else "",
-                "said": change.said if change else "",
+                "change": change.message if change else "",
             }
         )
-    text: str = environment.get_template("nights.html").render(
-        lang=lang,
-        summary=summary,
-        nights=list(reversed(nights)),
-        figures=figures,
-        test=TEST,
-        width=SPARK_WIDTH,
-        height=SPARK_HEIGHT,
+    page: str = (
+        templates.environment("validation", lang)
+        .get_template("nights.html")
+        .render(
+            lang=lang,
+            summary=summary,
+            nights=list(reversed(nights)),
+            figures=figures,
+            test=TEST,
+            width=SPARK_WIDTH,
+            height=SPARK_HEIGHT,
+        )
     )
-    return text + "\n"
+    return page + "\n"
 
 
 def _middle(values: Sequence[float]) -> float:

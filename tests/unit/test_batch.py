@@ -1,11 +1,8 @@
 """Batches: what is found, that a bad input stops nothing, a killed batch goes on, and nothing is half written."""
 
-import contextlib
 import csv
 import fcntl
-import functools
 import html.parser
-import io
 import json
 import os
 import pty
@@ -20,43 +17,22 @@ import subprocess
 import sys
 import termios
 import time
-import types
 import urllib.parse
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
 
-from processor import __main__
 from processor.batch import batch, finding, job, summary
 from processor.batch.figures import of_results
 from processor.cli import run as cli_run
-from processor.jobs import process, runner
+from processor.jobs import runner
 from processor.model import InputError, UsageError
 from processor.scan_folder import fingerprint
+from tests.support.batches import ENV, FAILING, REAL, ROOT, folder, run
 
-ROOT = Path(__file__).resolve().parents[2]
-ENV = {**os.environ, "PYTHONPATH": str(ROOT), "MPLBACKEND": "Agg"}
-REAL, FAILING = process.GUARDED, (sys.executable, str(ROOT / "tests/support/failing_job.py"))
 SPHERES = ("--steps", "spheres", "--method", "least-squares", "--seed", "3")
 SUMMARY = ("index.html", "summary.csv", "summary.json")
-
-
-def run(*arguments, code=0, program=FAILING):
-    """Run the command line in this process, the jobs by ``program``."""
-    out, err = io.StringIO(), io.StringIO()
-    with (
-        mock.patch.object(sys, "argv", ["processor", "batch", *map(str, arguments)]),
-        mock.patch.object(batch, "Settings", functools.partial(batch.Settings, program=program)),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(err),
-        pytest.raises(SystemExit) as end,
-    ):
-        __main__.main()
-    assert end.value.code == code, err.getvalue()
-    assert "Traceback" not in err.getvalue()
-    return types.SimpleNamespace(stdout=out.getvalue(), stderr=err.getvalue())
 
 
 def command(*arguments):
@@ -72,14 +48,6 @@ def until(condition, seconds=60):
     while not condition():
         assert time.monotonic() < end, "did not happen in time"
         time.sleep(0.01)
-
-
-def folder(path, plant="", content="1 2 3\n"):
-    path.mkdir(parents=True)
-    (path / "scan.xyz").write_text(content)
-    if plant:
-        (path / "plant").write_text(plant)
-    return path
 
 
 def said(out):
@@ -180,8 +148,8 @@ def test_what_is_left_out_is_said(tmp_path):
     names, left_out = found_in(tmp_path)
     assert names == ["bridge", "points.txt"]
     assert sorted(left_out) == ["README.txt", "bridge/inner", "link", "older", "own link", "run"]
-    assert "follows none" in left_out["link"]
-    assert "results of an earlier run" in left_out["run"]
+    assert left_out["link"].code == "batch.link"
+    assert left_out["run"].code == "batch.holds-results"
 
 
 # --- the hash of an input -------------------------------------------------------------------------------------------
@@ -214,7 +182,7 @@ def test_links_out_and_pipes_are_not_read(tmp_path):
     (one / "link").symlink_to("/dev/zero")
     (one / "loop").symlink_to(one)
     assert fingerprint.content_hash(one) == fingerprint.content_hash(one)
-    with pytest.raises(InputError, match="vanished"):
+    with pytest.raises(InputError, match="was deleted while it was read"):
         fingerprint.content_hash(tmp_path / "none")
 
 

@@ -6,9 +6,9 @@ import pytest
 
 from processor.batch import figures as batch_figures
 from processor.report import all_figures, page
+from tests.support import pages
+from tests.support.batches import folder, run
 from tests.support.browser import opened, picture, read_over
-from tests.unit import test_language_pages as pages
-from tests.unit.test_batch import folder, run
 
 BAD = "<script>alert(1)</script>.ply"
 WIDTHS = (1200, 400)

@@ -243,6 +243,7 @@ def test_a_unit_is_claimed_for_those_that_say_it_alone(tmp_path, monkeypatch, ca
         assert (" m," in out) == bool(unit)
         assert "the unit m is given by core.csv only; not by " in out
         assert "the unit m is given by" in err
+        assert [note["code"] for note in record["notes"]] == ["compare.unit"]
     found = compare.compare(Request(a, b))
     assert comparison.as_json(found)["unit_note"] is None
 

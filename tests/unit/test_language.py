@@ -3,20 +3,20 @@
 import dataclasses
 import re
 import string
-from html.parser import HTMLParser
 
 import numpy as np
 import pytest
 
 from processor import language
 from processor.evaluation.evaluate import ErrorReport
-from processor.language.messages import messages, text
-from processor.model import reason
+from processor.language.messages import messages
+from processor.language.messages import text as message
+from processor.model import Status, reason
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, view
 from processor.space_frame.design.matching import FrameRelation
-from processor.space_frame.result import Flag
 from tests.support.metrics import metric
+from tests.support.pages import Visible, latin
 from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge
 from tests.unit.test_report_balls import of_frame, whole, with_truth
 
@@ -90,7 +90,7 @@ def test_all_that_the_scripts_say_is_known(code):
     script, _ = view.script()
     said = set(re.findall(r'say\("([^"]+)"\)', script))
     assert len(said) > 20
-    assert said - set(language.language(code).of_scripts(script)) == set()
+    assert said - set(messages(code).of_scripts(script)) == set()
 
 
 def test_names_from_files_are_left_alone():
@@ -101,68 +101,13 @@ def test_names_from_files_are_left_alone():
 
 
 def test_live_figures_are_translated_but_for_names():
-    found = language.language("zh").in_figures(
-        {
-            "title": text("Balls in space"),
-            "parts": [{"name": "top", "text": text("balls: {flag}", flag=Flag.WRONG_SIZE)}],
-            "stops": ["left", 1.0],
-        }
+    found = messages("zh").rendered(
+        {"title": message("Balls in space"), "parts": [{"name": "top", "text": Status.OK}], "stops": ("left", 1.0)}
     )
-    assert found == {
-        "title": "螺栓球的三维视图",
-        "parts": [{"name": "top", "text": "螺栓球：规格不符"}],
-        "stops": ["left", 1.0],
-    }
+    assert found == {"title": "螺栓球的三维视图", "parts": [{"name": "top", "text": "正常"}], "stops": ["left", 1.0]}
 
 
 # --- Chinese -------------------------------------------------------------------------------------------------------
-
-UNITS = {"mm", "mrad", "ci", "ci95"}
-METHODS = {"adjustment", "corner", "line", "design", "aided", "ray", "ransac", "least", "squares"}
-STANDARDS = {"GB", "Cram", "rao"}  # Cramér-Rao, the name of a bound
-IN_FILES = {
-    "foot1",
-    "rib1",
-    "foot2",
-    "bridge",
-    "frame",
-    "project",
-    "toml",
-    "balls",
-    "results",
-    "csv",
-    "json",
-    "plausible",
-    "candidates",
-}
-SYMBOLS = {"dx", "dy", "dz", "lambda", "node_place_mm", "bow_mm", "max_balls"}
-STAYS = UNITS | METHODS | STANDARDS | IN_FILES | SYMBOLS
-
-
-class Visible(HTMLParser):
-    """Text of a page that a reader sees: no scripts, no style, no provenance; what stands for a picture too."""
-
-    def __init__(self, page):
-        super().__init__()
-        self.texts, self.lang, self._hidden = [], "", 0
-        self.feed(page)
-
-    def handle_starttag(self, tag, attrs):
-        self._hidden += tag in ("script", "style", "pre")
-        self.texts += [value for name, value in attrs if name in ("alt", "title")]
-        self.lang = dict(attrs).get("lang", self.lang)
-
-    def handle_endtag(self, tag):
-        self._hidden -= tag in ("script", "style", "pre")
-
-    def handle_data(self, data):
-        if not self._hidden:
-            self.texts.append(data)
-
-
-def latin(texts, stays=STAYS):
-    """Texts with words that are not Chinese and are no names."""
-    return [one for one in texts if set(re.findall(r"[A-Za-z]{2}[A-Za-z0-9_]*", one)) - stays]
 
 
 def chinese_page(execution, report):

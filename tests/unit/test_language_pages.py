@@ -8,10 +8,6 @@ import numpy as np
 import pytest
 
 from processor import language
-from processor.batch import figures as batch_figures
-from processor.batch import summary
-from processor.batch.job import Job
-from processor.batch.record import Record
 from processor.compare import compare
 from processor.defects.result import DefectClass
 from processor.defects.result import Result as Defects
@@ -22,45 +18,27 @@ from processor.language.messages import label, messages
 from processor.model import reason
 from processor.report import all_figures, comparison, page
 from processor.stitching.result import ControlPoints, ControlSightings
-from processor.validation import changes, night
+from processor.validation import changes
 from processor.validation import summary as nights_summary
 from tests.support import step_results, validation_nights
 from tests.support.metrics import metric
-from tests.unit.test_language import STAYS, Visible, latin
+from tests.support.pages import (
+    NAMES,
+    PAPER,
+    REASONS,
+    STAYS,
+    STITCH_CHECKS,
+    Visible,
+    checks_of,
+    indexed,
+    latin,
+    left_in_english,
+    searched,
+    two_nights,
+)
 
 SOURCES = Path(language.__file__).parents[1]
-NAMES = {
-    *(f"S{i}" for i in range(9)),
-    *("site", "scan", "made", "component", "ply", "summary", "timings"),
-    *("automatic", "default", "paper", "three", "point", "stitch", "deviation", "spheres", "defects", "pdf"),
-    *("PRCS", "SOCS", "GLCS", "T_PRCS_SOCS", "GLCS_PRCS", "LOD95", "lod95", "ppm", "rms"),
-}
-
-
-def left_in_english(text, *more):
-    seen = Visible(re.sub(r"T_(PR|GL)CS_SOCS\(.*?\)", "", text))
-    assert seen.lang == "zh"
-    assert len(seen.texts) > 20
-    return latin(seen.texts, STAYS | NAMES | set(more))
-
-
 # --- steps ----------------------------------------------------------------------------------------------------------
-
-
-def checks_of(step, *names):
-    return tuple(metric(name, 1.0, 0.0 if i % 2 else float("nan"), step=step) for i, name in enumerate(names))
-
-
-STITCH_CHECKS = (
-    "scans not placed", "station positions after datum fit, max", "station positions after datum fit, rms",
-    "rotations after datum fit, max", "scans called ok, over 50 mm off", "pose components within their 95 % intervals",
-    "station positions by control points, max",
-)  # fmt: skip
-DEFECT_CHECKS = (
-    *(f"missed: {kind}" for kind in DefectClass), "false alarms", "surface examined",
-    "class wrong", "depths off by more than a tenth and 2 LOD95", "depth error, median", "depth error, max",
-    "depths that are bounds alone",
-)  # fmt: skip
 
 
 def stitched():
@@ -123,22 +101,6 @@ def given():
     return step_results.execution(("stitch", "automatic", "{}", result), names=scans.name), ErrorReport()
 
 
-PAPER = (
-    reason("defects.paper-clusters", points=2000, spacing=4.5),
-    reason("defects.paper-fit", rms=1.2, share=87.0),
-    reason("defects.paper-threshold", threshold=3.1),
-)
-
-
-def searched():
-    placed = reason("defects.placed-by-deviation", registration=Registration.AS_GIVEN)
-    first = step_results.defects(reasons=(placed, *step_results.EXAMINED))
-    paper = step_results.defects(3, PAPER, method="paper")
-    made = step_results.execution(("defects", "default", "{}", first), ("defects", "paper", "{}", paper))
-    of_paper = metric("missed: step", 1.0, step="defects", method="paper")
-    return made, ErrorReport((*checks_of("defects", *DEFECT_CHECKS), of_paper))
-
-
 @pytest.mark.parametrize("made", [stitched, controlled, given, searched])
 def test_nothing_but_names_and_units_is_left_in_english(made):
     execution, report = made()
@@ -177,50 +139,6 @@ def test_a_word_of_two_senses_has_that_of_its_vocabulary_or_column():
 
 # --- a batch --------------------------------------------------------------------------------------------------------
 
-REASONS = (
-    "stopped before it ended",
-    "took longer than 3.5 s (--timeout-s)",
-    "needs more memory than 200 MB (--memory-mb)",
-    "crashed: SIGSEGV (signal 11)",
-    "crashed: signal 70",
-    "ended with exit code 9 and without results",
-    "ended with exit code 9 and without results: 坏",
-    "the input changed while it was processed, so nothing is kept; run again when it is complete",
-    "done, but not in this folder: all workers must share it, and the inputs, under the same path",
-    "every worker that did it died (out of memory?); run again, with fewer jobs at a time",
-    "a worker has other software: numpy 1.0, not 2.0; install the same everywhere",
-)
-LEFT_OUT = (
-    "cannot be read (Permission denied)",
-    "holds results of an earlier run",
-    "a link; the batch follows none",
-    "holds no rows of coordinates, so it is taken for no scan",
-    "lies within the scan folder 桥",
-    "has the name of one of the batch's own files; rename it",
-)
-
-
-LEFT = dict(zip("一二三四五六", LEFT_OUT, strict=True))
-
-
-def job(out, name):
-    (out / f"{name}.log").touch()
-    return Job(name, out, out, out, out / name, out / f"{name}.log", out, out, out, "", (), {}, {}, 1.0, 1, 1)
-
-
-def indexed(out, lang, reasons=REASONS):
-    everything = dict.fromkeys(batch_figures.COLUMNS, 3)
-    everything |= {"steps": "preassemble, spheres (partial), stitch (failed), deviation (ambiguous), defects (weak)"}
-    done = [
-        Record(f"扫描 {i}", "", status, figures={**everything, "verdict": verdict})
-        for i, (status, verdict) in enumerate(
-            [("done", "pass"), ("in-part", "indeterminate"), ("limit-missed", "fail"), ("done", None)]
-        )
-    ]
-    done += [Record(f"坏 {i}", "", "failed", reason) for i, reason in enumerate(reasons)]
-    found = summary.write(out, [(job(out, one.input), one) for one in done], LEFT, lang)
-    return found.page.read_text("utf-8")
-
 
 def test_the_index_of_a_batch_in_chinese(tmp_path):
     more = {"csv", "json", "SIGSEGV", "timeout", "memory", "MB", "mb", "numpy", "not", "Permission", "denied"}
@@ -229,7 +147,7 @@ def test_the_index_of_a_batch_in_chinese(tmp_path):
 
 def test_errors_of_inputs_are_marked_as_english(tmp_path):
     error = "scan.ply: expected 1000 points, found 50; export it again"
-    text = indexed(tmp_path, "zh", (error, *REASONS))
+    text = indexed(tmp_path, "zh", (reason("batch.error", message=error), *REASONS))
     assert f'lang="en">{error}</td>' in text
     assert "错误信息与命令行一致" in text
     assert text.count('lang="en"') == 1
@@ -239,30 +157,33 @@ def test_errors_of_inputs_are_marked_as_english(tmp_path):
 # --- a comparison ---------------------------------------------------------------------------------------------------
 
 
-def test_a_comparison_in_chinese():
-    share = {"core_points": 10, "without_lod": 2, "significant": 3, "significant_share": 0.375, "mean": -0.1,
-             "significant_share_ci95": [0.1, 0.6], "median": 1e-5, "sd": 0.2, "min": None, "max": 1.0,
-             "lod95_median": 0.01}  # fmt: skip
-    inputs = {name: {"file": f"{file}.ply"} for name, file in (("reference", "前"), ("compared", "后"))}
-    for unit in ("mm", "that of the files, which do not say it"):
-        for known in (2, 10):
-            record = {"summary": {**share, "without_lod": known}, "unit": unit, "inputs": inputs}
-            record["normals_note"] = compare.turned_note(Turned(np.empty((0, 3)), 1, 2, 3, 4, 2))
-            record["unit_note"] = compare.unit_note(
-                {"reference": "m", "compared": "", "core": ""}, dict.fromkeys(compare.CLOUDS, "a.ply")
-            )
-            drawn = [("Deviations; the outermost bars hold all beyond", b"")]
-            seen = Visible(comparison._page(record, drawn, "zh"))
+def test_a_comparison_in_chinese(tmp_path):
+    rng = np.random.default_rng(0)
+    for name in ("前", "后"):
+        np.savetxt(tmp_path / f"{name}.xyz", rng.uniform(0.0, [3.0, 3.0, 0.01], (2000, 3)))
+    first = compare.compare(compare.Request(tmp_path / "前.xyz", tmp_path / "后.xyz", tmp_path / "前.xyz"))
+    found = dataclasses.replace(
+        first,
+        turned=Turned(np.empty((0, 3)), 1, 2, 3, 4, 2),
+        units={"reference": "m", "compared": "", "core": ""},
+    )
+    without = dataclasses.replace(first.summary, without_lod=first.summary.core_points)
+    for unit in ("mm", ""):
+        for summary_ in (first.summary, without):
+            comparison.write(tmp_path / "out", dataclasses.replace(found, summary=summary_, unit=unit), "zh")
+            seen = Visible((tmp_path / "out" / "report.html").read_text("utf-8"))
             assert seen.lang == "zh"
-            assert "由 前.ply 至 后.ply" in seen.texts
-            assert [one for one in latin(seen.texts) if "ply" not in one] == []
+            assert "由 前.xyz 至 后.xyz" in seen.texts
+            assert latin(seen.texts, STAYS | {"xyz", "LOD95"}) == []
 
 
 # --- nights ---------------------------------------------------------------------------------------------------------
 
 
 def change(kind, size, is_ratio=True, unit="mm", cases=3, name=("spheres", "ray", "radii, bias")):
-    return changes.Change(name, kind, "paired", size, is_ratio, unit, 0.001, cases)
+    return changes.Change(
+        name, changes.ChangeKind(kind), "paired", size, is_ratio, unit, 0.001, cases, quantity="radii", statistic="bias"
+    )
 
 
 CHANGES = (
@@ -276,14 +197,14 @@ CHANGES = (
 def a_night(failed=1, missed=2, found=CHANGES, **more):
     cells = tuple({"failed": "x" if i < failed else ""} for i in range(3))
     figure = nights_summary.Figure("spheres", "ray", "radii, bias", 1.0, 0.5, "mm")
-    of = changes.Found(found, 12, 3, 4, **more)
+    of = changes.Detected(found, 12, 3, 4, **more)
     return nights_summary.Summary(
         "2026-11-21", validation_nights.SOFTWARE, cells, {"a": [figure] * missed} if missed else {}, of
     )
 
 
 @pytest.mark.parametrize(
-    "told",
+    "found",
     [
         *(a_night(found=(one,)) for one in CHANGES),
         a_night(),
@@ -292,25 +213,9 @@ def a_night(failed=1, missed=2, found=CHANGES, **more):
         a_night(2, 0, CHANGES[:1]),
     ],
 )
-def test_the_line_of_a_night_in_chinese(told):
-    said = language.language("zh").say(told.line)
-    assert latin([said.replace("ray", "").replace("c0ffeec0", "")]) == []
-
-
-def two_nights(out, lang):
-    stored = {figure["name"] for case in validation_nights.Simulated(1).cases for figure in case["figures"]}
-    figures_of = {name: (0.5, 0.2 if "bias" in name else None, "mm") for name in stored}
-    figures_of |= dict.fromkeys((*STITCH_CHECKS, *DEFECT_CHECKS), (1.0, None, "mm"))
-    rays = '[scan]\nmode = "rays"\nscanner = "phase"\nstep_mrad = 1.5\n'
-    cases = (
-        validation_nights.case(),
-        validation_nights.case("scan", text=rays),
-        validation_nights.case(steps=("defects",), methods=("default",)),
-    )
-    asked = validation_nights.matrix(*cases)
-    for day in ("2026-11-20", "2026-11-21"):
-        runner = validation_nights.runner(lambda cell: dict(figures_of))
-        night.run(asked, out, day, runner, made_by=validation_nights.SOFTWARE, lang=lang)
+def test_the_line_of_a_night_in_chinese(found):
+    line = messages("zh").text(found.line)
+    assert latin([line.replace("ray", "").replace("c0ffeec0", "")]) == []
 
 
 def test_pages_of_nights_in_chinese(tmp_path):
@@ -321,4 +226,5 @@ def test_pages_of_nights_in_chinese(tmp_path):
         text = (tmp_path / name).read_text("utf-8")
         text = re.sub(r"<code>[0-9a-f]+</code>|c0ffee\w*", "", text)
         assert left_in_english(text, *more) == []
+    assert "2026-11-20 异常" in (tmp_path / "nights.html").read_text("utf-8")  # the line of an earlier night
     assert 'lang="zh"' in (tmp_path / "nights/2026-11-20/certificate.html").read_text("utf-8")

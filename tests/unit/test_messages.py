@@ -1,6 +1,7 @@
 """The catalogues of messages: complete in every language, and nothing in them that no program uses."""
 
 import ast
+import re
 import string
 from pathlib import Path
 
@@ -8,8 +9,10 @@ import pytest
 
 import processor
 from processor import pipeline
+from processor.batch import record
 from processor.language.messages import CODES, Text, catalogue, messages, text
 from processor.model import VOCABULARIES, Status, reason
+from processor.validation import changes
 
 SOURCES = Path(processor.__file__).parent
 OTHERS = [code for code in CODES if code != "en"]
@@ -37,6 +40,12 @@ def headings():
                 )
 
 
+def in_templates():
+    """The texts of the pages' templates."""
+    for path in sorted(SOURCES.rglob("*.html")):
+        yield from re.findall(r'\btext\("([^"]+)"', path.read_text("utf-8"))
+
+
 def fields(template):
     return {name for _, name, _, _ in string.Formatter().parse(template) if name}
 
@@ -59,7 +68,8 @@ def test_every_code_of_a_catalogue_is_used(code):
 @pytest.mark.parametrize("code", OTHERS)
 def test_every_text_of_the_sources_is_translated_with_the_same_values(code):
     known = messages(code).texts
-    for template in {*(name for _, name, _ in calls("text", "figures_of")), *headings()}:
+    assert len(set(in_templates())) > 20
+    for template in {*(name for _, name, _ in calls("text", "figures_of")), *headings(), *in_templates()}:
         if all(not literal.strip(" ,.;:") for literal, *_ in string.Formatter().parse(template)):
             continue  # nothing but values
         assert template in known, f"not in {code}: {template!r}"
@@ -68,7 +78,8 @@ def test_every_text_of_the_sources_is_translated_with_the_same_values(code):
 
 @pytest.mark.parametrize("code", OTHERS)
 def test_words_of_a_catalogue_are_of_a_vocabulary(code):
-    pipeline.step_modules()  # their vocabularies are known once they are imported
+    assert pipeline.step_modules()
+    assert record.JobStatus is not changes.ChangeKind  # vocabularies are known once they are imported
     for key in messages(code).words:
         name, _, word = key.rpartition(".")
         if name:

@@ -94,6 +94,25 @@ def test_tables_hold_the_results_and_can_be_copied(tmp_path):
         assert [[cell.strip() for cell in row] for row in copied if any(row)][2:] == first[2:]
 
 
+@pytest.mark.parametrize("width", [1200, 400])
+def test_a_table_has_the_whole_width_and_shows_all_its_rows(tmp_path, width):
+    path = tmp_path / "r.html"
+    path.write_text(rendered(of_bridge()), "utf-8")
+    with opened(path, width) as shown:
+        tables = shown.evaluate(
+            "[...document.querySelectorAll('.scroll')].map((scroll) => ({"
+            " width: scroll.offsetWidth, section: scroll.closest('section').clientWidth,"
+            " hidden: scroll.scrollHeight - scroll.clientHeight, rows: scroll.querySelectorAll('tbody tr').length,"
+            " below: scroll.getBoundingClientRect().top"
+            "   - scroll.closest('section').querySelector('.copy').getBoundingClientRect().bottom}))"
+        )
+    assert max(table["rows"] for table in tables) > 20
+    for table in tables:
+        assert table["width"] == table["section"]
+        assert table["below"] >= 0.0
+        assert table["hidden"] <= 0 or table["rows"] > 60
+
+
 def test_no_other_script_runs(tmp_path):
     path = tmp_path / "r.html"
     path.write_text(rendered(of_bridge()).replace("</body>", "<script>document.title = 'run'</script></body>"), "utf-8")

@@ -157,7 +157,7 @@ def test_done_cells_are_not_done_again_and_failed_ones_are(tmp_path):
 
     told = run(tmp_path / "out", asked, once, done=done)
     assert [cell["title"] for cell in told.failed] == ["made seed 2"]
-    assert "1 cell failed" in told.line
+    assert "1 cell failed" in str(told.line)
     told = run(tmp_path / "out", asked, once, done=done)
     assert (done[4:], told.failed) == (["made seed 2"], [])
     run(tmp_path / "out", asked, once, done=done)
@@ -195,12 +195,12 @@ def test_a_regression_stays_until_it_is_accepted(tmp_path):
     for day in ("2026-11-02", "2026-11-03"):
         told = run(out, asked, worse, day)
         assert not told.passed
-        assert "1 worse: spheres (ray) sd 20" in told.line
+        assert "1 worse: spheres (ray) sd 20" in str(told.line)
     assert command.accept(out, None, None) == "2026-11-03: 1 figure(s) accepted as they are now"
     assert run(out, asked, worse, "2026-11-04").passed
     better = run(out, asked, before, "2026-11-05")
-    assert "1 better: spheres (ray) sd 20" in better.line
-    assert (out / "line.txt").read_text("utf-8") == better.line + "\n"
+    assert "1 better: spheres (ray) sd 20" in str(better.line)
+    assert (out / "line.txt").read_text("utf-8") == f"{better.line}" + "\n"
     page = (out / "nights.html").read_text("utf-8")
     assert all(day in page for day in ("2026-11-01", "2026-11-05", "nights/2026-11-03/certificate.html", "<polyline"))
     with pytest.raises(UsageError, match="no such night"):
@@ -215,7 +215,7 @@ def test_limits_missed_reach_the_ci_server(tmp_path):
 
     told = run(tmp_path / "out", validation_nights.matrix(validation_nights.case()), over)
     assert not told.passed
-    assert "1 limit missed" in told.line
+    assert "1 limit missed" in str(told.line)
     suite = ET.parse(tmp_path / "out" / "junit.xml").getroot()[0]
     assert (suite.get("tests"), suite.get("failures"), suite.get("errors")) == ("4", "1", "1")
     found = {case.get("name"): [(one.tag, one.get("message")) for one in case] for case in suite}

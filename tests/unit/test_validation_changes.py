@@ -83,9 +83,9 @@ def test_the_paired_test_is_a_t_test_of_log_ratios():
     expected = stats.ttest_1samp(np.log(after / before), math.log(1.02), alternative="greater").pvalue
     assert (change.kind, change.test, change.cases) == ("regression", "paired", 5)
     assert change.p == pytest.approx(2.0 * expected, rel=1e-9)  # by one of two tests
-    assert change.said == "20 % worse"
+    assert str(change.message) == "20 % worse"
     (back,) = changes.find(rows("2026-01-02", after) + rows("2026-01-03", before), "2026-01-03", {}).changes
-    assert (back.kind, back.said) == ("improvement", "20 % better")
+    assert (back.kind, str(back.message)) == ("improvement", "20 % better")
 
 
 def test_few_scenes_are_held_against_the_scatter_from_seed_to_seed():
@@ -133,7 +133,7 @@ def test_other_scenes_are_not_compared_and_lost_figures_are_told():
     other = ("spheres", "ray", "radii, number")
     seen = rows("2026-01-02", [60.0] * 5, name=other)
     (gone,) = changes.find(before + seen, "2026-01-02", {}).changes
-    assert (gone.kind, gone.said) == ("lost", "no longer measured in 5 cells")
+    assert (gone.kind, str(gone.message)) == ("lost", "no longer measured in 5 cells")
     assert changes.find(before + rows("2026-01-02", [math.nan] * 5), "2026-01-02", {}).changes[0].kind == "lost"
     method = ("spheres", "ransac", "radii, number")  # the matrix asks for another method: nothing is lost
     assert changes.find(before + rows("2026-01-02", [60.0] * 5, name=method), "2026-01-02", {}).changes == ()

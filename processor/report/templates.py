@@ -1,0 +1,20 @@
+"""Jinja2 templates of the pages: values are escaped, messages are written in the page's language."""
+
+from __future__ import annotations
+
+import jinja2
+
+from processor.language.messages import label, messages, text
+
+
+def environment(folder: str, lang: str) -> jinja2.Environment:
+    """Return the environment of the templates in a folder of this package, for a language of CODES.
+
+    Templates name their texts by ``text`` and ``label``; filter ``say`` writes a message, and all else as it is.
+    """
+    made = jinja2.Environment(
+        loader=jinja2.PackageLoader("processor", folder), autoescape=True, undefined=jinja2.StrictUndefined
+    )
+    made.filters["say"] = messages(lang).text
+    made.globals |= {"text": text, "label": label}
+    return made
