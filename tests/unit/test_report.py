@@ -32,8 +32,8 @@ from processor.report import table as report_table
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Balls
 from processor.store import store
-from tests.support import records
 from tests.support.metrics import metric
+from tests.support.records import assert_equal
 
 NAN = float("nan")
 KEYS = [f"P{i}" for i in range(1, 9)]
@@ -461,4 +461,4 @@ def test_results_go_through_the_store_unchanged(made, tmp_path):
     step = "preassemble" if isinstance(made, Result) else "spheres"
     store.write_results(tmp_path / "r.h5", [StepRun(step, made.method, "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {step: type(made)})
-    records.assert_equal(back.result, made)
+    assert_equal(back.result, made)

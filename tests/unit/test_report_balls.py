@@ -36,6 +36,7 @@ from processor.space_frame.result import (
     Tubes,
 )
 from processor.store import store
+from tests.support.records import assert_equal
 from tests.unit.test_report import PROVENANCE, Page, balls
 
 NAN = float("nan")
@@ -279,12 +280,7 @@ def test_the_result_goes_through_the_store_unchanged(tmp_path):
     made = whole()
     store.write_results(tmp_path / "r.h5", [StepRun("spheres", "ray", "{}", made)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {"spheres": Result})
-    for name in ("status", "method", "reasons", "movement_reference", "datum"):
-        assert getattr(back.result, name) == getattr(made, name)
-    for name in ("balls", "matching", "tubes", "stations", "control"):
-        table, same = getattr(back.result, name), getattr(made, name)
-        for field in dataclasses.fields(same):
-            np.testing.assert_equal(getattr(table, field.name), getattr(same, field.name))
+    assert_equal(back.result, made)
 
 
 # --- tables --------------------------------------------------------------------------------------------------------
