@@ -95,7 +95,7 @@ def test_the_truth_may_lie_beside_a_folder_of_scans(tmp_path):
 
 
 def test_the_truth_of_another_scene_is_refused(tmp_path):
-    from tests.unit.test_report import arch_scene, assembled
+    from tests.support.bridge_results import arch_scene, assembled
 
     ends = np.zeros((1, 2, 8, 3))
     truth = Truth(arch=ArchTruth(("other",), np.eye(4)[None], ends, ends, np.zeros((1, 2, 5, 3))))

@@ -18,10 +18,10 @@ from processor.preassembly.result import Gauge
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
 from processor.report import all_figures, page, view
 from processor.space_frame.design.matching import FrameRelation
+from tests.support.ball_results import of_frame, whole, with_truth
+from tests.support.bridge_results import LIMITS, SECTION, of_bridge, with_band
 from tests.support.metrics import metric
 from tests.support.pages import Visible, latin
-from tests.unit.test_report_adjusted import LIMITS, SECTION, of_bridge, with_band
-from tests.unit.test_report_balls import of_frame, whole, with_truth
 
 CODES = [code for code in messages_.CODES if code != "en"]
 

@@ -6,7 +6,6 @@ import io
 import json
 import os
 import re
-from html.parser import HTMLParser
 
 import matplotlib as mpl
 import numpy as np
@@ -14,8 +13,6 @@ import pytest
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import (
-    ArchDesign,
-    DesignPart,
     FrameDesign,
     InputError,
     Metric,
@@ -26,93 +23,16 @@ from processor.model import (
     reason,
 )
 from processor.pipeline import Execution
-from processor.preassembly.result import Components, Deviations, Gauge, Joints, Linear, MeanMax, Result
+from processor.preassembly.result import Deviations, Result
 from processor.report import all_figures, all_tables, page, results_folder, results_json
 from processor.report import table as report_table
 from processor.space_frame import step as space_frame_step
-from processor.space_frame.result import Balls
 from processor.store import store
+from tests.support.ball_results import balls
+from tests.support.bridge_results import KEYS, NAN, PROVENANCE, arch_scene, assembled
 from tests.support.metrics import metric
 from tests.support.records import assert_equal
-
-NAN = float("nan")
-KEYS = [f"P{i}" for i in range(1, 9)]
-PROVENANCE = {"input": "b.h5", "input_sha256": "00", "seed": 0, "software": {"processor": "0"}, "parameters": []}
-
-
-def arch_scene(names=("foot1", "rib1", "foot2"), joints=("J1", "J2")):
-    edge = np.stack([np.linspace(0.0, 4000.0, 21), np.zeros(21), np.zeros(21)], axis=1)
-    parts = tuple(
-        DesignPart(name, bottom_edge_left=edge + np.array([4000.0 * i, 450.0, 0.0]), bottom_edge_right=edge)
-        for i, name in enumerate(names)
-    )
-    points = np.arange(len(joints))[:, None, None] * np.array([4000.0, 0.0, 0.0]) + np.full((8, 3), 4000.0)
-    design = ArchDesign(parts, joints, names[:-1], names[1:], points)
-    return Scene("bridge", "arch-bridge", (Scan("s", np.zeros((2, 3))),), arch=design)
-
-
-def assembled(method="design-aided", names=("foot1", "rib1", "foot2"), joints=("J1", "J2"), scale=1.0):
-    """Gap of point k, axis a at the first joint: k + a / 10 mm, signs alternating; the second joint has no answer."""
-    gaps = np.full((2, 8, 3), NAN)
-    gaps[0] = scale * (np.arange(1.0, 9.0)[:, None] + np.arange(3) / 10.0) * np.where(np.arange(3) == 1, -1.0, 1.0)
-    key_points = np.full((3, 2, 8, 3), NAN)
-    key_points[0, 1] = np.arange(24.0).reshape(8, 3)
-    station = np.tile(np.arange(0.0, 12000.0, 200.0), 2)
-    missing = reason("preassemble.at", place="J2", reasons=(reason("preassemble.no-joint-edges"),))
-    deviation = scale * (1.0 + station / 1000.0)
-    return Result(
-        status="partial",
-        method=method,
-        components=Components(
-            name=names,
-            status=("ok", "ok", "failed"),
-            reasons=((), (), (missing,)),
-            scans=names,
-            T_bridge_scan=np.array([np.eye(4), np.eye(4), np.full((4, 4), NAN)]),
-            covariance=np.full((3, 6, 6), NAN),
-            key_points_scan=key_points,
-            key_points_sd=np.full((3, 2, 8, 3), NAN),
-        ),
-        joints=Joints(
-            name=joints,
-            left=names[:-1],
-            right=names[1:],
-            gaps=gaps,
-            gap_ci95=np.full((2, 8, 3), NAN),
-            verdict=("indeterminate", "indeterminate"),
-        ),
-        splicing=MeanMax(mean=4.6, max=8.2),
-        linear=Linear(
-            gauge=Gauge.LINES,
-            chainage=station,
-            edge=("left",) * 60 + ("right",) * 60,
-            assembled=Deviations(error=MeanMax(mean=2.0, max=3.0), deviation=deviation),
-            best_fit=Deviations(error=MeanMax(mean=4.0, max=5.0), deviation=deviation + scale),
-        ),
-    )
-
-
-def balls(method="ransac", radii=(45.5, 60.0, NAN), flag=("ok", "wrong-size", "not-found")):
-    radii = np.array(radii)
-    k = len(radii)
-    centres = np.where(np.isfinite(radii)[:, None], np.arange(3.0 * k).reshape(k, 3) * 1000.0, NAN)
-    found = Balls(
-        ids=np.arange(k) + 7,
-        centres=centres,
-        radii=radii,
-        lowest=centres - radii[:, None] * [0.0, 0.0, 1.0],
-        covariance=np.where(np.isfinite(radii)[:, None, None], 0.04 * np.eye(4), NAN),
-        lowest_sd=np.full(k, 0.1),
-        points=np.full(k, 50),
-        visible_fraction=np.full(k, 0.5),
-        rms=np.full(k, 1.0),
-        nominal_radii=np.full(k, 45.0),
-        evidence=("ball",) * k,
-        flag=tuple(flag),
-        reasons=tuple(() if one == "ok" else (reason("spheres.no-sphere"),) for one in flag),
-        verdict=("none",) * k,
-    )
-    return space_frame_step.Result(status="partial", method=method, balls=found)
+from tests.support.report_pages import TablesOfPage
 
 
 def frame_scene(k=3):
@@ -139,36 +59,6 @@ def of_frame():
 
 def render(execution, report):
     return page.html(execution, report, all_figures.of_run(execution, report))
-
-
-class Page(HTMLParser):
-    """Titles of tables, their cells, and every address that a browser would load."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.tables, self.addresses, self.tags = {}, [], []
-        self._title, self._in = "", ""
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.tags.append(tag)
-        self._in = tag
-        self.addresses += [v for k, v in attrs if k in ("src", "href", "data", "action", "srcset", "background")]
-        if tag == "h3":
-            self._title = ""
-        if tag == "tr":
-            self.tables.setdefault(self._title, []).append([])
-        if tag in ("td", "th"):
-            self.tables[self._title][-1].append("")
-
-    def handle_data(self, data):
-        if self._in == "h3":
-            self._title += data
-        if self._in in ("td", "th"):
-            self.tables[self._title][-1][-1] += data
-
-    def handle_endtag(self, tag):
-        self._in = ""
 
 
 # --- results.json --------------------------------------------------------------------------------------------------
@@ -294,7 +184,7 @@ def test_long_tables_are_cut_on_the_terminal_and_say_so():
 
 
 def test_gaps_stand_as_in_the_source_paper():
-    found = Page(render(of_bridge(), ErrorReport())).tables["Splicing error, method design-aided (mm)"]
+    found = TablesOfPage(render(of_bridge(), ErrorReport())).tables["Splicing error, method design-aided (mm)"]
     assert found[0] == ["", "J1: foot1 & rib1", "J2: rib1 & foot2"]
     assert found[1] == ["point", "dx", "dy", "dz", "dx", "dy", "dz"]
     assert found[4] == ["P3", "3.000", "-3.100", "3.200", "–", "–", "–"]
@@ -302,7 +192,7 @@ def test_gaps_stand_as_in_the_source_paper():
 
 
 def test_a_joint_without_an_answer_is_not_a_perfect_one():
-    found = Page(render(of_bridge(), ErrorReport())).tables["Joints, method design-aided (mm)"]
+    found = TablesOfPage(render(of_bridge(), ErrorReport())).tables["Joints, method design-aided (mm)"]
     assert found[1] == ["J1", "foot1", "rib1", "4.600", "8.200", "P8, z", "indeterminate"]
     assert found[2] == ["J2", "rib1", "foot2", "–", "–", "", "indeterminate"]
 
@@ -330,7 +220,7 @@ def test_figures_are_the_same_bytes_whatever_the_users_settings():
 @pytest.mark.parametrize("name", ["$\\frac$", "$x", "桥拱一", "_hidden", "a\nb", "x" * 5000, "<b>&amp;"])
 def test_any_name_can_be_drawn_and_shown(name):
     execution = of_bridge(names=(name, "rib1", "foot2"), joints=(name, "J2"))
-    found = Page(render(execution, ErrorReport()))
+    found = TablesOfPage(render(execution, ErrorReport()))
     assert found.tables["Components"][1][0] == report_table.shown(name)
 
 
@@ -366,7 +256,7 @@ def test_the_page_escapes_names_and_loads_nothing():
     text = render(
         of_bridge(scene, names=(bad, "rib1", "foot2")), ErrorReport((Metric("s", bad, 1.0, unit=bad, limit=2.0),))
     )
-    found = Page(text)
+    found = TablesOfPage(text)
     assert found.tags.count("script") == 2  # the page's own, and its data
     assert "alert" not in "".join(re.findall("<script>.*?</script>", text, re.DOTALL))
     assert text.count("&lt;script&gt;alert(1)") >= 5

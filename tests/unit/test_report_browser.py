@@ -7,9 +7,10 @@ import pytest
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.report import all_figures, page, results_json
+from tests.support.ball_results import of_frame
+from tests.support.bridge_results import of_bridge
 from tests.support.browser import opened, picture, read_over
-from tests.unit.test_report_adjusted import BAD, of_bridge, rendered
-from tests.unit.test_report_balls import of_frame
+from tests.support.report_pages import BAD, rendered
 
 
 def cells_below(shown, title):

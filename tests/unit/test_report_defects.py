@@ -18,7 +18,7 @@ from processor.report.record_json import as_object
 from processor.report.results_json import plain
 from processor.store import store
 from tests.support import step_results
-from tests.unit.test_report_adjusted import Page
+from tests.support.report_pages import Page
 
 
 def drawn(result):

@@ -11,7 +11,8 @@ import pytest
 from processor.evaluation.evaluate import ErrorReport
 from processor.report import results_json, view
 from processor.report.preassembly import view as preassembly_view
-from tests.unit.test_report_adjusted import BAD, Page, of_bridge, rendered
+from tests.support.bridge_results import of_bridge
+from tests.support.report_pages import BAD, Page, rendered
 
 
 def test_the_page_carries_what_its_script_draws():

@@ -1,0 +1,77 @@
+"""The report's page made and read: its tables, scripts, addresses and text."""
+
+from __future__ import annotations
+
+from html.parser import HTMLParser
+
+from processor.evaluation.evaluate import ErrorReport
+from processor.report import all_figures, page
+
+BAD = "</script><script>alert(1)</script>"
+
+
+def rendered(execution):
+    return page.html(execution, ErrorReport(), all_figures.of_run(execution, ErrorReport()))
+
+
+class Page(HTMLParser):
+    """Tables by title, ids, scripts by their type, and all text."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tables, self.scripts, self.text, self._title, self._in, self._kind = {}, [], "", "", "", ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self._in = tag
+        if tag == "script":
+            self.scripts.append([dict(attrs).get("type", ""), ""])
+        if tag == "h3":
+            self._title = ""
+        if tag == "tr":
+            self.tables.setdefault(self._title, []).append([])
+        if tag in ("td", "th"):
+            self.tables[self._title][-1].append("")
+
+    def handle_data(self, data):
+        if self._in == "script":
+            self.scripts[-1][1] += data
+        else:
+            self.text += data
+        if self._in == "h3":
+            self._title += data
+        if self._in in ("td", "th"):
+            self.tables[self._title][-1][-1] += data
+
+    def handle_endtag(self, tag):
+        self._in = ""
+
+
+class TablesOfPage(HTMLParser):
+    """Titles of tables, their cells, and every address that a browser would load."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tables, self.addresses, self.tags = {}, [], []
+        self._title, self._in = "", ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append(tag)
+        self._in = tag
+        self.addresses += [v for k, v in attrs if k in ("src", "href", "data", "action", "srcset", "background")]
+        if tag == "h3":
+            self._title = ""
+        if tag == "tr":
+            self.tables.setdefault(self._title, []).append([])
+        if tag in ("td", "th"):
+            self.tables[self._title][-1].append("")
+
+    def handle_data(self, data):
+        if self._in == "h3":
+            self._title += data
+        if self._in in ("td", "th"):
+            self.tables[self._title][-1][-1] += data
+
+    def handle_endtag(self, tag):
+        self._in = ""
