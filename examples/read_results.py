@@ -27,9 +27,13 @@ def main(folder: Path) -> None:
         print(f"results.h5, format {file.attrs['format_version'].decode()}")
         for number, run in file["results"].items():  # one group for each step and method that was run
             print(f"  {number}: step {run['step'][()].decode()}, method {run['method'][()].decode()}")
-            for name, array in run["result"].items():
-                if isinstance(array, h5py.Dataset) and array.shape:
-                    print(f"    {name} {array.shape} {array.dtype}")
+            run["result"].visititems(show)
+
+
+def show(name: str, item: h5py.Dataset | h5py.Group) -> None:
+    """Print the name, shape and type of an array; tables such as ``balls`` are groups of columns."""
+    if isinstance(item, h5py.Dataset) and item.shape:
+        print(f"    {name} {item.shape} {item.dtype}")
 
 
 if __name__ == "__main__":

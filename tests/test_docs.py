@@ -35,7 +35,7 @@ RUN = (
     "processor run my-frame -o results --params mine.toml",
     "processor run my-frame -o results --method ray,ransac",
     "processor check results",
-    "processor report results my-frame",
+    "processor report results",
     "processor run target.e57 -o results --steps spheres",
     "processor batch projects -o all-results --jobs 2",
     "processor batch projects -o all-results --jobs 4",

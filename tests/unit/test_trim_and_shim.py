@@ -224,7 +224,7 @@ def test_no_trim_mends_what_is_misaligned():
     np.testing.assert_allclose(found.misaligned_by, [0, 0, 0, 0, 0, 0.4, 1.1, 0], atol=1e-9)
     sentences = messages("en").sentences(found.reasons)
     assert sentences.endswith(
-        "No trim removes the misalignment, 2 mm at most, of the right part at P7 top 3.1 mm up (1.1 too much), "
+        "No trim removes the misalignment, 2 mm at most, of the right part at P7 top 3.1 mm up (1.1 too much); "
         "P6 right 2.4 mm to the right (0.4 too much)."
     )
     # A work that holds with 0 % is not proposed.
