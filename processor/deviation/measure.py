@@ -7,10 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.deviation import stable_fit, surface_movement, to_result
+from processor.deviation import placement, stable_fit, surface_movement, to_result
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
+from processor.deviation.placement import Elsewhere
 from processor.deviation.result import ErrorSource, Result
 from processor.deviation.stable_fit import Fits
 from processor.deviation.surface_movement import Cloud
@@ -53,13 +54,25 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
-    placed = surface_registration.place(scan.points, surface, given, params.register)
+    scan, placed, left_out = placement.place(scan, surface, given, params.register)
     if placed.registration is not Registration.AS_GIVEN:
         placed = replace(placed, T=_fitted_pose(scan, curved, placed, params))
     measured = _measured(scan, curved, placed.T, params)
     rigid_fits = _fits(measured, params)
     distance, error, source = distances(measured, rigid_fits, placed, params)
-    return _result(scan, placed, measured, distance, rigid_fits, origin, params, (error, source))
+    result = _result(scan, placed, measured, distance, rigid_fits, origin, params, (error, source))
+    return _without(result, left_out)
+
+
+def _without(result: Result, left_out: list[Elsewhere]) -> Result:
+    """Name the scans that were left out in the first reason of a result."""
+    if not left_out:
+        return result
+    names = ", ".join(one.name for one in left_out)
+    points = sum(one.points for one in left_out)
+    first = reason("deviation.scans-elsewhere", scans=names, points=points, read=result.points_read)
+    status = Status.WEAK if result.status is Status.OK else result.status
+    return replace(result, status=status, reasons=(first, *result.reasons))
 
 
 def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, most: int = 0) -> Measured:

@@ -1,0 +1,82 @@
+"""Placement of a scan at its design, and the scans of it that do not lie there: those in another frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.deviation.cloud import ScanCloud
+from processor.geometry import mesh_distance, rigid, surface_registration
+from processor.geometry.mesh_distance import MeshSurface
+from processor.geometry.neighbors import thinned
+from processor.geometry.surface_registration import NEAR_MM, NEAR_SHARE, Placed
+from processor.model import Floats, Ints
+
+# Points in another frame lie as often from NEAR_MM to twice as far from the design's surface as nearer to it; points of
+# the structure lie nearer. The limit is half way between these shares.
+AT_DESIGN = 0.75
+FEWEST_SHARE, FEWEST_POINTS = 0.01, 20  # of a scan's points within twice NEAR_MM: fewer are there by chance
+SAMPLE = 20_000
+
+
+@dataclass(frozen=True)
+class Elsewhere:
+    """A scan or station that was left out, as it does not lie at the design, and its number of points."""
+
+    name: str
+    points: int
+
+
+def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> tuple[ScanCloud, Placed, list[Elsewhere]]:
+    """Place a scan at its design from ``given`` (4, 4), by the sources of it that lie there; the others are left out.
+
+    If none lies there, the scan is placed as a whole, and nothing is left out.
+    """
+    everything = np.flatnonzero(np.bincount(scan.source, minlength=len(scan.sources)) > 0)
+    used = everything
+    if how == "auto" and len(everything) > 1:
+        lying = [source for source in everything.tolist() if _near(scan, source, surface, given)[0] >= NEAR_SHARE]
+        used = np.array(lying or everything)
+    placed = _placed(scan, used, surface, given, how)
+    if len(everything) == 1:
+        return scan, placed, []
+    at_design = _at_design(scan, everything, surface, placed.T)
+    if len(at_design) < len(everything) and how != "none":
+        # A scan in another frame moves the pose of the others: it is found again without it.
+        start = at_design if len(at_design) else everything[np.argmax(np.bincount(scan.source)[everything])][None]
+        other = _placed(scan, start, surface, given, how)
+        others = _at_design(scan, everything, surface, other.T)
+        if len(others) >= len(at_design):
+            placed, at_design = other, others
+    if not len(at_design) or len(at_design) == len(everything):
+        return scan, placed, []
+    count = np.bincount(scan.source, minlength=len(scan.sources))
+    left_out = [Elsewhere(scan.sources[k], int(count[k])) for k in everything if k not in at_design]
+    return scan.of(at_design), placed, left_out
+
+
+def _placed(scan: ScanCloud, sources: Ints, surface: MeshSurface, given: Floats, how: str) -> Placed:
+    few = scan.of(sources)
+    return surface_registration.place(few.points, surface, given, how)
+
+
+def _at_design(scan: ScanCloud, sources: Ints, surface: MeshSurface, T: Floats) -> Ints:
+    """Return the sources that lie at the design if the scan is placed by T (4, 4)."""
+    lying = []
+    for source in sources.tolist():
+        near, about, count = _near(scan, source, surface, T)
+        enough = about >= FEWEST_SHARE and about * count >= FEWEST_POINTS
+        if enough and near >= AT_DESIGN * about:
+            lying.append(source)
+    return np.array(lying, np.int64)
+
+
+def _near(scan: ScanCloud, source: int, surface: MeshSurface, T: Floats) -> tuple[float, float, int]:
+    """Return the shares of a source's points within NEAR_MM and twice NEAR_MM of the design, and the sample's size."""
+    points = thinned(scan.points[scan.source[: len(scan.points)] == source], SAMPLE)
+    if not len(points):
+        return 0.0, 0.0, 0
+    face, distance, beyond = surface.distances(rigid.apply(T, points), 2.0 * NEAR_MM)
+    off = np.abs(distance[mesh_distance.on_face(face, beyond)])
+    return float((off <= NEAR_MM).sum()) / len(points), float((off <= 2.0 * NEAR_MM).sum()) / len(points), len(points)
