@@ -113,7 +113,7 @@ def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
             deviation_figures.deviation_map(result.core + result.origin, result.normals, result.distances, result.unit),
             deviation_figures.histogram(result.distances, result.unit),
         ]
-    with results_folder.whole(out) as making:
+    with results_folder.replacing_folder(out) as making:
         table = csv.csv_text(result.origin, result.core, result.distances, result.normals)
         results_folder.write_text(making / TABLE, table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)

@@ -10,7 +10,7 @@ import numpy as np
 
 from processor.language.messages import messages
 from processor.model import Checked, Reason, Rows
-from processor.store.codec import reason_object
+from processor.store.codec import reason_to_json
 
 
 def as_object(record: Checked) -> dict[str, Any]:
@@ -41,7 +41,7 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
 
 def reason_json(reason: Reason) -> dict[str, Any]:
     """Write a reason with its English text."""
-    return {**reason_object(reason), "text": messages("en").text(reason)}
+    return {**reason_to_json(reason), "text": messages("en").text(reason)}
 
 
 def _put_field(target: dict[str, Any], field: dataclasses.Field[Any], value: Any) -> None:
