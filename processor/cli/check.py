@@ -23,7 +23,7 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
     from processor.report import all_tables
     from processor.report import table as report_table
 
-    found = _read_results(output)
+    results = _read_results(output)
     metrics = tuple(
         Metric(
             c["step"],
@@ -34,11 +34,11 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
             limit=_number(c["limit"]),
             method=c["method"],
         )
-        for c in found["checks"]
+        for c in results["checks"]
     )
     report = ErrorReport(metrics)
     if as_json:
-        click.echo(json.dumps({"passed": report.passed, "checks": found["checks"]}, ensure_ascii=False))
+        click.echo(json.dumps({"passed": report.passed, "checks": results["checks"]}, ensure_ascii=False))
     elif metrics:
         click.echo(report_table.plain_text(all_tables.of_checks(report), most=len(metrics)))
     else:
@@ -53,9 +53,9 @@ def _number(value: float | None) -> float:
 def _read_results(output: Path) -> dict[str, Any]:
     path = output / "results.json"
     try:
-        found: dict[str, Any] = json.loads(path.read_text("utf-8"))
+        results: dict[str, Any] = json.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{path}: no readable results ({error}); run processor run again") from error
-    if found.get("format") != "processor-results" or not isinstance(found.get("checks"), list):
+    if results.get("format") != "processor-results" or not isinstance(results.get("checks"), list):
         raise InputError(f"{path}: expected results of processor, found something else")
-    return found
+    return results

@@ -28,13 +28,13 @@ def init(folder: Path, force: bool, as_json: bool) -> None:
     path = folder / files.PROJECT
     if path.exists() and not force:
         raise UsageError(f"{path}: is there already; --force replaces it")
-    found = guess.guess(folder)
-    text = guess.to_toml(found)
+    project = guess.guess(folder)
+    text = guess.to_toml(project)
     with replacing(path) as temporary:
         temporary.write_text(text, "utf-8")
     if as_json:
-        click.echo(json.dumps(guess.as_json(found), ensure_ascii=False))
+        click.echo(json.dumps(guess.as_json(project), ensure_ascii=False))
         return
-    click.echo(f"{path}: kind {found.kind}, {len(found.scans)} file(s) of scans")
-    for one in found.unsure:
-        click.echo(f"? {one}")
+    click.echo(f"{path}: kind {project.kind}, {len(project.scans)} file(s) of scans")
+    for question in project.unsure:
+        click.echo(f"? {question}")

@@ -135,9 +135,9 @@ def lines(result: Comparison) -> list[Message]:
         interval = f" ± {half:.3g}" if math.isfinite(half) else ""
         return f"{value:.6g}{interval}{unit}"
 
-    known = summary.core_points - summary.without_lod
-    total = text("{count} core points, {known} with a level of detection", count=summary.core_points, known=known)
-    if not known:
+    with_lod = summary.core_points - summary.without_lod
+    total = text("{count} core points, {known} with a level of detection", count=summary.core_points, known=with_lod)
+    if not with_lod:
         return [total, *result.notes]
     share = summary.significant_share
     beyond = text(

@@ -84,20 +84,20 @@ def value_to_json(value: Any) -> Any:
     return [value_to_json(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _reason_from_json(found: Any) -> Reason:
+def _reason_from_json(stored: Any) -> Reason:
     """Return the reason that an object of :func:`reason_to_json` holds. Raises KeyError and TypeError for another."""
     return Reason(
-        str(found["code"]), {str(name): value_from_json(value) for name, value in dict(found["values"]).items()}
+        str(stored["code"]), {str(name): value_from_json(value) for name, value in dict(stored["values"]).items()}
     )
 
 
-def value_from_json(found: Any) -> Any:
+def value_from_json(stored: Any) -> Any:
     """Return the value that an object of :func:`value_to_json` holds."""
-    if isinstance(found, dict):
-        if "word" not in found:
-            return _reason_from_json(found)
-        return VOCABULARIES[found["of"]](found["word"])
-    return tuple(value_from_json(item) for item in found) if isinstance(found, list) else found
+    if isinstance(stored, dict):
+        if "word" not in stored:
+            return _reason_from_json(stored)
+        return VOCABULARIES[stored["of"]](stored["word"])
+    return tuple(value_from_json(item) for item in stored) if isinstance(stored, list) else stored
 
 
 def _encoded(text: str) -> bytes:

@@ -187,9 +187,9 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
     results = header["format"] == FORMATS["results"]
     readable = (RESULTS_VERSION,) if results else READABLE
     if header["format_version"] not in readable:
-        found = header["format_version"] or "none"
+        version = header["format_version"] or "none"
         advice = "; run processor run again" if results else ""
-        faults.append(f"expected format_version {' or '.join(readable)}, found {found}{advice}")
+        faults.append(f"expected format_version {' or '.join(readable)}, found {version}{advice}")
     if header["units"] != "mm":
         faults.append(f"expected units mm, found {header['units'] or 'none'}")
     return faults
