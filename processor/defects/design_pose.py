@@ -10,7 +10,6 @@ import numpy as np
 
 from processor.defects.params import Params
 from processor.geometry import merging, mesh_distance, rigid, surface_registration
-from processor.geometry.principal import AMBIGUOUS
 from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Reason, Scene, Status, reason
 
@@ -56,7 +55,7 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
         return DesignPose(None, error, (reason("defects.not-placed"),))
     T = rigid.transform(np.eye(3), origin) @ placed.T @ rigid.transform(np.eye(3), -cloud.origin)
     reasons, status = [reason("defects.best-fit")], Status.OK
-    if placed.ambiguity < AMBIGUOUS:
+    if placed.ambiguous:
         status = Status.AMBIGUOUS
         reasons.append(reason("defects.ambiguous"))
     return DesignPose(T, error, tuple(reasons), status)

@@ -20,7 +20,6 @@ from processor.deviation.result import ErrorSource, Result
 from processor.geometry import m3c2, mesh_distance, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
-from processor.geometry.principal import AMBIGUOUS
 from processor.geometry.surface_registration import NEAR_MM, Placed, Registration
 from processor.model import Floats, Ints, Reason, Scene, Status, reason
 
@@ -50,7 +49,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
-    placed = surface_registration.place(scan.points, surface, given, params.register)
+    placed = surface_registration.place(scan.points, surface, given, params.register, scan.scanner)
     diameter = params.projection_diameter_mm or m3c2.rounded(m3c2.diameter_for(POINTS_A_CORE, scan.spacing_mm))
     area = mesh_distance.area(vertices, surface.faces)
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
@@ -227,7 +226,7 @@ def _status(placed: Placed, total: m3c2.Summary, params: Params) -> tuple[Status
         if not np.isfinite(placed.T_best_fit).all():
             status = Status.WEAK
             reasons.append(reason("deviation.coarse-only"))
-    if placed.ambiguity < AMBIGUOUS:
+    if placed.ambiguous:
         status = Status.AMBIGUOUS
         reasons.append(reason("deviation.ambiguous", ratio=placed.ambiguity))
     if placed.weak and placed.registration is not Registration.AS_GIVEN and status is Status.OK:
