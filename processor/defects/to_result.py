@@ -65,7 +65,9 @@ def result_of(search: Search, params: Params, origin: Floats) -> Result:
     surface, field = search.surface, search.field
     seen = field.seen > 0
     cell = surface.charts.cell_mm
-    registration = search.alignment.sd(surface.centres[seen], surface.outward[seen])
+    registration = np.hypot(
+        search.alignment.sd(surface.centres[seen], surface.outward[seen]), np.sqrt(field.stations[seen])
+    )
     noise = _median(field.noise[seen])
     formal = np.sqrt(field.variance[seen]) * search.levels.inflation[0]
     examined = float(surface.share[seen].sum()) * cell**2
