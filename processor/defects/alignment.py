@@ -62,6 +62,11 @@ class Alignment:
         sd: Floats = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, self.covariance, J), 0.0))
         return sd
 
+    def pose_covariance(self) -> Floats:
+        """Return the covariance (6, 6) of the whole about ``centre``, with what stations leave undetermined."""
+        total: Floats = self.covariance + self.response @ self.station_covariance @ self.response.T
+        return total
+
 
 @dataclass(frozen=True)
 class StationBlocks:

@@ -260,6 +260,13 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     )
 
 
+def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
+    """Whether points (n, 3), or half of them beside clutter, lie near the surface at the pose that was found."""
+    few = thinned(points, FINE_POINTS)
+    near, _ = surface.tree.query(rigid.apply(placed.T, few), distance_upper_bound=NEAR_MM, workers=-1)
+    return bool(np.isfinite(near).mean() >= NEAR_SHARE)
+
+
 def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
     """Register points (n, 3), even in density, from any pose to samples of a design with its principal axes."""
     size = float(np.linalg.norm(np.ptp(design.points, axis=0)))

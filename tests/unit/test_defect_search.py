@@ -10,6 +10,7 @@ import trimesh
 from processor.defects import (
     alignment,
     baseline,
+    detect,
     deviation_field,
     pictures,
     regions,
@@ -19,7 +20,7 @@ from processor.defects import (
 )
 from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
-from processor.geometry import mesh_distance
+from processor.geometry import mesh_distance, rigid
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.pipeline import as_json
 from processor.report.defects import figures, section
@@ -225,6 +226,37 @@ def test_stations_that_are_off_are_no_defect():
         scans.append(dataclasses.replace(scan, points=scan.points + off * ray / np.linalg.norm(ray, axis=1)[:, None]))
     result = defects_step.run(dataclasses.replace(scene, scans=tuple(scans)), defects_step.Params())
     assert found(result) == []
+
+
+def test_the_last_movement_is_added_once(monkeypatch):
+    """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
+    scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
+    settled = defects_step.run(scene, defects_step.Params())
+    monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
+    again = defects_step.run(scene, defects_step.Params())
+    assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
+    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)  # plates fix y
+    assert again.covariance.shape == (6, 6)
+    assert 0.0 < np.sqrt(again.covariance[4, 4]) < 1.0
+
+
+def test_no_defect_is_sure_where_another_attitude_fits_as_well():
+    """A dent in a box that looks the same from four sides, scanned in a frame of its own."""
+    vertices, faces = box((0.0, 0.0, 0.0), (2000.0, 600.0, 400.0))
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    points, facet = trimesh.sample.sample_surface(solid, 60_000, seed=1)
+    depth = bump(9.0, 150.0, (700.0, 300.0))(points[:, 0], points[:, 1]) * (solid.face_normals[facet][:, 2] > 0.5)
+    points = points - [0.0, 0.0, 1.0] * depth[:, None] + np.random.default_rng(1).normal(0.0, 0.3, points.shape)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 2.0])), np.array([5e4, -3e4, 2e3]))
+    scans = (Scan("S1", rigid.apply(T, points), T_project_scan=np.eye(4)),)
+    scene = Scene("box", "structure", scans, structure=StructureDesign("box", vertices, faces))
+    result = defects_step.run(scene, defects_step.Params())
+    assert result.status == "ambiguous"
+    assert len(result.defects) > 0
+    assert result.defects.doubtful.all()
+    assert (result.defects.confidence <= 0.5).all()
+    assert all(row[-1].code == "defects.pose-ambiguous" for row in result.defects.reasons)
+    assert "no defects found and" in str(section.REPORT.summary(result)[0])
 
 
 def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
