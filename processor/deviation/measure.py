@@ -53,7 +53,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
-    placed = surface_registration.place(scan.points, surface, given, params.register)
+    placed = surface_registration.place(scan.points, surface, given, params.register, scan.scanner)
     if placed.registration is not Registration.AS_GIVEN:
         placed = replace(placed, T=_fitted_pose(scan, curved, placed, params))
     measured = _measured(scan, curved, placed.T, params)
