@@ -22,6 +22,7 @@ from processor.space_frame.spheres.final_fit import finish
 from processor.space_frame.spheres.gauss_newton import LEAST_COSINE
 from processor.space_frame.spheres.occlusion import AXIS_MM, FLAT_MM, Ends
 from processor.space_frame.spheres.records import (
+    AMBIGUOUS,
     AimedCrops,
     Chosen,
     Fits,
@@ -240,6 +241,10 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         earlier = Chosen(before.states, before.sizes, before.energy, before.second, before.second_energy)
         for new, old in zip(chosen, earlier, strict=True):
             new[~undecided] = old[~undecided]
+    # a doubtful size is no evidence against the nominal one
+    nominal = (chosen.second == problem.expected) & (chosen.second_energy < chosen.energy + AMBIGUOUS)
+    chosen.second[nominal] = chosen.sizes[nominal]
+    chosen.sizes[nominal] = chosen.states[nominal, 3] = problem.expected[nominal]
     priors = Priors(problem.centre_weight, chosen.sizes, np.full(len(chosen.sizes), size_weight))
     done = finish(problem.crops, masks, model, setting.model_points, priors, chosen.states, 4.5 * sigma)
     fits = Fits(

@@ -21,7 +21,6 @@ from scipy.sparse.csgraph import breadth_first_order, maximum_flow
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
 from processor.space_frame.members.members import Measured
-from processor.space_frame.members.records import Nodes
 from processor.space_frame.points import sphere_crops
 from processor.space_frame.points.source import Source
 from processor.space_frame.spheres import occlusion
@@ -57,10 +56,10 @@ def balls(source: Source, measured: Measured, threads: int = 0) -> Bools:
     rows = np.flatnonzero(np.isfinite(nodes.positions).all(axis=1))
     sphere, neck = np.zeros(nodes.count), np.zeros(nodes.count)
     if len(rows):
-        placed = Nodes(nodes.positions, nodes.covariance, nodes.axes, nodes.scatter)
-        ends = occlusion.ends(placed, members)
-        crops = sphere_crops.gather(source, nodes.positions[rows], REACH_MM, threads, POINTS * len(rows))
-        crops = aimed(crops, nodes.positions[rows], np.array(source.scanners, np.float64), threads)
+        ends = occlusion.ends(nodes, members)
+        places = nodes.positions[rows]
+        near = sphere_crops.gather(source, places, REACH_MM, threads, POINTS * len(rows))
+        crops = aimed(near, places, np.array(source.scanners, np.float64), threads)
         noise = float(np.median(members.rms)) if len(members.rms) else 1.0
         sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + AXIS_MM**2))
         over_ranges(partial(_evidence, rows, crops, ends, sd, sphere, neck), len(rows), threads)
@@ -125,7 +124,8 @@ def _evidence(rows, crops, ends, sd, sphere, neck, first, last):  # type: ignore
     """Fill the log likelihood ratios of the nodes in rows ``first`` to ``last``: of a sphere, and of narrowed tubes."""
     for j in range(first, last):
         k = rows[j]
-        points, rays = crops.points[crops.start[j] : crops.start[j + 1]], crops.rays[crops.start[j] : crops.start[j + 1]]
+        about = slice(crops.start[j], crops.start[j + 1])
+        points, rays = crops.points[about], crops.rays[about]
         own = slice(ends.start[k], ends.start[k + 1])
         feet, axes, tubes = ends.points[own], ends.directions[own], ends.tube_radii[own]
         if len(tubes) == 0:
