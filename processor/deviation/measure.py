@@ -19,7 +19,6 @@ from processor.geometry import m3c2, mesh_distance, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
 from processor.geometry.neighbors import thinned
-from processor.geometry.principal import AMBIGUOUS
 from processor.geometry.surface_registration import NEAR_MM, Placed, Registration
 from processor.model import Floats, Reason, Scene, Status, reason
 
@@ -256,7 +255,7 @@ def _status(
     if placed.registration is not Registration.AS_GIVEN and fits.stable.share < HALF:
         status = Status.WEAK
         reasons.insert(0, reason("deviation.no-stable-half", share=share, limit_mm=fits.limit_mm))
-    if placed.ambiguity < AMBIGUOUS:
+    if placed.ambiguous:
         status = Status.AMBIGUOUS
         reasons.append(reason("deviation.ambiguous", ratio=placed.ambiguity))
     if placed.weak and placed.registration is not Registration.AS_GIVEN and status is Status.OK:

@@ -18,6 +18,7 @@ from processor.model import Floats, Ints
 AT_DESIGN = 0.75
 FEWEST_SHARE, FEWEST_POINTS = 0.01, 20  # of a scan's points within twice NEAR_MM: fewer are there by chance
 SAMPLE = 20_000
+MOST_TRIALS = 6  # scans that are placed one by one, if all together do not lie at the design
 
 
 @dataclass(frozen=True)
@@ -41,24 +42,25 @@ def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> tup
     placed = _placed(scan, used, surface, given, how)
     if len(everything) == 1:
         return scan, placed, []
+    count = np.bincount(scan.source, minlength=len(scan.sources))
     at_design = _at_design(scan, everything, surface, placed.T)
-    if len(at_design) < len(everything) and how != "none":
-        # A scan in another frame moves the pose of the others: it is found again without it.
-        start = at_design if len(at_design) else everything[np.argmax(np.bincount(scan.source)[everything])][None]
-        other = _placed(scan, start, surface, given, how)
-        others = _at_design(scan, everything, surface, other.T)
-        if len(others) >= len(at_design):
-            placed, at_design = other, others
+    if how != "none" and not np.array_equal(at_design, used):
+        # A scan in another frame moves the pose of the others: it is found again without it, or by one scan.
+        largest = everything[np.argsort(-count[everything], kind="stable")][:MOST_TRIALS]
+        for start in [at_design] if len(at_design) else largest[:, None]:
+            other = _placed(scan, start, surface, given, how)
+            others = _at_design(scan, everything, surface, other.T)
+            if not len(at_design) or count[others].sum() > count[at_design].sum() or np.array_equal(others, at_design):
+                placed, at_design = other, others
     if not len(at_design) or len(at_design) == len(everything):
         return scan, placed, []
-    count = np.bincount(scan.source, minlength=len(scan.sources))
     left_out = [Elsewhere(scan.sources[k], int(count[k])) for k in everything if k not in at_design]
     return scan.of(at_design), placed, left_out
 
 
 def _placed(scan: ScanCloud, sources: Ints, surface: MeshSurface, given: Floats, how: str) -> Placed:
     few = scan.of(sources)
-    return surface_registration.place(few.points, surface, given, how)
+    return surface_registration.place(few.points, surface, given, how, few.scanner)
 
 
 def _at_design(scan: ScanCloud, sources: Ints, surface: MeshSurface, T: Floats) -> Ints:
