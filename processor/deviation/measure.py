@@ -7,11 +7,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.deviation import placement, stable_fit, surface_movement, to_result
+from processor.deviation import stable_fit, surface_movement, to_result
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
-from processor.deviation.placement import Elsewhere
+from processor.deviation.placement import Placement, place
 from processor.deviation.result import ErrorSource, Result
 from processor.deviation.stable_fit import Fits
 from processor.deviation.surface_movement import Cloud
@@ -53,24 +53,29 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
-    scan, placed, left_out = placement.place(scan, surface, given, params.register)
+    placement = place(scan, surface, given, params.register)
+    scan, placed = placement.scan, placement.placed
     if placed.registration is not Registration.AS_GIVEN:
         placed = replace(placed, T=_fitted_pose(scan, curved, placed, params))
     measured = _measured(scan, curved, placed.T, params)
     rigid_fits = _fits(measured, params)
     distance, error, source = distances(measured, rigid_fits, placed, params)
     result = _result(scan, placed, measured, distance, rigid_fits, origin, params, (error, source))
-    return _without(result, left_out)
+    return _doubted(result, placement)
 
 
-def _without(result: Result, left_out: list[Elsewhere]) -> Result:
-    """Name the scans that were left out in the first reason of a result."""
-    if not left_out:
+def _doubted(result: Result, placement: Placement) -> Result:
+    """Put first why a result is not sure: the scans that were left out, or that the scan does not lie at the design."""
+    status = result.status
+    if not placement.lies and placement.placed.registration is Registration.COARSE:
+        first, status = reason("deviation.not-at-design"), Status.FAILED
+    elif placement.left_out:
+        names = ", ".join(one.name for one in placement.left_out)
+        points = sum(one.points for one in placement.left_out)
+        first = reason("deviation.scans-elsewhere", scans=names, points=points, read=result.points_read)
+        status = Status.WEAK if status is Status.OK else status
+    else:
         return result
-    names = ", ".join(one.name for one in left_out)
-    points = sum(one.points for one in left_out)
-    first = reason("deviation.scans-elsewhere", scans=names, points=points, read=result.points_read)
-    status = Status.WEAK if result.status is Status.OK else result.status
     return replace(result, status=status, reasons=(first, *result.reasons))
 
 

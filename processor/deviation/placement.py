@@ -29,7 +29,17 @@ class Elsewhere:
     points: int
 
 
-def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> tuple[ScanCloud, Placed, list[Elsewhere]]:
+@dataclass(frozen=True)
+class Placement:
+    """A scan without what was left out of it, its pose, and whether anything of it lies at the design there."""
+
+    scan: ScanCloud
+    placed: Placed
+    left_out: tuple[Elsewhere, ...]
+    lies: bool
+
+
+def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> Placement:
     """Place a scan at its design from ``given`` (4, 4), by the sources of it that lie there; the others are left out.
 
     If none lies there, the scan is placed as a whole, and nothing is left out.
@@ -40,11 +50,9 @@ def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> tup
         lying = [source for source in everything.tolist() if _near(scan, source, surface, given)[0] >= NEAR_SHARE]
         used = np.array(lying or everything)
     placed = _placed(scan, used, surface, given, how)
-    if len(everything) == 1:
-        return scan, placed, []
     count = np.bincount(scan.source, minlength=len(scan.sources))
     at_design = _at_design(scan, everything, surface, placed.T)
-    if how != "none" and not np.array_equal(at_design, used):
+    if len(everything) > 1 and how != "none" and not np.isin(used, at_design).all():
         # A scan in another frame moves the pose of the others: it is found again without it, or by one scan.
         largest = everything[np.argsort(-count[everything], kind="stable")][:MOST_TRIALS]
         for start in [at_design] if len(at_design) else largest[:, None]:
@@ -52,10 +60,11 @@ def place(scan: ScanCloud, surface: MeshSurface, given: Floats, how: str) -> tup
             others = _at_design(scan, everything, surface, other.T)
             if not len(at_design) or count[others].sum() > count[at_design].sum() or np.array_equal(others, at_design):
                 placed, at_design = other, others
+    lies = bool(len(at_design)) or surface_registration.fits_design(placed, scan.points, surface)
     if not len(at_design) or len(at_design) == len(everything):
-        return scan, placed, []
-    left_out = [Elsewhere(scan.sources[k], int(count[k])) for k in everything if k not in at_design]
-    return scan.of(at_design), placed, left_out
+        return Placement(scan, placed, (), lies)
+    left_out = tuple(Elsewhere(scan.sources[k], int(count[k])) for k in everything if k not in at_design)
+    return Placement(scan.of(at_design), placed, left_out, lies)
 
 
 def _placed(scan: ScanCloud, sources: Ints, surface: MeshSurface, given: Floats, how: str) -> Placed:

@@ -191,6 +191,35 @@ def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     assert np.isfinite(result.core.lod95).mean() > 0.9
 
 
+def test_a_station_of_a_merged_scan_is_named_too():
+    scene, _ = scene_of(15, lambda p: 0.0 * p, count=30_000)
+    points = scene.scans[0].points.copy()
+    station = (np.arange(len(points)) % 3).astype(np.int32)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 0.8])), np.array([300.0, 200.0, 500.0]))
+    points[station == 1] = rigid.apply(T, points[station == 1])
+    merged = Scan("merged", points, point_station=station)
+    stations = Stations(("S1", "S2", "S3"), np.array([[9e3, 9e3, 9e3], [-9e3, 9e3, -9e3], [0.0, -9e3, 9e3]]))
+    result = deviation_step.run(
+        dataclasses.replace(scene, scans=(merged,), stations=stations), deviation_step.Params(register="none")
+    )
+    assert result.status == "weak"
+    assert result.reasons[0].values["scans"] == "S2"
+    assert result.points_kept < 21_000
+
+
+def test_a_scan_of_something_else_fails():
+    scene, _ = scene_of(13, lambda p: 0.0 * p, count=20_000)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, 0.2, 1.0])), np.array([90_000.0, 0.0, 0.0]))
+    rng = np.random.default_rng(1)
+    ground = np.column_stack(
+        [rng.uniform(-9e3, 9e3, 20_000), rng.uniform(-6e3, 6e3, 20_000), rng.uniform(0, 3e3, 20_000)]
+    )
+    other = dataclasses.replace(scene, scans=(Scan("yard", rigid.apply(T, ground)),))
+    result = deviation_step.run(other, deviation_step.Params())
+    assert result.status == "failed"
+    assert codes(result)[0] == "deviation.not-at-design"
+
+
 def test_after_a_stitch_that_failed_later_steps_do_not_run(tmp_path, monkeypatch):
     scene, _ = scene_of(12, count=5000)
     jobs = pipeline.plan(("stitch", "deviation", "defects"), (), {}, 0)
