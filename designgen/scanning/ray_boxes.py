@@ -28,10 +28,10 @@ def boxes(centres, radii, reach, spread, step, lowest, rows, columns, side):  # 
             low = max(low, int(np.floor((elevation - half - lowest) / step)))
             high = min(high, int(np.ceil((elevation + half - lowest) / step)))
             if abs(elevation) + half < 0.5 * np.pi - 1e-6 and half < 1.5:
-                side = np.arcsin(min(1.0, np.sin(half) / np.cos(elevation)))
+                half_azimuth = np.arcsin(min(1.0, np.sin(half) / np.cos(elevation)))
                 azimuth = np.arctan2(y, x)
-                first = int(np.floor((azimuth - side) * across))
-                last = int(np.ceil((azimuth + side) * across))
+                first = int(np.floor((azimuth - half_azimuth) * across))
+                last = int(np.ceil((azimuth + half_azimuth) * across))
         if low > high:
             continue
         whole = last - first >= columns

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from designgen.designs import structure
-from designgen.scanning import footprints, scanner
+from designgen.scanning import footprints, scanner, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.ray_kernels import Beam
 from designgen.scanning.raycast import Grid
@@ -159,6 +159,30 @@ def test_a_scan_does_not_depend_on_its_strips(monkeypatch):
     for other in found[1:]:
         for column in ("row", "column", "points", "source", "part", "range_error_mm"):
             np.testing.assert_array_equal(getattr(other, column), getattr(found[0], column))
+
+
+def test_mixed_pixels_do_not_depend_on_where_azimuth_begins():
+    """Balls all around, seen by a scanner turned by whole columns: other balls lie over the seam of the azimuth."""
+    builder = Builder()
+    for i, azimuth in enumerate(np.radians(np.arange(0.0, 360.0, 4.0))):
+        unit = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        for z in (-800.0, 0.0, 900.0):
+            builder.sphere(i, "ball", (4000.0 + 700.0 * (i % 3)) * unit + [0.0, 0.0, z], 130.0, [])
+    surfaces, params = builder.done(), scanner.Params(step_mrad=6.0, specular=0.0)
+    columns = round(2.0 * np.pi / 6e-3)
+    scans = []
+    for turned in (0, 5, 8, 10, 350):
+        T = survey.levelled(np.zeros(3), 2.0 * np.pi * turned / columns)
+        returns = scanning_returns.scan(surfaces, T, WIDE, params, 0, "S1").returns
+        column = (returns.column + turned) % columns
+        order = np.lexsort((returns.row, column))
+        ranges = np.linalg.norm(returns.points, axis=1)
+        scans.append([values[order] for values in (column, returns.row, returns.source, ranges)])
+    assert (scans[0][2] == scanning_returns.MIXED).sum() > 5_000
+    for scan in scans[1:]:
+        for values, expected in zip(scan[:3], scans[0][:3], strict=True):
+            np.testing.assert_array_equal(values, expected)
+        np.testing.assert_allclose(scan[3], scans[0][3], atol=1e-6)
 
 
 @pytest.mark.slow
