@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from designgen import __version__, recipes
+from designgen import __version__, recipe_files
 from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.software import check_same, versions
@@ -43,7 +43,7 @@ LOSSES = {
 }
 
 
-def make_scene(path: Path, name: str, recipe: recipes.Recipe, seed: int | None) -> tuple[int, int, int]:
+def make_scene(path: Path, name: str, recipe: recipe_files.Recipe, seed: int | None) -> tuple[int, int, int]:
     """Make the scene of a recipe with its truth and write it to ``path``; returns seed, number of scans, and of points.
 
     ``seed`` replaces the recipe's. The same recipe and seed give the same bytes, whatever the time, host and number of
@@ -67,7 +67,7 @@ def software() -> dict[str, str]:
     return {"designgen": __version__, **versions(SOFTWARE)}
 
 
-def _provenance(name: str, recipe: recipes.Recipe, seed: int, software: dict[str, str]) -> dict[str, Any]:
+def _provenance(name: str, recipe: recipe_files.Recipe, seed: int, software: dict[str, str]) -> dict[str, Any]:
     return {"software": software, "recipe": name, "parameters": recipe, "seed": seed}
 
 
@@ -91,7 +91,7 @@ class Job:
     folder: str  # absolute, as a cluster's workers have another working directory
     file: str
     recipe: str
-    parameters: recipes.Recipe
+    parameters: recipe_files.Recipe
     seed: int
     varied: tuple[str, ...]  # values as typed, in the order of their keys
     software: dict[str, str]
@@ -161,7 +161,7 @@ def _split(values: str, text: str) -> list[str]:
 
 
 def plan(
-    folder: Path, name: str, recipe: recipes.Recipe, varied: dict[str, list[str]], first: int | None, count: int
+    folder: Path, name: str, recipe: recipe_files.Recipe, varied: dict[str, list[str]], first: int | None, count: int
 ) -> list[Job]:
     """List the jobs of ``count`` seeds from ``first`` (default: the recipe's) times all varied values.
 
@@ -186,7 +186,7 @@ def plan(
         for combination in itertools.product(*varied.values()):
             settings = [f"{key}={value}" for key, value in zip(varied, combination, strict=True)]
             # A copy, as settings of inner sections would change the recipe of the other jobs.
-            parameters = recipes.overridden(copy.deepcopy(recipe), settings)
+            parameters = recipe_files.overridden(copy.deepcopy(recipe), settings)
             file = f"{stem}-{len(jobs) + 1:05d}-seed{seed}.h5"
             jobs.append(
                 Job(

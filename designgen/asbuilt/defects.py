@@ -14,8 +14,8 @@ import numpy as np
 
 from designgen.checks import expect
 from designgen.designs import plate_row
+from designgen.designs.box_and_tube import Box, Component
 from designgen.designs.patch import Bools, Displacement, Patch
-from designgen.designs.structure import Box, Component
 from processor.model import Floats, UsageError
 
 CLASSES = (

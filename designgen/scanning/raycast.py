@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from designgen.designs.patch import Bools, Surface
-from designgen.scanning import ray_boxes, ray_kernels
+from designgen.scanning import angular_bounds, ray_kernels
 from designgen.scanning.surfaces import CONE, DISC, SPHERE, TRIANGLE, Surfaces
 from processor.model import Floats, Ints, Labels, Shorts
 
@@ -90,11 +90,11 @@ def view(
     cuts = surfaces.cuts.copy()
     cuts[:, :3] = cuts[:, :3] @ R.T
     centres = surfaces.piece_centre @ R.T + t
-    covered = ray_boxes.boxes(
+    covered = angular_bounds.grid_windows(
         centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns,
         side,
     )  # fmt: skip
-    boxes, start = ray_boxes.by_strip(covered, width, -(-grid.columns // width), side)
+    boxes, start = angular_bounds.by_strip(covered, width, -(-grid.columns // width), side)
     return View(
         shapes=ray_kernels.Shapes(surfaces.kind, numbers, cuts, surfaces.cut_start),
         pieces=ray_kernels.Pieces(surfaces.piece_shape, centres, surfaces.piece_radius),

@@ -18,7 +18,7 @@ import numpy as np
 
 from designgen.designs.patch import Bools
 from designgen.frames import rigid
-from designgen.scanning import footprints, ray_kernels, raycast
+from designgen.scanning import edge_footprints, ray_kernels, raycast
 from designgen.scanning.raycast import Grid, View
 from designgen.scanning.scanner import BEAM_RINGS, Params, Scanner
 from designgen.scanning.surfaces import Surfaces
@@ -99,8 +99,8 @@ def scan(
     nearest = np.array([max(scanner.min_range_mm, 1.0)])
     spread = 2.0 * float(scanner.beam_angle(nearest)[0]) + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
     place: Floats = T_scene_scanner[:3, 3]
-    least = max(float(nearest[0]), footprints.nearest_mm(surfaces, place))
-    margin = footprints.margin(grid, outermost(params.sub_rays) * float(scanner.beam_angle(np.array([least]))[0]))
+    least = max(float(nearest[0]), edge_footprints.nearest_mm(surfaces, place))
+    margin = edge_footprints.margin(grid, outermost(params.sub_rays) * float(scanner.beam_angle(np.array([least]))[0]))
     work = _Work(
         surfaces=surfaces,
         view=raycast.view(surfaces, T_scanner_scene, grid, STRIP, margin.side, scanner.max_range_mm, spread),
@@ -163,7 +163,7 @@ class _Work:
     params: Params
     key: tuple[int, int]
     keep_hits: bool
-    margin: footprints.Margin
+    margin: edge_footprints.Margin
     least: float  # lower bound of the range to any surface, mm
 
     def strip(self, number: int) -> Returns:
@@ -183,7 +183,7 @@ class _Work:
         edge, near = np.zeros(shape.shape, bool), t
         if self.params.sub_rays > 1:
             surface = np.where(shape >= 0, self.surfaces.surface[shape], -1)
-            edge, near = footprints.mark(
+            edge, near = edge_footprints.mark(
                 surface, t, thin, used, self.margin, self.grid, beam_, outermost(self.params.sub_rays), self.least
             )
             inside &= ~edge

@@ -15,7 +15,7 @@ from designgen.frames import rigid
 from designgen.randomness import generator, random_pose
 from designgen.reading import filled
 from designgen.scanning import clutter, sampler, survey
-from designgen.scanning.modes import ByRays, Scanning
+from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
 from processor.model import (

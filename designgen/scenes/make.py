@@ -7,7 +7,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from designgen.scanning import modes
+from designgen.scanning.scan_settings import scan_settings_of
 from designgen.scenes import arch_bridge, space_frame, structure
 from processor.model import Scene, Truth, UsageError
 
@@ -37,4 +37,4 @@ def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")
     # The number of BLAS threads changes the order of its sums, and with it the last bits.
     with threadpool_limits(1, user_api="blas"):
-        return maker(name, recipe, modes.read(recipe), used)
+        return maker(name, recipe, scan_settings_of(recipe), used)

@@ -12,7 +12,7 @@ from designgen.designs import space_frame
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import clutter, frame_surfaces, sampler, survey
-from designgen.scanning.modes import ByRays, Scanning
+from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
 from processor.model import FrameDesign, FrameTruth, PointLabels, Scan, Scene, Truth

@@ -10,12 +10,12 @@ import numpy as np
 
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
-from designgen.designs import plate_row, structure, structure_types
+from designgen.designs import box_and_tube, plate_row, structure_registry
 from designgen.designs.patch import Bools, Displacement, Patch
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import clutter, picking, sampler, scanner, survey
-from designgen.scanning.modes import ByRays, Scanning
+from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
 from designgen.sequences import van_der_corput
@@ -35,14 +35,14 @@ from processor.model import (
 )
 
 TRUTH_STEP_MM = 250.0
-Components = tuple[structure.Component, ...]
+Components = tuple[box_and_tube.Component, ...]
 PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
 Built = tuple[PartPatches, Displacement | None, DefectTruth | None]
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of a structure of type ``structure.type``: stadium-roof, truss-bridge or plate-row."""
-    components = structure_types.design(recipe)
+    components = structure_registry.design(recipe)
     kind = recipe["structure"]["type"]
     patches, displacement, defects = BUILDERS[kind](components, recipe, seed)
     names = tuple(component.name for component in components)
@@ -71,7 +71,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"), hidden)
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
         labels = (PointLabels("scan", names, cloud.part, cloud.source),)
-    vertices, faces = structure.mesh_of(components)
+    vertices, faces = box_and_tube.mesh_of(components)
     scene = Scene(
         name,
         "structure",
@@ -130,7 +130,7 @@ def _truss(components: Components, recipe: Mapping[str, Any], seed: int) -> Buil
 
 
 def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
-    form = structure_types.params(recipe)
+    form = structure_registry.params(recipe)
     sizes = filled(asbuilt_defects.Params, recipe, "asbuilt")
     patches: PartPatches = []
     placed: list[tuple[plate_row.Place, asbuilt_defects.Defect]] = []
@@ -164,7 +164,7 @@ def _as_designed(components: Components) -> PartPatches:
 def _hidden(components: Components) -> Callable[[int, Floats, Floats], Bools]:
     """Return a function that marks the places on the design's faces inside of a body."""
     faces = [patch for _, patch in _as_designed(components)]
-    inside = structure.covered(components)
+    inside = box_and_tube.covered(components)
     return lambda row, p, q: inside(faces[row].at(p, q))
 
 
@@ -228,6 +228,6 @@ def _truth(components: Components, displacement: Displacement | None, origin: Fl
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)
-    visible = ~structure.covered(components)(x)
+    visible = ~box_and_tube.covered(components)(x)
     x = x[visible]
     return StructureTruth(x + origin, np.vstack(normals)[visible], displacement(x))

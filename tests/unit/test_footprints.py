@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen.designs import structure
-from designgen.scanning import footprints, scanner, survey
+from designgen.designs import box_and_tube
+from designgen.scanning import edge_footprints, scanner, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.ray_kernels import Beam
 from designgen.scanning.raycast import Grid
@@ -17,14 +17,14 @@ QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
 
 def mark_every_ray(monkeypatch):
     """Cut every ray of a strip into sub-rays."""
-    mark = footprints.mark
+    mark = edge_footprints.mark
 
     def every(surface, t, thin, used, margin, *rest):
         edge, near = mark(surface, t, thin, used, margin, *rest)
         edge[margin.side : margin.side + used] = True
         return edge, near
 
-    monkeypatch.setattr(footprints, "mark", every)
+    monkeypatch.setattr(edge_footprints, "mark", every)
 
 
 def test_nothing_thin_between_the_rays_is_overlooked(monkeypatch):
@@ -126,10 +126,10 @@ def large_faces():
         middle *= rng.uniform(2000.0, 9000.0) / np.linalg.norm(middle)
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         size = rng.uniform(150.0, 2500.0, 3)
-        for patch in structure.Box(middle, axes, size).patches():
+        for patch in box_and_tube.Box(middle, axes, size).patches():
             builder.patch(i, patch)
         builder.sphere(i, "ball", rng.uniform(-5000.0, 5000.0, 3), 120.0, [])
-    for patch in structure.Box(np.array([30.0, -20.0, 6000.0]), np.eye(3), np.full(3, 900.0)).patches():
+    for patch in box_and_tube.Box(np.array([30.0, -20.0, 6000.0]), np.eye(3), np.full(3, 900.0)).patches():
         builder.patch(40, patch)
     return builder.done()
 
@@ -218,12 +218,12 @@ def marked(surface, t, reach, side=0, used=None, across=0.01, level=1.0):
     """Mark the rays of a grid of steps of 10 mrad whose footprints reach so far, rad; nothing is thin."""
     rows = surface.shape[1]
     beside = np.full(rows, side, np.int32)
-    margin = footprints.Margin(
+    margin = edge_footprints.Margin(
         side=side, cast=beside, marked=beside, whole=np.zeros(rows, bool), level=np.full(rows, level)
     )
     grid = Grid(step=0.01, lowest=0.0, rows=rows, columns=2.0 * np.pi / across)
     used = len(surface) - 2 * side if used is None else used
-    return footprints.mark(surface, t, np.full(t.shape, np.inf), used, margin, grid, Beam(0.0, reach), 1.0, 1.0)
+    return edge_footprints.mark(surface, t, np.full(t.shape, np.inf), used, margin, grid, Beam(0.0, reach), 1.0, 1.0)
 
 
 def test_edges_are_where_a_neighbour_is_on_another_surface():
@@ -268,12 +268,12 @@ def test_nothing_is_nearer_than_the_nearest_range():
         ([200.0, 200.0, 10.0], np.hypot(100.0 * np.sqrt(2.0), 10.0)),
     ]
     for place, expected in cases:
-        assert footprints.nearest_mm(plate.done(), np.array(place)) == pytest.approx(expected)
+        assert edge_footprints.nearest_mm(plate.done(), np.array(place)) == pytest.approx(expected)
     ball = Builder()
     ball.sphere(0, "ball", np.array([300.0, 400.0, 0.0]), 120.0, [])
-    assert footprints.nearest_mm(ball.done(), np.zeros(3)) == pytest.approx(380.0)
-    assert footprints.nearest_mm(ball.done(), np.array([300.0, 400.0, 50.0])) == 0.0
-    assert footprints.nearest_mm(Builder().done(), np.zeros(3)) == np.inf
+    assert edge_footprints.nearest_mm(ball.done(), np.zeros(3)) == pytest.approx(380.0)
+    assert edge_footprints.nearest_mm(ball.done(), np.array([300.0, 400.0, 50.0])) == 0.0
+    assert edge_footprints.nearest_mm(Builder().done(), np.zeros(3)) == np.inf
 
 
 @pytest.mark.slow

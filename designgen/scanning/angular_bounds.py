@@ -8,7 +8,7 @@ from numba import njit
 
 
 @njit(cache=True, nogil=True)
-def boxes(centres, radii, reach, spread, step, lowest, rows, columns, side):  # type: ignore[no-untyped-def]
+def grid_windows(centres, radii, reach, spread, step, lowest, rows, columns, side):  # type: ignore[no-untyped-def]
     """Return the boxes (b, 5) of the pieces: piece, first and last column, first and last row.
 
     Columns extend ``side`` beyond the first and the last, so that a box over the seam is on both sides of it.
