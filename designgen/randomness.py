@@ -12,10 +12,10 @@ from processor.model import Floats
 POSE_REACH_MM = 5000.0  # largest offset of a scan's frame along each axis
 
 
-def generator(seed: int, purpose: str) -> np.random.Generator:
-    """Return the generator of a seed and purpose: draws for one purpose do not change those for another."""
+def generator(seed: int, purpose: str, *numbers: int) -> np.random.Generator:
+    """Return the generator of a seed, purpose and ``numbers`` from 1: draws for one do not change those for another."""
     digest = hashlib.sha256(purpose.encode()).digest()
-    return np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
+    return np.random.default_rng([seed, int.from_bytes(digest[:8], "little"), *numbers])
 
 
 def random_pose(rng: np.random.Generator) -> Floats:

@@ -1,4 +1,4 @@
-"""Compiled kernels of the ray caster: the boxes that shapes cover on the grid, in float64."""
+"""Compiled kernels of the ray caster: the windows of the angular grid that shapes cover, in float64."""
 # Numba infers the types of the arguments: the kernels have no annotations.
 
 from __future__ import annotations
@@ -9,9 +9,11 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def grid_windows(centres, radii, reach, spread, step, lowest, rows, columns, side):  # type: ignore[no-untyped-def]
-    """Return the boxes (b, 5) of the pieces: piece, first and last column, first and last row.
+    """Return the windows (b, 5) of bounding spheres on the grid: sphere, first and last column, first and last row.
 
-    Columns extend ``side`` beyond the first and the last, so that a box over the seam is on both sides of it.
+    Centres (k, 3) in the scanner's frame, ``radii`` (k,) and ``reach``, the greatest range, are in mm. ``spread``, the
+    largest angle between a ray and its nominal direction, ``step`` and ``lowest`` are in rad. Columns extend ``side``
+    beyond the first and the last, so that a window over the seam of the azimuth is on both sides of it.
     """
     result = np.empty((3 * len(radii), 5), np.int32)
     count = 0
@@ -35,24 +37,22 @@ def grid_windows(centres, radii, reach, spread, step, lowest, rows, columns, sid
         if low > high:
             continue
         whole = last - first >= columns
-        for turn in range(-1, 2):
-            a, z_ = max(first + turn * columns, -side), min(last + turn * columns, columns - 1 + side)
-            if whole and turn != 0:
-                continue
-            if whole:
-                a, z_ = -side, columns - 1 + side
-            if a <= z_:
-                result[count, 0], result[count, 1], result[count, 2] = k, a, z_
+        if whole:
+            first, last = -side, columns - 1 + side
+        for wrap in range(0 if whole else -1, 1 if whole else 2):
+            left, right = max(first + wrap * columns, -side), min(last + wrap * columns, columns - 1 + side)
+            if left <= right:
+                result[count, 0], result[count, 1], result[count, 2] = k, left, right
                 result[count, 3], result[count, 4] = low, high
                 count += 1
     return result[:count].copy()
 
 
 @njit(cache=True, nogil=True)
-def by_strip(boxes, width, strips, side):  # type: ignore[no-untyped-def]
-    """Return the boxes (c, 5) sorted by strip, and each strip's first (strips + 1,).
+def by_strip(windows, width, strips, side):  # type: ignore[no-untyped-def]
+    """Return the windows (c, 5) sorted by strip, and each strip's first (strips + 1,).
 
-    A box is in every strip it touches, with ``side`` columns on either side of the strip.
+    A window is in every strip it touches, with ``side`` columns on either side of the strip.
     """
     start = np.zeros(strips + 1, np.int64)
     for fill in range(2):
@@ -60,11 +60,11 @@ def by_strip(boxes, width, strips, side):  # type: ignore[no-untyped-def]
             start = np.cumsum(start)
             place = start[:-1].copy()
             result = np.empty((start[-1], 5), np.int32)
-        for b in range(len(boxes)):
-            low = max(0, (boxes[b, 1] - side) // width)
-            for s in range(low, min(strips - 1, (boxes[b, 2] + side) // width) + 1):
+        for w in range(len(windows)):
+            low = max(0, (windows[w, 1] - side) // width)
+            for s in range(low, min(strips - 1, (windows[w, 2] + side) // width) + 1):
                 if fill:
-                    result[place[s]] = boxes[b]
+                    result[place[s]] = windows[w]
                     place[s] += 1
                 else:
                     start[s + 1] += 1

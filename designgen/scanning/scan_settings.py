@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from designgen.reading import filled
 from designgen.scanning import sampler, scanner
@@ -14,8 +14,10 @@ from processor.model import UsageError
 
 @dataclass(frozen=True)
 class ByRays:
-    """A scan by rays of a device."""
+    """A scan by rays of a device; spacing and noise differ from point to point."""
 
+    spacing_mm: ClassVar[float] = float("nan")
+    sigma_mm: ClassVar[float] = float("nan")
     params: scanner.Params
     device: scanner.Scanner
 

@@ -101,7 +101,8 @@ class Params:
     sub_rays: int = 7
     reflectance: float = 0.5
     specular: float = 0.3  # specular fraction of the reflection, as on bare steel; 0 = matt
-    stations: tuple[int, ...] = (2, 2)  # two: a grid below a frame; one: a sequence of which any length is a start
+    # (rows, columns) of a grid, or one number of stations; adding stations keeps the earlier ones
+    stations: tuple[int, ...] = (2, 2)
     distance_mm: float = 5_000.0  # of the stations from a part's surface
     height_mm: float = 1_600.0  # of the scanner above the ground
     clutter: int = 0  # number of objects that are no part of the structure

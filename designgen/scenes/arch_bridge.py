@@ -86,8 +86,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         arch=ArchTruth(part_names, np.array(poses), np.array(key_scan), np.array(key_bridge), edges),
         stations=survey.joined_truth(station_truth),
         as_built=ledger.record() if "asbuilt" in recipe else None,
-        spacing_mm=sampler.spacing_mm(scanning),
-        sigma_mm=sampler.sigma_mm(scanning),
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
     )
 
 
@@ -106,12 +106,12 @@ def _survey_part(
     axes = np.stack([along, [0.0, 1.0, 0.0], np.cross(along, [0.0, 1.0, 0.0])])
     middle = ends.mean(axis=0)
     half = np.abs((ends - middle) @ axes.T).max(axis=0)
-    poses = survey.around(axes, middle, half, params, seed, f"{part.name}/")
+    poses = survey.stations_around_box(axes, middle, half, params, seed, f"{part.name}/")
     places = [T[:3, 3] for T in poses.values()]
     for i in range(params.clutter):
         rng = generator(seed, f"clutter {part.name} {i}")
         clutter.add_pole(builder, places[i % len(places)], middle, axes[2], (0.3, 0.6), rng, on_ground=False)
-    return survey.survey(builder.done(), part_names, poses, scanning.device, params, seed)
+    return survey.survey(builder.to_surfaces(), part_names, poses, scanning.device, params, seed)
 
 
 def _scaled(at: Surface, factor: float) -> Surface:

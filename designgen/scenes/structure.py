@@ -56,7 +56,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
             builder.patch(part, patch)
         poses = _places(kind, patches, params, seed)
         _add_poles(builder, poses, patches, params.clutter, seed)
-        surveyed = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
+        surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
         picks = _picks(recipe, scans, station_truth, seed)
         if not params.registered:
@@ -88,8 +88,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         defects=defects and dataclasses.replace(defects, centres=defects.centres + origin),
         stations=station_truth,
         as_built=_ledger(kind, recipe),
-        spacing_mm=sampler.spacing_mm(scanning),
-        sigma_mm=sampler.sigma_mm(scanning),
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
     )
 
 
@@ -194,7 +194,7 @@ def _places(kind: str, patches: PartPatches, params: scanner.Params, seed: int) 
         scans = params.scans_at_first if i < params.repeated else 1
         for k in range(scans):
             heading = generator(seed, f"heading {station} {k}").uniform(0.0, 2.0 * np.pi)
-            poses[station if scans == 1 else f"{station}-{k + 1}"] = survey.levelled(at, heading)
+            poses[station if scans == 1 else f"{station}-{k + 1}"] = survey.levelled_pose(at, heading)
     return poses
 
 

@@ -29,7 +29,10 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
 
     def places(n):
         params = scanner.Params(stations=(n,))
-        found = [survey.below(low, high, params, 3), survey.around(AXES, low, HALF, params, 3, "p/")]
+        found = [
+            survey.stations_below_box(low, high, params, 3),
+            survey.stations_around_box(AXES, low, HALF, params, 3, "p/"),
+        ]
         for name in ("stadium-roof", "truss-bridge", "plates-defects"):
             recipe = recipe_files.load(name)[1]
             components = structure_registry.design(recipe)
@@ -44,14 +47,14 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
 
 def test_stations_stand_within_their_area():
     low, high = np.array([0.0, 0.0, 6000.0]), np.array([30_000.0, 20_000.0, 8000.0])
-    at = np.array([T[:2, 3] for T in survey.below(low, high, scanner.Params(stations=(12,)), 3).values()])
+    at = np.array([T[:2, 3] for T in survey.stations_below_box(low, high, scanner.Params(stations=(12,)), 3).values()])
     assert (at >= low[:2]).all()
     assert (at <= high[:2]).all()
     quarters = (at > high[:2] / 2.0) @ [1, 2]
     assert (np.bincount(quarters, minlength=4) >= 2).all()
     near = np.linalg.norm(at[:, None] - at, axis=2) + 1e9 * np.eye(12)
     assert near.min() > 2000.0  # 600 m2 for 12: 7 m apart were a grid's
-    grid = survey.below(low, high, scanner.Params(stations=(2, 3)), 3)
+    grid = survey.stations_below_box(low, high, scanner.Params(stations=(2, 3)), 3)
     cells = [(int(T[0, 3] // 15_000.0), int(T[1, 3] // (20_000.0 / 3.0))) for T in grid.values()]
     assert cells == [(i, j) for i in range(2) for j in range(3)]
 
