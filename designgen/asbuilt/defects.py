@@ -164,10 +164,10 @@ def _whole(kind: str, params: Params, form: plate_row.Params) -> Defect:
         depth = params.sized("bend_mm")
         displacement, volume = _out(lambda x: -depth * np.cos(np.pi * x[:, 0] / L)), area * depth * 2.0 / np.pi
     elif kind == "twist":
-        turn = 1e-3 * params.sized("twist_mrad")
-        displacement, depth = _twist(turn / L), 0.5 * H * np.sin(0.5 * turn)
+        angle = 1e-3 * params.sized("twist_mrad")
+        displacement, depth = _twist(angle / L), 0.5 * H * np.sin(0.5 * angle)
         # Two quarters inward, two outward: integral of |b| over the height times |sin| of the angle along the length.
-        volume = 0.25 * H**2 * 2.0 * L / turn * (1.0 - np.cos(0.5 * turn))
+        volume = 0.25 * H**2 * 2.0 * L / angle * (1.0 - np.cos(0.5 * angle))
     elif kind == "waviness":
         high, wave_number = params.sized("wave_mm"), 2.0 * np.pi / params.wave_length_mm
         half_waves, rest = divmod(0.5 * L * wave_number, np.pi)
@@ -239,8 +239,8 @@ def _out(height: Callable[[Floats], Floats]) -> Displacement:
 
 def _bump(a: float, b: float, depth: float, radius: float) -> Displacement:
     def height(x: Floats) -> Floats:
-        away = np.minimum(((x[:, 0] - a) ** 2 + (x[:, 1] - b) ** 2) / radius**2, 1.0)
-        result: Floats = -depth * (1.0 - away) ** 2
+        share = np.minimum(((x[:, 0] - a) ** 2 + (x[:, 1] - b) ** 2) / radius**2, 1.0)
+        result: Floats = -depth * (1.0 - share) ** 2
         return result
 
     return _out(height)
@@ -355,12 +355,9 @@ def movement(params: MovementParams, components: tuple[Component, ...]) -> Displ
 
     def displacement(points: Floats) -> Floats:
         x, y, z = ((points - middle) / half).T
-        away = np.minimum(np.hypot(x, y), 1.0)
-        inward = 1.0 - away
-        sag = (
-            -params.sag_mm * inward * (2.0 - inward)
-            + params.ripple_mm * np.cos(params.ripples * np.arctan2(y, x)) * inward
-        )
+        inward = 1.0 - np.minimum(np.hypot(x, y), 1.0)
+        ripple = params.ripple_mm * np.cos(params.ripples * np.arctan2(y, x)) * inward
+        sag = -params.sag_mm * inward * (2.0 - inward) + ripple
         lean = params.lean_mm * 0.5 * (z + 1.0)
         return np.stack([lean, 0.4 * lean * x, sag], axis=1)
 

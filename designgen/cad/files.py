@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import re
-import shutil
 import tempfile
 import unicodedata
 from collections.abc import Mapping
@@ -16,10 +14,10 @@ from typing import Any
 
 from designgen.cad.bodies import UNITS_MM, CadFile
 from designgen.cad.process import received
+from designgen.new_folder import check_new, new_folder
 from designgen.ply import write_mesh
 from processor.jobs.process import Cause, isolated, run
 from processor.model import InputError, UsageError
-from processor.store import store
 
 STEP_SUFFIXES, IFC_SUFFIXES = (".step", ".stp"), (".ifc",)
 MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"
@@ -108,8 +106,7 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
 
     Raises UsageError where the folder exists and is not empty, InputError as :func:`read`.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"{folder}: exists and is not empty; name a new folder")
+    check_new(folder)
     content = _content(path)
     cad = _read(path, content, units, LIMIT_S, MEMORY_BYTES)
     report: dict[str, Any] = {
@@ -122,9 +119,7 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
         "bodies": [],
         "problems": list(cad.problems),
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with new_folder(folder) as making:
         taken = set[str]()
         for body in cad.bodies:
             file = f"{_file_stem(body.name, taken)}.ply"
@@ -144,23 +139,13 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
             )
         text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         (making / "import.json").write_text(text, encoding="utf-8")
-        for written in (*making.iterdir(), making):
-            store.sync(written)
-        if folder.exists():
-            folder.rmdir()
-        os.chmod(making, 0o755)
-        os.replace(making, folder)
-        store.sync(folder.parent)
-    except BaseException:
-        shutil.rmtree(making, ignore_errors=True)
-        raise
     return report
 
 
 def summary(report: Mapping[str, Any]) -> list[str]:
     """Return the result of :func:`import_file` as lines of text: the unit, then a line for each body."""
-    other = f"; the file says {report['unit_said'] or 'none'}" if report["unit_said"] != report["unit"] else ""
-    lines = [f"{report['file']}: unit {report['unit']} ({report['unit_mm']:.10g} mm, {report['unit_from']}{other})"]
+    in_file = f"; the file says {report['unit_said'] or 'none'}" if report["unit_said"] != report["unit"] else ""
+    lines = [f"{report['file']}: unit {report['unit']} ({report['unit_mm']:.10g} mm, {report['unit_from']}{in_file})"]
     for body in report["bodies"]:
         x, y, z = body["size_mm"]
         volume = f"{body['volume_mm3']:.6g} mm3" if body["kind"] == "solid" else "no volume: a surface"

@@ -56,18 +56,10 @@ def build(params: Params) -> tuple[ArchPart, ...]:
     plates = Plates(params.plate_bottom_mm, params.plate_top_mm, params.plate_web_mm)
     cuts = [curve.length * c for c in (0.0, *params.joints, 1.0)]
     parts = []
-    for i, name in enumerate(NAMES):
-        section = {"s0_mm": cuts[i], "s1_mm": cuts[i + 1], "width_mm": params.width_mm, "height_mm": params.height_mm}
-        if name.startswith("rib"):
-            parts.append(arch_rib.build(name, curve, arch_rib.Params(**section, plates=plates)))
-            continue
-        foot = arch_foot.Params(
-            **section,
-            base_width_mm=params.base_width_mm,
-            base_height_mm=params.base_height_mm,
-            taper=params.taper,
-            plates=plates,
-            base_at="start" if i == 0 else "end",
-        )
-        parts.append(arch_foot.build(name, curve, foot))
+    for name, ends in zip(NAMES, pairwise(cuts), strict=True):
+        part = arch_rib.build(name, curve, ends, params.width_mm, params.height_mm, plates)
+        if name.startswith("foot"):
+            base_at = "start" if name == NAMES[0] else "end"
+            part = arch_foot.build(part, params.base_width_mm, params.base_height_mm, params.taper, base_at)
+        parts.append(part)
     return tuple(parts)

@@ -313,10 +313,10 @@ def _pad_faces(part: ArchPart) -> list[Face]:
         return Face(name, at, lambda p, q: np.full_like(p, PAD_SIZE_MM * height))
 
     result = [rectangle("pad", origin + PAD_HEIGHT_MM * up, along, left, PAD_SIZE_MM)]
-    sides = [(sign, axis, other) for axis, other in ((along, left), (left, along)) for sign in (1.0, -1.0)]
-    for i, (sign, axis, other) in enumerate(sides):
-        centre = origin + sign * half * axis + 0.5 * PAD_HEIGHT_MM * up
-        result.append(rectangle(f"pad-side-{i}", centre, other, up, PAD_HEIGHT_MM))
+    sides = [(sign, out, edge) for out, edge in ((along, left), (left, along)) for sign in (1.0, -1.0)]
+    for i, (sign, out, edge) in enumerate(sides):
+        centre = origin + sign * half * out + 0.5 * PAD_HEIGHT_MM * up
+        result.append(rectangle(f"pad-side-{i}", centre, edge, up, PAD_HEIGHT_MM))
     return result
 
 

@@ -85,10 +85,10 @@ def presets() -> dict[str, dict[str, Any]]:
 
 def preset(name: str) -> dict[str, Any]:
     """Return the numbers of a class of scanner; UsageError for an unknown one."""
-    known = presets()
-    if name not in known:
-        raise UsageError(f"scan.scanner: expected one of {', '.join(known)}, got {name!r}")
-    return {key: value for key, value in known[name].items() if key in Scanner.__dataclass_fields__}
+    classes = presets()
+    if name not in classes:
+        raise UsageError(f"scan.scanner: expected one of {', '.join(classes)}, got {name!r}")
+    return {key: value for key, value in classes[name].items() if key in Scanner.__dataclass_fields__}
 
 
 @dataclass(frozen=True)

@@ -29,9 +29,9 @@ def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple
     if kind not in MAKERS:
         raise UsageError(f"recipe {name}: kind: expected one of {', '.join(MAKERS)}, got {kind!r}")
     section, maker = MAKERS[kind]
-    known = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
-    if unknown := sorted(set(recipe) - known):
-        raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(known))}")
+    keys = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
+    if unknown := sorted(set(recipe) - keys):
+        raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")
     used = recipe.get("seed", 0) if seed is None else seed
     if not isinstance(used, int) or isinstance(used, bool) or used < 0:
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")

@@ -44,7 +44,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     """Make the scene of a structure of type ``structure.type``: stadium-roof, truss-bridge or plate-row."""
     components = structure_registry.design(recipe)
     kind = recipe["structure"]["type"]
-    patches, displacement, defects = BUILDERS[kind](components, recipe, seed)
+    patches, displacement, defects = _built(kind, components, recipe, seed)
     names = tuple(component.name for component in components)
     stations, station_truth, picks = None, None, None
     origin = np.zeros(3)
@@ -103,12 +103,16 @@ def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth
     return picking.pick(scans, [T_project_scan[scan.name] for scan in scans], params, seed)[0]
 
 
-def _stadium(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+def _built(kind: str, components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+    if kind == "plate-row":
+        return _plates(components, recipe, seed)
+    designed = _as_designed(components)
     if "asbuilt" not in recipe:
-        return _as_designed(components), None, None
+        return designed, None, None
+    if kind == "truss-bridge":
+        raise UsageError("asbuilt: a truss-bridge is built as designed; leave the section asbuilt out")
     displacement = asbuilt_defects.movement(filled(asbuilt_defects.MovementParams, recipe, "asbuilt"), components)
-    built = [(part, patch.displaced(displacement)) for part, patch in _as_designed(components)]
-    return built, displacement, None
+    return [(part, patch.displaced(displacement)) for part, patch in designed], displacement, None
 
 
 def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
@@ -121,12 +125,6 @@ def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
         ledger.note("ripple at the middle", "roof", params.ripple_mm, "mm")
         ledger.note("ripples around", "roof", params.ripples, "count")
     return ledger.record()
-
-
-def _truss(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
-    if "asbuilt" in recipe:
-        raise UsageError("asbuilt: a truss-bridge is built as designed; leave the section asbuilt out")
-    return _as_designed(components), None, None
 
 
 def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
@@ -152,9 +150,6 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
         volume_mm3=np.array([defect.volume_mm3 for _, defect in placed]),
     )
     return patches, None, truth
-
-
-BUILDERS = {"stadium-roof": _stadium, "truss-bridge": _truss, "plate-row": _plates}
 
 
 def _as_designed(components: Components) -> PartPatches:
@@ -187,9 +182,9 @@ def _places(kind: str, patches: PartPatches, params: scanner.Params, seed: int) 
             side = 1.0 if i % 2 else -1.0
             at = np.array([12_000.0 * (i // 2) + 3_000.0, side * params.distance_mm, params.height_mm])
         else:
-            turn = 2.0 * np.pi * fraction
+            angle = 2.0 * np.pi * fraction
             reach = 0.5 * (high - low)[:2] * 0.45
-            at = np.array([*(0.5 * (low + high)[:2] + reach * [np.cos(turn), np.sin(turn)]), params.height_mm])
+            at = np.array([*(0.5 * (low + high)[:2] + reach * [np.cos(angle), np.sin(angle)]), params.height_mm])
         at[:2] += rng.uniform(-300.0, 300.0, 2)
         scans = params.scans_at_first if i < params.repeated else 1
         for k in range(scans):
