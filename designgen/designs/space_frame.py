@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.checks import expect
+from designgen.checks import expect_all
 from designgen.designs import bolt_ball
 from processor.model import Floats, Ints, UsageError
 
@@ -46,7 +46,8 @@ class Params:
         reach = 0.5 * self.spacing_mm * (max(nodes) - 1)
         flat = self.shape != "dome" or self.rise_mm < 0.7 * reach
         least = 4.0 * max(self.radii_mm, default=0.0)
-        for fits, key, value, expected in (
+        expect_all(
+            "frame",
             (min(nodes) >= 2, "nodes_x, nodes_y", nodes, "2 or more"),
             (count <= 1_000_000, "nodes_x * nodes_y", count, "a million at most"),
             (self.layers in (1, 2), "layers", self.layers, "1 or 2"),
@@ -57,8 +58,7 @@ class Params:
             (self.spacing_mm > least, "spacing_mm", self.spacing_mm, f"more than four radii ({least:g})"),
             (self.depth_mm > 0.0, "depth_mm", self.depth_mm, "a length above 0"),
             *((radius > 0.0, "radii_mm", radius, "radii above 0") for radius in self.radii_mm),
-        ):
-            expect(fits, f"frame.{key}", value, expected)
+        )
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen.checks import expect
+from designgen.checks import expect_all
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
 from designgen.designs.patch import Bools, Patch, within_triangle
@@ -30,11 +30,14 @@ class Params:
     member_reach_mm: float = 0.0  # frames: members are sampled to this distance from each ball; 0 = over their length
 
     def __post_init__(self) -> None:
-        expect(0.05 <= self.spacing_mm <= 1000.0, "scan.spacing_mm", self.spacing_mm, "0.05 to 1000")
-        expect(0.0 <= self.sigma_mm <= 1000.0, "scan.sigma_mm", self.sigma_mm, "0 to 1000")
-        expect(0.0 <= self.outlier_share < 1.0, "scan.outlier_share", self.outlier_share, "0 to less than 1")
-        expect(self.inner_depth_mm > 0.0, "scan.inner_depth_mm", self.inner_depth_mm, "a length above 0")
-        expect(self.member_reach_mm >= 0.0, "scan.member_reach_mm", self.member_reach_mm, "0 or a length")
+        expect_all(
+            "scan",
+            (0.05 <= self.spacing_mm <= 1000.0, "spacing_mm", self.spacing_mm, "0.05 to 1000"),
+            (0.0 <= self.sigma_mm <= 1000.0, "sigma_mm", self.sigma_mm, "0 to 1000"),
+            (0.0 <= self.outlier_share < 1.0, "outlier_share", self.outlier_share, "0 to less than 1"),
+            (self.inner_depth_mm > 0.0, "inner_depth_mm", self.inner_depth_mm, "a length above 0"),
+            (self.member_reach_mm >= 0.0, "member_reach_mm", self.member_reach_mm, "0 or a length"),
+        )
 
 
 @dataclass(frozen=True)

@@ -155,7 +155,7 @@ def in_project(
     T_project_scene = translation(origin)
     registered = T_project_scene @ surveyed.registered
     truth = dataclasses.replace(surveyed.truth, T_project_station=T_project_scene @ surveyed.truth.T_project_station)
-    stations = with_stations(None, surveyed.truth.ids, registered)
+    stations = stations_of(surveyed.truth.ids, registered)
     if merge:
         scan, labels = merged(surveyed, "scan", np.eye(4), 0)
         return (dataclasses.replace(scan, origin=origin),), (labels,), stations, truth
@@ -163,23 +163,13 @@ def in_project(
     return tuple(scans), surveyed.labels, stations, truth
 
 
-def with_stations(stations: Stations | None, ids: tuple[str, ...], poses: Floats) -> Stations:
-    """Return the stations with those of poses T_frame_station (k, 4, 4) added."""
-    if stations is None:
-        return Stations(ids, poses[:, :3, 3], poses)
-    return Stations(
-        (*stations.ids, *ids),
-        np.vstack([stations.positions, poses[:, :3, 3]]),
-        np.concatenate([stations.T_project_station, poses]),
-    )
+def stations_of(ids: tuple[str, ...], poses: Floats) -> Stations:
+    """Return the stations of poses T_frame_station (k, 4, 4)."""
+    return Stations(ids, poses[:, :3, 3], poses)
 
 
-def joined_truth(truths: Sequence[StationTruth]) -> StationTruth | None:
-    """Return the stations' truths of several surveys as one; None without any."""
-    if not truths:
-        return None
+def joined_truth(truths: Sequence[StationTruth]) -> StationTruth:
+    """Return the stations' truths of several surveys as one."""
     columns = ("T_project_station", "zero_offset_mm", "scale_ppm", "tilt")
-    return StationTruth(
-        tuple(name for truth in truths for name in truth.ids),
-        *(np.concatenate([getattr(truth, column) for truth in truths]) for column in columns),
-    )
+    joined = {column: np.concatenate([getattr(truth, column) for truth in truths]) for column in columns}
+    return StationTruth(tuple(name for truth in truths for name in truth.ids), **joined)
