@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from processor.model import UsageError
-from processor.store import store
+from processor.store.atomic_file import sync
 
 
 def check_new(folder: Path) -> None:
@@ -27,12 +27,12 @@ def new_folder(folder: Path) -> Iterator[Path]:
     try:
         yield making
         for written in (*making.rglob("*"), making):
-            store.sync(written)
+            sync(written)
         if folder.exists():
             folder.rmdir()
         os.chmod(making, 0o755)
         os.replace(making, folder)
-        store.sync(folder.parent)
+        sync(folder.parent)
     except BaseException:
         shutil.rmtree(making, ignore_errors=True)
         raise
