@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from designgen.curves import Curve
-from designgen.designs.patch import Bools, Patch, Surface
+from designgen.designs.patch import Bools, Patch, Surface, outside
 from processor.model import Floats
 
 if TYPE_CHECKING:
@@ -152,10 +152,7 @@ class Face:
 
     def present(self, p: Floats, q: Floats) -> Bools:
         """Mark the parameters (n,) that lie outside of all holes."""
-        result = np.ones(len(p), bool)
-        for p0, p1, q0, q1 in self.holes:
-            result &= ~((p > p0) & (p < p1) & (q > q0) & (q < q1))
-        return result
+        return outside(p, q, self.holes)
 
     def patch(self, across: int = 1) -> Patch:
         """Return the face as a patch whose net has ``across`` cells in q."""

@@ -11,11 +11,7 @@ from designgen.designs.box_and_tube import Component
 from designgen.reading import filled
 from processor.model import UsageError
 
-TYPES: dict[Any, ModuleType] = {
-    "stadium-roof": stadium_roof,
-    "truss-bridge": truss_bridge,
-    "plate-row": plate_row,
-}
+TYPES: dict[Any, ModuleType] = {"stadium-roof": stadium_roof, "truss-bridge": truss_bridge, "plate-row": plate_row}
 
 
 def params(recipe: Mapping[str, Any]) -> Any:

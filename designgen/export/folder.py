@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen.export import formats, solids
+from designgen.export import METRES, formats, solids
 from designgen.export.formats import Written
 from designgen.new_folder import check_new, new_folder
 from designgen.ply import write_mesh
@@ -96,7 +96,7 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_me
     (folder / "scans").mkdir()
     lines = [f"name = {_quoted(scene.name)}", f"kind = {_quoted(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
-    scale = 1.0 if format_ == "ply" else formats.METRES
+    scale = 1.0 if format_ == "ply" else METRES
     design = _design(scene, folder, scale, with_meshes=with_meshes)
     if design:
         lines.append(f"design = {_quoted(design)}")

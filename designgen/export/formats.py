@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from designgen.export import e57
+from designgen.export import METRES, e57
 from designgen.ply import records, write_columns
 from processor.model import Floats, Ints, Scan, Stations, UsageError
 
-METRES = 0.001  # of a millimetre
 LAS_STEP_M = 0.0001
 
 

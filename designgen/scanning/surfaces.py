@@ -117,12 +117,7 @@ class Builder:
         return len(self._labels) - 1
 
     def _add(
-        self,
-        kind: int,
-        part: int,
-        surface: int,
-        numbers: Sequence[float],
-        pieces: Sequence[tuple[Floats, float]],
+        self, kind: int, part: int, surface: int, numbers: Sequence[float], pieces: Sequence[tuple[Floats, float]]
     ) -> None:
         row = np.zeros(NUMBERS)
         row[: len(numbers)] = numbers

@@ -18,17 +18,7 @@ from designgen.scanning import clutter, sampler, survey
 from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
-from processor.model import (
-    ArchDesign,
-    ArchTruth,
-    DesignPart,
-    Floats,
-    PointLabels,
-    Scan,
-    Scene,
-    StationTruth,
-    Truth,
-)
+from processor.model import ArchDesign, ArchTruth, DesignPart, Floats, PointLabels, Scan, Scene, StationTruth, Truth
 
 EDGE_POINTS = 501  # on each bottom edge in the truth
 

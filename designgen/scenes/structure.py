@@ -203,7 +203,7 @@ def _add_poles(builder: Builder, poses: dict[str, Floats], patches: PartPatches,
         rng = generator(seed, f"clutter {i}")
         target = middles[rng.integers(len(middles))]
         station = np.array(places[i % len(places)])
-        clutter.add_pole(builder, station, target, np.array([0.0, 0.0, 1.0]), (0.2, 0.4), rng, on_ground=True)
+        clutter.add_pole(builder, station, target, clutter.UP, (0.2, 0.4), rng, on_ground=True)
 
 
 def _truth(components: Components, displacement: Displacement | None, origin: Floats) -> StructureTruth | None:
