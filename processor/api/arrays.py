@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from processor.deviation import measure as deviation_measure
 from processor.geometry import m3c2 as m3c2_distances
-from processor.geometry import mesh_distance, normal_orientation, principal, rigid, surface_registration
+from processor.geometry import mesh_distance, normal_orientation, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.geometry.merging import MergedCloud
 from processor.geometry.mesh_distance import MeshSurface
@@ -156,7 +156,7 @@ def register(
     surface = mesh_distance.of_design(corners - origin, triangles.astype(np.int64))
     given = rigid.transform(np.eye(3), scan_origin - origin)
     placed = surface_registration.place(local, surface, given, "auto")
-    rival = placed.T_rival if placed.ambiguity < principal.AMBIGUOUS else None
+    rival = placed.T_rival if placed.ambiguous else None
     if rival is not None and scanners is not None:
         seen_from = np.broadcast_to(_finite(scanners, "scanners"), cloud.shape) - scan_origin
         shares = [_facing_share(local, seen_from, surface, T) for T in (placed.T, rival)]
