@@ -44,7 +44,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     """Make the scene of a structure of type ``structure.type``: stadium-roof, truss-bridge or plate-row."""
     components = structure_registry.design(recipe)
     kind = recipe["structure"]["type"]
-    patches, displacement, defects = _built(kind, components, recipe, seed)
+    patches, displacement, defects = built_faces(kind, components, recipe, seed)
     names = tuple(component.name for component in components)
     stations, station_truth, picks = None, None, None
     origin = np.zeros(3)
@@ -103,7 +103,8 @@ def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth
     return picking.pick(scans, [T_project_scan[scan.name] for scan in scans], params, seed)[0]
 
 
-def _built(kind: str, components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+def built_faces(kind: str, components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+    """Return the faces as built, the displacement of a whole structure, and the truth of plates' defects."""
     if kind == "plate-row":
         return _plates(components, recipe, seed)
     designed = _as_designed(components)

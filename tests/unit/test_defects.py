@@ -24,7 +24,7 @@ def row_of(row, kinds, sizes, seed=1):
     structure = {"type": "plate-row", "components": list(kinds), **row}
     recipe = {"kind": "structure", "structure": structure, "asbuilt": sizes}
     components = structure_registry.design(recipe)
-    return components, *scenes_structure.BUILDERS["plate-row"](components, recipe, seed)[::2]
+    return components, *scenes_structure.built_faces("plate-row", components, recipe, seed)[::2]
 
 
 def volume(patches):
