@@ -8,11 +8,13 @@ import pytest
 
 from processor.geometry import rigid
 from processor.language.messages import messages
-from processor.model import Scene
+from processor.model import Scene, reason
+from processor.preassembly import assemble
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.parts import assignment
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.attitude import Shapes
+from processor.preassembly.result import Result
 from processor.preassembly.verdicts import reasons
 from tests.support import arch_clouds
 
@@ -95,6 +97,16 @@ def test_two_scans_of_one_part_keep_it():
     assert [scan.parts for scan in solved] == [("rib2",), ("rib2",)]
     assert [bool(scan.wrong) for scan in solved] == [True, False]
     assert [one.code for one in ScanParts("S", "rib1", ()).wrong] == ["preassemble.scan-of-none"]
+    assert [one.code for one in ScanParts("rib1", "rib1", ("rib2",)).wrong] == ["preassemble.named-scan-of-other"]
+
+
+def test_a_scan_that_is_assigned_to_no_part_is_named(monkeypatch):
+    scene, _ = arch_clouds.bridge(spacing_mm=200.0, seed=1)
+    spare = type(scene.scans[0])("spare", scene.scans[0].points, component="crane")
+    monkeypatch.setattr(assemble, "assemble", lambda *_: Result("ok", "adjustment"))
+    scene = Scene("b", "arch-bridge", (*scene.scans, spare), arch=scene.arch)
+    result = preassembly_step.run(scene, preassembly_step.Params())
+    assert result.reasons == (reason("preassemble.scans-without-part", scans=("spare",)),)
 
 
 @pytest.mark.slow

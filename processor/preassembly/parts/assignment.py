@@ -37,6 +37,8 @@ class ScanParts:
             return ()
         if not self.parts:
             return (reason("preassemble.scan-of-none", scan=self.scan),)
+        if len(self.parts) == 1 and self.scan == self.assigned:
+            return (reason("preassemble.named-scan-of-other", scan=self.scan, part=self.parts[0]),)
         if len(self.parts) == 1:
             return (reason("preassemble.scan-of-other", scan=self.scan, part=self.parts[0], assigned=self.assigned),)
         return (reason("preassemble.scan-of-others", scan=self.scan, parts=self.parts, assigned=self.assigned),)
