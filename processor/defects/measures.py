@@ -13,7 +13,7 @@ from scipy.spatial import cKDTree
 from processor.defects.alignment import Alignment, rays_to
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
-from processor.defects.places.profiles import Cells
+from processor.defects.places.profiles import PlaceCells
 from processor.defects.regions import Region, unrolled
 from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
 from processor.geometry.mesh_distance import Bools
@@ -154,7 +154,7 @@ def measure(
     )
 
 
-def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: Bools) -> Cells | None:
+def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: Bools) -> PlaceCells | None:
     """Return the cells about a region that are seen and of no other place; None where it is small or on a cylinder.
 
     ``claimed`` (cells,) marks the cells of all places.
@@ -172,7 +172,7 @@ def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: B
     used = (field.seen[rows] > 0) & (~claimed[rows] | np.isin(rows, region.cells))
     rows, grid = rows[used], np.stack([u, v], axis=1)[used]
     corners = layout(charts, np.full(1, chart), surface.vertices[np.unique(surface.faces[surface.chart_of == chart])])
-    return Cells(
+    return PlaceCells(
         uv=charts.low[chart] + (grid + 0.5) * charts.cell_mm,
         value=field.deviation[rows],
         noise=np.sqrt(field.variance[rows]),
@@ -187,7 +187,7 @@ def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: B
 def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float]:
     """Return the volume inward and its standard deviation from noise, with a border about the region.
 
-    Cells of the border are too shallow to be significant one by one, but add up.
+    PlaceCells of the border are too shallow to be significant one by one, but add up.
     """
     charts, chart = surface.charts, region.chart
     mask = np.zeros(int(charts.shape[chart].prod()), bool)

@@ -12,7 +12,7 @@ LOW, HIGH, CELL, NOISE = np.array([0.0, 0.0]), np.array([6000.0, 1100.0]), 25.0,
 
 
 def place(height, centre, half, seed=0, seen=lambda u, v: np.ones(len(u), bool)):
-    """Cells about a place, as a scan shows them: not within 20 mm of the face's border."""
+    """PlaceCells about a place, as a scan shows them: not within 20 mm of the face's border."""
     centre, half = np.array(centre, float), np.array(half, float)
     low, high = np.maximum(centre - 1.6 * half - 50.0, LOW), np.minimum(centre + 1.6 * half + 50.0, HIGH)
     grid = np.meshgrid(*(np.arange(a, b, CELL) + 0.5 * CELL for a, b in zip(low, high, strict=True)))
@@ -21,7 +21,9 @@ def place(height, centre, half, seed=0, seen=lambda u, v: np.ones(len(u), bool))
     uv = uv[seen(uv[:, 0], uv[:, 1])]
     value = height(uv[:, 0], uv[:, 1]) + NOISE * np.random.default_rng(seed).normal(size=len(uv))
     noise = np.full(len(uv), NOISE)
-    return profiles.Cells(uv, value, noise, LOW, HIGH, centre, half, CELL)
+    return profiles.PlaceCells(
+        uv=uv, value=value, noise=noise, low=LOW, high=HIGH, centre=centre, half=half, cell_mm=CELL
+    )
 
 
 def round_off(s):

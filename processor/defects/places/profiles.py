@@ -47,7 +47,7 @@ class Fit:
 
 
 @dataclass(frozen=True)
-class Cells:
+class PlaceCells:
     """Cells of a face about a place: ``uv`` (n, 2) on the face, outward deviations (n,) and their noise (n,), mm.
 
     ``low`` and ``high`` (2,) are the borders of the face there, ``centre`` (2,) and ``half`` (2,) those of the place.
@@ -63,7 +63,7 @@ class Cells:
     cell_mm: float
 
 
-def fit(cells: Cells, sign: int) -> Fit | None:
+def fit(cells: PlaceCells, sign: int) -> Fit | None:
     """Return the profile of a place to one side, ``sign`` -1 inward and 1 outward; None with too few cells."""
     if len(cells.value) < FEWEST_CELLS:
         return None
@@ -99,7 +99,7 @@ def fit(cells: Cells, sign: int) -> Fit | None:
 Model = Callable[[Floats, Floats], Floats]
 
 
-def _models(cells: Cells, top: float) -> Iterator[tuple[Profile, int, Floats, Model]]:
+def _models(cells: PlaceCells, top: float) -> Iterator[tuple[Profile, int, Floats, Model]]:
     """Yield profiles, axes, starts of the parameters (depth, place, reach, middle across, half width), models."""
     centre, half = cells.centre, cells.half
     yield Profile.BUMP, 0, np.array([top, centre[0], 1.3 * half[0], centre[1], 1.3 * half[1]]), _bump_model
@@ -136,7 +136,7 @@ def _shown(uv: Floats, x: Floats, axis: int, cell_mm: float) -> bool:
     return all(int((beside & (way * off > 0.5) & (way * off < 2.5)).sum()) >= 2.0 * fewest for way in (-1.0, 1.0))
 
 
-def _bounds(start: Floats, cells: Cells, top: float) -> tuple[Floats, Floats]:
+def _bounds(start: Floats, cells: PlaceCells, top: float) -> tuple[Floats, Floats]:
     """Return the least and the largest parameters (5,)."""
     least, most = LEAST_SIZE * start[[2, 4]], MOST_SIZE * start[[2, 4]]
     room = np.array([start[2] + cells.cell_mm, start[4] + cells.cell_mm])
