@@ -187,7 +187,7 @@ def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: B
 def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float]:
     """Return the volume inward and its standard deviation from noise, with a border about the region.
 
-    PlaceCells of the border are too shallow to be significant one by one, but add up.
+    Cells of the border are too shallow to be significant one by one, but add up.
     """
     charts, chart = surface.charts, region.chart
     mask = np.zeros(int(charts.shape[chart].prod()), bool)

@@ -12,7 +12,7 @@ LOW, HIGH, CELL, NOISE = np.array([0.0, 0.0]), np.array([6000.0, 1100.0]), 25.0,
 
 
 def place(height, centre, half, seed=0, seen=lambda u, v: np.ones(len(u), bool)):
-    """PlaceCells about a place, as a scan shows them: not within 20 mm of the face's border."""
+    """Cells about a place, as a scan shows them: not within 20 mm of the face's border."""
     centre, half = np.array(centre, float), np.array(half, float)
     low, high = np.maximum(centre - 1.6 * half - 50.0, LOW), np.minimum(centre + 1.6 * half + 50.0, HIGH)
     grid = np.meshgrid(*(np.arange(a, b, CELL) + 0.5 * CELL for a, b in zip(low, high, strict=True)))
