@@ -96,15 +96,15 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     if scanner is not None:
         seen_from = np.broadcast_to(_finite(scanner, "scanner"), cloud.shape) - origin
     params = Params(radius_mm=float("nan") if radius is None else float(radius), max_balls=1)
-    found = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
-    balls = found.balls
+    measured = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
+    balls = measured.balls
     if not len(balls):
         return SphereFit(
             centre=np.full(3, np.nan),
             radius=float("nan"),
             covariance=np.full((4, 4), np.nan),
             status=Status.FAILED,
-            reasons=found.reasons,
+            reasons=measured.reasons,
             points=0,
             rms=float("nan"),
         )
@@ -239,7 +239,7 @@ def m3c2(
         directions = _finite(normals, "normals")
         if directions.shape != places.shape:
             raise ValueError(f"normals: expected shape {places.shape}, one normal a core point; got {directions.shape}")
-    found = m3c2_distances.distances(
+    measured = m3c2_distances.distances(
         grid,
         m3c2_distances.grid(second - origin, projection_diameter),
         local,
@@ -248,7 +248,7 @@ def m3c2(
         max_depth_mm=max_depth,
         registration_error_mm=registration_error,
     )
-    return CorePoints(**vars(found), core=places, normals=directions)
+    return CorePoints(**vars(measured), core=places, normals=directions)
 
 
 def _check_lengths(reference: Floats, normal_diameter: float, projection_diameter: float, max_depth: float) -> None:

@@ -49,7 +49,9 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     fit = ok if ok.sum() >= LEAST_OK else np.ones(len(rows), bool)
     fitted = datum(T[fit], true[fit]) @ T
     off = np.linalg.norm(fitted[:, :3, 3] - true[:, :3, 3], axis=1)
-    turn = 1e3 * np.array([rigid.rotation_angle(a[:3, :3] @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)])
+    turn = 1e3 * np.array(
+        [rigid.rotation_angle(frames.rotation_of(a) @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)]
+    )
     # The accuracy of points picked by hand is no limit of the software.
     position, rotation = (NAN, NAN) if result.method == "three-point" else (POSITION_MM, ROTATION_MRAD)
     metrics += [
@@ -82,7 +84,7 @@ def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:
             continue
         expected = M @ true_pose
         position = scans.position[i]
-        in_scan = rigid.apply(rigid.invert(scans.T_project_scan[i]), position)
+        in_scan = rigid.apply(frames.invert(scans.T_project_scan[i]), position)
         rotation = frames.difference(scans.T_project_scan[i], expected)[:3]
         shift = position - rigid.apply(expected, in_scan)
         pulls.append(np.concatenate([shift / scans.position_sd[i], rotation / scans.rotation_sd[i]]))
