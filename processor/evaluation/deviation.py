@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.deviation.result import Result
-from processor.evaluation.error_statistics import signed
+from processor.evaluation.error_statistics import covered, covered_pulls
 from processor.geometry import principal, rigid
 from processor.model import Floats, Metric, Scene, Statistic, StructureTruth, Truth
 
@@ -15,6 +15,7 @@ REACH_MM = 500.0  # of a core point: a movement is smooth
 LEAST_MM = 50.0  # nearer points count the same
 NAN = float("nan")
 OTHER_POSE = "not compared with the truth: the pose found is another of those that fit about as well, turned by"
+STABLE_MM = 1e-6  # of the largest movement of a structure that is as designed
 BEYOND_LIMIT = 5.0  # % of core points farther from the truth than their level of detection
 
 
@@ -29,9 +30,10 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         return []
     if any(not scan.T_project_scan.size for scan in scene.scans) and len(scene.scans) > 1:
         return []
-    if result.status == "ambiguous" and (turn := _otherwise(result)) is not None:
+    true_pose = np.eye(4) if truth.pose is None else truth.pose.T_design_project
+    if result.status == "ambiguous" and (turn := _otherwise(result, true_pose)) is not None:
         return [Metric("deviation", OTHER_POSE, turn, unit="deg")]
-    true = true_deviation(result, truth.structure)
+    true = true_deviation(result, truth.structure, true_pose)
     error = result.core.distance - true
     known = np.isfinite(error) & np.isfinite(result.core.lod95)
     if not known.any():
@@ -52,15 +54,44 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("deviation", "deviation error", float(np.mean(error[known])), Statistic.MEAN, unit="mm"),
         Metric("deviation", "true deviation", float(np.sqrt(np.mean(true[known] ** 2))), Statistic.RMS, unit="mm"),
         Metric("deviation", "LOD95", float(np.median(result.core.lod95[known])), Statistic.MEDIAN, unit="mm"),
-        *signed("deviation", "deviations", error[known]),
+        *covered("deviation", "deviations", error, result.core.lod95),
+        *_extremes(result, true[known], result.core.distance[known]),
+        *([] if truth.pose is None else _pose(result, truth.structure, true_pose)),
     ]
 
 
-def _otherwise(result: Result) -> float | None:
-    """By what the pose found is turned, degrees, where it is another one than the design's; else nothing."""
+def _extremes(result: Result, true: Floats, found: Floats) -> list[Metric]:
+    """Coverage of the least and the greatest deviation, against the true extremes of the core points (k,)."""
+    if not (result.min_ci95.size and result.max_ci95.size):
+        return []
+    errors = np.array([found.min() - true.min(), found.max() - true.max()])
+    half = np.array([np.ptp(result.min_ci95), np.ptp(result.max_ci95)]) / 2.0
+    return covered("deviation", "least and greatest deviations", errors, half)
+
+
+def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metric]:
+    """Error of the pose of a structure that is not in the design's frame, at the structure's middle.
+
+    The covariance is that of a best fit, which has the true pose where nothing moved.
+    """
+    middle = result.core.points.mean(axis=0) + result.origin
+    off = result.T_design_scan @ rigid.invert(true_pose)
+    shift, turn = rigid.apply(off, middle[None])[0] - middle, rigid.vector_from_rotation(off[:3, :3])
+    metrics = [
+        Metric("deviation", "pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm"),
+        Metric("deviation", "pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad"),
+    ]
+    if result.covariance.size and np.abs(truth.displacement).max(initial=0.0) < STABLE_MM:
+        error = np.concatenate([turn, off[:3, 3]])
+        metrics += covered_pulls("deviation", "poses", error / np.sqrt(np.diag(result.covariance)))
+    return metrics
+
+
+def _otherwise(result: Result, true_pose: Floats) -> float | None:
+    """By what the pose found is turned, degrees, where it is another one than the true one; else nothing."""
     if not len(result.core):
         return None
-    T = result.T_design_scan
+    T = result.T_design_scan @ rigid.invert(true_pose)
     centre = result.origin + result.core.points.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(result.core.points, axis=0)))
     if not principal.differ(T, np.eye(4), centre, size):
@@ -68,7 +99,7 @@ def _otherwise(result: Result) -> float | None:
     return float(np.degrees(rigid.rotation_angle(T[:3, :3])))
 
 
-def true_deviation(result: Result, truth: StructureTruth) -> Floats:
+def true_deviation(result: Result, truth: StructureTruth, true_pose: Floats) -> Floats:
     """Movement (k,) along the normal of each core point by the nearest points of the truth, NaN where none is near."""
     places = truth.points - result.origin
     distance, index = cKDTree(places).query(
@@ -86,7 +117,7 @@ def true_deviation(result: Result, truth: StructureTruth) -> Floats:
     right = np.einsum("nk,nki,nkj->nij", weight, basis, truth.displacement[at])
     moved = np.linalg.solve(normal, right)[:, 0]
     moved[~near.any(axis=1)] = np.nan
-    T = rigid.with_origin(result.T_design_scan, -result.origin)
+    T = rigid.with_origin(result.T_design_scan @ rigid.invert(true_pose), -result.origin)
     T = rigid.transform(T[:3, :3], T[:3, 3] - result.origin)
     found: Floats = np.einsum(
         "ni,ni->n", rigid.apply(T, result.core.points + moved) - result.core.points, result.core.normals

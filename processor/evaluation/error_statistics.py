@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.model import Floats, Metric, Statistic
+from processor.model import NORMAL_95, Floats, Metric, Statistic
 
 
 def signed(step: str, quantity: str, errors: Floats, bound: Floats | None = None, unit: str = "mm") -> list[Metric]:
@@ -31,3 +31,30 @@ def signed(step: str, quantity: str, errors: Floats, bound: Floats | None = None
             rms = float(np.sqrt(np.mean((found[bounded] / least[bounded]) ** 2)))
             figures.append((Statistic.EFFICIENCY, 1.0 / rms if rms > 0.0 else nan, ""))
     return [Metric(step, quantity, value, statistic, unit=own) for statistic, value, own in figures]
+
+
+def covered(step: str, quantity: str, errors: Floats, half_widths: Floats, unit: str = "mm") -> list[Metric]:
+    """Share of errors within the half-widths of their 95 % intervals, with the figures of :func:`signed`.
+
+    Errors without an interval (NaN) are left out. A quantity that has intervals always has this share.
+    """
+    known = np.isfinite(errors) & np.isfinite(half_widths)
+    if not known.any():
+        return []
+    share = 100.0 * float(np.mean(np.abs(errors[known]) <= half_widths[known]))
+    return [
+        Metric(step, quantity, share, Statistic.COVERAGE, unit="%"),
+        *signed(step, quantity, errors[known], unit=unit),
+    ]
+
+
+def covered_pulls(step: str, quantity: str, pulls: Floats) -> list[Metric]:
+    """Share of errors within their 95 % intervals, of errors in standard deviations; without figures in a unit."""
+    known = pulls[np.isfinite(pulls)]
+    if not len(known):
+        return []
+    share = 100.0 * float(np.mean(np.abs(known) <= NORMAL_95))
+    return [
+        Metric(step, quantity, share, Statistic.COVERAGE, unit="%"),
+        Metric(step, quantity, float(len(known)), Statistic.NUMBER),
+    ]

@@ -6,9 +6,11 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.evaluation.error_statistics import signed
+from processor.evaluation.error_statistics import covered, signed
+from processor.geometry import rigid
 from processor.model import NORMAL_95, Better, Floats, FrameTruth, Ints, Metric, Scene, Statistic, Truth
-from processor.space_frame.result import Balls, Flag, Result
+from processor.space_frame.design.matching import robust_fit
+from processor.space_frame.result import Balls, Flag, MovementGauge, Result
 from processor.space_frame.spheres import isolated
 
 NAN = float("nan")
@@ -70,8 +72,31 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *signed("spheres", "centres", off[ok], bound[ok, :3]),
         *signed("spheres", "radii", radius[ok], bound[ok, 3]),
         *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
+        *_movements(scene, result, true, rows[ok], matches[ok]),
     ]
     return metrics
+
+
+def _movements(scene: Scene, result: Result, true: FrameTruth, rows: Ints, matches: Ints) -> list[Metric]:
+    """Return movements of balls ``rows`` (m,) against the true ones, relative to the same datum.
+
+    By a best fit, the truth is fitted as the balls are: by the robust fit of the same nodes.
+    """
+    balls, design = result.balls, scene.frame
+    if design is None or not len(balls.movement) or not np.isfinite(balls.movement[rows]).any():
+        return []
+    known = {int(id_): k for k, id_ in enumerate(design.ids)}
+    nominal = np.array([design.centres[known[int(balls.ids[row])]] for row in rows]).reshape(-1, 3)
+    places = true.centres[matches]
+    if result.movement_reference is not None and result.movement_reference.gauge is MovementGauge.BEST_FIT:
+        middle = places.mean(axis=0)
+        places = rigid.apply(robust_fit(places - middle, nominal)[0], places - middle)
+    vector = places - nominal
+    size = np.linalg.norm(vector, axis=1)
+    return [
+        *covered("spheres", "movements", balls.movement[rows] - vector, balls.movement_ci95[rows]),
+        *covered("spheres", "sizes of movements", balls.movement_size[rows] - size, balls.movement_size_ci95[rows]),
+    ]
 
 
 def true_rows(scene: Scene, balls: Balls, true: FrameTruth) -> Ints:

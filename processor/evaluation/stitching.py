@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.evaluation.error_statistics import covered_pulls
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, Metric, Scene, Statistic, Status, Truth
+from processor.model import Floats, Metric, Scene, Statistic, Status, Truth
 from processor.stitching import frames
 from processor.stitching.result import Result
 
@@ -61,11 +62,23 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     if result.by_control:
         error = float(np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)[fit].max())
         metrics.append(Metric("stitch", "station positions by control points", error, Statistic.MAX, unit="mm"))
-    pulls = pulls_of(result, rows, true)
-    if len(pulls):
-        share = 100.0 * float((np.abs(pulls) < NORMAL_95).mean())
-        metrics.append(Metric("stitch", "pose components", share, Statistic.COVERAGE, unit="%"))
-    return metrics
+    return [
+        *metrics,
+        *covered_pulls("stitch", "pose components", pulls_of(result, rows, true)),
+        *covered_pulls("stitch", "poses of pairs", _pulls_of_pairs(result, known)),
+        *covered_pulls("stitch", "scales", (result.pairs.scale - 1.0) / result.pairs.scale_sd),
+    ]
+
+
+def _pulls_of_pairs(result: Result, known: dict[str, Floats]) -> Floats:
+    """Return errors by standard deviations (m,) of the poses of the pairs that were used."""
+    pulls, pairs = [], result.pairs
+    for i, (a, b) in enumerate(zip(pairs.a, pairs.b, strict=True)):
+        if pairs.used[i] and a in known and b in known and np.isfinite(pairs.covariance[i]).all():
+            off = pairs.T_a_b[i] @ rigid.invert(known[b]) @ known[a]
+            error = np.concatenate([rigid.vector_from_rotation(off[:3, :3]), off[:3, 3]])
+            pulls.append(error / np.sqrt(np.diag(pairs.covariance[i])))
+    return np.concatenate(pulls) if pulls else np.empty(0)
 
 
 def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:
