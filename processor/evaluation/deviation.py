@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.deviation.result import Result
-from processor.evaluation.error_statistics import covered, covered_pulls
+from processor.evaluation.error_statistics import covered, covered_pulls, pulls_of
 from processor.geometry import principal, rigid
 from processor.model import Floats, Metric, Scene, Statistic, StructureTruth, Truth
 
@@ -16,6 +16,10 @@ LEAST_MM = 50.0  # nearer points count the same
 NAN = float("nan")
 OTHER_POSE = "not compared with the truth: the pose found is another of those that fit about as well, turned by"
 STABLE_MM = 1e-6  # of the largest movement of a structure that is as designed
+LODS = 2.0  # levels of detection beyond which a movement has to be found
+LEAST_SHARE = 0.2  # of a structure's surface that did not move
+MOST_FALSE, MOST_MISSED = 6.0, 10.0  # %
+STABLE_POSE_MM, STABLE_POSE_MRAD, AS_DESIGNED_MM = 0.5, 0.05, 0.05
 BEYOND_LIMIT = 5.0  # % of core points farther from the truth than their level of detection
 
 
@@ -47,7 +51,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
             beyond,
             Statistic.SHARE,
             unit="%",
-            limit=BEYOND_LIMIT if result.method == "default" else NAN,
+            limit=BEYOND_LIMIT if _limited(result) else NAN,
         ),
         Metric("deviation", "deviation error", float(np.median(size)), Statistic.MEDIAN, unit="mm"),
         Metric("deviation", "deviation error", float(np.quantile(size, 0.95)), Statistic.P95, unit="mm"),
@@ -56,6 +60,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("deviation", "LOD95", float(np.median(result.core.lod95[known])), Statistic.MEDIAN, unit="mm"),
         *covered("deviation", "deviations", error, result.core.lod95),
         *_extremes(result, true[known], result.core.distance[known]),
+        *_moved_and_not(result, truth.structure),
         *([] if truth.pose is None else _pose(result, truth.structure, true_pose)),
     ]
 
@@ -70,21 +75,58 @@ def _extremes(result: Result, true: Floats, found: Floats) -> list[Metric]:
 
 
 def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metric]:
-    """Error of the pose of a structure that is not in the design's frame, at the structure's middle.
+    """Error of the pose of a structure that is not in the design's frame, at the middle of what did not move.
 
     The covariance is that of a best fit, which has the true pose where nothing moved.
     """
-    middle = result.core.points.mean(axis=0) + result.origin
+    size = np.linalg.norm(truth.displacement, axis=1)
+    still = size < STABLE_MM
+    in_part = bool(LEAST_SHARE < still.mean() < 1.0)
+    middle = truth.points[still if still.any() else slice(None)].mean(axis=0)
     off = result.T_design_scan @ rigid.invert(true_pose)
     shift, turn = rigid.apply(off, middle[None])[0] - middle, rigid.vector_from_rotation(off[:3, :3])
+    shift_limit, turn_limit = (STABLE_POSE_MM, STABLE_POSE_MRAD) if in_part and _limited(result) else (NAN, NAN)
     metrics = [
-        Metric("deviation", "pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm"),
-        Metric("deviation", "pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad"),
+        Metric("deviation", "pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm", limit=shift_limit),
+        Metric("deviation", "pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad", limit=turn_limit),
     ]
-    if result.covariance.size and np.abs(truth.displacement).max(initial=0.0) < STABLE_MM:
+    if result.covariance.size and still.all():
         error = np.concatenate([turn, off[:3, 3]])
-        metrics += covered_pulls("deviation", "poses", error / np.sqrt(np.diag(result.covariance)))
+        metrics += covered_pulls("deviation", "poses", pulls_of(error, result.covariance))
     return metrics
+
+
+def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:
+    """Return what was found of steel that moved and of steel that did not, in the true frame of the design.
+
+    A core point moved where the movement along its normal is over twice its LOD95. Limits are for structures of which
+    one part moved, and for the mean of those exactly as designed.
+    """
+    nearest = cKDTree(truth.points).query(result.core.points + result.origin)[1]
+    displacement = truth.displacement[nearest]
+    still = np.linalg.norm(displacement, axis=1) < STABLE_MM
+    along = np.abs(np.einsum("ki,ki->k", displacement, result.core.normals))
+    lod95, found = result.core.lod95, np.abs(result.core.distance)
+    known, limited = np.isfinite(found) & np.isfinite(lod95), _limited(result)
+    if still.all() and known.any():
+        mean = abs(float(result.core.distance[known].mean()))
+        limit = AS_DESIGNED_MM if limited else NAN
+        return [Metric("deviation", "mean of steel as designed", mean, unit="mm", limit=limit)]
+    moved = known & (along > LODS * lod95)
+    if not LEAST_SHARE < still.mean() < 1.0 or not moved.any():
+        return []
+    false = 100.0 * float(np.mean((found > lod95)[known & still]))
+    missed = 100.0 * float(np.mean((found <= lod95)[moved]))
+    limits = (MOST_FALSE, MOST_MISSED) if limited else (NAN, NAN)
+    return [
+        Metric("deviation", "unmoved steel beyond LOD95", false, Statistic.SHARE, unit="%", limit=limits[0]),
+        Metric("deviation", "moved steel within LOD95", missed, Statistic.SHARE, unit="%", limit=limits[1]),
+    ]
+
+
+def _limited(result: Result) -> bool:
+    """Whether limits are for this method; figures of the baseline have none."""
+    return result.method == "default"
 
 
 def _otherwise(result: Result, true_pose: Floats) -> float | None:

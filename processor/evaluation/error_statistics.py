@@ -48,6 +48,12 @@ def covered(step: str, quantity: str, errors: Floats, half_widths: Floats, unit:
     ]
 
 
+def pulls_of(errors: Floats, covariance: Floats) -> Floats:
+    """Return errors (6,) in standard deviations, NaN where a variance of the covariance (6, 6) is not positive."""
+    variance = np.diag(covariance)
+    return np.asarray(errors / np.sqrt(np.where(variance > 0.0, variance, np.nan)))
+
+
 def covered_pulls(step: str, quantity: str, pulls: Floats) -> list[Metric]:
     """Share of errors within their 95 % intervals, of errors in standard deviations; without figures in a unit."""
     known = pulls[np.isfinite(pulls)]

@@ -16,6 +16,7 @@ from processor.space_frame.spheres import isolated
 NAN = float("nan")
 WRONG_MM = 10.0  # a centre farther off is that of another ball
 FOUND_MM = 3.0  # a node this near to the true one is found
+OTHER_SIZE_MM = 2.0  # tolerances of blanks are less, steps between sizes more
 LOWEST_MM = 3.0  # an unflagged lowest point farther off is a wrong answer
 NEAR = f"nodes found within {FOUND_MM:g} mm"
 WRONG_CENTRE = f"balls called ok, centre over {WRONG_MM:g} mm off"
@@ -73,8 +74,24 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *signed("spheres", "radii", radius[ok], bound[ok, 3]),
         *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
         *_movements(scene, result, true, rows[ok], matches[ok]),
+        *_sizes(balls, true, rows, matches, result.method == "ray"),
     ]
     return metrics
+
+
+def _sizes(balls: Balls, true: FrameTruth, rows: Ints, matches: Ints, limited: bool) -> list[Metric]:
+    """Return numbers of right sizes called wrong, and of wrong sizes that are not, by the design's radii."""
+    nominal = balls.nominal_radii[rows] if len(balls.nominal_radii) else np.full(len(rows), NAN)
+    known = np.isfinite(nominal)
+    if not known.any():
+        return []
+    wrong = np.abs(true.radii[matches] - nominal)[known] > OTHER_SIZE_MM
+    called = balls.flagged(Flag.WRONG_SIZE)[rows][known]
+    limit = 0.0 if limited else NAN
+    return [
+        Metric("spheres", "right sizes called wrong", float((called & ~wrong).sum()), Statistic.COUNT, limit=limit),
+        Metric("spheres", "wrong sizes called right", float((wrong & ~called).sum()), Statistic.COUNT),
+    ]
 
 
 def _movements(scene: Scene, result: Result, true: FrameTruth, rows: Ints, matches: Ints) -> list[Metric]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.evaluation import error_statistics
 from processor.evaluation.error_statistics import covered_pulls
 from processor.geometry import rigid
 from processor.model import Floats, Metric, Scene, Statistic, Status, Truth
@@ -77,7 +78,7 @@ def _pulls_of_pairs(result: Result, known: dict[str, Floats]) -> Floats:
         if pairs.used[i] and a in known and b in known and np.isfinite(pairs.covariance[i]).all():
             off = pairs.T_a_b[i] @ rigid.invert(known[b]) @ known[a]
             error = np.concatenate([rigid.vector_from_rotation(off[:3, :3]), off[:3, 3]])
-            pulls.append(error / np.sqrt(np.diag(pairs.covariance[i])))
+            pulls.append(error_statistics.pulls_of(error, pairs.covariance[i]))
     return np.concatenate(pulls) if pulls else np.empty(0)
 
 
