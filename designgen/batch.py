@@ -392,7 +392,7 @@ def _read_index(path: Path) -> dict[str, Content]:
 
 
 def _write_index(path: Path, jobs: Sequence[Job], keys: Sequence[str], outcomes: dict[str, Outcome]) -> None:
-    from processor.store import store
+    from processor.store.atomic_file import replacing
 
     text = io.StringIO(newline="")
     table = csv.writer(text, lineterminator="\n")
@@ -403,5 +403,5 @@ def _write_index(path: Path, jobs: Sequence[Job], keys: Sequence[str], outcomes:
         cells = [content.points, content.scans, content.scene_hash, content.sha256] if content else [""] * 4
         status = "done" if content else "failed"
         table.writerow([job.file, job.recipe, job.seed, *job.varied, *cells, status, outcome.reason])
-    with store.replacing(path) as temporary:
+    with replacing(path) as temporary:
         temporary.write_text(text.getvalue(), "utf-8")

@@ -120,6 +120,12 @@ def described(default: Any = dataclasses.MISSING, **shown: Any) -> Any:
     return dataclasses.field(default=default, metadata=shown)
 
 
+def per_point_fields(record: type) -> tuple[str, ...]:
+    """Return the names of the fields of a scan or its labels that have one row a point."""
+    fields = dataclasses.fields(record)
+    return tuple(field.name for field in fields if field.metadata.get("shape", ("",))[0] == "n")
+
+
 def newer() -> Any:
     """Declare a record that came to the schema later: absent, it changes no scene's hash."""
     return dataclasses.field(default=None, metadata={"newer": True})

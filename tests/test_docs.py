@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner
 
 import designgen.cli
-import processor.cli.run
+import processor.cli.main
 from docs import make_parameters
 from processor import pipeline
 from processor.evaluation import truth_json
@@ -25,7 +25,7 @@ from processor.scan_folder.folder import read_input
 ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 MODULES = {"processor": processor, "designgen": designgen}
-PROGRAMS = {"processor": processor.cli.run.commands, "designgen": designgen.cli.commands}
+PROGRAMS = {"processor": processor.cli.main.commands, "designgen": designgen.cli.commands}
 README_LINES = 120
 LARGEST_PICTURE = 300_000
 # Commands of the pages that take seconds, in an order in which each finds what it needs; as they stand in the pages.

@@ -19,7 +19,7 @@ from designgen.cad.process import received
 from designgen.ply import write_mesh
 from processor.jobs.process import Cause, isolated, run
 from processor.model import InputError, UsageError
-from processor.store import store
+from processor.store.atomic_file import sync
 
 STEP_SUFFIXES, IFC_SUFFIXES = (".step", ".stp"), (".ifc",)
 MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"
@@ -145,12 +145,12 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
         text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         (making / "import.json").write_text(text, encoding="utf-8")
         for written in (*making.iterdir(), making):
-            store.sync(written)
+            sync(written)
         if folder.exists():
             folder.rmdir()
         os.chmod(making, 0o755)
         os.replace(making, folder)
-        store.sync(folder.parent)
+        sync(folder.parent)
     except BaseException:
         shutil.rmtree(making, ignore_errors=True)
         raise

@@ -18,7 +18,17 @@ import numpy as np
 from designgen.export import formats, solids
 from designgen.export.formats import Written
 from designgen.ply import write_mesh
-from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Picks, PointLabels, Scan, Scene, UsageError
+from processor.model import (
+    KEY_POINTS,
+    ArchDesign,
+    FrameDesign,
+    Picks,
+    PointLabels,
+    Scan,
+    Scene,
+    UsageError,
+    per_point_fields,
+)
 from processor.store import store
 
 PICKS, PICK_COLUMNS = "picks.csv", ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
@@ -88,9 +98,7 @@ def _labels_as_read(labels: Sequence[PointLabels], written: Sequence[Written]) -
             continue
         label = of_scan[scan.name]
         columns = {
-            field.name: getattr(label, field.name)[rows]
-            for field in dataclasses.fields(label)
-            if field.metadata.get("shape") == ("n",) and len(getattr(label, field.name))
+            field: getattr(label, field)[rows] for field in per_point_fields(PointLabels) if len(getattr(label, field))
         }
         result.append(dataclasses.replace(label, scan=name, **columns))
     return tuple(result)

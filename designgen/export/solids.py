@@ -12,7 +12,7 @@ from designgen.cad.process import escape
 from designgen.designs import arch_bridge, arch_part, space_frame, structure, structure_types
 from designgen.reading import filled
 from processor.model import UsageError
-from processor.store import store
+from processor.store.atomic_file import replacing
 
 if TYPE_CHECKING:
     import cadquery as cq
@@ -59,7 +59,7 @@ def write_step(path: Path, shapes: Mapping[str, cq.Shape], origin_mm: Sequence[f
     placeholders = {f"name-{number:06d}-of-shape": name for number, name in enumerate(shapes)}
     for placeholder, shape in zip(placeholders, shapes.values(), strict=True):
         assembly.add(shape, name=placeholder, loc=location)
-    with store.replacing(path) as temporary:
+    with replacing(path) as temporary:
         assembly.export(str(temporary), exportType="STEP")
         text = temporary.read_text("ascii")
         # The kernel writes the date and the temporary file's name.

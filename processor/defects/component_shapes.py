@@ -130,7 +130,7 @@ def significant(
         size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
         inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
         points, outward = _with_corners(surface, rows)
-        registration = alignment.sd(points, outward)
+        registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
         for k, shape in candidates:
             value = shape.values(fit.frame, points, outward)
             top = int(np.argmax(np.abs(value)))

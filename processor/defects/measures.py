@@ -118,7 +118,7 @@ def measure(
     along = surface.charts.axes[region.chart, 0]
     across = np.cross(outward, along)
     longest = turn[0, 1] * along + turn[1, 1] * across
-    registration = float(alignment.sd(place[None], outward[None])[0])
+    registration = float(np.hypot(alignment.sd(place[None], outward[None])[0], field.stations_sd(rows)))
     edge, borders = _borders(region, surface, middle)
     volume, volume_sd = _volume(region, field, surface)
     if region.sign == 0:

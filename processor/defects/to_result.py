@@ -58,14 +58,19 @@ class Defect:
     field: Field
 
 
-def result_of(search: Search, params: Params, origin: Floats) -> Result:
-    """Return the result, the largest defects first, in the design's frame; ``origin`` (3,) was subtracted from it."""
+def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | None = None) -> Result:
+    """Return the result, the largest defects first, in the design's frame; ``origin`` (3,) was subtracted from it.
+
+    ``doubt`` is why no defect is sure, as where another pose fits as well.
+    """
     defects = [*_shape_defects(search), *_place_defects(search)]
     defects.sort(key=lambda defect: (-abs(defect.values["volume_mm3"]), defect.values["centre"].tolist()))
     surface, field = search.surface, search.field
     seen = field.seen > 0
     cell = surface.charts.cell_mm
-    registration = search.alignment.sd(surface.centres[seen], surface.outward[seen])
+    registration = np.hypot(
+        search.alignment.sd(surface.centres[seen], surface.outward[seen]), np.sqrt(field.stations[seen])
+    )
     noise = _median(field.noise[seen])
     formal = np.sqrt(field.variance[seen]) * search.levels.inflation[0]
     examined = float(surface.share[seen].sum()) * cell**2
@@ -84,7 +89,7 @@ def result_of(search: Search, params: Params, origin: Floats) -> Result:
         examined_mm2=examined,
         expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
         least_depth=_least_depth(search.levels, cell, noise, _median(field.count[seen])),
-        defects=table([defect.values for defect in defects], origin),
+        defects=table([defect.values for defect in defects], origin, doubt),
         pictures=pictures.of_defects(drawn, surface),
         surface=pictures.of_surface([defect.cells for defect in defects], field, surface, origin),
     )
@@ -102,13 +107,17 @@ def _least_depth(levels: Levels, cell: float, noise: float, points: float) -> Wi
     return Windows(side=sides * cell, depth=depth, noise_inflation=levels.inflation)
 
 
-def table(rows: Sequence[dict[str, Any]], origin: Floats) -> Defects:
-    """Return defects as a table, their centres shifted by ``origin`` (3,)."""
+def table(rows: Sequence[dict[str, Any]], origin: Floats, doubt: Reason | None = None) -> Defects:
+    """Return defects as a table, their centres shifted by ``origin`` (3,); with a ``doubt`` none of them is sure."""
     if not rows:
         return Defects()
     columns: dict[str, Any] = {key: tuple(row[key] for row in rows) for key in rows[0]}
     columns["centre"] = np.array(columns["centre"]) + origin
     columns["doubtful"] = np.array(columns["chance"]) > DOUBTFUL
+    if doubt is not None:
+        columns["doubtful"] = np.ones(len(rows), bool)
+        columns["confidence"] = np.minimum(columns["confidence"], classes.COIN)
+        columns["reasons"] = tuple((*of_row, doubt) for of_row in columns["reasons"])
     return Defects(id=np.arange(len(rows)), **columns)
 
 
@@ -135,7 +144,7 @@ def _shape_defects(search: Search) -> Iterator[Defect]:
     for component, shapes in sorted(search.significant.items()):
         rows = front_of(surface, component, search.field)
         rows = rows[surface.share[rows] > 0.5]
-        for shape in shapes:
+        for shape in shapes if len(rows) else ():
             yield _shape_defect(search, component, rows, shape, frames[component])
 
 
@@ -146,7 +155,8 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
     extent = 2.0 * frame.half[:2]
     part = np.ones(len(rows), bool)
     if kind == "step":  # the part beyond the step
-        part = np.abs(value) > max(judged.ci95, STEP_SHARE * abs(judged.peak))
+        beyond = np.abs(value) > max(judged.ci95, STEP_SHARE * abs(judged.peak))
+        part = beyond if beyond.any() else part
         extent[int(judged.shape.at[0])] *= 0.5 * (1.0 - judged.shape.at[1])
     area = surface.share[rows] * surface.charts.cell_mm**2
     both_ways = kind in ("twist", "waviness")

@@ -15,11 +15,16 @@ MOST_POINTS = 3_000_000  # of a scan; more are thinned evenly
 
 @dataclass(frozen=True)
 class ScanCloud:
-    """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order, and scanners (n, 3)."""
+    """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order, and scanners (n, 3).
+
+    The points ``removed`` (m, 3) as outliers have the scanners ``removed_scanner`` (m, 3).
+    """
 
     points: Floats
     origin: Floats
     scanner: Floats | None
+    removed: Floats
+    removed_scanner: Floats | None
     spacing_mm: float
     read: int
     kept: int
@@ -42,18 +47,23 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     spacing = neighbors.spacing(grid)
     if not spacing > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
-    rows = np.arange(grid.count)
+    inlier = np.ones(grid.count, bool)
     if ratio > 0.0:
-        rows = np.flatnonzero(neighbors.statistical_inliers(grid, neighbours, ratio))
-    kept = len(rows)
-    rows = rows[:: max(1, -(-kept // MOST_POINTS))]
-    thinner = np.sqrt(kept / len(rows))
-    scanner = None if cloud.scanner is None else cloud.scanner[grid.order[rows]]
+        inlier = neighbors.statistical_inliers(grid, neighbours, ratio)
+    step = max(1, -(-int(inlier.sum()) // MOST_POINTS))
+    rows, out = np.flatnonzero(inlier)[::step], np.flatnonzero(~inlier)[::step]
+    kept = int(inlier.sum())
+
+    def scanner(at: Ints) -> Floats | None:
+        return None if cloud.scanner is None else cloud.scanner[grid.order[at]]
+
     return ScanCloud(
         points=grid.cells.points[rows],
         origin=cloud.origin,
-        scanner=scanner,
-        spacing_mm=spacing * thinner,
+        scanner=scanner(rows),
+        removed=grid.cells.points[out],
+        removed_scanner=scanner(out),
+        spacing_mm=spacing * np.sqrt(kept / len(rows)),
         read=grid.count,
         kept=kept,
         unposed=unposed,

@@ -51,7 +51,9 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     fit = ok if ok.sum() >= LEAST_OK else np.ones(len(rows), bool)
     fitted = datum(T[fit], true[fit]) @ T
     off = np.linalg.norm(fitted[:, :3, 3] - true[:, :3, 3], axis=1)
-    turn = 1e3 * np.array([rigid.rotation_angle(a[:3, :3] @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)])
+    turn = 1e3 * np.array(
+        [rigid.rotation_angle(frames.rotation_of(a) @ b[:3, :3].T) for a, b in zip(fitted, true, strict=True)]
+    )
     # The accuracy of points picked by hand is no limit of the software.
     position, rotation = (NAN, NAN) if result.method == "three-point" else (POSITION_MM, ROTATION_MRAD)
     metrics += [
@@ -77,7 +79,7 @@ def _pulls_of_pairs(result: Result, known: dict[str, Floats]) -> Floats:
     for i, (a, b) in enumerate(zip(pairs.a, pairs.b, strict=True)):
         if pairs.used[i] and a in known and b in known and np.isfinite(pairs.covariance[i]).all():
             off = pairs.T_a_b[i] @ rigid.invert(known[b]) @ known[a]
-            error = np.concatenate([rigid.vector_from_rotation(off[:3, :3]), off[:3, 3]])
+            error = np.concatenate([rigid.vector_from_rotation(frames.rotation_of(off)), off[:3, 3]])
             pulls.append(error_statistics.pulls_of(error, pairs.covariance[i]))
     return np.concatenate(pulls) if pulls else np.empty(0)
 
@@ -96,7 +98,7 @@ def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:
             continue
         expected = M @ true_pose
         position = scans.position[i]
-        in_scan = rigid.apply(rigid.invert(scans.T_project_scan[i]), position)
+        in_scan = rigid.apply(frames.invert(scans.T_project_scan[i]), position)
         rotation = frames.difference(scans.T_project_scan[i], expected)[:3]
         shift = position - rigid.apply(expected, in_scan)
         pulls.append(np.concatenate([shift / scans.position_sd[i], rotation / scans.rotation_sd[i]]))

@@ -308,7 +308,7 @@ def _extents(vertices: Floats, faces: Ints) -> Floats:
 # --- the guess as project.toml and as JSON ----------------------------------------------------------------------------
 
 
-def written(project: Guess) -> str:
+def to_toml(project: Guess) -> str:
     """Return the text of project.toml, with reasons and further keys as comments."""
     lines = ["# Made by `processor init`. What is unsure is marked with a question mark."]
     lines += [f"# ? {_one_line(text)}" for text in project.unsure] + [""]

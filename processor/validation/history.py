@@ -20,7 +20,7 @@ from typing import Any
 
 from processor.language.messages import Text
 from processor.model import InputError
-from processor.store.codec import value_object, value_of
+from processor.store.codec import value_from_json, value_to_json
 from processor.validation.cells import Cell, Figure, Origin, Outcome, figures_of
 from processor.validation.software import Software
 
@@ -320,13 +320,13 @@ def _json(value: Any) -> str:
 def _text_object(message: Any) -> Any:
     """Return a text as JSON holds it, with the texts and words among its values."""
     if not isinstance(message, Text):
-        return value_object(message)
+        return value_to_json(message)
     values = None if message.values is None else {key: _text_object(value) for key, value in message.values.items()}
     return {"template": message.template, "values": values}
 
 
 def _text_of(stored: Any) -> Any:
     if not isinstance(stored, dict) or "template" not in stored:
-        return value_of(stored)
+        return value_from_json(stored)
     values = stored["values"]
     return Text(stored["template"], values and {key: _text_of(value) for key, value in values.items()})

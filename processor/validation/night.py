@@ -21,7 +21,7 @@ from typing import Any
 from processor import pipeline
 from processor.jobs.runner import locked
 from processor.model import UsageError
-from processor.store.store import replacing
+from processor.store.atomic_file import replacing
 from processor.validation import certificate, changes, coverage, junit, software, summary
 from processor.validation.cells import Cell, Outcome
 from processor.validation.history import History

@@ -7,10 +7,20 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.defects import baseline, deviation_field, pictures, regions, scan_statistic, shape_models, surface_charts
+from processor.defects import (
+    alignment,
+    baseline,
+    detect,
+    deviation_field,
+    pictures,
+    regions,
+    scan_statistic,
+    shape_models,
+    surface_charts,
+)
 from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
-from processor.geometry import mesh_distance
+from processor.geometry import mesh_distance, rigid
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.pipeline import as_json
 from processor.report.defects import figures, section
@@ -218,6 +228,37 @@ def test_stations_that_are_off_are_no_defect():
     assert found(result) == []
 
 
+def test_the_last_movement_is_added_once(monkeypatch):
+    """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
+    scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
+    settled = defects_step.run(scene, defects_step.Params())
+    monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
+    again = defects_step.run(scene, defects_step.Params())
+    assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
+    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)  # plates fix y
+    assert again.covariance.shape == (6, 6)
+    assert 0.0 < np.sqrt(again.covariance[4, 4]) < 1.0
+
+
+def test_no_defect_is_sure_where_another_attitude_fits_as_well():
+    """A dent in a box that looks the same from four sides, scanned in a frame of its own."""
+    vertices, faces = box((0.0, 0.0, 0.0), (2000.0, 600.0, 400.0))
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    points, facet = trimesh.sample.sample_surface(solid, 60_000, seed=1)
+    depth = bump(9.0, 150.0, (700.0, 300.0))(points[:, 0], points[:, 1]) * (solid.face_normals[facet][:, 2] > 0.5)
+    points = points - [0.0, 0.0, 1.0] * depth[:, None] + np.random.default_rng(1).normal(0.0, 0.3, points.shape)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 2.0])), np.array([5e4, -3e4, 2e3]))
+    scans = (Scan("S1", rigid.apply(T, points), T_project_scan=np.eye(4)),)
+    scene = Scene("box", "structure", scans, structure=StructureDesign("box", vertices, faces))
+    result = defects_step.run(scene, defects_step.Params())
+    assert result.status == "ambiguous"
+    assert len(result.defects) > 0
+    assert result.defects.doubtful.all()
+    assert (result.defects.confidence <= 0.5).all()
+    assert all(row[-1].code == "defects.pose-ambiguous" for row in result.defects.reasons)
+    assert "no defects found and" in str(section.REPORT.summary(result)[0])
+
+
 def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
     dent = bump(3.0, 90.0, (250.0, 300.0))
     scene = scene_of(3, dent)
@@ -287,12 +328,57 @@ def test_false_alarms_are_no_more_than_asked_for():
     for seed in range(10):
         noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
         ones = np.ones(len(seen), np.int64)
-        field = deviation_field.Field(noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen)
+        field = deviation_field.Field(
+            noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen, 0 * ones
+        )
         levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
         sign = scan_statistic.search(field, plate, levels).sign
         alarms += int((np.abs(plate.charts.image(sign.astype(float), chart)) > 0).any())
     assert alarms <= 10  # of 10 runs, in each of which 1 is allowed: at 0.63 a run, ten of ten is one in a hundred
     assert np.all(levels.inflation < 1.1)
+
+
+# --- alignment of stations -----------------------------------------------------------------------------------------
+
+
+def two_sides(seed, off_mm):
+    """Blocks of two pairs of stations, each pair on its side: of the other's they see what hardly shows shifts in x."""
+    rng = np.random.default_rng(seed)
+    moved = off_mm * rng.normal(size=(4, 7)) * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    rows = [(0, 1), (2, 3)] * 600 + [(0, 1, 2, 3)] * 400
+    block = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    station = np.concatenate(rows)
+    normal = rng.normal(size=(len(rows), 3))
+    normal[1200:, 0] = 0.02
+    normal = (normal / np.linalg.norm(normal, axis=1)[:, None])[block]
+    arm = (rng.uniform(-1.0, 1.0, (len(rows), 3)) * [5000.0, 800.0, 800.0])[block]
+    J = np.hstack([np.cross(arm, normal), normal, np.zeros((len(block), 1))])
+    free = 5.0 * rng.normal(size=len(rows))[block]
+    mean = free + np.einsum("nk,nk->n", J, moved[station]) + 0.2 * rng.normal(size=len(block))
+    blocks = alignment.StationBlocks(block, station, mean, np.full(len(block), 0.04), np.zeros(len(block), np.int64))
+    return blocks, J, moved
+
+
+def test_stations_that_agree_are_not_moved_by_what_hardly_shows():
+    shifts = []
+    for seed in range(3):
+        blocks, J, _ = two_sides(seed, 0.0)
+        x, covariance = alignment.station_movements(blocks, J, 4)
+        shifts.append(np.abs(x[:, 3:6]).max())
+        assert np.sqrt(np.diag(covariance).reshape(4, 7)[:, 3:6].max()) < 0.1
+    assert max(shifts) < 0.1  # with a prior of 3 mm for every station, up to 0.7 mm
+
+
+def test_what_stations_leave_undetermined_is_in_their_covariance():
+    z = []
+    for seed in range(20):
+        blocks, J, moved = two_sides(seed, 0.5)
+        x, covariance = alignment.station_movements(blocks, J, 4)
+        between = np.zeros((4, 7))
+        between[:, 3] = [0.5, 0.5, -0.5, -0.5]  # of the sides, along x
+        error = float(((x - moved) * between).sum())
+        z.append(error / np.sqrt(between.ravel() @ covariance @ between.ravel()))
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 def test_facets_are_the_nearest_that_a_scanner_can_see():

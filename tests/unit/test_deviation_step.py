@@ -85,7 +85,7 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
     fitted = deviation_step.run(scene, deviation_step.Params(register="fine"))
     assert fitted.registration == "fine"
     assert abs(np.nanmean(fitted.core.distance[result.core.normals[:, 1] > 0.9])) < 0.7  # the best fit has it
-    assert codes(fitted) == ["deviation.best-fit"]
+    assert codes(fitted) == ["deviation.stable-fit"]
     assert metrics(scene, fitted, truth)["core points farther from the truth than their LOD95"].value < 5.0
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from processor.cli import run
+from processor.cli import main
 from processor.model import InputError, UsageError
 from processor.scan_folder import component_names, folder, guess
 
@@ -103,7 +103,7 @@ def bridge(tmp_path):
 
 
 def init(place, *options):
-    return CliRunner().invoke(run.commands, ["init", str(place), *options])
+    return CliRunner().invoke(main.commands, ["init", str(place), *options])
 
 
 def test_a_bridge_with_names_and_without(bridge):
@@ -171,7 +171,7 @@ def test_one_mesh_is_a_structure(tmp_path):
     write_scan(tmp_path / "hall.xyz", box_points((30.0, 20.0, 5.0), 1, turn=False))
     found = guess.guess(tmp_path)
     assert (found.kind, found.design, found.design_units, found.units) == ("structure", "design/hall.obj", "mm", "m")
-    (tmp_path / "project.toml").write_text(guess.written(found), "utf-8")
+    (tmp_path / "project.toml").write_text(guess.to_toml(found), "utf-8")
     scene = folder.read_input(tmp_path)
     assert np.ptp(scene.structure.vertices, axis=0) == pytest.approx([30_000.0, 20_000.0, 5_000.0])
     (tmp_path / "project.toml").write_text('design = "design/hall.obj"\n', "utf-8")  # then the mesh is in m as well
