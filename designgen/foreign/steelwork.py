@@ -316,7 +316,8 @@ def write_structure(folder: Path, cuboids: list[Cuboid], cloud: Array, truth: di
     (folder / "project.toml").write_text(
         'kind = "structure"\ndesign = "steel.stl"\ndesign_units = "mm"\n[[scan]]\nfile = "Merge_2 (clean).ply"\n'
     )
-    (folder / "truth.json").write_text(json.dumps({"format": "processor-truth"} | truth))
+    pose = {"T_design_project": np.linalg.inv(T).tolist()}
+    (folder / "truth.json").write_text(json.dumps({"format": "processor-truth", "pose": pose} | truth))
 
 
 def make_deviation(folder: Path, settings: dict[str, Any], rng: np.random.Generator) -> None:
@@ -325,10 +326,7 @@ def make_deviation(folder: Path, settings: dict[str, Any], rng: np.random.Genera
     cuboids, move = lattice(length), half_moved(length, number(settings, "moved"))
     stations = around(np.array([0, 0, -900.0]), np.array([length, 2600.0, 1900]), 6, 3500.0, (1700.0, 3900.0), rng)
     cloud, T = merged(cuboids, stations, move, nothing, settings, rng), frame_of(rng)
-    back = np.linalg.inv(T)
-    write_structure(
-        folder, cuboids, cloud, {"structure": surface(cuboids, move), "pose": {"T_design_project": back.tolist()}}, T
-    )
+    write_structure(folder, cuboids, cloud, {"structure": surface(cuboids, move)}, T)
 
 
 def make_defects(folder: Path, settings: dict[str, Any], rng: np.random.Generator) -> None:
@@ -382,10 +380,7 @@ def make_plate(folder: Path, settings: dict[str, Any], rng: np.random.Generator)
     if number(settings, "sides") > 1:
         stations = np.vstack([stations, stations * [1, 1, -1]])
     cloud, T = merged(cuboids, stations, still, nothing, settings, rng), frame_of(rng)
-    back = np.linalg.inv(T)
-    write_structure(
-        folder, cuboids, cloud, {"structure": surface(cuboids, still), "pose": {"T_design_project": back.tolist()}}, T
-    )
+    write_structure(folder, cuboids, cloud, {"structure": surface(cuboids, still)}, T)
 
 
 def hall(bays: int, rng: np.random.Generator) -> list[Cuboid]:

@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.defects.result import DefectClass, Defects, Result
-from processor.evaluation.error_statistics import covered, signed
+from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
 from processor.model import Better, DefectTruth, Floats, Ints, Metric, Scene, Statistic, Truth
 
 DEPTH_SHARE = 0.10
@@ -67,6 +67,9 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("defects", "false alarms", float(false), Statistic.COUNT, limit=float(most)),
         Metric("defects", "surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
     ]
+    if truth.pose is not None and result.T_design_project.size and result.covariance.size:
+        pulls = pose_pulls(result.T_design_project, truth.pose.T_design_project, result.covariance)
+        metrics += covered_pulls("defects", "poses", pulls)
     if (rows >= 0).any():
         metrics += _classes_and_depths(result.defects, truth.defects, rows, limited)
     return metrics

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.deviation.result import Result
-from processor.evaluation.error_statistics import covered, covered_pulls, pulls_of
+from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
 from processor.geometry import principal, rigid
 from processor.model import Floats, Metric, Scene, Statistic, StructureTruth, Truth
 
@@ -77,7 +77,7 @@ def _extremes(result: Result, true: Floats, found: Floats) -> list[Metric]:
 def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metric]:
     """Error of the pose of a structure that is not in the design's frame, at the middle of what did not move.
 
-    The covariance is that of a best fit, which has the true pose where nothing moved.
+    The covariance is that of the fit, which has the true pose where enough of the structure did not move.
     """
     size = np.linalg.norm(truth.displacement, axis=1)
     still = size < STABLE_MM
@@ -90,9 +90,8 @@ def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metr
         Metric("deviation", "pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm", limit=shift_limit),
         Metric("deviation", "pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad", limit=turn_limit),
     ]
-    if result.covariance.size and still.all():
-        error = np.concatenate([turn, off[:3, 3]])
-        metrics += covered_pulls("deviation", "poses", pulls_of(error, result.covariance))
+    if result.covariance.size and still.mean() > LEAST_SHARE:
+        metrics += covered_pulls("deviation", "poses", pose_pulls(result.T_design_scan, true_pose, result.covariance))
     return metrics
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Metric, Statistic
 
 
@@ -48,10 +49,17 @@ def covered(step: str, quantity: str, errors: Floats, half_widths: Floats, unit:
     ]
 
 
-def pulls_of(errors: Floats, covariance: Floats) -> Floats:
-    """Return errors (6,) in standard deviations, NaN where a variance of the covariance (6, 6) is not positive."""
+def pose_pulls(T: Floats, true: Floats, covariance: Floats) -> Floats:
+    """Return the errors (6,) of a pose T_a_b in standard deviations: turns about and shifts along the axes of a.
+
+    ``T`` and ``true`` are 4 x 4, the covariance (6, 6) is of the left perturbation of T; where its variance is not
+    positive, the error is NaN. A scale within T is no part of the error.
+    """
+    off = T @ rigid.invert(true)
+    R = off[:3, :3] / np.cbrt(np.linalg.det(off[:3, :3]))
     variance = np.diag(covariance)
-    return np.asarray(errors / np.sqrt(np.where(variance > 0.0, variance, np.nan)))
+    error = np.concatenate([rigid.vector_from_rotation(R), off[:3, 3]])
+    return np.asarray(error / np.sqrt(np.where(variance > 0.0, variance, np.nan)))
 
 
 def covered_pulls(step: str, quantity: str, pulls: Floats) -> list[Metric]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import least_squares
 
-from processor.evaluation.error_statistics import covered, covered_pulls, pulls_of, signed
+from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
 from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Status, Truth
@@ -171,9 +171,7 @@ def _pose_pulls(result: Result, truth: ArchTruth, assembly: TrueAssembly, rows: 
     for i, row in enumerate(rows):
         T, covariance = result.components.T_bridge_scan[i], result.components.covariance[i]
         if np.isfinite(T).all() and np.isfinite(covariance).all():
-            off = T @ rigid.invert(assembly.motions[i] @ truth.T_bridge_scan[row])
-            error = np.concatenate([rigid.vector_from_rotation(off[:3, :3]), off[:3, 3]])
-            pulls.append(pulls_of(error, covariance))
+            pulls.append(pose_pulls(T, assembly.motions[i] @ truth.T_bridge_scan[row], covariance))
     return np.concatenate(pulls) if pulls else np.empty(0)
 
 

@@ -15,6 +15,9 @@ from processor.validation.cells import Origin
 from processor.validation.history import Row
 
 
+AT_LEAST = ("mean and largest errors",)  # quantities whose intervals are stated to hold 95 % or more
+
+
 @dataclass(frozen=True)
 class Limits:
     """Limits of coverage, %: ``low`` to ``high`` of all errors together, ``scene`` the least of one scene.
@@ -83,7 +86,7 @@ def _judged(
         holds = Holds.FEW
     elif share < limits.low or least < limits.scene:
         holds = Holds.NARROW
-    elif share > limits.high:
+    elif share > limits.high and key[3] not in AT_LEAST:
         holds = Holds.WIDE
     origin, step, method, quantity = key
     return Coverage(

@@ -1,5 +1,6 @@
 """The matrix, its cells, the history, the certificate and what a CI server reads: by stubbed cells."""
 
+import dataclasses
 import json
 import math
 import sqlite3
@@ -431,6 +432,9 @@ def test_the_written_limits_of_coverage(share, scene, holds):
     (found,) = coverage.pooled(rows, ["n"], {name}, limits)
     assert (found.share, found.worst, found.holds) == (pytest.approx(share), scene, holds)
     assert coverage.pooled(rows, ["other"], {name}, limits) == ()
+    bands = [dataclasses.replace(row, quantity="mean and largest errors") for row in rows]  # of 95 % or more
+    (found,) = coverage.pooled(bands, ["n"], {name}, limits)
+    assert found.holds == ("as stated" if holds == "too wide" else holds)
 
 
 def test_conditions_of_scans_without_rays():
