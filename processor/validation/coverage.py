@@ -14,7 +14,6 @@ from processor.model import Statistic, Word
 from processor.validation.cells import Origin
 from processor.validation.history import Row
 
-
 AT_LEAST = ("mean and largest errors",)  # quantities whose intervals are stated to hold 95 % or more
 
 
