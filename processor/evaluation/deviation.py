@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from processor.deviation.result import Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
 from processor.geometry import principal, rigid
-from processor.model import Floats, Metric, Scene, Statistic, StructureTruth, Truth
+from processor.model import Floats, Metric, Scene, Statistic, Status, StructureTruth, Truth
 
 NEIGHBOURS = 24
 REACH_MM = 500.0  # of a core point: a movement is smooth
@@ -86,7 +86,9 @@ def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metr
     off = result.T_design_scan @ rigid.invert(true_pose)
     shift, turn = rigid.apply(off, middle[None])[0] - middle, rigid.vector_from_rotation(off[:3, :3])
     shift_limit, turn_limit = (STABLE_POSE_MM, STABLE_POSE_MRAD) if in_part and _limited(result) else (NAN, NAN)
+    wrong = result.status == Status.OK and _otherwise(result, true_pose) is not None
     metrics = [
+        Metric("deviation", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
         Metric("deviation", "pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm", limit=shift_limit),
         Metric("deviation", "pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad", limit=turn_limit),
     ]

@@ -91,6 +91,8 @@ def test_steel_as_designed_has_the_mean_and_the_pose_of_the_truth():
     assert found["mean of steel as designed"].passed
     assert not slab(-0.06, half=False)["mean of steel as designed"].passed
     assert found["poses within their 95 % intervals"].value == 100.0
+    assert slab(0.04, half=False)["wrong poses called ok"].passed
+    assert not slab(0.04, turn=3000.0, half=False)["wrong poses called ok"].passed
     assert slab(0.04, turn=10.0, half=False)["poses within their 95 % intervals"].value == pytest.approx(500.0 / 6.0)
 
 
