@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
 from processor.deviation import baseline
@@ -313,7 +313,7 @@ def test_it_is_written_as_the_interface_says(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
-    scene, truth = make("roof", recipes.overridden(recipes.load("stadium-roof")[1], [f"seed={seed}"]))
+    scene, truth = make("roof", recipe_files.overridden(recipe_files.load("stadium-roof")[1], [f"seed={seed}"]))
     result = deviation_step.run(scene, deviation_step.Params())
     assert all(one.passed for one in deviation_evaluation.check(scene, result, truth))
     assert np.isfinite(result.core.lod95).mean() > 0.95
