@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+import runpy
 import sqlite3
 import subprocess
 import sys
@@ -107,6 +108,14 @@ def test_the_default_matrix_covers_every_step_that_is_there():
 
     covered = {step for entry in matrix.read(matrix.DEFAULT, False).entries for step in entry.case.steps}
     assert covered == set(pipeline.step_modules())
+
+
+def test_foreign_cells_name_settings_that_their_generators_have():
+    foreign = [e.case for e in matrix.read(matrix.DEFAULT, True).entries if e.case.origin is cells.Origin.FOREIGN]
+    assert {case.recipe for case in foreign} == {path.stem for path in (ROOT / "designgen/foreign").glob("[a-z]*.py")}
+    for case in foreign:
+        known = runpy.run_path(str(ROOT / "designgen/foreign" / f"{case.recipe}.py"))["SETTINGS"]
+        assert {setting.split("=")[0] for setting in case.settings} <= set(known), case.name
 
 
 def test_figures_are_told_apart_by_method():
