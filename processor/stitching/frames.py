@@ -1,4 +1,8 @@
-"""Covariances of poses and their differences under a change of frame. Order: rotation (rad), then translation (mm)."""
+"""Covariances of poses and their differences under a change of frame, also of poses with a scale.
+
+Order: rotation (rad), then translation (mm), then the logarithm of the scale where there is one. A pose with a scale is
+T = [s R, t].
+"""
 
 from __future__ import annotations
 
@@ -16,6 +20,44 @@ def turned(covariance: Floats, R: Floats) -> Floats:
     return rotated
 
 
+def scale_of(T: Floats) -> float:
+    """Return the scale of T (4, 4)."""
+    return float(np.cbrt(np.linalg.det(T[:3, :3])))
+
+
+def rotation_of(T: Floats) -> Floats:
+    """Return the rotation (3, 3) of T (4, 4) without its scale."""
+    R: Floats = T[:3, :3] / scale_of(T)
+    return R
+
+
+def invert(T: Floats) -> Floats:
+    """Invert T (4, 4) with its scale."""
+    back = T[:3, :3].T / scale_of(T) ** 2
+    return rigid.transform(back, -back @ T[:3, 3])
+
+
 def difference(T: Floats, S: Floats) -> Floats:
-    """Return the small motion (6,) that brings S to T: rotation about the origin of S, and the shift of that origin."""
-    return np.concatenate([rigid.vector_from_rotation(T[:3, :3] @ S[:3, :3].T), T[:3, 3] - S[:3, 3]])
+    """Return the small motion (7,) that brings S to T: rotation about the origin of S, its shift, and the scale."""
+    turn = rigid.vector_from_rotation(rotation_of(T) @ rotation_of(S).T)
+    return np.concatenate([turn, T[:3, 3] - S[:3, 3], [np.log(scale_of(T) / scale_of(S))]])
+
+
+def adjoint(T: Floats, size: int = 7) -> Floats:
+    """Return the derivative (size, size) by which a small motion in T's source frame is one in its target frame.
+
+    Rotation, scale and shift are about the origins of the two frames.
+    """
+    J, R = np.eye(7), rotation_of(T)
+    J[:3, :3] = R
+    J[3:6, :3] = rigid.cross_matrix(T[:3, 3]) @ R
+    J[3:6, 3:6] = T[:3, :3]
+    J[3:6, 6] = -T[:3, 3]
+    return J[:size, :size]
+
+
+def about(covariance: Floats, position: Floats) -> Floats:
+    """Return the covariance of a motion, 6 or 7 rows, about the origin from that about a ``position`` (3,)."""
+    J = adjoint(rigid.transform(np.eye(3), position), len(covariance))
+    at_origin: Floats = J @ covariance @ J.T
+    return at_origin

@@ -17,7 +17,9 @@ class Params:
     method: str = METHODS[0]
     seed: int = 0
     reference: str = ""  # name of the scan whose pose is fixed; empty: the first
-    scale: str = SCALES[0]  # three-point: fixed = six parameters with scale as a diagnostic, free = the paper's seven
+    scale: str = SCALES[
+        0
+    ]  # three-point: fixed = six parameters with scale as a diagnostic, free = the paper's seven, written too
     scale_limit_ppm: float = 1000.0  # three-point: a significant scale beyond this is a blunder
     cell_mm: float = 0.0  # side of the cells; 0 = from the density of the points
     levelled_mrad: float = 0.0  # tilt of the instruments at most; 0 = unknown

@@ -42,6 +42,10 @@ class Scans(Rows):
 
     Covariances: order (rotation about x, y, z of the project's frame in rad; translation in mm), left perturbation
     T = exp(xi) T_project_scan. They are relative to the reference scan, unless control points fix the frame.
+
+    With ``[stitch] scale = "free"`` a pose holds the scale of its scan: T_project_scan = [s R, t]. The covariance is
+    then that of the rotation about the scan's ``position`` and of the latter, written for the project's origin; the
+    error of the scale, ``scale_sd``, moves a point by its distance from there.
     """
 
     name: tuple[str, ...] = names("k")
@@ -52,6 +56,8 @@ class Scans(Rows):
     position: Floats = column("k", 3, unit="mm")  # of the scanner; if unknown, of the centroid of the points
     position_sd: Floats = column("k", 3, unit="mm")
     rotation_sd: Floats = column("k", 3, unit="rad")  # about the project's axes
+    scale: Floats = column("k")  # of T_project_scan; 1 unless it is free
+    scale_sd: Floats = column("k")
     rivalry: Floats = column("k")  # score of the next best pose by that of the best one
     T_rival_scan: Floats = column("k", 4, 4, nullable=True)
     from_frame: tuple[str, ...] = names("k", json="from")  # of T_project_scan
@@ -74,9 +80,9 @@ class Pairs(Rows):
     used: Flags = column("p", dtype=np.bool_)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("p")
     shared: Ints = column("p", dtype=np.int64)  # planar pieces or picked points that both scans have
-    T_a_b: Floats = column("p", 4, 4)
+    T_a_b: Floats = column("p", 4, 4)  # with ``scale`` where that is free
     covariance: Floats = column("p", 6, 6)
-    scale: Floats = column("p")  # three-point: of b in a; with six parameters a diagnostic
+    scale: Floats = column("p")  # three-point: of b in a; with six parameters a diagnostic, which T_a_b does not hold
     scale_sd: Floats = column("p")
     from_frame: tuple[str, ...] = names("p", json="from")  # of T_a_b
     to_frame: tuple[str, ...] = names("p", json="to")

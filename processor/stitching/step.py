@@ -23,6 +23,7 @@ __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "r
 
 NAME = "stitch"
 NEEDS: tuple[str, ...] = ()
+PLACES = True  # steps that need this one do not run without the poses of its scans
 KIND = "structure"
 LEAST_POINTS = 100
 
@@ -112,10 +113,11 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
         for (a, b), row in zip(fits, pair_reasons, strict=True)
         for single in row
     ]
-    T, covariance = three_point.adjust(pairs, k, reference)
+    adjusted = three_point.adjust(pairs, k, reference)
+    misclosed = () if adjusted.factor == 1.0 else (reason("stitch.loops-misclose", factor=adjusted.factor),)
     return Network(
-        T=T,
-        covariance=covariance,
+        T=adjusted.T,
+        covariance=adjusted.covariance,
         origins=origins,
         rivalry=np.zeros(k),
         T_rival=np.full((k, 4, 4), np.nan),
@@ -127,9 +129,10 @@ def _by_picks(scans: Sequence[Scan], picked: Picked, reference: int, params: Par
         pair_reasons=pair_reasons,
         scale=np.array([fit.scale for fit in pooled]),
         scale_sd=np.array([three_point.widened(fit.scale_sd, fit.scaled_freedoms) for fit in pooled]),
+        pose_scale_sd=adjusted.scale_sd,
         unplaced=_unplaced(names, shortages, {row for pair in fits for row in pair}),
         point_mm=float(np.median([fit.sd_mm for fit in pooled])) if pooled else float("nan"),
-        reasons=(*unused, *of_pairs),
+        reasons=(*unused, *misclosed, *of_pairs),
     )
 
 

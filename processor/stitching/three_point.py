@@ -1,7 +1,8 @@
 """Method ``three-point``: pairs of scans by picked common points, chained into one frame. Source: paper 003, eq. 1-2.
 
 The paper's model x_a = t + lambda R x_b has seven parameters. With three points a free scale absorbs a blunder in one
-of them without a trace. Six parameters are therefore the default, and the scale is a diagnostic.
+of them without a trace. Six parameters are therefore the default, and the scale is a diagnostic. With seven parameters
+all matrices hold the scale: T_a_b = [lambda R, t].
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import numpy as np
 from scipy.stats import f
 from scipy.stats import t as student
 
+from processor.adjustment import data_snooping
 from processor.geometry import rigid
 from processor.model import NORMAL_95, Floats, Picks, Reason, Scan, reason
 from processor.stitching import frames
@@ -36,11 +38,11 @@ class TooFewError(ValueError):
 
 @dataclass(frozen=True)
 class PairFit:
-    """Pose of a pair of scans by its picks: T_a_b (rotation and shift), scale of b in a, and residuals.
+    """Pose of a pair of scans by its picks: T_a_b with the scale where it is free, scale of b in a, and residuals.
 
-    ``covariance`` (6, 6): rotation along a's axes about the origin of b, and shift. ``freedoms`` are those that
-    ``sd_mm`` is known by; ``scaled_sd_mm`` and ``scaled_freedoms`` are the same for the difference of both scans' picks
-    with a free scale.
+    ``covariance`` (6, 6): rotation along a's axes about the origin of b, and shift; with a free scale (7, 7), its
+    logarithm last. ``freedoms`` are those that ``sd_mm`` is known by; ``scaled_sd_mm`` and ``scaled_freedoms`` are the
+    same for the difference of both scans' picks with a free scale.
     """
 
     T_a_b: Floats
@@ -94,13 +96,13 @@ def fit_pair(points_a: Floats, points_b: Floats, scale_free: bool) -> PairFit:
     difference_sd = max(float(np.sqrt((residuals**2).sum() / freedoms)), LEAST_SD_MM)
     # The scale's standard deviation follows from the residuals of seven parameters, which do not contain its deviation.
     scaled_sd = max(float(np.sqrt(((a - scale * rotated) ** 2).sum() / (3 * n - 7))), LEAST_SD_MM)
-    J = rigid.motion(rotated).reshape(-1, 6)
-    T = rigid.transform(R, middle_a - used * R @ middle_b)
-    # From rotations about the centroid of the points to rotations about the origin of b, in a.
-    covariance = rigid.about_origin(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
-    if scale_free:  # the error of the scale acts on the vector from the origin of b to the points
-        arm = R @ middle_b
-        covariance[3:, 3:] += (difference_sd**2 / float((rotated**2).sum())) * np.outer(arm, arm)
+    J = rigid.motion(used * rotated)
+    if scale_free:
+        J = np.concatenate([J, used * rotated[:, :, None]], axis=2)
+    J = J.reshape(3 * n, -1)
+    T = rigid.transform(used * R, middle_a - used * R @ middle_b)
+    # From motions about the centroid of the points to motions about the origin of b, in a.
+    covariance = frames.about(np.linalg.inv(J.T @ J) * difference_sd**2, middle_a - T[:3, 3])
     return PairFit(
         T_a_b=T, scale=scale, scale_sd=scaled_sd / float(np.sqrt((rotated**2).sum())), residuals=residuals,
         sd_mm=difference_sd / np.sqrt(2.0), covariance=covariance, freedoms=freedoms,
@@ -174,39 +176,60 @@ def as_pair(a: int, b: int, fit: PairFit) -> Pair:
     )
 
 
-def adjust(pairs: list[Pair], count: int, reference: int) -> tuple[Floats, Floats]:
-    """Adjust a network of pairs: poses T_ref_scan (k, 4, 4) and their covariance (6k, 6k); NaN of scans not reached.
+@dataclass(frozen=True)
+class Adjusted:
+    """Poses T_ref_scan (k, 4, 4) of a network of pairs and their covariance (6k, 6k); NaN of scans not reached.
 
-    Initial poses are those of the paper's chain. Rotations are about the scans' own origins, along the reference's
-    axes.
+    Rotations are about the scans' own origins, along the reference's axes. ``scale_sd`` (k,) is that of the scale in T,
+    0 where it is fixed. ``factor`` multiplied all standard deviations, as loops contradict the pairs' covariances.
     """
+
+    T: Floats
+    covariance: Floats
+    scale_sd: Floats
+    factor: float
+
+
+def adjust(pairs: list[Pair], count: int, reference: int) -> Adjusted:
+    """Adjust a network of pairs; initial poses are those of the paper's chain."""
     T = _chained(pairs, count, reference)
+    m = len(pairs[0].covariance) if pairs else 6  # unknowns of a scan
     placed = np.flatnonzero(np.isfinite(T).all(axis=(1, 2))).tolist()
     used = [pair for pair in pairs if pair.a in placed and pair.b in placed]
     unknown = [s for s in placed if s != reference]
-    covariance = np.full((6 * count, 6 * count), np.nan)
-    fixed = slice(6 * reference, 6 * reference + 6)
+    covariance = np.full((m * count, m * count), np.nan)
+    fixed = slice(m * reference, m * reference + m)
     covariance[fixed], covariance[:, fixed] = 0.0, 0.0
-    rows = np.array([6 * s + np.arange(6) for s in unknown], np.int64).ravel()
-    if not len(rows):
-        return T, covariance
-    for _ in range(10):
-        N, g = np.zeros((6 * count, 6 * count)), np.zeros(6 * count)
+    rows = np.array([m * s + np.arange(m) for s in unknown], np.int64).ravel()
+    for _ in range(10 if len(rows) else 0):
+        N, g = np.zeros(covariance.shape), np.zeros(m * count)
         for pair in used:
             A, r, W = _equation(pair, T)
-            at = np.concatenate([6 * pair.a + np.arange(6), 6 * pair.b + np.arange(6)])
+            at = np.concatenate([m * pair.a + np.arange(m), m * pair.b + np.arange(m)])
             N[np.ix_(at, at)] += A.T @ W @ A
             g[at] += A.T @ W @ r
-        step = np.zeros(6 * count)
+        step = np.zeros(m * count)
         step[rows] = -np.linalg.solve(N[np.ix_(rows, rows)], g[rows])
         for s in unknown:
-            d = step[6 * s : 6 * s + 6]
-            T[s, :3, :3] = rigid.rotation_from_vector(d[:3]) @ T[s, :3, :3]
-            T[s, :3, 3] += d[3:]
+            d = step[m * s : m * s + m]
+            T[s, :3, :3] = np.exp(d[6:].sum()) * rigid.rotation_from_vector(d[:3]) @ T[s, :3, :3]
+            T[s, :3, 3] += d[3:6]
         if np.abs(step).max() < 1e-9:
             break
-    covariance[np.ix_(rows, rows)] = np.linalg.inv(N[np.ix_(rows, rows)])
-    return T, covariance
+    if len(rows):
+        covariance[np.ix_(rows, rows)] = np.linalg.inv(N[np.ix_(rows, rows)])
+    factor = _factor(used, T, len(rows))
+    covariance *= factor**2
+    of_motion = np.arange(m * count).reshape(count, m)[:, :6].ravel()
+    scale_sd = np.sqrt(np.diag(covariance)[6::7]) if m == 7 else np.where(np.isfinite(T[:, 0, 0]), 0.0, np.nan)
+    return Adjusted(T=T, covariance=covariance[np.ix_(of_motion, of_motion)], scale_sd=scale_sd, factor=factor)
+
+
+def _factor(pairs: list[Pair], T: Floats, unknowns: int) -> float:
+    """Return the factor of standard deviations that explains the misclosures of adjusted pairs; 1 if chance does."""
+    square = sum(float(r @ W @ r) for _, r, W in (_equation(pair, T) for pair in pairs))
+    freedoms = sum(len(pair.covariance) for pair in pairs) - unknowns
+    return float(np.sqrt(square / freedoms)) if data_snooping.beyond_chance(square, freedoms) else 1.0
 
 
 def _chained(pairs: list[Pair], count: int, reference: int) -> Floats:
@@ -214,24 +237,30 @@ def _chained(pairs: list[Pair], count: int, reference: int) -> Floats:
     T = np.full((count, 4, 4), np.nan)
     T[reference] = np.eye(4)
     placed = {reference}
-    order = sorted(pairs, key=lambda pair: (float(np.trace(pair.covariance[3:, 3:])), pair.a, pair.b))
+    order = sorted(pairs, key=lambda pair: (float(np.trace(pair.covariance[3:6, 3:6])), pair.a, pair.b))
     while pair := next((p for p in order if (p.a in placed) != (p.b in placed)), None):
         if pair.a in placed:
             T[pair.b] = T[pair.a] @ pair.T_a_b
         else:
-            T[pair.a] = T[pair.b] @ rigid.invert(pair.T_a_b)
+            T[pair.a] = T[pair.b] @ frames.invert(pair.T_a_b)
         placed |= {pair.a, pair.b}
     return T
 
 
 def _equation(pair: Pair, T: Floats) -> tuple[Floats, Floats, Floats]:
-    """Return the derivative (6, 12) by both scans' motions, the misclosure (6,) in a's axes, and the weight (6, 6)."""
-    R = T[pair.a, :3, :3]
-    r = frames.difference(rigid.invert(T[pair.a]) @ T[pair.b], pair.T_a_b)
+    """Return the derivative by both scans' motions, the misclosure in a's axes, and the weight.
+
+    With m = 6 unknowns a scan, or 7 with its scale: (m, 2m), (m,) and (m, m).
+    """
+    m, to_a = len(pair.covariance), frames.invert(T[pair.a])
+    R, S = frames.rotation_of(T[pair.a]).T, to_a[:3, :3]
+    r = frames.difference(to_a @ T[pair.b], pair.T_a_b)[:m]
     arm = T[pair.b, :3, 3] - T[pair.a, :3, 3]
-    A = np.zeros((6, 12))
-    A[:3, :3], A[:3, 6:9] = -R.T, R.T
-    A[3:, 3:6], A[3:, 9:] = -R.T, R.T
-    A[3:, :3] = R.T @ rigid.cross_matrix(arm)
+    A = np.zeros((7, 14))
+    A[:3, :3], A[:3, 7:10] = -R, R
+    A[3:6, 3:6], A[3:6, 10:13] = -S, S
+    A[3:6, :3], A[3:6, 6] = S @ rigid.cross_matrix(arm), -S @ arm
+    A[6, 6], A[6, 13] = -1.0, 1.0
+    A = A[:m, np.concatenate([np.arange(m), 7 + np.arange(m)])]
     weight: Floats = np.asarray(np.linalg.pinv(pair.covariance, rcond=1e-14, hermitian=True), np.float64)
     return A, r, weight

@@ -38,6 +38,7 @@ class Network:
     pair_reasons: list[tuple[Reason, ...]]
     scale: Floats = field(default_factory=lambda: np.empty(0))
     scale_sd: Floats = field(default_factory=lambda: np.empty(0))
+    pose_scale_sd: Floats = field(default_factory=lambda: np.empty(0))  # (k,) of the scale in T; absent: it is fixed
     refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`network.refuted`
     contradictions: Sequence[Contradiction] = ()  # of each scan's pose by faces
     estimated: tuple[float, float, float] = (NAN, NAN, NAN)  # noise, patches, ends
@@ -109,6 +110,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
 
 def _scans(names: Sequence[str], network: Network, base: Floats, frame: ProjectFrame, params: Params) -> Scans:
     k = len(names)
+    is_free = len(network.pose_scale_sd) > 0 and bool(np.nanmax(network.pose_scale_sd) > 0.0)
     T, T_rival, covariance = np.full((k, 4, 4), NAN), np.full((k, 4, 4), NAN), np.full((k, 6, 6), NAN)
     position, position_sd, rotation_sd = np.full((k, 3), NAN), np.full((k, 3), NAN), np.full((k, 3), NAN)
     status = list[Status]()
@@ -138,6 +140,8 @@ def _scans(names: Sequence[str], network: Network, base: Floats, frame: ProjectF
         position=position,
         position_sd=position_sd,
         rotation_sd=rotation_sd,
+        scale=np.array([frames.scale_of(pose) if is_free else 1.0 for pose in T]),
+        scale_sd=network.pose_scale_sd if is_free else np.zeros(k),
         rivalry=network.rivalry,
         T_rival_scan=T_rival,
         from_frame=tuple(map(_socs, names)),
@@ -194,7 +198,7 @@ def _pairs(names: Sequence[str], network: Network) -> Pairs:
             ]
         ),
         covariance=np.array(
-            [rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3] + origins[pair.a]) for pair in pairs]
+            [rigid.about_origin(pair.covariance[:6, :6], pair.T_a_b[:3, 3] + origins[pair.a]) for pair in pairs]
         ),
         scale=network.scale if len(network.scale) else unknown,
         scale_sd=network.scale_sd if len(network.scale_sd) else unknown,
@@ -205,7 +209,7 @@ def _pairs(names: Sequence[str], network: Network) -> Pairs:
 
 def _closures(names: Sequence[str], network: Network) -> Closures:
     used = [pair for pair, is_used in zip(network.pairs, network.used, strict=True) if is_used]
-    weights = np.array([1.0 / max(float(np.trace(pair.covariance[3:, 3:])), 1e-12) for pair in used])
+    weights = np.array([1.0 / max(float(np.trace(pair.covariance[3:6, 3:6])), 1e-12) for pair in used])
     loops = pair_checks.loops(used, weights, len(names)) if used else []
     return Closures(
         loop=tuple(tuple(names[i] for i in loop.rows) for loop in loops),

@@ -64,7 +64,8 @@ def stitching(names=("S1", "S2", "S3", "S4", "S5", "S6", "S7", "S8", "S9")):
     scans = Scans(
         name=names, status=STATES, reasons=[(one,) if one else () for one in SCAN_REASONS], T_project_scan=pose,
         covariance=np.zeros((k, 6, 6)), position=pose[:, :3, 3], position_sd=np.full((k, 3), 0.2),
-        rotation_sd=np.full((k, 3), 1e-5), rivalry=np.full(k, 0.5), T_rival_scan=np.full((k, 4, 4), np.nan),
+        rotation_sd=np.full((k, 3), 1e-5), scale=np.ones(k), scale_sd=np.zeros(k),
+        rivalry=np.full(k, 0.5), T_rival_scan=np.full((k, 4, 4), np.nan),
         from_frame=names, to_frame=("PRCS",) * k,
     )  # fmt: skip
     pairs = Pairs(

@@ -245,6 +245,7 @@ def checks_of(T, true, status, **more):
     scans = Scans(
         name=names, status=status, reasons=((),) * k, T_project_scan=T, position=T[:, :3, 3],
         position_sd=np.full((k, 3), 1.0), rotation_sd=np.full((k, 3), 1e-4), covariance=np.zeros((k, 6, 6)),
+        scale=np.ones(k), scale_sd=np.zeros(k),
         rivalry=np.zeros(k), T_rival_scan=np.full((k, 4, 4), np.nan), from_frame=names, to_frame=names,
     )  # fmt: skip
     made = stitching_step.Result(status="ok", method="automatic", reference="S1", scans=scans, **more)

@@ -39,11 +39,53 @@ def test_seven_parameters_absorb_a_scale_that_six_show():
     free = three_point.fit_pair(a, CORNERS, scale_free=True)
     assert free.scale == pytest.approx(1.0005, abs=1e-12)
     assert np.abs(free.residuals).max() < 1e-9
-    np.testing.assert_allclose(free.T_a_b[:3, :3], R, atol=1e-12)
+    np.testing.assert_allclose(free.T_a_b[:3, :3], 1.0005 * R, atol=1e-12)
     np.testing.assert_allclose(free.T_a_b[:3, 3], [100.0, 200.0, 300.0], atol=1e-6)
     fixed = three_point.fit_pair(a, CORNERS, scale_free=False)
     assert fixed.scale == pytest.approx(1.0005, abs=1e-9)
     assert np.abs(fixed.residuals).max() > 1.0
+
+
+@pytest.mark.parametrize("scale", [0.995, 1.0, 1.005])
+@pytest.mark.parametrize("noise", [0.0, 5.0])
+def test_the_written_matrix_of_seven_parameters_holds_the_scale(scale, noise):
+    """Places of the structure by each scan's matrix, against the truth: the pose that is judged is the one written."""
+    errors, pulls = [], []
+    for seed in range(10):
+        T, scene = network(seed, noise, scale=1.0 / scale, count=2, points=8)
+        result = stitching_step.run(scene, stitching_step.Params(method="three-point", scale="free"))
+        in_b = scene.picks.in_b
+        true = (np.linalg.inv(T[0]) @ T[1] @ np.diag([scale, scale, scale, 1.0])) @ np.vstack(
+            [in_b.T, np.ones(len(in_b))]
+        )
+        found = result.scans.T_project_scan[1] @ np.vstack([in_b.T, np.ones(len(in_b))])
+        errors.append(np.sqrt(((found - true)[:3] ** 2).sum(axis=0).mean()))
+        assert result.scans.scale[1] == pytest.approx(np.linalg.det(found_rotation(result)) ** (1 / 3), abs=1e-12)
+        pulls.append((result.scans.scale[1] - scale) / max(result.scans.scale_sd[1], 1e-12))
+    assert max(errors) < 3.0 * noise + 1e-6
+    assert noise == 0.0 or np.mean(np.abs(pulls) < 1.96) >= 0.8
+
+
+def found_rotation(result):
+    return result.scans.T_project_scan[1][:3, :3]
+
+
+def test_a_loop_of_scans_of_different_scales_closes():
+    T, scene = network(4, 0.0)
+    sizes = dict(zip((scan.name for scan in scene.scans), (1.0, 1.003, 0.996, 1.001, 1.004), strict=True))
+    picks = scene.picks
+    scaled = {
+        "in_a": picks.in_a / np.array([sizes[name] for name in picks.scan_a])[:, None],
+        "in_b": picks.in_b / np.array([sizes[name] for name in picks.scan_b])[:, None],
+    }
+    result = stitching_step.run(
+        dataclasses.replace(scene, picks=dataclasses.replace(picks, **scaled)),
+        stitching_step.Params(method="three-point", scale="free"),
+    )
+    want = np.linalg.inv(T[0]) @ T
+    want[:, :3, :3] *= np.array(list(sizes.values()))[:, None, None]
+    np.testing.assert_allclose(result.scans.T_project_scan, want, atol=1e-5)
+    assert result.closures.mm[0] < 1e-5
 
 
 def test_likely_cause_of_a_scale():
@@ -244,3 +286,11 @@ def test_a_scan_that_cannot_be_placed_has_a_reason():
     ]  # fmt: skip
     assert [one.values["shortage"].values["points"] for one in shortages] == [1, 2]
     assert codes(result.scans.reasons[5]) == ["stitch.no-picks"]
+
+
+def test_loops_that_misclose_widen_all_intervals():
+    """Exact picks of scans that were each scaled against the next: no pair shows it, the loop does."""
+    _, scene = network(1, 0.0, scale=1.004, count=3)
+    result = stitching_step.run(scene, stitching_step.Params(method="three-point", scale="free"))
+    assert "stitch.loops-misclose" in codes(result.reasons)
+    assert set(result.scans.status[1:]) == {"weak"}

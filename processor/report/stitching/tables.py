@@ -101,7 +101,8 @@ def _pairs(result: Result, method: str, suffix: str) -> Table:
         "a", "b", "overlap_percent", "residual_mm", "shared", "used", "scale_ppm", "scale_ci95_ppm", "message",
     )  # fmt: skip
     note = text(
-        "Shared: planar pieces, or picked points, that both scans have. The scale of b in a is a diagnostic value."
+        "Shared: planar pieces, or picked points, that both scans have. The scale of b in a is a diagnostic "
+        "value unless it is free."
     )
     return Table(text("Pairs of scans, method {method}", method=method), columns, rows, f"stitch-pairs{suffix}", note)
 

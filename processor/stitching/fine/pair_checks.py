@@ -25,8 +25,8 @@ class Pair:
     a: int
     b: int
     pieces: int
-    T_a_b: Floats
-    covariance: Floats  # along the axes of a, rotation about the origin of b
+    T_a_b: Floats  # with the scale of b in a where that is free
+    covariance: Floats  # (6, 6), with a free scale (7, 7); along the axes of a, rotation about the origin of b
     residual: float
     chi2: float  # of its difference from the network's pose
 
@@ -38,7 +38,7 @@ class Pair:
 
 @dataclass(frozen=True)
 class Loop:
-    """Scans around a loop (the first again at the end), its misclosure, and chi2 of this by its 6 freedoms."""
+    """Scans around a loop (the first again at the end), its misclosure, and chi2 of this by its 6 or 7 freedoms."""
 
     rows: tuple[int, ...]
     mm: float
@@ -59,7 +59,7 @@ def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
     start = np.stack([np.eye(4), rigid.invert(network.T[a]) @ network.T[b]])
     solution = bundle_adjustment.solve(local, start, 0, iterations=3, robust=False, tau=network.tau)
     covariance = solution.covariance[6:, 6:]
-    d = frames.difference(solution.T[1], start[1])
+    d = frames.difference(solution.T[1], start[1])[:6]
     points = local.kind == 0
     weight = local.sums[points, 9]
     residual = float(np.sqrt((weight * solution.offset[points] ** 2).sum() / max(weight.sum(), 1e-12)))
@@ -104,28 +104,27 @@ def _path(tree: dict[int, list[tuple[int, Pair]]], start: int, end: int) -> list
 
 def _loop(path: list[Pair], start: int) -> Loop:
     """Chain the poses and covariances of pairs around a loop, in the frame of scan ``start``."""
-    T, C, at, rows = np.eye(4), np.zeros((6, 6)), start, [start]
+    size = len(path[0].covariance)
+    T, C, at, rows = np.eye(4), np.zeros((size, size)), start, [start]
     for pair in path:
         forward = pair.a == at
         # With rotations about the origin of a's frame the adjoint transforms the covariance.
-        covariance = rigid.about_origin(pair.covariance, pair.T_a_b[:3, 3])
+        covariance = frames.about(pair.covariance, pair.T_a_b[:3, 3])
         if forward:
             C = C + _transformed(covariance, T)
             T = T @ pair.T_a_b
         else:
-            T = T @ rigid.invert(pair.T_a_b)
+            T = T @ frames.invert(pair.T_a_b)
             C = C + _transformed(covariance, T)
         at = pair.b if forward else pair.a
         rows.append(at)
-    xi = np.concatenate([rigid.vector_from_rotation(T[:3, :3]), T[:3, 3]])
-    ratio = float(xi @ np.linalg.solve(C, xi)) / 6.0
-    return Loop(tuple(rows), float(np.linalg.norm(xi[3:])), float(1e3 * np.linalg.norm(xi[:3])), ratio)
+    xi = frames.difference(T, np.eye(4))[:size]
+    ratio = float(xi @ np.linalg.solve(C, xi)) / size
+    return Loop(tuple(rows), float(np.linalg.norm(xi[3:6])), float(1e3 * np.linalg.norm(xi[:3])), ratio)
 
 
 def _transformed(covariance: Floats, T: Floats) -> Floats:
-    """Transform the covariance (6, 6) of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
-    J = np.zeros((6, 6))
-    J[:3, :3] = J[3:, 3:] = T[:3, :3]
-    J[3:, :3] = rigid.cross_matrix(T[:3, 3]) @ T[:3, :3]
+    """Transform the covariance of a small motion to the frame that T (4, 4) maps to, by the adjoint of T."""
+    J = frames.adjoint(T, len(covariance))
     transformed: Floats = J @ covariance @ J.T
     return transformed
