@@ -20,7 +20,7 @@ from processor.model import InputError, UsageError
 from processor.preassembly import step as preassembly_step
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.params import SystematicParams
-from processor.preassembly.parts import measure
+from processor.preassembly.parts import attitude, measure
 from processor.scan_folder import folder
 from processor.store import store
 
@@ -225,7 +225,7 @@ def test_parts_of_one_shape_are_named():
 
 def measured(scan, index, design):
     systematic = SystematicParams()
-    return measure.estimate([measure.fit([scan], index, design, 1.0, systematic)], systematic)[0]
+    return measure.estimate([measure.fit([scan], index, attitude.Shapes(design), 1.0, systematic)], systematic)[0]
 
 
 @pytest.mark.slow
