@@ -8,8 +8,8 @@ import traceback
 
 import click
 
-from processor.cli.common import say
-from processor.cli.run import commands
+from processor.cli.common import print_error_line
+from processor.cli.main import commands
 from processor.model import InputError, UsageError
 
 WRONG_USAGE, BAD_INPUT = 2, 3
@@ -28,7 +28,7 @@ def main() -> None:
         error.show()
         sys.exit(WRONG_USAGE)
     except UsageError as error:
-        say(f"error: {error}")
+        print_error_line(f"error: {error}")
         sys.exit(WRONG_USAGE)
     except BrokenPipeError:
         # Whoever read the output has seen enough. Python would complain once more when it flushes at exit.
@@ -38,7 +38,7 @@ def main() -> None:
         if "--debug" in sys.argv:
             traceback.print_exc()
         foreseen = isinstance(error, (InputError, OSError))
-        say(f"error: {error}" if foreseen else f"error: internal error: {error!r}; --debug shows where")
+        print_error_line(f"error: {error}" if foreseen else f"error: internal error: {error!r}; --debug shows where")
         sys.exit(BAD_INPUT)
 
 

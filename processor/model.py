@@ -120,6 +120,12 @@ def described(default: Any = dataclasses.MISSING, **shown: Any) -> Any:
     return dataclasses.field(default=default, metadata=shown)
 
 
+def per_point_fields(record: type) -> tuple[str, ...]:
+    """Return the names of the fields of a scan or its labels that have one row a point."""
+    fields = dataclasses.fields(record)
+    return tuple(field.name for field in fields if field.metadata.get("shape", ("",))[0] == "n")
+
+
 def newer() -> Any:
     """Declare a record that came to the schema later: absent, it changes no scene's hash."""
     return dataclasses.field(default=None, metadata={"newer": True})
@@ -508,6 +514,13 @@ class DefectTruth(Checked):
 
 
 @dataclass(frozen=True)
+class PoseTruth(Checked):
+    """Where the design lies in a scene whose scans are in another frame than the design."""
+
+    T_design_project: Floats = column(4, 4)
+
+
+@dataclass(frozen=True)
 class Truth(Checked):
     """What the generator knows and no step may see."""
 
@@ -520,6 +533,7 @@ class Truth(Checked):
     defects: DefectTruth | None = None
     stations: StationTruth | None = None
     as_built: AsBuilt | None = None
+    pose: PoseTruth | None = newer()  # without it the scans are in the design's frame
 
 
 # --- checks ---------------------------------------------------------------------------------------------------------

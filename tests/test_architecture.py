@@ -64,7 +64,7 @@ def test_tests_share_code_through_support():
         assert not {name for name in found if not within({name}, "tests.bench")}, path.name
 
 
-@pytest.mark.parametrize("module", ["processor.cli.run", "designgen.cli"])
+@pytest.mark.parametrize("module", ["processor.cli.main", "designgen.cli"])
 def test_help_comes_at_once(module):
     code = (
         f"import sys; from {module} import commands\n"

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from designgen.cad.process import escape
-from designgen.designs import arch_bridge, arch_part, space_frame, structure, structure_types
+from designgen.designs import arch_bridge, arch_part, box_and_tube, space_frame, structure_registry
 from designgen.reading import filled
 from processor.model import UsageError
-from processor.store import store
+from processor.store.atomic_file import replacing
 
 if TYPE_CHECKING:
     import cadquery as cq
@@ -38,8 +38,8 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
         shapes = {"frame": space_frame.solid(space_frame.build(filled(space_frame.Params, recipe, "frame")))}
     elif kind == "structure":
         path = folder / "structure.step"
-        components = structure_types.design(recipe)
-        shapes = {component.name: structure.solid([component]) for component in components}
+        components = structure_registry.design(recipe)
+        shapes = {component.name: box_and_tube.solid([component]) for component in components}
     else:
         raise UsageError("--step: the scene does not name the recipe it was made from, so its solids are not known")
     write_step(path, shapes, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))
@@ -59,7 +59,7 @@ def write_step(path: Path, shapes: Mapping[str, cq.Shape], origin_mm: Sequence[f
     placeholders = {f"name-{number:06d}-of-shape": name for number, name in enumerate(shapes)}
     for placeholder, shape in zip(placeholders, shapes.values(), strict=True):
         assembly.add(shape, name=placeholder, loc=location)
-    with store.replacing(path) as temporary:
+    with replacing(path) as temporary:
         assembly.export(str(temporary), exportType="STEP")
         text = temporary.read_text("ascii")
         # The kernel writes the date and the temporary file's name.

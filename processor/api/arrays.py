@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from processor.deviation import measure as deviation_measure
 from processor.geometry import m3c2 as m3c2_distances
-from processor.geometry import mesh_distance, normal_orientation, principal, rigid, surface_registration
+from processor.geometry import mesh_distance, normal_orientation, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
 from processor.geometry.merging import MergedCloud
 from processor.geometry.mesh_distance import MeshSurface
@@ -96,15 +96,15 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     if scanner is not None:
         seen_from = np.broadcast_to(_finite(scanner, "scanner"), cloud.shape) - origin
     params = Params(radius_mm=float("nan") if radius is None else float(radius), max_balls=1)
-    found = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
-    balls = found.balls
+    measured = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
+    balls = measured.balls
     if not len(balls):
         return SphereFit(
             centre=np.full(3, np.nan),
             radius=float("nan"),
             covariance=np.full((4, 4), np.nan),
             status=Status.FAILED,
-            reasons=found.reasons,
+            reasons=measured.reasons,
             points=0,
             rms=float("nan"),
         )
@@ -156,7 +156,7 @@ def register(
     surface = mesh_distance.of_design(corners - origin, triangles.astype(np.int64))
     given = rigid.transform(np.eye(3), scan_origin - origin)
     placed = surface_registration.place(local, surface, given, "auto")
-    rival = placed.T_rival if placed.ambiguity < principal.AMBIGUOUS else None
+    rival = placed.T_rival if placed.ambiguous else None
     if rival is not None and scanners is not None:
         seen_from = np.broadcast_to(_finite(scanners, "scanners"), cloud.shape) - scan_origin
         shares = [_facing_share(local, seen_from, surface, T) for T in (placed.T, rival)]
@@ -239,7 +239,7 @@ def m3c2(
         directions = _finite(normals, "normals")
         if directions.shape != places.shape:
             raise ValueError(f"normals: expected shape {places.shape}, one normal a core point; got {directions.shape}")
-    found = m3c2_distances.distances(
+    measured = m3c2_distances.distances(
         grid,
         m3c2_distances.grid(second - origin, projection_diameter),
         local,
@@ -248,7 +248,7 @@ def m3c2(
         max_depth_mm=max_depth,
         registration_error_mm=registration_error,
     )
-    return CorePoints(**vars(found), core=places, normals=directions)
+    return CorePoints(**vars(measured), core=places, normals=directions)
 
 
 def _check_lengths(reference: Floats, normal_diameter: float, projection_diameter: float, max_depth: float) -> None:

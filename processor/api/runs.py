@@ -43,11 +43,11 @@ class Results:
     @property
     def comparison(self) -> dict[str, dict[str, Any]]:
         """Result records of further methods, by step and method."""
-        found: dict[str, dict[str, Any]] = {}
+        metrics: dict[str, dict[str, Any]] = {}
         for run in self.execution.runs:
             if self.steps[run.step] is not run.result:
-                found.setdefault(run.step, {})[run.method] = run.result
-        return found
+                metrics.setdefault(run.step, {})[run.method] = run.result
+        return metrics
 
     @property
     def checks(self) -> tuple[Metric, ...]:

@@ -27,7 +27,7 @@ from processor.jobs.software import OtherSoftwareError, check_same, versions
 from processor.language.messages import messages
 from processor.model import InputError, Reason, reason
 from processor.scan_folder import fingerprint
-from processor.store.store import sync
+from processor.store.atomic_file import sync
 from processor.version import __version__
 
 PACKAGES = (

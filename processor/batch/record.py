@@ -15,7 +15,7 @@ from typing import Any
 
 from processor.language.messages import messages
 from processor.model import Reason, Word
-from processor.store.store import replacing
+from processor.store.atomic_file import replacing
 
 FORMAT, FORMAT_VERSION = "processor-batch-job", "1.0"
 RECORD, RESULTS = "job.json", "results.json"

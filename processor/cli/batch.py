@@ -9,8 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, UNITS, named, say
-from processor.model import UsageError
+from processor.cli.common import (
+    DONE,
+    IN_PART,
+    LANGUAGES,
+    LIMIT_MISSED,
+    UNITS,
+    check_jobs,
+    debug_option,
+    print_error_line,
+    split_names,
+)
 
 if TYPE_CHECKING:
     from processor.batch.batch import Settings
@@ -44,14 +53,14 @@ class BatchOptions:
 @click.option("--timeout-s", type=click.FloatRange(min=0, min_open=True), default=3600.0, show_default=True)
 @click.option("--memory-mb", type=click.IntRange(min=64), help="of a job  [default: its share of 80 % of the machine]")
 @click.option("--retry", is_flag=True, help="try again what failed, though nothing has changed")
-@click.option("--steps", callback=named, metavar="A,B", help="as of run; so are the options below")
-@click.option("--method", "methods", callback=named, metavar="NAME[,NAME]")
+@click.option("--steps", callback=split_names, metavar="A,B", help="as of run; so are the options below")
+@click.option("--method", "methods", callback=split_names, metavar="NAME[,NAME]")
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("--units", type=click.Choice(UNITS), help="of scans; scene files know theirs")
 @click.option("--seed", type=click.IntRange(min=0))
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of all pages")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")
-@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+@debug_option
 @click.pass_context
 def batch(context: click.Context, /, root: Path, **options: Any) -> None:
     """Process every scan folder, scene file and scan file below ROOT, each in a process of its own.
@@ -60,12 +69,14 @@ def batch(context: click.Context, /, root: Path, **options: Any) -> None:
     a folder of results for each input, index.html, summary.csv and summary.json. Exit codes: 1 where an input failed
     (it is listed), 4 where none did and an accuracy limit was missed.
     """
-    from processor.batch import batch as whole
+    from processor.batch import batch as batch_run
     from processor.jobs.runner import StoppedError
 
     chosen = BatchOptions(**options)
     try:
-        summary = whole.run(_settings(root, chosen), say, lambda record: _report_input(record, chosen.as_json))
+        summary = batch_run.run(
+            _settings(root, chosen), print_error_line, lambda record: _report_input(record, chosen.as_json)
+        )
     except StoppedError:
         context.exit(IN_PART)
     counts = {name: count for name, count in summary.counts.items() if count}
@@ -81,17 +92,16 @@ def batch(context: click.Context, /, root: Path, **options: Any) -> None:
 def _settings(root: Path, options: BatchOptions) -> Settings:
     """Check the options and turn them into the settings of a batch."""
     from processor import pipeline
-    from processor.batch import batch as whole
+    from processor.batch import batch as batch_run
 
-    if options.jobs is not None and options.cluster is not None:
-        raise UsageError("--jobs and --cluster exclude each other: a cluster does as many at a time as it has workers")
+    check_jobs(options.jobs, options.cluster)
     parameters = pipeline.read_params(options.params)
     if options.steps or options.methods or parameters:  # wrong names are reported once, not by every input
         pipeline.plan(options.steps or tuple(pipeline.step_modules()), options.methods, parameters, options.seed)
     seed = "" if options.seed is None else str(options.seed)
     arguments = {"--steps": ",".join(options.steps), "--method": ",".join(options.methods), "--seed": seed}
     arguments["--lang"] = options.lang
-    return whole.Settings(
+    return batch_run.Settings(
         root=root,
         out=options.output,
         arguments=tuple(text for name, value in arguments.items() if value for text in (name, value)),
@@ -120,4 +130,4 @@ def _report_input(record: Record, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"event": "input", **as_object(record)}))
     elif record.reason is not None:
-        say(f"{record.input}: failed: {messages('en').text(record.reason)}")
+        print_error_line(f"{record.input}: failed: {messages('en').text(record.reason)}")

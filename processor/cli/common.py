@@ -1,19 +1,52 @@
-"""What the commands of ``processor`` share: exit codes, units to choose from, and how a line is said."""
+"""What the commands of ``processor`` share: exit codes, units, shared options, and output on the terminal."""
 
 from __future__ import annotations
 
+from pathlib import Path
+from typing import TYPE_CHECKING
+
 import click
+
+from processor.model import Status, UsageError
+
+if TYPE_CHECKING:
+    from processor.api.runs import Results
 
 DONE, IN_PART, LIMIT_MISSED = 0, 1, 4
 LANGUAGES = ("en", "zh")
 UNITS = ("m", "mm", "cm", "inch", "ft")
 
 
-def say(line: str) -> None:
-    """Write one line on standard error, whatever control characters a name in it holds."""
-    click.echo("".join(one if one.isprintable() else "\N{REPLACEMENT CHARACTER}" for one in line), err=True)
+debug_option = click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 
 
-def named(_: click.Context, __: click.Parameter, value: str | None) -> tuple[str, ...]:
+def print_error_line(line: str) -> None:
+    """Write one line on standard error; control characters, as of a file's name, are replaced."""
+    click.echo("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line), err=True)
+
+
+def check_jobs(jobs: int | None, cluster: str | None) -> None:
+    """Raise UsageError where both --jobs and --cluster are given."""
+    if jobs is not None and cluster is not None:
+        raise UsageError("--jobs and --cluster exclude each other: a cluster has as many processes as it has workers")
+
+
+def split_names(_: click.Context, __: click.Parameter, value: str | None) -> tuple[str, ...]:
     """Split an option's names at the commas."""
     return tuple(name.strip() for name in value.split(",") if name.strip()) if value else ()
+
+
+def show_results(context: click.Context, output: Path, results: Results, as_json: bool) -> None:
+    """Print what was found and set the exit code."""
+    from processor.report import all_tables, results_folder
+    from processor.report import table as report_table
+
+    if as_json:
+        click.echo((output / results_folder.RESULTS).read_text("utf-8"), nl=False)
+    else:
+        for table in all_tables.all_of(results.execution, results.report):
+            if table.on_terminal:
+                click.echo(report_table.plain_text(table) + "\n")
+        click.echo(f"report: {output / 'report.html'}")
+    complete = all(result.status == Status.OK for result in results.steps.values())
+    context.exit(LIMIT_MISSED if not results.report.passed else DONE if complete else IN_PART)

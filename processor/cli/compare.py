@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from processor.cli.common import LANGUAGES, say
+from processor.cli.common import LANGUAGES, debug_option, print_error_line
 
 LENGTH = click.FloatRange(min=0.0, min_open=True)
 FILE = click.Path(path_type=Path)
@@ -43,7 +43,7 @@ class _Diameters(click.Command):
 @click.option("--normals", type=FILE, help="nx, ny, nz of every core point, PLY or text, instead of fitted ones")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
 @click.option("--json", "as_json", is_flag=True, help="print compare.json")
-@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+@debug_option
 def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: bool, **options: Any) -> None:
     """Distances from cloud REFERENCE to cloud COMPARED along normals, with levels of detection (M3C2).
 
@@ -55,7 +55,7 @@ def compare(reference: Path, compared: Path, output: Path, lang: str, as_json: b
 
     comparison.check_output(output, (reference, compared, options["core"], options["normals"]))
     given = {name: value for name, value in options.items() if value is not None}
-    result = comparing.compare(comparing.Request(reference, compared, **given), say)
+    result = comparing.compare(comparing.Request(reference, compared, **given), print_error_line)
     record = comparison.write(output, result, lang)
     if as_json:
         click.echo(json.dumps(record, ensure_ascii=False))

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import click
 
+from processor.cli.common import debug_option
 from processor.model import UsageError
 
 
@@ -14,7 +15,7 @@ from processor.model import UsageError
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
 @click.option("--force", is_flag=True, help="replace the project.toml that is there")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
-@click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
+@debug_option
 def init(folder: Path, force: bool, as_json: bool) -> None:
     """Write FOLDER/project.toml as its files suggest: kind, units, design, and which scan is which component.
 
@@ -22,18 +23,18 @@ def init(folder: Path, force: bool, as_json: bool) -> None:
     the file: look at it before the first run.
     """
     from processor.scan_folder import files, guess
-    from processor.store import store
+    from processor.store.atomic_file import replacing
 
     path = folder / files.PROJECT
     if path.exists() and not force:
         raise UsageError(f"{path}: is there already; --force replaces it")
-    found = guess.guess(folder)
-    text = guess.written(found)
-    with store.replacing(path) as temporary:
+    project = guess.guess(folder)
+    text = guess.to_toml(project)
+    with replacing(path) as temporary:
         temporary.write_text(text, "utf-8")
     if as_json:
-        click.echo(json.dumps(guess.as_json(found), ensure_ascii=False))
+        click.echo(json.dumps(guess.as_json(project), ensure_ascii=False))
         return
-    click.echo(f"{path}: kind {found.kind}, {len(found.scans)} file(s) of scans")
-    for one in found.unsure:
-        click.echo(f"? {one}")
+    click.echo(f"{path}: kind {project.kind}, {len(project.scans)} file(s) of scans")
+    for question in project.unsure:
+        click.echo(f"? {question}")

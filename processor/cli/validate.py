@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED
+from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, check_jobs, debug_option
 
 
 @dataclass(frozen=True)
@@ -40,6 +40,7 @@ class ValidateOptions:
 @click.option("--accept", is_flag=True, help="do nothing but accept what got worse in the night as the new level")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the pages")
 @click.option("--json", "as_json", is_flag=True, help="print summary.json instead of one line")
+@debug_option
 @click.pass_context
 def validate(context: click.Context, /, matrix: Path | None, **options: Any) -> None:
     """Make, run and check a matrix of scenes, and report what changed since the nights before.
@@ -50,8 +51,7 @@ def validate(context: click.Context, /, matrix: Path | None, **options: Any) -> 
     from processor.validation import command
 
     chosen = ValidateOptions(**options)
-    if chosen.jobs is not None and chosen.cluster is not None:
-        raise click.UsageError("--jobs and --cluster exclude each other: a cluster has as many processes as workers")
+    check_jobs(chosen.jobs, chosen.cluster)
     if chosen.accept:
         click.echo(command.accept(chosen.output, chosen.history, chosen.night))
         return

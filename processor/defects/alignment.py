@@ -1,15 +1,18 @@
 """Alignment of stations to each other, and of the whole to the design; what remains is the structure's own deviation.
 
 Stations that see one place must agree, whatever the structure's deviation there: this gives a small movement and a
-range offset of each station. The whole is then fitted to the design with redescending weights, as components that moved
-are few.
+range offset of each station. How large these are as a rule is estimated with them, as variance components: stations
+that hardly share a surface are not moved by more than those that agree show. The whole is then fitted to the design
+with redescending weights, as components that moved are few. What stations leave undetermined is carried into the
+variance of every place.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numba import njit
 
 from processor.defects.observations import Pairs, Stations
 from processor.defects.surface_charts import DesignSurface
@@ -17,12 +20,15 @@ from processor.geometry import rigid
 from processor.model import Floats, Ints
 
 BLOCK_MM = 80.0
-# Prior standard deviations of a station's error: rotation (rad), translation (mm), range offset (mm).
+# Largest and least standard deviations of a station's error: rotation (rad), translation (mm), range offset (mm).
 PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
+LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])
+GROUPS = (slice(0, 3), slice(3, 6), slice(6, 7))  # of parameters with one variance component each
 WHOLE_PRIOR = np.array([5e-3] * 3 + [50.0] * 3)
 FLOOR_MM = 0.15  # standard deviation of a block's mean: beams, encoders and the roughness of the steel
 FEWEST_COMPONENTS = 3  # to fit the whole by: of fewer, a component that moved cannot be identified
 ROUNDS = 12
+MOST_ROUNDS, SETTLED = 40, 0.05  # of the stations' variance components, and the relative change of the last round
 CAUCHY = 2.385
 MOST_COUPLED = 3_000_000  # blocks times stations, beyond which stations are not fitted
 
@@ -31,7 +37,9 @@ MOST_COUPLED = 3_000_000  # blocks times stations, beyond which stations are not
 class Alignment:
     """Movements of stations and of the whole: rotations about ``centre`` (rad), translations and range offsets (mm).
 
-    ``movements`` (k, 7) are of the stations, ``whole`` (6,) of everything; ``covariance`` (6, 6) is that of the whole.
+    ``movements`` (k, 7) are of the stations, ``whole`` (6,) of everything; ``covariance`` (6, 6) is that of the whole
+    if the stations' movements were known, ``station_covariance`` (7k, 7k) that of these. The whole moves by
+    ``response`` (6, 7k) times an error of the stations' movements.
     """
 
     centre: Floats
@@ -39,6 +47,8 @@ class Alignment:
     whole: Floats
     covariance: Floats
     fitted: bool
+    station_covariance: Floats
+    response: Floats
 
     def corrections(self, points: Floats, outward: Floats, rays: Floats, station: Ints) -> Floats:
         """Return the corrections (n,) to subtract from deviations at points (n, 3) along unit rays (n, 3), mm."""
@@ -51,6 +61,11 @@ class Alignment:
         J = _derivative(points - self.centre, outward, np.zeros_like(points))[:, :6]
         sd: Floats = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", J, self.covariance, J), 0.0))
         return sd
+
+    def pose_covariance(self) -> Floats:
+        """Return the covariance (6, 6) of the whole about ``centre``, with what stations leave undetermined."""
+        total: Floats = self.covariance + self.response @ self.station_covariance @ self.response.T
+        return total
 
 
 @dataclass(frozen=True)
@@ -72,7 +87,15 @@ def none(surface: DesignSurface, stations: int, error_mm: float) -> Alignment:
     covariance = np.zeros((6, 6))
     covariance[3:, 3:] = np.eye(3) * error_mm**2
     centre = surface.vertices.mean(axis=0)
-    return Alignment(centre, np.zeros((stations, 7)), np.zeros(6), covariance, False)
+    return Alignment(
+        centre=centre,
+        movements=np.zeros((stations, 7)),
+        whole=np.zeros(6),
+        covariance=covariance,
+        fitted=False,
+        station_covariance=np.zeros((7 * stations, 7 * stations)),
+        response=np.zeros((6, 7 * stations)),
+    )
 
 
 def align(
@@ -88,14 +111,65 @@ def align(
         return start
     points, outward = surface.centres[blocks.cell], surface.outward[blocks.cell]
     J = _derivative(points - start.centre, outward, rays_to(points, stations.positions[blocks.station]))
-    movements = _stations(blocks, J, len(stations.names))
+    movements, station_covariance = station_movements(blocks, J, len(stations.names))
+    start = replace(start, movements=movements, station_covariance=station_covariance)
     residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
     component = surface.charts.component[chart_of_cells(surface)[blocks.cell]]
     used = ~np.isin(component, sorted(excluded))
     if len(np.unique(component[used])) < FEWEST_COMPONENTS:
-        return Alignment(start.centre, movements, start.whole, start.covariance, False)
-    whole, covariance = _whole(residual[used], J[used, :6], component[used])
-    return Alignment(start.centre, movements, whole, covariance, True)
+        return start
+    whole, covariance, gain = _whole(residual[used], J[used, :6], component[used])
+    response = np.zeros((6, station_covariance.shape[0]))
+    for k in range(len(stations.names)):
+        rows = np.flatnonzero(blocks.station[used] == k)
+        response[:, 7 * k : 7 * k + 7] = -gain[:, rows] @ J[used][rows]
+    return replace(start, whole=whole, covariance=covariance, fitted=True, response=response)
+
+
+def station_variance(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment) -> Floats:
+    """Return the variance (cells,) of the cells' deviations by errors of the stations' movements, mm2."""
+    points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
+    rays = rays_to(points, stations.positions[pairs.station])
+    J = _derivative(points - alignment.centre, outward, rays)
+    total = np.maximum(np.bincount(pairs.cell, pairs.count, len(surface.share)), 1.0)
+    C, R = alignment.station_covariance, alignment.response
+    return quadratic_forms(
+        pairs.cell, pairs.station, pairs.count / total[pairs.cell], J, C, C @ R.T, R @ C @ R.T, total
+    )
+
+
+@njit(cache=True, nogil=True)
+def quadratic_forms(
+    cell: Ints, station: Ints, weight: Floats, J: Floats, C: Floats, CR: Floats, RCR: Floats, like: Floats
+) -> Floats:
+    """Return (cells,) the form g C g' of each cell, g = sum over its pairs of weight J + the cell's J[:6] R.
+
+    ``J`` (n, 7) of pairs sorted by cell; C (7k, 7k) covariance, CR (7k, 6) and RCR (6, 6) its products with R (6, 7k).
+    """
+    variance = np.zeros_like(like)
+    start, n = 0, len(cell)
+    while start < n:
+        end = start
+        while end < n and cell[end] == cell[start]:
+            end += 1
+        total = 0.0
+        for i in range(start, end):
+            a = 7 * station[i]
+            for p in range(7):
+                row = 0.0
+                for j in range(start, end):
+                    b = 7 * station[j]
+                    for q in range(7):
+                        row += weight[j] * J[j, q] * C[a + p, b + q]
+                for q in range(6):
+                    row += 2.0 * J[i, q] * CR[a + p, q]
+                total += weight[i] * J[i, p] * row
+        for p in range(6):
+            for q in range(6):
+                total += J[start, p] * J[start, q] * RCR[p, q]
+        variance[cell[start]] = max(total, 0.0)
+        start = end
+    return variance
 
 
 def corrected_pose(T_design_project: Floats, alignment: Alignment) -> Floats:
@@ -155,41 +229,68 @@ def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
     )
 
 
-def _stations(blocks: StationBlocks, J: Floats, stations: int) -> Floats:
-    """Return the movements (k, 7) by which stations agree, with Cauchy's weights; the deviation of a block is free."""
+def station_movements(blocks: StationBlocks, J: Floats, stations: int) -> tuple[Floats, Floats]:
+    """Return the movements (k, 7) by which stations agree, with Cauchy's weights, and their covariance (7k, 7k).
+
+    The deviation of a block is free. The movements' standard deviations are variance components of maximum likelihood
+    (expectation maximisation, Dempster et al. 1977), from PRIOR down. Where stations do not show one at all, as a
+    single station does not, nothing is moved: an error that stations share is stated by the parameters.
+    """
     _, block = np.unique(blocks.block, return_inverse=True)
     block = block.reshape(-1)
     count = int(block.max()) + 1
-    x = np.zeros((stations, 7))
+    x: Floats = np.zeros((stations, 7))
+    covariance: Floats = np.zeros((7 * stations, 7 * stations))
     if count * stations >= MOST_COUPLED:
-        return x
+        return x, covariance
+    seen = np.bincount(blocks.station, minlength=stations) > 0
+    prior = PRIOR.copy()
     weight = 1.0 / blocks.variance
-    for _ in range(ROUNDS):
+    for iteration in range(MOST_ROUNDS):
         residual = blocks.mean - np.einsum("nk,nk->n", J, x[blocks.station])
         total = np.bincount(block, weight, count)
         middle = np.bincount(block, weight * residual, count) / total
         normalized = (residual - middle[block]) / np.sqrt(blocks.variance)
         weight = 1.0 / blocks.variance / (1.0 + (normalized / CAUCHY) ** 2)
-        # Normal equations, reduced by the deviation of each block (Schur complement).
-        total = np.bincount(block, weight, count)
-        A = np.diag(np.tile(1.0 / PRIOR**2, stations))
-        right = np.zeros(7 * stations)
-        coupling = np.zeros((count, 7 * stations))
-        for k in range(stations):
-            rows = blocks.station == k
-            wJ = weight[rows, None] * J[rows]
-            here = slice(7 * k, 7 * k + 7)
-            A[here, here] += wJ.T @ J[rows]
-            right[here] += wJ.T @ blocks.mean[rows]
-            np.add.at(coupling[:, here], block[rows], wJ)
-        A -= coupling.T @ (coupling / total[:, None])
-        right -= coupling.T @ (np.bincount(block, weight * blocks.mean, count) / total)
-        x = np.asarray(np.linalg.solve(A, right), np.float64).reshape(stations, 7)
-    return x
+        A, right = _normal_equations(blocks, J, block, weight, stations)
+        covariance = np.asarray(np.linalg.inv(A + np.diag(np.tile(1.0 / prior**2, stations))), np.float64)
+        x = (covariance @ right).reshape(stations, 7)
+        expected = x**2 + np.diag(covariance).reshape(stations, 7)
+        before = prior.copy()
+        for group in GROUPS:
+            known = 1.0 - np.diag(covariance).reshape(stations, 7)[:, group] / prior[group] ** 2
+            undetermined = iteration == 0 and known.sum() < 1.0
+            size = 0.0 if undetermined else float(np.sqrt(expected[seen][:, group].mean()))
+            prior[group] = max(size, LEAST_PRIOR[group][0])
+        if iteration >= ROUNDS - 1 and np.abs(prior / before - 1.0).max() < SETTLED:
+            break
+    return x, covariance
 
 
-def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Floats]:
-    """Return the movement (6,) of the whole, with redescending weights, and its covariance.
+def _normal_equations(
+    blocks: StationBlocks, J: Floats, block: Ints, weight: Floats, stations: int
+) -> tuple[Floats, Floats]:
+    """Return the normal equations (7k, 7k), (7k,) reduced by the deviation of each block (Schur complement)."""
+    count = int(block.max()) + 1
+    total = np.bincount(block, weight, count)
+    A, right = np.zeros((7 * stations, 7 * stations)), np.zeros(7 * stations)
+    coupling = np.zeros((count, 7 * stations))
+    for k in range(stations):
+        rows = blocks.station == k
+        wJ = weight[rows, None] * J[rows]
+        here = slice(7 * k, 7 * k + 7)
+        A[here, here] += wJ.T @ J[rows]
+        right[here] += wJ.T @ blocks.mean[rows]
+        np.add.at(coupling[:, here], block[rows], wJ)
+    A -= coupling.T @ (coupling / total[:, None])
+    right -= coupling.T @ (np.bincount(block, weight * blocks.mean, count) / total)
+    return A, right
+
+
+def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Floats, Floats]:
+    """Return the movement (6,) of the whole, with redescending weights, its covariance, and its gain (6, n).
+
+    The movement is the gain times the deviations.
 
     The covariance follows from the scatter between components (sandwich estimator), plus that of the fit itself.
     """
@@ -214,4 +315,4 @@ def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Float
     inverse = np.linalg.inv(A)
     count = len(np.unique(component))
     covariance = inverse @ (groups.T @ groups) @ inverse * count / max(count - 6.0, 1.0) + inverse
-    return x, covariance
+    return x, covariance, inverse @ (weight[:, None] * J / scale**2).T

@@ -10,7 +10,6 @@ import numpy as np
 
 from processor.defects.params import Params
 from processor.geometry import merging, mesh_distance, rigid, surface_registration
-from processor.geometry.principal import AMBIGUOUS
 from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Reason, Scene, Status, reason
 
@@ -20,12 +19,16 @@ SAMPLE = 200_000
 
 @dataclass(frozen=True)
 class DesignPose:
-    """``T_design_project`` (4, 4), None where it is not known; the standard deviation of its translation in mm."""
+    """``T_design_project`` (4, 4), None where it is not known; the standard deviation of its translation in mm.
+
+    ``doubt`` is why no defect is sure at this pose; None where the pose is sure.
+    """
 
     T_design_project: Floats | None
     error_mm: float
     reasons: tuple[Reason, ...] = ()
     status: Status = Status.OK
+    doubt: Reason | None = None
 
 
 def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
@@ -37,9 +40,12 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
     if before is not None and before.T_design_scan.size:
         errors = (params.registration_error_mm, before.registration_error)
         error = next((value for value in errors if math.isfinite(value)), DEFAULT_ERROR_MM)
-        status = Status.AMBIGUOUS if before.status == Status.AMBIGUOUS else Status.OK
         source = reason("defects.placed-by-deviation", registration=before.registration)
-        return DesignPose(before.T_design_scan, error, (source,), status)
+        if before.status == Status.FAILED:
+            return DesignPose(None, error, (source, *before.reasons))
+        if before.status == Status.AMBIGUOUS:
+            return _ambiguous(before.T_design_scan, error, (source,))
+        return DesignPose(before.T_design_scan, error, (source,))
     error = params.registration_error_mm if math.isfinite(params.registration_error_mm) else DEFAULT_ERROR_MM
     assert scene.structure is not None
     cloud = merging.merged(scene, with_scanner=False)
@@ -55,8 +61,18 @@ def pose(scene: Scene, earlier: dict[str, Any], params: Params) -> DesignPose:
     if not np.isfinite(placed.T_best_fit).all():
         return DesignPose(None, error, (reason("defects.not-placed"),))
     T = rigid.transform(np.eye(3), origin) @ placed.T @ rigid.transform(np.eye(3), -cloud.origin)
-    reasons, status = [reason("defects.best-fit")], Status.OK
-    if placed.ambiguity < AMBIGUOUS:
-        status = Status.AMBIGUOUS
-        reasons.append(reason("defects.ambiguous"))
-    return DesignPose(T, error, tuple(reasons), status)
+    reasons = (reason("defects.best-fit"),)
+    if not surface_registration.fits_design(placed, few, surface):
+        return DesignPose(None, error, (reason("defects.not-placed"),))
+    return _ambiguous(T, error, reasons) if placed.ambiguous else DesignPose(T, error, reasons)
+
+
+def _ambiguous(T: Floats, error_mm: float, reasons: tuple[Reason, ...]) -> DesignPose:
+    """Return a pose (4, 4) that another attitude fits as well as."""
+    return DesignPose(
+        T_design_project=T,
+        error_mm=error_mm,
+        reasons=(*reasons, reason("defects.ambiguous")),
+        status=Status.AMBIGUOUS,
+        doubt=reason("defects.pose-ambiguous"),
+    )

@@ -67,10 +67,11 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     if registered is None:
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.no-point"),))
     search = _search(scene, registered, pose.error_mm, params)
-    result = to_result.result_of(search, params, origin)
+    result = to_result.result_of(search, params, origin, pose.doubt)
     T = alignment.corrected_pose(registered.T_design_project, search.alignment)
     return dataclasses.replace(
         result,
+        covariance=rigid.about_origin(search.alignment.pose_covariance(), search.alignment.centre + origin),
         status=pose.status if result.status is Status.OK else result.status,
         reasons=(*pose.reasons, *result.reasons),
         T_design_project=rigid.transform(np.eye(3), origin) @ T,
@@ -84,7 +85,7 @@ def _registered(
 ) -> Registered | None:
     """Assign points to cells and align them, again after a large movement; None without points near the design."""
     base = surface_charts.of_mesh(vertices, faces, _coarse_cell(vertices, faces))
-    for _ in range(ROUNDS):
+    for left in reversed(range(ROUNDS)):
         observed = observations.observe(scene, T, base, params.reach_mm)
         if not len(observed.chart):
             return None
@@ -96,7 +97,7 @@ def _registered(
             aligned = alignment.none(surface, len(observed.stations.names), error_mm)
             break
         aligned = alignment.align(pairs, surface, observed.stations, error_mm)
-        if _largest_movement(aligned, surface) < AGAIN_MM:
+        if not left or _largest_movement(aligned, surface) < AGAIN_MM:
             break
         T = alignment.corrected_pose(T, aligned)
     return Registered(T_design_project=T, observed=observed, surface=surface, pairs=pairs, alignment=aligned)

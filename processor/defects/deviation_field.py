@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
-from processor.defects.alignment import Alignment, chart_of_cells, rays_to
+from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
 from processor.model import Floats, Ints
@@ -23,7 +23,8 @@ class Field:
     """Deviation (mm, outward positive) of each cell (cells,), its variance from noise, and numbers of points.
 
     ``stray`` counts points that do not agree with the others of the cell. ``inner`` are cells away from their face's
-    border, ``seen`` those of them with enough points.
+    border, ``seen`` those of them with enough points. ``stations`` is the variance by errors of the stations'
+    movements, which neighbouring cells have in common; 0 in cells without points.
     """
 
     deviation: Floats
@@ -33,6 +34,12 @@ class Field:
     noise: Floats  # standard deviation of one point
     inner: Floats  # 0 or 1
     seen: Floats  # 0 or 1
+    stations: Floats
+
+    def stations_sd(self, cells: Ints) -> float:
+        """Return the standard deviation that cells have in common by errors of the stations' movements, mm."""
+        variance = self.stations[cells][self.count[cells] > 0]
+        return float(np.sqrt(variance.mean())) if len(variance) else 0.0
 
     def less(self, shape: Floats) -> Field:
         """Return the field less a shape (cells,)."""
@@ -76,6 +83,7 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         noise=noise,
         inner=inner,
         seen=inner * (count + stray >= FEWEST_POINTS),
+        stations=station_variance(pairs, surface, stations, alignment),
     )
 
 

@@ -119,7 +119,7 @@ class Defects(Rows):
     lod95: Floats = column("k", unit="mm")  # of a mean over the defect
     z: Floats = column("k")  # deviation by its standard deviation
     chance: Floats = column("k", json="by_chance_on_100_m2")
-    doubtful: npt.NDArray[np.bool_] = column("k", dtype=np.bool_)  # chance above DOUBTFUL
+    doubtful: npt.NDArray[np.bool_] = column("k", dtype=np.bool_)  # chance above DOUBTFUL, or an ambiguous pose
     reasons: tuple[tuple[Reason, ...], ...] = reasons("k")
     deflection: tuple[Curve, ...] = ()  # empty curves where a defect has none
 
@@ -133,7 +133,8 @@ class Defects(Rows):
 class Result(Checked):
     """Defects of a structure.
 
-    ``T_design_project`` maps the frame of the scans as merged. ``registration_error``, ``noise`` of a point and
+    ``T_design_project`` maps the frame of the scans as merged, and was used for all places; ``covariance`` (turn about
+    the design frame's axes, translation) is its own. ``registration_error``, ``noise`` of a point and
     ``lod95`` of a cell are medians over the surface. ``examined_mm2`` is the area searched for deviations,
     ``expected_mm2`` the area that scanners should have seen. ``points_used`` are within reach of the design.
     ``pictures`` are of the first defects, in order.
@@ -143,6 +144,7 @@ class Result(Checked):
     method: str = described()
     reasons: tuple[Reason, ...] = reasons()
     T_design_project: Floats = optional(4, 4)
+    covariance: Floats = optional(6, 6)
     registration_error: float = described(NAN, unit="mm")  # one standard deviation
     cell: float = described(NAN, unit="mm")
     noise: float = described(NAN, unit="mm")  # one standard deviation

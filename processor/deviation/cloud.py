@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -15,15 +15,39 @@ MOST_POINTS = 3_000_000  # of a scan; more are thinned evenly
 
 @dataclass(frozen=True)
 class ScanCloud:
-    """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order, and scanners (n, 3)."""
+    """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order, and scanners (n, 3).
+
+    The points ``removed`` (m, 3) as outliers have the scanners ``removed_scanner`` (m, 3). ``source`` (n + m,) is the
+    row in ``sources`` of the scan that a point is from, or of the station if the scene is one scan. Scans that
+    stitching did not place are not in it: ``unplaced`` names them.
+    """
 
     points: Floats
     origin: Floats
     scanner: Floats | None
+    removed: Floats
+    removed_scanner: Floats | None
     spacing_mm: float
     read: int
     kept: int
+    source: Ints
+    sources: tuple[str, ...]
     unposed: int = 0  # scans without a pose
+    unplaced: tuple[str, ...] = ()
+
+    def of(self, sources: Ints) -> ScanCloud:
+        """Return the points of some sources alone."""
+        used = np.isin(self.source, sources)
+        rows, out = np.flatnonzero(used[: len(self.points)]), np.flatnonzero(used[len(self.points) :])
+        return replace(
+            self,
+            points=self.points[rows],
+            scanner=None if self.scanner is None else self.scanner[rows],
+            removed=self.removed[out],
+            removed_scanner=None if self.removed_scanner is None else self.removed_scanner[out],
+            source=self.source[used],
+            kept=len(rows),
+        )
 
 
 def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) -> ScanCloud:
@@ -31,7 +55,7 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
 
     Raises InputError for too few points.
     """
-    scene = merging.stitched(scene, stitched)
+    whole, scene = scene, merging.stitched(scene, stitched)
     unposed = sum(not scan.T_project_scan.size for scan in scene.scans)
     cloud = merging.merged(scene, with_scanner=True)
     if len(cloud.points) < merging.FEWEST_POINTS:
@@ -42,22 +66,41 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     spacing = neighbors.spacing(grid)
     if not spacing > 0.0:
         raise InputError(f"{scene.name}: most points of the scan lie at the same place; export it again")
-    rows = np.arange(grid.count)
+    inlier = np.ones(grid.count, bool)
     if ratio > 0.0:
-        rows = np.flatnonzero(neighbors.statistical_inliers(grid, neighbours, ratio))
-    kept = len(rows)
-    rows = rows[:: max(1, -(-kept // MOST_POINTS))]
-    thinner = np.sqrt(kept / len(rows))
-    scanner = None if cloud.scanner is None else cloud.scanner[grid.order[rows]]
+        inlier = neighbors.statistical_inliers(grid, neighbours, ratio)
+    step = max(1, -(-int(inlier.sum()) // MOST_POINTS))
+    rows, out = np.flatnonzero(inlier)[::step], np.flatnonzero(~inlier)[::step]
+    kept = int(inlier.sum())
+
+    source, sources = _sources(scene)
+
+    def scanner(at: Ints) -> Floats | None:
+        return None if cloud.scanner is None else cloud.scanner[grid.order[at]]
+
     return ScanCloud(
         points=grid.cells.points[rows],
         origin=cloud.origin,
-        scanner=scanner,
-        spacing_mm=spacing * thinner,
+        scanner=scanner(rows),
+        removed=grid.cells.points[out],
+        removed_scanner=scanner(out),
+        spacing_mm=spacing * np.sqrt(kept / len(rows)),
         read=grid.count,
         kept=kept,
+        source=source[grid.order[np.concatenate([rows, out])]],
+        sources=sources,
         unposed=unposed,
+        unplaced=tuple(scan.name for scan in whole.scans if all(scan.name != used.name for used in scene.scans)),
     )
+
+
+def _sources(scene: Scene) -> tuple[Ints, tuple[str, ...]]:
+    """Return the scan (n,) of each point in the order of the scans, or its station in a single one, and their names."""
+    scans = scene.scans
+    if len(scans) == 1 and len(scans[0].point_station) and scene.stations is not None:
+        station = scans[0].point_station.astype(np.int64)
+        return np.where(station < 0, len(scene.stations.ids), station), (*scene.stations.ids, "-")
+    return np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans]), tuple(scan.name for scan in scans)
 
 
 def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:

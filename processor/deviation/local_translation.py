@@ -28,15 +28,17 @@ DETERMINED = 0.05  # least eigenvalue of the mean of n n' for which the translat
 class Movement:
     """At each place (k,): movement along its normal, number of points used, and standard deviation of one point.
 
-    ``vector`` (k, 3) is the translation itself, without the directions that the points do not determine. The standard
-    error of ``along`` is sd / sqrt(count); ``sd`` includes the estimated unknowns and Student's factor for few points,
-    so that 1.96 standard errors are 95 %. NaN below FEWEST_FOR_LOD points.
+    ``vector`` (k, 3) is the translation itself, without the directions that the points do not determine, and ``rank``
+    (k,) the number of the others. The standard error of ``along`` is sd / sqrt(count); ``sd`` includes the estimated
+    unknowns and Student's factor for few points, so that 1.96 standard errors are 95 %. NaN below FEWEST_FOR_LOD
+    points.
     """
 
     along: Floats
     count: Ints
     sd: Floats
     vector: Floats
+    rank: Ints
 
 
 class _Feet(NamedTuple):
@@ -93,7 +95,9 @@ def movement(
     over_ranges(lambda a, b: _movement(feet.cells, measured, wanted, a, b, moved), k, least=LEAST_RANGE)
     table = stdtrit(np.arange(1.0, 401.0), 0.975) / Z95
     factor = np.where(moved.free > 0, table[np.clip(moved.free, 1, 400) - 1], np.nan)
-    return Movement(moved.along, moved.number, np.sqrt(moved.variance) * factor, moved.vector)
+    return Movement(
+        moved.along, moved.number, np.sqrt(moved.variance) * factor, moved.vector, moved.number - moved.free
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -8,6 +8,7 @@ from processor.model import UsageError
 
 METHODS = ("default", "paper")  # the first is the default
 REGISTER = ("auto", "none", "fine", "coarse")
+FIT = ("stable", "all")
 NAN = float("nan")
 
 
@@ -29,6 +30,7 @@ class Params:
     method: str = METHODS[0]
     seed: int = 0
     register: str = "auto"  # none: the frame as it is; fine: from where it is; coarse: from anywhere; auto: see README
+    fit: str = "stable"  # a scan that is registered is fitted to: the largest part that agrees (stable); all: best fit
     neighbours: int = 20  # K of the outlier removal
     outlier_ratio: float = 1.0  # n: standard deviations of the mean distance to K neighbours; 0 = no removal
     projection_diameter_mm: float = 0.0
@@ -41,6 +43,8 @@ class Params:
         """Raise UsageError for parameters that make no sense."""
         if self.register not in REGISTER:
             raise UsageError(f"deviation.register: expected one of {', '.join(REGISTER)}, got {self.register!r}")
+        if self.fit not in FIT:
+            raise UsageError(f"deviation.fit: expected one of {', '.join(FIT)}, got {self.fit!r}")
         paper = self.paper
         for name, sound in (
             ("neighbours", self.neighbours >= 1),

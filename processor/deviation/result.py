@@ -30,7 +30,7 @@ class ErrorSource(Word):
     """Where the registration error within LOD95 is from."""
 
     UNKNOWN = "not known: the scan does not determine the best fit"
-    COVARIANCE = "covariance of the best fit, rms over the core points"
+    COVARIANCE = "covariance of the fit, mean over the core points"
     GIVEN = "given"
     CLONE = "a clone of the scan"
 
@@ -64,9 +64,11 @@ class CorePoints(Rows):
 class Result(Checked):
     """Deviations of a scanned surface from its design.
 
-    ``T_design_scan`` maps the frame of the scans as merged; ``T_best_fit`` is that of a best fit, applied or not, with
-    ``covariance`` (design frame, rotation about its origin and translation). The statistics are of the core points
-    that have a level of detection.
+    ``T_design_scan`` maps the frame of the scans as merged. ``T_best_fit`` is that of a best fit to all that was
+    measured, ``T_stable_fit`` that of a fit to the largest part of it that agrees with one rigid motion to within
+    ``stable_fit_limit``, applied or not, with the areas that they rest on. ``covariance`` (design frame, rotation about
+    its origin and translation) is that of the fit wanted. The statistics are of the core points that have a level of
+    detection.
     """
 
     status: Status = described(words=Status)
@@ -81,6 +83,15 @@ class Result(Checked):
     T_best_fit: Floats = optional(4, 4, json="best_fit.T_design_scan")
     best_fit_shift: Floats = optional(3, json="best_fit.shift", unit="mm")  # of the scan's middle, from T_design_scan
     best_fit_turn: float = described(NAN, json="best_fit.turn", unit="rad")
+    best_fit_area: float = described(NAN, json="best_fit.area", unit="m2", heading="best fit: area it rests on")
+    T_stable_fit: Floats = optional(4, 4, json="stable_fit.T_design_scan")
+    stable_fit_shift: Floats = optional(3, json="stable_fit.shift", unit="mm")
+    stable_fit_turn: float = described(NAN, json="stable_fit.turn", unit="rad")
+    stable_fit_area: float = described(NAN, json="stable_fit.area", unit="m2", heading="stable fit: area it rests on")
+    stable_fit_share: float = described(
+        NAN, json="stable_fit.area_share", percent=True, heading="stable fit: share of the area measured"
+    )
+    stable_fit_limit: float = described(NAN, json="stable_fit.limit", unit="mm", heading="stable fit: agreement within")
     core_points: int = described(0, heading="core points")
     core_points_measured: int = described(0, heading="core points measured")
     significant_share: float = described(NAN, percent=True, heading="beyond LOD95")

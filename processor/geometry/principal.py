@@ -12,10 +12,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import rigid
+from processor.geometry.neighbors import voxel_means
 from processor.model import Floats, Ints
 
 ALIKE = 1.25  # ratio of the variances along two axes below which these may be swapped
 SAME_TURN, SAME_SHIFT = 0.02, 0.01  # rad, and share of the size: poses that differ by less are one pose
+SIZE_SHARE = 0.01  # of the longest size: scans of a part differ less from its sizes, by noise, form and voxels
 AMBIGUOUS = 1.3  # ratio of two poses' errors below which either may be right
 
 
@@ -46,6 +48,15 @@ def of_points(points: Floats) -> PrincipalAxes:
     centre = points.mean(axis=0)
     local = points - centre
     return _from_moments(centre, local.T @ local / len(points))
+
+
+def sizes(points: Floats) -> Floats:
+    """Sizes (3,) of a surface's points (n, 3) along its principal axes, longest first, without single outliers."""
+    spread = float(np.linalg.norm(np.ptp(points, axis=0)))
+    even = voxel_means(points, spread / 150.0, least=2)
+    even = even if len(even) >= 50 else points
+    size: Floats = np.sort(np.ptp(even @ of_points(even).axes, axis=0))[::-1]
+    return size
 
 
 def of_mesh(vertices: Floats, faces: Ints) -> PrincipalAxes:

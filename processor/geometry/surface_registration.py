@@ -1,17 +1,19 @@
 """Registration of a scan to the surface of its design: coarse by principal axes, then fine by least squares.
 
 The fine registration needs a pose that is right to a few millimetres; see :mod:`processor.geometry.principal` for the
-search from any pose. :func:`place` decides which of the two a scan needs.
+search from any pose, and :mod:`processor.geometry.attitude` for the choice between the attitudes of a nearly symmetric
+structure. :func:`place` decides which of these a scan needs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from processor.geometry import icp, mesh_distance, principal, rigid
+from processor.geometry import attitude, icp, mesh_distance, principal, rigid
 from processor.geometry.mesh_distance import Bools, MeshSurface, Samples, on_face
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.principal import CoarsePose, PrincipalAxes
@@ -177,6 +179,7 @@ EVEN_CELLS = 200.0  # voxels along the scan's extent, for points of even density
 NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000
+PROMISING = 3.0  # ratio of two poses' errors after the coarse registration, below which the fine one decides
 NAN = float("nan")
 
 
@@ -193,7 +196,8 @@ class Placed:
     """``T`` (4, 4) and ``T_best_fit`` (4, 4) map the scan's local frame to the design's; ``registration`` says how.
 
     ``covariance`` (6, 6) is that of the best fit. ``shift`` (3,) and ``turn`` are what the best fit does to the scan's
-    middle relative to T.
+    middle relative to T. ``ambiguity`` is the ratio of the coarse errors of the next best attitude and this one; the
+    pose is ``ambiguous`` if no surface distinguishes it from ``T_rival``.
     """
 
     T: Floats
@@ -206,29 +210,35 @@ class Placed:
     turn: float
     weak: tuple[Motion, ...]
     sigma_mm: float
-    T_rival: Floats  # (4, 4) of the next best coarse pose; NaN without one
+    ambiguous: bool
+    T_rival: Floats  # (4, 4) of another attitude that fits as well; NaN without one
 
 
-def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Placed:
+def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner: Floats | None = None) -> Placed:
     """Place a scan's points (n, 3) at its design from ``given`` (4, 4); ``how``: auto, none, fine or coarse.
 
     A best fit absorbs whatever a structure moved as a whole. A scan that lies at its design already is therefore left
-    where it is by ``auto``, and the best fit is only reported.
+    where it is by ``auto``, and the best fit is only reported. ``scanner`` (n, 3) is the position that each point was
+    measured from, if known: it helps to distinguish attitudes.
     """
     axes = principal.of_mesh(surface.vertices, surface.faces)
     few = thinned(points, FINE_POINTS)
     near, _ = surface.tree.query(rigid.apply(given, few), distance_upper_bound=NEAR_MM, workers=-1)
     near_share = float(np.isfinite(near).mean())
-    start, ambiguity, registration = given, NAN, Registration.AS_GIVEN
-    rival = np.full((4, 4), NAN)
+    registration, rivals, ambiguity = Registration.AS_GIVEN, [], NAN
     if how == "coarse" or (how == "auto" and near_share < NEAR_SHARE):
-        spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
-        pose = coarse(even(points), mesh_distance.sampled(surface.vertices, surface.faces, spacing), axes)
-        start, ambiguity, registration = pose.T_target_source, pose.ambiguity, Registration.COARSE
-        rival = pose.T_rival
-    elif how == "fine":
-        registration = Registration.FINE
-    fitted = fine(few, surface, axes.axes, start)
+        registration = Registration.COARSE
+        poses = _attitudes(even(points), surface, axes)
+        starts = [T for error, T in poses if error <= PROMISING * poses[0][0]]
+        fits = [fine(few, surface, axes.axes, start) for start in starts]
+        choice = attitude.choose(points, surface, [fit.T_design_scan for fit in fits], scanner)
+        start, fitted = starts[choice.best], fits[choice.best]
+        rivals = [fits[k].T_design_scan for k in choice.rivals]
+        others = [error for k, (error, _) in enumerate(poses) if k != choice.best]
+        ambiguity = min(others, default=NAN) / max(poses[choice.best][0], 1e-9)
+    else:
+        start, registration = given, Registration.FINE if how == "fine" else Registration.AS_GIVEN
+        fitted = fine(few, surface, axes.axes, given)
     determined = np.isfinite(fitted.covariance).all()
     best = fitted.T_design_scan if determined else np.full((4, 4), NAN)
     T = start if registration is Registration.AS_GIVEN or not determined else best
@@ -245,13 +255,26 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str) -> Plac
         turn=rigid.rotation_angle(between[:3, :3]),
         weak=fitted.weak,
         sigma_mm=fitted.sigma_mm,
-        T_rival=rival,
+        ambiguous=bool(rivals),
+        T_rival=rivals[0] if rivals else np.full((4, 4), NAN),
     )
+
+
+def fits_design(placed: Placed, points: Floats, surface: MeshSurface) -> bool:
+    """Whether points (n, 3), or half of them beside clutter, lie near the surface at the pose that was found."""
+    few = thinned(points, FINE_POINTS)
+    near, _ = surface.tree.query(rigid.apply(placed.T, few), distance_upper_bound=NEAR_MM, workers=-1)
+    return bool(np.isfinite(near).mean() >= NEAR_SHARE)
 
 
 def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
     """Register points (n, 3), even in density, from any pose to samples of a design with its principal axes."""
     size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
+    return principal.coarse(principal.of_points(points), axes, size, _refined(points, design, size))
+
+
+def _refined(points: Floats, design: Samples, size: float) -> Callable[[Floats], tuple[float, Floats]]:
+    """Return the function that improves a pose (4, 4) of points (n, 3), and returns the rms in mm left with it."""
     tree = cKDTree(design.points)
     few = thinned(points, COARSE_POINTS)
     gates = tuple(share * size for share in GATE_SHARES)
@@ -262,7 +285,31 @@ def coarse(points: Floats, design: Samples, axes: PrincipalAxes) -> CoarsePose:
         ).T_target_source
         return _rms(few, design, tree, T, gates[-1]), T
 
-    return principal.coarse(principal.of_points(points), axes, size, refined)
+    return refined
+
+
+def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> list[tuple[float, Floats]]:
+    """Return the rms in mm and coarse pose (4, 4) of points (n, 3) in every attitude, the least rms first.
+
+    Attitudes are that of the best pose by principal axes, its rival, and the best turned as the design's principal axes
+    allow: the axes of a scan from one side are off, and may not lead to every attitude.
+    """
+    spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
+    design = mesh_distance.sampled(surface.vertices, surface.faces, spacing)
+    size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
+    first = coarse(points, design, axes)
+    refined = _refined(points, design, size)
+    turns = [axes.axes @ turn @ axes.axes.T for turn in principal.possible_turns(axes.variances, axes.variances)]
+    found = [refined(rigid.transform(R, axes.centre - R @ axes.centre) @ first.T_target_source) for R in turns]
+    found.append((first.rms_mm, first.T_target_source))
+    if np.isfinite(first.T_rival).all():
+        found.append((first.ambiguity * first.rms_mm, first.T_rival))
+    distinct: list[tuple[float, Floats]] = []
+    for k in sorted(range(len(found)), key=lambda k: (found[k][0], k)):
+        T = found[k][1]
+        if all(principal.differ(T, other, points.mean(axis=0), size) for _, other in distinct):
+            distinct.append(found[k])
+    return distinct
 
 
 def even(points: Floats) -> Floats:

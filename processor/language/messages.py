@@ -96,8 +96,8 @@ class Messages(string.Formatter):
     def format_field(self, value: Any, format_spec: str) -> str:
         """Write one value of a template."""
         if format_spec.startswith("?"):
-            one, _, many = format_spec[1:].partition("|")
-            return one if value == 1 else many
+            singular, _, plural = format_spec[1:].partition("|")
+            return singular if value == 1 else plural
         if isinstance(value, float) and not math.isfinite(value):
             return NO_NUMBER
         if format_spec == ".":

@@ -19,6 +19,7 @@ from processor.preassembly.chain.adjustment import Adjusted
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.params import Params, TrimParams
 from processor.preassembly.parts import measure
+from processor.preassembly.parts.attitude import Shapes
 from processor.preassembly.parts.measure import MeasuredPart
 from processor.preassembly.parts.systematic_errors import EXPANSION_PER_K
 from processor.preassembly.result import Result
@@ -38,10 +39,11 @@ def assemble(scans: Sequence[Sequence[Scan]], scene: Scene, design: ArchDesign, 
     shrink = 1.0 / (1.0 + EXPANSION_PER_K * degrees)
     limits = standards.default_for(scene.tolerance)
     frames = np.array([joint_frame(points) for points in design.joint_points])
+    shapes = Shapes(design)
     fitted = [
-        measure.fit(of_part, index, design, shrink, params.systematic) for index, of_part in enumerate(tracked(scans))
+        measure.fit(of_part, index, shapes, shrink, params.systematic) for index, of_part in enumerate(tracked(scans))
     ]
-    parts = measure.estimate(fitted, params.systematic)
+    parts = measure.assigned(measure.estimate(fitted, params.systematic))
     curve = _adjust(parts, design, frames, params.adjust.weight)
     adjusted = curve[params.adjust.weight]
     placed = placement.place(parts, adjusted, design, frames)

@@ -38,8 +38,11 @@ def run(scene: Scene, params: Params, kept: dict[str, Any] | None = None) -> Res
     if design is None or len(design.parts) < 2:
         raise InputError(f"{scene.name}: preassembly needs an arch-bridge design of at least two parts (design.json)")
     scans = scans_in_order(scene, design)
+    unused = tuple(scan.name for scan in scene.scans if not any(scan is one for of_part in scans for one in of_part))
     if params.method == "adjustment":
-        return assemble.assemble(scans, scene, design, params)
+        result = assemble.assemble(scans, scene, design, params)
+        remarks = (reason("preassemble.scans-without-part", scans=unused),) if unused else ()
+        return replace(result, reasons=(*remarks, *result.reasons))
     several = [part.name for part, of_part in zip(design.parts, scans, strict=True) if len(of_part) > 1]
     if several:
         raise InputError(f"{scene.name}: method {params.method} takes one scan a part, {several[0]} has several")

@@ -37,6 +37,7 @@ from processor.preassembly.result import (
 from processor.preassembly.verdicts.chain import unused_limits
 from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
 from processor.preassembly.verdicts.joints import Conformity, LimitOrigin
+from processor.preassembly.verdicts.reasons import of_assignment
 from processor.preassembly.verdicts.trim_and_shim import Proposal
 
 
@@ -207,6 +208,7 @@ def _budget(parts: Sequence[MeasuredPart], design: ArchDesign, systematic: Syste
 def _reasons(assembly: Assembly) -> Iterator[Reason]:
     """Yield the remarks on the whole assembly."""
     limits = assembly.limits
+    yield from of_assignment(assembly.parts)
     yield reason("preassemble.weight", weight=assembly.params.adjust.weight)
     if assembly.temperature_corrected:
         yield reason("preassemble.temperature-corrected")

@@ -34,7 +34,7 @@ def read(path: Path) -> list[RawScan]:
         raise InputError(f"{path}: the file is empty; copy or export it again")
     module = _FORMATS[suffix]
     try:
-        if getattr(module, "apart", lambda _: False)(path):
+        if getattr(module, "needs_sandbox", lambda _: False)(path):
             return sandbox.read(path, module.__name__.rpartition(".")[2])
         # numpy warns of signalling NaNs in damaged files; coordinates that are not finite are refused later.
         with np.errstate(invalid="ignore", over="ignore"):

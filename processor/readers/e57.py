@@ -30,7 +30,7 @@ MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
 
-def apart(path: Path) -> bool:
+def needs_sandbox(path: Path) -> bool:
     """Whether the file is read in a separate process: always."""
     return True
 

@@ -22,7 +22,7 @@ VERTICAL_UNIT_KEY, MODEL_KEY, GEOGRAPHIC = 4099, 1024, 2
 EPSG_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 
 
-def apart(path: Path) -> bool:
+def needs_sandbox(path: Path) -> bool:
     """Whether the file is read in a separate process: if it is compressed, as native code decompresses it."""
     with path.open("rb") as file:
         head = file.read(105)

@@ -113,7 +113,7 @@ def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
             deviation_figures.deviation_map(result.core + result.origin, result.normals, result.distances, result.unit),
             deviation_figures.histogram(result.distances, result.unit),
         ]
-    with results_folder.whole(out) as making:
+    with results_folder.replacing_folder(out) as making:
         table = csv.csv_text(result.origin, result.core, result.distances, result.normals)
         results_folder.write_text(making / TABLE, table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
@@ -135,9 +135,9 @@ def lines(result: Comparison) -> list[Message]:
         interval = f" ± {half:.3g}" if math.isfinite(half) else ""
         return f"{value:.6g}{interval}{unit}"
 
-    known = summary.core_points - summary.without_lod
-    total = text("{count} core points, {known} with a level of detection", count=summary.core_points, known=known)
-    if not known:
+    with_lod = summary.core_points - summary.without_lod
+    total = text("{count} core points, {known} with a level of detection", count=summary.core_points, known=with_lod)
+    if not with_lod:
         return [total, *result.notes]
     share = summary.significant_share
     beyond = text(

@@ -10,7 +10,7 @@ import numpy as np
 
 from processor.language.messages import messages
 from processor.model import Checked, Reason, Rows
-from processor.store.codec import reason_object
+from processor.store.codec import reason_to_json
 
 
 def as_object(record: Checked) -> dict[str, Any]:
@@ -18,14 +18,14 @@ def as_object(record: Checked) -> dict[str, Any]:
 
     A record within it is null where all that it would hold is absent.
     """
-    found: dict[str, Any] = {}
+    values: dict[str, Any] = {}
     for field in dataclasses.fields(record):  # type: ignore[arg-type]
         value = getattr(record, field.name)
         if not _absent(value, field.metadata):
-            _put_field(found, field, value)
+            _put_field(values, field, value)
         if "sentence" in field.metadata:
-            _put(found, field.metadata["sentence"], messages("en").sentences(value))
-    return found
+            _put(values, field.metadata["sentence"], messages("en").sentences(value))
+    return values
 
 
 def as_rows(table: Rows) -> list[dict[str, Any]]:
@@ -41,7 +41,7 @@ def as_rows(table: Rows) -> list[dict[str, Any]]:
 
 def reason_json(reason: Reason) -> dict[str, Any]:
     """Write a reason with its English text."""
-    return {**reason_object(reason), "text": messages("en").text(reason)}
+    return {**reason_to_json(reason), "text": messages("en").text(reason)}
 
 
 def _put_field(target: dict[str, Any], field: dataclasses.Field[Any], value: Any) -> None:
@@ -78,8 +78,8 @@ def _present(table: Rows, metadata: Mapping[str, Any]) -> list[int]:
     """Return the rows that have a value in a column: all, or those where column ``where`` is finite."""
     if "where" not in metadata:
         return list(range(len(table)))
-    known = getattr(table, metadata["where"])
-    return np.flatnonzero(np.isfinite(known.reshape(len(known), -1)).all(axis=1)).tolist() if len(known) else []
+    present = getattr(table, metadata["where"])
+    return np.flatnonzero(np.isfinite(present.reshape(len(present), -1)).all(axis=1)).tolist() if len(present) else []
 
 
 def _put(target: dict[str, Any], key: str, value: Any) -> None:

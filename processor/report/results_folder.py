@@ -51,7 +51,7 @@ def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en"
     Only the page is in the language ``lang``. Raises InputError where they cannot be written, and leaves ``out`` as it
     was.
     """
-    with whole(out) as making:
+    with replacing_folder(out) as making:
         store.write_results(making / RUNS, execution.runs, execution.provenance)
         content = results_json.results_json(execution, report)
         write_text(making / RESULTS, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
@@ -71,7 +71,7 @@ def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en"
 
 
 @contextmanager
-def whole(out: Path) -> Iterator[Path]:
+def replacing_folder(out: Path) -> Iterator[Path]:
     """Yield a folder to write into, which replaces ``out`` when all is written and is removed on any error.
 
     Raises InputError where it cannot be written.

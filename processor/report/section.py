@@ -32,5 +32,5 @@ class StepReport:
 
 def of(step: str) -> StepReport:
     """Return how a step reports."""
-    found: StepReport = importlib.import_module(f"processor.report.{package_of(step)}.section").REPORT
-    return found
+    report: StepReport = importlib.import_module(f"processor.report.{package_of(step)}.section").REPORT
+    return report

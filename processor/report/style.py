@@ -62,8 +62,8 @@ def write_beside(axes: Axes, rows: Sequence[tuple[str, str]], line: float, size:
     """Write rows of a name and a value at spacing ``line``, a share of the panel's height; "–" for no number."""
     axes.axis("off")
     for row, (what, value) in enumerate(rows):
-        known = value if not re.search(r"\bnan\b", value) else "–"
-        for x, text, side in ((0.0, what, "left"), (1.0, known, "right")):
+        text_value = value if not re.search(r"\bnan\b", value) else "–"
+        for x, text, side in ((0.0, what, "left"), (1.0, text_value, "right")):
             axes.text(x, 1.0 - line * row, text, fontsize=size, ha=side, va="top", transform=axes.transAxes)
 
 
@@ -76,8 +76,8 @@ def label(name: str, place: int) -> str:
 
 def colour_limit(values: Floats) -> float:
     """Return the magnitude at which the colours of values (n,) end: 98 % of the finite ones are within."""
-    known = np.abs(values[np.isfinite(values)])
-    return max(float(np.quantile(known, 0.98)), LEAST_SHOWN_MM) if len(known) else LEAST_SHOWN_MM
+    magnitudes = np.abs(values[np.isfinite(values)])
+    return max(float(np.quantile(magnitudes, 0.98)), LEAST_SHOWN_MM) if len(magnitudes) else LEAST_SHOWN_MM
 
 
 def rounded(value: float) -> float:

@@ -52,14 +52,14 @@ def of_points(
     first are outlined, each with a mark and a tick to switch it; ``region_of`` (n,) is the row of each point's region,
     -1 = none.
     """
-    known = np.isfinite(values)
-    if not known.any():
+    finite = np.isfinite(values)
+    if not finite.any():
         return None
-    origin = np.round(points[known].mean(axis=0))
-    step = max(1, -(-int(known.sum()) // MOST_POINTS))
+    origin = np.round(points[finite].mean(axis=0))
+    step = max(1, -(-int(finite.sum()) // MOST_POINTS))
     drawn = []
     for name, rows in parts:
-        drawn_rows = rows[known[rows]][::step]
+        drawn_rows = rows[finite[rows]][::step]
         near = points[drawn_rows] - origin
         drawn.append(
             {
@@ -86,7 +86,7 @@ def of_points(
         "stops": DIVERGING_STOPS,
         "tones": TONES,
         "limit": colour_limit(values),
-        "spacing": spacing(points[known][::step]),
+        "spacing": spacing(points[finite][::step]),
         "parts": drawn + lines,
         "marks": shown + spots,
         "regions": [_heading(region) for region in regions] if region_of is not None else [],

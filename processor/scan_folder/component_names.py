@@ -38,7 +38,7 @@ def components(stem: str, names: Sequence[str]) -> list[str]:
     """Return the components, of those in ``names``, that the stem of a file can refer to.
 
     In this order: the component's full name; its word and number (``拱肋2``, ``2号拱肋``, ``Rib_02_scan``); its word
-    alone; and, for a stem that is only a number, the position in ``names``.
+    alone. A number alone refers to none: scans are numbered as they were made.
     """
     text = plain(stem)
     exact = [name for name in names if plain(name) == text]
@@ -53,13 +53,7 @@ def components(stem: str, names: Sequence[str]) -> list[str]:
             continue
         by_number += [name] if digits is None or _has_number(text, word, digits[0].lstrip("0")) else []
         by_word.append(name)
-    if by_number or by_word:
-        return by_number or by_word
-    numbers = re.findall(r"\d+", text)
-    if len(numbers) == 1 and not re.search(r"[^\W\d_]", re.sub(r"scan|part|no|号|段|节|第|扫描|构件", "", text)):
-        place = int(numbers[0])
-        return [names[place - 1]] if 1 <= place <= len(names) else []
-    return []
+    return by_number or by_word
 
 
 def _has_word(text: str, word: str) -> bool:

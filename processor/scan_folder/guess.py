@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.optimize import linear_sum_assignment
 
 from processor import readers
-from processor.geometry import principal
+from processor.geometry import mesh_distance, principal
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
 from processor.readers import RawScan
 from processor.scan_folder import component_names
@@ -25,8 +26,9 @@ DESIGN = "design"
 UNITS = ("m", "mm", "cm", "inch", "ft")  # candidates, the likeliest first
 UNIT_TOLERANCE = 0.25  # relative difference of a scan's size from its design's
 LARGEST_M = 2000.0  # a scan larger than this is not in metres
-SAME_SHAPE, OTHER_SHAPE = 0.05, 0.15  # greatest difference of extents by the longest: up to, and beyond
-SAMPLE = 20_000  # points that extents are measured from
+# Greatest difference of extents by the longest: of a scan of the part, of one with gaps, and of another part.
+SAME_SHAPE, LIKE_SHAPE, OTHER_SHAPE = principal.SIZE_SHARE, 0.05, 0.15
+SAMPLE = 100_000  # points that extents are measured from
 
 Surface = tuple[Floats, Ints]
 
@@ -44,6 +46,7 @@ class ScanGuess:
     units: str = ""  # given by the format
     stem: str = ""
     similar: tuple[str, ...] = ()  # components of the scan's shape
+    differences: dict[str, float] = field(default_factory=dict)  # of its extents from each component's, by the longest
     extents: Floats = field(default_factory=lambda: np.zeros(3))  # in the file's unit, longest first
     radius: float = 0.0  # from the middle
 
@@ -176,10 +179,8 @@ def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
         return scan
     scan.units = known_unit(raws[0].unit) if raws[0].unit else ""
     points = _sample(raws)
-    local = points - points.mean(axis=0)
-    along = local @ principal.of_points(local).axes
-    scan.extents = np.sort(np.ptp(np.quantile(along, [0.001, 0.999], axis=0), axis=0))[::-1]
-    scan.radius = radius(local)
+    scan.extents = principal.sizes(points)
+    scan.radius = radius(points - points.mean(axis=0))
     if len(raws) > 1:
         scan.reason = f"holds {len(raws)} scans: {', '.join(raw.name for raw in raws[:6])}"
     return scan
@@ -241,20 +242,15 @@ def _guess_kind(project: Guess) -> None:
 def _guess_components(project: Guess, design: ArchDesign) -> None:
     """Assign components to scans by name and shape; contradictions and ambiguities are added to ``unsure``."""
     names = [part.name for part in design.parts]
-    shapes = {part.name: _extents(part.vertices, part.faces) for part in design.parts}
+    surfaces = {part.name: mesh_distance.spread(part.vertices, part.faces, lambda _: SAMPLE) for part in design.parts}
+    shapes = {name: principal.sizes(surface.points) for name, surface in surfaces.items()}
     scans = [scan for scan in project.scans if not scan.error]
     for scan in scans:
         extents = scan.extents * MM_PER_UNIT[scan.units or project.units or "m"]
-        differences = {name: float(np.abs(extents - shape).max() / shape[0]) for name, shape in shapes.items()}
+        scan.differences = {name: float(np.abs(extents - shape).max() / shape[0]) for name, shape in shapes.items()}
         scan.station = component_names.station(scan.stem)
-        _choose(scan, component_names.components(scan.stem, names), differences)
-    taken = {scan.component for scan in project.scans if scan.sure}
-    for scan in scans:
-        left = [name for name in scan.similar if name not in taken]
-        if left and not scan.sure and len(scan.similar) > 1:
-            scan.component = left[0]
-            scan.reason += f"; {'the only one of them left' if len(left) == 1 else 'taken in the order of the bridge'}"
-            taken.add(left[0])
+        _choose(scan, component_names.components(scan.stem, names))
+    _assign_similar(scans, names)
     project.unsure += [
         f"{scan.file}: {scan.component or 'no component'}: {scan.reason}" for scan in scans if not scan.sure
     ]
@@ -269,25 +265,42 @@ def _guess_components(project: Guess, design: ArchDesign) -> None:
     ]
 
 
-def _choose(scan: ScanGuess, named: Sequence[str], differences: dict[str, float]) -> None:
+def _assign_similar(scans: Sequence[ScanGuess], names: Sequence[str]) -> None:
+    """Assign the scans whose shape matches several components to those left, with the least differences in sum."""
+    taken = {scan.component for scan in scans if scan.sure}
+    left = [name for name in names if name not in taken]
+    unsure = [scan for scan in scans if not scan.sure and len(scan.similar) > 1]
+    cost = np.array([[scan.differences[name] if name in scan.similar else 1.0 for name in left] for scan in unsure])
+    for row, column in zip(*linear_sum_assignment(cost.reshape(len(unsure), len(left))), strict=True):
+        scan, name = unsure[row], left[column]
+        if name in scan.similar:
+            scan.component = name
+            only = sum(other in left for other in scan.similar) == 1
+            scan.reason += f"; {'the only one of them left' if only else 'any of them may be right'}"
+
+
+def _choose(scan: ScanGuess, named: Sequence[str]) -> None:
     """Choose a scan's component among those ``named`` by its file, else among all, by the differences of extents."""
-    several = f"{scan.reason}; " if scan.reason else ""
+    several, differences = f"{scan.reason}; " if scan.reason else "", scan.differences
     by_shape = sorted(named or differences, key=lambda name: differences[name])
     best = by_shape[0]
-    similar = [name for name in by_shape if differences[name] <= SAME_SHAPE]
     shape = f"extents within {100.0 * differences[best]:.2g} % of the design's"
     if len(named) == 1:
         scan.component = best
-        scan.sure = differences[best] <= OTHER_SHAPE and not several
+        # A scan with gaps may have other extents than its part, but by chance those of another.
+        nearest = min(differences, key=lambda name: differences[name])
+        other = differences[nearest] <= SAME_SHAPE < differences[best]
+        scan.sure = differences[best] <= OTHER_SHAPE and not several and not other
         scan.reason = f"{several}by its name; {shape}"
-        if differences[best] > OTHER_SHAPE:
-            nearest = min(differences, key=lambda name: differences[name])
-            scan.reason = f"{several}by its name, but its extents differ by {100.0 * differences[best]:.0f} %" + (
-                f"; the extents match {nearest}" if differences[nearest] <= SAME_SHAPE else ""
+        if other or differences[best] > OTHER_SHAPE:
+            scan.reason = f"{several}by its name, but its extents differ by {100.0 * differences[best]:.2g} %" + (
+                f"; the extents match {nearest}" if differences[nearest] <= LIKE_SHAPE else ""
             )
         return
+    same = [name for name in by_shape if differences[name] <= SAME_SHAPE]
+    similar = same or [name for name in by_shape if differences[name] <= LIKE_SHAPE]
     scan.component, scan.similar = best if similar else "", tuple(name for name in differences if name in similar)
-    scan.sure = len(similar) == 1 and not several
+    scan.sure = len(same) == 1 and not several
     which = f"its name matches {', '.join(named)}; " if named else "its name matches no component; "
     if not similar:
         difference = f"the nearest, {best}, differs by {100.0 * differences[best]:.0f} %"
@@ -298,17 +311,10 @@ def _choose(scan: ScanGuess, named: Sequence[str], differences: dict[str, float]
         scan.reason = f"{several}{which}by its shape alone; {shape}"
 
 
-def _extents(vertices: Floats, faces: Ints) -> Floats:
-    """Return the extents (3,) of a mesh along its principal axes, longest first."""
-    along = (vertices - vertices.mean(axis=0)) @ principal.of_mesh(vertices, faces).axes
-    extents: Floats = np.sort(np.ptp(along, axis=0))[::-1]
-    return extents
-
-
 # --- the guess as project.toml and as JSON ----------------------------------------------------------------------------
 
 
-def written(project: Guess) -> str:
+def to_toml(project: Guess) -> str:
     """Return the text of project.toml, with reasons and further keys as comments."""
     lines = ["# Made by `processor init`. What is unsure is marked with a question mark."]
     lines += [f"# ? {_one_line(text)}" for text in project.unsure] + [""]

@@ -22,7 +22,7 @@ from processor.space_frame.members.members import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import Flag
-from processor.space_frame.spheres import fit_all, quality, visibility
+from processor.space_frame.spheres import fit_all, joint_kind, quality, visibility
 from processor.space_frame.spheres.quality import Bools
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
@@ -79,15 +79,21 @@ class Extracted:
 class Start:
     """Nodes known to 20 mm, and pairs of them that a member may join; the design's row (k,) of each, -1 = none.
 
-    ``pose`` is the matching that gave T_design_scan, where the design had to be located.
+    ``balls`` (k,) are the nodes that have a ball; the members of others are measured as well, for the stations'
+    registration. ``pose`` is the matching that gave T_design_scan, where the design had to be located.
     """
 
     positions: Floats
     pairs: Ints
     design_row: Ints
     measured: Measured
+    balls: Bools
     pose: Matching | None = None
     reasons: tuple[Reason, ...] = ()
+
+    def of_nodes(self, kept: Bools) -> Start:
+        """Keep some of the nodes (k,)."""
+        return replace(self, positions=self.positions[kept], design_row=self.design_row[kept], balls=self.balls[kept])
 
 
 @dataclass(frozen=True)
@@ -128,9 +134,10 @@ def extract(
         return None
     registered = _register(source, start, control, options)
     measured = registered.measured
-    if design is None:
-        measured = members.with_meeting_axes(measured, params.largest_scatter_mm)
-        start = replace(start, design_row=np.full(measured.nodes.count, -1, np.int64))
+    kept = (start.design_row >= 0) | (start.balls & members.meeting(measured, params.largest_scatter_mm))
+    if not kept.any():
+        return None
+    measured, start = members.of_nodes(measured, kept), start.of_nodes(kept)
     nodes, spheres = _fit_spheres(registered.source, measured, start, design, catalogue, options, registered.trusted)
     shared_offset = registered.shared_offset_at(spheres.centres)
     if registered.stations is not None:
@@ -163,7 +170,10 @@ def blind(source: Source, params: members.Params) -> Start | None:
     if graph is None or not len(graph.pairs):
         return None
     rows = np.full(len(graph.nodes), -1, np.int64)
-    return _measured(source, graph.nodes, graph.pairs, rows, params)
+    start = _measured(source, graph.nodes, graph.pairs, rows, params)
+    start = replace(start, balls=joint_kind.balls(source, start.measured, params.threads))
+    others = int((~start.balls & members.meeting(start.measured, params.largest_scatter_mm)).sum())
+    return replace(start, reasons=(reason("spheres.other-joints", joints=others),)) if others else start
 
 
 def _measured(
@@ -172,7 +182,8 @@ def _measured(
     """Measure the members between pairs of nodes at ``positions`` (k, 3)."""
     points = members.points_near(source, positions, pairs, params)
     measured = members.measure(points, source.scanners, positions, pairs, params)
-    return Start(positions=positions, pairs=pairs, design_row=rows, measured=measured, pose=pose)
+    every = np.ones(len(positions), bool)
+    return Start(positions=positions, pairs=pairs, design_row=rows, measured=measured, balls=every, pose=pose)
 
 
 def _designed(source: Source, design: FrameDesign, catalogue: Catalogue, options: Options) -> Start | None:
@@ -195,7 +206,8 @@ def _located(
     source: Source, start: Start, design: FrameDesign, pairs: Ints, catalogue: Catalogue, options: Options
 ) -> Start:
     """Locate the design among nodes found blind, and measure all members of both."""
-    seen = members.with_meeting_axes(start.measured, options.members.largest_scatter_mm)
+    found = start.balls & members.meeting(start.measured, options.members.largest_scatter_mm)
+    seen = members.of_nodes(start.measured, found)
     node_a, node_b = seen.members.node_a, seen.members.node_b
     pattern = NodePattern(seen.nodes.positions, source.origin, node_a=node_a, node_b=node_b)
 
@@ -205,7 +217,7 @@ def _located(
 
     pose = matching.match(pattern, design, expansion=options.expansion, sized=sized)
     if pose.status is Status.FAILED:
-        return replace(start, reasons=(reason("spheres.design-not-found", reasons=pose.reasons),))
+        return replace(start, reasons=(*start.reasons, reason("spheres.design-not-found", reasons=pose.reasons)))
     nominal, middle = matching.expanded(design, options.expansion)
     positions = rigid.apply(rigid.invert(pose.T_design_scan), nominal + middle) - source.origin
     # Found nodes are where they were found, the others where the design has them.
@@ -217,7 +229,7 @@ def _located(
     every = np.unique(np.sort(np.vstack([pairs, found_pairs]), axis=1), axis=0)
     rows = np.concatenate([np.arange(len(positions)), np.full(int(extra.sum()), -1)])
     positions = np.vstack([positions, seen.nodes.positions[extra]])
-    return _measured(source, positions, every, rows, options.members, pose)
+    return replace(_measured(source, positions, every, rows, options.members, pose), reasons=start.reasons)
 
 
 # --- stations --------------------------------------------------------------------------------------------------------

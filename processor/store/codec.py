@@ -70,32 +70,34 @@ def write_texts(group: Any, name: str, texts: Sequence[str]) -> None:
     _create(group, name, np.array(data, _text_type(max([1, *map(len, data)]))))
 
 
-def reason_object(item: Reason) -> dict[str, Any]:
+def reason_to_json(item: Reason) -> dict[str, Any]:
     """Return a reason as JSON objects, its words and reasons within as well."""
-    return {"code": item.code, "values": {name: value_object(value) for name, value in item.values.items()}}
+    return {"code": item.code, "values": {name: value_to_json(value) for name, value in item.values.items()}}
 
 
-def value_object(value: Any) -> Any:
-    """Return a value of a message as JSON holds it; :func:`value_of` reads it."""
+def value_to_json(value: Any) -> Any:
+    """Return a value of a message as JSON holds it; :func:`value_from_json` reads it."""
     if isinstance(value, Reason):
-        return reason_object(value)
+        return reason_to_json(value)
     if isinstance(value, Word):
         return {"word": str(value), "of": type(value).__name__}
-    return [value_object(item) for item in value] if isinstance(value, list | tuple) else value
+    return [value_to_json(item) for item in value] if isinstance(value, list | tuple) else value
 
 
-def _reason(found: Any) -> Reason:
-    """Return the reason that an object of :func:`reason_object` holds. Raises KeyError and TypeError for another."""
-    return Reason(str(found["code"]), {str(name): value_of(value) for name, value in dict(found["values"]).items()})
+def _reason_from_json(stored: Any) -> Reason:
+    """Return the reason that an object of :func:`reason_to_json` holds. Raises KeyError and TypeError for another."""
+    return Reason(
+        str(stored["code"]), {str(name): value_from_json(value) for name, value in dict(stored["values"]).items()}
+    )
 
 
-def value_of(found: Any) -> Any:
-    """Return the value that an object of :func:`value_object` holds."""
-    if isinstance(found, dict):
-        if "word" not in found:
-            return _reason(found)
-        return VOCABULARIES[found["of"]](found["word"])
-    return tuple(value_of(item) for item in found) if isinstance(found, list) else found
+def value_from_json(stored: Any) -> Any:
+    """Return the value that an object of :func:`value_to_json` holds."""
+    if isinstance(stored, dict):
+        if "word" not in stored:
+            return _reason_from_json(stored)
+        return VOCABULARIES[stored["of"]](stored["word"])
+    return tuple(value_from_json(item) for item in stored) if isinstance(stored, list) else stored
 
 
 def _encoded(text: str) -> bytes:
@@ -129,9 +131,9 @@ def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type
         write_texts(group, name, [json.dumps(row, ensure_ascii=False) for row in value])
     elif "reasons" in metadata:
         rows = (
-            [[reason_object(item) for item in row] for row in value]
+            [[reason_to_json(item) for item in row] for row in value]
             if metadata["reasons"]
-            else map(reason_object, value)
+            else map(reason_to_json, value)
         )
         write_texts(group, name, [json.dumps(row, ensure_ascii=False, allow_nan=True) for row in rows])
     elif isinstance(value, str):
@@ -205,7 +207,9 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
         return _read_json(group, name, lambda row: tuple(map(str, row)))
     if "reasons" in metadata:
         by_row = bool(metadata["reasons"])
-        return _read_json(group, name, lambda row: tuple(map(_reason, row)) if by_row else _reason(row))
+        return _read_json(
+            group, name, lambda row: tuple(map(_reason_from_json, row)) if by_row else _reason_from_json(row)
+        )
     if kind is str or ("words" in metadata and "axis" not in metadata):
         return read_text(group, name)
     if kind in (bool, int, float):
@@ -222,11 +226,11 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     return _read_member(group[name], kind, hooks)
 
 
-def _read_json(group: Any, name: str, made: Callable[[Any], Any]) -> tuple[Any, ...]:
-    """Read texts of JSON, and what ``made`` makes of each."""
+def _read_json(group: Any, name: str, decode: Callable[[Any], Any]) -> tuple[Any, ...]:
+    """Read texts of JSON, each mapped by ``decode``."""
     where = f"{group.name}/{name}"
     try:
-        return tuple(made(json.loads(_decoded(item, where))) for item in _dataset(group, name, "S", 1)[()].tolist())
+        return tuple(decode(json.loads(_decoded(item, where))) for item in _dataset(group, name, "S", 1)[()].tolist())
     except (json.JSONDecodeError, KeyError, TypeError, ValueError) as error:
         raise DecodeError([f"{where}: expected JSON ({error})"]) from None
 
@@ -236,15 +240,20 @@ def _read_member(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> Any:
     return hook(group) if hook else read_record(group, kind, hooks)
 
 
-def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[Any, ...]:
+def numbered_groups(group: Any) -> list[Any]:
+    """Return the groups 0000, 0001, ... of a group. Raises DecodeError for other content."""
     expected = [f"{i:04d}" for i in range(len(group))]
     if list(group) != expected or not all(isinstance(group[name], h5py.Group) for name in expected):
         raise DecodeError([f"{group.name}: expected groups 0000, 0001, ..."])
+    return [group[name] for name in expected]
+
+
+def _read_members(group: Any, kind: Any, hooks: Mapping[type, Hook]) -> tuple[Any, ...]:
     problems: list[str] = []
     items = []
-    for name in expected:
+    for member in numbered_groups(group):
         try:
-            items.append(_read_member(group[name], kind, hooks))
+            items.append(_read_member(member, kind, hooks))
         except DecodeError as error:
             problems += error.problems
     if problems:

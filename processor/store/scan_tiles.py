@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import h5py
 import numpy as np
 
 import processor.store.codec as codec
 import processor.store.tiles as tiles
-from processor.model import Floats, Ints, Scan
+from processor.model import Floats, Ints, Scan, per_point_fields
 from processor.store.codec import DecodeError
 
 AXES = ("x", "y", "z")
@@ -22,9 +22,9 @@ def write_scan(group: Any, scan: Scan) -> Ints:
     """Write a scan into a group; returns the row (n,) of ``scan.points`` at each position of the file."""
     tiled = tiles.arrange(scan.points)
     sorted_columns = {
-        field.name: getattr(scan, field.name)[tiled.order]
-        for field in dataclasses.fields(scan)
-        if field.metadata.get("shape") == ("n",) and getattr(scan, field.name).size
+        name: getattr(scan, name)[tiled.order]
+        for name in per_point_fields(Scan)
+        if name != "points" and getattr(scan, name).size
     }
     codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points"})
     points = group.create_group("points")
@@ -41,11 +41,12 @@ def write_scan(group: Any, scan: Scan) -> Ints:
 
 def read_scan(group: Any) -> Scan:
     """Read a scan. Raises DecodeError also for points that are not finite or lie outside their tile."""
-    grid, cell, _, count, columns = _read_tiles(group)
-    data = tuple(column[()] for column in columns)
+    stored = _read_tiles(group)
+    grid = stored.grid
+    data = tuple(column[()] for column in stored.columns)
     if not all(np.isfinite(column).all() for column in data):
         raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
-    wrong = tiles.misplaced(grid, cell, count, (data[0], data[1], data[2]))
+    wrong = tiles.misplaced(grid, stored.cell, stored.counts, (data[0], data[1], data[2]))
     if wrong:
         raise DecodeError([f"{group.name}/points: {wrong} points lie outside their tile of the index"])
     scan = codec.read_record(group, Scan, given={"points": grid.millimetres((data[0], data[1], data[2]))})
@@ -54,19 +55,18 @@ def read_scan(group: Any) -> Scan:
     return scan
 
 
-PER_POINT = tuple(f.name for f in dataclasses.fields(Scan) if f.metadata.get("shape", ("",))[0] == "n")
-
-
 def read_scan_alone(group: Any) -> Scan:
     """Read a scan with empty per-point columns."""
     _read_tiles(group)
-    none = {f.name: np.empty(0, f.metadata["dtype"]) for f in dataclasses.fields(Scan) if f.name in PER_POINT}
+    none = {
+        f.name: np.empty(0, f.metadata["dtype"]) for f in dataclasses.fields(Scan) if f.name in per_point_fields(Scan)
+    }
     return codec.read_record(group, Scan, given=none)
 
 
 def count(group: Any) -> int:
     """Return the number of points of a scan's group."""
-    return int(sum(_read_tiles(group)[3].tolist()))
+    return len(_read_tiles(group).columns[0])
 
 
 def shape(group: Any, name: str) -> tuple[int, ...]:
@@ -83,7 +83,8 @@ def _column(group: Any, name: str) -> Any:
 def pieces(group: Any, name: str, size: int) -> Iterator[Any]:
     """Yield a per-point column of a scan's group, ``size`` rows at a time. DecodeError for points not finite."""
     if name == "points":
-        grid, _, _, _, columns = _read_tiles(group)
+        stored = _read_tiles(group)
+        grid, columns = stored.grid, stored.columns
         for start in range(0, len(columns[0]), size):
             x, y, z = (column[start : start + size] for column in columns)
             points = grid.millimetres((x, y, z))
@@ -96,7 +97,17 @@ def pieces(group: Any, name: str, size: int) -> Iterator[Any]:
         yield column[start : start + size]
 
 
-def _read_tiles(group: Any) -> tuple[tiles.Grid, Ints, Ints, Ints, list[Any]]:
+class StoredTiles(NamedTuple):
+    """Index (:mod:`processor.store.tiles`) and coordinate datasets x, y, z of a scan's group."""
+
+    grid: tiles.Grid
+    cell: Ints
+    start: Ints
+    counts: Ints
+    columns: list[Any]
+
+
+def _read_tiles(group: Any) -> StoredTiles:
     points = group.get("points")
     where = f"{group.name}/points"
     if not isinstance(points, h5py.Group):
@@ -119,7 +130,7 @@ def _read_tiles(group: Any) -> tuple[tiles.Grid, Ints, Ints, Ints, list[Any]]:
     faults = tiles.problems(grid, cell, start, count, lengths.pop())
     if faults:
         raise DecodeError([f"{where}: {fault}" for fault in faults])
-    return grid, cell, start, count, columns
+    return StoredTiles(grid, cell, start, count, columns)
 
 
 def read_box(group: Any, lower: Floats, upper: Floats) -> Floats:

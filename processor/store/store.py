@@ -5,7 +5,7 @@ A file has the root attributes ``format``, ``format_version``, ``units`` and ``h
 (:mod:`processor.store.tiles`), each coordinate a column of its own, with every other column of the scan and its truth
 labels in the same order. The same content makes the same bytes.
 
-Files are not trusted: :mod:`processor.store.safety` checks their structure before any data are read.
+Files are not trusted: :mod:`processor.store.file_structure_checks` checks their structure before any data are read.
 """
 
 from __future__ import annotations
@@ -13,9 +13,6 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import os
-import re
-import secrets
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,9 +22,10 @@ import h5py
 import numpy as np
 
 import processor.store.codec as codec
-import processor.store.safety as safety
+import processor.store.file_structure_checks as file_structure_checks
 import processor.store.scan_tiles as scan_tiles
-from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth
+from processor.model import InputError, Ints, PointLabels, Scan, Scene, StepRun, Truth, per_point_fields
+from processor.store.atomic_file import replacing
 from processor.store.codec import DecodeError
 
 FORMATS = {"scene": "processor-scene", "truth": "processor-truth", "results": "processor-results"}
@@ -51,39 +49,6 @@ Pieces = Callable[[int, str], tuple[tuple[int, ...], Iterator[Any]]]
 
 
 # --- writing ---------------------------------------------------------------------------------------------------------
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Yield a temporary path beside ``path``, and replace ``path`` by it once its content is on the disk.
-
-    Raises InputError where the file cannot be written. On any error the temporary file is removed and ``path`` stays
-    unchanged.
-    """
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-    try:
-        yield temporary
-        sync(temporary)
-        os.replace(temporary, path)
-        sync(path.parent)
-    except (OSError, RuntimeError) as error:
-        # HDF5 reports a full disk within a longer text, and not always as an OSError.
-        message = re.search(r"error message = '([^']*)'", str(error))
-        if isinstance(error, RuntimeError) and not message:
-            raise
-        reason = message[1] if message else getattr(error, "strerror", None) or error
-        raise InputError(f"{path}: cannot be written ({reason}); free the disk or choose another folder") from error
-    finally:
-        temporary.unlink(missing_ok=True)
-
-
-def sync(path: Path) -> None:
-    """Wait until a file or folder is written to the disk."""
-    handle = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
 
 
 @contextmanager
@@ -137,8 +102,7 @@ def _in_order(labels: PointLabels, orders: Mapping[str, Ints], path: Path) -> Po
     order = orders.get(labels.scan)
     if order is None:
         raise InputError(f"{path}: the truth has labels of a scan {labels.scan!r}, which is not in the scene")
-    per_point = (field.name for field in dataclasses.fields(labels) if field.metadata.get("shape") == ("n",))
-    columns = {name: getattr(labels, name) for name in per_point}
+    columns = {name: getattr(labels, name) for name in per_point_fields(PointLabels)}
     for name, column in columns.items():
         if len(column) not in (0, len(order)):
             raise InputError(
@@ -184,11 +148,11 @@ def write_results(path: Path, runs: Sequence[StepRun], provenance: Mapping[str, 
 def opened(path: Path, kinds: Sequence[str]) -> Iterator[Any]:
     """Open a file of one of ``kinds`` whose structure is safe to read. Raises InputError for any other, or damage."""
     try:
-        with safety.limited_memory():
+        with file_structure_checks.limited_memory():
             file = h5py.File(path, "r", locking=False)
         with file:
-            with safety.limited_memory():
-                faults = safety.problems(file, path)
+            with file_structure_checks.limited_memory():
+                faults = file_structure_checks.problems(file, path)
             faults = faults or _header_problems(file, kinds)
             if faults:
                 raise DecodeError(faults)
@@ -223,9 +187,9 @@ def _header_problems(file: Any, kinds: Sequence[str]) -> list[str]:
     results = header["format"] == FORMATS["results"]
     readable = (RESULTS_VERSION,) if results else READABLE
     if header["format_version"] not in readable:
-        found = header["format_version"] or "none"
+        version = header["format_version"] or "none"
         advice = "; run processor run again" if results else ""
-        faults.append(f"expected format_version {' or '.join(readable)}, found {found}{advice}")
+        faults.append(f"expected format_version {' or '.join(readable)}, found {version}{advice}")
     if header["units"] != "mm":
         faults.append(f"expected units mm, found {header['units'] or 'none'}")
     return faults
@@ -286,11 +250,7 @@ def read_results(path: Path, result_classes: Mapping[str, type]) -> tuple[StepRu
         return codec.read_record(group, StepRun, given={"result": result})
 
     with opened(path, ["results"]) as file:
-        runs = _group(file, "results")
-        expected = [f"{i:04d}" for i in range(len(runs))]
-        if list(runs) != expected or not all(isinstance(runs[name], h5py.Group) for name in expected):
-            raise DecodeError(["/results: expected groups 0000, 0001, ..."])
-        return tuple(read_run(runs[name]) for name in expected)
+        return tuple(read_run(group) for group in codec.numbered_groups(_group(file, "results")))
 
 
 def read_provenance(path: Path) -> dict[str, Any]:
@@ -307,6 +267,7 @@ def read_provenance(path: Path) -> dict[str, Any]:
 
 def problems(path: Path) -> list[str]:
     """List all faults of a scene, truth or results file; an empty list means that it can be read."""
+    kind = ""
 
     def attempt(read: Callable[[Path], object]) -> list[str]:
         try:
@@ -316,14 +277,14 @@ def problems(path: Path) -> list[str]:
             return cause.problems if isinstance(cause, DecodeError) else [str(error).removeprefix(f"{path}: ")]
         return []
 
-    def read_kind(path: Path) -> str:
+    def read_kind(path: Path) -> None:
+        nonlocal kind
         with opened(path, list(FORMATS)) as file:
-            return _attribute(file, "format")
+            kind = _attribute(file, "format")
 
     faults = attempt(read_kind)
     if faults:
         return faults
-    kind = read_kind(path)
     faults = attempt(read_provenance)
     if kind == FORMATS["scene"]:
         faults += attempt(read_scene)
@@ -362,7 +323,7 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
     elif dataclasses.is_dataclass(value):
         digest.update(f"{name}:{type(value).__name__}(".encode())
         for field in dataclasses.fields(value):
-            if pieces is not None and isinstance(value, Scan) and field.metadata.get("shape", ("",))[0] == "n":
+            if pieces is not None and isinstance(value, Scan) and field.name in per_point_fields(Scan):
                 shape, parts = pieces(scan, field.name)
                 kind = np.dtype(field.metadata["dtype"]).newbyteorder("<")
                 digest.update(f"{field.name}:{kind.str}{shape};".encode())

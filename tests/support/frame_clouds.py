@@ -89,11 +89,11 @@ def scanned(
             u = (b - a) / length
             ends = []
             for start, out in ((a, u), (b, -u)):
-                flat, sleeve = start + 50.0 * out, start + 85.0 * out
+                flat, sleeve = start + (ball_radius - 5.0) * out, start + (ball_radius + 30.0) * out
                 parts.append(tube(flat, sleeve, 18.0, per_tube // 50, scanner, sigma, rng))
-                ends.append(start + 135.0 * out)
+                ends.append(start + (ball_radius + 80.0) * out)
                 parts.append(tube(sleeve, ends[-1], 22.0, per_tube // 30, scanner, sigma, rng, end_radius=radius))
-            tube_length = length - 270.0
+            tube_length = length - 2.0 * (ball_radius + 80.0)
             parts.append(tube(*ends, radius, per_tube, scanner, sigma, rng, bow=share * tube_length))
         cloud = np.concatenate(parts)
         clouds.append(cloud + (0.0 if moved is None else moved[s]))

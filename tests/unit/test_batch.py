@@ -25,7 +25,7 @@ import pytest
 
 from processor.batch import batch, finding, job, summary
 from processor.batch.figures import of_results
-from processor.cli import run as cli_run
+from processor.cli import main as cli_main
 from processor.jobs import runner
 from processor.model import InputError, UsageError
 from processor.scan_folder import fingerprint
@@ -532,7 +532,7 @@ def test_output_that_cannot_be_written_to(tmp_path, site, small_disk):
 def test_a_run_whose_input_changes_writes_nothing(site, tmp_path, monkeypatch):
     from click.testing import CliRunner
 
-    from processor.cli import run as cli_run
+    from processor.cli import main as cli_main
     from processor.evaluation import evaluate
 
     root, _ = copied(site, tmp_path)
@@ -544,7 +544,7 @@ def test_a_run_whose_input_changes_writes_nothing(site, tmp_path, monkeypatch):
         return real(path, execution)
 
     monkeypatch.setattr(evaluate, "evaluate", late)
-    done = CliRunner().invoke(cli_run.commands, ["run", str(root / "c/d"), "-o", str(tmp_path / "out"), *SPHERES])
+    done = CliRunner().invoke(cli_main.commands, ["run", str(root / "c/d"), "-o", str(tmp_path / "out"), *SPHERES])
     assert isinstance(done.exception, InputError)
     assert "target.xyz: changed while it was processed" in str(done.exception)
     assert not (tmp_path / "out").exists()
@@ -727,7 +727,7 @@ def test_the_command_of_the_snakefile_is_one_that_processor_takes():
     text = text.replace("{{", "{").replace("}}", "}")
     assert subprocess.run(["bash", "-n", "-c", text], check=False).returncode == 0
     words = shlex.split(text.split(">")[0])
-    context = cli_run.commands.commands["run"].make_context("run", words[2:])
+    context = cli_main.commands.commands["run"].make_context("run", words[2:])
     assert [str(context.params[name]) for name in ("input_", "output")] == list(names.values())
     for code, taken in ((0, 0), (1, 0), (3, 1), (4, 0)):
         stub = f"processor() {{ return {code}; }}; set -e; {text}"

@@ -7,10 +7,20 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.defects import baseline, deviation_field, pictures, regions, scan_statistic, shape_models, surface_charts
+from processor.defects import (
+    alignment,
+    baseline,
+    detect,
+    deviation_field,
+    pictures,
+    regions,
+    scan_statistic,
+    shape_models,
+    surface_charts,
+)
 from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
-from processor.geometry import mesh_distance
+from processor.geometry import mesh_distance, rigid
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
 from processor.pipeline import as_json
 from processor.report.defects import figures, section
@@ -218,6 +228,37 @@ def test_stations_that_are_off_are_no_defect():
     assert found(result) == []
 
 
+def test_the_last_movement_is_added_once(monkeypatch):
+    """The whole is 1.5 mm off; an alignment that never settles gives the same pose as one that does."""
+    scene = scene_of(4, lambda x, z: np.full(len(x), 1.5))
+    settled = defects_step.run(scene, defects_step.Params())
+    monkeypatch.setattr(detect, "AGAIN_MM", 0.0)
+    again = defects_step.run(scene, defects_step.Params())
+    assert settled.T_design_project[1, 3] == pytest.approx(-1.5, abs=0.03)
+    np.testing.assert_allclose(again.T_design_project[1], settled.T_design_project[1], atol=0.01)  # plates fix y
+    assert again.covariance.shape == (6, 6)
+    assert 0.0 < np.sqrt(again.covariance[4, 4]) < 1.0
+
+
+def test_no_defect_is_sure_where_another_attitude_fits_as_well():
+    """A dent in a box that looks the same from four sides, scanned in a frame of its own."""
+    vertices, faces = box((0.0, 0.0, 0.0), (2000.0, 600.0, 400.0))
+    solid = trimesh.Trimesh(vertices, faces, process=False)
+    points, facet = trimesh.sample.sample_surface(solid, 60_000, seed=1)
+    depth = bump(9.0, 150.0, (700.0, 300.0))(points[:, 0], points[:, 1]) * (solid.face_normals[facet][:, 2] > 0.5)
+    points = points - [0.0, 0.0, 1.0] * depth[:, None] + np.random.default_rng(1).normal(0.0, 0.3, points.shape)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 2.0])), np.array([5e4, -3e4, 2e3]))
+    scans = (Scan("S1", rigid.apply(T, points), T_project_scan=np.eye(4)),)
+    scene = Scene("box", "structure", scans, structure=StructureDesign("box", vertices, faces))
+    result = defects_step.run(scene, defects_step.Params())
+    assert result.status == "ambiguous"
+    assert len(result.defects) > 0
+    assert result.defects.doubtful.all()
+    assert (result.defects.confidence <= 0.5).all()
+    assert all(row[-1].code == "defects.pose-ambiguous" for row in result.defects.reasons)
+    assert "no defects found and" in str(section.REPORT.summary(result)[0])
+
+
 def test_the_order_of_points_and_the_place_in_the_world_do_not_matter():
     dent = bump(3.0, 90.0, (250.0, 300.0))
     scene = scene_of(3, dent)
@@ -287,12 +328,57 @@ def test_false_alarms_are_no_more_than_asked_for():
     for seed in range(10):
         noise = np.random.default_rng(seed).normal(0.0, 0.1, len(seen))
         ones = np.ones(len(seen), np.int64)
-        field = deviation_field.Field(noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen)
+        field = deviation_field.Field(
+            noise, np.full(len(seen), 0.01), 9 * ones, 0 * ones, 0.3 * seen, seen, seen, 0 * ones
+        )
         levels = scan_statistic.levels_of(field, plate, 1e-8, 0.0)
         sign = scan_statistic.search(field, plate, levels).sign
         alarms += int((np.abs(plate.charts.image(sign.astype(float), chart)) > 0).any())
     assert alarms <= 10  # of 10 runs, in each of which 1 is allowed: at 0.63 a run, ten of ten is one in a hundred
     assert np.all(levels.inflation < 1.1)
+
+
+# --- alignment of stations -----------------------------------------------------------------------------------------
+
+
+def two_sides(seed, off_mm):
+    """Blocks of two pairs of stations, each pair on its side: of the other's they see what hardly shows shifts in x."""
+    rng = np.random.default_rng(seed)
+    moved = off_mm * rng.normal(size=(4, 7)) * [0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 0.0]
+    rows = [(0, 1), (2, 3)] * 600 + [(0, 1, 2, 3)] * 400
+    block = np.repeat(np.arange(len(rows)), [len(row) for row in rows])
+    station = np.concatenate(rows)
+    normal = rng.normal(size=(len(rows), 3))
+    normal[1200:, 0] = 0.02
+    normal = (normal / np.linalg.norm(normal, axis=1)[:, None])[block]
+    arm = (rng.uniform(-1.0, 1.0, (len(rows), 3)) * [5000.0, 800.0, 800.0])[block]
+    J = np.hstack([np.cross(arm, normal), normal, np.zeros((len(block), 1))])
+    free = 5.0 * rng.normal(size=len(rows))[block]
+    mean = free + np.einsum("nk,nk->n", J, moved[station]) + 0.2 * rng.normal(size=len(block))
+    blocks = alignment.StationBlocks(block, station, mean, np.full(len(block), 0.04), np.zeros(len(block), np.int64))
+    return blocks, J, moved
+
+
+def test_stations_that_agree_are_not_moved_by_what_hardly_shows():
+    shifts = []
+    for seed in range(3):
+        blocks, J, _ = two_sides(seed, 0.0)
+        x, covariance = alignment.station_movements(blocks, J, 4)
+        shifts.append(np.abs(x[:, 3:6]).max())
+        assert np.sqrt(np.diag(covariance).reshape(4, 7)[:, 3:6].max()) < 0.1
+    assert max(shifts) < 0.1  # with a prior of 3 mm for every station, up to 0.7 mm
+
+
+def test_what_stations_leave_undetermined_is_in_their_covariance():
+    z = []
+    for seed in range(20):
+        blocks, J, moved = two_sides(seed, 0.5)
+        x, covariance = alignment.station_movements(blocks, J, 4)
+        between = np.zeros((4, 7))
+        between[:, 3] = [0.5, 0.5, -0.5, -0.5]  # of the sides, along x
+        error = float(((x - moved) * between).sum())
+        z.append(error / np.sqrt(between.ravel() @ covariance @ between.ravel()))
+    assert 0.6 < np.sqrt(np.mean(np.square(z))) < 1.4
 
 
 def test_facets_are_the_nearest_that_a_scanner_can_see():
@@ -415,3 +501,91 @@ def test_the_pieces_of_a_crack_are_one_and_what_lies_beside_it_is_not():
     np.testing.assert_array_equal(first[0].cells, np.unique(joined))
     assert sorted(len(group) for group in others) == [1, 1]
     assert {id(group[0]) for group in others} == {id(beside), id(raised)}
+
+
+# --- what should have been seen ------------------------------------------------------------------------------------
+
+
+def plates_on_a_wall(gone, gap=0.0):
+    """Expected and missing places of a wall with two plates on it, the points from one station in front of it."""
+    wall = box((0.0, 0.0, 0.0), (2000.0, 20.0, 1000.0))
+    plates = [box((x, -10.0 - gap, 300.0), (x + 400.0, -gap, 700.0)) for x in (300.0, 1300.0)]
+    solids = [wall, *plates]
+    vertices = np.vstack([corners for corners, _ in solids])
+    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
+    built = solids[:-1] if gone else solids
+    rng = np.random.default_rng(1)
+    station = np.array([1000.0, -4000.0, 500.0])
+    x, z = rng.uniform(0.0, 2000.0, 200_000), rng.uniform(0.0, 1000.0, 200_000)
+    y = np.zeros(len(x))
+    for corners, _ in built[1:]:
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        y = np.where((x > low[0]) & (x < high[0]) & (z > low[2]) & (z < high[2]), low[1], y)
+    points = np.stack([x, y + rng.normal(0.0, 0.3, len(x)), z], axis=1)
+    scene = Scene(
+        "wall", "structure", (Scan("S1", points, position=station, T_project_scan=np.eye(4)),),
+        structure=StructureDesign("wall", vertices, faces),
+    )  # fmt: skip
+    return defects_step.run(scene, defects_step.Params(align=False, registration_error_mm=0.01))
+
+
+@pytest.mark.parametrize("gap", [-0.1, 0.0, 0.1])
+def test_faces_that_touch_another_body_are_not_missing(gap):
+    assert found(plates_on_a_wall(gone=False, gap=gap)) == []
+
+
+def test_lines_of_sight_end_at_facets():
+    """Lines from a wide plate to a far place cross a narrow plate 600 mm before it, or pass beside it."""
+    near, far = box((0.0, 0.0, 0.0), (1000.0, 10.0, 1000.0)), box((-500.0, 600.0, -500.0), (1500.0, 610.0, 1500.0))
+    vertices, faces = np.vstack([near[0], far[0]]), np.vstack([near[1], far[1] + 8])
+    surface = surface_charts.of_mesh(vertices, faces, 100.0)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 30.0)
+    rng = np.random.default_rng(3)
+    starts = np.stack([rng.uniform(-450, 1450, 400), np.full(400, 599.0), rng.uniform(-450, 1450, 400)], axis=1)
+    ends = np.repeat([[500.0, -6000.0, 450.0]], 400, axis=0)
+    shares = {y: (599.0 - y) / 6599.0 for y in (10.0, 0.0)}
+    at = [starts + share * (ends - starts) for share in shares.values()]
+    crossed = np.array([((p[:, [0, 2]] > 0.0) & (p[:, [0, 2]] < 1000.0)).all(axis=1) for p in at])
+    row, _, share = mesh_distance.crossings(grid, starts, ends, False)
+    across = np.array([np.isclose(share, expected) for expected in shares.values()])
+    for k in range(2):
+        assert 0 < crossed[k].sum() < 400
+        np.testing.assert_array_equal(np.sort(row[across[k]]), np.flatnonzero(crossed[k]))
+    sides = crossed.any(axis=0)
+    assert set(mesh_distance.crossings(grid, starts, ends, True)[0]) >= set(np.flatnonzero(sides).tolist())
+
+
+def girder_with_brackets(gone):
+    """A web with brackets standing off it, seen from two stations above and below; the last bracket may be gone."""
+    solids = [box((0.0, 0.0, 0.0), (3000.0, 14.0, 1400.0))]
+    solids += [box((x, -140.0, 700.0), (x + 400.0, 0.0, 714.0)) for x in (300.0, 1300.0, 2300.0)]
+    vertices = np.vstack([corners for corners, _ in solids])
+    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
+    built = trimesh.util.concatenate(
+        [trimesh.Trimesh(corners, own, process=False) for corners, own in (solids[:-1] if gone else solids)]
+    )
+    scans = []
+    for seed, station in enumerate(([1500.0, -3500.0, 2500.0], [1500.0, -3500.0, -1200.0])):
+        position = np.array(station)
+        points, facet = trimesh.sample.sample_surface(built, 400_000, seed=seed)
+        points, normal = np.asarray(points), np.asarray(built.face_normals)[facet]
+        front = np.einsum("ni,ni->n", position - points, normal) > 0.0
+        points, normal = points[front], normal[front]
+        surface = surface_charts.of_mesh(np.asarray(built.vertices), np.asarray(built.faces).astype(np.int64), 100.0)
+        grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
+        hidden = mesh_distance.crossings(grid, points + normal, np.repeat(position[None], len(points), axis=0), True)[0]
+        points = np.delete(points, hidden, axis=0)
+        ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
+        points = points + np.random.default_rng(seed).normal(0.0, 0.3, len(points))[:, None] * ray
+        scans.append(Scan(f"S{seed}", points, position=position, T_project_scan=np.eye(4)))
+    design = StructureDesign("girder", vertices, faces)
+    return Scene("girder", "structure", tuple(scans), structure=design)
+
+
+def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it():
+    params = defects_step.Params(align=False, registration_error_mm=0.01)
+    whole = defects_step.run(girder_with_brackets(gone=False), params)
+    assert found(whole) == []
+    result = defects_step.run(girder_with_brackets(gone=True), params)
+    assert result.defects.defect_class == ("missing-part",)
+    np.testing.assert_allclose(result.defects.centre[0], [2500.0, -70.0, 707.0], atol=60.0)

@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from processor import readers
-from processor.cli.run import commands
+from processor.cli.main import commands
 from processor.scan_folder.folder import read_input
 
 FIXTURES = Path(__file__).resolve().parents[2] / "fixtures"

@@ -118,12 +118,35 @@ def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     assert np.abs(end.departure[list(on_side)] - corners[list(on_side)]).max() < 1.0
 
 
-def test_a_face_of_which_one_side_alone_was_seen_may_be_the_inner_one():
-    rng = np.random.default_rng(5)
-    end = fitted(
-        built(cloud(rng, 8.0, (1.0, 1.0, 0.0, 1.0)), np.zeros((4, 3))), rng
-    )  # no points on the outside of the top
+def without_the_outside(side):
+    """Points of a box as designed, none on the outside of one wall (bottom, right, top, left)."""
+    rng = np.random.default_rng(5 + side)
+    shares = np.ones(4)
+    shares[side] = 0.0
+    return cloud(rng, 8.0, shares), rng
+
+
+@pytest.mark.parametrize("side", range(4))
+def test_a_face_seen_from_its_inner_side_is_placed_by_the_thickness(side):
+    """The points of the end face lie outside of the layer seen, so it is the inner side."""
+    end = fitted(*without_the_outside(side))
+    assert end.doubts == ()
+    assert [one.code for one in end.remarks] == ["preassemble.by-inner-side"]
+    assert np.abs(end.departure).max() < 0.5
+    assert (np.abs(end.departure.ravel()) < 1.96 * np.sqrt(np.diag(end.covariance)) + 0.05).all()
+
+
+@pytest.mark.parametrize("further_in", [0.0, 1.0])
+def test_a_face_of_which_one_side_alone_was_seen_may_be_either(further_in):
+    """Without points of the end face there, both the plate as designed and the plate further in are in the interval."""
+    points, rng = without_the_outside(2)
+    bare = points[~((points[:, 0] > -1.0) & (points[:, 2] > H - T - 1.0))]
+    end = fitted(bare, rng)
     assert end.doubts == (reason("preassemble.inner-side", faces=("top",)),)
+    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
+    off = np.abs(end.departure + np.array([0.0, 0.0, further_in * T]))[[2, 3, 6], 2]  # P3, P4 and P7 are on the top
+    assert (off < 1.96 * sd[[2, 3, 6], 2] + 0.2).all()
+    assert sd[[0, 1, 4], 2].max() < 0.5
 
 
 def test_the_outermost_layer_of_a_tilted_plate():

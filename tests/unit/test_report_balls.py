@@ -280,7 +280,7 @@ def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
 
 
 def test_starting_the_program_loads_no_drawing_library():
-    code = "import sys, processor.cli.run, processor.report.results_folder; assert 'ezdxf' not in sys.modules"
+    code = "import sys, processor.cli.main, processor.report.results_folder; assert 'ezdxf' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

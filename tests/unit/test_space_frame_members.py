@@ -19,7 +19,7 @@ def find(source, params=None):
     start = extract.blind(source, params)
     if start is None:
         return Nodes(), Members()
-    found = members.with_meeting_axes(start.measured, params.largest_scatter_mm)
+    found = members.of_nodes(start.measured, start.balls & members.meeting(start.measured, params.largest_scatter_mm))
     return found.nodes, found.members
 
 

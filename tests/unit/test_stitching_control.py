@@ -11,7 +11,7 @@ from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
-from processor.cli import run
+from processor.cli import main
 from processor.geometry import rigid
 from processor.model import Control, InputError, reason
 from processor.report.record_json import as_object
@@ -352,7 +352,7 @@ def test_a_folder_with_control_points_says_what_they_hold(tmp_path):
     with (folder / "control.csv").open("w", newline="") as file:
         csv.writer(file).writerows(rows)
     (folder / "project.toml").write_text('kind = "structure"\n')
-    ran = CliRunner().invoke(run.commands, ["run", str(folder), "-o", str(tmp_path / "out"), "--steps", "stitch"])
+    ran = CliRunner().invoke(main.commands, ["run", str(folder), "-o", str(tmp_path / "out"), "--steps", "stitch"])
     assert ran.exit_code in (0, 1), ran.output
     said = ran.output.replace("\n", " ")
     assert "fixed by 5 control points in 20 sightings" in said

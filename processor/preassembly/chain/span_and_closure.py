@@ -110,7 +110,7 @@ def limiting(
             k = int(np.argmax(sd))
             worst, where = float(sd[k]), (j, k // 3, k % 3)
     missing = _missing(parts, adjusted, design)
-    if worst == 0.0:
+    if worst == 0.0 or any(part.of_others for part in parts):
         return missing, missing
     j, point, axis = where
     variance: dict[PartEnd, float] = {}
@@ -154,7 +154,10 @@ def mean_max_ci95(vectors: Floats, variance: Floats) -> tuple[float, float]:
 
 
 def _missing(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign) -> tuple[Reason, ...]:
-    """Return what to scan where joints have no result."""
+    """Return what to do where joints have no result."""
+    others = tuple(part.name for part in parts if part.of_others)
+    if others:
+        return (reason("preassemble.assign-scans", parts=others),)
     joints: dict[tuple[str, ...], list[str]] = {}
     for name, gaps, *beside in zip(design.joint_names, adjusted.gaps, parts, parts[1:], strict=False):
         if not np.isfinite(gaps).all():

@@ -118,7 +118,7 @@ def _faces(
     points, at = part.points[rows], index[rows]
     offset = points - line.at(fine[at])
     along, level, up = (np.einsum("ni,ni->n", offset, frame[k][at]) for k in range(3))
-    nearest = part.surface.distances(points, REACH_MM)[0]
+    nearest, distance, _ = part.surface.distances(points, REACH_MM)
     face, residual, beyond = part.outer.distances(points, REACH_MM)
     measured = (nearest >= 0) & on_face(face, beyond) & (np.abs(residual) < plate_sides.REACH_MM)
     # The sense of the normals is not used: meshes come with either.
@@ -133,7 +133,8 @@ def _faces(
     web = inside & looks[0] & (np.abs(level) < plate_sides.REACH_MM) & (up > margin) & (up < REACH_MM)
     bottom = inside & looks[1] & (np.abs(up) < plate_sides.REACH_MM) & (inward > margin) & (inward < REACH_MM)
     for used, out in ((web, sense * np.sign(facing[0])), (bottom, -np.sign(facing[1]))):
-        used[used] = _outer(interval[used], (out * residual)[used])
+        inner = np.abs(distance) < np.abs(residual) - plate_sides.LAYER_MM  # nearer to another face of the design
+        used[used] = _outer(interval[used], (out * residual)[used], inner[used])
     return (
         _FacePoints(interval[web], x[web], up[web], np.sign(facing[0][web]) * residual[web]),
         _FacePoints(interval[bottom], x[bottom], inward[bottom], np.sign(facing[1][bottom]) * residual[bottom]),
@@ -150,12 +151,16 @@ def _frame(line: Polyline, other: Polyline, chainage: Floats, sense: float) -> t
     return along, left, np.cross(along, left)
 
 
-def _outer(interval: Ints, out: Floats) -> Bools:
-    """Mark points (n,) that are not of a plate's inner side, interval by interval."""
+def _outer(interval: Ints, out: Floats, inner: Bools) -> Bools:
+    """Mark points (n,) that are not of a plate's inner side, interval by interval.
+
+    A single layer where the design has the ``inner`` (n,) side may be either side, and is left out.
+    """
     outer = np.ones(len(out), bool)
     for number in np.unique(interval[out < -plate_sides.LAYER_MM]):
         rows = np.flatnonzero(interval == number)
-        outer[rows] = plate_sides.outer_layer(out[rows])
+        layer = plate_sides.outer_layer(out[rows])
+        outer[rows] = layer & ~inner[rows] if layer.all() else layer
     return outer
 
 

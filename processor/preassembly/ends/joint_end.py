@@ -13,7 +13,7 @@ the sizes of the other ends' departures set the weights of the hypotheses for ea
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -23,7 +23,7 @@ from processor.adjustment import model_averaging, variance_components
 from processor.adjustment.model_averaging import SIZES_MM, Bools, Estimate
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
-from processor.model import Floats, Ints, Reason, reason
+from processor.model import NORMAL_95, Floats, Ints, Reason, reason
 from processor.preassembly.ends import faces as ends_faces
 from processor.preassembly.ends import plate_sides
 from processor.preassembly.ends import ring as ends_ring
@@ -35,6 +35,7 @@ from processor.preassembly.ends.faces import (
     REACH_MM,
     ZONE_MM,
     FaceFit,
+    PlateFace,
     RegisteredPart,
     UsedPoints,
 )
@@ -44,6 +45,8 @@ from processor.preassembly.ends.joint_frame import EndPlace
 BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
 BEND_WEIGHTS = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))
 RING = 8  # coefficients of the ring
+MITRE_MM = 0.01
+PLATE_SD_MM = 0.5  # of a plate's thickness: as delivered within -0.6 and +1.0 mm at 15 to 25 mm (EN 10029, class A)
 ITERATIONS = 4  # of a corner's place on its faces
 # Share of a departure, one standard deviation. Terms are taken where the design has the surface, not where the surface
 # is. For a corner 20 mm off, on faces tilted by as much over their width, the difference is 0.5 mm. The coefficients
@@ -67,6 +70,15 @@ class JointEnd:
     covariance: Floats
     by_pose: Floats
     doubts: tuple[Reason, ...] = ()  # why the end is not known, or may be that of another plate side
+    remarks: tuple[Reason, ...] = ()  # that do not put it in doubt
+
+
+class PlateSides(NamedTuple):
+    """Thicknesses (4,) by which the faces may lie further in, and what is to be said of the sides of the plates."""
+
+    either: Floats
+    doubts: tuple[Reason, ...]
+    remarks: tuple[Reason, ...]
 
 
 @dataclass(frozen=True)
@@ -82,7 +94,17 @@ class FittedEnd:
     pose: Floats
     place: EndPlace
     third_order: Floats  # (8, 2) of the four faces, see variance_components.third_order
-    doubts: tuple[Reason, ...] = ()
+    sides: PlateSides
+
+    @property
+    def doubts(self) -> tuple[Reason, ...]:
+        """Why the end may be that of another plate side."""
+        return self.sides.doubts
+
+    @property
+    def remarks(self) -> tuple[Reason, ...]:
+        """Return the remarks that do not put the end in doubt."""
+        return self.sides.remarks
 
 
 class _Block(NamedTuple):
@@ -116,6 +138,7 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
     residual = np.concatenate([face.used.residual for face in faces])
     sigma = float(np.sqrt(residual @ residual / max(len(residual) - FACE * len(faces), 1)))
     thickness = _design_thickness(part.surface, place)
+    faces, sides = _outer_sides(local, faces, place, thickness, sigma)
     ring, on_ring = _fit_ring(local, part.station, faces, place, thickness, sigma)
     if not len(ring.coefficients):
         return unknown(reason("preassemble.few-points-on-end-face"))
@@ -128,7 +151,7 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
         pose=part.pose,
         place=place,
         third_order=np.vstack([variance_components.third_order(f.used.basis, f.used.residual) for f in faces]),
-        doubts=_inner_side(faces, thickness),
+        sides=sides,
     )
 
 
@@ -140,14 +163,49 @@ def estimate(ends: Sequence[FittedEnd]) -> list[JointEnd]:
     return [_corners_of(end, averaged, bending) for end, averaged in zip(ends, _averaged(ends), strict=True)]
 
 
-def _inner_side(faces: Sequence[FaceFit], thickness: Floats) -> tuple[Reason, ...]:
-    """Return a doubt where a face lies further in than half its plate and no second layer was found."""
-    doubtful = tuple(
-        name
-        for (name, axis, _), face in zip(FACES, faces, strict=True)
-        if face.single_layer and face.coefficients[0] < -0.5 * thickness[axis - 1] < 0.0
-    )
-    return (reason("preassemble.inner-side", faces=doubtful),) if doubtful else ()
+def _outer_sides(
+    local: Floats, faces: Sequence[FaceFit], place: EndPlace, thickness: Floats, sigma: float
+) -> tuple[list[FaceFit], PlateSides]:
+    """Replace faces that were fitted to the inner side of their plates by the outer side.
+
+    A face further in than half its plate, with no second layer, may be the plate's inner side, seen where the outer one
+    was not. The end face is between both sides, so its points lie outside of the inner side and inside of the outer
+    one. Where they are too few, the inner side is the more probable one, for a departure by just the plate's thickness
+    is rare. The other side then is within the interval.
+    """
+    outer, either = list(faces), np.zeros(len(FACES))
+    shown: list[PlateFace] = []
+    doubtful: list[PlateFace] = []
+    level = np.eye(1, FACE)[0]
+    for k, ((name, axis, sense), face) in enumerate(zip(FACES, faces, strict=True)):
+        plate = float(thickness[axis - 1])
+        if not (face.single_layer and face.coefficients[0] < -0.5 * plate < 0.0):
+            continue
+        inward, wide = _inward(local, face, place, axis, sense)
+        beyond = place.outward * local[wide, 0]
+        outside, inside = plate_sides.beside(beyond, inward[wide], sigma)
+        if inside >= max(plate_sides.FEWEST_BESIDE, 2 * outside):
+            continue
+        if outside >= max(plate_sides.FEWEST_BESIDE, 2 * inside):
+            plate = plate_sides.ring_width(beyond, -inward[wide], sigma, plate)
+            shown.append(name)
+        else:
+            either[k] = plate
+            doubtful.append(name)
+        by_plate = face.covariance + PLATE_SD_MM**2 * np.outer(level, level)
+        outer[k] = replace(face, coefficients=face.coefficients + plate * level, covariance=by_plate)
+    doubts = (reason("preassemble.inner-side", faces=tuple(doubtful)),) if doubtful else ()
+    remarks = (reason("preassemble.by-inner-side", faces=tuple(shown)),) if shown else ()
+    return outer, PlateSides(either, doubts, remarks)
+
+
+def _inward(local: Floats, face: FaceFit, place: EndPlace, axis: int, sense: float) -> tuple[Floats, Bools]:
+    """Distances (n,) of points inward from a face, and a mark of those away from the section's corners."""
+    across = 1 if axis == 2 else 2
+    half = place.half[across]
+    departure = ends_faces.basis(local[:, 0], local[:, across] / half) @ face.coefficients
+    wide = np.abs(local[:, across]) < half - np.minimum(plate_sides.REACH_MM, 0.5 * half)
+    return place.half[axis] + departure - sense * local[:, axis], wide
 
 
 def _full_covariances(fits: Sequence[tuple[Floats, UsedPoints]], between_stations: float) -> list[Floats]:
@@ -170,19 +228,22 @@ def _corners_of(end: FittedEnd, averaged: Estimate, bending: float) -> JointEnd:
     covariance = derivative @ averaged.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
     at_joint = derivative[:, AT_JOINT]
     covariance += bending * at_joint @ at_joint.T
+    levels = derivative[:, AT_JOINT[::2]] * end.sides.either / NORMAL_95
+    covariance += levels @ levels.T
     by_pose = derivative @ averaged.not_followed(end.motion)
-    return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.doubts)
+    return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.doubts, end.remarks)
 
 
 def _design_thickness(surface: MeshSurface, place: EndPlace) -> Floats:
     """Thickness (2,) of webs and flanges at the joint: the depth of the facets of the design's end face."""
     T_joint_bridge = rigid.invert(place.T_bridge_joint)
-    upright = np.flatnonzero(np.abs(surface.normals @ T_joint_bridge[0, :3]) > 0.9)
-    corners = rigid.apply(T_joint_bridge, surface.vertices[surface.faces[upright]])
+    across = np.flatnonzero(np.abs(surface.normals @ T_joint_bridge[0, :3]) > 0.9)
+    corners = rigid.apply(T_joint_bridge, surface.vertices[surface.faces[across]])
     corners = corners[(np.abs(corners[:, :, 0]) < 0.5).all(axis=1)]
     depth = place.half[1:] - np.abs(corners[:, :, 1:])
-    middle = depth.mean(axis=1)
-    on_web = middle[:, 0] < middle[:, 1]
+    lean = depth[:, :, 0].mean(axis=1) - depth[:, :, 1].mean(axis=1)
+    upright = np.ptp(corners[:, :, 2], axis=1) > np.ptp(corners[:, :, 1], axis=1)
+    on_web = np.where(np.abs(lean) < MITRE_MM, upright, lean < 0.0)  # a mitred facet is as deep on both
     return np.array([depth[on_web, :, 0].max(initial=0.0), depth[~on_web, :, 1].max(initial=0.0)])
 
 
@@ -196,10 +257,7 @@ def _fit_ring(
     half = place.half
     depth, plates, x = [], [], place.outward * local[:, 0]
     for (_, axis, sense), face in zip(FACES, faces, strict=True):
-        across = 1 if axis == 2 else 2
-        w = local[:, across] / half[across]
-        e = half[axis] + ends_faces.basis(local[:, 0], w) @ face.coefficients - sense * local[:, axis]
-        wide = np.abs(local[:, across]) < half[across] - np.minimum(plate_sides.REACH_MM, 0.5 * half[across])
+        e, wide = _inward(local, face, place, axis, sense)
         plates.append(plate_sides.plate_thickness(x[wide], e[wide], sigma, float(thickness[axis - 1])))
         depth.append(e)
     clear = np.array([max(plates[1], plates[3]), max(plates[0], plates[2])]) + ends_ring.REACH * sigma + 1.0

@@ -20,6 +20,7 @@ CLEAR_SHARE = 0.35  # of the fullest bin: fewer points are outliers and no layer
 SECOND_SHARE = 0.05  # of all points, inside the outermost layer: fewer are outliers
 FEWEST = 40
 FEWEST_OF_CELL = 12
+FEWEST_BESIDE = 10  # points of the end face on one side of a layer, which show that the plate is there
 CLIMBS = 2  # a plate has two sides
 ONE_LAYER_SHARE = 0.7  # of the points above a layer that must lie on one surface, to be a layer themselves
 THINNEST_MM = 6.0
@@ -99,17 +100,36 @@ def plate_thickness(x: Floats, e: Floats, sigma_mm: float, design_mm: float) -> 
     ``x`` (n,) is outward from the end, ``e`` (n,) inward from the outer face, of points away from the section's
     corners. It is the distance of the inner wall or, without points on it, the width of the ring.
     """
-    reach = 4.0 * sigma_mm + 2.0
+    reach = _reach(sigma_mm)
     inner = e[(x < -reach) & (x > -REACH_MM) & (e > max(THINNEST_MM, reach)) & (e < REACH_MM)]
     if len(inner) >= FEWEST:
         inner = inner[outer_layer(-inner)]
         thickness = float(np.median(inner))
         if np.median(np.abs(inner - thickness)) > 2.0 * sigma_mm + 1.0:  # clutter
             return design_mm
-    else:
-        ring = e[(np.abs(x) < reach) & (e > reach) & (e < REACH_MM)]
-        if len(ring) < FEWEST:
-            return design_mm
-        thickness = float(np.quantile(ring, RING_SHARE))
-        thickness = reach + (thickness - reach) / RING_SHARE
-    return thickness if abs(thickness - design_mm) > 2.0 * sigma_mm + 1.0 else design_mm
+        return thickness if abs(thickness - design_mm) > 2.0 * sigma_mm + 1.0 else design_mm
+    return ring_width(x, e, sigma_mm, design_mm)
+
+
+def ring_width(x: Floats, e: Floats, sigma_mm: float, design_mm: float) -> float:
+    """Width in mm of the ring of the plate's end face: ``design_mm`` unless the points clearly differ.
+
+    ``x`` (n,) is outward from the end, ``e`` (n,) the distance from one side of the plate towards the other.
+    """
+    reach = _reach(sigma_mm)
+    ring = e[(np.abs(x) < reach) & (e > reach) & (e < REACH_MM)]
+    if len(ring) < FEWEST:
+        return design_mm
+    width = reach + (float(np.quantile(ring, RING_SHARE)) - reach) / RING_SHARE
+    return width if abs(width - design_mm) > 2.0 * sigma_mm + 1.0 else design_mm
+
+
+def beside(x: Floats, e: Floats, sigma_mm: float) -> tuple[int, int]:
+    """Count the points beside a layer near the end, on its outer and on its inner side; ``x``, ``e`` as above."""
+    near = (np.abs(x) < REACH_MM) & (np.abs(e) > _reach(sigma_mm)) & (np.abs(e) < REACH_MM)
+    return int((near & (e < 0.0)).sum()), int((near & (e > 0.0)).sum())
+
+
+def _reach(sigma_mm: float) -> float:
+    """Distance from a layer beyond which points are not of it."""
+    return 4.0 * sigma_mm + 2.0

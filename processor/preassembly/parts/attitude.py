@@ -17,7 +17,7 @@ from processor.geometry import icp, mesh_distance, principal, rigid, surface_reg
 from processor.geometry.mesh_distance import MeshSurface
 from processor.geometry.neighbors import thinned, voxel_means
 from processor.geometry.parallel import each
-from processor.model import DesignPart, Floats, Reason, Status, reason
+from processor.model import ArchDesign, DesignPart, Floats, Reason, Status, reason
 
 SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.1 m
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
@@ -30,6 +30,7 @@ SAME_SIZE = 0.05  # relative difference of sizes along an axis that a piece of f
 # A hypothesis whose misfit after the coarse gates exceeds PROMISING times the best plus PROMISING_MM is dropped; the
 # right one may have converged some millimetres off.
 PROMISING, PROMISING_MM = 4.0, 10.0
+ROUGH_KEPT = 4  # of the promising hypotheses, for a rough pose
 SHORT_SHARE = 0.1  # of its length, by which a scan of a whole part may be shorter
 NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose explains the scan
 SAME_POSE_MM = 5.0  # poses are equal where no corner of the part differs by more
@@ -51,6 +52,9 @@ class Attitude:
     T_rival: Floats = field(default_factory=lambda: np.full((4, 4), np.nan))  # of an ambiguous part: the other pose
 
 
+NOWHERE = Attitude(np.full((4, 4), np.nan), np.full((4, 4), np.nan), Status.FAILED)
+
+
 @dataclass(frozen=True)
 class Surface:
     """Samples (n, 3) of a design part's surface in the bridge's frame with unit normals (n, 3)."""
@@ -62,6 +66,23 @@ class Surface:
     centre: Floats  # (3,) of its area
     axes: Floats  # (3, 3) principal axes as columns
     size: float  # diagonal of the bounding box
+    sizes: Floats  # (3,) along its principal axes, as of a scan
+
+
+class Shapes:
+    """The sampled surfaces of a design's parts by their numbers, each made when it is first asked for."""
+
+    def __init__(self, design: ArchDesign) -> None:
+        self.design = design
+        self._made: dict[int, Surface] = {}
+
+    def __getitem__(self, index: int) -> Surface:
+        if index not in self._made:
+            self._made[index] = sample_surface(self.design.parts[index])
+        return self._made[index]
+
+    def __len__(self) -> int:
+        return len(self.design.parts)
 
 
 @dataclass(frozen=True)
@@ -95,6 +116,7 @@ def sample_surface(part: DesignPart) -> Surface:
         centre=axes.centre,
         axes=axes.axes,
         size=size,
+        sizes=principal.sizes(points),
     )
 
 
@@ -153,16 +175,8 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     is none, or the scan does not show it, the status is ``ambiguous``.
     """
     surface = sample_surface(part) if surface is None else surface
-    seeds = voxel_means(points, surface.size / 150.0, least=2)
-    if len(seeds) < 50:
-        seeds = points
-    few = thinned(seeds, COARSE_POINTS)
-    starts = [_Candidate(T, T) for T in principal_hypotheses(points, part)]
-    coarse = each(partial(_align, few, surface, COARSE_GATES_MM), starts)
-    box = _corners(points)
-    if min(c.misfit for c in coarse) > PIECE_MM:
-        coarse += _of_pieces(seeds, few, surface, part)
-    coarse = _promising(coarse, box)
+    box, even = _corners(points), _even(points, surface)
+    coarse = _coarse(points, even, surface, part, pieces=True)
     # Single points: voxel means blur the end faces, which alone constrain the part along its length.
     seeds = thinned(points, FINE_POINTS)
     align = partial(_align, seeds, surface, FINE_GATES_MM)
@@ -174,7 +188,7 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     turns = [c.start @ rigid.invert(best.start) for c in coarse]
     turns += [_about(surface.centre, R) for R in _rotations(surface.axes, surface.axes)]
     turned = [_Candidate(S @ best.T, S @ best.start) for S in turns]
-    screened = each(partial(_align, few, surface, COARSE_GATES_MM[1:]), turned)
+    screened = each(partial(_align, even[1], surface, COARSE_GATES_MM[1:]), turned)
     turned = _promising([replace(c, misfit=s.misfit) for c, s in zip(turned, screened, strict=True)], box)
     candidates = _distinct(candidates + each(align, turned), box)
     best = candidates[0]
@@ -183,6 +197,36 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
         return Attitude(best.start, best.T, Status.FAILED, (why,))
     rivals = [c for c in candidates if c.misfit <= RIVAL_RATIO * best.misfit + 0.5]
     return _decide(points, box, seeds, surface, rivals)
+
+
+def rough(points: Floats, part: DesignPart, surface: Surface, *, pieces: bool) -> Floats:
+    """T_bridge_scan (4, 4) of the hypothesis that a few hundred of points (n, 3) fit best; of a symmetric part any.
+
+    With ``pieces`` the scan may also be of a piece of the part.
+    """
+    even = _even(points, surface)
+    coarse = _coarse(points, even, surface, part, pieces=pieces)[:ROUGH_KEPT]
+    return min(each(partial(_align, even[1], surface, FINE_GATES_MM), coarse), key=lambda c: c.misfit).T
+
+
+def _even(points: Floats, surface: Surface) -> tuple[Floats, Floats]:
+    """Return points of even density, and a few hundred of them."""
+    seeds = voxel_means(points, surface.size / 150.0, least=2)
+    if len(seeds) < 50:
+        seeds = points
+    return seeds, thinned(seeds, COARSE_POINTS)
+
+
+def _coarse(
+    points: Floats, even: tuple[Floats, Floats], surface: Surface, part: DesignPart, *, pieces: bool
+) -> list[_Candidate]:
+    """Align all hypotheses by a few hundred points, and return the promising ones, the best first."""
+    seeds, few = even
+    starts = [_Candidate(T, T) for T in principal_hypotheses(points, part)]
+    coarse = each(partial(_align, few, surface, COARSE_GATES_MM), starts)
+    if pieces and min(c.misfit for c in coarse) > PIECE_MM:
+        coarse += _of_pieces(seeds, few, surface, part)
+    return _promising(coarse, _corners(points))
 
 
 def _of_pieces(seeds: Floats, few: Floats, surface: Surface, part: DesignPart) -> list[_Candidate]:

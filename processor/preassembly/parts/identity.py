@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from processor.geometry import box_girder, rigid
 from processor.geometry.mesh_distance import on_face
 from processor.geometry.neighbors import thinned
-from processor.model import ArchDesign, DesignPart, Floats, Reason, reason
+from processor.model import Floats, Reason, reason
 from processor.preassembly.parts import attitude
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, SAMPLE_SPACING_MM
 
@@ -39,6 +39,10 @@ class Identity:
     rather: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
     same: tuple[str, ...] = ()
+
+    def parts(self, part: str) -> tuple[str, ...]:
+        """Name the parts that the scan may be of, placed on a part of this name."""
+        return self.rather or (part, *self.unseen, *self.same)
 
     @property
     def contradiction(self) -> tuple[Reason, ...]:
@@ -69,17 +73,17 @@ class _Surroundings(NamedTuple):
     departure: Floats
 
 
-def identify(points: Floats, T: Floats, surface: attitude.Surface, part: DesignPart, design: ArchDesign) -> Identity:
-    """Compare points (n, 3), placed on the part's surface by T_bridge_scan (4, 4), with the parts of the same shape."""
+def identify(points: Floats, T: Floats, index: int, shapes: attitude.Shapes) -> Identity:
+    """Compare points (n, 3), placed on part ``index`` by T_bridge_scan (4, 4), with the parts of the same shape."""
     rather, unseen, same = [], [], []
-    for other in design.parts:
-        motions = box_girder.motions(part, other) if other.name != part.name else []
+    part, surface = shapes.design.parts[index], shapes[index]
+    for k, other in enumerate(shapes.design.parts):
+        motions = box_girder.motions(part, other) if k != index else []
         if not motions:
             continue
-        other_surface = attitude.sample_surface(other)
         # A part that is symmetric but for its mark lies on the other in two ways. Where the marks agree in one of them
         # the two parts are the same; a mark that agrees in the other way is the part's own, turned round.
-        outcomes = {_compare(points, T, surface, other_surface, motion) for motion in motions}
+        outcomes = {_compare(points, T, surface, shapes[k], motion) for motion in motions}
         if _Outcome.SAME in outcomes:
             same.append(other.name)
         elif _Outcome.OTHER in outcomes:

@@ -8,22 +8,22 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from processor.adjustment import variance_components
-from processor.geometry import box_girder, icp, principal, rigid, surface_registration
+from processor.geometry import box_girder, icp, rigid, surface_registration
 from processor.geometry.mesh_distance import MeshSurface, on_face
-from processor.geometry.neighbors import by_cell, thinned, voxel_means
+from processor.geometry.neighbors import by_cell, thinned
 from processor.geometry.polyline import Polyline
-from processor.model import ArchDesign, DesignPart, Floats, Ints, Reason, Scan, Status, reason
+from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
 from processor.preassembly.ends import bottom_edges, faces, joint_end
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.faces import RegisteredPart
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
 from processor.preassembly.ends.joint_frame import end_place
 from processor.preassembly.params import SystematicParams
-from processor.preassembly.parts import attitude, identity, systematic_errors
+from processor.preassembly.parts import assignment, attitude, identity, systematic_errors
+from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.member import Member
 
 CELL_MM = 40.0  # points of a cell are looked up one after the other
-SIZE_SHARE = 0.01  # of a part's length: scans of the part differ less from its size, by noise, form and voxels
 SLICES, LEAST_OF_TYPICAL = (
     40,
     0.1,
@@ -48,6 +48,13 @@ class MeasuredPart:
     T_rival: Floats  # (4, 4) of an ambiguous part: the other pose that fits as well; NaN of others
     residual_points: Floats  # (r, 3) of the scan, thinned, on the design
     residuals: Floats  # (r,) from the design's surface, outward
+    identities: tuple[ScanParts, ...] = ()  # of its scans
+
+    @property
+    def of_others(self) -> tuple[Reason, ...]:
+        """Why none of its scans is of the part; empty where one may be."""
+        wrong = tuple(identity.wrong for identity in self.identities)
+        return tuple(one for of_scan in wrong for one in of_scan) if all(wrong) else ()
 
 
 @dataclass(frozen=True)
@@ -76,6 +83,7 @@ class _PlacedScan:
     rejected: tuple[Reason, ...] = ()
     identity: identity.Identity = field(default_factory=identity.Identity)
     doubts: tuple[Reason, ...] = ()
+    parts: tuple[str, ...] = ()  # that it may be of
 
     @property
     def sure(self) -> tuple[bool, bool]:
@@ -89,7 +97,7 @@ class _PlacedScan:
 
 
 def fit(
-    scans: Sequence[Scan], index: int, design: ArchDesign, shrink: float, systematic: SystematicParams
+    scans: Sequence[Scan], index: int, shapes: attitude.Shapes, shrink: float, systematic: SystematicParams
 ) -> FittedPart:
     """Register the scans of a part, the design's number ``index``, and fit its ends and edges.
 
@@ -97,10 +105,10 @@ def fit(
     their points. ``shrink`` is the ratio of lengths at the reference temperature to lengths as scanned. The covariance
     of the edges includes ``systematic`` errors, that of the ends does not yet.
     """
+    design, shape = shapes.design, shapes[index]
     part = design.parts[index]
-    shape = attitude.sample_surface(part)
     joints = [j if 0 <= j < len(design.joint_names) else None for j in (index - 1, index)]
-    placed = [_place(scan, part, design, shape, shrink) for scan in scans]
+    placed = [_place(scan, index, shapes, shrink) for scan in scans]
     usable = [scan for scan in placed if not scan.rejected]
     if not usable:
         return _failed(part, joints, placed, shrink)
@@ -113,26 +121,31 @@ def fit(
         for outward, joint in zip((-1.0, 1.0), joints, strict=True)
     )
     edges = _edges(registered, part, first.registration.sigma_mm, systematic)
-    doubtful_ends = tuple(
-        reason("preassemble.at", place=design.joint_names[joint], reasons=end.doubts)
-        for end, joint in zip(ends, joints, strict=True)
-        if end is not None and joint is not None and end.doubts
+    known = [
+        (design.joint_names[j], end) for end, j in zip(ends, joints, strict=True) if end is not None and j is not None
+    ]
+    of_ends = tuple(
+        reason("preassemble.at", place=joint, reasons=(*end.doubts, *end.remarks))
+        for joint, end in known
+        if end.doubts or end.remarks
     )
-    status = Status.WEAK if first.registration.weak or first.doubts or doubtful_ends else Status.OK
+    doubtful = first.doubts or any(end.doubts for _, end in known)
+    status = Status.WEAK if first.registration.weak or doubtful else Status.OK
     status = Status.AMBIGUOUS if first.attitude.status == Status.AMBIGUOUS else status
-    resemblance = _resemblance(first.points, design, part) if status != Status.OK else ()
+    resemblance = _resemblance(first.points, index, shapes) if status != Status.OK else ()
     residual_points, residuals = _residuals(registered.points, shape.mesh)
     measured = MeasuredPart(
         name=part.name,
         scans=tuple(scan.scan for scan in used),
         status=status,
-        reasons=(*_reasons(placed, used, part, doubtful_ends), *resemblance),
+        reasons=(*_reasons(placed, used, part, of_ends), *resemblance),
         T_bridge_scan=first.registration.T_design_scan,
         member=Member((None, None), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
         T_rival=first.attitude.T_rival,
         residual_points=residual_points,
         residuals=residuals,
+        identities=_identities(placed, part),
     )
     return FittedPart(part, measured, ends)
 
@@ -151,8 +164,20 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
     return measured
 
 
+def assigned(parts: Sequence[MeasuredPart]) -> list[MeasuredPart]:
+    """Assign the scans of all parts together; a part whose scan is of another by exclusion alone is ambiguous."""
+    solved = iter(assignment.solve([scan for part in parts for scan in part.identities]))
+    found = [replace(part, identities=tuple(next(solved) for _ in part.identities)) for part in parts]
+    return [
+        replace(part, status=Status.AMBIGUOUS, reasons=(*part.of_others, *part.reasons))
+        if part.of_others and part.status != Status.FAILED
+        else part
+        for part in found
+    ]
+
+
 def _reasons(
-    placed: Sequence[_PlacedScan], used: Sequence[_PlacedScan], part: DesignPart, doubtful_ends: Sequence[Reason]
+    placed: Sequence[_PlacedScan], used: Sequence[_PlacedScan], part: DesignPart, of_ends: Sequence[Reason]
 ) -> Iterator[Reason]:
     """Yield the remarks on a part, in the order in which they are shown."""
     first = used[0]
@@ -161,7 +186,7 @@ def _reasons(
         if scan not in used:
             why = scan.rejected or scan.attitude.reasons or scan.doubts or scan.weak
             yield reason("preassemble.scan-not-used", scan=scan.scan.name, reasons=why)
-    yield from (*doubtful_ends, *first.weak, *first.doubts)
+    yield from (*of_ends, *first.weak, *first.doubts)
     if part.source == box_girder.SOURCE:
         yield reason("preassemble.no-mesh")
     # One scan that shows the part's mark is enough.
@@ -217,11 +242,35 @@ def _station_numbers(by_scan: Sequence[Ints]) -> Ints:
     return np.concatenate(numbers)
 
 
-def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Surface, shrink: float) -> _PlacedScan:
-    """Register one scan and check that it is of the part."""
+def _place(scan: Scan, index: int, shapes: attitude.Shapes, shrink: float) -> _PlacedScan:
+    """Register one scan and check that it is of part ``index``."""
     order = by_cell(scan.points, CELL_MM)
     points = scan.points[order] * shrink
     station = scan.point_station[order].astype(np.int64) if len(scan.point_station) else np.zeros(len(points), np.int64)
+    part, every = shapes.design.parts[index], tuple(part.name for part in shapes.design.parts)
+    other = assignment.rather(points, index, shapes)
+    if other is not None:
+        # Only a scan that fits the other part is of the other part; a misfit may have other causes.
+        there = _register(scan, points, station, other, shapes) if other >= 0 else None
+        if there is None or not (there.rejected or there.doubts):
+            parts = () if there is None else there.identity.parts(shapes.design.parts[other].name)
+            if part.name not in parts:
+                why = (*ScanParts(scan.name, part.name, parts).wrong, *_resemblance(points, index, shapes))
+                return _PlacedScan(scan, points, station, attitude.NOWHERE, rejected=why, parts=parts)
+    placed = _register(scan, points, station, index, shapes)
+    if placed.identity.contradiction and not placed.rejected:
+        # A part of another size may by chance have its mark where the other part of this shape has its own.
+        resemblance = _resemblance(points, index, shapes)
+        if resemblance:
+            return replace(placed, rejected=resemblance, parts=every)
+        why = (*ScanParts(scan.name, part.name, placed.identity.rather).wrong, *placed.identity.contradiction)
+        return replace(placed, rejected=why, parts=placed.identity.rather)
+    return replace(placed, parts=every if placed.rejected else placed.identity.parts(part.name))
+
+
+def _register(scan: Scan, points: Floats, station: Ints, index: int, shapes: attitude.Shapes) -> _PlacedScan:
+    """Register a scan to part ``index``, and compare it with the parts of the same shape."""
+    part, shape = shapes.design.parts[index], shapes[index]
     pose = attitude.find(points, part, shape)
     placed = _PlacedScan(scan, points, station, pose)
     if pose.status == Status.FAILED:
@@ -230,22 +279,23 @@ def _place(scan: Scan, part: DesignPart, design: ArchDesign, shape: attitude.Sur
     placed = replace(placed, registration=registration)
     misfit = _misfit(registration)
     if misfit:
-        return replace(placed, rejected=(*misfit, *(_resemblance(points, design, part) or RIGHT_PART)))
+        return replace(placed, rejected=(*misfit, *(_resemblance(points, index, shapes) or RIGHT_PART)))
     # A part without a mesh has approximate surfaces: points of the right part lie off them, too.
     if registration.used_share < 1.0 - surface_registration.CLUTTER_SHARE and part.source != box_girder.SOURCE:
         # A part of another size fits the design as far as the two are alike; the rest looks like clutter.
         away = 1.0 - registration.used_share
-        resemblance = _resemblance(points, design, part)
+        resemblance = _resemblance(points, index, shapes)
         if resemblance:
             return replace(placed, rejected=(reason("preassemble.points-away", share=away), *resemblance))
         covered = _covered(points, registration.T_design_scan, shape)
         if covered < LEAST_COVERED:
             doubt = reason("preassemble.sides-not-covered", share=away, covered=covered)
             placed = replace(placed, doubts=(doubt, *RIGHT_PART))
-    others = identity.identify(points, registration.T_design_scan, shape, part, design)
-    # A part of another size may by chance have its mark where the other part of this shape has its own.
-    wrong = (_resemblance(points, design, part) or others.contradiction) if others.contradiction else ()
-    return replace(placed, identity=others, rejected=wrong)
+    return replace(placed, identity=identity.identify(points, registration.T_design_scan, index, shapes))
+
+
+def _identities(placed: Sequence[_PlacedScan], part: DesignPart) -> tuple[ScanParts, ...]:
+    return tuple(ScanParts(scan.scan.name, part.name, scan.parts) for scan in placed)
 
 
 def _misfit(registration: surface_registration.SurfaceFit) -> tuple[Reason, ...]:
@@ -292,21 +342,11 @@ def _residuals(points: Floats, surface: MeshSurface) -> tuple[Floats, Floats]:
     return points[near], distance[near]
 
 
-def _resemblance(points: Floats, design: ArchDesign, part: DesignPart) -> tuple[Reason, ...]:
+def _resemblance(points: Floats, index: int, shapes: attitude.Shapes) -> tuple[Reason, ...]:
     """State which parts of the design have the size of the scan, unless the part itself is one."""
-    size = _size_of(points)
-    limit = SIZE_SHARE * float(size.max())
-    alike = [p.name for p in design.parts if np.abs(_size_of(attitude.samples_of(p)[0]) - size).max() < limit]
-    return (reason("preassemble.size-of-other", parts=tuple(alike)),) if alike and part.name not in alike else ()
-
-
-def _size_of(points: Floats) -> Floats:
-    """Sizes (3,) of a surface's points (n, 3) along its principal axes, without single outliers."""
-    spread = float(np.linalg.norm(np.ptp(points, axis=0)))
-    even = voxel_means(points, spread / 150.0, least=2)
-    even = even if len(even) >= 50 else points
-    size: Floats = np.sort(np.ptp(even @ principal.of_points(even).axes, axis=0))
-    return size
+    alike = assignment.of_size(points, shapes)
+    names = tuple(shapes.design.parts[k].name for k in alike)
+    return (reason("preassemble.size-of-other", parts=names),) if alike and index not in alike else ()
 
 
 def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_PlacedScan], shrink: float) -> FittedPart:
@@ -326,5 +366,6 @@ def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_Pl
         T_rival=nowhere,
         residual_points=np.empty((0, 3)),
         residuals=np.empty(0),
+        identities=_identities(placed, part),
     )
     return FittedPart(part, measured, tuple(None if joint is None else joint_end.unknown(*why) for joint in joints))

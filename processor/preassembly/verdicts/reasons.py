@@ -7,14 +7,31 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from processor.model import Floats, Reason, Status, reason
+from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.measure import MeasuredPart
 
 
+def of_assignment(parts: Sequence[MeasuredPart]) -> tuple[Reason, ...]:
+    """Name the scans that are of other parts than stated, and the parts of all scans; empty where none is."""
+    scans = sorted((scan for part in parts for scan in part.identities), key=lambda one: one.scan)
+    wrong = tuple(why for scan in scans for why in scan.wrong)
+    if not wrong:
+        return ()
+    matching = tuple(f"{scan.scan} = {_which(scan, len(parts))}" for scan in scans)
+    return (reason("preassemble.wrong-assignment", scans=wrong, matching=matching),)
+
+
+def _which(scan: ScanParts, count: int) -> str:
+    """Write the parts that a scan may be of; a question mark where nothing is known of it."""
+    return " / ".join(scan.parts) if 0 < len(scan.parts) < count else "?"
+
+
 def of_joint(left: MeasuredPart, right: MeasuredPart) -> tuple[Reason, ...]:
-    """Why a joint's gaps may be wrong: an ambiguous part, an end that may be that of another plate side."""
+    """Why a joint's gaps may be wrong: an ambiguous part, a scan of another, an end of maybe another plate side."""
+    others = (*left.of_others, *right.of_others)
     ends = ((left, left.member.ends[1]), (right, right.member.ends[0]))
     doubts = (reason("preassemble.at", place=part.name, reasons=end.doubts) for part, end in ends if end and end.doubts)
-    return (*_ambiguous((left, right)), *doubts)
+    return (*others, *_ambiguous((left, right)), *doubts)
 
 
 def of_chain(parts: Sequence[MeasuredPart], joints: Sequence[str], gaps: Floats) -> tuple[Reason, ...]:

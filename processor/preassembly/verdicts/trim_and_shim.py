@@ -173,10 +173,10 @@ def propose(
     on an unknown size. Without a limit of the groove gap nothing is cut.
     """
     params = params or TrimParams()
-    if not measures.known:
-        return _no_proposal(reason("preassemble.gaps-unknown"))
     if doubts:
         return _no_proposal(reason("preassemble.doubtful-gaps", reasons=doubts))
+    if not measures.known:
+        return _no_proposal(reason("preassemble.gaps-unknown"))
     limits = {limit.measure: limit for limit in reversed(joint_limits(tolerance))}
     drawn = draws(measures.gaps.ravel(), measures.covariance).reshape(-1, 8, 3)
 

@@ -100,8 +100,8 @@ def _map(axes: Axes, figure: Figure, result: Result, k: int) -> None:
         return
     values, part = np.asarray(picture.deviation, float), picture.part
     x, y = (low + picture.cell * np.arange(n + 1) for low, n in zip(picture.low, values.shape, strict=True))
-    known = np.abs(values[np.isfinite(values)])
-    limit = max(float(np.quantile(known, 0.995)) if len(known) else 0.0, LEAST_SHOWN_MM)
+    magnitudes = np.abs(values[np.isfinite(values)])
+    limit = max(float(np.quantile(magnitudes, 0.995)) if len(magnitudes) else 0.0, LEAST_SHOWN_MM)
     axes.patch.set(facecolor="white", hatch="////", edgecolor="0.8")
     mesh = axes.pcolormesh(
         x, y, np.ma.masked_invalid(values.T), cmap=DIVERGING, vmin=-limit, vmax=limit, rasterized=True

@@ -13,19 +13,19 @@ COLUMNS = ("x", "y", "z", "distance", "lod95", "significant", "n1", "n2", "std1"
 ROWS_AT_ONCE = 50_000
 
 
-def csv_text(origin: Floats, core: Floats, found: Distances, normals: Floats) -> str:
+def csv_text(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> str:
     """Write core points (k, 3), less an ``origin`` (3,), with distances and normals (k, 3); nan where there is none."""
-    return "".join(_lines(origin, core, found, normals))
+    return "".join(_lines(origin, core, distances, normals))
 
 
-def _lines(origin: Floats, core: Floats, found: Distances, normals: Floats) -> Iterator[str]:
+def _lines(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> Iterator[str]:
     yield ",".join(COLUMNS) + "\n"
     for start in range(0, len(core), ROWS_AT_ONCE):
         part = slice(start, start + ROWS_AT_ONCE)
-        significant = found.significant[part].astype(np.int64)
+        significant = distances.significant[part].astype(np.int64)
         numbers = (
-            *(core[part] + origin).T, found.distance[part], found.lod95[part], significant, found.n1[part],
-            found.n2[part], found.std1[part], found.std2[part], *normals[part].T,
+            *(core[part] + origin).T, distances.distance[part], distances.lod95[part], significant, distances.n1[part],
+            distances.n2[part], distances.std1[part], distances.std2[part], *normals[part].T,
         )  # fmt: skip
         texts = [map(repr, column.tolist()) for column in numbers]
         yield "".join(",".join(row) + "\n" for row in zip(*texts, strict=True))

@@ -23,7 +23,7 @@ LEGEND_COLOUR = "#404040"
 BOTH_SIDES = 0.1  # share of core points that look away from which they get a panel of their own
 
 
-def deviation_map(core: Floats, normals: Floats, found: Distances, unit: str) -> tuple[Message, bytes]:
+def deviation_map(core: Floats, normals: Floats, distances: Distances, unit: str) -> tuple[Message, bytes]:
     """Draw core points (k, 3) with normals (k, 3) by distance, seen along the axis on which they spread least.
 
     What is beyond its level of detection is a large dot, what is within a small one, so that grey print tells too. A
@@ -33,17 +33,19 @@ def deviation_map(core: Floats, normals: Floats, found: Distances, unit: str) ->
     spread = np.ptp(core, axis=0) if len(core) else np.zeros(3)
     across, up = sorted(np.argsort(-spread, kind="stable")[:2].tolist())
     along = 3 - across - up
-    away = normals[drawn, along] < 0.0
-    known = np.isfinite(found.lod95[drawn])
-    size = np.abs(found.distance[drawn][known])
-    limit = max(float(np.quantile(size, COLOUR_QUANTILE)) if known.any() else 0.0, 1e-12)
+    from_behind = normals[drawn, along] < 0.0
+    has_lod = np.isfinite(distances.lod95[drawn])
+    size = np.abs(distances.distance[drawn][has_lod])
+    limit = max(float(np.quantile(size, COLOUR_QUANTILE)) if has_lod.any() else 0.0, 1e-12)
     norm = TwoSlopeNorm(0.0, -limit, limit)
-    sides = [(drawn[~away], "+"), (drawn[away], "-")] if away.mean() > BOTH_SIDES else [(drawn, "")]
+    sides = (
+        [(drawn[~from_behind], "+"), (drawn[from_behind], "-")] if from_behind.mean() > BOTH_SIDES else [(drawn, "")]
+    )
     wide = spread[across] > spread[up]
     figure = Figure(figsize=(8.0, 4.8 * len(sides) + 1.0) if wide else (7.0 * len(sides), 6.5), layout="constrained")
     panels = np.atleast_1d(figure.subplots(*((len(sides), 1) if wide else (1, len(sides)))))
     for axes, (rows, side) in zip(panels, sides, strict=True):
-        _panel(axes, core[rows][:, [across, up]], rows, found, norm)
+        _panel(axes, core[rows][:, [across, up]], rows, distances, norm)
         axes.set(xlabel=f"{AXES[across]}{_in(unit)}", ylabel=f"{AXES[up]}{_in(unit)}")
         if side:
             axes.set_title(f"what looks towards {side}{AXES[along]}", fontsize=10)
@@ -55,12 +57,12 @@ def deviation_map(core: Floats, normals: Floats, found: Distances, unit: str) ->
     return text(template, axis=AXES[along], drawn=len(drawn), all=len(core)), png(figure)
 
 
-def _panel(axes: Axes, places: Floats, rows: Ints, found: Distances, norm: TwoSlopeNorm) -> None:
-    distance, known = found.distance[rows], np.isfinite(found.lod95[rows])
-    beyond = found.significant[rows]
+def _panel(axes: Axes, places: Floats, rows: Ints, distances: Distances, norm: TwoSlopeNorm) -> None:
+    distance, has_lod = distances.distance[rows], np.isfinite(distances.lod95[rows])
+    beyond = distances.significant[rows]
     u, v = places.T
-    axes.scatter(u[~known], v[~known], s=2.0, marker="x", linewidths=0.4, color="0.6")
-    for which, size in ((known & ~beyond, WITHIN_SIZE), (beyond, BEYOND_SIZE)):
+    axes.scatter(u[~has_lod], v[~has_lod], s=2.0, marker="x", linewidths=0.4, color="0.6")
+    for which, size in ((has_lod & ~beyond, WITHIN_SIZE), (beyond, BEYOND_SIZE)):
         order = np.flatnonzero(which)
         order = order[np.argsort(np.abs(distance[order]), kind="stable")]
         shown = np.clip(distance[order], norm.vmin, norm.vmax)
@@ -68,7 +70,7 @@ def _panel(axes: Axes, places: Floats, rows: Ints, found: Distances, norm: TwoSl
     axes.ticklabel_format(useOffset=True, style="plain")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
-    counts = int((~known).sum()), int((known & ~beyond).sum()), int(beyond.sum())
+    counts = int((~has_lod).sum()), int((has_lod & ~beyond).sum()), int(beyond.sum())
     axes.legend(handles=_legend(*counts), fontsize=7, loc="upper right")
 
 
@@ -85,14 +87,14 @@ def _legend(unknown: int, within: int, beyond: int) -> list[Line2D]:
     ]
 
 
-def histogram(found: Distances, unit: str) -> tuple[Message, bytes]:
+def histogram(distances: Distances, unit: str) -> tuple[Message, bytes]:
     """Draw how distances are spread, those beyond their level of detection hatched, and the median level."""
     figure = Figure(figsize=(8.0, 3.9), layout="constrained")
     axes = figure.subplots()
-    known = np.isfinite(found.lod95)
-    distance, beyond = found.distance[known], found.significant[known]
+    has_lod = np.isfinite(distances.lod95)
+    distance, beyond = distances.distance[has_lod], distances.significant[has_lod]
     low, high = np.quantile(distance, (0.005, 0.995)) if len(distance) else (-1.0, 1.0)
-    middle = float(np.median(found.lod95[known])) if known.any() else 0.0
+    middle = float(np.median(distances.lod95[has_lod])) if has_lod.any() else 0.0
     low, high = min(float(low), -1.2 * middle, -1e-12), max(float(high), 1.2 * middle, 1e-12)
     axes.hist(
         [np.clip(distance[~beyond], low, high), np.clip(distance[beyond], low, high)],

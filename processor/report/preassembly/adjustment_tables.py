@@ -60,31 +60,31 @@ SPAN_NOTE = text(
 
 def adjusted(result: Result, method: str) -> list[Table]:
     """Tables of the adjustment's own records, what to do first; none for a result without them."""
-    found = result.adjustment
-    if found is None:
+    adjustment = result.adjustment
+    if adjustment is None:
         return []
     return [
-        *_what_to_do(found, method),
-        _limits(found, method),
-        *_chain(found, method),
+        *_what_to_do(adjustment, method),
+        _limits(adjustment, method),
+        *_chain(adjustment, method),
         Table(
             text("Measures of the joints, method {method}", method=method),
             ("joint", "measure", "value", "ci95", "low95", "high95", "unit"),
-            tuple(_measures(found)),
+            tuple(_measures(adjustment)),
             file="measures",
             on_terminal=False,
         ),
         Table(
             text("Span and closure, method {method}", method=method),
             ("figure", "departure", "ci95", "unit", "beyond_its_interval"),
-            tuple(_span_and_closure(found)),
+            tuple(_span_and_closure(adjustment)),
             file="span",
             note=SPAN_NOTE,
         ),
         Table(
             text("Budget of the uncertainty, method {method}", method=method),
             ("source", "sd_mm"),
-            tuple(zip(BudgetSource, found.budget_sd.tolist(), strict=False)),
+            tuple(zip(BudgetSource, adjustment.budget_sd.tolist(), strict=False)),
             file="budget",
             note=BUDGET_NOTE,
         ),
@@ -92,21 +92,21 @@ def adjusted(result: Result, method: str) -> list[Table]:
             text("What limits the accuracy, and which scan would help"),
             ("question", "answer"),
             (
-                (text("what limits the accuracy"), text("{reasons:;}", reasons=found.limiting)),
-                (text("which scan would help"), text("{reasons:;}", reasons=found.advice)),
+                (text("what limits the accuracy"), text("{reasons:;}", reasons=adjustment.limiting)),
+                (text("which scan would help"), text("{reasons:;}", reasons=adjustment.advice)),
             ),
             file="accuracy",
             on_page=False,
         ),
-        *_candidates(result, found),
-        _trade_off(result, found, method),
+        *_candidates(result, adjustment),
+        _trade_off(result, adjustment, method),
     ]
 
 
-def _what_to_do(found: Adjustment, method: str) -> list[Table]:
+def _what_to_do(adjustment: Adjustment, method: str) -> list[Table]:
     """Tabulate the proposals with the measures they are made from; on the terminal apart."""
     title = text("Joints: what to do, method {method}", method=method)
-    rows = tuple(_joint_rows(found))
+    rows = tuple(_joint_rows(adjustment))
     proposals = tuple((row[0], row[PROPOSAL]) for row in rows)
     return [
         Table(title, WHAT_TO_DO, rows, file=TO_DO, note=_NOTE, groups=_GROUPS, on_terminal=False),
@@ -125,43 +125,43 @@ def _without_proposal(row: tuple[Any, ...]) -> tuple[Any, ...]:
     return row[:PROPOSAL] + row[PROPOSAL + 1 :]
 
 
-def _joint_rows(found: Adjustment) -> Iterator[tuple[Any, ...]]:
-    joints = found.joints
+def _joint_rows(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
+    joints = adjustment.joints
     for joint, measures, conformity, proposal in zip(
         joints.name, joints.measures, joints.conformity, joints.proposal, strict=True
     ):
         pairs = [number for name in _PAIRS for number in measures.of(name)]
         turns = [(*measures.of(f"rotation_{axis}"), axis) for axis in "xyz"]
-        known = [turn for turn in turns if math.isfinite(turn[0])]
-        turn = max(known, key=lambda turn: abs(turn[0])) if known else (NAN, NAN, "")
+        finite = [turn for turn in turns if math.isfinite(turn[0])]
+        turn = max(finite, key=lambda turn: abs(turn[0])) if finite else (NAN, NAN, "")
         sentences = text("{reasons:.}", reasons=proposal.reasons)
         yield (joint, conformity.verdict, sentences, *pairs, *turn, conformity.probability, proposal.probability)
 
 
-def _limits(found: Adjustment, method: str) -> Table:
+def _limits(adjustment: Adjustment, method: str) -> Table:
     columns = (
         "joint", "limit", "verdict", "standing", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability",
         "clause",
     )  # fmt: skip
     rows = tuple(
         (joint, *row)
-        for joint, conformity in zip(found.joints.name, found.joints.conformity, strict=True)
+        for joint, conformity in zip(adjustment.joints.name, adjustment.joints.conformity, strict=True)
         for row in _limit_rows(conformity.limits)
     )
     return Table(text("Limits, method {method} (mm)", method=method), columns, rows, file=LIMITS, note=LIMITS_NOTE)
 
 
 def _limit_rows(limits: ComparedLimits) -> Iterator[tuple[Any, ...]]:
-    for k, what in enumerate(limits.what):
+    for k, quantity in enumerate(limits.what):
         standing: Message = LimitStanding.VERIFIED if limits.verified[k] else LimitStanding.NOT_VERIFIED
         if not limits.bounds_known[k]:
             standing = text("{standing}; depends on a size that is not known", standing=standing)
         numbers = (limits.value, limits.ci95, limits.low, limits.high, limits.probability)
         values = (float(column[k]) for column in numbers)
-        yield (label(what), limits.verdict[k], standing, *values, label(limits.clause[k]))
+        yield (label(quantity), limits.verdict[k], standing, *values, label(limits.clause[k]))
 
 
-def _chain(found: Adjustment, method: str) -> Iterator[Table]:
+def _chain(adjustment: Adjustment, method: str) -> Iterator[Table]:
     """Yield the limits of the whole chain, and those stated ones that nothing is compared with."""
     columns = (
         "limit", "verdict", "standing", "value_mm", "ci95_mm", "least_mm", "greatest_mm", "probability", "clause",
@@ -169,7 +169,7 @@ def _chain(found: Adjustment, method: str) -> Iterator[Table]:
     )  # fmt: skip
     rows = tuple(
         (*row, edition, label(source))
-        for conformity in found.chain
+        for conformity in adjustment.chain
         for row, edition, source in zip(
             _limit_rows(conformity.limits), conformity.limits.edition, conformity.limits.source, strict=True
         )
@@ -177,21 +177,21 @@ def _chain(found: Adjustment, method: str) -> Iterator[Table]:
     if rows:
         title = text("Limits of the whole chain, method {method} (mm)", method=method)
         yield Table(title, columns, rows, file=CHAIN, note=CHAIN_NOTE)
-    if found.unused_limits:
+    if adjustment.unused_limits:
         yield Table(
             text("Limits that nothing is compared with"),
             ("key", "limit"),
-            tuple(zip(found.unused_limits, map(label, found.unused_limits_what), strict=True)),
+            tuple(zip(adjustment.unused_limits, map(label, adjustment.unused_limits_what), strict=True)),
             file="limits-not-held",
             note=text("They are given for this project, and no measured quantity corresponds to them."),
         )
 
 
-def _candidates(result: Result, found: Adjustment) -> Iterator[Table]:
+def _candidates(result: Result, adjustment: Adjustment) -> Iterator[Table]:
     """Yield both poses of ambiguous parts, to read and as matrices."""
     rows, matrices = [], []
     parts = result.components
-    for name, rival in zip(found.rivals.component, found.rivals.T_rival_scan, strict=True):
+    for name, rival in zip(adjustment.rivals.component, adjustment.rivals.T_rival_scan, strict=True):
         i = parts.name.index(name)
         pose, reasons = parts.T_bridge_scan[i], text("{reasons:;}", reasons=parts.reasons[i])
         turn = math.degrees(rigid.rotation_angle(rival[:3, :3] @ pose[:3, :3].T))
@@ -218,32 +218,34 @@ def _candidates(result: Result, found: Adjustment) -> Iterator[Table]:
     )
 
 
-def _measures(found: Adjustment) -> Iterator[tuple[Any, ...]]:
-    for joint, measures in zip(found.joints.name, found.joints.measures, strict=True):
+def _measures(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
+    for joint, measures in zip(adjustment.joints.name, adjustment.joints.measures, strict=True):
         rows = measures.quantities
         columns = (rows.value.tolist(), rows.ci95.tolist(), rows.low.tolist(), rows.high.tolist(), rows.unit)
         for name, *numbers in zip(rows.name, *columns, strict=True):
             yield (joint, label(str(name).replace("_", " ")), *numbers)
 
 
-def _span_and_closure(found: Adjustment) -> Iterator[tuple[Any, ...]]:
-    rows: list[tuple[Message, float, float, str]] = [(text("span"), found.span_departure, found.span_ci95, "mm")]
-    values, halves = found.closure.ravel().tolist(), found.closure_ci95.ravel().tolist()
+def _span_and_closure(adjustment: Adjustment) -> Iterator[tuple[Any, ...]]:
+    rows: list[tuple[Message, float, float, str]] = [
+        (text("span"), adjustment.span_departure, adjustment.span_ci95, "mm")
+    ]
+    values, halves = adjustment.closure.ravel().tolist(), adjustment.closure_ci95.ravel().tolist()
     rows += zip(CLOSURE, values, halves, ["mm"] * 3 + ["mrad"] * 3, strict=False)
     for name, value, half, unit in rows:
-        known = math.isfinite(value) and math.isfinite(half)
-        beyond = (text("yes") if abs(value) > half else text("no")) if known else ""
+        finite = math.isfinite(value) and math.isfinite(half)
+        beyond = (text("yes") if abs(value) > half else text("no")) if finite else ""
         yield (name, value, half, unit, beyond)
 
 
-def _trade_off(result: Result, found: Adjustment, method: str) -> Table:
+def _trade_off(result: Result, adjustment: Adjustment, method: str) -> Table:
     trade = result.trade_off
     return Table(
         text("Trade-off over lambda, method {method} (mm)", method=method),
         ("lambda", "splicing_mean_mm", "splicing_max_mm", "linear_mean_mm", "linear_max_mm"),
         tuple((weight, *row) for weight, row in zip(trade.weight.tolist(), trade.figures.tolist(), strict=True)),
         file="trade-off",
-        note=text("The result was made with lambda {weight:g}.", weight=found.weight),
+        note=text("The result was made with lambda {weight:g}.", weight=adjustment.weight),
         groups=("", *[text("splicing error")] * 2, *[text("linear error")] * 2),
         on_terminal=False,
     )

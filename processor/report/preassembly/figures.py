@@ -36,20 +36,20 @@ TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest 
 def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
     """Draw the first run's bridge and the linear error of all; what a result does not have is left out."""
     result: Result = runs[0].result
-    found: Drawn = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
+    figures: Drawn = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
     adjustment = result.adjustment
     if adjustment is not None and np.isfinite(adjustment.linear_offset_ci95).any():
-        found["linear-offset.png"] = _linear_offset(scene, runs[0])
-    if adjustment is not None and any(np.isfinite(one.gaps).all() for one in adjustment.joints.measures):
-        found["gap-vectors.png"] = gap_vectors(result)
+        figures["linear-offset.png"] = _linear_offset(scene, runs[0])
+    if adjustment is not None and any(np.isfinite(measure.gaps).all() for measure in adjustment.joints.measures):
+        figures["gap-vectors.png"] = gap_vectors(result)
     if len(runs) > 1:
-        found["gaps-by-axis.png"] = by_axis(runs)
+        figures["gaps-by-axis.png"] = by_axis(runs)
     if adjustment is not None and np.isfinite(result.trade_off.figures).all(axis=1).any():
-        found["trade-off.png"] = _trade_off(result, adjustment.weight)
+        figures["trade-off.png"] = _trade_off(result, adjustment.weight)
     residuals = residual_map.draw(scene, result)
     if residuals is not None:
-        found["residuals.png"] = residuals
-    return found
+        figures["residuals.png"] = residuals
+    return figures
 
 
 # --- bridge --------------------------------------------------------------------------------------------------------
@@ -78,8 +78,8 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     for j, name in enumerate(labels):
         x, _, z = scene.arch.joint_points[j].mean(axis=0) / 1e3
         size = np.abs(joints.gaps[j])
-        known = bool(np.isfinite(size).any())
-        _write(side, f"{name}\n{np.nanmax(size):.2f} mm" if known else f"{name}\nno answer", (x, z), 30)
+        finite = bool(np.isfinite(size).any())
+        _write(side, f"{name}\n{np.nanmax(size):.2f} mm" if finite else f"{name}\nno answer", (x, z), 30)
     drawn = f"gaps drawn {times:,.0f} times their size" if times else "no gap is known"
     side.set(ylabel="height, m", title=f"side view, with the largest |d| of each joint; {drawn}")
     plan.set(ylabel="across, left up, m", title=f"plan; {drawn}")
@@ -180,8 +180,8 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[Message, bytes
     ):
         for k, run in styled:
             deviations: Deviations = run.result.linear.best_fit if best_fit else run.result.linear.assembled
-            known = deviations.deviation[np.isfinite(deviations.deviation)]
-            means += [float(np.median(known))] if len(known) else []
+            finite = deviations.deviation[np.isfinite(deviations.deviation)]
+            means += [float(np.median(finite))] if len(finite) else []
             _draw_deviations(axes, run, deviations, k)
         axes.set(ylabel="linear error, mm", title=title)
         axes.grid(alpha=0.3, which="both")
@@ -316,8 +316,8 @@ def _trade_off(result: Result, chosen: float) -> tuple[Message, bytes]:
         axes.plot(
             at_chosen[x], at_chosen[y], "s", color=COLOURS[1], markersize=12, fillstyle="none", mew=2.0, label=marked
         )
-        known = np.isfinite(figures).all(axis=1)
-        for weight, at in zip(result.trade_off.weight[known], figures[known], strict=True):
+        finite = np.isfinite(figures).all(axis=1)
+        for weight, at in zip(result.trade_off.weight[finite], figures[finite], strict=True):
             axes.annotate(
                 f"{weight:g}", (at[x], at[y]), xytext=(8, 6), textcoords="offset points", fontsize=9, bbox=BEHIND_TEXT
             )

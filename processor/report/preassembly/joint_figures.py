@@ -28,14 +28,14 @@ def gap_vectors(result: Result) -> tuple[Message, bytes]:
     """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without a result says so."""
     measures = () if result.adjustment is None else result.adjustment.joints.measures
     shown = range(len(measures))[:MOST_JOINTS]
-    known = [j for j in shown if np.isfinite(measures[j].gaps).all()]
+    complete = [j for j in shown if np.isfinite(measures[j].gaps).all()]
     across = min(2, len(shown))
     down = math.ceil(len(shown) / across)
     figure = Figure(figsize=(4.6 * across, 4.3 * down + 0.5), layout="constrained")
     panels = np.atleast_1d(figure.subplots(down, across, squeeze=False).ravel())
-    times = _times([measures[j] for j in known])
+    times = _times([measures[j] for j in complete])
     for axes, j in zip(panels, shown, strict=False):
-        if j in known:
+        if j in complete:
             _section(axes, measures[j], times)
         else:
             axes.set(xticks=[], yticks=[])
@@ -91,10 +91,10 @@ def by_axis(runs: Sequence[StepRun]) -> tuple[Message, bytes]:
 def _times(measures: Sequence[Measures]) -> float:
     """By how much arrows are enlarged; intervals count, lest noise look like a gap."""
     longest, size = LEAST_SHOWN_MM, 0.0
-    for one in measures:
-        reach = RAYLEIGH_95 * np.sqrt(np.maximum(np.diag(one.covariance), 0.0)).reshape(8, 3)[:, 1:].max()
-        longest = max(longest, float(np.linalg.norm(one.gaps[:, 1:], axis=1).max()), float(reach))
-        size = max(size, float(np.ptp(one.points[:, 1:], axis=0).min()))
+    for measure in measures:
+        reach = RAYLEIGH_95 * np.sqrt(np.maximum(np.diag(measure.covariance), 0.0)).reshape(8, 3)[:, 1:].max()
+        longest = max(longest, float(np.linalg.norm(measure.gaps[:, 1:], axis=1).max()), float(reach))
+        size = max(size, float(np.ptp(measure.points[:, 1:], axis=0).min()))
     return rounded(ARROW_SHARE * size / longest)
 
 

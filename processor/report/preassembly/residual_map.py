@@ -67,10 +67,10 @@ def _heights(along: Floats, up: Floats, length: float) -> Floats:
     """Height of the section (n,) at each point, from the highest points about it."""
     piece = np.clip((along / max(length, 1e-9) * SECTIONS).astype(int), 0, SECTIONS - 1)
     top = np.array([np.quantile(up[piece == i], 0.98) if (piece == i).any() else np.nan for i in range(SECTIONS)])
-    known = np.isfinite(top)
+    finite = np.isfinite(top)
     centres = (np.arange(SECTIONS) + 0.5) * length / SECTIONS
-    found: Floats = np.maximum(np.interp(along, centres[known], top[known]), 1e-6)
-    return found
+    heights: Floats = np.maximum(np.interp(along, centres[finite], top[finite]), 1e-6)
+    return heights
 
 
 def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
@@ -87,18 +87,18 @@ def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
     )
     i = np.clip(np.searchsorted(x, flat.along, side="right") - 1, 0, columns - 1)
     k = np.clip(np.searchsorted(y, flat.around, side="right") - 1, 0, len(y) - 2)
-    found = np.full((len(y) - 1, columns), np.nan)
+    means = np.full((len(y) - 1, columns), np.nan)
     place = k * columns + i
     order = np.argsort(place, kind="stable")
     starts = np.flatnonzero(np.diff(place[order], prepend=-1))
     for group in np.split(order, starts[1:]):
-        found.flat[place[group[0]]] = np.median(values[group])
-    return found, x, y
+        means.flat[place[group[0]]] = np.median(values[group])
+    return means, x, y
 
 
 def _can_show(part: DesignPart, residuals: Residuals, i: int) -> bool:
-    known = (residuals.component == i) & np.isfinite(residuals.distance)
-    return bool(known.any()) and min(len(part.bottom_edge_left), len(part.bottom_edge_right)) > 1
+    finite = (residuals.component == i) & np.isfinite(residuals.distance)
+    return bool(finite.any()) and min(len(part.bottom_edge_left), len(part.bottom_edge_right)) > 1
 
 
 def draw(scene: Scene, result: Result) -> tuple[Message, bytes] | None:

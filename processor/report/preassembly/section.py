@@ -22,7 +22,9 @@ VERDICTS = {
 def _summary(result: Result) -> tuple[Message, Message]:
     placed = sum(status != Status.FAILED for status in result.components.status)
     counts = collections.Counter(result.joints.verdict)
-    verdicts = [Text(known.template, {"count": counts[name]}) for name, known in VERDICTS.items() if counts[name]]
+    verdicts = [
+        Text(verdict_text.template, {"count": counts[name]}) for name, verdict_text in VERDICTS.items() if counts[name]
+    ]
     head = text(
         "{status}, {placed} of {parts} parts placed",
         status=result.status,
@@ -39,10 +41,10 @@ def _summary(result: Result) -> tuple[Message, Message]:
         head = text(
             "of {joints} joints {verdicts}; assembly {head}", joints=len(result.joints), verdicts=verdicts, head=head
         )
-        chain = [one for one in result.adjustment.chain if len(one.limits)]
-        body += [text("Whole chain: {verdict}.", verdict=one.verdict) for one in chain]
+        chain = [limits for limits in result.adjustment.chain if len(limits.limits)]
+        body += [text("Whole chain: {verdict}.", verdict=limits.verdict) for limits in chain]
         compared = (*result.adjustment.joints.conformity, *chain)
-        if not all(one.limits.verified.all() for one in compared):
+        if not all(limits.limits.verified.all() for limits in compared):
             body.append(text("The limits are NOT VERIFIED against the standard's text."))
     return head, text("{sentences:.}", sentences=body)
 
@@ -59,19 +61,21 @@ def _mean_max(error: MeanMax) -> Text:
 
 def _further(result: Result) -> list[tuple[Message, Message]]:
     """Return what the adjustment states of the whole bridge, beside the verdict."""
-    found = result.adjustment
-    if found is None:
+    adjustment = result.adjustment
+    if adjustment is None:
         return []
     rows: list[tuple[Message, Message]] = []
-    if np.isfinite(found.span_departure):
-        sentences = [text("{span} mm against the design", span=_with_ci95(found.span_departure, found.span_ci95))]
-        if np.isfinite(found.closure).any():
-            sentences.append(_closure(found.closure[0], found.closure_ci95[0]))
+    if np.isfinite(adjustment.span_departure):
+        sentences = [
+            text("{span} mm against the design", span=_with_ci95(adjustment.span_departure, adjustment.span_ci95))
+        ]
+        if np.isfinite(adjustment.closure).any():
+            sentences.append(_closure(adjustment.closure[0], adjustment.closure_ci95[0]))
         rows.append((text("Span"), text("{sentences:.}", sentences=sentences)))
-    if found.limiting:
-        rows.append((text("What limits the accuracy"), text("{reasons:.}", reasons=found.limiting)))
-    if found.advice:
-        rows.append((text("Which scan would help"), text("{reasons:.}", reasons=found.advice)))
+    if adjustment.limiting:
+        rows.append((text("What limits the accuracy"), text("{reasons:.}", reasons=adjustment.limiting)))
+    if adjustment.advice:
+        rows.append((text("Which scan would help"), text("{reasons:.}", reasons=adjustment.advice)))
     return rows
 
 

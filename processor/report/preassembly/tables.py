@@ -32,16 +32,16 @@ POINTS = text(
 def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     """Tables of an assembled bridge, what to do first; ``runs`` are the result and the methods compared with it."""
     first, method = runs[0].result, runs[0].method
-    found = [*adjusted(first, method), _summary(runs), _components(first), *_others(runs[1:]), _joints(first, method)]
-    found += _by_point(first, text("Splicing error, method {method} (mm)", method=method), first.joints.gaps)
+    tables = [*adjusted(first, method), _summary(runs), _components(first), *_others(runs[1:]), _joints(first, method)]
+    tables += _by_point(first, text("Splicing error, method {method} (mm)", method=method), first.joints.gaps)
     if np.isfinite(first.joints.gap_ci95).any():
         title = text("95 % half-widths, method {method} (mm)", method=method)
-        found += _by_point(first, title, first.joints.gap_ci95)
+        tables += _by_point(first, title, first.joints.gap_ci95)
     for run in runs[1:]:
         title = text("Splicing error, method {method} (mm)", method=run.method)
-        found += [replace(one, on_terminal=False) for one in _by_point(run.result, title, run.result.joints.gaps)]
-    found += [_gaps(run, "gaps" if run is runs[0] else f"gaps-{run.method}") for run in runs]
-    return [*found, _linear(first, method)]
+        tables += [replace(table, on_terminal=False) for table in _by_point(run.result, title, run.result.joints.gaps)]
+    tables += [_gaps(run, "gaps" if run is runs[0] else f"gaps-{run.method}") for run in runs]
+    return [*tables, _linear(first, method)]
 
 
 def _summary(runs: Sequence[StepRun]) -> Table:
@@ -73,11 +73,11 @@ def _summary(runs: Sequence[StepRun]) -> Table:
 
 def _half_widths(runs: Sequence[StepRun]) -> list[Text]:
     """State the intervals of the errors, of the methods that have them."""
-    found = []
+    half_widths = []
     for run in runs:
         ci95 = tuple(run.result.errors_ci95.tolist())
         if run.result.bands_as_designed:
-            found.append(
+            half_widths.append(
                 text(
                     "Of a bridge exactly as designed, scanned alike, {method} states up to {ci95} (95 % or more).",
                     method=run.method,
@@ -85,7 +85,7 @@ def _half_widths(runs: Sequence[StepRun]) -> list[Text]:
                 )
             )
         elif np.isfinite(run.result.errors_ci95).any():
-            found.append(
+            half_widths.append(
                 text(
                     "95 % or more of the true errors by {method} are within ± {ci95} of those stated, in the table's "
                     "order.",
@@ -93,7 +93,7 @@ def _half_widths(runs: Sequence[StepRun]) -> list[Text]:
                     ci95=ci95,
                 )
             )
-    return found
+    return half_widths
 
 
 def _components(result: Result) -> Table:
@@ -151,7 +151,9 @@ def _gaps(run: StepRun, name: str) -> Table:
         axes = ("along", "left", "up")
         columns = (*columns, *(f"{axis}_mm" for axis in axes), *(f"ci95_{axis}_mm" for axis in axes))
         measures = adjustment.joints.measures
-        local = np.concatenate([[one.gaps for one in measures], [one.gaps_ci95 for one in measures]], axis=2)
+        local = np.concatenate(
+            [[measure.gaps for measure in measures], [measure.gaps_ci95 for measure in measures]], axis=2
+        )
         rows = [(*row, *further) for row, further in zip(rows, local.reshape(-1, 6), strict=True)]
     title = text("Gaps at the joints, method {method}", method=run.method)
     return Table(title, columns, tuple(rows), name, on_page=False, on_terminal=False)
@@ -186,10 +188,10 @@ JOINTS_ABREAST = 4
 
 def _by_point(result: Result, title: Message, values: Floats) -> list[Table]:
     """Lay out (j, 8, 3) as the source paper does (paper 000, tables 4 to 7): point pairs down, joints across."""
-    joints, found = result.joints, []
+    joints, tables = result.joints, []
     for start in range(0, len(joints), JOINTS_ABREAST):
         chosen = range(start, min(start + JOINTS_ABREAST, len(joints)))
-        found.append(
+        tables.append(
             Table(
                 title,
                 ("point", *["dx", "dy", "dz"] * len(chosen)),
@@ -201,4 +203,4 @@ def _by_point(result: Result, title: Message, values: Floats) -> list[Table]:
                 ),
             )
         )
-    return found
+    return tables

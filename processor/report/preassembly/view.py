@@ -27,7 +27,7 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     result: Result = runs[0].result
     residuals = Residuals() if result.adjustment is None else result.adjustment.residuals
     trade = result.trade_off
-    found = {
+    view = {
         "title": text("Gaps and residuals in space") if len(residuals) else text("Gaps in space"),
         "arrows": text("gaps as arrows"),
         "values": text("residuals"),
@@ -60,7 +60,7 @@ def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
             "linear_max": np.round(trade.linear_max, 6),
         },
     }
-    made: dict[str, Any] = plain(found)
+    made: dict[str, Any] = plain(view)
     return made
 
 

@@ -74,8 +74,8 @@ def doubtful(scene: Scene, result: Result) -> list[int]:
 
 def _places(result: Result, nominal: Floats) -> Floats:
     """Return where each ball is (k, 3), or where the design has it."""
-    found: Floats = np.where(np.isfinite(result.balls.centres), result.balls.centres, nominal)
-    return found
+    centres: Floats = np.where(np.isfinite(result.balls.centres), result.balls.centres, nominal)
+    return centres
 
 
 def _drawn(scene: Scene, result: Result, stored: Path | None, most: int) -> Iterator[tuple[int, Figure]]:
@@ -102,9 +102,9 @@ def designed_places(scene: Scene, result: Result) -> Floats:
     nodes = scene.frame.centres
     if result.matching is not None:
         nodes = rigid.apply(rigid.invert(result.matching.T_design_scan), nodes)
-    known = dict(zip(scene.frame.ids.tolist(), nodes, strict=True))
+    place_of_id = dict(zip(scene.frame.ids.tolist(), nodes, strict=True))
     for i in np.flatnonzero(~np.isfinite(places).all(axis=1)).tolist():
-        places[i] = known.get(int(result.balls.ids[i]), places[i])
+        places[i] = place_of_id.get(int(result.balls.ids[i]), places[i])
     return places
 
 
@@ -123,28 +123,28 @@ def crops_about(scene: Scene, centres: Floats, reach: Floats, stored: StoredPoin
 
 def _boxes(scene: Scene, centre: Floats, far: float) -> list[tuple[Floats, Floats]]:
     """Box a scan, less its origin, that holds all that is within ``far`` of a place (3,) in the project's frame."""
-    found = []
+    boxes = []
     for scan in scene.scans:
         T = scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
         middle = T[:3, :3].T @ (centre - T[:3, 3]) - scan.origin
-        found.append((middle - far - SLACK_MM, middle + far + SLACK_MM))
-    return found
+        boxes.append((middle - far - SLACK_MM, middle + far + SLACK_MM))
+    return boxes
 
 
 def _within(source: SceneSource, centres: Floats, reach: Floats) -> list[Floats]:
     middles = centres - source.origin
-    found: list[list[Floats]] = [[] for _ in reach]
+    pieces: list[list[Floats]] = [[] for _ in reach]
     for chunk in source.chunks():
         for k, (middle, far) in enumerate(zip(middles, reach, strict=True)):
             # By one axis first: most of a roof is far away.
             near = chunk.points[np.abs(chunk.points[:, 0] - middle[0]) <= far] - middle
-            found[k].append(near[np.einsum("ij,ij->i", near, near) <= far**2])
-    return [np.vstack(parts) if parts else np.empty((0, 3)) for parts in found]
+            pieces[k].append(near[np.einsum("ij,ij->i", near, near) <= far**2])
+    return [np.vstack(parts) if parts else np.empty((0, 3)) for parts in pieces]
 
 
 def _radius(result: Result, i: int) -> float:
-    known = [float(one[i]) for one in (result.balls.radii, result.balls.nominal_radii) if np.isfinite(one[i])]
-    return max([LEAST_RADIUS_MM, *known])
+    radii = [float(column[i]) for column in (result.balls.radii, result.balls.nominal_radii) if np.isfinite(column[i])]
+    return max([LEAST_RADIUS_MM, *radii])
 
 
 def _ball(result: Result, i: int, middle: Floats, nominal: Floats, points: Floats, reach: float) -> Figure:
@@ -193,7 +193,9 @@ def _numbers(balls: Balls, i: int, nominal: Floats) -> list[tuple[str, str]]:
     ]
     off = zip("xyz", (-nominal).tolist(), strict=True)
     rows += [(f"off the design's place, {axis}", f"{value:.2f}") for axis, value in off]
-    rows += [(f"least possible ±, {what}", f"{NORMAL_95 * bound[k]:.2f}") for k, what in ((2, "z"), (3, "radius"))]
+    rows += [
+        (f"least possible ±, {quantity}", f"{NORMAL_95 * bound[k]:.2f}") for k, quantity in ((2, "z"), (3, "radius"))
+    ]
     rows += [
         ("residuals, rms", f"{balls.rms[i]:.2f}"),
         ("points", f"{int(balls.points[i])}"),
@@ -222,10 +224,10 @@ def _members(axes: Axes, result: Result, i: int, middle: Floats, across: tuple[i
     tubes, id_ = result.tubes, result.balls.ids[i]
     for tube in np.flatnonzero((tubes.a == id_) | (tubes.b == id_)).tolist():
         start, end = tubes.start[tube] - middle, tubes.end[tube] - middle
-        away = end - start if tubes.a[tube] == id_ else start - end
-        away = away / np.linalg.norm(away)
-        foot = start - (start @ away) * away
-        line = foot + np.array([[-0.25], [2.0]]) * reach * away
+        direction = end - start if tubes.a[tube] == id_ else start - end
+        direction = direction / np.linalg.norm(direction)
+        foot = start - (start @ direction) * direction
+        line = foot + np.array([[-0.25], [2.0]]) * reach * direction
         axes.plot(*line[:, across].T, "-.", color=COLOURS[2], linewidth=1.1, zorder=3.0)
 
 

@@ -32,16 +32,16 @@ PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors
 def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> Drawn:
     """Draw balls; ``runs`` are the answer and those compared with it, ``stored`` the file that still has the points."""
     first: Result = runs[0].result
-    found: Drawn = {}
+    figures: Drawn = {}
     if len(first.balls) > 1:
-        found[PLAN] = _plan(scene, runs[0])
+        figures[PLAN] = _plan(scene, runs[0])
         if report.true_radii:
-            found[RADIUS_ERRORS] = _radius_errors(runs, report)
+            figures[RADIUS_ERRORS] = _radius_errors(runs, report)
         if has_bounds(first):
-            found[BALL_ERRORS] = _ball_errors(runs[0], report)
+            figures[BALL_ERRORS] = _ball_errors(runs[0], report)
     if has_bounds(first):
-        found |= close_ups.of_result(scene, first, stored)
-    return found
+        figures |= close_ups.of_result(scene, first, stored)
+    return figures
 
 
 # --- plan ----------------------------------------------------------------------------------------------------------
@@ -90,13 +90,15 @@ def _movements(figure: Figure, axes: Axes, result: Result) -> Message | None:
     """Draw the movements of nodes in plan as arrows and in height as colours; return a caption, None without any."""
     centres, reference = result.balls.centres, result.movement_reference
     vector = centres - nominal_places(result)
-    known = np.isfinite(vector).all(axis=1)
-    if reference is None or not known.any():
+    finite = np.isfinite(vector).all(axis=1)
+    if reference is None or not finite.any():
         return None
-    vector, places = vector[known], centres[known, :2] / 1000.0
-    apart = cKDTree(centres[known]).query(centres[known], k=2)[0][:, 1] if known.sum() > 1 else np.ones(1)
+    vector, places = vector[finite], centres[finite, :2] / 1000.0
+    neighbour_distance = (
+        cKDTree(centres[finite]).query(centres[finite], k=2)[0][:, 1] if finite.sum() > 1 else np.ones(1)
+    )
     long = max(float(np.quantile(np.hypot(vector[:, 0], vector[:, 1]), 0.95)), LEAST_SHOWN_MM)
-    times = rounded(ARROW_SHARE * float(np.median(apart)) / long)
+    times = rounded(ARROW_SHARE * float(np.median(neighbour_distance)) / long)
     limit = max(float(np.quantile(np.abs(vector[:, 2]), 0.98)), LEAST_SHOWN_MM)
     up = axes.scatter(
         places[:, 0], places[:, 1], c=np.clip(vector[:, 2], -limit, limit), s=30.0, cmap=DIVERGING,
@@ -159,9 +161,9 @@ def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[Message, bytes]:
     """Draw histograms of radius and centre: errors, or without a truth standard deviations, and those of the bound."""
     balls = run.result.balls
     figure = Figure(figsize=(9.0, 3.9), layout="constrained")
-    found = ~balls.flagged(Flag.NOT_FOUND)
-    sd = np.sqrt(np.maximum(np.einsum("kii->ki", balls.covariance), 0.0))[found]
-    bound = balls.bound_sd[found]
+    located = ~balls.flagged(Flag.NOT_FOUND)
+    sd = np.sqrt(np.maximum(np.einsum("kii->ki", balls.covariance), 0.0))[located]
+    bound = balls.bound_sd[located]
     radii, centres = report.true_radii.get(run.method), report.true_centres.get(run.method)
     panels = figure.subplots(1, 2)
     if radii is None or centres is None:
@@ -172,7 +174,7 @@ def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[Message, bytes]:
             "contain all beyond"
         )
     else:
-        off = (balls.radii - radii)[found], (balls.centres - centres)[found]
+        off = (balls.radii - radii)[located], (balls.centres - centres)[located]
         _errors(panels[0], off[0], sd[:, 3], bound[:, 3], "radius error, mm", "balls")
         _errors(panels[1], off[1], sd[:, :3], bound[:, :3], "centre error along x, y and z, mm", "coordinates")
         caption = text(
@@ -186,21 +188,21 @@ def _ball_errors(run: StepRun, report: ErrorReport) -> tuple[Message, bytes]:
     return caption, png(figure)
 
 
-def _errors(axes: Axes, off: Floats, sd: Floats, bound: Floats, what: str, of: str) -> None:
+def _errors(axes: Axes, off: Floats, sd: Floats, bound: Floats, xlabel: str, ylabel: str) -> None:
     """Draw errors, and the distribution that they would have: a normal one a ball, all added up."""
-    known = np.isfinite(off)
-    errors = off[known]
+    finite = np.isfinite(off)
+    errors = off[finite]
     reach = float(np.quantile(np.abs(errors), 0.99)) if len(errors) else 1.0
-    reach = 1.15 * max(reach, 2.5 * _middle(bound[known]), LEAST_SHOWN_MM)
+    reach = 1.15 * max(reach, 2.5 * _middle(bound[finite]), LEAST_SHOWN_MM)
     bins = np.linspace(-reach, reach, 31)
     _bars(axes, np.clip(errors, -reach, reach), bins, f"errors (n = {len(errors)})")
     x = np.linspace(-reach, reach, 301)
     for k, (name, one) in enumerate((("Cramér-Rao bound, stations held", bound), ("as stated", sd)), start=1):
-        y = _mixture(x, one[known], bins[1] - bins[0])
+        y = _mixture(x, one[finite], bins[1] - bins[0])
         if y is not None:
             axes.plot(x, y, DASHES[k], color=COLOURS[k], label=f"expected, {name}")
     axes.axvline(0.0, color="0.3", linewidth=0.8)
-    axes.set(xlabel=what, ylabel=of)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
 
 
 def _mixture(x: Floats, sd: Floats, width: float) -> Floats | None:
@@ -215,14 +217,14 @@ def _mixture(x: Floats, sd: Floats, width: float) -> Floats | None:
     return density
 
 
-def _deviations(axes: Axes, sd: Floats, bound: Floats, what: str, of: str) -> None:
+def _deviations(axes: Axes, sd: Floats, bound: Floats, xlabel: str, ylabel: str) -> None:
     """Draw standard deviations as stated over those of the bound."""
-    ends = [one[np.isfinite(one)] for one in (sd, bound)]
-    high = max([LEAST_SHOWN_MM, *(float(np.quantile(one, 0.98)) for one in ends if len(one))])
+    ends = [values[np.isfinite(values)] for values in (sd, bound)]
+    high = max([LEAST_SHOWN_MM, *(float(np.quantile(values, 0.98)) for values in ends if len(values))])
     bins = np.linspace(0.0, 1.1 * high, 31)
-    for k, (name, one) in enumerate(zip(("as stated", "Cramér-Rao bound, stations held"), ends, strict=True)):
-        _bars(axes, np.minimum(one, 1.1 * high), bins, f"{name} (n = {len(one)})", k)
-    axes.set(xlabel=what, ylabel=of)
+    for k, (name, values) in enumerate(zip(("as stated", "Cramér-Rao bound, stations held"), ends, strict=True)):
+        _bars(axes, np.minimum(values, 1.1 * high), bins, f"{name} (n = {len(values)})", k)
+    axes.set(xlabel=xlabel, ylabel=ylabel)
 
 
 def _bars(axes: Axes, values: npt.NDArray[np.float64], bins: Floats, label: str, k: int = 0) -> None:
@@ -233,5 +235,5 @@ def _bars(axes: Axes, values: npt.NDArray[np.float64], bins: Floats, label: str,
 
 
 def _middle(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else 0.0
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else 0.0

@@ -109,10 +109,10 @@ def _with_bounds(run: StepRun, true: Floats, file: str) -> Table:
         for i, ball in enumerate(balls.ids.tolist())
     )
     columns = (
-        "id", *COORDINATES, *(f"ci95_{one}" for one in COORDINATES), "radius_mm", "ci95_radius_mm", "size_mm",
+        "id", *COORDINATES, *(f"ci95_{name}" for name in COORDINATES), "radius_mm", "ci95_radius_mm", "size_mm",
         "nominal_radius_mm", "true_radius_mm", "radius_error_mm", "lowest_z_mm", "ci95_lowest_z_mm",
-        *(f"bound_sd_{one}_mm" for one in (*XYZ, "radius", "lowest_z")),
-        *(f"efficiency_{one}" for one in ("centre", "radius", "lowest_z")),
+        *(f"bound_sd_{name}_mm" for name in (*XYZ, "radius", "lowest_z")),
+        *(f"efficiency_{name}" for name in ("centre", "radius", "lowest_z")),
         "points", "visible_fraction", "rms_mm", "axes", "stations", "evidence", "flag", "remark",
     )  # fmt: skip
     return Table(_title(run.method), columns, rows, file, on_page=False, on_terminal=False)
@@ -160,9 +160,9 @@ def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
     rows = []
     for run in runs:
         error = np.abs(run.result.balls.radii - report.true_radii[run.method])
-        known = error[np.isfinite(error)]
-        figures = np.quantile(known, [0.5, 0.95, 1.0]).tolist() if len(known) else [NAN] * 3
-        rows.append((run.method, len(known), len(error), *figures, _points_used(run)))
+        finite = error[np.isfinite(error)]
+        figures = np.quantile(finite, [0.5, 0.95, 1.0]).tolist() if len(finite) else [NAN] * 3
+        rows.append((run.method, len(finite), len(error), *figures, _points_used(run)))
     columns = ("method", "fitted", "balls", "median_mm", "quantile_95_mm", "largest_mm", "points_used")
     return Table(text("|radius error| by method (mm)"), columns, tuple(rows), "summary")
 
@@ -222,19 +222,19 @@ def _summary(result: Result, method: str) -> Table:
 
 
 def _movements(balls: Balls) -> Iterator[tuple[Any, ...]]:
-    moved = np.isfinite(balls.movement_size)
-    known = balls.movement_size[moved]
+    has_movement = np.isfinite(balls.movement_size)
+    known = balls.movement_size[has_movement]
     yield text("movement of a node, median"), _median(known), "mm"
     yield text("movement of a node, largest"), float(known.max()) if len(known) else NAN, "mm"
-    counts = collections.Counter(verdict for verdict, known in zip(balls.verdict, moved, strict=True) if known)
+    counts = collections.Counter(verdict for verdict, known in zip(balls.verdict, has_movement, strict=True) if known)
     for verdict in Verdict:
         if counts[verdict]:
             yield text("nodes, verdict {verdict}", verdict=verdict), counts[verdict], ""
 
 
 def _median(values: Floats) -> float:
-    known = values[np.isfinite(values)]
-    return float(np.median(known)) if len(known) else NAN
+    finite = values[np.isfinite(values)]
+    return float(np.median(finite)) if len(finite) else NAN
 
 
 def _nodes(result: Result) -> list[Table]:

@@ -81,23 +81,23 @@ def _in_project(scan: Scan, T: Floats, origin: Floats) -> Floats:
     return transformed
 
 
-def _distances(points: Floats, own: cKDTree, others: Sequence[cKDTree], scanner: Floats) -> Floats:
+def _distances(points: Floats, tree: cKDTree, other_trees: Sequence[cKDTree], scanner: Floats) -> Floats:
     """Return the distance (n,) of points (n, 3) from the nearest other scan's surface, positive to their scanner.
 
     Both surfaces are the means of NEIGHBOURS points; the distance is along the normal of the other one. NaN = none.
     """
     nearest, least = np.full(len(points), -1), np.full(len(points), np.inf)
-    for k, other in enumerate(others):
-        distance = other.query(points, distance_upper_bound=REACH_MM, workers=-1)[0]
+    for k, other_tree in enumerate(other_trees):
+        distance = other_tree.query(points, distance_upper_bound=REACH_MM, workers=-1)[0]
         nearer = distance < least
         nearest[nearer], least[nearer] = k, distance[nearer]
     distances = np.full(len(points), np.nan)
-    for k, other in enumerate(others):
+    for k, other_tree in enumerate(other_trees):
         rows = np.flatnonzero(nearest == k)
         if not len(rows):
             continue
-        near, width = _neighbours(own, points[rows])
-        there, wide = _neighbours(other, points[rows])
+        near, width = _neighbours(tree, points[rows])
+        there, wide = _neighbours(other_tree, points[rows])
         enough = np.maximum(width, wide) < REACH_MM
         rows, near, there = rows[enough], near[enough], there[enough]
         middle = there.mean(axis=1)

@@ -6,6 +6,7 @@ import dataclasses
 from dataclasses import dataclass, replace
 
 import numpy as np
+import numpy.typing as npt
 
 from processor.model import Floats, Ints
 from processor.space_frame.members import axis_intersection, junctions
@@ -126,16 +127,21 @@ def measure(points: Gathered, scanners: Floats, starts: Floats, pairs: Ints, par
     )
 
 
-def with_meeting_axes(measured: Measured, largest_scatter_mm: float) -> Measured:
-    """Remove nodes whose axes do not meet within a scatter, and members with neither of their nodes left."""
+def meeting(measured: Measured, largest_scatter_mm: float) -> npt.NDArray[np.bool_]:
+    """Return at which nodes (k,) axes meet within a scatter."""
+    nodes = measured.nodes
+    return np.asarray(np.isfinite(nodes.positions).all(axis=1) & ~(nodes.scatter > largest_scatter_mm))
+
+
+def of_nodes(measured: Measured, kept: npt.NDArray[np.bool_]) -> Measured:
+    """Keep some of the nodes (k,), and the members with either of their nodes left."""
     nodes, members = measured.nodes, measured.members
-    meeting = np.isfinite(nodes.positions).all(axis=1) & ~(nodes.scatter > largest_scatter_mm)
-    row = np.where(meeting, np.cumsum(meeting) - 1, -1)
+    row = np.where(kept, np.cumsum(kept) - 1, -1)
     a, b = row[members.node_a], row[members.node_b]
     rows = np.flatnonzero((a >= 0) | (b >= 0))
     columns = {field.name: getattr(members, field.name)[rows] for field in dataclasses.fields(members)}
     columns |= {"node_a": a[rows], "node_b": b[rows]}
-    left = Nodes(nodes.positions[meeting], nodes.covariance[meeting], nodes.axes[meeting], nodes.scatter[meeting])
+    left = Nodes(nodes.positions[kept], nodes.covariance[kept], nodes.axes[kept], nodes.scatter[kept])
     return replace(measured, nodes=left, members=Members(**columns), lines=measured.lines[rows])
 
 

@@ -7,12 +7,9 @@ noise, the scatter of radii and the stations' shifts; then choose and fit again.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-from numba import njit
 
-from processor.geometry.parallel import over_ranges
 from processor.limits import standards
 from processor.model import Floats, Tolerance
 from processor.space_frame.catalogue import Catalogue
@@ -20,10 +17,12 @@ from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
 from processor.space_frame.spheres import noise_model, occlusion, quality
+from processor.space_frame.spheres.aiming import aimed
 from processor.space_frame.spheres.final_fit import finish
 from processor.space_frame.spheres.gauss_newton import LEAST_COSINE
 from processor.space_frame.spheres.occlusion import AXIS_MM, FLAT_MM, Ends
 from processor.space_frame.spheres.records import (
+    AMBIGUOUS,
     AimedCrops,
     Chosen,
     Fits,
@@ -128,7 +127,7 @@ def fit_crops(
     """Fit a sphere to each node's gathered points; see :func:`fit_spheres`."""
     params = params or Params()
     problem = _Problem(
-        crops=_aimed(crops, np.array(nodes.positions), np.array(scanners, np.float64), params.threads),
+        crops=aimed(crops, np.array(nodes.positions), np.array(scanners, np.float64), params.threads),
         ends=occlusion.ends(nodes, members),
         centre_weight=centre_weights(nodes.covariance),
         expected=np.full(nodes.count, NAN) if expected_mm is None else np.asarray(expected_mm, np.float64),
@@ -242,6 +241,10 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         earlier = Chosen(before.states, before.sizes, before.energy, before.second, before.second_energy)
         for new, old in zip(chosen, earlier, strict=True):
             new[~undecided] = old[~undecided]
+    # a doubtful size is no evidence against the nominal one
+    nominal = (chosen.second == problem.expected) & (chosen.second_energy < chosen.energy + AMBIGUOUS)
+    chosen.second[nominal] = chosen.sizes[nominal]
+    chosen.sizes[nominal] = chosen.states[nominal, 3] = problem.expected[nominal]
     priors = Priors(problem.centre_weight, chosen.sizes, np.full(len(chosen.sizes), size_weight))
     done = finish(problem.crops, masks, model, setting.model_points, priors, chosen.states, 4.5 * sigma)
     fits = Fits(
@@ -270,29 +273,3 @@ def centre_weights(covariance: Floats) -> Floats:
     known[known] &= np.linalg.eigvalsh(covariance[known]).max(axis=1) < VAGUE_MM**2
     weights[known] = np.linalg.inv(covariance[known])
     return weights
-
-
-def _aimed(crops: Crops, nodes: Floats, scanners: Floats, threads: int) -> AimedCrops:
-    """Add the rays of gathered points from the scanners (s, 3) that saw them."""
-    rays, ranges = np.zeros((len(crops.points), 3)), np.zeros(len(crops.points))
-    aimed = AimedCrops(crops.start, crops.points, rays, ranges, crops.station)
-    over_ranges(partial(_aim, aimed, nodes, scanners), len(nodes), threads)
-    return aimed
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _aim(crops, nodes, scanners, first, last):  # type: ignore[no-untyped-def]
-    """Fill unit rays (n, 3), 0 where the scanner is unknown, and ranges (n,)."""
-    points = crops.points
-    for k in range(first, last):
-        for i in range(crops.start[k], crops.start[k + 1]):
-            s = crops.station[i]
-            if s < 0 or s >= len(scanners):
-                continue
-            x = points[i, 0] + (nodes[k, 0] - scanners[s, 0])
-            y = points[i, 1] + (nodes[k, 1] - scanners[s, 1])
-            z = points[i, 2] + (nodes[k, 2] - scanners[s, 2])
-            d = np.sqrt(x * x + y * y + z * z)
-            if d > 0.0:
-                crops.rays[i, 0], crops.rays[i, 1], crops.rays[i, 2] = x / d, y / d, z / d
-                crops.ranges[i] = d

@@ -18,7 +18,7 @@ import h5py
 
 GZIP_LIMIT = 1032  # deflate's largest possible expansion
 CHUNK_LIMIT = 64 * 2**20
-ROOM = 1 << 16  # bytes; compressed datasets up to this size may expand by more than GZIP_LIMIT
+SMALL_DATASET_BYTES = 1 << 16  # cannot fill the memory; may expand by more than GZIP_LIMIT
 FILTERS = {h5py.h5z.FILTER_DEFLATE, h5py.h5z.FILTER_SHUFFLE}
 MEMORY_BYTES = 1 << 30  # for a file's structure
 
@@ -108,7 +108,7 @@ def _dataset(dataset: Any) -> list[str]:
         return ["has no extent"]
     size = dataset.dtype.itemsize * math.prod(int(length) for length in dataset.shape)
     room = dataset.id.get_storage_size() * (GZIP_LIMIT if filters else 1)
-    if size > room and not (filters and size <= ROOM and room):
+    if size > room and not (filters and size <= SMALL_DATASET_BYTES and room):
         return [f"declares {size} bytes but stores {dataset.id.get_storage_size()}"]
     if not dataset.chunks:
         return []

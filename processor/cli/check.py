@@ -1,0 +1,61 @@
+"""Command ``processor check``: the checks of earlier results, printed again."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import click
+
+from processor.cli.common import DONE, LIMIT_MISSED, debug_option
+from processor.model import InputError, Metric, Statistic
+
+
+@click.command()
+@click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object instead of a table")
+@debug_option
+@click.pass_context
+def check(context: click.Context, output: Path, as_json: bool) -> None:
+    """Print the checks of the run in OUT again; exits 4 when a limit was missed."""
+    from processor.evaluation.evaluate import ErrorReport
+    from processor.report import all_tables
+    from processor.report import table as report_table
+
+    results = _read_results(output)
+    metrics = tuple(
+        Metric(
+            c["step"],
+            c["quantity"],
+            _number(c["value"]),
+            Statistic(c["statistic"]),
+            unit=c["unit"],
+            limit=_number(c["limit"]),
+            method=c["method"],
+        )
+        for c in results["checks"]
+    )
+    report = ErrorReport(metrics)
+    if as_json:
+        click.echo(json.dumps({"passed": report.passed, "checks": results["checks"]}, ensure_ascii=False))
+    elif metrics:
+        click.echo(report_table.plain_text(all_tables.of_checks(report), most=len(metrics)))
+    else:
+        click.echo("no checks: the input held no truth")
+    context.exit(DONE if report.passed else LIMIT_MISSED)
+
+
+def _number(value: float | None) -> float:
+    return float("nan") if value is None else float(value)
+
+
+def _read_results(output: Path) -> dict[str, Any]:
+    path = output / "results.json"
+    try:
+        results: dict[str, Any] = json.loads(path.read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, ValueError) as error:
+        raise InputError(f"{path}: no readable results ({error}); run processor run again") from error
+    if results.get("format") != "processor-results" or not isinstance(results.get("checks"), list):
+        raise InputError(f"{path}: expected results of processor, found something else")
+    return results

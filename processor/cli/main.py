@@ -1,0 +1,21 @@
+"""The program ``processor``: its commands. Heavy modules are imported where they are used, so that help is fast."""
+
+from __future__ import annotations
+
+import click
+
+from processor.cli import batch, check, compare, init, report, run, validate
+from processor.version import __version__
+
+
+@click.group(context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__, prog_name="processor")
+def commands() -> None:
+    """Check steel structures from laser scans.
+
+    Exit codes: 0 done, 1 done in part, 2 wrong usage, 3 bad input, 4 an accuracy limit was missed.
+    """
+
+
+for module in (run, batch, check, compare, init, report, validate):
+    commands.add_command(getattr(module, module.__name__.rpartition(".")[2]))

@@ -1,0 +1,36 @@
+"""Command ``processor report``: the report of earlier results, made again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import click
+
+from processor.cli.common import LANGUAGES, UNITS, debug_option, show_results
+
+
+@click.command()
+@click.argument("output", metavar="OUT", type=click.Path(path_type=Path, exists=True, file_okay=False))
+@click.argument("input_", metavar="[INPUT]", required=False, type=click.Path(path_type=Path))
+@click.option("--units", type=click.Choice(UNITS), help="as given to the run")
+@click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
+@debug_option
+@click.pass_context
+def report(
+    context: click.Context, output: Path, input_: Path | None, units: str | None, lang: str, as_json: bool
+) -> None:
+    """Check and report again what is in OUT, without running its steps on INPUT anew.
+
+    Without INPUT the file of its name beside OUT is taken, or in the current folder, if its content is the same.
+    """
+    from processor import pipeline
+    from processor.api import runs
+    from processor.evaluation.evaluate import evaluate
+    from processor.report import results_folder
+
+    results_folder.check_output(output, input_)
+    input_ = input_ or pipeline.find_input(output / results_folder.RUNS)
+    execution = pipeline.read_execution(output / results_folder.RUNS, input_, units)
+    results = runs.write(runs.Results(execution, evaluate(input_, execution)), output, lang)
+    show_results(context, output, results, as_json)

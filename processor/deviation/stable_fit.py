@@ -1,0 +1,310 @@
+"""Rigid motions of a scan relative to its design: the best fit of all steel, and that of the steel that is stable.
+
+As in deformation monitoring, a structure of which a part moved is related to its design by the largest part that
+agrees with one rigid motion. The movements at the core points are combined in blocks, each with up to three orthogonal
+directions. A random sample consensus (Fischler and Bolles 1981, scored as by Torr and Zisserman 2000) finds the motion
+that the largest area agrees with; iteratively reweighted least squares (Tukey's biweight) refine it. Covariances are
+sandwiches over clusters of blocks (Liang and Zeger 1986), for clusters of several sizes: the largest one is taken, as
+residuals may agree over any length.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+from scipy.spatial import cKDTree
+
+from processor.deviation.local_translation import Movement
+from processor.geometry import rigid
+from processor.geometry.m3c2 import Z95
+from processor.geometry.mesh_distance import Samples
+from processor.model import Floats, Ints
+
+Bools = npt.NDArray[np.bool_]
+
+BLOCKS_ALONG = 40.0  # blocks along the extent of the structure
+BLOCK_DIAMETERS = 3.0  # least side of a block
+LEVELS = 3  # sizes of blocks, each twice the last: a movement that grows gradually shows in large ones first
+LEAST_STRENGTH = 0.005  # share of a block's points along a direction, below which its curvature would count as a face
+TRIALS, BLOCKS_A_TRIAL, REFINED = 400, 3, 6
+ITERATIONS, CONVERGED_MM = 30, 1e-6
+TUKEY = 4.685  # standard deviations at which the weight is 0: 95 % efficient for normal errors
+AGREES = 2.5  # standard deviations within which a block agrees with a motion
+MOST_CONDITION = 1e10
+FEWEST_CLUSTERS = 12  # for a sandwich with six unknowns
+CHI2_MEDIAN = 0.4549  # of chi-squared with one degree of freedom
+
+
+@dataclass(frozen=True)
+class RigidFit:
+    """Rigid ``motion`` (4, 4) that the scan has relative to the design, in the core points' frame.
+
+    ``covariance`` (6, 6) is of its rotation about the frame's origin and its translation; both are NaN where the points
+    do not determine the motion. ``error_mm`` is the mean over the core points of the standard deviation along their
+    normals, of what is determined. ``share`` of the measured area is what the fit rests on.
+    """
+
+    motion: Floats
+    covariance: Floats
+    error_mm: float
+    share: float
+
+
+@dataclass(frozen=True)
+class Fits:
+    """The best fit of all the area measured, and the fit of its stable part; ``limit_mm`` within which that agrees."""
+
+    best: RigidFit
+    stable: RigidFit
+    limit_mm: float
+
+    def of(self, name: str) -> RigidFit:
+        """Return the fit ``stable`` or ``all``."""
+        return self.stable if name == "stable" else self.best
+
+    @property
+    def determined(self) -> bool:
+        """Whether the points determine both motions."""
+        return bool(np.isfinite(self.best.motion).all() and np.isfinite(self.stable.motion).all())
+
+
+UNDETERMINED = RigidFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float("nan"), float("nan"))
+
+
+@dataclass(frozen=True)
+class _Blocks:
+    """Observations (m,) of block translations: value = design (m, 6) x motion, with variance, area, block and centre.
+
+    Motions are about ``middle`` (3,), rotations in units of 1 / ``arm``. ``first_point`` is a core point of each block,
+    ``of_point`` (k,) the block of each core point.
+    """
+
+    value: Floats
+    design: Floats
+    variance: Floats
+    area: Floats
+    block: Ints
+    centre: Floats
+    middle: Floats
+    arm: float
+    side: float
+    first_point: Ints
+    of_point: Ints
+
+
+def fits(core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, seed: int) -> Fits:
+    """Fit rigid motions to movements at core points, one per ``spacing_mm`` squared."""
+    known = np.flatnonzero(np.isfinite(moved.along) & np.isfinite(moved.sd))
+    nothing = Fits(UNDETERMINED, UNDETERMINED, float("nan"))
+    if len(known) < FEWEST_CLUSTERS:
+        return nothing
+    error = moved.sd[known] / np.sqrt(moved.count[known])
+    places = core.points[known], core.normals[known]
+    # The circles about core points overlap: each scanned point counts in several.
+    overlap = max(1.0, 0.25 * np.pi * (diameter_mm / spacing_mm) ** 2)
+    blocks = _blocks(*places, moved.along[known], np.sqrt(overlap) * error, diameter_mm)
+    if int(blocks.block.max()) + 1 < FEWEST_CLUSTERS:
+        return nothing
+    wavy = _short_range(blocks)
+    variance = blocks.variance + wavy
+    best = _solved(blocks, 1.0 / variance)
+    limit = np.maximum(AGREES * np.sqrt(variance), Z95 * float(np.median(error)))
+    stable = _consensus(blocks, best, limit, seed)
+    levels = [_Level(blocks, blocks.block, _scaled(blocks, stable, np.sqrt(variance), limit))]
+    for level in range(1, LEVELS):
+        larger = _blocks(*places, moved.along[known], np.sqrt(overlap) * error, diameter_mm, 2.0**level)
+        parent = larger.of_point[blocks.first_point][blocks.block]
+        inside = np.bincount(parent, minlength=int(larger.block.max()) + 1)[larger.block]
+        sd = np.sqrt(larger.variance + wavy / inside)
+        levels.append(_Level(larger, parent, _scaled(larger, stable, sd, np.full(len(sd), np.median(limit)))))
+    stable = _reweighted(levels, stable)
+    share = float(blocks.area[_worst(blocks, stable[None], limit)[0] <= 1.0].sum() / blocks.area.sum())
+    worst, sd = _largest(levels, stable), levels[0].sd
+    weight = _tukey(worst)
+    z = np.abs(blocks.value - blocks.design @ stable) / sd
+    slope = np.where(z < worst, weight, _tukey_slope(z))
+    return Fits(
+        best=_fit(blocks, best, 1.0 / variance, 1.0 / variance, 1.0, places),
+        stable=_fit(blocks, stable, weight / sd**2, slope / sd**2, share, places),
+        limit_mm=float(np.median(limit)),
+    )
+
+
+@dataclass(frozen=True)
+class _Level:
+    """Blocks of one size, the ``parent`` (m,) of them that each smallest observation is in, and their sd (m,)."""
+
+    blocks: _Blocks
+    parent: Ints
+    sd: Floats
+
+
+def _blocks(
+    points: Floats, normals: Floats, along: Floats, error: Floats, diameter: float, times: float = 1.0
+) -> _Blocks:
+    """Combine movements in blocks: weighted least squares of a translation, along its principal directions."""
+    middle, extent = points.mean(axis=0), np.ptp(points, axis=0)
+    arm = max(0.5 * float(np.linalg.norm(extent)), 1e-6)
+    side = times * max(BLOCK_DIAMETERS * diameter, float(extent.max()) / BLOCKS_ALONG)
+    _, first, block = np.unique(_cells(points, side), axis=0, return_index=True, return_inverse=True)
+    block = block.reshape(-1)
+    count = np.bincount(block)
+    centre = np.stack([np.bincount(block, points[:, i]) for i in range(3)], axis=1) / count[:, None]
+    J = np.hstack([np.cross(points - middle, normals) / arm, normals])
+    weight = 1.0 / np.maximum(error, 1e-6) ** 2
+
+    def summed(values: Floats) -> Floats:
+        flat = values.reshape(len(values), -1)
+        sums: Floats = np.stack([np.bincount(block, flat[:, i]) for i in range(flat.shape[1])], axis=1)
+        return sums.reshape(-1, *values.shape[1:])
+
+    weighted = weight[:, None] * normals
+    A, b = summed(weighted[:, :, None] * normals[:, None]), summed(weighted * along[:, None])
+    B = summed(weighted[:, :, None] * J[:, None])
+    w, V = np.linalg.eigh(A)
+    row, k = np.nonzero(w > LEAST_STRENGTH * w.sum(axis=1)[:, None])
+    direction, strength = V[row, :, k], w[row, k]
+    value = np.einsum("mi,mi->m", direction, b[row]) / strength
+    design = np.einsum("mi,mij->mj", direction, B[row]) / strength[:, None]
+    area = count[row] * strength / np.bincount(row, strength, len(count))[row]
+    return _Blocks(
+        value=value, design=design, variance=1.0 / strength, area=area, block=row, centre=centre, middle=middle,
+        arm=arm, side=side, first_point=first, of_point=block,
+    )  # fmt: skip
+
+
+def _cells(points: Floats, side: float) -> Ints:
+    cells: Ints = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
+    return cells
+
+
+def _short_range(blocks: _Blocks) -> float:
+    """Variance of movements from one block to the next beyond that of their noise, mm^2: waviness of the surface."""
+    direction = blocks.design[:, 3:]
+    sign = np.where(direction[np.arange(len(direction)), np.argmax(np.abs(direction), axis=1)] < 0.0, -1.0, 1.0)
+    place = np.hstack([blocks.centre[blocks.block] / blocks.side, 4.0 * sign[:, None] * direction])
+    other = cKDTree(place).query(place, k=2)[1][:, 1]
+    square = 0.5 * (sign * blocks.value - (sign * blocks.value)[other]) ** 2
+    noise = 0.5 * (blocks.variance + blocks.variance[other])
+    return max(0.0, float(np.median(square) / CHI2_MEDIAN - np.median(noise)))
+
+
+def _solved(blocks: _Blocks, weight: Floats) -> Floats:
+    """Return the motion (6,) of weighted least squares."""
+    H = blocks.design
+    normal = H.T @ (weight[:, None] * H)
+    motion: Floats = np.linalg.lstsq(normal, H.T @ (weight * blocks.value), rcond=1.0 / MOST_CONDITION)[0]
+    return motion
+
+
+def _consensus(blocks: _Blocks, best: Floats, limit: Floats, seed: int) -> Floats:
+    """Return the motion (6,) that the largest area agrees with, of trials on few blocks, each refined."""
+    H, weight = blocks.design, 1.0 / blocks.variance
+    count = int(blocks.block.max()) + 1
+    sums = np.zeros((count, 6, 7))
+    np.add.at(
+        sums, blocks.block, weight[:, None, None] * H[:, :, None] * np.hstack([H, blocks.value[:, None]])[:, None]
+    )
+    size = np.bincount(blocks.block, blocks.area, count)
+    rng = np.random.default_rng(seed)
+    drawn = sums[rng.choice(count, (TRIALS, BLOCKS_A_TRIAL), p=size / size.sum())].sum(axis=1)
+    sound = np.linalg.cond(drawn[:, :, :6]) < MOST_CONDITION
+    trials = np.linalg.solve(drawn[sound, :, :6], drawn[sound, :, 6:])[:, :, 0]
+    trials = np.vstack([best, trials])
+    first = np.argsort(-_scores(blocks, trials, limit), kind="stable")[:REFINED]
+    candidates = [best, *(trials[k] for k in first)]
+    level = _Level(blocks, blocks.block, limit / AGREES)
+    refined = np.array([_reweighted([level], x) for x in candidates])
+    return np.asarray(refined[np.argmax(_scores(blocks, refined, limit))])
+
+
+def _worst(blocks: _Blocks, motions: Floats, scale: Floats) -> Floats:
+    """Largest residual (t, m) of motions (t, 6), over ``scale`` (m,), in any direction of each observation's block."""
+    residual = np.abs(blocks.value - motions @ blocks.design.T) / scale
+    largest = np.maximum.reduceat(residual, np.unique(blocks.block, return_index=True)[1], axis=1)
+    worst: Floats = largest[:, np.unique(blocks.block, return_inverse=True)[1].reshape(-1)]
+    return worst
+
+
+def _scores(blocks: _Blocks, motions: Floats, limit: Floats) -> Floats:
+    """Area (t,) that agrees with motions (t, 6), less for larger residuals."""
+    scores: Floats = np.maximum(0.0, 1.0 - _worst(blocks, motions, limit) ** 2) @ blocks.area
+    return scores
+
+
+def _reweighted(levels: list[_Level], motion: Floats) -> Floats:
+    """Refine a motion (6,): blocks lose weight if they, or the larger blocks they are in, do not agree with it."""
+    blocks, sd = levels[0].blocks, levels[0].sd
+    for _ in range(ITERATIONS):
+        last, motion = motion, _solved(blocks, _tukey(_largest(levels, motion)) / sd**2)
+        if np.abs(motion - last).max() < CONVERGED_MM:
+            break
+    return motion
+
+
+def _largest(levels: list[_Level], motion: Floats) -> Floats:
+    """Return the largest residual (m,) in sd of a motion (6,) in any block that each smallest observation is in."""
+    largest: Floats = np.zeros(len(levels[0].parent))
+    for level in levels:
+        worst = np.zeros(int(level.blocks.block.max()) + 1)
+        worst[level.blocks.block] = _worst(level.blocks, motion[None], level.sd)[0]
+        largest = np.maximum(largest, worst[level.parent])
+    return largest
+
+
+def _scaled(blocks: _Blocks, motion: Floats, sd: Floats, limit: Floats) -> Floats:
+    """Return standard deviations (m,) raised to the scale of the residuals of the blocks that agree with a motion."""
+    z = (blocks.value - blocks.design @ motion) / sd
+    near = _worst(blocks, motion[None], limit)[0] <= 1.0
+    return sd * (max(1.0, float(np.sqrt(np.median(z[near] ** 2) / CHI2_MEDIAN))) if near.any() else 1.0)
+
+
+def _tukey(z: Floats) -> Floats:
+    weight: Floats = np.clip(1.0 - (z / TUKEY) ** 2, 0.0, 1.0) ** 2
+    return weight
+
+
+def _tukey_slope(z: Floats) -> Floats:
+    """Return the derivative of the influence z w(z)."""
+    u = (z / TUKEY) ** 2
+    slope: Floats = np.where(u < 1.0, (1.0 - u) * (1.0 - 5.0 * u), 0.0)
+    return slope
+
+
+def _fit(
+    blocks: _Blocks, motion: Floats, weight: Floats, slope: Floats, share: float, places: tuple[Floats, Floats]
+) -> RigidFit:
+    """Return a motion (6,) in the core points' frame with its covariance: the largest of sandwiches over clusters."""
+    H = blocks.design
+    normal = H.T @ (slope[:, None] * H)
+    bread = np.linalg.pinv(normal, rcond=1.0 / MOST_CONDITION, hermitian=True)
+    gradient = H * (weight * (blocks.value - H @ motion))[:, None]
+    used = weight > 0.0
+    scaling = np.diag(np.repeat([1.0 / blocks.arm, 1.0], 3))
+    covariance, error, side = np.full((6, 6), np.nan), -1.0, 1.0
+    while True:
+        cell = np.unique(_cells(blocks.centre[blocks.block[used]] / blocks.side, side), axis=0, return_inverse=True)[1]
+        cell = cell.reshape(-1)
+        number = int(cell.max()) + 1 if len(cell) else 0
+        if number < FEWEST_CLUSTERS:
+            break
+        sums = np.stack([np.bincount(cell, gradient[used, k], number) for k in range(6)], axis=1)
+        at_middle = scaling @ (bread @ (sums.T @ sums * (number / (number - 6.0))) @ bread) @ scaling
+        at_origin = rigid.about_origin(at_middle, blocks.middle)
+        along = _error_along(at_origin, *places)
+        if along > error:
+            covariance, error = at_origin, along
+        side *= 2.0
+    if error < 0.0 or not np.linalg.cond(normal) < MOST_CONDITION:
+        return RigidFit(UNDETERMINED.motion, UNDETERMINED.covariance, error if error >= 0.0 else float("nan"), share)
+    x = scaling @ motion
+    R = rigid.rotation_from_vector(x[:3])
+    return RigidFit(rigid.transform(R, blocks.middle + x[3:] - R @ blocks.middle), covariance, error, share)
+
+
+def _error_along(covariance: Floats, points: Floats, normals: Floats) -> float:
+    """Mean over points (k, 3) of the standard deviation along normals (k, 3) that a motion's covariance causes, mm."""
+    J = np.hstack([np.cross(points, normals), normals])
+    return float(np.mean(np.sqrt(np.maximum(np.einsum("ki,ij,kj->k", J, covariance, J), 0.0))))

@@ -1,0 +1,137 @@
+"""Whether a scan is of the part it is assigned to, before the costly registration; and the assignment of all scans.
+
+A scan whose size is that of its part goes on without delay. Otherwise rough poses on the part and on the others are
+compared by surface that only one of two designs has there: the scan shows that of the right one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from processor.geometry import box_girder, principal, rigid, surface_registration
+from processor.geometry.neighbors import thinned
+from processor.model import ArchDesign, Floats, Reason, reason
+from processor.preassembly.parts import attitude
+from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Shapes, Surface
+
+POINTS, SAMPLES = 100_000, 3_000  # of a scan, and of the surfaces that its rough poses are compared by
+NEAR_MM = surface_registration.GATES_MM[1]
+
+
+@dataclass(frozen=True)
+class ScanParts:
+    """The part that a scan is assigned to, and the parts that it may be of by its points; () = none of the design."""
+
+    scan: str
+    assigned: str
+    parts: tuple[str, ...]
+
+    @property
+    def wrong(self) -> tuple[Reason, ...]:
+        """Why the scan is not of the part that it is assigned to; empty where it may be."""
+        if self.assigned in self.parts:
+            return ()
+        if not self.parts:
+            return (reason("preassemble.scan-of-none", scan=self.scan),)
+        if len(self.parts) == 1 and self.scan == self.assigned:
+            return (reason("preassemble.named-scan-of-other", scan=self.scan, part=self.parts[0]),)
+        if len(self.parts) == 1:
+            return (reason("preassemble.scan-of-other", scan=self.scan, part=self.parts[0], assigned=self.assigned),)
+        return (reason("preassemble.scan-of-others", scan=self.scan, parts=self.parts, assigned=self.assigned),)
+
+
+def of_size(points: Floats, shapes: Shapes) -> list[int]:
+    """Return the numbers of the parts that have the size of a scan's points (n, 3)."""
+    size = principal.sizes(points)
+    limit = principal.SIZE_SHARE * float(size.max())
+    return [k for k in range(len(shapes)) if np.abs(shapes[k].sizes - size).max() < limit]
+
+
+def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
+    """Return the number of a part that points (n, 3) show rather than part ``index``; -1 for no part, None for none.
+
+    Of parts with equal edges, which their marks alone distinguish, it is any: see :mod:`.identity`.
+    """
+    alike = of_size(points, shapes)
+    others = _other_shapes(index, alike or range(len(shapes)), shapes.design)
+    if index in alike and not others:
+        return None
+    few = thinned(points, POINTS)
+    pieces = not alike
+
+    def rough(k: int) -> Floats:
+        return attitude.rough(few, shapes.design.parts[k], shapes[k], pieces=pieces)
+
+    best, T_best = index, rough(index)
+    share = _near_share(few, T_best, shapes[index])
+    if pieces and share >= 1.0 - surface_registration.CLUTTER_SHARE:
+        return None  # a piece of the part
+    for other in others:
+        T = rough(other)
+        share = max(share, _near_share(few, T, shapes[other]))
+        if _shows_other(few, (shapes[best], T_best), (shapes[other], T)):
+            best, T_best = other, T
+    if share <= surface_registration.LEAST_SHARE:
+        return -1
+    return None if best == index else best
+
+
+def _other_shapes(index: int, numbers: Sequence[int] | range, design: ArchDesign) -> list[int]:
+    """Return those of the numbers of parts that differ in shape from part ``index``, one of each shape."""
+    found = [index]
+    for k in numbers:
+        if not any(k == one or box_girder.motions(design.parts[one], design.parts[k]) for one in found):
+            found.append(k)
+    return found[1:]
+
+
+def _near_share(points: Floats, T: Floats, surface: Surface) -> float:
+    """Share of points (n, 3), placed by T (4, 4), near a part's surface."""
+    placed = rigid.apply(T, thinned(points, SAMPLES))
+    _, distance, beyond = surface.mesh.distances(placed, 2.0 * NEAR_MM)
+    return float(((np.abs(distance) < NEAR_MM) & (beyond < TELLING_MM)).mean())
+
+
+def _shows_other(points: Floats, part: tuple[Surface, Floats], other: tuple[Surface, Floats]) -> bool:
+    """Whether points (n, 3) show surface that the other part alone has, each part with its T_bridge_scan (4, 4)."""
+    of_part, of_other = (_sparse(*part), _sparse(*other))
+    part_count = attitude.shown(points, part[1], attitude.only_in(*of_part, *of_other)[0])
+    other_count = attitude.shown(points, other[1], attitude.only_in(*of_other, *of_part)[0])
+    return other_count >= max(LEAST_EVIDENCE, 2 * part_count)
+
+
+def _sparse(surface: Surface, T: Floats) -> tuple[Surface, Floats]:
+    points, normals = thinned(surface.points, SAMPLES), thinned(surface.normals, SAMPLES)
+    return replace(surface, points=points, normals=normals), T
+
+
+def solve(scans: Sequence[ScanParts]) -> list[ScanParts]:
+    """Assign all scans to the parts that scans are assigned to, each as often as now, with the fewest contradictions.
+
+    Of the parts that a scan may be of, those remain that are in one of these assignments (Kuhn 1955). A scan that is
+    of one part by its points keeps it, also where other parts are then left without a scan; one of which nothing is
+    known may be of all parts, and stays so.
+    """
+    slots = [scan.assigned for scan in scans]
+    cost = np.array([[part not in scan.parts for part in slots] for scan in scans], float).reshape(len(scans), -1)
+    solved = []
+    for i, scan in enumerate(scans):
+        if set(slots) <= set(scan.parts):
+            solved.append(scan)
+            continue
+        fewest = {part: _contradictions(cost, i, [slot == part for slot in slots]) for part in scan.parts}
+        left = tuple(part for part in scan.parts if fewest[part] == min(fewest.values()))
+        solved.append(replace(scan, parts=left))
+    return solved
+
+
+def _contradictions(cost: Floats, row: int, columns: list[bool]) -> float:
+    """Fewest contradictions of all assignments with a scan in some of the columns."""
+    forced = cost.copy()
+    forced[row, ~np.array(columns)] = len(cost) + 1.0
+    rows, assigned = linear_sum_assignment(forced)
+    return float(forced[rows, assigned].sum())

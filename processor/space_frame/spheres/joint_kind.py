@@ -1,0 +1,220 @@
+"""Which of the places where members meet have balls: joints of scaffolds, pipes and purlins have none.
+
+Two things in the points about a joint tell. A ball's surface lies at one distance from the node, where clamps and
+crossing tubes differ from a sphere by a share of their size. And members of bolted balls narrow to sleeves before the
+ball, so that points lie inside the tube's surface, where a tube that goes on would hide them. Not all frames have
+sleeves: how often joints of either kind have them is estimated from all joints. What a joint's own points leave open is
+decided by the joints that its members lead to.
+"""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.sparse import coo_matrix, csr_matrix
+from scipy.sparse.csgraph import breadth_first_order, maximum_flow
+
+from processor.geometry.parallel import over_ranges
+from processor.model import Floats, Ints
+from processor.space_frame.members.members import Measured
+from processor.space_frame.points import sphere_crops
+from processor.space_frame.points.source import Source
+from processor.space_frame.spheres import occlusion
+from processor.space_frame.spheres.aiming import aimed
+from processor.space_frame.spheres.gauss_newton import residual
+
+Bools = npt.NDArray[np.bool_]
+
+REACH_MM = 240.0  # about a node: sleeve and cone of an ordinary ball
+POINTS = 512  # of a joint, at most
+RADII = np.arange(25.0, 160.0, 2.5)
+LEAST_RATIO = 1.25  # of a ball's radius to that of its thinnest tube
+LUMP = 0.12  # rms departure of a cylinder or box from the nearest sphere, in radii
+BESIDE_MM = 25.0  # points this far from a surface are those of something else
+STRAY, STRAY_OF_LUMP = 0.05, 0.3  # share of points that are on neither, at a ball and at something else
+NARROWEST = 0.2  # of a sleeve, in tube radii
+STEP_MM = 20.0  # of the lengths of sleeve and cone that are tried
+LEAST_STEPS = 2
+CLAMP = 2.2  # tube radii from the node: a clamp reaches no farther
+CLEAR_MM = 5.0  # of either
+AXIS_MM = 1.5  # error of an axis at the node
+MISTAKEN = 0.01  # probability that evidence of one kind is wrong as a whole, however many points it has
+UNLIKE = 0.2  # probability that a member joins a ball and something else
+TURNS = 50
+
+
+def balls(source: Source, measured: Measured, threads: int = 0) -> Bools:
+    """Return which nodes (k,) have a ball, the most likely assignment of all together; one pass over the source.
+
+    Nodes without a position are undecided by their points.
+    """
+    nodes, members = measured.nodes, measured.members
+    rows = np.flatnonzero(np.isfinite(nodes.positions).all(axis=1))
+    sphere, neck = np.zeros(nodes.count), np.zeros(nodes.count)
+    if len(rows):
+        ends = occlusion.ends(nodes, members)
+        places = nodes.positions[rows]
+        near = sphere_crops.gather(source, places, REACH_MM, threads, POINTS * len(rows))
+        crops = aimed(near, places, np.array(source.scanners, np.float64), threads)
+        noise = float(np.median(members.rms)) if len(members.rms) else 1.0
+        sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + AXIS_MM**2))
+        over_ranges(partial(_evidence, rows, crops, ends, sd, sphere, neck), len(rows), threads)
+    joined = (members.node_a >= 0) & (members.node_b >= 0)
+    pairs = np.unique(np.sort(np.stack([members.node_a, members.node_b], axis=1)[joined], axis=1), axis=0)
+    return most_likely(for_a_ball(sphere, neck), pairs.reshape(-1, 2))
+
+
+def for_a_ball(sphere: Floats, neck: Floats) -> Floats:
+    """Log odds (k,) of a ball by the log likelihood ratios of both kinds of evidence.
+
+    Joints are of three kinds: balls with sleeves, balls without, and others. The shares of the kinds are estimated by
+    expectation and maximization, with one joint of each kind added.
+    """
+    sphere, neck = _bounded(sphere), _bounded(neck)
+    likelihood = np.exp(np.stack([sphere + neck, sphere, np.zeros(len(sphere))], axis=1))
+    share = np.full(3, 1.0 / 3.0)
+    for _ in range(TURNS):
+        belongs = likelihood * share
+        belongs /= belongs.sum(axis=1, keepdims=True)
+        share = (belongs.sum(axis=0) + 1.0) / (len(sphere) + 3.0)
+    weighted = likelihood * share
+    odds: Floats = np.log(weighted[:, :2].sum(axis=1) / weighted[:, 2])
+    return odds
+
+
+def most_likely(odds: Floats, pairs: Ints) -> Bools:
+    """Most likely assignment (k,) by log odds (k,) of each node, where pairs (p, 2) are mostly of one kind.
+
+    The minimum cut of a binary Markov field (Greig, Porteous and Seheult 1989).
+    """
+    k = len(odds)
+    if not k:
+        return np.zeros(0, bool)
+    other, ball = k, k + 1
+    units = 1e4  # capacities are whole numbers
+    cost = np.rint(units * np.abs(odds)).astype(np.int32)
+    alike = np.full(len(pairs), round(units * np.log((1.0 - UNLIKE) / UNLIKE)), np.int32)
+    nodes = np.arange(k)
+    start = np.concatenate([pairs[:, 0], pairs[:, 1], np.full(k, other), nodes])
+    end = np.concatenate([pairs[:, 1], pairs[:, 0], nodes, np.full(k, ball)])
+    room = np.concatenate([alike, alike, np.where(odds < 0.0, cost, 0), np.where(odds > 0.0, cost, 0)])
+    graph = csr_matrix(coo_matrix((room, (start, end)), shape=(k + 2, k + 2)))
+    left = graph - maximum_flow(graph, other, ball).flow
+    left.data = np.maximum(left.data, 0)
+    left.eliminate_zeros()
+    reached = np.zeros(k + 2, bool)
+    reached[breadth_first_order(left, other, return_predecessors=False)] = True
+    return ~reached[:k]
+
+
+def _bounded(ratio: Floats) -> Floats:
+    """Log likelihood ratios, given that evidence may be mistaken as a whole."""
+    bounded: Floats = np.logaddexp(np.log1p(-MISTAKEN) + ratio, np.log(MISTAKEN)) - np.logaddexp(
+        np.log1p(-MISTAKEN), np.log(MISTAKEN) + ratio
+    )
+    return bounded
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _evidence(rows, crops, ends, sd, sphere, neck, first, last):  # type: ignore[no-untyped-def]
+    """Fill the log likelihood ratios of the nodes in rows ``first`` to ``last``: of a sphere, and of narrowed tubes."""
+    for j in range(first, last):
+        k = rows[j]
+        about = slice(crops.start[j], crops.start[j + 1])
+        points, rays = crops.points[about], crops.rays[about]
+        own = slice(ends.start[k], ends.start[k + 1])
+        feet, axes, tubes = ends.points[own], ends.directions[own], ends.tube_radii[own]
+        if len(tubes) == 0:
+            continue
+        seen = _beside_members(points, rays, feet, axes, tubes, sd)
+        best, radius = -np.inf, 0.0
+        for r in RADII:
+            if r >= LEAST_RATIO * tubes.min():
+                ratio = _sphere_ratio(points[seen], rays[seen], r, sd)
+                if ratio > best:
+                    best, radius = ratio, r
+        sphere[k] = best - np.log(len(RADII)) if best > -np.inf else 0.0
+        if sphere[k] < 0.0:
+            radius = 0.0  # no ball that could hide the start of a sleeve
+        for m in range(len(tubes)):
+            neck[k] += _neck_ratio(points, feet[m], axes[m], tubes[m], max(radius, CLAMP * tubes[m]) + CLEAR_MM, sd)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _beside_members(points, rays, feet, axes, tubes, sd):  # type: ignore[no-untyped-def]
+    """Rows of the points that face the scanner and are on no sleeve."""
+    rows = np.empty(len(points), np.int64)
+    n = 0
+    for i in range(len(points)):
+        x, u = points[i], rays[i]
+        if x[0] * u[0] + x[1] * u[1] + x[2] * u[2] > 0.0:
+            continue
+        free = True
+        for m in range(len(tubes)):
+            along, off = _by_axis(x, feet[m], axes[m])
+            free = free and (along <= 0.0 or off > occlusion.SLEEVE_OF_TUBE * tubes[m] + occlusion.FLAT_MM + sd)
+        if free:
+            rows[n] = i
+            n += 1
+    return rows[:n]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _sphere_ratio(points, rays, radius, sd):  # type: ignore[no-untyped-def]
+    """Log likelihood ratio of a ball of this radius about the node to a lump of about its size."""
+    wide = np.sqrt(sd * sd + (LUMP * radius) ** 2)
+    stray = 0.5 / BESIDE_MM
+    total = 0.0
+    for i in range(len(points)):
+        p, u = points[i], rays[i]
+        e, cosine, _, _, _, _ = residual(p[0], p[1], p[2], u[0], u[1], u[2], 0.0, 0.0, 0.0, radius)
+        if cosine < 0.3 or e < -BESIDE_MM:
+            continue
+        if e > BESIDE_MM:
+            if u[0] != 0.0 or u[1] != 0.0 or u[2] != 0.0:  # the ray passed through
+                total += np.log(STRAY / STRAY_OF_LUMP)
+            continue
+        on_ball = (1.0 - STRAY) * _normal(e, sd) + STRAY * stray
+        total += np.log(on_ball / ((1.0 - STRAY_OF_LUMP) * _normal(e, wide) + STRAY_OF_LUMP * stray))
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _neck_ratio(points, foot, axis, tube, beyond, sd):  # type: ignore[no-untyped-def]
+    """Log likelihood ratio of a member that narrows towards the node to a tube of one radius.
+
+    How far the sleeve and the cone reach is unknown: the likelihood is the mean over their lengths.
+    """
+    steps = np.zeros(int((REACH_MM - beyond) / STEP_MM))
+    if len(steps) < LEAST_STEPS:
+        return 0.0
+    inside = 1.0 / ((1.0 - NARROWEST) * tube + sd)
+    for i in range(len(points)):
+        along, off = _by_axis(points[i], foot, axis)
+        step = int(np.floor((along - beyond) / STEP_MM))
+        if step < 0 or step >= len(steps) or off < NARROWEST * tube or off > tube + 3.0 * sd:
+            continue
+        on_tube = _normal(off - tube, sd)
+        narrow = (1.0 - STRAY) * inside + STRAY * on_tube if off < tube + sd else STRAY * on_tube
+        ratio = np.log(narrow / ((1.0 - STRAY) * on_tube + STRAY * inside))
+        steps[step] += ratio if off < tube + sd else min(ratio, 0.0)
+    total = np.cumsum(steps)[LEAST_STEPS - 1 :]
+    most = total.max()
+    return most + np.log(np.mean(np.exp(total - most)))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _by_axis(point, foot, axis):  # type: ignore[no-untyped-def]
+    """Distances of a point along an axis and from it."""
+    x, y, z = point[0] - foot[0], point[1] - foot[1], point[2] - foot[2]
+    along = x * axis[0] + y * axis[1] + z * axis[2]
+    return along, np.sqrt(max(x * x + y * y + z * z - along * along, 0.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _normal(e, sd):  # type: ignore[no-untyped-def]
+    return np.exp(-0.5 * (e / sd) ** 2) / (sd * np.sqrt(2.0 * np.pi))

@@ -1,0 +1,45 @@
+"""Files that are replaced as a whole: written under a temporary name, synced, and moved."""
+
+from __future__ import annotations
+
+import os
+import re
+import secrets
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from processor.model import InputError
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Yield a temporary path beside ``path``, and replace ``path`` by it once its content is on the disk.
+
+    Raises InputError where the file cannot be written. On any error the temporary file is removed and ``path`` stays
+    unchanged.
+    """
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        yield temporary
+        sync(temporary)
+        os.replace(temporary, path)
+        sync(path.parent)
+    except (OSError, RuntimeError) as error:
+        # HDF5 reports a full disk within a longer text, and not always as an OSError.
+        message = re.search(r"error message = '([^']*)'", str(error))
+        if isinstance(error, RuntimeError) and not message:
+            raise
+        reason = message[1] if message else getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: cannot be written ({reason}); free the disk or choose another folder") from error
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def sync(path: Path) -> None:
+    """Wait until a file or folder is written to the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

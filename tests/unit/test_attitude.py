@@ -1,0 +1,66 @@
+"""Attitude of nearly symmetric structures: boxes with small plates on their sides, sampled with noise."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from processor.geometry import attitude, mesh_distance, rigid, surface_registration
+
+GIRDER = (6000.0, 800.0, 1400.0)
+PLATE = (400.0, 140.0, 14.0)  # a bracket, its upper side in the girder's middle
+
+
+def bracket(x, y=1.0, up=0.0, away=0.0):
+    return trimesh.creation.box(PLATE, rigid.transform(np.eye(3), [x, y * (470.0 + away), -7.0 + up]))
+
+
+def structure(*brackets):
+    return trimesh.util.concatenate([trimesh.creation.box(GIRDER), *brackets])
+
+
+def placed(design, built, seed, count=60_000, noise=1.0):
+    """Pose of a scan relative to the true one, and whether it is ambiguous."""
+    rng = np.random.default_rng(seed)
+    points = np.asarray(trimesh.sample.sample_surface(built, count, seed=seed)[0])
+    points += rng.normal(0.0, noise, points.shape)
+    T = rigid.transform(rigid.rotation_from_vector(2.0 * rng.normal(size=3)), 2e4 * rng.normal(size=3))
+    surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
+    found = surface_registration.place(rigid.apply(rigid.invert(T), points), surface, np.eye(4), "auto")
+    return found.T @ rigid.invert(T), found.ambiguous
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_bracket_distinguishes_the_attitudes_of_a_box(seed):
+    # By half a turn about the length the brackets come to lie on themselves but for their thickness.
+    design = structure(bracket(-1500.0, 1.0), bracket(-1500.0, -1.0), bracket(700.0, 1.0), bracket(700.0, -1.0))
+    off, ambiguous = placed(design, design, seed)
+    assert rigid.rotation_angle(off[:3, :3]) < 2e-4
+    assert not ambiguous
+
+
+def test_a_displaced_and_a_missing_bracket_turn_nothing_over():
+    at = [-2400.0, -1200.0, 300.0, 1800.0]
+    design = structure(*(bracket(x, y) for x in at for y in (1.0, -1.0)))
+    built = structure(*(bracket(x, y) for x in at[1:] for y in (1.0, -1.0)), bracket(at[0], 1.0, up=14.0))
+    for seed in range(3):
+        off, ambiguous = placed(design, built, seed)
+        assert rigid.rotation_angle(off[:3, :3]) < 2e-4
+        assert not ambiguous
+
+
+def test_what_nothing_distinguishes_is_ambiguous():
+    design = structure(bracket(1500.0, 1.0))
+    assert placed(structure(), structure(), 0)[1]
+    assert placed(design, structure(), 0)[1]  # the bracket was left out: nothing shows where it belongs
+    assert not placed(design, design, 0)[1]
+
+
+def test_a_contradiction_as_large_as_the_evidence_is_no_choice():
+    design = structure(bracket(-1500.0, 1.0), bracket(900.0, 1.0))
+    points = np.asarray(trimesh.sample.sample_surface(structure(bracket(-1500.0, 1.0)), 60_000, seed=1)[0])
+    surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
+    turned = rigid.transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3))
+    assert attitude.choose(points, surface, [np.eye(4), turned]) == attitude.Choice(best=0, rivals=())
+    both = structure(bracket(-1500.0, 1.0), bracket(1500.0, -1.0))  # one where each of the attitudes has one
+    points = np.asarray(trimesh.sample.sample_surface(both, 60_000, seed=1)[0])
+    assert len(attitude.choose(points, surface, [np.eye(4), turned]).rivals) == 1

@@ -1,0 +1,116 @@
+"""Faces of points near edges and on thin plates: a plate as designed has no deviation, whatever is known of it."""
+
+import numpy as np
+import pytest
+import trimesh
+
+from processor.deviation import assignment, enclosure
+from processor.deviation import step as deviation_step
+from processor.geometry import mesh_distance
+from processor.model import Scan, Scene, StructureDesign
+
+STATIONS = np.array([[2500.0, 1800.0, 2500.0], [-2200.0, -2600.0, -2400.0]])
+SIGMA = 0.5
+
+
+def plate(thickness, seed, stations, positions):
+    """A plate as designed, with noise along the rays of the stations that see each place, one scan a station."""
+    mesh = trimesh.creation.box((300.0, 300.0, thickness))
+    rng = np.random.default_rng(seed)
+    points, facet = trimesh.sample.sample_surface(mesh, 60_000, seed=seed)
+    points, normals = np.asarray(points), mesh.face_normals[facet]
+    sees = np.einsum("nki,ni->nk", stations - points[:, None], normals) > 0.0
+    chosen = np.argmax(sees * rng.random(sees.shape), axis=1)
+    scans = []
+    for k, station in enumerate(stations):
+        some = points[sees.any(axis=1) & (chosen == k)]
+        ray = (some - station) / np.linalg.norm(some - station, axis=1)[:, None]
+        place = {"position": station} if positions else {}
+        scans.append(Scan(f"s{k}", some + rng.normal(0.0, SIGMA, len(some))[:, None] * ray, **place))
+    design = StructureDesign("plate", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    return Scene("plate", "structure", tuple(scans), structure=design, units="mm")
+
+
+def from_edge(core, thickness):
+    half = 0.5 * np.array([300.0, 300.0, thickness])
+    distance = half - np.abs(core.points)
+    distance[np.arange(len(core)), np.argmax(np.abs(core.normals), axis=1)] = np.inf
+    return distance.min(axis=1)
+
+
+@pytest.mark.parametrize("thickness", [5.0, 20.0])
+@pytest.mark.parametrize("positions", [False, True])
+@pytest.mark.parametrize("sides", [1, 2])
+def test_a_plate_as_designed_deviates_nowhere(thickness, positions, sides):
+    scene = plate(thickness, 3, STATIONS[:sides], positions)
+    core = deviation_step.run(scene, deviation_step.Params()).core
+    known = np.isfinite(core.lod95)
+    edge = from_edge(core, thickness)
+    assert 0.02 < core.distances.significant[known].mean() < 0.07
+    near = known & (edge < 5.0)
+    assert near.sum() > 100
+    assert core.distances.significant[near].mean() < 0.12  # core points that share points: about 60 are independent
+    assert np.abs(core.distance[known]).max() < 1.0
+    assert abs(core.distance[known].mean()) < 0.02
+    faces = np.argmax(np.abs(core.normals), axis=1) == 2
+    seen = faces & (core.normals @ STATIONS[0] > 0.0)
+    assert known[seen].mean() > 0.99
+    if sides == 1:
+        assert not known[faces & ~seen].any()
+
+
+def test_a_plate_thinner_than_its_noise_has_no_answer_without_positions():
+    scene = plate(1.0, 4, STATIONS, positions=False)
+    core = deviation_step.run(scene, deviation_step.Params()).core
+    assert np.isfinite(core.lod95).mean() < 0.01
+    scene = plate(1.0, 4, STATIONS, positions=True)
+    core = deviation_step.run(scene, deviation_step.Params()).core
+    known = np.isfinite(core.lod95)
+    assert known.mean() > 0.9
+    assert core.distances.significant[known].mean() < 0.07
+
+
+def test_the_nearest_face_is_taken_and_its_clearance_is_the_distance_of_the_next():
+    mesh = trimesh.creation.box((200.0, 200.0, 20.0))
+    surface = mesh_distance.of_design(np.array(mesh.vertices), np.array(mesh.faces, np.int64))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 30.0)
+    curved = mesh_distance.of_surface(surface)
+    points = np.array([[97.0, 0.0, 9.5], [99.5, 0.0, 7.0], [0.0, 0.0, 8.0], [0.0, 0.0, -50.0], [101.0, 0.0, 12.0]])
+    seen = assignment.assigned(points, None, curved, grid)
+    np.testing.assert_allclose(seen.distance[:3], [-0.5, -0.5, -2.0], atol=1e-9)
+    np.testing.assert_allclose(surface.normals[seen.facet[:3]], [[0, 0, 1], [1, 0, 0], [0, 0, 1]], atol=1e-12)
+    np.testing.assert_allclose(seen.clearance[:3], [3.0, 3.0, 10.0], atol=1e-9)  # half of the thickness
+    assert seen.facet[3] == -1
+    assert not assignment.clear(seen, np.full(5, 2.0))[[0, 1, 3, 4]].any()
+    assert assignment.clear(seen, np.full(5, 2.0))[2]
+    # From below, the top is not visible: neither to a point that lies there, nor as what a point may be mistaken for.
+    below = assignment.assigned(points, np.tile([0.0, 0.0, -5000.0], (5, 1)), curved, grid)
+    assert surface.normals[below.facet[2], 2] == pytest.approx(-1.0)
+    assert not np.isfinite(below.clearance[2])
+
+
+def test_what_is_within_another_body_or_in_contact_with_it_is_enclosed():
+    def box(size, at):
+        return trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+
+    hollow = box((300, 300, 300), (0, 3000, 0))
+    hollow.invert()  # the cavity of the next
+    bodies = [box((2000, 100, 100), (0, 0, 0)), box((100, 100, 900), (0, 0, 430)), box((200, 100, 20), (900, 0, 60)),
+              box((320, 320, 320), (0, 3000, 0)), hollow]  # fmt: skip
+    mesh = trimesh.util.concatenate(bodies)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
+    surface = mesh_distance.of_design(vertices, faces)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 20.0)
+    points = np.array(
+        [[0, 0, 50], [500, 0, 50], [0, 50, 0], [0, 0, -20], [900, 0, 50], [900, 0, 50], [900, 0, 70], [150, 3000, 0]],
+        float,
+    )
+    normals = np.array(
+        [[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 0, -1], [0, 0, 1], [0, 0, -1], [0, 0, 1], [-1, 0, 0]], float
+    )
+    inside = enclosure.enclosed(points, normals, grid, surface.faces)
+    # Of the beam below the post; beside it; its side; the post's end; beam and plate in contact; the plate; the cavity.
+    np.testing.assert_array_equal(inside, [True, False, False, True, True, True, False, False])
+    opened = surface.faces[1:]  # a beam without one facet is no body
+    assert not enclosure.closed_bodies(opened)[:11].any()
+    assert enclosure.closed_bodies(opened)[11:].all()
