@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from processor.geometry import parallel, rigid
-from processor.model import Floats, Scan
+from processor.model import Floats, Ints, Scan
 from processor.stitching import three_point
 from processor.stitching.coarse import network, pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
@@ -50,6 +50,8 @@ class RegisteredScans:
     elsewhere: list[bool]  # whether the best candidate pose of each pair is not the adjusted one
     contradictions: list[Contradiction]  # of each scan's pose
     refuted: Floats  # (k,), see network.refuted
+    links: list[tuple[int, int]]  # pairs of scans that overlap, not contradicted by free space
+    groups: Ints  # (k,), see network.groups
 
 
 def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked) -> RegisteredScans:
@@ -80,6 +82,8 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked
         ],
         contradictions=contradictions.of_scans(cells, solution, GATES[0] * cells.size_mm),
         refuted=network.refuted(scores, len(scans), reference),
+        links=network.links(scores),
+        groups=network.groups(candidates, len(scans)),
     )
 
 

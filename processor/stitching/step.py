@@ -86,6 +86,8 @@ def _automatic(scans: Sequence[Scan], picked: Picked, reference: int, params: Pa
         ],
         contradictions=registered.contradictions,
         refuted=registered.refuted,
+        links=registered.links,
+        groups=registered.groups,
         estimated=(noise, solution.tau[0], solution.tau[1]),
         point_mm=noise,
     )

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, InputError, Reason, Scan, Scene, Status, reason
+from processor.model import NORMAL_95, Floats, InputError, Ints, Reason, Scan, Scene, Status, reason
 from processor.stitching import frames
 from processor.stitching.coarse.network import AMBIGUOUS
 from processor.stitching.fine import control_points, pair_checks
@@ -19,6 +19,7 @@ from processor.stitching.result import NAN, Closures, ControlPoints, Pairs, Proj
 
 CONTRARY = 0.25  # least share of the support that contradicts a pose; people and cars that move cause some
 LITTLE = 0.1  # overlap of both scans
+STRANGE = ("stitch.free-space", "stitch.little-overlap")  # of a scan of another place
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,8 @@ class Network:
     pose_scale_sd: Floats = field(default_factory=lambda: np.empty(0))  # (k,) of the scale in T; absent: it is fixed
     refuted: Floats = field(default_factory=lambda: np.empty(0))  # (k,), see :func:`network.refuted`
     contradictions: Sequence[Contradiction] = ()  # of each scan's pose by faces
+    links: Sequence[tuple[int, int]] | None = None  # see :func:`network.links`; None: not known
+    groups: Ints | None = None  # (k,), see :func:`network.groups`; None: not known
     estimated: tuple[float, float, float] = (NAN, NAN, NAN)  # noise, patches, ends
     unplaced: Sequence[Reason] = ()  # why each scan has no pose, where it has none
     by_control: Sequence[Reason | None] = ()  # contradictions of each scan's pose by control points
@@ -80,7 +83,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
     T_reference = rigid.with_origin(base @ network.T[reference], network.origins[reference])
     is_global = network.base is not None or not np.array_equal(T_reference, np.eye(4))
     frame = ProjectFrame.GLCS if is_global else ProjectFrame.PRCS
-    table = _scans(names, network, base, frame, params)
+    table = _scans(names, network, base, frame, reference, params)
     states = table.status
     status = Status.OK if set(states) == {Status.OK} else Status.PARTIAL
     if sum(state != Status.FAILED for state in states) < 2:
@@ -94,7 +97,7 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
     return Result(
         status=status,
         method=params.method,
-        reasons=(*network.reasons, *of_scans),
+        reasons=(*_strangers(names, network, table, reference), *network.reasons, *of_scans),
         reference=names[reference],
         scans=table,
         pairs=_pairs(names, network),
@@ -108,7 +111,9 @@ def result(scans: Sequence[Scan], network: Network, reference: int, params: Para
     )
 
 
-def _scans(names: Sequence[str], network: Network, base: Floats, frame: ProjectFrame, params: Params) -> Scans:
+def _scans(
+    names: Sequence[str], network: Network, base: Floats, frame: ProjectFrame, reference: int, params: Params
+) -> Scans:
     k = len(names)
     is_free = len(network.pose_scale_sd) > 0 and bool(np.nanmax(network.pose_scale_sd) > 0.0)
     T, T_rival, covariance = np.full((k, 4, 4), NAN), np.full((k, 4, 4), NAN), np.full((k, 6, 6), NAN)
@@ -131,6 +136,10 @@ def _scans(names: Sequence[str], network: Network, base: Floats, frame: ProjectF
         state, why = _assess(network, s, position_sd[s], rotation_sd[s], params)
         status.append(state)
         reasons.append(() if why is None else (why,))
+    unsure = tuple(name for name, state in zip(names, status, strict=True) if state == Status.AMBIGUOUS)
+    for s in _not_joined(network.links, status, reference):
+        status[s] = Status.AMBIGUOUS
+        reasons[s] = (reason("stitch.rests-on", scans=unsure) if unsure else reason("stitch.joins-contradicted"),)
     return Scans(
         name=tuple(names),
         status=tuple(status),
@@ -147,6 +156,40 @@ def _scans(names: Sequence[str], network: Network, base: Floats, frame: ProjectF
         from_frame=tuple(map(_socs, names)),
         to_frame=(str(frame),) * k,
     )
+
+
+def _not_joined(links: Sequence[tuple[int, int]] | None, status: Sequence[Status], reference: int) -> list[int]:
+    """Return the scans that are ok by themselves, but whose links lead to the reference only by way of ambiguous ones.
+
+    A repetitive structure may be placed wrongly in two halves, each of which is right by itself.
+    """
+    near: dict[int, set[int]] = {s: set() for s in range(len(status))}
+    for a, b in links or ():
+        near[a].add(b)
+        near[b].add(a)
+    reached, todo = {reference}, [reference]
+    while todo:
+        for s in near[todo.pop()] - reached:
+            reached.add(s)
+            if status[s] not in (Status.AMBIGUOUS, Status.FAILED):
+                todo.append(s)
+    return [] if links is None else [s for s, state in enumerate(status) if state == Status.OK and s not in reached]
+
+
+def _strangers(names: Sequence[str], network: Network, scans: Scans, reference: int) -> tuple[Reason, ...]:
+    """Name the scans that do not belong to the network of most; the reference where it is not of the largest group."""
+    if network.groups is None:
+        return ()
+    sizes = np.bincount(network.groups, minlength=len(names))
+    if sizes.max() > 1 and sizes[network.groups[reference]] < sizes.max():
+        out = np.flatnonzero(network.groups == network.groups[reference]).tolist()
+    else:
+        out = [s for s in range(len(names)) if _is_stranger(scans.status[s], scans.reasons[s])]
+    return (reason("stitch.not-of-network", scans=tuple(names[s] for s in out)),) if out else ()
+
+
+def _is_stranger(status: Status, reasons: Sequence[Reason]) -> bool:
+    return status == Status.FAILED or any(one.code in STRANGE for one in reasons)
 
 
 def _assess(

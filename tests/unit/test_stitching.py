@@ -138,6 +138,21 @@ def test_scans_of_different_places_are_never_called_ok():
     assert result.status != "ok"
 
 
+@pytest.mark.parametrize("reference", ["S1", "X"])
+def test_a_scan_of_another_place_is_named_first(reference):
+    """Also where it is the reference: the others agree with each other."""
+    _, scans = four(step_mrad=20.0)
+    room = (np.array([-2000.0, -9000.0, 0.0]), np.array([2500.0, 8000.0, 5200.0]))
+    things = ((np.array([-2000.0, 3000.0, 0.0]), np.array([-500.0, 4000.0, 2600.0])),)
+    other = stitch_clouds.scan(
+        "X", stitch_clouds.pose([0.0, 0.0, 1500.0], 0.0), 9, step_mrad=20.0, room=room, things=things
+    )
+    scene = Scene("two", "structure", (*scans, other))
+    result = stitching_step.run(scene, stitching_step.Params(reference=reference))
+    assert result.reasons[0].code == "stitch.not-of-network"
+    assert result.reasons[0].values["scans"] == ("X",)
+
+
 def test_scans_without_a_grid_are_registered():
     T, scans = four(grid=False)
     result = stitching_step.run(Scene("room", "structure", scans), stitching_step.Params(reference="S2"))

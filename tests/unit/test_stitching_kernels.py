@@ -4,7 +4,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from processor.stitching.coarse import face_index
-from processor.stitching.planes import hashing
+from processor.stitching.fine import correspondences
+from processor.stitching.planes import borders, extraction, hashing
 from processor.stitching.planes.samples import Patches
 
 
@@ -71,3 +72,32 @@ def test_nearest_patches_are_those_by_all_distances():
     J = np.hstack([np.cross((p - centre) / reach, m), m])
     np.testing.assert_allclose(H, J.T @ (w[:, None] * J), atol=1e-9)
     np.testing.assert_allclose(g, J.T @ (w * r), atol=1e-9)
+
+
+def test_points_next_to_the_edge_of_a_bar_are_left_out_without_a_grid():
+    """A bar's face 5 m away and its side face behind the edge: border points go, inner ones stay, sky is no border."""
+    angle = np.arange(-0.05, 0.05, 0.002)
+    a, e = (x.ravel() for x in np.meshgrid(angle, angle, indexing="ij"))
+    rays = np.stack([np.ones(len(a)), a, e], axis=1)
+    # The face ends at y = 100 mm; beyond, the rays meet its side face, which leads away.
+    side = a > 0.02
+    points = rays * np.where(side, 5000.0 + 60.0 * (a - 0.02) / 0.002, 5000.0)[:, None]
+    points += np.random.default_rng(0).normal(0.0, 0.5, len(points))[:, None] * rays
+    piece = np.where(a < 0.0301, 0, -1)  # the cube of the face holds the first points of the side face too
+    face = points[~side]
+    planes = extraction.planes_of(extraction.sums_of(face).sum(axis=0)[None])
+    clear = borders.inside(points, None, piece, planes)
+    assert not clear[side].any()
+    assert not clear[(a > 0.0181) & ~side].any()
+    inner = (a < 0.015) & (np.abs(e) < 0.045)
+    assert clear[inner].mean() > 0.9
+
+
+def test_pieces_that_scatter_by_more_than_the_noise_weigh_less():
+    rng = np.random.default_rng(1)
+    flat = np.column_stack([rng.uniform(-500.0, 500.0, (400, 2)), rng.normal(0.0, 1.0, 400)])
+    rough = flat * [1.0, 1.0, 3.0]
+    sums = np.stack([extraction.sums_of(points).sum(axis=0) for points in (flat, flat, rough, rough)])
+    excess = correspondences._excess(sums, np.full(4, 400.0), np.array([0, 0, 1, 1]), 2)
+    assert 1.0 <= excess[0] < 1.15
+    assert 8.0 < excess[1] < 10.0

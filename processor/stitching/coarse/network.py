@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from processor.geometry import rigid
-from processor.model import Floats
+from processor.model import Floats, Ints
 from processor.stitching.coarse import pairwise
 from processor.stitching.coarse.pairwise import ScanPatches, ScoredPose
 
@@ -37,14 +37,14 @@ class CoarsePoses:
 class Network:
     """All scans with the candidate poses of their pairs, and the poses T (k, 4, 4) of those placed so far.
 
-    The pose of a placed scan does not change any more: scores beside it are cached.
+    Scores of relative poses are cached.
     """
 
     scans: list[ScanPatches]
     candidates: Pairs
     T: Floats
     placed: list[int]
-    cache: dict[tuple[int, int, bytes], ScoredPose] = field(default_factory=dict)
+    cache: dict[tuple[int, int, bytes, bytes], ScoredPose] = field(default_factory=dict)
 
     def poses_beside(self, i: int, j: int) -> list[tuple[Floats, float]]:
         """Return the candidate poses of scan j in scan i with their scores, in either order of the pair."""
@@ -54,7 +54,7 @@ class Network:
 
     def score_beside(self, i: int, j: int, pose: Floats) -> ScoredPose:
         """Score a pose (4, 4) of scan j beside the placed scan i."""
-        key = (i, j, pose.tobytes())
+        key = (i, j, self.T[i].tobytes(), pose.tobytes())
         if key not in self.cache:
             self.cache[key] = pairwise.score_pose(self.scans[i], self.scans[j], rigid.invert(self.T[i]) @ pose)
         return self.cache[key]
@@ -74,7 +74,91 @@ def place(scans: list[ScanPatches], candidates: Pairs, reference: int) -> Coarse
         j, pose = best
         T[j] = pose
         network.placed.append(j)
-    return _rated(network, reference)
+    coarse = _rated(network, reference)
+    for _ in range(k):
+        moves = _moves(network, coarse, reference)
+        better = max(moves, key=lambda move: move.ratio, default=None)
+        if better is None or better.ratio <= 1.0:
+            return _with_moves(coarse, moves)
+        for j in better.scans:
+            T[j] = better.M @ T[j]
+        coarse = _rated(network, reference)
+    return _with_moves(coarse, moves)
+
+
+@dataclass(frozen=True)
+class Move:
+    """A motion M (4, 4) of some scans together, and the score of what lies across by that without the motion."""
+
+    scans: list[int]
+    M: Floats
+    ratio: float
+
+
+def _moves(network: Network, coarse: CoarsePoses, reference: int) -> list[Move]:
+    """Return the motions that rival poses of single pairs suggest, each of the scans that move along best.
+
+    In a hall of nearly equal bays not one scan alone may stand a bay off, but all those beyond it too: beside these,
+    any other pose of a single one is contradicted. Scans that are ambiguous already are not tried again.
+    """
+    moves = list[Move]()
+    ambiguous = set(np.flatnonzero(coarse.rivalry > AMBIGUOUS).tolist())
+    for (i, j), poses in network.candidates.items():
+        if not {i, j} <= set(network.placed):
+            continue
+        now = network.score_beside(i, j, network.T[j])
+        for pose in poses:
+            wanted = network.T[i] @ pose.T_a_b
+            if {i, j} & ambiguous or pose.score <= AMBIGUOUS * now.score or network.same(wanted, network.T[j], j):
+                continue
+            move = _followers(network, i, j, wanted @ rigid.invert(network.T[j]))
+            if reference in move.scans:
+                rest = [s for s in network.placed if s not in move.scans]
+                move = Move(scans=rest, M=rigid.invert(move.M), ratio=move.ratio)
+            moves.append(move)
+            if move.ratio > AMBIGUOUS:
+                ambiguous |= set(move.scans)
+    return moves
+
+
+def _followers(network: Network, i: int, j: int, M: Floats) -> Move:
+    """Return the motion of j by M (4, 4) while i stays, with the scans that follow as the score across rises."""
+    size = len(network.scans)
+    before, after = np.zeros((size, size, 3)), np.zeros((size, size, 3))
+    for a in network.placed:
+        for b in set(network.placed) - {a}:
+            for table, pose in ((before, network.T[b]), (after, M @ network.T[b])):
+                scored = network.score_beside(a, b, pose)
+                supports = scored.overlap > LEAST_OVERLAP
+                table[a, b] = (scored.agree, scored.against, scored.agree / scored.overlap) if supports else (
+                    0.0, scored.against, 0.0
+                )  # fmt: skip
+
+    def ratio(moving: list[int]) -> float:
+        across = np.ix_([s for s in network.placed if s not in moving], moving)
+        first, second = (pairwise.score(*table[across].sum(axis=(0, 1))) for table in (after, before))
+        return first / max(second, 1e-12)
+
+    moving, rest = [j], [s for s in network.placed if s not in (i, j)]
+    best = ratio(moving)
+    while rest:
+        ratios = [ratio([*moving, s]) for s in rest]
+        row = int(np.argmax(ratios))
+        if ratios[row] <= best:
+            break
+        best = ratios[row]
+        moving.append(rest.pop(row))
+    return Move(scans=moving, M=M, ratio=best)
+
+
+def _with_moves(coarse: CoarsePoses, moves: list[Move]) -> CoarsePoses:
+    """Enter motions of groups of scans as rivals of the poses of all scans that move."""
+    rivalry, T_rival = coarse.rivalry.copy(), coarse.T_rival.copy()
+    for move in moves:
+        for s in move.scans:
+            if move.ratio > rivalry[s]:
+                rivalry[s], T_rival[s] = move.ratio, move.M @ coarse.T[s]
+    return replace(coarse, rivalry=rivalry, T_rival=T_rival)
 
 
 def _most_certain(network: Network) -> tuple[int, Floats] | None:
@@ -150,6 +234,24 @@ def joint_score(network: Network, j: int, others: list[int], pose: Floats) -> fl
             agree += scored.agree
             total += scored.agree / scored.overlap
     return pairwise.score(agree, against, total)
+
+
+def groups(candidates: Pairs, count: int) -> Ints:
+    """Return the group (count,) of each scan: those joined by pairs with a pose that free space does not contradict."""
+    group: Ints = np.arange(count)
+    for (i, j), poses in candidates.items():
+        if poses and poses[0].score > pairwise.SURE:
+            group[group == group[j]] = group[i]
+    return group
+
+
+def links(poses: dict[tuple[int, int], ScoredPose]) -> list[tuple[int, int]]:
+    """Return the pairs of scans that overlap and of which free space does not contradict the adjusted pose."""
+    return [
+        pair
+        for pair, pose in poses.items()
+        if pose.overlap > LEAST_OVERLAP and pose.against <= pairwise.LITTLE_AGAINST * pose.agree
+    ]
 
 
 def refuted(poses: dict[tuple[int, int], ScoredPose], count: int, reference: int) -> Floats:

@@ -173,8 +173,9 @@ def score_pose(a: ScanPatches, b: ScanPatches, T_a_b: Floats, rough: bool = Fals
         agree += float(weight[match].sum())
         total += float(weight.sum())
         if other.cloud.free_space is not None:
-            rest = rigid.apply(T, patches.points[~match])
-            against += float(weight[~match] @ other.cloud.free_space.contains(rest, margin_mm))
+            rest, normals = rigid.apply(T, patches.points[~match]), patches.normals[~match] @ T[:3, :3].T
+            sure = weight[~match] * other.cloud.free_space.resolved(rest, normals, a.side_mm)
+            against += float(sure @ other.cloud.free_space.contains(rest, margin_mm))
     return ScoredPose(T_a_b, agree, against, agree / max(total, 1e-12))
 
 

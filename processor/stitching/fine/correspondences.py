@@ -22,6 +22,7 @@ ACROSS_SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # share of the noise th
 FLAT_SIGMAS, SLACK_SIGMAS = 1.6, 0.5  # scatter of a merged piece: by the noise across it, and beside that
 LEAST_WEIGHT_SHARE = 0.05  # noise across a face seen at grazing incidence, of the range noise
 MOST_SCANS = 4096
+PRIOR_FREEDOMS = 20.0  # with which a piece's points are taken to scatter as the noise model states
 
 
 @dataclass(frozen=True)
@@ -154,10 +155,25 @@ def _blocks(cells: CellTable, rows: Ints, piece: Ints) -> Blocks:
     enough = count >= LEAST_POINTS
     _, number = np.unique(piece[first][enough], return_inverse=True)
     number = number.ravel()
+    pieces = int(number.max()) + 1 if len(number) else 0
+    excess = _excess(weighted[enough], count[enough], number, pieces)
     return Blocks(
-        piece=number, scan=scan[first][enough], sums=weighted[enough], count=count[enough],
-        kind=np.zeros(len(number), np.int64), pieces=int(number.max()) + 1 if len(number) else 0,
+        piece=number, scan=scan[first][enough], sums=weighted[enough] / excess[number][:, None], count=count[enough],
+        kind=np.zeros(len(number), np.int64), pieces=pieces,
     )  # fmt: skip
+
+
+def _excess(weighted: Floats, count: Floats, piece: Ints, pieces: int) -> Floats:
+    """Return the variance (pieces,) of the points about the planes of their scans, by that of the noise; at least 1.
+
+    Rough ground, corroded steel and grazing rays scatter by more than the noise model has it. Taken as being as good
+    as the rest, such pieces would have too much weight, and the poses too small a covariance.
+    """
+    planes = extraction.planes_of(weighted)
+    freedoms = np.bincount(piece, count - 3.0, pieces)
+    square = np.bincount(piece, planes.variance[:, 0] * planes.count, pieces)
+    excess: Floats = np.maximum((square + PRIOR_FREEDOMS) / (freedoms + PRIOR_FREEDOMS), 1.0)
+    return excess
 
 
 def direction_class(normals: Floats) -> Ints:

@@ -2,8 +2,9 @@
 
 A cube at the border of a face also holds the first millimetres of the adjacent face, which lie behind it. They bias the
 plane: bars of a truss come out 0.02 mm too thin, ten times the effect of the point noise. A point is therefore left out
-if a neighbour on the scanner's grid lies off the face. This criterion depends on the neighbour's position and not on
-the point's own noise, so that it introduces no bias.
+if a neighbour as seen by the scanner lies off the face. This criterion depends on the neighbour's position and not on
+the point's own noise, so that it introduces no bias. Neighbours are those on the scanner's grid, or without one those
+at the least angles.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.spatial import cKDTree
 
 from processor.model import Floats, Ints
 from processor.stitching.planes.extraction import Planes
@@ -18,15 +20,21 @@ from processor.stitching.planes.extraction import Planes
 ON_SIGMAS = 3.0  # a point this close to a plane lies on it
 LEAST_SHARE = 0.5  # of a piece's points that must remain
 BEYOND = 0.05  # of the range: a point this far behind the plane is not on a side face of the same bar
+NEIGHBOURS = 8  # in angle, where there is no grid
+CHUNK = 1 << 18
 
 
-def inside(points: Floats, grid: Ints, piece: Ints, planes: Planes) -> npt.NDArray[np.bool_]:
+def inside(points: Floats, grid: Ints | None, piece: Ints, planes: Planes) -> npt.NDArray[np.bool_]:
     """Return which points (n,) lie clear of the borders of their planar piece.
 
-    ``points`` (n, 3) are in the scanner's frame, ``grid`` is their scan grid, ``piece`` (n,) a row of ``planes`` or -1.
-    A piece that would lose most of its points, such as a bar hit by few rays, keeps them all.
+    ``points`` (n, 3) are in the scanner's frame, ``grid`` is their scan grid, if known, ``piece`` (n,) a row of
+    ``planes`` or -1. On a grid, a piece that would lose most of its points, such as a bar hit by few rays, keeps them
+    all: the ends of its faces determine the poses. Without a grid there are no ends, and such pieces alone, all biased
+    to one side, would shift a scan by tenths of a millimetre.
     """
     limit = ON_SIGMAS * np.sqrt(planes.variance[:, 0])
+    if grid is None:
+        return _clear_in_angle(points, piece, planes, limit)
     clear = np.zeros(len(points), np.bool_)
     clear_of_borders(grid, np.ascontiguousarray(points), piece, planes.mean, planes.normal, limit, clear)
     count = len(planes.count)
@@ -35,6 +43,24 @@ def inside(points: Floats, grid: Ints, piece: Ints, planes: Planes) -> npt.NDArr
     few = np.bincount(piece[clear], minlength=count) < LEAST_SHARE * whole
     selected: npt.NDArray[np.bool_] = clear | (on_piece & few[piece])
     return selected
+
+
+def _clear_in_angle(points: Floats, piece: Ints, planes: Planes, limit: Floats) -> npt.NDArray[np.bool_]:
+    """Mark points (n,) on the plane of their piece whose neighbours in angle lie on it too, or far behind it."""
+    reach = np.linalg.norm(points, axis=1)
+    rays = points / np.maximum(reach, 1e-9)[:, None]
+    tree = cKDTree(rays)
+    clear = np.zeros(len(points), np.bool_)
+    on = np.flatnonzero(piece >= 0)
+    for start in range(0, len(on), CHUNK):
+        rows = on[start : start + CHUNK]
+        near = np.minimum(tree.query(rays[rows], NEIGHBOURS + 1)[1], len(points) - 1)
+        f = piece[rows]
+        off = np.einsum("nki,ni->nk", points[near] - planes.mean[f][:, None], planes.normal[f])
+        own = np.abs(np.einsum("ni,ni->n", points[rows] - planes.mean[f], planes.normal[f])) < limit[f]
+        good = (np.abs(off) < limit[f][:, None]) | (np.abs(off) > BEYOND * reach[rows][:, None])
+        clear[rows] = own & good.all(axis=1)
+    return clear
 
 
 @njit(cache=True, nogil=True)

@@ -14,6 +14,7 @@ PIXELS = 320  # at most along each side of the six faces of the cube: 0.28 degre
 FEWEST_PIXELS = 40
 SEEN_NEIGHBOURS = 5  # of 3 x 3 pixels, that must hold rays for a point to count as lying in free space
 FILLED = 0.85  # share of the pixels with points that must have so many neighbours: else pixels are too small
+RAYS = 2.0  # across a patch, that are sure to hit it
 UNANSWERED = 0.3  # weight of a point in a direction of rays without a return: bare steel may return none as well
 
 
@@ -46,6 +47,18 @@ class FreeSpace:
         weight = np.zeros(len(points))
         weigh_free(np.ascontiguousarray(points), self.near, tolerance_mm, slope, SEEN_NEIGHBOURS, UNANSWERED, weight)
         return weight
+
+    def resolved(self, points: Floats, normals: Floats, side_mm: float) -> Floats:
+        """Return the share (n,), 0 to 1, of patches of side ``side_mm`` that the rays cannot have missed.
+
+        Two rays across a patch in both directions are sure to hit it; a column far away or a floor at grazing incidence
+        may lie between the rays. ``points`` and ``normals`` (n, 3) are in the scanner's frame.
+        """
+        reach = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
+        rays = side_mm / (RAYS * (0.5 * np.pi / self.near.shape[1]) * reach)
+        cosine = np.abs(np.einsum("ni,ni->n", points, normals)) / reach
+        share: Floats = np.minimum(rays, 1.0) * np.minimum(rays * cosine, 1.0)
+        return share
 
 
 @njit(cache=True, nogil=True)

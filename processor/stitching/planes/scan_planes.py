@@ -57,11 +57,13 @@ def extract(scan: Scan, cell_mm: float = 0.0) -> Cloud:
     sigma = _scatter(cells, sums, size, scan.sigma_mm)
     piece, level = extraction.flat_pieces(cells, sums, size, LIMIT_SIGMAS * sigma, LEVELS)
     on_grid = known and len(scan.grid_row) > 0
+    row, column = np.empty(0, np.int64), np.empty(0, np.int64)
     if on_grid:
         row, column = scan.grid_row[finite].astype(np.int64), scan.grid_column[finite].astype(np.int64)
+    if known:
         on_piece = np.flatnonzero(piece >= 0)
         rough = extraction.planes_of(hashing.summed(sums[on_piece], piece[on_piece], len(level)))
-        clear = borders.inside(points, grid_of(row, column), piece[of_point], rough)
+        clear = borders.inside(points, grid_of(row, column) if on_grid else None, piece[of_point], rough)
         sums = hashing.sums_of_points(points[clear], of_point[clear], len(first))
     merged, piece_of_merged = _merged(cells, sums, piece, level)
     planes = extraction.planes_of(hashing.summed(merged, piece_of_merged, len(level)))
