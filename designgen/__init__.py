@@ -54,8 +54,8 @@ def make(
     (5, 4, 4)
     """
     # Imported here, so that the package itself loads at once.
-    from designgen import recipes
+    from designgen import recipe_files
     from designgen.scenes import make as scenes
 
-    name, content = recipes.load(recipe)
-    return scenes.make(name, recipes.overridden(content, settings or {}), seed)
+    name, content = recipe_files.load(recipe)
+    return scenes.make(name, recipe_files.overridden(content, settings or {}), seed)

@@ -7,12 +7,12 @@ cluster, or a run that was killed and started again has made it.
 
 from __future__ import annotations
 
-import copy
 import csv
 import hashlib
 import io
 import itertools
 import json
+import math
 import os
 import re
 import sys
@@ -23,7 +23,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from designgen import __version__, recipes
+from designgen import __version__, recipe_files
 from processor.jobs import process, runner
 from processor.jobs.child import Loss, Lost
 from processor.jobs.software import check_same, versions
@@ -43,7 +43,7 @@ LOSSES = {
 }
 
 
-def make_scene(path: Path, name: str, recipe: recipes.Recipe, seed: int | None) -> tuple[int, int, int]:
+def make_scene(path: Path, name: str, recipe: recipe_files.Recipe, seed: int | None) -> tuple[int, int, int]:
     """Make the scene of a recipe with its truth and write it to ``path``; returns seed, number of scans, and of points.
 
     ``seed`` replaces the recipe's. The same recipe and seed give the same bytes, whatever the time, host and number of
@@ -67,7 +67,7 @@ def software() -> dict[str, str]:
     return {"designgen": __version__, **versions(SOFTWARE)}
 
 
-def _provenance(name: str, recipe: recipes.Recipe, seed: int, software: dict[str, str]) -> dict[str, Any]:
+def _provenance(name: str, recipe: recipe_files.Recipe, seed: int, software: dict[str, str]) -> dict[str, Any]:
     return {"software": software, "recipe": name, "parameters": recipe, "seed": seed}
 
 
@@ -91,11 +91,11 @@ class Job:
     folder: str  # absolute, as a cluster's workers have another working directory
     file: str
     recipe: str
-    parameters: recipes.Recipe
+    parameters: recipe_files.Recipe
     seed: int
     varied: tuple[str, ...]  # values as typed, in the order of their keys
     software: dict[str, str]
-    known: Content | None = None  # from the index of an earlier run
+    indexed: Content | None = None  # of the file in the index of an earlier run
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def _split(values: str, text: str) -> list[str]:
 
 
 def plan(
-    folder: Path, name: str, recipe: recipes.Recipe, varied: dict[str, list[str]], first: int | None, count: int
+    folder: Path, name: str, recipe: recipe_files.Recipe, varied: dict[str, list[str]], first: int | None, count: int
 ) -> list[Job]:
     """List the jobs of ``count`` seeds from ``first`` (default: the recipe's) times all varied values.
 
@@ -171,9 +171,7 @@ def plan(
     first = recipe.get("seed", 0) if first is None else first
     if not isinstance(first, int) or isinstance(first, bool) or not 0 <= first <= MOST_SEED - count:
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0 and below 2^63, got {first!r}")
-    combinations = 1
-    for values in varied.values():
-        combinations *= len(values)
+    combinations = math.prod(len(values) for values in varied.values())
     if count * combinations > MOST_SCENES:
         raise UsageError(
             f"{count:,} seed(s) of {combinations:,} combination(s) are {count * combinations:,} scenes; "
@@ -185,15 +183,12 @@ def plan(
     for seed in range(first, first + count):
         for combination in itertools.product(*varied.values()):
             settings = [f"{key}={value}" for key, value in zip(varied, combination, strict=True)]
-            # A copy, as settings of inner sections would change the recipe of the other jobs.
-            parameters = recipes.overridden(copy.deepcopy(recipe), settings)
-            file = f"{stem}-{len(jobs) + 1:05d}-seed{seed}.h5"
             jobs.append(
                 Job(
                     folder=place,
-                    file=file,
+                    file=f"{stem}-{len(jobs) + 1:05d}-seed{seed}.h5",
                     recipe=name,
-                    parameters=parameters,
+                    parameters=recipe_files.overridden(recipe, settings),
                     seed=seed,
                     varied=combination,
                     software=installed,
@@ -239,12 +234,12 @@ def _earlier(path: Path, job: Job) -> Content | str:
         provenance = store.read_provenance(path)
     except InputError:
         return "is damaged or no scene"
-    wanted = json.loads(json.dumps(_provenance(job.recipe, job.parameters, job.seed, job.software)))
-    if other := [key for key in wanted if provenance.get(key) != wanted[key]]:
-        return f"was made with other {' and '.join(other)}"
+    expected = json.loads(json.dumps(_provenance(job.recipe, job.parameters, job.seed, job.software)))
+    if different := [key for key in expected if provenance.get(key) != expected[key]]:
+        return f"was made with other {' and '.join(different)}"
     digest = _sha256(path)
-    if job.known is not None:
-        return job.known if digest == job.known.sha256 else "is damaged (not the bytes that the index has)"
+    if job.indexed is not None:
+        return job.indexed if digest == job.indexed.sha256 else "is damaged (not the bytes that the index has)"
     if problems := store.problems(path):
         return f"is damaged ({problems[0]})"
     return _content(path, digest)
@@ -282,16 +277,16 @@ def make_many(
     busy = f"{folder}: another designgen is making scenes here; wait for it or stop it"
     try:
         with (
-            runner.executor(cluster, processes, _say) as executor,
+            runner.executor(cluster, processes, print_error_line) as executor,
             runner.stoppable() as check_stop,
             runner.locked(folder, busy),
         ):
-            known = _read_index(folder / INDEX)
+            indexed = _read_index(folder / INDEX)
             # There is no index until all is done: an older one would list scenes that are being replaced.
             (folder / INDEX).unlink(missing_ok=True)
             _remove_leftovers(folder)
             _report_strangers(folder, jobs)
-            jobs = [replace(job, known=known.get(job.file)) for job in jobs]
+            jobs = [replace(job, indexed=indexed.get(job.file)) for job in jobs]
             try:
                 with closing(executor.run(partial(process.in_process, run_job), jobs, check_stop)) as results:
                     outcomes = _outcomes(results, len(jobs))
@@ -305,7 +300,8 @@ def make_many(
     return _summary(folder, jobs, outcomes)
 
 
-def _say(line: str) -> None:
+def print_error_line(line: str) -> None:
+    """Write one line on standard error, above a progress bar, with its control characters replaced."""
     from tqdm import tqdm
 
     tqdm.write("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line), file=sys.stderr)
@@ -322,10 +318,10 @@ def _outcomes(results: runner.Results[Job, Outcome | Lost], total: int) -> dict[
                 outcome = Outcome(None, reason_of(result)) if isinstance(result, Lost) else result
                 outcomes[job.file] = outcome
                 if outcome.replaced:
-                    _say(f"{job.file}: {outcome.replaced}")
+                    print_error_line(f"{job.file}: {outcome.replaced}")
                 bar.update()
     except BaseException:
-        _say(f"stopped: {len(outcomes)} of {total} scene(s) are done; run again to go on")
+        print_error_line(f"stopped: {len(outcomes)} of {total} scene(s) are done; run again to go on")
         raise
     return outcomes
 
@@ -368,7 +364,7 @@ def _report_strangers(folder: Path, jobs: Sequence[Job]) -> None:
     ours = {job.file for job in jobs}
     strangers = sorted(p.name for p in folder.iterdir() if SCENE_FILE.fullmatch(p.name) and p.name not in ours)
     if strangers:
-        _say(f"{folder}: {len(strangers)} scene(s) of other runs are left as they are, e.g. {strangers[0]}")
+        print_error_line(f"{folder}: {len(strangers)} scene(s) of other runs are left as they are, e.g. {strangers[0]}")
 
 
 def _present(folder: Path, outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
@@ -380,15 +376,15 @@ def _present(folder: Path, outcomes: dict[str, Outcome]) -> dict[str, Outcome]:
 
 def _read_index(path: Path) -> dict[str, Content]:
     """Return contents by file name from the index of an earlier run; empty if there is none that can be read."""
-    known = {}
+    contents = {}
     try:
         for row in csv.DictReader(io.StringIO(path.read_text("utf-8"), newline="")):
             with suppress(KeyError, TypeError, ValueError):  # of a failed scene, or edited
                 content = Content(int(row["scans"]), int(row["points"]), row["scene_hash"], row["sha256"])
-                known[row["file"]] = content
+                contents[row["file"]] = content
     except (OSError, UnicodeDecodeError, csv.Error):
         return {}
-    return known
+    return contents
 
 
 def _write_index(path: Path, jobs: Sequence[Job], keys: Sequence[str], outcomes: dict[str, Outcome]) -> None:

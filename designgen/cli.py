@@ -25,12 +25,12 @@ def commands() -> None:
 @commands.command("list")
 def list_() -> None:
     """List the types of components and the recipes, a line each."""
-    from designgen import recipes
+    from designgen import recipe_files
 
     names = [module.name for module in pkgutil.iter_modules(designs.__path__)]
     modules = {name: importlib.import_module(f"designgen.designs.{name}") for name in names}
     types = {name: module.ABOUT for name, module in modules.items() if hasattr(module, "ABOUT")}
-    named = {name: recipe["about"] for name, recipe in recipes.named().items()}
+    named = {name: recipe["about"] for name, recipe in recipe_files.named().items()}
     width = max(map(len, [*types, *named]))
     for heading, lines in (("component types", types), ("recipes", named)):
         click.echo(heading)
@@ -72,10 +72,10 @@ def make(
     With --count or --vary, make several scenes in a folder with an index.csv. A second run keeps complete scenes.
     Exit codes: 0 done, 1 some scenes failed (reasons are in the index), 2 all failed or wrong usage, 3 bad input.
     """
-    from designgen import batch, recipes
+    from designgen import batch, recipe_files
 
-    name, loaded = recipes.load(recipe)
-    loaded = recipes.overridden(loaded, settings)
+    name, loaded = recipe_files.load(recipe)
+    loaded = recipe_files.overridden(loaded, settings)
     many = count is not None or bool(vary)
     batch.check_usage(output, settings, vary, many=many, jobs=jobs, cluster=cluster)
     if many:

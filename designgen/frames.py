@@ -14,6 +14,12 @@ def rigid(R: Floats, t: Floats) -> Floats:
     return T
 
 
+def inverse(T: Floats) -> Floats:
+    """Return the inverse of a rigid transform (4, 4)."""
+    R = T[:3, :3].T
+    return rigid(R, -R @ T[:3, 3])
+
+
 def translation(t: Floats) -> Floats:
     """Return the transform (4, 4) of a translation (3,)."""
     return rigid(np.eye(3), t)

@@ -11,14 +11,19 @@ import numpy as np
 from processor.model import Floats, Ints
 
 
+def records(columns: Mapping[str, Any]) -> np.ndarray:
+    """Return columns (n,) by name as records (n,) in little-endian order."""
+    result = np.empty(len(columns["x"]), [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
+    for name, column in columns.items():
+        result[name] = column
+    return result
+
+
 def write_columns(path: Path, columns: Mapping[str, Any], faces: Ints | None = None) -> None:
     """Write vertices from columns (n,) by name, with their types, and triangles (f, 3)."""
     from plyfile import PlyData, PlyElement
 
-    vertex = np.empty(len(columns["x"]), [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
-    for name, column in columns.items():
-        vertex[name] = column
-    elements = [PlyElement.describe(vertex, "vertex")]
+    elements = [PlyElement.describe(records(columns), "vertex")]
     if faces is not None:
         face = np.empty(len(faces), dtype=[("vertex_indices", "<i4", (3,))])
         face["vertex_indices"] = faces

@@ -12,10 +12,10 @@ from processor.model import Floats
 POSE_REACH_MM = 5000.0  # largest offset of a scan's frame along each axis
 
 
-def generator(seed: int, purpose: str) -> np.random.Generator:
-    """Return the generator of a seed and purpose: draws for one purpose do not change those for another."""
+def generator(seed: int, purpose: str, *numbers: int) -> np.random.Generator:
+    """Return the generator of a seed, purpose and ``numbers`` from 1: draws for one do not change those for another."""
     digest = hashlib.sha256(purpose.encode()).digest()
-    return np.random.default_rng([seed, int.from_bytes(digest[:8], "little")])
+    return np.random.default_rng([seed, int.from_bytes(digest[:8], "little"), *numbers])
 
 
 def random_pose(rng: np.random.Generator) -> Floats:
@@ -33,11 +33,11 @@ def random_pose(rng: np.random.Generator) -> Floats:
 
 def small_motion(rng: np.random.Generator, turn_rad: float, shift_mm: float) -> Floats:
     """Draw a small transform (4, 4), by the standard deviations of rotation about and translation along each axis."""
-    turn, shift = turn_rad * rng.standard_normal(3), shift_mm * rng.standard_normal(3)
-    angle = float(np.linalg.norm(turn))
+    rotation, shift = turn_rad * rng.standard_normal(3), shift_mm * rng.standard_normal(3)
+    angle = float(np.linalg.norm(rotation))
     T = np.eye(4)
     if angle > 0.0:
-        x, y, z = turn / angle
+        x, y, z = rotation / angle
         K = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         T[:3, :3] += np.sin(angle) * K + (1.0 - np.cos(angle)) * K @ K
     T[:3, 3] = shift

@@ -33,6 +33,6 @@ def on_sphere(number: int) -> Floats:
     pair, second = divmod(number, 2)
     # The start 3/16 and the turn 3/8 were chosen by a search: they cover most of the sides and ends of long boxes.
     height = 1.0 - (van_der_corput(pair) + 0.1875) % 1.0
-    level, turn = np.sqrt(1.0 - height**2), 0.75 * np.pi * pair
-    unit = np.array([height, level * np.cos(turn), level * np.sin(turn)])
+    radius, angle = np.sqrt(1.0 - height**2), 0.75 * np.pi * pair
+    unit = np.array([height, radius * np.cos(angle), radius * np.sin(angle)])
     return -unit if second else unit

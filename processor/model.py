@@ -514,6 +514,13 @@ class DefectTruth(Checked):
 
 
 @dataclass(frozen=True)
+class PoseTruth(Checked):
+    """Where the design lies in a scene whose scans are in another frame than the design."""
+
+    T_design_project: Floats = column(4, 4)
+
+
+@dataclass(frozen=True)
 class Truth(Checked):
     """What the generator knows and no step may see."""
 
@@ -526,6 +533,7 @@ class Truth(Checked):
     defects: DefectTruth | None = None
     stations: StationTruth | None = None
     as_built: AsBuilt | None = None
+    pose: PoseTruth | None = newer()  # without it the scans are in the design's frame
 
 
 # --- checks ---------------------------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from processor.model import InputError, Scene, StepRun, UsageError
+from processor.model import InputError, Scene, Status, StepRun, UsageError, reason
 from processor.progress import stage
 from processor.version import __version__
 
@@ -254,6 +254,10 @@ def execute(
             needs: dict[str, Any] = {}
             if job.module.NEEDS:
                 needs["earlier"] = {name: answers[name] for name in job.module.NEEDS if name in answers}
+            if stopping := _stopping(job, answers):
+                runs.append(_stopped(job, stopping, log))
+                answers.setdefault(job.step, runs[-1].result)
+                continue
             if job.step in answers and getattr(job.module, "COMPARES", False):
                 needs["answer_given"] = answers[job.step]
             if getattr(job.module, "KEEPS", False):
@@ -269,6 +273,22 @@ def execute(
         "parameters": _parameters(runs),
     }
     return Execution(scene, tuple(runs), provenance, path if piecewise else None)
+
+
+def _stopping(job: Job, answers: Mapping[str, Any]) -> str:
+    """Name the step that places the scans, if a job needs it and it failed or is ambiguous; else nothing."""
+    modules = step_modules()
+    placing = [name for name in job.module.NEEDS if name in answers and getattr(modules[name], "PLACES", False)]
+    return next((name for name in placing if answers[name].status in (Status.FAILED, Status.AMBIGUOUS)), "")
+
+
+def _stopped(job: Job, step: str, log: Callable[[str], None]) -> StepRun:
+    """Return the result of a step that does not run, as the scans have no sure poses."""
+    result = job.module.Result(
+        status=Status.FAILED, method=job.params.method, reasons=(reason("pipeline.scans-not-placed", step=step),)
+    )
+    log(f"{job.step} ({job.params.method}): not run, {step} failed or is ambiguous")
+    return StepRun(job.step, job.params.method, as_json(dataclasses.asdict(job.params)), result)
 
 
 def _run(path: Path, scene: Scene, job: Job, given: Mapping[str, Any], log: Callable[[str], None]) -> StepRun:

@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline, readers
 from processor.model import Scene, StepRun, UsageError
@@ -51,13 +51,13 @@ def test_every_reader_says_what_it_reads():
     assert all(callable(module.read) for module in formats.values())
 
 
-@pytest.mark.parametrize("name", recipes.named())
+@pytest.mark.parametrize("name", recipe_files.named())
 def test_every_recipe_makes_a_scene_that_goes_through_the_store(name, tmp_path):
-    recipe = recipes.load(name)[1]
+    recipe = recipe_files.load(name)[1]
     if recipe.get("frame", {}).get("nodes_x", 0) > 10:
         recipe["frame"] |= {"nodes_x": 5, "nodes_y": 6, "shape": "flat"}
     coarse = {"rays": "scan.step_mrad=15", "surface": "scan.spacing_mm=60"}[recipe["scan"]["mode"]]
-    recipe = recipes.overridden(recipe, [coarse])
+    recipe = recipe_files.overridden(recipe, [coarse])
     assert len(recipe["about"]) > 20
     scene, truth = make(name, recipe)
     store.write_scene(tmp_path / "s.h5", scene, truth, {})

@@ -1,5 +1,6 @@
 """README and docs: their commands exist and run, their links lead somewhere, their tables say what the code says."""
 
+import dataclasses
 import itertools
 import json
 import re
@@ -16,6 +17,7 @@ import designgen.cli
 import processor.cli.main
 from docs import make_parameters
 from processor import pipeline
+from processor.evaluation import truth_json
 from processor.limits import standards
 from processor.scan_folder import folder
 from processor.scan_folder.folder import read_input
@@ -275,7 +277,11 @@ def test_the_page_of_the_scan_folder_names_every_key():
     for key in (*folder.KEYS, *folder.SCAN_KEYS):
         assert re.search(rf"`(\[+)?{key}(\]+)?`", text), key
     examples = re.findall(r"```json\n(.*?)```", text, flags=re.DOTALL)
-    assert [sorted(json.loads(example))[0] for example in examples] == ["components", "kind", "S1"]
+    assert [sorted(json.loads(example))[0] for example in examples] == ["components", "kind", "S1", "format"]
+    truth = text.split("## truth.json")[1].split("## Results")[0]
+    for kind, record in truth_json.RECORDS.items():
+        for name in (kind, *(field.name for field in dataclasses.fields(record))):
+            assert kind == "as_built" or f"`{name}`" in truth, (kind, name)
 
 
 def test_the_runner_installs_what_the_check_asks_for():

@@ -14,8 +14,8 @@ import numpy as np
 
 from designgen.checks import expect
 from designgen.designs import plate_row
-from designgen.designs.patch import Bools, Displacement, Patch
-from designgen.designs.structure import Box, Component
+from designgen.designs.box_and_tube import Box, Component
+from designgen.designs.patch import Bools, Displacement, Patch, outside
 from processor.model import Floats, UsageError
 
 CLASSES = (
@@ -142,12 +142,17 @@ def _bumped(kind: str, params: Params, form: plate_row.Params, shares: tuple[flo
     pit = kind == "pit"
     radius = params.pit_radius_mm if pit else params.dent_radius_mm
     depth = params.sized("pit_depth_mm" if pit else "dent_depth_mm") * (-1.0 if kind == "bulge" else 1.0)
-    middle = _middle(shares, extent(form), (radius, radius))
+    a, b = _middle(shares, extent(form), (radius, radius))
     area = np.pi * radius**2
+
+    def height(x: Floats) -> Floats:
+        result: Floats = -depth * (1.0 - np.minimum(((x[:, 0] - a) ** 2 + (x[:, 1] - b) ** 2) / radius**2, 1.0)) ** 2
+        return result
+
     return Defect(
         kind=kind,
-        place=middle,
-        displacement=_bump(*middle, depth, radius),
+        place=(a, b),
+        displacement=_out(height),
         area_mm2=area,
         depth_max_mm=depth,
         volume_mm3=area * depth / 3.0,
@@ -164,10 +169,10 @@ def _whole(kind: str, params: Params, form: plate_row.Params) -> Defect:
         depth = params.sized("bend_mm")
         displacement, volume = _out(lambda x: -depth * np.cos(np.pi * x[:, 0] / L)), area * depth * 2.0 / np.pi
     elif kind == "twist":
-        turn = 1e-3 * params.sized("twist_mrad")
-        displacement, depth = _twist(turn / L), 0.5 * H * np.sin(0.5 * turn)
+        angle = 1e-3 * params.sized("twist_mrad")
+        displacement, depth = _rotation(0.0, angle / L), 0.5 * H * np.sin(0.5 * angle)
         # Two quarters inward, two outward: integral of |b| over the height times |sin| of the angle along the length.
-        volume = 0.25 * H**2 * 2.0 * L / turn * (1.0 - np.cos(0.5 * turn))
+        volume = 0.25 * H**2 * 2.0 * L / angle * (1.0 - np.cos(0.5 * angle))
     elif kind == "waviness":
         high, wave_number = params.sized("wave_mm"), 2.0 * np.pi / params.wave_length_mm
         half_waves, rest = divmod(0.5 * L * wave_number, np.pi)
@@ -183,7 +188,7 @@ def _whole(kind: str, params: Params, form: plate_row.Params) -> Defect:
     else:
         shift, tilt = params.sized("shift_mm"), 1e-3 * params.sized("tilt_mrad")
         reach = 0.5 * H * np.sin(tilt)
-        displacement, depth = _tilt(shift, tilt), shift + reach
+        displacement, depth = _rotation(tilt, 0.0, shift), shift + reach
         # If the tilt exceeds the shift, one end is displaced outward.
         volume = area * (shift if reach <= shift else 0.5 * (shift**2 + reach**2) / reach)
     return Defect(
@@ -237,32 +242,13 @@ def _out(height: Callable[[Floats], Floats]) -> Displacement:
     return lambda x: np.stack([np.zeros(len(x)), np.zeros(len(x)), height(x)], axis=1)
 
 
-def _bump(a: float, b: float, depth: float, radius: float) -> Displacement:
-    def height(x: Floats) -> Floats:
-        away = np.minimum(((x[:, 0] - a) ** 2 + (x[:, 1] - b) ** 2) / radius**2, 1.0)
-        result: Floats = -depth * (1.0 - away) ** 2
-        return result
+def _rotation(angle: float, rate: float, shift: float = 0.0) -> Displacement:
+    """Return a rotation about the component's axis by ``angle`` plus ``rate`` times a, and a shift inward."""
 
-    return _out(height)
-
-
-def _turn(b: Floats, n: Floats, angle: Floats | float) -> tuple[Floats, Floats]:
-    """Return the displacements upward and outward (n,) of a rotation about the axis of the component."""
-    up, out = b * np.cos(angle) - n * np.sin(angle) - b, b * np.sin(angle) + n * np.cos(angle) - n
-    return up, out
-
-
-def _twist(rate: float) -> Displacement:
     def displacement(x: Floats) -> Floats:
-        return np.stack([np.zeros(len(x)), *_turn(x[:, 1], x[:, 2], rate * x[:, 0])], axis=1)
-
-    return displacement
-
-
-def _tilt(shift: float, tilt: float) -> Displacement:
-    def displacement(x: Floats) -> Floats:
-        up, out = _turn(x[:, 1], x[:, 2], tilt)
-        return np.stack([np.zeros(len(x)), up, out - shift], axis=1)
+        a, b, n = x.T
+        c, s = np.cos(angle + rate * a), np.sin(angle + rate * a)
+        return np.stack([np.zeros(len(x)), b * c - n * s - b, b * s + n * c - n - shift], axis=1)
 
     return displacement
 
@@ -302,10 +288,7 @@ def _present(patch: Patch, place: plate_row.Place, holes: Floats) -> Bools:
     """Mark the cells of a patch's net that lie outside of all holes."""
     p, q = np.meshgrid(0.5 * (patch.p[1:] + patch.p[:-1]), 0.5 * (patch.q[1:] + patch.q[:-1]), indexing="ij")
     local = place.local(patch.at(p.ravel(), q.ravel()))
-    result = np.ones(len(local), bool)
-    for a0, a1, b0, b1 in holes:
-        result &= ~((local[:, 0] > a0) & (local[:, 0] < a1) & (local[:, 1] > b0) & (local[:, 1] < b1))
-    return result.reshape(p.shape)
+    return outside(local[:, 0], local[:, 1], holes).reshape(p.shape)
 
 
 def _cut(place: plate_row.Place, body: Box, hole: Floats, side: int, number: int) -> Patch:
@@ -315,9 +298,7 @@ def _cut(place: plate_row.Place, body: Box, hole: Floats, side: int, number: int
     b0, b1 = np.clip(hole[2:], low[1], high[1])
     corners = np.array([[a0, b0], [a1, b0], [a1, b1], [a0, b1]])
     start, end = corners[side], corners[(side + 1) % 4]
-    open_edge = (side in (1, 3) and hole[1 if side == 1 else 0] != (a1, a0)[side == 3]) or (
-        side in (0, 2) and hole[3 if side == 2 else 2] != (b1, b0)[side == 0]
-    )
+    open_edge = (hole[2] != b0, hole[1] != a1, hole[3] != b1, hole[0] != a0)[side]
 
     def at(p: Floats, q: Floats) -> Floats:
         ab = start + np.outer(q, end - start)
@@ -355,12 +336,9 @@ def movement(params: MovementParams, components: tuple[Component, ...]) -> Displ
 
     def displacement(points: Floats) -> Floats:
         x, y, z = ((points - middle) / half).T
-        away = np.minimum(np.hypot(x, y), 1.0)
-        inward = 1.0 - away
-        sag = (
-            -params.sag_mm * inward * (2.0 - inward)
-            + params.ripple_mm * np.cos(params.ripples * np.arctan2(y, x)) * inward
-        )
+        inward = 1.0 - np.minimum(np.hypot(x, y), 1.0)
+        ripple = params.ripple_mm * np.cos(params.ripples * np.arctan2(y, x)) * inward
+        sag = -params.sag_mm * inward * (2.0 - inward) + ripple
         lean = params.lean_mm * 0.5 * (z + 1.0)
         return np.stack([lean, 0.4 * lean * x, sag], axis=1)
 

@@ -90,15 +90,14 @@ class Ledger:
 
     rows: list[tuple[str, str, float, str]] = field(default_factory=list)
 
-    def note(self, what: str, where: str, value: float, unit: str) -> float:
-        """Add a row and return its value."""
-        self.rows.append((what, where, float(value), unit))
-        return float(value)
+    def note(self, imperfection: str, where: str, value: float, unit: str) -> None:
+        """Add a row."""
+        self.rows.append((imperfection, where, float(value), unit))
 
     def record(self) -> AsBuilt:
         """Return the rows as the truth's record."""
-        what, where, value, unit = zip(*self.rows, strict=True) if self.rows else ((), (), (), ())
-        return AsBuilt(what, where, np.array(value, np.float64), unit)
+        imperfection, where, value, unit = zip(*self.rows, strict=True) if self.rows else ((), (), (), ())
+        return AsBuilt(imperfection, where, np.array(value, np.float64), unit)
 
 
 # --- arch parts ---------------------------------------------------------------------------------------------------
@@ -122,10 +121,10 @@ class _Spot:
     v: float
     half: float
 
-    def disjoint(self, other: _Spot) -> bool:
+    def disjoint(self, spot: _Spot) -> bool:
         """Return whether two squares do not overlap."""
-        reach = self.half + other.half
-        return self.wall != other.wall or abs(self.s - other.s) >= reach or abs(self.v - other.v) >= reach
+        reach = self.half + spot.half
+        return self.wall != spot.wall or abs(self.s - spot.s) >= reach or abs(self.v - spot.v) >= reach
 
     def where(self, part: ArchPart) -> str:
         """Return the place as text for the ledger."""
@@ -145,8 +144,8 @@ class ArchErrors:
 
     ends: Floats  # (2, 3): length, skew about the vertical and about the horizontal axis of the section
     twist: float
-    bow: tuple[float, float]  # sideways, upward
-    section: tuple[float, float]  # width, height
+    bow: Floats  # (2,) sideways, upward
+    section: Floats  # (2,) width, height
     waves: dict[str, _Wave]  # by wall
     dents: tuple[_Dent, ...] = ()
     corners: Floats = field(default_factory=lambda: np.zeros((2, 4, 3)))  # of P1 to P4 at each end: along, left, up
@@ -168,8 +167,8 @@ def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[H
             move = wave.amplitude * np.sin(2.0 * np.pi * s / wave.length + wave.phase) * window
             for dent in errors.dents:
                 if dent.wall == wall:
-                    away = ((s - dent.s) ** 2 + (c - dent.c) ** 2) / dent.radius**2
-                    move = move - dent.depth * np.where(away < 1.0, (1.0 - np.minimum(away, 1.0)) ** 2, 0.0)
+                    share = ((s - dent.s) ** 2 + (c - dent.c) ** 2) / dent.radius**2
+                    move = move - dent.depth * np.where(share < 1.0, (1.0 - np.minimum(share, 1.0)) ** 2, 0.0)
             outward = {"bottom": -1.0, "top": 1.0, "left": 1.0, "right": -1.0}[wall] * move
             u, v = (u, v + outward) if flat else (u + outward, v)
         width, height = errors.section
@@ -179,8 +178,8 @@ def fabricate(part: ArchPart, errors: ArchErrors, plates: Plates, holes: tuple[H
         s = s + (1.0 - q) * (first[0] + first[1] * u + first[2] * vc) + q * (last[0] + last[1] * u + last[2] * vc)
         along, left, up = _corner_displacement(errors.corners, u / b, 2.0 * vc / h, q * span, (1.0 - q) * span)
         s, u, vc = s + along, u + left, vc + up
-        turn = errors.twist * (q - 0.5)
-        u, vc = u * np.cos(turn) - vc * np.sin(turn), u * np.sin(turn) + vc * np.cos(turn)
+        angle = errors.twist * (q - 0.5)
+        u, vc = u * np.cos(angle) - vc * np.sin(angle), u * np.sin(angle) + vc * np.cos(angle)
         bend = np.sin(np.pi * q)
         return s, u + errors.bow[0] * bend, vc + 0.5 * h + errors.bow[1] * bend
 
@@ -195,8 +194,8 @@ def _corner_displacement(corners: Floats, a: Floats, c: Floats, from_start: Floa
     left, up = 0.5 * (1.0 + a), 0.5 * (1.0 + c)
     shares = np.stack([left * (1.0 - up), (1.0 - left) * (1.0 - up), (1.0 - left) * up, left * up])
     result = np.zeros((3, len(a)))
-    for end, away in enumerate((from_start, from_end)):
-        x = np.clip(away / CORNER_REACH_MM, 0.0, 1.0)
+    for end, distance in enumerate((from_start, from_end)):
+        x = np.clip(distance / CORNER_REACH_MM, 0.0, 1.0)
         result += (1.0 - x) ** 2 * (1.0 + 2.0 * x) * (corners[end].T @ shares)
     return result
 
@@ -239,30 +238,22 @@ def _draw_errors(
         ledger.note("skew about the vertical", f"{part.name} {end}", ends[i, 1], "rad")
         ledger.note("skew about the horizontal", f"{part.name} {end}", ends[i, 2], "rad")
         for k, axis in np.ndindex(4, 3) if params.corner_mm else ():
-            what = f"corner P{k + 1}, {('along', 'left', 'up')[axis]}"
-            ledger.note(what, f"{part.name} {end}", corners[i, k, axis], "mm")
-    for what, value in zip(("bow sideways", "bow upward", "width", "height"), (*bow, *section), strict=True):
-        ledger.note(what, part.name, value, "mm")
+            corner = f"corner P{k + 1}, {('along', 'left', 'up')[axis]}"
+            ledger.note(corner, f"{part.name} {end}", corners[i, k, axis], "mm")
+    for size, value in zip(("bow sideways", "bow upward", "width", "height"), (*bow, *section), strict=True):
+        ledger.note(size, part.name, value, "mm")
     ledger.note("twist", part.name, twist, "rad")
     plates = Plates(*(np.array(dataclasses.astuple(part.plates)) + thickness).tolist())
     if params.plate_mm:
         _check_plates(part, plates)
     _check_section(part, section)
-    for what, value in zip(("bottom plate", "top plate", "web plate"), thickness, strict=True):
-        ledger.note(what, part.name, value, "mm")
+    for plate, value in zip(("bottom plate", "top plate", "web plate"), thickness, strict=True):
+        ledger.note(plate, part.name, value, "mm")
     waves = {
         wall: _Wave(float(amplitude), float(phase), params.waviness_length_mm)
         for wall, amplitude, phase in zip(("bottom", "top", "left", "right"), amplitudes, phases, strict=True)
     }
-    errors = ArchErrors(
-        ends=ends,
-        twist=twist,
-        bow=(float(bow[0]), float(bow[1])),
-        section=(float(section[0]), float(section[1])),
-        waves=waves,
-        corners=corners,
-    )
-    return errors, plates
+    return ArchErrors(ends=ends, twist=twist, bow=bow, section=section, waves=waves, corners=corners), plates
 
 
 def _sizes(part: ArchPart) -> tuple[float, float]:
@@ -273,29 +264,27 @@ def _sizes(part: ArchPart) -> tuple[float, float]:
 def _check_plates(part: ArchPart, plates: Plates) -> None:
     """Raise UsageError for drawn plates that are too thin or fill the part."""
     width, height = _sizes(part)
-    for what, thickness in zip(("bottom", "top", "web"), dataclasses.astuple(plates), strict=True):
+    for plate, thickness in dataclasses.asdict(plates).items():
         if thickness < LEAST_PLATE_MM:
             raise UsageError(
-                f"asbuilt.plate_mm: expected plates of {LEAST_PLATE_MM:g} mm at least, drew a {what} plate of "
+                f"asbuilt.plate_mm: expected plates of {LEAST_PLATE_MM:g} mm at least, drew a {plate} plate of "
                 f"{thickness:.1f} mm for {part.name}; give smaller errors of plates"
             )
-    for what, both, size in (
-        ("bottom and top", plates.bottom + plates.top, height),
-        ("two web", 2.0 * plates.web, width),
-    ):
+    pairs = (("bottom and top", plates.bottom + plates.top, height), ("two web", 2.0 * plates.web, width))
+    for pair, both, size in pairs:
         if both > MOST_FILLED * size:
             raise UsageError(
-                f"asbuilt.plate_mm: expected plates that leave {part.name} hollow, drew {what} plates of {both:.1f} mm "
+                f"asbuilt.plate_mm: expected plates that leave {part.name} hollow, drew {pair} plates of {both:.1f} mm "
                 f"together where the section measures {size:g} mm; give smaller errors of plates"
             )
 
 
 def _check_section(part: ArchPart, section: Floats) -> None:
     """Raise UsageError for a drawn section much smaller than designed."""
-    for what, error, size in zip(("width", "height"), section, _sizes(part), strict=True):
+    for side, error, size in zip(("width", "height"), section, _sizes(part), strict=True):
         if size + error < LEAST_SHARE * size:
             raise UsageError(
-                f"asbuilt.section_mm: expected at least half of {part.name}'s section, drew an error of its {what} "
+                f"asbuilt.section_mm: expected at least half of {part.name}'s section, drew an error of its {side} "
                 f"of {error:.1f} mm where it measures {size:g} mm; give smaller errors of sections"
             )
 
@@ -316,7 +305,7 @@ def _on_web(part: ArchPart, size: float, rng: np.random.Generator, damaged: list
     for _ in range(MOST_DRAWS):
         wall = ("left", "right")[int(rng.integers(2))]
         spot = _Spot(wall, rng.uniform(s0 + 1.5 * size, s1 - 1.5 * size), rng.uniform(low, high), size)
-        if all(spot.disjoint(other) for other in damaged):
+        if all(spot.disjoint(earlier) for earlier in damaged):
             damaged.append(spot)
             return spot
     raise UsageError(
@@ -327,9 +316,9 @@ def _on_web(part: ArchPart, size: float, rng: np.random.Generator, damaged: list
 
 def _dent(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, damaged: list[_Spot]) -> _Dent:
     spot = _on_web(part, params.dent_radius_mm, rng, damaged)
-    where = spot.where(part)
-    depth = ledger.note("dent, depth", where, params.dent_depth_mm, "mm")
-    return _Dent(spot.wall, spot.s, spot.v, depth, ledger.note("dent, radius", where, params.dent_radius_mm, "mm"))
+    ledger.note("dent, depth", spot.where(part), params.dent_depth_mm, "mm")
+    ledger.note("dent, radius", spot.where(part), params.dent_radius_mm, "mm")
+    return _Dent(spot.wall, spot.s, spot.v, params.dent_depth_mm, params.dent_radius_mm)
 
 
 def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: Ledger, damaged: list[_Spot]) -> Hole:
@@ -366,10 +355,9 @@ def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger:
     unit = along / length[:, None]
     side = np.cross(unit, np.eye(3)[np.argmin(np.abs(unit), axis=1)])
     side /= np.linalg.norm(side, axis=1)[:, None]
-    other = np.cross(unit, side)
-
+    second_side = np.cross(unit, side)
     draws = params.eccentricity_mm * rng.standard_normal((members, 2, 2))
-    offsets = draws[..., 0, None] * side[:, None] + draws[..., 1, None] * other[:, None]
+    offsets = draws[..., 0, None] * side[:, None] + draws[..., 1, None] * second_side[:, None]
     angle = rng.uniform(0.0, 2.0 * np.pi, members)
     connection = nominal.connection.scaled(grown)
     built = dataclasses.replace(nominal, centres=centres, radii=radii, offsets=offsets, connection=connection)
@@ -378,7 +366,7 @@ def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger:
     except UsageError as error:
         raise UsageError(f"asbuilt: this frame cannot be built with errors so large: {error}") from error
     bow = params.bow_share * tubes * rng.uniform(0.0, 1.0, members)
-    bows = bow[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * other)
+    bows = bow[:, None] * (np.cos(angle)[:, None] * side + np.sin(angle)[:, None] * second_side)
     missing = np.zeros((members, 2), bool)
     for place in np.sort(rng.permutation(2 * members)[: params.missing_bolts]):
         missing[place // 2, place % 2] = True

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 import re
-import shutil
 import tempfile
 import unicodedata
 from collections.abc import Mapping
@@ -16,10 +14,10 @@ from typing import Any
 
 from designgen.cad.bodies import UNITS_MM, CadFile
 from designgen.cad.process import received
+from designgen.new_folder import check_new, new_folder
 from designgen.ply import write_mesh
 from processor.jobs.process import Cause, isolated, run
 from processor.model import InputError, UsageError
-from processor.store.atomic_file import sync
 
 STEP_SUFFIXES, IFC_SUFFIXES = (".step", ".stp"), (".ifc",)
 MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"
@@ -36,42 +34,21 @@ def unit_mm(name: str) -> float:
     return UNITS_MM[name.lower()]
 
 
-def read(path: Path, units: str = "", *, limit_s: float = LIMIT_S, memory_bytes: int = MEMORY_BYTES) -> CadFile:
-    """Read a STEP or IFC file; ``units``, if given, replace the unit of length in the file.
+def read(
+    path: Path,
+    units: str = "",
+    *,
+    content: bytes | None = None,
+    limit_s: float = LIMIT_S,
+    memory_bytes: int = MEMORY_BYTES,
+) -> CadFile:
+    """Read a STEP or IFC file, or its ``content``; ``units``, if given, replace the unit of length in the file.
 
     A child process reads it, within ``limit_s`` seconds and ``memory_bytes`` of memory. Raises InputError for a file
     that cannot be read so, is of another kind, cut off, damaged, or without geometry; UsageError for unknown units and
     where the library for IFC is missing.
     """
-    return _read(path, _content(path), units, limit_s, memory_bytes)
-
-
-def _content(path: Path) -> bytes:
-    """Return a file's bytes; InputError where they are not of the kind of its suffix, or are cut off."""
-    suffix = path.suffix.lower()
-    if suffix not in STEP_SUFFIXES + IFC_SUFFIXES:
-        raise InputError(f"{path}: expected a CAD file (.step, .stp, .ifc), found {suffix or 'no suffix'}")
-    try:
-        if path.exists() and not path.is_file():
-            raise InputError(f"{path}: expected a CAD file, found a folder or device")
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if not content[:4096].lstrip(b"\xef\xbb\xbf \r\n\t").startswith(MAGIC):
-        raise InputError(
-            f"{path}: expected a STEP or IFC text file (ISO-10303-21), found another kind; export it again"
-        )
-    schema = re.search(rb"FILE_SCHEMA\s*\(\s*\(\s*'([\w ]*)", content[:65536])
-    if schema and schema[1].upper().startswith(b"IFC") != (suffix in IFC_SUFFIXES):
-        article = "a STEP" if suffix in IFC_SUFFIXES else "an IFC"
-        raise InputError(f"{path}: by its schema {schema[1].decode()} it is {article} file; give it the ending of one")
-    # The kernels read a file without its end as if it were complete.
-    if content.rfind(END) < 0:
-        raise InputError(f"{path}: is cut off: its last line, {END.decode()}, is missing; copy or export it again")
-    return content
-
-
-def _read(path: Path, content: bytes, units: str, limit_s: float, memory_bytes: int) -> CadFile:
+    content = _content(path) if content is None else content
     if units:
         unit_mm(units)
     job: dict[str, Any] = {"path": str(path), "suffix": path.suffix.lower(), "units": units.lower()}
@@ -103,15 +80,39 @@ def _read(path: Path, content: bytes, units: str, limit_s: float, memory_bytes: 
     return content_read
 
 
+def _content(path: Path) -> bytes:
+    """Return a file's bytes; InputError where they are not of the kind of its suffix, or are cut off."""
+    suffix = path.suffix.lower()
+    if suffix not in STEP_SUFFIXES + IFC_SUFFIXES:
+        raise InputError(f"{path}: expected a CAD file (.step, .stp, .ifc), found {suffix or 'no suffix'}")
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path}: expected a CAD file, found a folder or device")
+        content = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if not content[:4096].lstrip(b"\xef\xbb\xbf \r\n\t").startswith(MAGIC):
+        raise InputError(
+            f"{path}: expected a STEP or IFC text file (ISO-10303-21), found another kind; export it again"
+        )
+    schema = re.search(rb"FILE_SCHEMA\s*\(\s*\(\s*'([\w ]*)", content[:65536])
+    if schema and schema[1].upper().startswith(b"IFC") != (suffix in IFC_SUFFIXES):
+        article = "a STEP" if suffix in IFC_SUFFIXES else "an IFC"
+        raise InputError(f"{path}: by its schema {schema[1].decode()} it is {article} file; give it the ending of one")
+    # The kernels read a file without its end as if it were complete.
+    if content.rfind(END) < 0:
+        raise InputError(f"{path}: is cut off: its last line, {END.decode()}, is missing; copy or export it again")
+    return content
+
+
 def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
     """Write the meshes of a CAD file and import.json as a new folder; return the content of import.json.
 
     Raises UsageError where the folder exists and is not empty, InputError as :func:`read`.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"{folder}: exists and is not empty; name a new folder")
+    check_new(folder)
     content = _content(path)
-    cad = _read(path, content, units, LIMIT_S, MEMORY_BYTES)
+    cad = read(path, units, content=content)
     report: dict[str, Any] = {
         "file": path.name,
         "sha256": sha256(content).hexdigest(),
@@ -122,9 +123,7 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
         "bodies": [],
         "problems": list(cad.problems),
     }
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with new_folder(folder) as making:
         taken = set[str]()
         for body in cad.bodies:
             file = f"{_file_stem(body.name, taken)}.ply"
@@ -144,23 +143,13 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
             )
         text = json.dumps(report, indent=1, ensure_ascii=False, allow_nan=False) + "\n"
         (making / "import.json").write_text(text, encoding="utf-8")
-        for written in (*making.iterdir(), making):
-            sync(written)
-        if folder.exists():
-            folder.rmdir()
-        os.chmod(making, 0o755)
-        os.replace(making, folder)
-        sync(folder.parent)
-    except BaseException:
-        shutil.rmtree(making, ignore_errors=True)
-        raise
     return report
 
 
 def summary(report: Mapping[str, Any]) -> list[str]:
     """Return the result of :func:`import_file` as lines of text: the unit, then a line for each body."""
-    other = f"; the file says {report['unit_said'] or 'none'}" if report["unit_said"] != report["unit"] else ""
-    lines = [f"{report['file']}: unit {report['unit']} ({report['unit_mm']:.10g} mm, {report['unit_from']}{other})"]
+    in_file = f"; the file says {report['unit_said'] or 'none'}" if report["unit_said"] != report["unit"] else ""
+    lines = [f"{report['file']}: unit {report['unit']} ({report['unit_mm']:.10g} mm, {report['unit_from']}{in_file})"]
     for body in report["bodies"]:
         x, y, z = body["size_mm"]
         volume = f"{body['volume_mm3']:.6g} mm3" if body["kind"] == "solid" else "no volume: a surface"

@@ -74,19 +74,9 @@ def _limit(limit_s: float, memory_bytes: int) -> None:
 
 
 def _header(cad: CadFile) -> dict[str, Any]:
-    bodies = [
-        {
-            "name": body.name,
-            "solid": body.solid,
-            "closed": body.closed,
-            "volume_mm3": body.volume_mm3 if body.solid else None,
-            "area_mm2": body.area_mm2,
-            "deviation_mm": body.deviation_mm,
-        }
-        for body in cad.bodies
-    ]
-    header = {"unit": cad.unit, "unit_mm": cad.unit_mm, "unit_said": cad.unit_said, "bodies": bodies}
-    return {**header, "problems": list(cad.problems)}
+    scalars = ("name", "solid", "closed", "volume_mm3", "area_mm2", "deviation_mm")
+    header = {key: getattr(cad, key) for key in ("unit", "unit_mm", "unit_said", "problems")}
+    return {**header, "bodies": [{key: getattr(body, key) for key in scalars} for body in cad.bodies]}
 
 
 def received(answer: IO[bytes]) -> CadFile:

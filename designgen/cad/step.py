@@ -50,10 +50,10 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     entities = [model.Value(i) for i in range(1, model.NbEntities() + 1)]
     unit_given, sizes = _units(reader, entities)
     damaged = _damaged(reader, entities)
-    known = bool(sizes) and not any(re.match("StepBasic_.*(Length|Conversion)", kind) for kind in damaged)
-    if not known and not units and any("SHAPE" in type(entity).__name__.upper() for entity in entities):
+    unit_readable = bool(sizes) and not any(re.match("StepBasic_.*(Length|Conversion)", kind) for kind in damaged)
+    if not unit_readable and not units and any("SHAPE" in type(entity).__name__.upper() for entity in entities):
         raise InputError(f"{path}: {NO_UNIT}")
-    unit, problems = unit_name(path, unit_given, sizes[0]) if known else ("", [])
+    unit, problems = unit_name(path, unit_given, sizes[0]) if unit_readable else ("", [])
     geometry = [kind.split("_", 1)[1] for kind in damaged if kind.startswith(("StepShape_", "StepGeom_"))]
     if geometry:
         problems.append(f"{len(geometry)} damaged entities, first {geometry[0]}: bodies may be missing")
@@ -91,7 +91,7 @@ def _units(reader: Any, entities: list[Any]) -> tuple[str, list[float]]:
             context = STEPConstruct_UnitContext()
             context.ComputeFactors(entity.GlobalUnitAssignedContext())
             size = float(context.LengthFactor())
-            if context.LengthDone() and not any(abs(size / known - 1.0) < 1e-9 for known in sizes if known):
+            if context.LengthDone() and not any(abs(size / earlier - 1.0) < 1e-9 for earlier in sizes if earlier):
                 sizes.append(size)
     return (str(lengths.Value(1).ToCString()) if lengths.Length() == 1 else ""), sizes
 
@@ -116,16 +116,12 @@ def _damaged(reader: Any, entities: list[Any]) -> list[str]:
 
 def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
     """Return as problems the solids, and the number of faces, that the kernel did not convert."""
-    shape, nowhere = reader.OneShape() if reader.NbShapes() else None, TopLoc_Location()
     made, faces = set[Any](), TopTools_IndexedMapOfShape()
-    for kind in (TopAbs_SOLID, TopAbs_FACE) if shape is not None else ():
-        explorer = TopExp_Explorer(shape, kind)
-        while explorer.More():
-            if kind == TopAbs_FACE:
-                faces.Add(explorer.Current().Located(nowhere))
-            else:
-                made.add(names.item(explorer.Current()))
-            explorer.Next()
+    if reader.NbShapes():
+        shape = reader.OneShape()
+        made = {names.item(solid) for solid in _parts(shape, TopAbs_SOLID)}
+        for face in _parts(shape, TopAbs_FACE):
+            faces.Add(face.Located(TopLoc_Location()))
     solids = [entity for entity in entities if isinstance(entity, StepShape_ManifoldSolidBrep)]
     problems = [f"solid {_text(s)!r} is damaged, so that it did not become one" for s in solids if s not in made]
     expected = sum(isinstance(entity, StepShape_FaceSurface) for entity in entities)
@@ -136,18 +132,24 @@ def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
 
 def _pieces(shape: Any) -> Iterator[tuple[Any, bool]]:
     """Yield every solid (True), then every shell and the loose faces outside of solids (False)."""
-    for kind, avoided in ((TopAbs_SOLID, None), (TopAbs_SHELL, TopAbs_SOLID)):
-        explorer = TopExp_Explorer(shape, kind, *([avoided] if avoided is not None else []))
-        while explorer.More():
-            yield explorer.Current(), avoided is None
-            explorer.Next()
-    builder, loose, faces = BRep_Builder(), TopoDS_Compound(), TopExp_Explorer(shape, TopAbs_FACE, TopAbs_SHELL)
-    builder.MakeCompound(loose)
-    if faces.More():
-        while faces.More():
-            builder.Add(loose, faces.Current())
-            faces.Next()
+    for solid in _parts(shape, TopAbs_SOLID):
+        yield solid, True
+    for shell in _parts(shape, TopAbs_SHELL, TopAbs_SOLID):
+        yield shell, False
+    if faces := list(_parts(shape, TopAbs_FACE, TopAbs_SHELL)):
+        builder, loose = BRep_Builder(), TopoDS_Compound()
+        builder.MakeCompound(loose)
+        for face in faces:
+            builder.Add(loose, face)
         yield loose, False
+
+
+def _parts(shape: Any, *kinds: Any) -> Iterator[Any]:
+    """Yield the parts of a shape of the first kind, outside of those of the second."""
+    explorer = TopExp_Explorer(shape, *kinds)
+    while explorer.More():
+        yield explorer.Current()
+        explorer.Next()
 
 
 def _body(path: str, name: str, shape: Any, scale: float, *, solid: bool) -> Body | str:
@@ -189,9 +191,8 @@ class _Names:
     """Names of shapes: of the solid, else of its occurrence in an assembly, else of its product."""
 
     def __init__(self, reader: Any, entities: list[Any]) -> None:
-
         self._transfers = reader.WS().TransferReader()
-        self._known, self._items = TopTools_IndexedMapOfShape(), list[Any]()
+        self._bare_shapes, self._items = TopTools_IndexedMapOfShape(), list[Any]()
         products: dict[Any, str] = {}  # of representations
         pairs = []
         for entity in entities:
@@ -225,10 +226,10 @@ class _Names:
     def item(self, shape: Any) -> Any:
         """Return the entity from which a shape was made, regardless of its location; None where it is unknown."""
         bare = shape.Located(TopLoc_Location())
-        if not self._known.Contains(bare):  # the kernel searches all entities, so each result is stored
-            self._known.Add(bare)
+        if not self._bare_shapes.Contains(bare):  # the kernel searches all entities, so each result is stored
+            self._bare_shapes.Add(bare)
             self._items.append(self._transfers.EntityFromShapeResult(bare, 1))
-        return self._items[self._known.FindIndex(bare) - 1]
+        return self._items[self._bare_shapes.FindIndex(bare) - 1]
 
 
 def _product(representation: Any) -> str:

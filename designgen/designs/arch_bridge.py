@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from itertools import pairwise
 
-from designgen.checks import expect, expect_positive
+from designgen.checks import expect_all, expect_positive
 from designgen.curves import NAMES as CURVES
 from designgen.curves import make as make_curve
 from designgen.designs import arch_foot, arch_rib
@@ -37,7 +37,8 @@ class Params:
         expect_positive(self, "bridge", *lengths)
         plates = self.plate_bottom_mm + self.plate_top_mm
         rising = len(self.joints) == 4 and all(a < z for a, z in pairwise((0.0, *self.joints, 1.0)))
-        for fits, key, value, expected in (
+        expect_all(
+            "bridge",
             (self.curve in CURVES, "curve", self.curve, f"one of {', '.join(CURVES)}"),
             (self.rise_mm < 0.5 * self.span_mm, "rise_mm", self.rise_mm, "less than half of span_mm"),
             (self.plate_web_mm < 0.5 * self.width_mm, "plate_web_mm", self.plate_web_mm, "less than half of width_mm"),
@@ -46,8 +47,7 @@ class Params:
             (self.base_height_mm >= self.height_mm, "base_height_mm", self.base_height_mm, "at least height_mm"),
             (0.0 < self.taper < 1.0, "taper", self.taper, "between 0 and 1"),
             (rising, "joints", list(self.joints), "four rising fractions between 0 and 1"),
-        ):
-            expect(fits, f"bridge.{key}", value, expected)
+        )
 
 
 def build(params: Params) -> tuple[ArchPart, ...]:
@@ -56,18 +56,10 @@ def build(params: Params) -> tuple[ArchPart, ...]:
     plates = Plates(params.plate_bottom_mm, params.plate_top_mm, params.plate_web_mm)
     cuts = [curve.length * c for c in (0.0, *params.joints, 1.0)]
     parts = []
-    for i, name in enumerate(NAMES):
-        section = {"s0_mm": cuts[i], "s1_mm": cuts[i + 1], "width_mm": params.width_mm, "height_mm": params.height_mm}
-        if name.startswith("rib"):
-            parts.append(arch_rib.build(name, curve, arch_rib.Params(**section, plates=plates)))
-            continue
-        foot = arch_foot.Params(
-            **section,
-            base_width_mm=params.base_width_mm,
-            base_height_mm=params.base_height_mm,
-            taper=params.taper,
-            plates=plates,
-            base_at="start" if i == 0 else "end",
-        )
-        parts.append(arch_foot.build(name, curve, foot))
+    for name, ends in zip(NAMES, pairwise(cuts), strict=True):
+        part = arch_rib.build(name, curve, ends, params.width_mm, params.height_mm, plates)
+        if name.startswith("foot"):
+            base_at = "start" if name == NAMES[0] else "end"
+            part = arch_foot.build(part, params.base_width_mm, params.base_height_mm, params.taper, base_at)
+        parts.append(part)
     return tuple(parts)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from designgen.curves import Curve
-from designgen.designs.patch import Bools, Patch, Surface
+from designgen.designs.patch import Bools, Patch, Surface, outside
 from processor.model import Floats
 
 if TYPE_CHECKING:
@@ -152,10 +152,7 @@ class Face:
 
     def present(self, p: Floats, q: Floats) -> Bools:
         """Mark the parameters (n,) that lie outside of all holes."""
-        result = np.ones(len(p), bool)
-        for p0, p1, q0, q1 in self.holes:
-            result &= ~((p > p0) & (p < p1) & (q > q0) & (q < q1))
-        return result
+        return outside(p, q, self.holes)
 
     def patch(self, across: int = 1) -> Patch:
         """Return the face as a patch whose net has ``across`` cells in q."""
@@ -313,10 +310,10 @@ def _pad_faces(part: ArchPart) -> list[Face]:
         return Face(name, at, lambda p, q: np.full_like(p, PAD_SIZE_MM * height))
 
     result = [rectangle("pad", origin + PAD_HEIGHT_MM * up, along, left, PAD_SIZE_MM)]
-    sides = [(sign, axis, other) for axis, other in ((along, left), (left, along)) for sign in (1.0, -1.0)]
-    for i, (sign, axis, other) in enumerate(sides):
-        centre = origin + sign * half * axis + 0.5 * PAD_HEIGHT_MM * up
-        result.append(rectangle(f"pad-side-{i}", centre, other, up, PAD_HEIGHT_MM))
+    sides = [(sign, out, edge) for out, edge in ((along, left), (left, along)) for sign in (1.0, -1.0)]
+    for i, (sign, out, edge) in enumerate(sides):
+        centre = origin + sign * half * out + 0.5 * PAD_HEIGHT_MM * up
+        result.append(rectangle(f"pad-side-{i}", centre, edge, up, PAD_HEIGHT_MM))
     return result
 
 

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     import cadquery as cq
 
 ABOUT = "bolt ball: sphere with milled flats, threaded holes and a process hole"
+CONE_EDGE_MM = 3.0  # by which the wide end of a cone is larger than the sleeve's corners
 PROCESS_HOLE_RADIUS_MM, PROCESS_HOLE_DEPTH_MM = 10.0, 35.0
 
 
@@ -41,6 +42,11 @@ class Connection:
         """Radius of the flat milled for the sleeve."""
         return self.sleeve_corner_radius + 1.0
 
+    @property
+    def cone_radius(self) -> float:
+        """Radius of the cone's wide end, next to the sleeve."""
+        return self.sleeve_corner_radius + CONE_EDGE_MM
+
     def scaled(self, factor: float) -> Connection:
         """Return the connection with all its sizes times ``factor``."""
         return Connection(**{key: factor * size for key, size in dataclasses.asdict(self).items()})
@@ -60,8 +66,8 @@ def connection(tube_diameter: float) -> Connection:
     for candidate in CONNECTIONS:
         if candidate.tube_diameter == tube_diameter:
             return candidate
-    known = ", ".join(f"{c.tube_diameter:g}" for c in CONNECTIONS)
-    raise UsageError(f"frame.tube_diameter_mm: expected one of {known}, got {tube_diameter:g}")
+    diameters = ", ".join(f"{c.tube_diameter:g}" for c in CONNECTIONS)
+    raise UsageError(f"frame.tube_diameter_mm: expected one of {diameters}, got {tube_diameter:g}")
 
 
 @dataclass(frozen=True)
@@ -91,25 +97,25 @@ class Params:
         return math.sqrt(self.radius_mm**2 - self.connection.flat_radius**2)
 
 
-def least_radius(directions: Floats, joined: Connection) -> float:
+def least_radius(directions: Floats, connection: Connection) -> float:
     """Return the least radius of a ball whose sleeves along directions (m, 3) do not touch: rc / sin(angle / 2)."""
     if len(directions) < 2:
         return 0.0
     cosines = directions @ directions.T - 2.0 * np.eye(len(directions))
     angle = math.acos(min(1.0, max(-1.0, float(cosines.max()))))
-    return joined.sleeve_corner_radius / math.sin(0.5 * angle)
+    return connection.sleeve_corner_radius / math.sin(0.5 * angle)
 
 
 def build(params: Params) -> cq.Shape:
     """Return the CadQuery solid, centred at the origin."""
     import cadquery as cq
 
-    R, joined = params.radius_mm, params.connection
+    R, bolt = params.radius_mm, params.connection.bolt
     ball: cq.Shape = cq.Solid.makeSphere(R, cq.Vector(0, 0, 0), cq.Vector(0, 0, 1), -90, 90, 360)
     for direction in params.directions:
         out = cq.Vector(*direction)
         flat = cq.Solid.makeCylinder(2.0 * R, R, out * params.flat_distance, out)
-        bore = cq.Solid.makeCylinder(0.5 * joined.bolt, 0.8 * R, out * (0.3 * R), out)
+        bore = cq.Solid.makeCylinder(0.5 * bolt, 0.8 * R, out * (0.3 * R), out)
         ball = ball.cut(flat).cut(bore)
     if params.process_hole:
         hole = cq.Solid.makeCylinder(

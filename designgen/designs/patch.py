@@ -51,6 +51,14 @@ class Patch:
         return dataclasses.replace(self, at=displaced_at)
 
 
+def outside(a: Floats, b: Floats, rectangles: Floats) -> Bools:
+    """Mark the points (a, b), (n,) each, that lie in none of the rectangles (k, 4): a0, a1, b0, b1."""
+    result = np.ones(len(a), bool)
+    for a0, a1, b0, b1 in rectangles:
+        result &= ~((a > a0) & (a < a1) & (b > b0) & (b < b1))
+    return result
+
+
 def within_triangle(u: Floats, v: Floats) -> tuple[Floats, Floats]:
     """Fold parameters (n,) of the unit square onto the triangle u + v <= 1: what is uniform stays uniform."""
     beyond = u + v > 1.0

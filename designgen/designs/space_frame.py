@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from designgen.checks import expect
+from designgen.checks import expect_all
 from designgen.designs import bolt_ball
 from processor.model import Floats, Ints, UsageError
 
@@ -46,7 +46,8 @@ class Params:
         reach = 0.5 * self.spacing_mm * (max(nodes) - 1)
         flat = self.shape != "dome" or self.rise_mm < 0.7 * reach
         least = 4.0 * max(self.radii_mm, default=0.0)
-        for fits, key, value, expected in (
+        expect_all(
+            "frame",
             (min(nodes) >= 2, "nodes_x, nodes_y", nodes, "2 or more"),
             (count <= 1_000_000, "nodes_x * nodes_y", count, "a million at most"),
             (self.layers in (1, 2), "layers", self.layers, "1 or 2"),
@@ -57,8 +58,7 @@ class Params:
             (self.spacing_mm > least, "spacing_mm", self.spacing_mm, f"more than four radii ({least:g})"),
             (self.depth_mm > 0.0, "depth_mm", self.depth_mm, "a length above 0"),
             *((radius > 0.0, "radii_mm", radius, "radii above 0") for radius in self.radii_mm),
-        ):
-            expect(fits, f"frame.{key}", value, expected)
+        )
 
 
 @dataclass(frozen=True)
@@ -100,17 +100,25 @@ class Frame:
         result: Floats = self.bows[member] if len(self.bows) else np.zeros(3)
         return result
 
+    @cached_property
+    def stacks(self) -> Floats:
+        """Where sleeve, cone and tube start (m, 2, 3) on a member's axis, from either end, mm.
+
+        Raises UsageError for a ball that cannot be built.
+        """
+        flats = np.array([self.ball(node).flat_distance for node in range(len(self.centres))])[self.members]
+        cones = flats + self.connection.sleeve_length
+        return np.stack([flats, cones, cones + self.connection.cone_length], axis=-1)
+
     def tube_lengths(self) -> Floats:
         """Return the lengths (m,) of the tubes between their cones, mm.
 
         Raises UsageError for a ball that cannot be built, and for a tube without length.
         """
-        flats = np.array([self.ball(node).flat_distance for node in range(len(self.centres))])
         axes = self.centres[self.members[:, 1]] - self.centres[self.members[:, 0]]
         if len(self.offsets):
             axes = axes + self.offsets[:, 1] - self.offsets[:, 0]
-        joints = flats[self.members] + self.connection.sleeve_length + self.connection.cone_length
-        lengths: Floats = np.linalg.norm(axes, axis=1) - joints.sum(axis=1)
+        lengths: Floats = np.linalg.norm(axes, axis=1) - self.stacks[:, :, 2].sum(axis=1)
         if not (lengths > 0.0).all():
             worst = int(np.argmin(lengths))
             raise UsageError(
@@ -147,8 +155,8 @@ def build(params: Params) -> Frame:
             np.stack([upper[:-1].ravel(), upper[1:].ravel()], axis=1),
             np.stack([upper[:, :-1].ravel(), upper[:, 1:].ravel()], axis=1),
         ]
-        for below in (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:]):
-            members.append(np.stack([below.ravel(), upper.ravel()], axis=1))
+        corners = (index[:-1, :-1], index[1:, :-1], index[:-1, 1:], index[1:, 1:])
+        members += [np.stack([lower.ravel(), upper.ravel()], axis=1) for lower in corners]
     elif params.diagonals:
         members.append(np.stack([index[:-1, :-1].ravel(), index[1:, 1:].ravel()], axis=1))
     nodes = _shaped(np.vstack(centres), params)
@@ -187,30 +195,18 @@ def solid(frame: Frame) -> cq.Compound:
     shapes: list[cq.Shape] = [
         bolt_ball.build(frame.ball(i)).moved(cq.Location(cq.Vector(*centre))) for i, centre in enumerate(frame.centres)
     ]
-    joined = frame.connection
-    for i, j in frame.members:
+    connection, tube = frame.connection, 0.5 * frame.connection.tube_diameter
+    for (i, j), stacks in zip(frame.members, frame.stacks, strict=True):
         span = frame.centres[j] - frame.centres[i]
         length, unit = float(np.linalg.norm(span)), span / np.linalg.norm(span)
-        starts = []
-        for node, out in ((i, unit), (j, -unit)):
-            foot = frame.centres[node] + frame.ball(node).flat_distance * out
+        for node, out, (sleeve, cone, _) in zip((i, j), (unit, -unit), stacks, strict=True):
+            foot, tip = (frame.centres[node] + start * out for start in (sleeve, cone))
             plane = cq.Plane(origin=tuple(foot), normal=tuple(out))
-            corners = [plane.toWorldCoords(tuple(c)) for c in joined.sleeve_corner_radius * HEXAGON]
+            corners = [plane.toWorldCoords(tuple(c)) for c in connection.sleeve_corner_radius * HEXAGON]
             hexagon = cq.Wire.makePolygon(corners, close=True)
-            shapes.append(cq.Solid.extrudeLinear(hexagon, [], cq.Vector(*(joined.sleeve_length * out))))
-            tip = foot + joined.sleeve_length * out
-            shapes.append(
-                cq.Solid.makeCone(
-                    joined.sleeve_corner_radius + 3.0,
-                    0.5 * joined.tube_diameter,
-                    joined.cone_length,
-                    cq.Vector(*tip),
-                    cq.Vector(*out),
-                )
-            )
-            starts.append(np.linalg.norm(tip - frame.centres[node]) + joined.cone_length)
-        begin = frame.centres[i] + starts[0] * unit
-        shapes.append(
-            cq.Solid.makeCylinder(0.5 * joined.tube_diameter, length - sum(starts), cq.Vector(*begin), cq.Vector(*unit))
-        )
+            shapes.append(cq.Solid.extrudeLinear(hexagon, [], cq.Vector(*(connection.sleeve_length * out))))
+            radii = connection.cone_radius, tube
+            shapes.append(cq.Solid.makeCone(*radii, connection.cone_length, cq.Vector(*tip), cq.Vector(*out)))
+        begin, size = frame.centres[i] + stacks[0, 2] * unit, length - stacks[:, 2].sum()
+        shapes.append(cq.Solid.makeCylinder(tube, size, cq.Vector(*begin), cq.Vector(*unit)))
     return cq.Compound.makeCompound(shapes)

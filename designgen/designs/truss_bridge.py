@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from designgen.checks import expect, expect_positive
-from designgen.designs.structure import Box, Component, component
+from designgen.designs.box_and_tube import Box, Component, component
 from processor.model import Floats
 
 ABOUT = "truss bridge: two trusses of box sections on abutments, with floor beams and bracing"
@@ -72,11 +71,11 @@ def _line(x: Floats, z: float) -> Floats:
 
 def _bar(start: Floats, end: Floats, size: float) -> Box:
     """Return a square bar between two points, with two sides parallel to Y unless the bar runs along Y."""
-    axis = np.asarray(end) - np.asarray(start)
+    axis = end - start
     length = float(np.linalg.norm(axis))
     unit = axis / length
-    reference: Sequence[float] = (0.0, 1.0, 0.0) if abs(unit[1]) < 0.9 else (1.0, 0.0, 0.0)
-    side = np.asarray(reference) - unit * np.dot(reference, unit)
-    side = side / np.linalg.norm(side)
+    reference = np.array([0.0, 1.0, 0.0] if abs(unit[1]) < 0.9 else [1.0, 0.0, 0.0])
+    side = reference - unit * np.dot(reference, unit)
+    side /= np.linalg.norm(side)
     axes = np.stack([unit, side, np.cross(unit, side)])
-    return Box(0.5 * (np.asarray(start) + np.asarray(end)), axes, np.array([length, size, size]))
+    return Box(0.5 * (start + end), axes, np.array([length, size, size]))

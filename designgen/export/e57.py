@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from designgen.export import METRES
 from processor.model import Floats, Scan
 
-METRES = 0.001
 CHUNK = 1_000_000
 
 

@@ -5,9 +5,6 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,8 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from designgen.export import formats, solids
+from designgen.export import METRES, formats, solids
 from designgen.export.formats import Written
+from designgen.new_folder import check_new, new_folder
 from designgen.ply import write_mesh
 from processor.model import (
     KEY_POINTS,
@@ -62,8 +60,7 @@ def export(
     Raises UsageError where the folder exists and is not empty, for a format that cannot hold the scene, where no scan
     is left, and for a scene other than an arch bridge without meshes.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise UsageError(f"{folder}: exists and is not empty; name a new folder")
+    check_new(folder)
     whole = store.read_scene(source)
     scans = tuple(scan for scan in whole.scans if len(scan.points) >= FEWEST_POINTS)
     if whole.scans and not scans:
@@ -71,21 +68,12 @@ def export(
     if not with_meshes and whole.arch is None:
         raise UsageError(f"{source}: only an arch bridge has a design without meshes")
     scene = dataclasses.replace(whole, scans=scans)
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    try:
+    with new_folder(folder) as making:
         written = _write(scene, making, format_, spherical=spherical, with_meshes=with_meshes)
         if step:
             solids.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
         if with_truth:
             store.copy_truth(source, making / "truth.h5", lambda labels: _labels_as_read(labels, written))
-        if folder.exists():
-            folder.rmdir()
-        os.chmod(making, 0o755)
-        os.replace(making, folder)
-    except BaseException:
-        shutil.rmtree(making, ignore_errors=True)
-        raise
     return Exported(len(scans), tuple(scan.name for scan in whole.scans if len(scan.points) < FEWEST_POINTS))
 
 
@@ -108,7 +96,7 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_me
     (folder / "scans").mkdir()
     lines = [f"name = {_quoted(scene.name)}", f"kind = {_quoted(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
-    scale = 1.0 if format_ == "ply" else formats.METRES
+    scale = 1.0 if format_ == "ply" else METRES
     design = _design(scene, folder, scale, with_meshes=with_meshes)
     if design:
         lines.append(f"design = {_quoted(design)}")
@@ -122,8 +110,8 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_me
             lines += _of_file(file.scans)
         else:
             (scan,) = file.scans
-            own_pose = format_ == "ptx" or (format_ == "e57" and scan.T_project_scan.size > 0)
-            lines += _of_scan(scan, scale, own_pose=own_pose)
+            with_pose = format_ == "ptx" or (format_ == "e57" and scan.T_project_scan.size > 0)
+            lines += _of_scan(scan, scale, with_pose=with_pose)
     if scene.stations is not None and any(len(scan.point_station) for scan in scene.scans):
         places = {
             name: {"position": (position * scale).tolist()}
@@ -153,18 +141,18 @@ def _of_file(scans: Sequence[Scan]) -> list[str]:
     return [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
 
 
-def _of_scan(scan: Scan, scale: float, *, own_pose: bool) -> list[str]:
-    """Return the lines of project.toml about one scan; ``own_pose``: the file contains the scanner's pose."""
+def _of_scan(scan: Scan, scale: float, *, with_pose: bool) -> list[str]:
+    """Return the lines of project.toml about one scan; ``with_pose``: the file contains the scanner's pose."""
     lines = [f"component = {_quoted(scan.component)}"] if scan.component else []
     if scan.station:
         lines.append(f"station = {_quoted(scan.station)}")
     if np.isfinite(scan.sigma_mm):
         lines.append(f"sigma_mm = {scan.sigma_mm!r}")
-    if scan.T_project_scan.size and not own_pose:
+    if scan.T_project_scan.size and not with_pose:
         pose = scan.T_project_scan.copy()
         pose[:3, 3] *= scale
         lines.append(f"pose = {json.dumps(pose.tolist())}")
-    if scan.position.size and not own_pose:
+    if scan.position.size and not with_pose:
         lines.append(f"position = {json.dumps((scan.position * scale).tolist())}")
     return lines
 
@@ -209,14 +197,13 @@ def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
     """Return the design as JSON, and write its meshes to ``folder`` unless it is None."""
     components: dict[str, dict[str, Any]] = {}
     for part in design.parts:
-        components[part.name] = {
-            "bottom_edge_left": part.bottom_edge_left.tolist(),
-            "bottom_edge_right": part.bottom_edge_right.tolist(),
-        }
+        component = components[part.name] = {}
         if folder is not None:
+            component["mesh"] = f"design/{part.name}.ply"
             (folder / "design").mkdir(exist_ok=True)
-            write_mesh(folder / "design" / f"{part.name}.ply", part.vertices, part.faces)
-            components[part.name] = {"mesh": f"design/{part.name}.ply", **components[part.name]}
+            write_mesh(folder / component["mesh"], part.vertices, part.faces)
+        component["bottom_edge_left"] = part.bottom_edge_left.tolist()
+        component["bottom_edge_right"] = part.bottom_edge_right.tolist()
     joints = [
         {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, points.tolist(), strict=True))}
         for name, left, right, points in zip(

@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from designgen.export import e57
-from designgen.ply import write_columns
+from designgen.export import METRES, e57
+from designgen.ply import records, write_columns
 from processor.model import Floats, Ints, Scan, Stations, UsageError
 
-METRES = 0.001  # of a millimetre
 LAS_STEP_M = 0.0001
 
 
@@ -26,14 +25,19 @@ def station_numbers(scan: Scan) -> Ints:
     return scan.point_station.astype(np.int64) + 1
 
 
-def write_ply(path: Path, scan: Scan) -> None:
-    """Write binary PLY with coordinates as doubles, mm."""
-    columns: dict[str, Any] = {axis: scan.points[:, i] + scan.origin[i] for i, axis in enumerate("xyz")}
+def _columns(scan: Scan, scale: float = 1.0) -> dict[str, Any]:
+    """Return coordinates times ``scale``, and the intensities and stations that there are, by name."""
+    columns: dict[str, Any] = {axis: (scan.points[:, i] + scan.origin[i]) * scale for i, axis in enumerate("xyz")}
     if len(scan.intensity):
         columns["intensity"] = scan.intensity.astype(np.float32)
     if len(scan.point_station):
         columns["station"] = station_numbers(scan).astype(np.int32)
-    write_columns(path, columns)
+    return columns
+
+
+def write_ply(path: Path, scan: Scan) -> None:
+    """Write binary PLY with coordinates as doubles, mm."""
+    write_columns(path, _columns(scan))
 
 
 def write_las(path: Path, scan: Scan) -> None:
@@ -63,14 +67,8 @@ def write_las(path: Path, scan: Scan) -> None:
 
 def write_pcd(path: Path, scan: Scan) -> None:
     """Write binary PCD in metres, coordinates as doubles."""
-    columns: dict[str, Any] = {axis: (scan.points[:, i] + scan.origin[i]) * METRES for i, axis in enumerate("xyz")}
-    if len(scan.intensity):
-        columns["intensity"] = scan.intensity.astype(np.float32)
-    if len(scan.point_station):
-        columns["station"] = station_numbers(scan).astype(np.int32)
-    rows = np.empty(len(scan.points), [(name, column.dtype.newbyteorder("<")) for name, column in columns.items()])
-    for name, column in columns.items():
-        rows[name] = column
+    columns = _columns(scan, METRES)
+    rows = records(columns)
     types = [column.dtype for column in columns.values()]
     header = (
         f"VERSION 0.7\nFIELDS {' '.join(columns)}\nSIZE {' '.join(str(t.itemsize) for t in types)}\n"
@@ -82,17 +80,10 @@ def write_pcd(path: Path, scan: Scan) -> None:
 
 def write_xyz(path: Path, scan: Scan) -> None:
     """Write text in metres to 0.1 micrometre; with a header if there are columns besides the coordinates."""
-    columns, names, forms = [(scan.points + scan.origin) * METRES], ["x", "y", "z"], ["%.7f"] * 3
-    if len(scan.intensity):
-        columns.append(scan.intensity[:, None])
-        names.append("intensity")
-        forms.append("%.5g")
-    if len(scan.point_station):
-        columns.append(station_numbers(scan)[:, None].astype(np.float64))
-        names.append("station")
-        forms.append("%d")
-    header = " ".join(names) if len(names) > 3 else ""
-    np.savetxt(path, np.hstack(columns), fmt=forms, header=header, comments="")
+    columns = _columns(scan, METRES) | ({"intensity": scan.intensity} if len(scan.intensity) else {})
+    forms = ["%.7f"] * 3 + [{"intensity": "%.5g", "station": "%d"}[name] for name in list(columns)[3:]]
+    header = " ".join(columns) if len(columns) > 3 else ""
+    np.savetxt(path, np.stack(list(columns.values()), axis=1), fmt=forms, header=header, comments="")
 
 
 def write_ptx(path: Path, scan: Scan, stations: Stations | None) -> None:

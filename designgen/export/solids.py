@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from designgen.cad.process import escape
-from designgen.designs import arch_bridge, arch_part, space_frame, structure, structure_types
+from designgen.designs import arch_bridge, arch_part, box_and_tube, space_frame, structure_registry
 from designgen.reading import filled
 from processor.model import UsageError
 from processor.store.atomic_file import replacing
@@ -38,8 +38,8 @@ def write_design(recipe: Mapping[str, Any], folder: Path) -> list[Path]:
         shapes = {"frame": space_frame.solid(space_frame.build(filled(space_frame.Params, recipe, "frame")))}
     elif kind == "structure":
         path = folder / "structure.step"
-        components = structure_types.design(recipe)
-        shapes = {component.name: structure.solid([component]) for component in components}
+        components = structure_registry.design(recipe)
+        shapes = {component.name: box_and_tube.solid([component]) for component in components}
     else:
         raise UsageError("--step: the scene does not name the recipe it was made from, so its solids are not known")
     write_step(path, shapes, recipe.get("scan", {}).get("origin_mm", (0.0, 0.0, 0.0)))

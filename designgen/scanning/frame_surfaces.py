@@ -36,24 +36,21 @@ def _add_ball(builder: Builder, node: int, centre: Floats, ball: bolt_ball.Param
 
 
 def _add_member(builder: Builder, frame: Frame, member: int) -> None:
-    joined = frame.connection
-    a, b = frame.ends(member)
+    connection, (a, b) = frame.connection, frame.ends(member)
     length = float(np.linalg.norm(b - a))
     unit = (b - a) / length
-    starts = []
-    for end, (node, origin, out) in enumerate(zip(frame.members[member], (a, b), (unit, -unit), strict=True)):
-        flat = frame.ball(int(node)).flat_distance
-        tip = flat + joined.sleeve_length
+    radius, corner_radius = 0.5 * connection.tube_diameter, connection.sleeve_corner_radius
+    for end, (origin, out) in enumerate(((a, unit), (b, -unit))):
+        flat, tip, _ = frame.stacks[member, end]
         if frame.has_sleeve(member, end):
             side = perpendicular(out)
-            ring = joined.sleeve_corner_radius * (HEXAGON[:, :2] @ np.stack([side, np.cross(out, side)]))
+            ring = corner_radius * (HEXAGON[:, :2] @ np.stack([side, np.cross(out, side)]))
             near, far = origin + flat * out + ring, origin + tip * out + ring
             for k in range(6):
                 n = (k + 1) % 6
                 builder.polygon(-1, "sleeve", np.array([near[k], near[n], far[n], far[k]]))
-        radii = (joined.sleeve_corner_radius + 3.0, 0.5 * joined.tube_diameter)
-        builder.disc(-1, "cone end", origin + tip * out, out, radii[0])
-        builder.cone(-1, "cone", origin + tip * out, out, radii, joined.cone_length)
-        starts.append(tip + joined.cone_length)
-    tube, radius = length - sum(starts), 0.5 * joined.tube_diameter
-    builder.cone(-1, "tube", a + starts[0] * unit, unit, (radius, radius), tube, (frame.bow(member), 0.0, tube))
+        builder.disc(-1, "cone end", origin + tip * out, out, connection.cone_radius)
+        builder.cone(-1, "cone", origin + tip * out, out, (connection.cone_radius, radius), connection.cone_length)
+    first, last = frame.stacks[member, :, 2]
+    tube = length - (first + last)
+    builder.cone(-1, "tube", a + first * unit, unit, (radius, radius), tube, (frame.bow(member), 0.0, tube))

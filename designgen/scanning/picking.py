@@ -63,12 +63,12 @@ def _draw_points(scan: Scan, params: Params, rng: np.random.Generator) -> Floats
     for _ in range(MOST_DRAWS):
         if len(scan.points) < params.points:
             break
-        chosen: Floats = scan.points[rng.choice(len(scan.points), params.points, replace=False)]
-        sides = np.linalg.norm(chosen[:, None] - chosen, axis=2)[np.triu_indices(params.points, 1)]
+        points: Floats = scan.points[rng.choice(len(scan.points), params.points, replace=False)]
+        sides = np.linalg.norm(points[:, None] - points, axis=2)[np.triu_indices(params.points, 1)]
         # The second singular value is the points' extent across their best line.
-        across = np.linalg.svd(chosen - chosen.mean(axis=0), compute_uv=False)[1]
+        across = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)[1]
         if sides.min() >= params.apart_mm and across > AWAY_FROM_A_LINE * sides.max():
-            return chosen
+            return points
     raise UsageError(
         f"picks: scan {scan.name} has no {params.points} points {params.apart_mm:g} mm from one another and away from "
         "a line; give fewer points or a smaller picks.apart_mm"

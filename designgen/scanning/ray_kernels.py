@@ -1,7 +1,8 @@
 """Compiled kernels of the ray caster: intersections of rays with shapes, in float64.
 
-Every kernel works on one strip of columns on its own, so that results do not depend on the number of threads. The
-numbers of a shape are those of :class:`designgen.scanning.surfaces.Builder`; rays start at the scanner's origin.
+Every kernel works on one strip of columns on its own, so that results do not depend on the number of threads. Rays
+start at the scanner's origin. Lengths are in mm, in the scanner's frame. The numbers ``n`` of a shape are those of
+:class:`designgen.scanning.surfaces.Builder`; the position ``n[0:3]`` is a centre, a start or the first corner.
 """
 # Numba infers the types of the arguments: the kernels have no annotations.
 
@@ -18,6 +19,10 @@ from processor.model import Floats, Ints, Labels, Shorts
 
 MISS = -1
 SLACK = 1e-9  # relative, so that two triangles with a common edge leave no gap
+# Offsets of a shape's numbers: of discs and cones the axis (unit vector), and of cones what follows.
+AXIS, R_START, R_END, LENGTH, BOW, BOW_OFFSET, BOW_SPAN = 3, 6, 7, 8, 9, 12, 13
+RADIUS = 3  # of a sphere
+R_OUTER, R_INNER = 6, 7  # of a disc
 FEW_ROWS = 12  # testing so many rays costs no more than finding those that may meet a triangle
 
 
@@ -39,9 +44,9 @@ class Pieces(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Adjacent columns of the grid, the columns cast beside them, and the boxes of pieces that they meet."""
+    """Adjacent columns of the grid, the columns cast beside them, and the windows of pieces that they meet."""
 
-    boxes: Labels  # (b, 5): piece, first and last column, first and last row
+    windows: Labels  # (b, 5): piece, first and last column, first and last row
     first: int  # column
     width: int
     side: int  # columns cast on either side
@@ -71,7 +76,7 @@ def hit(kind, n, cuts, c0, c1, dx, dy, dz):  # type: ignore[no-untyped-def]
         b = (n[0] * dx + n[1] * dy + n[2] * dz) / d2
         # About the foot of the perpendicular, to avoid a difference of large squares.
         fx, fy, fz = n[0] - b * dx, n[1] - b * dy, n[2] - b * dz
-        inside = n[3] * n[3] - (fx * fx + fy * fy + fz * fz)
+        inside = n[RADIUS] * n[RADIUS] - (fx * fx + fy * fy + fz * fz)
         if inside < 0.0:
             return np.inf
         root = np.sqrt(inside / d2)
@@ -91,13 +96,13 @@ def hit(kind, n, cuts, c0, c1, dx, dy, dz):  # type: ignore[no-untyped-def]
     if kind == CONE:
         return hit_cone(n, dx, dy, dz)
     if kind == DISC:
-        slope = n[3] * dx + n[4] * dy + n[5] * dz
+        slope = n[AXIS] * dx + n[AXIS + 1] * dy + n[AXIS + 2] * dz
         if slope == 0.0:
             return np.inf
-        t = (n[3] * n[0] + n[4] * n[1] + n[5] * n[2]) / slope
+        t = (n[AXIS] * n[0] + n[AXIS + 1] * n[1] + n[AXIS + 2] * n[2]) / slope
         ux, uy, uz = t * dx - n[0], t * dy - n[1], t * dz - n[2]
         r2 = ux * ux + uy * uy + uz * uz
-        return t if t > 0.0 and n[7] * n[7] <= r2 <= n[6] * n[6] else np.inf
+        return t if t > 0.0 and n[R_INNER] * n[R_INNER] <= r2 <= n[R_OUTER] * n[R_OUTER] else np.inf
     e1x, e1y, e1z = n[3] - n[0], n[4] - n[1], n[5] - n[2]
     e2x, e2y, e2z = n[6] - n[0], n[7] - n[1], n[8] - n[2]
     px, py, pz = dy * e2z - dz * e2y, dz * e2x - dx * e2z, dx * e2y - dy * e2x
@@ -116,45 +121,49 @@ def hit(kind, n, cuts, c0, c1, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def cone_at(n, t, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return height z along a cone's axis at range t, squared distance from it less squared radius, and its d/dt."""
-    ux, uy, uz = t * dx - n[0], t * dy - n[1], t * dz - n[2]
-    z = ux * n[3] + uy * n[4] + uz * n[5]
-    rate = dx * n[3] + dy * n[4] + dz * n[5]
-    q = (n[12] + z) / n[13]
-    move, change = 4.0 * q * (1.0 - q), 4.0 * (1.0 - 2.0 * q) * rate / n[13]
-    ux, uy, uz = ux - z * n[3] - move * n[9], uy - z * n[4] - move * n[10], uz - z * n[5] - move * n[11]
-    vx = dx - rate * n[3] - change * n[9]
-    vy = dy - rate * n[4] - change * n[10]
-    vz = dz - rate * n[5] - change * n[11]
-    taper = (n[7] - n[6]) / n[8]
-    r = n[6] + taper * z
-    value = ux * ux + uy * uy + uz * uz - r * r
-    return z, value, 2.0 * (ux * vx + uy * vy + uz * vz - r * taper * rate)
+def cone_at(n, ux, uy, uz, dx, dy, dz):  # type: ignore[no-untyped-def]
+    """Return a bowed cone's equation at u, a position from its start, mm, and its derivative along d.
+
+    The result is the height along the axis, the squared distance from it less the squared radius, and the derivative of
+    this difference.
+    """
+    ax, ay, az = n[AXIS], n[AXIS + 1], n[AXIS + 2]
+    bx, by, bz = n[BOW], n[BOW + 1], n[BOW + 2]
+    z, rate = ux * ax + uy * ay + uz * az, dx * ax + dy * ay + dz * az
+    q = (n[BOW_OFFSET] + z) / n[BOW_SPAN]
+    move, change = 4.0 * q * (1.0 - q), 4.0 * (1.0 - 2.0 * q) * rate / n[BOW_SPAN]
+    ux, uy, uz = ux - z * ax - move * bx, uy - z * ay - move * by, uz - z * az - move * bz
+    vx, vy, vz = dx - rate * ax - change * bx, dy - rate * ay - change * by, dz - rate * az - change * bz
+    taper = (n[R_END] - n[R_START]) / n[LENGTH]
+    r = n[R_START] + taper * z
+    return z, ux * ux + uy * uy + uz * uz - r * r, 2.0 * (ux * vx + uy * vy + uz * vz - r * taper * rate)
 
 
 @njit(cache=True, nogil=True)
 def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Return the least range of a cone: solve for the straight cone displaced by the bow, then Newton on the bowed."""
-    rate = dx * n[3] + dy * n[4] + dz * n[5]
-    taper = (n[7] - n[6]) / n[8]
-    bowed = n[9] != 0.0 or n[10] != 0.0 or n[11] != 0.0
+    ax, ay, az = n[AXIS], n[AXIS + 1], n[AXIS + 2]
+    bx, by, bz = n[BOW], n[BOW + 1], n[BOW + 2]
+    r_start, length = n[R_START], n[LENGTH]
+    rate = dx * ax + dy * ay + dz * az
+    taper = (n[R_END] - r_start) / length
+    bowed = bx != 0.0 or by != 0.0 or bz != 0.0
     ox, oy, oz = -n[0], -n[1], -n[2]
-    z0 = ox * n[3] + oy * n[4] + oz * n[5]
+    z0 = ox * ax + oy * ay + oz * az
     # The quadratic equation is set up about the range nearest to the axis, where it has no large terms.
-    wx, wy, wz = dx - rate * n[3], dy - rate * n[4], dz - rate * n[5]
-    px, py, pz = ox - z0 * n[3], oy - z0 * n[4], oz - z0 * n[5]
+    wx, wy, wz = dx - rate * ax, dy - rate * ay, dz - rate * az
+    px, py, pz = ox - z0 * ax, oy - z0 * ay, oz - z0 * az
     w2 = wx * wx + wy * wy + wz * wz
     near = -(px * wx + py * wy + pz * wz) / w2 if w2 > 1e-18 else 0.0
     if rate != 0.0:  # a ray nearly along the axis is nearest to it far away
-        enter, leave = -z0 / rate, (n[8] - z0) / rate
+        enter, leave = -z0 / rate, (length - z0) / rate
         near = min(max(near, min(enter, leave)), max(enter, leave))
     if bowed:
-        q = (n[12] + min(max(z0 + near * rate, 0.0), n[8])) / n[13]
+        q = (n[BOW_OFFSET] + min(max(z0 + near * rate, 0.0), length)) / n[BOW_SPAN]
         move = 4.0 * q * (1.0 - q)
-        px, py, pz = px - move * n[9], py - move * n[10], pz - move * n[11]
+        px, py, pz = px - move * bx, py - move * by, pz - move * bz
     fx, fy, fz = px + near * wx, py + near * wy, pz + near * wz
-    r = n[6] + taper * (z0 + near * rate)
+    r = r_start + taper * (z0 + near * rate)
     a = w2 - taper * taper * rate * rate
     b = fx * wx + fy * wy + fz * wz - r * taper * rate
     c = fx * fx + fy * fy + fz * fz - r * r
@@ -172,17 +181,17 @@ def hit_cone(n, dx, dy, dz):  # type: ignore[no-untyped-def]
         z = z0 + t * rate
         if bowed:
             for _ in range(8):
-                z, value, slope = cone_at(n, t, dx, dy, dz)
+                z, value, slope = cone_at(n, t * dx - n[0], t * dy - n[1], t * dz - n[2], dx, dy, dz)
                 if slope == 0.0:
                     break
                 step = value / slope
                 t -= step
                 if abs(step) < 1e-9 * abs(t):
                     break
-            z, value, slope = cone_at(n, t, dx, dy, dz)
-            if abs(value) > 1e-5 * n[6]:  # Newton did not converge for this grazing ray
+            z, value, slope = cone_at(n, t * dx - n[0], t * dy - n[1], t * dz - n[2], dx, dy, dz)
+            if abs(value) > 1e-5 * r_start:  # Newton did not converge for this grazing ray
                 continue
-        if t > 0.0 and 0.0 <= z <= n[8] and n[6] + taper * z > 0.0:
+        if t > 0.0 and 0.0 <= z <= length and r_start + taper * z > 0.0:
             return t
     return np.inf
 
@@ -199,6 +208,15 @@ def direction(ca, sa, level, rise, da, de):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def elevations(grid, rows):  # type: ignore[no-untyped-def]
+    """Return cosine and sine (rows,) of the elevations of a grid's rows."""
+    cosine, sine = np.empty(rows), np.empty(rows)
+    for i in range(rows):
+        cosine[i], sine[i] = np.cos(grid.lowest + grid.step * i), np.sin(grid.lowest + grid.step * i)
+    return cosine, sine
+
+
+@njit(cache=True, nogil=True)
 def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-untyped-def]
     """Return shape and range of the nearest hit of each ray of a strip and beside it, (width + 2 side, rows) each.
 
@@ -206,7 +224,7 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
     are cast. No hit: -1 and infinite. The third result is the range at which the beam may touch a shape so thin that
     the grid's rays may all miss it; infinite where there is none.
     """
-    boxes, first, width, side = strip  # in local variables, as the inner loops are faster with them
+    windows, first, width, side = strip  # in local variables, as the inner loops are faster with them
     kind, numbers, cuts, cut_start = shapes
     owner, centres, radii = pieces
     jitter, largest_jitter, min_range, max_range = rays
@@ -215,29 +233,27 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
     thin = np.full((width + 2 * side, rows), np.inf)
     shape = np.full((width + 2 * side, rows), MISS, np.int32)
     used = min(width, grid.columns - first)
-    level, rise = np.empty(rows), np.empty(rows)
-    for i in range(rows):
-        level[i], rise[i] = np.cos(grid.lowest + grid.step * i), np.sin(grid.lowest + grid.step * i)
-    for b in range(len(boxes)):
-        k = boxes[b, 0]
+    level, rise = elevations(grid, rows)
+    for b in range(len(windows)):
+        k = windows[b, 0]
         i, radius = owner[k], radii[k]
         cx, cy, cz, r2 = centres[k, 0], centres[k, 1], centres[k, 2], 1.000001 * radius * radius
         c2 = cx * cx + cy * cy + cz * cz
         # Thinner than 1.5 times the distance between rays of the grid there.
         slim = thickness(kind[i], numbers[i]) < 1.5 * grid.step * (np.sqrt(c2) + radius)
-        wide = kind[i] == TRIANGLE and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        wide = kind[i] == TRIANGLE and windows[b, 4] - windows[b, 3] >= FEW_ROWS
         if wide:
             planes = edge_planes(numbers[i])
-        for column in range(max(boxes[b, 1], first - side), min(boxes[b, 2], first + used - 1 + side) + 1):
+        for column in range(max(windows[b, 1], first - side), min(windows[b, 2], first + used - 1 + side) + 1):
             j = column - first + side
-            away = max(first - column, column - first - used + 1)
+            outside = max(first - column, column - first - used + 1)
             azimuth = 2.0 * np.pi * column / grid.columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
-            low, high = boxes[b, 3], boxes[b, 4]
+            low, high = windows[b, 3], windows[b, 4]
             if wide:
                 low, high = rows_within(planes, ca, sa, largest_jitter, grid, low, high)
             for row in range(low, high + 1):
-                if away > beside[row]:
+                if outside > beside[row]:
                     continue
                 dx, dy, dz = direction(ca, sa, level[row], rise[row], jitter[j, row, 0], jitter[j, row, 1])
                 along = dx * cx + dy * cy + dz * cz
@@ -289,9 +305,9 @@ def rows_within(planes, ca, sa, slack, grid, low, high):  # type: ignore[no-unty
         # The elevations e with across cos e + up sin e >= -slack form one interval.
         middle, half = np.arctan2(up, across), np.arccos(-slack / size)
         a, z = np.inf, -np.inf
-        for turn in range(-1, 2):
-            first = max(bottom, middle - half + 2.0 * np.pi * turn)
-            last = min(top, middle + half + 2.0 * np.pi * turn)
+        for wrap in range(-1, 2):
+            first = max(bottom, middle - half + 2.0 * np.pi * wrap)
+            last = min(top, middle + half + 2.0 * np.pi * wrap)
             if first <= last:
                 a, z = min(a, first), max(z, last)
         if a > z:
@@ -302,7 +318,7 @@ def rows_within(planes, ca, sa, slack, grid, low, high):  # type: ignore[no-unty
 
 @njit(cache=True, nogil=True)
 def hide(shape, best, least):  # type: ignore[no-untyped-def]
-    """Turn hits below the least range into misses: a shape too near hides the shapes behind it."""
+    """Turn hits below the ``least`` range, mm, into misses: a shape too near hides the shapes behind it."""
     for j in range(best.shape[0]):
         for k in range(best.shape[1]):
             if best[j, k] < least:
@@ -313,8 +329,8 @@ def hide(shape, best, least):  # type: ignore[no-untyped-def]
 def thickness(kind, n):  # type: ignore[no-untyped-def]
     """Return the diameter of a ball or bar, which may fall between two rays; infinite for faces."""
     if kind == SPHERE:
-        return 2.0 * n[3]
-    return 2.0 * max(n[6], n[7]) if kind == CONE else np.inf
+        return 2.0 * n[RADIUS]
+    return 2.0 * max(n[R_START], n[R_END]) if kind == CONE else np.inf
 
 
 @njit(cache=True, nogil=True)
@@ -324,7 +340,7 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
     ``number`` (width + 2 side, rows) is a ray's row in the result, -1 for none. The sub-rays' directions differ from
     the ray's by ``angle`` (m,) times ``offsets`` (k, 2).
     """
-    boxes, first, width, side = strip  # in local variables, as the inner loops are faster with them
+    windows, first, width, side = strip  # in local variables, as the inner loops are faster with them
     kind, numbers, cuts, cut_start = shapes
     owner, centres, radii = pieces
     jitter, largest_jitter, min_range, max_range = rays
@@ -334,22 +350,20 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
     farthest = np.full(count, np.inf)  # range of each ray's sub-rays
     broadest = angle.max() if count else 0.0
     rows = number.shape[1]
-    level, rise = np.empty(rows), np.empty(rows)
-    for i in range(rows):
-        level[i], rise[i] = np.cos(grid.lowest + grid.step * i), np.sin(grid.lowest + grid.step * i)
-    for b in range(len(boxes)):
-        k = boxes[b, 0]
+    level, rise = elevations(grid, rows)
+    for b in range(len(windows)):
+        k = windows[b, 0]
         i = owner[k]
         cx, cy, cz, r = centres[k, 0], centres[k, 1], centres[k, 2], radii[k]
         c2 = cx * cx + cy * cy + cz * cz
-        wide = kind[i] == TRIANGLE and boxes[b, 4] - boxes[b, 3] >= FEW_ROWS
+        wide = kind[i] == TRIANGLE and windows[b, 4] - windows[b, 3] >= FEW_ROWS
         if wide:
             planes = edge_planes(numbers[i])
-        for column in range(max(boxes[b, 1], first), min(boxes[b, 2], first + width - 1) + 1):
+        for column in range(max(windows[b, 1], first), min(windows[b, 2], first + width - 1) + 1):
             j = column - first + side
             azimuth = 2.0 * np.pi * column / grid.columns
             ca, sa = np.cos(azimuth), np.sin(azimuth)
-            low, high = boxes[b, 3], boxes[b, 4]
+            low, high = windows[b, 3], windows[b, 4]
             if wide:
                 low, high = rows_within(planes, ca, sa, largest_jitter + broadest, grid, low, high)
             for row in range(low, high + 1):
@@ -383,17 +397,17 @@ def normals(kind, numbers, shape, points):  # type: ignore[no-untyped-def]
     for k in range(len(shape)):
         n = numbers[shape[k]]
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        what = kind[shape[k]]
-        if what == SPHERE:
+        shape_kind = kind[shape[k]]
+        if shape_kind == SPHERE:
             nx, ny, nz = x - n[0], y - n[1], z - n[2]
-        elif what == CONE:
+        elif shape_kind == CONE:
             # The gradient of the bowed cone's equation.
-            length = np.sqrt(x * x + y * y + z * z)
-            nx = cone_slope(n, x, y, z, 1.0, 0.0, 0.0, length)
-            ny = cone_slope(n, x, y, z, 0.0, 1.0, 0.0, length)
-            nz = cone_slope(n, x, y, z, 0.0, 0.0, 1.0, length)
-        elif what == DISC:
-            nx, ny, nz = n[3], n[4], n[5]
+            ux, uy, uz = x - n[0], y - n[1], z - n[2]
+            nx = cone_at(n, ux, uy, uz, 1.0, 0.0, 0.0)[2]
+            ny = cone_at(n, ux, uy, uz, 0.0, 1.0, 0.0)[2]
+            nz = cone_at(n, ux, uy, uz, 0.0, 0.0, 1.0)[2]
+        elif shape_kind == DISC:
+            nx, ny, nz = n[AXIS], n[AXIS + 1], n[AXIS + 2]
         else:
             ax, ay, az = n[3] - n[0], n[4] - n[1], n[5] - n[2]
             bx, by, bz = n[6] - n[0], n[7] - n[1], n[8] - n[2]
@@ -401,17 +415,3 @@ def normals(kind, numbers, shape, points):  # type: ignore[no-untyped-def]
         size = np.sqrt(nx * nx + ny * ny + nz * nz)
         result[k, 0], result[k, 1], result[k, 2] = nx / size, ny / size, nz / size
     return result
-
-
-@njit(cache=True, nogil=True)
-def cone_slope(n, x, y, z, ex, ey, ez, length):  # type: ignore[no-untyped-def]
-    """Return the derivative of the bowed cone's equation at (x, y, z) along the unit vector e."""
-    ux, uy, uz = x - n[0], y - n[1], z - n[2]
-    h = ux * n[3] + uy * n[4] + uz * n[5]
-    rate = ex * n[3] + ey * n[4] + ez * n[5]
-    q = (n[12] + h) / n[13]
-    move, change = 4.0 * q * (1.0 - q), 4.0 * (1.0 - 2.0 * q) * rate / n[13]
-    ux, uy, uz = ux - h * n[3] - move * n[9], uy - h * n[4] - move * n[10], uz - h * n[5] - move * n[11]
-    vx, vy, vz = ex - rate * n[3] - change * n[9], ey - rate * n[4] - change * n[10], ez - rate * n[5] - change * n[11]
-    taper = (n[7] - n[6]) / n[8]
-    return ux * vx + uy * vy + uz * vz - (n[6] + taper * h) * taper * rate

@@ -15,13 +15,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from designgen.designs.patch import Bools, Surface
-from designgen.scanning import ray_boxes, ray_kernels
+from designgen.scanning import angular_bounds, ray_kernels
 from designgen.scanning.surfaces import CONE, DISC, SPHERE, TRIANGLE, Surfaces
-from processor.model import Floats, Ints, Labels, Shorts
+from processor.model import Floats, Labels, Shorts
 
 WEIGHTS = (-3.0, 4.0)  # bounds of the weights of a net triangle's edges within which a hit on the face is sought
 POINTS = {SPHERE: (0,), CONE: (0,), DISC: (0,), TRIANGLE: (0, 3, 6)}  # columns of points in a shape's numbers
-VECTORS: dict[int, tuple[int, ...]] = {SPHERE: (), CONE: (3, 9), DISC: (3,), TRIANGLE: ()}  # columns of vectors
+VECTORS = {CONE: (ray_kernels.AXIS, ray_kernels.BOW), DISC: (ray_kernels.AXIS,)}  # columns of vectors
 
 
 class Grid(NamedTuple):
@@ -32,44 +32,27 @@ class Grid(NamedTuple):
     rows: int
     columns: int
 
-    def levels(self) -> Floats:
+    def cos_elevations(self) -> Floats:
         """Return the cosines (rows,) of the rows' elevations."""
         cosines: Floats = np.cos(self.lowest + self.step * np.arange(self.rows))
         return cosines
 
-    def directions(self, row: Labels, column: Labels) -> Floats:
-        """Return unit vectors (n, 3) in the scanner's frame."""
+    def directions(self, row: Labels, column: Labels, jitter: Floats | Shorts | None = None) -> Floats:
+        """Return unit vectors (n, 3) in the scanner's frame, rotated by ``jitter`` (n, 2), rad, to the left and up."""
         azimuth, elevation = 2.0 * np.pi * column / self.columns, self.lowest + self.step * row
-        level = np.cos(elevation)
-        return np.stack([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)], axis=-1)
-
-    def turned_directions(self, row: Labels, column: Labels, jitter: Floats | Shorts) -> Floats:
-        """Return the directions (n, 3) of rays rotated by ``jitter`` (n, 2), rad, as :func:`ray_kernels.direction`."""
-        azimuth, elevation = 2.0 * np.pi * column / self.columns, self.lowest + self.step * row
-        level, rise, ca, sa = np.cos(elevation), np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
-        da, de = jitter[:, 0].astype(np.float64), jitter[:, 1].astype(np.float64)
-        flat = level - de * rise
-        return np.stack([flat * ca - da * sa, flat * sa + da * ca, rise + de * level], axis=1)
+        da, de = (0.0, 0.0) if jitter is None else jitter.T.astype(np.float64)
+        cosines_and_sines = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+        formula: Any = ray_kernels.direction
+        return np.stack(formula.py_func(*cosines_and_sines, da, de), axis=-1)
 
 
 @dataclass(frozen=True)
 class View:
-    """The surfaces in a scanner's frame, and the boxes that their pieces cover on the grid, sorted by strip.
-
-    A strip has ``width`` columns; ``side`` columns on either side are cast with it, to find its edges.
-    """
+    """The surfaces in a scanner's frame, and the strips of the grid with the windows that pieces cover."""
 
     shapes: ray_kernels.Shapes
     pieces: ray_kernels.Pieces
-    boxes: Labels  # (b, 5): piece, first and last column, first and last row
-    strip_start: Ints  # (strips + 1,)
-    width: int
-    side: int
-
-    def strip(self, number: int) -> ray_kernels.Strip:
-        """Return a strip with its boxes."""
-        boxes = self.boxes[self.strip_start[number] : self.strip_start[number + 1]]
-        return ray_kernels.Strip(boxes=boxes, first=number * self.width, width=self.width, side=self.side)
+    strips: tuple[ray_kernels.Strip, ...]
 
 
 def view(
@@ -77,38 +60,38 @@ def view(
 ) -> View:
     """Transform surfaces into a scanner's frame and draw their bounding spheres onto its grid.
 
-    ``width`` is the number of columns of a strip, ``side`` of those that are cast on either side of it. ``reach`` is
-    the greatest range (mm), ``spread`` the largest angle (rad) between a ray and its nominal direction.
+    A strip has ``width`` columns; ``side`` columns on either side are cast with it, to find its edges. ``reach`` is the
+    greatest range (mm), ``spread`` the largest angle (rad) between a ray and its nominal direction.
     """
     R, t = T_scanner_scene[:3, :3], T_scanner_scene[:3, 3]
     numbers = surfaces.numbers.copy()
     for kind in POINTS:
         rows = np.flatnonzero(surfaces.kind == kind)
-        for columns, shift in ((POINTS[kind], t), (VECTORS[kind], np.zeros(3))):
+        for columns, shift in ((POINTS[kind], t), (VECTORS.get(kind, ()), np.zeros(3))):
             for c in columns:
                 numbers[rows, c : c + 3] = numbers[rows, c : c + 3] @ R.T + shift
     cuts = surfaces.cuts.copy()
     cuts[:, :3] = cuts[:, :3] @ R.T
     centres = surfaces.piece_centre @ R.T + t
-    covered = ray_boxes.boxes(
+    covered = angular_bounds.grid_windows(
         centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns,
         side,
     )  # fmt: skip
-    boxes, start = ray_boxes.by_strip(covered, width, -(-grid.columns // width), side)
+    windows, start = angular_bounds.by_strip(covered, width, -(-grid.columns // width), side)
     return View(
         shapes=ray_kernels.Shapes(surfaces.kind, numbers, cuts, surfaces.cut_start),
         pieces=ray_kernels.Pieces(surfaces.piece_shape, centres, surfaces.piece_radius),
-        boxes=boxes,
-        strip_start=start,
-        width=width,
-        side=side,
+        strips=tuple(
+            ray_kernels.Strip(windows=windows[start[i] : start[i + 1]], first=i * width, width=width, side=side)
+            for i in range(len(start) - 1)
+        ),
     )
 
 
-def meet(
-    seen: View, surfaces: Surfaces, T_scanner_scene: Floats, shape: Labels, ray: Floats, t: Floats
+def refine_hits(
+    view: View, surfaces: Surfaces, T_scanner_scene: Floats, shape: Labels, ray: Floats, t: Floats
 ) -> tuple[Floats, Floats]:
-    """Return ranges (n,) and cosines of incidence (n,) of rays (n, 3) that meet shapes (n,) near ranges t (n,).
+    """Return ranges (n,), mm, and cosines of incidence (n,) of rays (n, 3) that meet shapes (n,) near ranges t (n,).
 
     Patches are met on their own surfaces instead of their nets. The range is NaN where the search does not converge, as
     at the edge of a patch at grazing incidence.
@@ -116,7 +99,7 @@ def meet(
     range_, normal = t.copy(), np.empty((len(t), 3))
     plain = surfaces.patch[shape] < 0
     points = ray[plain] * t[plain, None]
-    normal[plain] = ray_kernels.normals(seen.shapes.kind, seen.shapes.numbers, shape[plain], points)
+    normal[plain] = ray_kernels.normals(view.shapes.kind, view.shapes.numbers, shape[plain], points)
     if not plain.all():
         curved = ~plain
         range_[curved], normal[curved] = _on_patches(surfaces, T_scanner_scene, shape[curved], ray[curved], t[curved])
@@ -136,19 +119,19 @@ def _on_patches(
         at, triangle = surfaces.patches[patch[rows[0]]].at, shape[rows]
         d = ray[rows] @ R  # in the scene's frame
         corners, pq = surfaces.numbers[triangle, :9].reshape(-1, 3, 3), surfaces.corner_pq[triangle]
-        edge, turn = corners[:, 1:] - corners[:, :1], pq[:, 1:] - pq[:, :1]
-        # Newton with the derivatives of the net's triangle: dx = edge^T w for d(p, q) = turn^T w.
+        edge, pq_edges = corners[:, 1:] - corners[:, :1], pq[:, 1:] - pq[:, :1]
+        # Newton with the derivatives of the net's triangle: dx = edge^T w for d(p, q) = pq_edges^T w.
         inverse, regular = _inverse(edge[:, 0], edge[:, 1], -d)
         range_ = t[rows].copy()
         weights = np.einsum("nij,nj->ni", inverse, origin + range_[:, None] * d - corners[:, 0])[:, :2]
         now, met, error = np.empty((len(rows), 2)), np.empty((len(rows), 3)), np.full(len(rows), np.inf)
         live: Any = slice(None)  # rays that have not converged: mostly all or none
         for _ in range(12):
-            now[live] = pq[live, 0] + np.einsum("ni,nij->nj", weights[live], turn[live])
+            now[live] = pq[live, 0] + np.einsum("ni,nij->nj", weights[live], pq_edges[live])
             met[live] = at(now[live, 0], now[live, 1])
-            left = origin + range_[live, None] * d[live] - met[live]
-            error[live] = np.sqrt(np.einsum("ni,ni->n", left, left))
-            step = np.einsum("nij,nj->ni", inverse[live], left)
+            residual = origin + range_[live, None] * d[live] - met[live]
+            error[live] = np.sqrt(np.einsum("ni,ni->n", residual, residual))
+            step = np.einsum("nij,nj->ni", inverse[live], residual)
             # Without bounds, a grazing ray may leave the range in which the face's function is defined.
             weights[live] = np.clip(weights[live] + step[:, :2], *WEIGHTS)
             range_[live] += step[:, 2]
@@ -157,7 +140,7 @@ def _on_patches(
                 break
             live = more if len(more) < len(rows) else live
         range_[~(error < tolerance_mm) | ~regular] = np.nan
-        result[rows], normal[rows] = range_, _normals(at, now, met, turn) @ R.T
+        result[rows], normal[rows] = range_, _normals(at, now, met, pq_edges) @ R.T
     return result, normal
 
 
@@ -174,10 +157,10 @@ def _inverse(a: Floats, b: Floats, c: Floats) -> tuple[Floats, Bools]:
     return inverse, regular
 
 
-def _normals(at: Surface, pq: Floats, points: Floats, turn: Floats) -> Floats:
-    """Return unit normals (n, 3) of a patch at pq (n, 2), with its ``points`` there, by differences along ``turn``."""
+def _normals(at: Surface, pq: Floats, points: Floats, pq_edges: Floats) -> Floats:
+    """Return unit normals (n, 3) of a patch at pq (n, 2), its ``points``, by differences along ``pq_edges``."""
     fraction = 1e-5  # of the net's edges, which bend by a few degrees at most: 1e-6 rad of the normal
-    first, second = (at(*(pq + fraction * turn[:, k]).T) - points for k in range(2))
+    first, second = (at(*(pq + fraction * pq_edges[:, k]).T) - points for k in range(2))
     normal = np.cross(first, second)
     unit: Floats = normal / np.sqrt(np.einsum("ni,ni->n", normal, normal))[:, None]
     return unit

@@ -8,17 +8,19 @@ behaviour. Weak signals are lost, and some returns become outliers. A station ha
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import Any, TypeVar
 
 import numpy as np
 
 from designgen.designs.patch import Bools
-from designgen.frames import rigid
-from designgen.scanning import footprints, ray_kernels, raycast
+from designgen.frames import inverse
+from designgen.randomness import generator
+from designgen.scanning import edge_footprints, ray_kernels, raycast
+from designgen.scanning.ray_kernels import Strip
 from designgen.scanning.raycast import Grid, View
 from designgen.scanning.scanner import BEAM_RINGS, Params, Scanner
 from designgen.scanning.surfaces import Surfaces
@@ -60,20 +62,38 @@ class StationScan:
 
 @dataclass(frozen=True)
 class Echoes:
-    """Echoes before noise, a row each; ``t`` is the true range of the ray's middle, mm."""
+    """Echoes before noise, a row each."""
 
-    row: Labels
+    row: Labels  # of the grid
     column: Labels
-    shape: Labels
-    t: Floats
-    range: Floats
-    signal: Floats
-    cosine: Floats
-    ray: Floats  # (n, 3)
-    source: Codes
+    shape: Labels  # row of Surfaces
+    t: Floats  # true range of the ray's middle, mm; NaN for none
+    range: Floats  # range of the whole footprint, mm
+    signal: Floats  # relative to that of a white matt surface at normal incidence and 10 m
+    cosine: Floats  # of the angle of incidence
+    ray: Floats  # (n, 3) unit vector of the ray's middle, scanner's frame
+    source: Codes  # row of SOURCES
 
 
-def scan(
+Columns = TypeVar("Columns", Returns, Echoes)
+
+
+def map_columns(record: Columns, function: Callable[[str], Any]) -> Columns:
+    """Return a record of the same class whose columns are a function of their names."""
+    return type(record)(**{field.name: function(field.name) for field in dataclasses.fields(record)})
+
+
+def join(pieces: Sequence[Columns]) -> Columns:
+    """Return the rows of all pieces, in order."""
+    return map_columns(pieces[0], lambda name: np.concatenate([getattr(piece, name) for piece in pieces]))
+
+
+def rows_of(record: Columns, rows: Any) -> Columns:
+    """Return the rows of a record that numbers or a mask select."""
+    return map_columns(record, lambda name: getattr(record, name)[rows])
+
+
+def scan_station(
     surfaces: Surfaces,
     T_scene_scanner: Floats,
     scanner: Scanner,
@@ -82,9 +102,12 @@ def scan(
     station: str,
     keep_hits: bool = False,
 ) -> StationScan:
-    """Scan from one station. All random numbers depend only on seed, station and grid."""
-    key = (seed, int.from_bytes(hashlib.sha256(f"station {station}".encode()).digest()[:8], "little"))
-    draws = np.random.default_rng(key).standard_normal(4)
+    """Scan ``surfaces`` from the station named ``station``; ``T_scene_scanner`` (4, 4) is its true pose, mm.
+
+    All random numbers depend only on ``seed``, the station's name and the grid. With ``keep_hits`` the returns have the
+    true hits as well.
+    """
+    draws = generator(seed, f"station {station}").standard_normal(4)
     offset, scale = scanner.offset_mm * draws[0], scanner.scale_ppm * draws[1]
     tilt = 1e-6 * scanner.tilt_urad * draws[2:]
     step = 1e-3 * params.step_mrad
@@ -94,27 +117,28 @@ def scan(
         rows=int(np.radians(HIGHEST_DEG - LOWEST_DEG) / step),
         columns=max(8, round(2.0 * np.pi / step)),
     )
-    R = T_scene_scanner[:3, :3].T
-    T_scanner_scene = rigid(R, -R @ T_scene_scanner[:3, 3])
+    T_scanner_scene = inverse(T_scene_scanner)
     nearest = np.array([max(scanner.min_range_mm, 1.0)])
     spread = 2.0 * float(scanner.beam_angle(nearest)[0]) + ENCODER_SIGMAS * 1e-6 * scanner.encoder_urad
-    place: Floats = T_scene_scanner[:3, 3]
-    least = max(float(nearest[0]), footprints.nearest_mm(surfaces, place))
-    margin = footprints.margin(grid, outermost(params.sub_rays) * float(scanner.beam_angle(np.array([least]))[0]))
-    work = _Work(
+    least = max(float(nearest[0]), edge_footprints.nearest_mm(surfaces, T_scene_scanner[:3, 3]))
+    margin = edge_footprints.margin(grid, outermost(params.sub_rays) * float(scanner.beam_angle(np.array([least]))[0]))
+    caster = _StationCaster(
         surfaces=surfaces,
         view=raycast.view(surfaces, T_scanner_scene, grid, STRIP, margin.side, scanner.max_range_mm, spread),
         T_scanner_scene=T_scanner_scene,
         grid=grid,
         scanner=scanner,
         params=params,
-        key=key,
+        seed=seed,
+        station=station,
         keep_hits=keep_hits,
         margin=margin,
         least=least,
     )
     with ThreadPoolExecutor(_threads()) as pool:  # the kernels release the interpreter's lock
-        returns = _joined_returns(list(pool.map(work.strip, range(-(-grid.columns // STRIP)))))
+        # One strip at least: it gives the columns of an empty scan their types.
+        strips = [i for i, strip in enumerate(caster.view.strips) if len(strip.windows)] or [0]
+        returns = join(list(pool.map(caster.strip, strips)))
     measured = np.linalg.norm(returns.points, axis=1)
     factor = (measured * (1.0 + 1e-6 * scale) + offset) / measured
     turned = np.array([[1.0, 0.0, tilt[1]], [0.0, 1.0, -tilt[0]], [-tilt[1], tilt[0], 1.0]])
@@ -124,12 +148,6 @@ def scan(
 
 def _threads() -> int:
     return int(os.environ.get("OMP_NUM_THREADS") or os.cpu_count() or 1)
-
-
-def _joined_returns(pieces: Sequence[Returns]) -> Returns:
-    """Join the strips' returns."""
-    names = [field.name for field in dataclasses.fields(Returns)]
-    return Returns(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
 
 def beam(count: int) -> tuple[Floats, Floats]:
@@ -152,7 +170,7 @@ def outermost(count: int) -> float:
 
 
 @dataclass(frozen=True)
-class _Work:
+class _StationCaster:
     """Data of one station, and the steps from rays to returns for each strip."""
 
     surfaces: Surfaces
@@ -161,36 +179,37 @@ class _Work:
     grid: Grid
     scanner: Scanner
     params: Params
-    key: tuple[int, int]
+    seed: int
+    station: str
     keep_hits: bool
-    margin: footprints.Margin
+    margin: edge_footprints.Margin
     least: float  # lower bound of the range to any surface, mm
 
     def strip(self, number: int) -> Returns:
         """Return the returns of one strip of columns."""
-        if self.view.strip_start[number] == self.view.strip_start[number + 1]:
-            return self._returns(np.random.default_rng(0), _joined([]))
-        # From 1: a key with a 0 at its end gives the same generator as without, which is that of the station.
-        rng = np.random.default_rng([*self.key, number + 1])
-        used, side = min(STRIP, self.grid.columns - number * STRIP), self.margin.side
-        strip, rays = self.view.strip(number), self._rays(rng, used)
+        strip = self.view.strips[number]
+        # From 1: a 0 at the end gives the same generator as without, which is that of the station.
+        rng = generator(self.seed, f"station {self.station}", number + 1)
+        used, side = min(STRIP, self.grid.columns - strip.first), strip.side
+        rays = self._rays(rng, used)
         beam_ = ray_kernels.Beam(0.5 * self.scanner.beam_exit_mm, 0.5e-3 * self.scanner.divergence_mrad)
         shape, t, thin = ray_kernels.cast(
-            self.view.shapes, self.view.pieces, strip, self.grid, rays, beam_, self.margin.cast
+            self.view.shapes, self.view.pieces, strip, self.grid, rays, beam_, self.margin.cast_columns
         )
         inside = shape >= 0
         inside[:side], inside[side + used :] = False, False
         edge, near = np.zeros(shape.shape, bool), t
         if self.params.sub_rays > 1:
             surface = np.where(shape >= 0, self.surfaces.surface[shape], -1)
-            edge, near = footprints.mark(
+            edge, near = edge_footprints.mark_edges(
                 surface, t, thin, used, self.margin, self.grid, beam_, outermost(self.params.sub_rays), self.least
             )
             inside &= ~edge
         column, row = (index.astype(np.int32) for index in np.nonzero(inside))
-        on_surfaces = self._on_surfaces(number, column, row, shape[column, row], t[column, row], rays)
-        at_edges = self._at_edges(number, edge, near, rays) if edge.any() else []
-        return self._returns(rng, _joined([on_surfaces, *at_edges]))
+        on_surfaces = self._on_surfaces(strip, column, row, shape[column, row], t[column, row], rays)
+        at_edges = self._at_edges(strip, edge, near, rays) if edge.any() else []
+        echoes = join([on_surfaces, *at_edges])
+        return self._returns(rng, rows_of(echoes, np.lexsort((echoes.row, echoes.column))))
 
     def _rays(self, rng: np.random.Generator, used: int) -> ray_kernels.Rays:
         """Draw the encoders' noise of a strip with ``used`` columns; the rays beside it have none."""
@@ -201,18 +220,18 @@ class _Work:
             drawn[:] = rng.standard_normal((used, self.grid.rows, 2), np.float32)
             drawn *= np.float32(encoder)
             # A change of azimuth rotates a ray by the cosine of its elevation times as much.
-            drawn[:, :, 0] *= self.margin.level
+            drawn[:, :, 0] *= self.margin.cos_elevation
         # Two perpendicular encoders rotate a ray by at most sqrt 2 times as much; the rest is for rounding.
         largest = 1.5e-6 * ENCODER_SIGMAS * self.scanner.encoder_urad + 1e-6
         return ray_kernels.Rays(jitter, largest, self.scanner.min_range_mm, self.scanner.max_range_mm)
 
     def _on_surfaces(
-        self, strip: int, column: Labels, row: Labels, shape: Labels, t: Floats, rays: ray_kernels.Rays
+        self, strip: Strip, column: Labels, row: Labels, shape: Labels, t: Floats, rays: ray_kernels.Rays
     ) -> Echoes:
         """Return the echoes of footprints on a single surface each."""
-        columns = (strip * STRIP + column - self.margin.side).astype(np.int32)
-        ray = self.grid.turned_directions(row, columns, rays.jitter[column, row])
-        exact, cosine = raycast.meet(self.view, self.surfaces, self.T_scanner_scene, shape, ray, t)
+        columns = (strip.first + column - strip.side).astype(np.int32)
+        ray = self.grid.directions(row, columns, rays.jitter[column, row])
+        exact, cosine = raycast.refine_hits(self.view, self.surfaces, self.T_scanner_scene, shape, ray, t)
         met = np.isfinite(exact)
         t, cosine = exact[met], cosine[met]
         return Echoes(
@@ -227,7 +246,7 @@ class _Work:
             source=np.full(len(t), SURFACE, np.uint8),
         )
 
-    def _at_edges(self, strip: int, edge: Bools, near: Floats, rays: ray_kernels.Rays) -> list[Echoes]:
+    def _at_edges(self, strip: Strip, edge: Bools, near: Floats, rays: ray_kernels.Rays) -> list[Echoes]:
         """Return the echoes of the rays marked in ``edge``: of footprints on one surface after all, and mixed ones."""
         column, row = (index.astype(np.int32) for index in np.nonzero(edge))
         number = np.full(edge.shape, -1, np.int32)
@@ -235,7 +254,7 @@ class _Work:
         offsets = beam(self.params.sub_rays)[0]
         angle = self.scanner.beam_angle(near[column, row])
         subs, ranges = ray_kernels.cast_around(
-            self.view.shapes, self.view.pieces, self.view.strip(strip), self.grid, rays, number, angle, offsets
+            self.view.shapes, self.view.pieces, strip, self.grid, rays, number, angle, offsets
         )
         surface = np.where(subs >= 0, self.surfaces.surface[subs], -1)
         whole = (surface == surface[:, :1]).all(axis=1) & (subs[:, 0] >= 0)
@@ -247,7 +266,7 @@ class _Work:
 
     def _mixed(
         self,
-        strip: int,
+        strip: Strip,
         column: Labels,
         row: Labels,
         subs: Labels,
@@ -258,13 +277,12 @@ class _Work:
         """Return the echoes of footprints on several surfaces, or partly on none; ``subs``, ``ranges`` (n, k)."""
         offsets, share = beam(self.params.sub_rays)
         jitter = rays.jitter[column, row]
-        columns = (strip * STRIP + column - self.margin.side).astype(np.int32)
+        columns = (strip.first + column - strip.side).astype(np.int32)
         t, cosine = np.full(ranges.shape, np.nan), np.zeros(ranges.shape)
-        which, k = np.nonzero(subs >= 0)
-        turned = jitter[which] + angle[which, None] * offsets[k]
-        ray = self.grid.turned_directions(row[which], columns[which], turned)
-        t[which, k], cosine[which, k] = raycast.meet(
-            self.view, self.surfaces, self.T_scanner_scene, subs[which, k], ray, ranges[which, k]
+        n, k = np.nonzero(subs >= 0)
+        ray = self.grid.directions(row[n], columns[n], jitter[n] + angle[n, None] * offsets[k])
+        t[n, k], cosine[n, k] = raycast.refine_hits(
+            self.view, self.surfaces, self.T_scanner_scene, subs[n, k], ray, ranges[n, k]
         )
         hit = np.isfinite(t)
         ranges, t, cosine = np.where(hit, t, np.inf), np.where(hit, t, 1.0), np.where(hit, cosine, 0.0)
@@ -283,7 +301,7 @@ class _Work:
             range=(energy[back] * t[back]).sum(axis=1) / total,
             signal=total,
             cosine=np.take_along_axis(cosine[back], most, axis=1)[:, 0],
-            ray=self.grid.turned_directions(row[back], columns[back], jitter[back]),
+            ray=self.grid.directions(row[back], columns[back], jitter[back]),
             source=np.full(len(total), MIXED, np.uint8),
         )
 
@@ -312,29 +330,7 @@ class _Work:
             hits=echoes.ray * echoes.t[:, None] if self.keep_hits else np.empty((n, 0)),
         )
         detected = (echoes.signal * speckle >= self.scanner.threshold) & (measured > 0.0)
-        columns = {field.name: getattr(returns, field.name)[detected] for field in dataclasses.fields(Returns)}
-        return Returns(**columns)
-
-
-def _joined(pieces: Sequence[Echoes]) -> Echoes:
-    """Return echoes in the order of the grid: by columns, then rows."""
-    if not pieces:
-        none, no_label = np.empty(0), np.empty(0, np.int32)
-        return Echoes(
-            row=no_label,
-            column=no_label,
-            shape=no_label,
-            t=none,
-            range=none,
-            signal=none,
-            cosine=none,
-            ray=np.empty((0, 3)),
-            source=np.empty(0, np.uint8),
-        )
-    names = [field.name for field in dataclasses.fields(Echoes)]
-    columns = {name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names}
-    order = np.lexsort((columns["row"], columns["column"]))
-    return Echoes(**{name: column[order] for name, column in columns.items()})
+        return rows_of(returns, detected)
 
 
 def strongest_echo(ranges: Floats, energy: Floats, separation_mm: float) -> Floats:

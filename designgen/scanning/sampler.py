@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from designgen.checks import expect
+from designgen.checks import expect_all
 from designgen.designs import arch_part, bolt_ball, space_frame
 from designgen.designs.arch_part import Face
 from designgen.designs.patch import Bools, Patch, within_triangle
@@ -30,21 +30,14 @@ class Params:
     member_reach_mm: float = 0.0  # frames: members are sampled to this distance from each ball; 0 = over their length
 
     def __post_init__(self) -> None:
-        expect(0.05 <= self.spacing_mm <= 1000.0, "scan.spacing_mm", self.spacing_mm, "0.05 to 1000")
-        expect(0.0 <= self.sigma_mm <= 1000.0, "scan.sigma_mm", self.sigma_mm, "0 to 1000")
-        expect(0.0 <= self.outlier_share < 1.0, "scan.outlier_share", self.outlier_share, "0 to less than 1")
-        expect(self.inner_depth_mm > 0.0, "scan.inner_depth_mm", self.inner_depth_mm, "a length above 0")
-        expect(self.member_reach_mm >= 0.0, "scan.member_reach_mm", self.member_reach_mm, "0 or a length")
-
-
-def spacing_mm(params: object) -> float:
-    """Return the spacing of a sampled scene, mm; NaN for a scene by rays, where it differs from point to point."""
-    return params.spacing_mm if isinstance(params, Params) else float("nan")
-
-
-def sigma_mm(params: object) -> float:
-    """Return the noise of a sampled scene, mm; NaN for a scene by rays, where it differs from point to point."""
-    return params.sigma_mm if isinstance(params, Params) else float("nan")
+        expect_all(
+            "scan",
+            (0.05 <= self.spacing_mm <= 1000.0, "spacing_mm", self.spacing_mm, "0.05 to 1000"),
+            (0.0 <= self.sigma_mm <= 1000.0, "sigma_mm", self.sigma_mm, "0 to 1000"),
+            (0.0 <= self.outlier_share < 1.0, "outlier_share", self.outlier_share, "0 to less than 1"),
+            (self.inner_depth_mm > 0.0, "inner_depth_mm", self.inner_depth_mm, "a length above 0"),
+            (self.member_reach_mm >= 0.0, "member_reach_mm", self.member_reach_mm, "0 or a length"),
+        )
 
 
 @dataclass(frozen=True)
@@ -99,10 +92,10 @@ def scan_patches(
         if not area.sum() > 0.0:  # the whole face is missing
             continue
         count = rng.poisson(area.sum() / params.spacing_mm**2)
-        chosen = triangles[rng.choice(len(area), count, p=area / area.sum())]
+        corners = triangles[rng.choice(len(area), count, p=area / area.sum())]
         u, v = within_triangle(rng.random(count), rng.random(count))
-        pq = knots[chosen[:, 0]] + u[:, None] * (knots[chosen[:, 1]] - knots[chosen[:, 0]])
-        pq += v[:, None] * (knots[chosen[:, 2]] - knots[chosen[:, 0]])
+        start, second, third = knots[corners.T]
+        pq = start + u[:, None] * (second - start) + v[:, None] * (third - start)
         if hidden is not None:
             pq = pq[~hidden(row, pq[:, 0], pq[:, 1])]
         clouds.append(patch.at(pq[:, 0], pq[:, 1]))
@@ -129,38 +122,33 @@ def _unit_vectors(count: int, rng: np.random.Generator) -> Floats:
 
 def _on_member(frame: space_frame.Frame, member: int, params: Params, rng: np.random.Generator) -> Floats:
     """Sample a member's sleeves, cones and tube."""
-    joined, (a, b) = frame.connection, frame.ends(member)
+    connection, (a, b) = frame.connection, frame.ends(member)
     length = float(np.linalg.norm(b - a))
     unit = (b - a) / length
     side = perpendicular(unit)
     basis = np.stack([side, np.cross(unit, side), unit])
     reach = params.member_reach_mm or length
-    tube = 0.5 * joined.tube_diameter
-    ends = [
-        frame.ball(int(node)).flat_distance + joined.sleeve_length + joined.cone_length
-        for node in frame.members[member]
-    ]
+    tube, (first, last) = 0.5 * connection.tube_diameter, frame.stacks[member, :, 2]
 
     def on_tube(low: float, high: float) -> Floats:
         cloud = _on_cone((tube, tube), (low, high), params.spacing_mm, rng)
-        q = (cloud[:, 2] - ends[0]) / (length - sum(ends))
+        q = (cloud[:, 2] - first) / (length - (first + last))
         bowed: Floats = a + (cloud @ basis + np.outer(4.0 * q * (1.0 - q), frame.bow(member)))
         return bowed
 
     points = []
-    for end, (origin, sign) in enumerate(((a, 1.0), (b, -1.0))):
-        tip = ends[end] - joined.cone_length
+    for end, (origin, sign, start) in enumerate(((a, 1.0, first), (b, -1.0, last))):
         axial = basis * np.array([[1.0], [1.0], [sign]])
-        widest = joined.sleeve_corner_radius + 3.0
-        near = [_on_cone((widest, tube), (tip, ends[end]), params.spacing_mm, rng)]
+        tip = start - connection.cone_length
+        near = [_on_cone((connection.cone_radius, tube), (tip, start), params.spacing_mm, rng)]
         if frame.has_sleeve(member, end):
-            bounds = (tip - joined.sleeve_length, tip)
-            near.append(_on_prism(joined.sleeve_corner_radius, bounds, params.spacing_mm, rng))
+            bounds = (tip - connection.sleeve_length, tip)
+            near.append(_on_prism(connection.sleeve_corner_radius, bounds, params.spacing_mm, rng))
         points += [origin + cloud @ axial for cloud in near]
-        if ends[end] < reach < 0.5 * length:
-            points.append(on_tube(ends[0], reach) if end == 0 else on_tube(length - reach, length - ends[1]))
+        if start < reach < 0.5 * length:
+            points.append(on_tube(first, reach) if end == 0 else on_tube(length - reach, length - last))
     if reach >= 0.5 * length:
-        points.append(on_tube(ends[0], length - ends[1]))
+        points.append(on_tube(first, length - last))
     return np.vstack(points)
 
 

@@ -11,20 +11,14 @@ The returns of a ray are modelled in :mod:`designgen.scanning.returns`.
 from __future__ import annotations
 
 import math
-import sys
 from dataclasses import dataclass
-from importlib import resources
 from typing import Any
 
 import numpy as np
 
-from designgen.checks import expect
+from designgen.checks import expect, expect_all
+from designgen.recipe_files import packaged
 from processor.model import Floats, UsageError
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 MODE = "rays"
 SIGNAL_RANGE_MM = 10_000.0  # range at which the signal is 1
@@ -78,17 +72,15 @@ class Scanner:
 
 def presets() -> dict[str, dict[str, Any]]:
     """Return the classes of scanners in scanners.toml by name, with their descriptions and sources."""
-    classes: dict[str, dict[str, Any]]
-    classes = tomllib.loads((resources.files("designgen") / "scanners.toml").read_text("utf-8"))
-    return classes
+    return packaged("scanners.toml")
 
 
 def preset(name: str) -> dict[str, Any]:
     """Return the numbers of a class of scanner; UsageError for an unknown one."""
-    known = presets()
-    if name not in known:
-        raise UsageError(f"scan.scanner: expected one of {', '.join(known)}, got {name!r}")
-    return {key: value for key, value in known[name].items() if key in Scanner.__dataclass_fields__}
+    classes = presets()
+    if name not in classes:
+        raise UsageError(f"scan.scanner: expected one of {', '.join(classes)}, got {name!r}")
+    return {key: value for key, value in classes[name].items() if key in Scanner.__dataclass_fields__}
 
 
 @dataclass(frozen=True)
@@ -101,7 +93,8 @@ class Params:
     sub_rays: int = 7
     reflectance: float = 0.5
     specular: float = 0.3  # specular fraction of the reflection, as on bare steel; 0 = matt
-    stations: tuple[int, ...] = (2, 2)  # two: a grid below a frame; one: a sequence of which any length is a start
+    # (rows, columns) of a grid, or one number of stations; adding stations keeps the earlier ones
+    stations: tuple[int, ...] = (2, 2)
     distance_mm: float = 5_000.0  # of the stations from a part's surface
     height_mm: float = 1_600.0  # of the scanner above the ground
     clutter: int = 0  # number of objects that are no part of the structure
@@ -116,7 +109,8 @@ class Params:
     def __post_init__(self) -> None:
         count, posed = math.prod(self.stations), self.registered or not self.merged
         nonnegative = ("distance_mm", "height_mm", "clutter", "registration_mm", "registration_mrad", "repeated")
-        for fits, key, value, expected in (
+        expect_all(
+            "scan",
             (0.05 <= self.step_mrad <= 50.0, "step_mrad", self.step_mrad, "0.05 to 50"),
             (self.sub_rays in BEAM_RINGS, "sub_rays", self.sub_rays, "1, 7 or 19"),
             (0.0 < self.reflectance <= 1.0, "reflectance", self.reflectance, "above 0 to 1"),
@@ -128,8 +122,7 @@ class Params:
             *((getattr(self, key) >= 0, key, getattr(self, key), "0 or more") for key in nonnegative),
             (self.repeated <= count, "repeated", self.repeated, f"no more than the {count} stations"),
             (posed, "merged", True, "false with registered = false: a cloud needs poses"),
-        ):
-            expect(fits, f"scan.{key}", value, expected)
+        )
 
     def signal(self, cosine: Floats, R: Floats) -> Floats:
         """Return the signal (n,) of a whole beam by the cosine of the angle of incidence and the range, mm."""

@@ -1,13 +1,14 @@
 """The exact surfaces of a scene for rays: spheres with caps cut off, cones, discs and triangles.
 
 Curved faces whose intersection with a ray has no closed form are patches. Rays meet the net of a patch, and
-:func:`designgen.scanning.raycast.meet` moves the hit to the patch's own surface.
+:func:`designgen.scanning.raycast.refine_hits` moves the hit to the patch's own surface.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -116,12 +117,7 @@ class Builder:
         return len(self._labels) - 1
 
     def _add(
-        self,
-        kind: int,
-        part: int,
-        surface: int,
-        numbers: Sequence[float],
-        pieces: Sequence[tuple[Floats, float]],
+        self, kind: int, part: int, surface: int, numbers: Sequence[float], pieces: Sequence[tuple[Floats, float]]
     ) -> None:
         row = np.zeros(NUMBERS)
         row[: len(numbers)] = numbers
@@ -132,55 +128,60 @@ class Builder:
         self._part.append(part)
         self._cuts.append(np.empty((0, 4)))
 
-    def done(self) -> Surfaces:
+    def to_surfaces(self) -> Surfaces:
         """Return all shapes."""
-        plain = len(self._kind)
-        kinds, numbers = [np.array(self._kind, np.int8)], [np.array(self._numbers).reshape(-1, NUMBERS)]
-        surface, part = [np.array(self._surface, np.int32)], [np.array(self._part, np.int32)]
-        patch, pq = [np.full(plain, -1, np.int32)], [np.zeros((plain, 3, 2))]
-        owner = [np.array([p[0] for p in self._pieces], np.int32)]
-        centres = [np.array([p[1] for p in self._pieces]).reshape(-1, 3)]
-        radii = [np.array([p[2] for p in self._pieces])]
-        count = plain
+        count = len(self._kind)
+        blocks: list[dict[str, Any]] = [
+            {
+                "kind": np.array(self._kind, np.int8),
+                "numbers": np.array(self._numbers).reshape(-1, NUMBERS),
+                "surface": np.array(self._surface, np.int32),
+                "part": np.array(self._part, np.int32),
+                "patch": np.full(count, -1, np.int32),
+                "corner_pq": np.zeros((count, 3, 2)),
+                "piece_shape": np.array([shape for shape, _, _ in self._pieces], np.int32),
+                "piece_centre": np.array([centre for _, centre, _ in self._pieces]).reshape(-1, 3),
+                "piece_radius": np.array([radius for _, _, radius in self._pieces]),
+            }
+        ]
         numbered: dict[tuple[int, str], int] = {}
-        for number, (face, of_part) in enumerate(self._nets):
-            knots, faces = face.net()
-            corners = face.at(knots[:, 0], knots[:, 1])[faces]
-            rows = np.zeros((len(faces), NUMBERS))
-            rows[:, :9] = corners.reshape(-1, 9)
-            kinds.append(np.full(len(faces), TRIANGLE, np.int8))
-            numbers.append(rows)
-            key = of_part, face.name  # patches of the same part and name are pieces of one smooth surface
+        for number, (patch, part) in enumerate(self._nets):
+            key = part, patch.name  # patches of the same part and name are pieces of one smooth surface
             if key not in numbered:
-                numbered[key] = self._name(face.name)
-            surface.append(np.full(len(faces), numbered[key], np.int32))
-            part.append(np.full(len(faces), of_part, np.int32))
-            patch.append(np.full(len(faces), -1 if _is_flat(face, knots[faces], corners) else number, np.int32))
-            pq.append(knots[faces])
-            middle = corners.mean(axis=1)
-            owner.append(np.arange(count, count + len(faces), dtype=np.int32))
-            centres.append(middle)
-            radii.append(np.linalg.norm(corners - middle[:, None], axis=2).max(axis=1))
-            count += len(faces)
+                numbered[key] = self._name(patch.name)
+            blocks.append(_net_shapes(patch, number, part, numbered[key], count))
+            count += len(blocks[-1]["kind"])
         names = tuple(dict.fromkeys(self._labels))
         rows_of = {name: i for i, name in enumerate(names)}
-        ends = np.cumsum([0, *(len(c) for c in self._cuts), *[0] * (count - plain)])
+        ends = np.cumsum([0, *(len(c) for c in self._cuts), *[0] * (count - len(self._kind))])
         return Surfaces(
-            kind=np.concatenate(kinds),
-            numbers=np.concatenate(numbers),
-            surface=np.concatenate(surface),
-            part=np.concatenate(part),
-            patch=np.concatenate(patch),
-            corner_pq=np.concatenate(pq),
+            **{key: np.concatenate([block[key] for block in blocks]) for key in blocks[0]},
             cuts=np.concatenate([np.empty((0, 4)), *self._cuts]),
             cut_start=ends.astype(np.int64),
-            piece_shape=np.concatenate(owner),
-            piece_centre=np.concatenate(centres),
-            piece_radius=np.concatenate(radii),
             patches=tuple(patch for patch, _ in self._nets),
             surface_names=names,
             surface_label=np.array([rows_of[label] for label in self._labels], np.int32),
         )
+
+
+def _net_shapes(patch: Patch, number: int, part: int, surface: int, first: int) -> dict[str, Any]:
+    """Return the triangles of a patch's net, from row ``first`` of all shapes, as columns of Surfaces."""
+    knots, faces = patch.net()
+    corners = patch.at(knots[:, 0], knots[:, 1])[faces]
+    count, centre = len(faces), corners.mean(axis=1)
+    numbers = np.zeros((count, NUMBERS))
+    numbers[:, :9] = corners.reshape(-1, 9)
+    return {
+        "kind": np.full(count, TRIANGLE, np.int8),
+        "numbers": numbers,
+        "surface": np.full(count, surface, np.int32),
+        "part": np.full(count, part, np.int32),
+        "patch": np.full(count, -1 if _is_flat(patch, knots[faces], corners) else number, np.int32),
+        "corner_pq": knots[faces],
+        "piece_shape": np.arange(first, first + count, dtype=np.int32),
+        "piece_centre": centre,
+        "piece_radius": np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1),
+    }
 
 
 def _is_flat(patch: Patch, pq: Floats, corners: Floats) -> bool:

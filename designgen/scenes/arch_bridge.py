@@ -11,25 +11,14 @@ import numpy as np
 from designgen.asbuilt import imperfections
 from designgen.designs import arch_bridge, arch_mesh, arch_part
 from designgen.designs.patch import Surface
-from designgen.frames import rigid
+from designgen.frames import inverse, rigid
 from designgen.randomness import generator, random_pose
 from designgen.reading import filled
 from designgen.scanning import clutter, sampler, survey
-from designgen.scanning.modes import ByRays, Scanning
+from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
-from processor.model import (
-    ArchDesign,
-    ArchTruth,
-    DesignPart,
-    Floats,
-    PointLabels,
-    Scan,
-    Scene,
-    Stations,
-    StationTruth,
-    Truth,
-)
+from processor.model import ArchDesign, ArchTruth, DesignPart, Floats, PointLabels, Scan, Scene, StationTruth, Truth
 
 EDGE_POINTS = 501  # on each bottom edge in the truth
 
@@ -45,8 +34,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     grown = imperfections.expansion(errors.temperature_C)
     part_names = tuple(part.name for part in parts)
     scans, labels, poses, key_bridge, key_scan = [], [], [], [], []
-    stations: Stations | None = None
-    station_truth: list[StationTruth] = []
+    registered: list[Floats] = []  # poses of each part's stations in the frame of its scan
+    station_truths: list[StationTruth] = []
     for number, part in enumerate(built):
         T_scan_bridge = random_pose(generator(seed, f"pose {part.name}"))
         R, t = T_scan_bridge[:3, :3], T_scan_bridge[:3, 3]
@@ -54,11 +43,10 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         T_scan_grown = rigid(R, grown * t)
         if isinstance(scanning, ByRays):
             surveyed = _survey_part(part, number, part_names, grown, scanning, seed)
-            first_station = len(stations.ids) if stations else 0
-            scan, label = survey.merged(surveyed, part.name, T_scan_grown, first_station, part.name)
-            truth = surveyed.truth
-            stations = survey.with_stations(stations, truth.ids, T_scan_grown @ surveyed.registered)
-            station_truth.append(dataclasses.replace(truth, T_project_station=T_scan_grown @ truth.T_project_station))
+            scan, label = survey.merged(surveyed, part.name, T_scan_grown, sum(map(len, registered)), part.name)
+            registered.append(T_scan_grown @ surveyed.registered)
+            poses_true = T_scan_grown @ surveyed.truth.T_project_station
+            station_truths.append(dataclasses.replace(surveyed.truth, T_project_station=poses_true))
         else:
             cloud = sampler.scan_part(part, number, scanning, generator(seed, f"scan {part.name}"))
             points = (grown * cloud.points) @ R.T + grown * t
@@ -66,16 +54,17 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
             label = PointLabels(part.name, part_names, cloud.part, cloud.source)
         scans.append(scan)
         labels.append(label)
-        poses.append(rigid(R.T, -R.T @ t))
+        poses.append(inverse(T_scan_bridge))
         ends = np.array([_end_points(part, "start", part.s0), _end_points(part, "end", part.s1)])
         key_bridge.append(ends)
         key_scan.append(grown * (ends @ R.T + t))
+    station_truth = survey.joined_truth(station_truths) if station_truths else None
     scene = Scene(
         name,
         "arch-bridge",
         tuple(scans),
         arch=_design(parts),
-        stations=stations,
+        stations=survey.stations_of(station_truth.ids, np.concatenate(registered)) if station_truth else None,
         temperature_C=imperfections.stated(errors.temperature_C),
         units="mm",
         units_reason=MADE_IN_MM,
@@ -84,10 +73,10 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     return scene, Truth(
         tuple(labels),
         arch=ArchTruth(part_names, np.array(poses), np.array(key_scan), np.array(key_bridge), edges),
-        stations=survey.joined_truth(station_truth),
+        stations=station_truth,
         as_built=ledger.record() if "asbuilt" in recipe else None,
-        spacing_mm=sampler.spacing_mm(scanning),
-        sigma_mm=sampler.sigma_mm(scanning),
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
     )
 
 
@@ -106,12 +95,12 @@ def _survey_part(
     axes = np.stack([along, [0.0, 1.0, 0.0], np.cross(along, [0.0, 1.0, 0.0])])
     middle = ends.mean(axis=0)
     half = np.abs((ends - middle) @ axes.T).max(axis=0)
-    poses = survey.around(axes, middle, half, params, seed, f"{part.name}/")
+    poses = survey.stations_around_box(axes, middle, half, params, seed, f"{part.name}/")
     places = [T[:3, 3] for T in poses.values()]
     for i in range(params.clutter):
         rng = generator(seed, f"clutter {part.name} {i}")
         clutter.add_pole(builder, places[i % len(places)], middle, axes[2], (0.3, 0.6), rng, on_ground=False)
-    return survey.survey(builder.done(), part_names, poses, scanning.device, params, seed)
+    return survey.survey(builder.to_surfaces(), part_names, poses, scanning.device, params, seed)
 
 
 def _scaled(at: Surface, factor: float) -> Surface:

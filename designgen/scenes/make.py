@@ -7,7 +7,7 @@ from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from designgen.scanning import modes
+from designgen.scanning.scan_settings import scan_settings_of
 from designgen.scenes import arch_bridge, space_frame, structure
 from processor.model import Scene, Truth, UsageError
 
@@ -29,12 +29,12 @@ def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple
     if kind not in MAKERS:
         raise UsageError(f"recipe {name}: kind: expected one of {', '.join(MAKERS)}, got {kind!r}")
     section, maker = MAKERS[kind]
-    known = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
-    if unknown := sorted(set(recipe) - known):
-        raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(known))}")
+    keys = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
+    if unknown := sorted(set(recipe) - keys):
+        raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")
     used = recipe.get("seed", 0) if seed is None else seed
     if not isinstance(used, int) or isinstance(used, bool) or used < 0:
         raise UsageError(f"recipe {name}: seed: expected a whole number from 0, got {used!r}")
     # The number of BLAS threads changes the order of its sums, and with it the last bits.
     with threadpool_limits(1, user_api="blas"):
-        return maker(name, recipe, modes.read(recipe), used)
+        return maker(name, recipe, scan_settings_of(recipe), used)

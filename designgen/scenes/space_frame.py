@@ -12,7 +12,7 @@ from designgen.designs import space_frame
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import clutter, frame_surfaces, sampler, survey
-from designgen.scanning.modes import ByRays, Scanning
+from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
 from processor.model import FrameDesign, FrameTruth, PointLabels, Scan, Scene, Truth
@@ -35,8 +35,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         frame_surfaces.add_frame(builder, built)
         low, high = built.centres.min(axis=0), built.centres.max(axis=0)
         clutter.add_below_roof(builder, low, high, params.clutter, generator(seed, "clutter"))
-        poses = survey.below(low, high, params, seed)
-        surveyed = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
+        poses = survey.stations_below_box(low, high, params, seed)
+        surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
     else:
         cloud = sampler.scan_frame(built, scanning, generator(seed, "scan"))
@@ -66,6 +66,6 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         frame=FrameTruth(ids, built.centres + origin, built.radii, lowest + origin),
         stations=station_truth,
         as_built=ledger.record() if "asbuilt" in recipe else None,
-        spacing_mm=sampler.spacing_mm(scanning),
-        sigma_mm=sampler.sigma_mm(scanning),
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
     )

@@ -10,12 +10,12 @@ import numpy as np
 
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.asbuilt import imperfections
-from designgen.designs import plate_row, structure, structure_types
+from designgen.designs import box_and_tube, plate_row, structure_registry
 from designgen.designs.patch import Bools, Displacement, Patch
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import clutter, picking, sampler, scanner, survey
-from designgen.scanning.modes import ByRays, Scanning
+from designgen.scanning.scan_settings import ByRays, Scanning
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import MADE_IN_MM
 from designgen.sequences import van_der_corput
@@ -35,16 +35,16 @@ from processor.model import (
 )
 
 TRUTH_STEP_MM = 250.0
-Components = tuple[structure.Component, ...]
+Components = tuple[box_and_tube.Component, ...]
 PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
 Built = tuple[PartPatches, Displacement | None, DefectTruth | None]
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of a structure of type ``structure.type``: stadium-roof, truss-bridge or plate-row."""
-    components = structure_types.design(recipe)
+    components = structure_registry.design(recipe)
     kind = recipe["structure"]["type"]
-    patches, displacement, defects = BUILDERS[kind](components, recipe, seed)
+    patches, displacement, defects = built_faces(kind, components, recipe, seed)
     names = tuple(component.name for component in components)
     stations, station_truth, picks = None, None, None
     origin = np.zeros(3)
@@ -56,7 +56,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
             builder.patch(part, patch)
         poses = _places(kind, patches, params, seed)
         _add_poles(builder, poses, patches, params.clutter, seed)
-        surveyed = survey.survey(builder.done(), names, poses, scanning.device, params, seed)
+        surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
         picks = _picks(recipe, scans, station_truth, seed)
         if not params.registered:
@@ -71,7 +71,7 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"), hidden)
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
         labels = (PointLabels("scan", names, cloud.part, cloud.source),)
-    vertices, faces = structure.mesh_of(components)
+    vertices, faces = box_and_tube.mesh_of(components)
     scene = Scene(
         name,
         "structure",
@@ -88,8 +88,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         defects=defects and dataclasses.replace(defects, centres=defects.centres + origin),
         stations=station_truth,
         as_built=_ledger(kind, recipe),
-        spacing_mm=sampler.spacing_mm(scanning),
-        sigma_mm=sampler.sigma_mm(scanning),
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
     )
 
 
@@ -103,12 +103,17 @@ def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth
     return picking.pick(scans, [T_project_scan[scan.name] for scan in scans], params, seed)[0]
 
 
-def _stadium(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+def built_faces(kind: str, components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
+    """Return the faces as built, the displacement of a whole structure, and the truth of plates' defects."""
+    if kind == "plate-row":
+        return _plates(components, recipe, seed)
+    designed = _as_designed(components)
     if "asbuilt" not in recipe:
-        return _as_designed(components), None, None
+        return designed, None, None
+    if kind == "truss-bridge":
+        raise UsageError("asbuilt: a truss-bridge is built as designed; leave the section asbuilt out")
     displacement = asbuilt_defects.movement(filled(asbuilt_defects.MovementParams, recipe, "asbuilt"), components)
-    built = [(part, patch.displaced(displacement)) for part, patch in _as_designed(components)]
-    return built, displacement, None
+    return [(part, patch.displaced(displacement)) for part, patch in designed], displacement, None
 
 
 def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
@@ -123,14 +128,8 @@ def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
     return ledger.record()
 
 
-def _truss(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
-    if "asbuilt" in recipe:
-        raise UsageError("asbuilt: a truss-bridge is built as designed; leave the section asbuilt out")
-    return _as_designed(components), None, None
-
-
 def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
-    form = structure_types.params(recipe)
+    form = structure_registry.params(recipe)
     sizes = filled(asbuilt_defects.Params, recipe, "asbuilt")
     patches: PartPatches = []
     placed: list[tuple[plate_row.Place, asbuilt_defects.Defect]] = []
@@ -154,9 +153,6 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
     return patches, None, truth
 
 
-BUILDERS = {"stadium-roof": _stadium, "truss-bridge": _truss, "plate-row": _plates}
-
-
 def _as_designed(components: Components) -> PartPatches:
     return [(part, patch) for part, component in enumerate(components) for patch in component.patches]
 
@@ -164,7 +160,7 @@ def _as_designed(components: Components) -> PartPatches:
 def _hidden(components: Components) -> Callable[[int, Floats, Floats], Bools]:
     """Return a function that marks the places on the design's faces inside of a body."""
     faces = [patch for _, patch in _as_designed(components)]
-    inside = structure.covered(components)
+    inside = box_and_tube.covered(components)
     return lambda row, p, q: inside(faces[row].at(p, q))
 
 
@@ -187,14 +183,14 @@ def _places(kind: str, patches: PartPatches, params: scanner.Params, seed: int) 
             side = 1.0 if i % 2 else -1.0
             at = np.array([12_000.0 * (i // 2) + 3_000.0, side * params.distance_mm, params.height_mm])
         else:
-            turn = 2.0 * np.pi * fraction
+            angle = 2.0 * np.pi * fraction
             reach = 0.5 * (high - low)[:2] * 0.45
-            at = np.array([*(0.5 * (low + high)[:2] + reach * [np.cos(turn), np.sin(turn)]), params.height_mm])
+            at = np.array([*(0.5 * (low + high)[:2] + reach * [np.cos(angle), np.sin(angle)]), params.height_mm])
         at[:2] += rng.uniform(-300.0, 300.0, 2)
         scans = params.scans_at_first if i < params.repeated else 1
         for k in range(scans):
             heading = generator(seed, f"heading {station} {k}").uniform(0.0, 2.0 * np.pi)
-            poses[station if scans == 1 else f"{station}-{k + 1}"] = survey.levelled(at, heading)
+            poses[station if scans == 1 else f"{station}-{k + 1}"] = survey.levelled_pose(at, heading)
     return poses
 
 
@@ -208,7 +204,7 @@ def _add_poles(builder: Builder, poses: dict[str, Floats], patches: PartPatches,
         rng = generator(seed, f"clutter {i}")
         target = middles[rng.integers(len(middles))]
         station = np.array(places[i % len(places)])
-        clutter.add_pole(builder, station, target, np.array([0.0, 0.0, 1.0]), (0.2, 0.4), rng, on_ground=True)
+        clutter.add_pole(builder, station, target, clutter.UP, (0.2, 0.4), rng, on_ground=True)
 
 
 def _truth(components: Components, displacement: Displacement | None, origin: Floats) -> StructureTruth | None:
@@ -228,6 +224,6 @@ def _truth(components: Components, displacement: Displacement | None, origin: Fl
             points.append(patch.at(p, q))
             normals.append(normal / np.linalg.norm(normal, axis=1)[:, None])
     x = np.vstack(points)
-    visible = ~structure.covered(components)(x)
+    visible = ~box_and_tube.covered(components)(x)
     x = x[visible]
     return StructureTruth(x + origin, np.vstack(normals)[visible], displacement(x))

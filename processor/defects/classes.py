@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from processor.defects.places.profiles import Fit, Profile
 from processor.defects.result import DefectClass
 
 PIT_THICKNESSES = 5.0  # largest diameter of a pit by the plate's thickness: bent steel deviates over more than that
@@ -64,6 +65,20 @@ def of_shape(kind: str, margin: float) -> Classification:
     if confidence >= LEAST_CONFIDENCE:
         return Classification(DefectClass(kind), confidence, DefectClass.UNKNOWN)
     return Classification(DefectClass.UNKNOWN, confidence, DefectClass(kind))
+
+
+def of_profile(fitted: Fit, thickness: float, before: Classification) -> Classification:
+    """Classify a place with a bent edge or a step by its profile, in place of the classification ``before`` it.
+
+    The lips of a crack are bent over a few thicknesses of the plate; plates joined out of line deviate over more.
+    """
+    confidence = float(1.0 - COIN * np.exp(-0.05 * max(fitted.margin, 0.0)))
+    kind = DefectClass.BEND
+    if fitted.profile is Profile.STEP:
+        near = _above(PIT_THICKNESSES * thickness, fitted.reach)
+        kind = DefectClass.CRACK if near > COIN else DefectClass.STEP
+        confidence *= max(near, 1.0 - near)
+    return Classification(kind, confidence, before.defect_class)
 
 
 def _slim(length: float, width: float, thickness: float) -> float:

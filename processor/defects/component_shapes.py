@@ -129,7 +129,7 @@ def significant(
         # Noise of blocks; the common error of larger places is added below.
         size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
         inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
-        points, outward = _with_corners(surface, rows)
+        points, outward = with_corners(surface, rows)
         registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
         for k, shape in candidates:
             value = shape.values(fit.frame, points, outward)
@@ -210,7 +210,7 @@ def _masked(fine: shape_models.Blocks, fitted: shape_models.Fitted, blocks: shap
     return dataclasses.replace(fine, weight=fine.weight * (fitted.weight / blocks.weight)[nearest])
 
 
-def _with_corners(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats]:
+def with_corners(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats]:
     """Return places (n, 3) and normals (n, 3) of cells and of the corners of their faces, where shapes are largest."""
     on_faces = np.isin(surface.chart_of, np.unique(chart_of_cells(surface)[cells]))
     corners = surface.vertices[surface.faces[on_faces]].reshape(-1, 3)

@@ -13,8 +13,10 @@ from scipy.spatial import cKDTree
 from processor.defects.alignment import Alignment, rays_to
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
+from processor.defects.places.profiles import PlaceCells
 from processor.defects.regions import Region, unrolled
-from processor.defects.surface_charts import CYLINDER, DesignSurface
+from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
+from processor.geometry.mesh_distance import Bools
 from processor.model import NORMAL_95, Floats, Ints
 
 SMOOTH_SHARE = 0.35  # of a region's radius, over which deviations are averaged to find the deepest place
@@ -22,11 +24,13 @@ FIT_SHARE = 0.45  # of a region's radius, within which a paraboloid is fitted fo
 CURVE_SHARE = 0.65  # of a region's radius, for its curvature
 FEWEST_CELLS = 9
 BORDER_CELLS = 1.6
+FEWEST_PROFILE, PROFILE_MARGIN = 6, 0.5  # cells of a region with a profile, and margin about it by its size
 VOLUME_BORDER = 0.25  # of a region's radius, that belongs to its volume
 DEEPEST_MM = 500.0  # of the design behind a place
 
 MARGIN_CELLS = 2  # about a region, of which points are used for a small bump
 FEWEST_POINTS = 12
+EXPONENTS = (2.0, 12.0)  # of a bump: from round to flat-bottomed
 ROBUST_SDS = 2.0  # of a point, from which on its weight decreases
 
 
@@ -150,6 +154,36 @@ def measure(
     )
 
 
+def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: Bools) -> PlaceCells | None:
+    """Return the cells about a region that are seen and of no other place; None where it is small or on a cylinder.
+
+    ``claimed`` (cells,) marks the cells of all places.
+    """
+    charts, chart = surface.charts, region.chart
+    if charts.kind[chart] == CYLINDER or len(region.cells) < FEWEST_PROFILE:
+        return None
+    shape, first = charts.shape[chart], int(charts.first[chart])
+    ij = np.stack(np.divmod(region.cells - first, shape[1]), axis=1)
+    low, high = ij.min(axis=0), ij.max(axis=0)
+    wide = np.maximum(np.ceil(PROFILE_MARGIN * (high - low + 1)), 2).astype(np.int64)
+    start, stop = np.maximum(low - wide, 0), np.minimum(high + wide + 1, shape)
+    u, v = (part.ravel() for part in np.meshgrid(*(np.arange(a, b) for a, b in zip(start, stop, strict=True))))
+    rows = first + u * shape[1] + v
+    used = (field.seen[rows] > 0) & (~claimed[rows] | np.isin(rows, region.cells))
+    rows, grid = rows[used], np.stack([u, v], axis=1)[used]
+    corners = layout(charts, np.full(1, chart), surface.vertices[np.unique(surface.faces[surface.chart_of == chart])])
+    return PlaceCells(
+        uv=charts.low[chart] + (grid + 0.5) * charts.cell_mm,
+        value=field.deviation[rows],
+        noise=np.sqrt(field.variance[rows]),
+        low=corners.min(axis=0),
+        high=corners.max(axis=0),
+        centre=charts.low[chart] + (0.5 * (low + high) + 0.5) * charts.cell_mm,
+        half=0.5 * (high - low + 1) * charts.cell_mm,
+        cell_mm=charts.cell_mm,
+    )
+
+
 def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float]:
     """Return the volume inward and its standard deviation from noise, with a border about the region.
 
@@ -270,9 +304,9 @@ def thickness_at(
 
 
 def refined(measured: Measures, region: Region, points: CellPoints, field: Field, shape_values: Floats) -> Measures:
-    """Return measures with the depth of a bump d (1 - r^2 / R^2)^2 fitted to the points; unchanged without a fit.
+    """Return measures with the depth of a bump d exp(-(r / R)^q) fitted to the points; unchanged without a fit.
 
-    For small dents and pits: cells average their depth.
+    For small dents and pits: cells average their depth. The exponent q covers round and flat bottoms.
     """
     uv, deviation = points.about(region, shape_values)
     middle = unrolled(points.surface, region).mean(axis=0)
@@ -284,14 +318,13 @@ def refined(measured: Measures, region: Region, points: CellPoints, field: Field
         return measured
 
     def bump(x: Floats) -> Floats:
-        square = ((uv[:, 0] - x[0]) ** 2 + (uv[:, 1] - x[1]) ** 2) / x[2] ** 2
-        height: Floats = -x[3] * np.maximum(1.0 - square, 0.0) ** 2
+        height: Floats = -x[3] * np.exp(-((np.hypot(uv[:, 0] - x[0], uv[:, 1] - x[1] + 1e-12) / x[2]) ** x[4]))
         return height
 
     fit = least_squares(
         lambda x: (deviation - bump(x)) / noise,
-        [0.0, 0.0, 1.3, measured.depth],
-        bounds=([-1.5, -1.5, 0.3, -np.inf], [1.5, 1.5, 3.0, np.inf]),
+        [0.0, 0.0, 0.8, measured.depth, 3.0],
+        bounds=([-1.5, -1.5, 0.2, -np.inf, EXPONENTS[0]], [1.5, 1.5, 3.0, np.inf, EXPONENTS[1]]),
         loss="soft_l1",
         f_scale=ROBUST_SDS,
     )
@@ -303,5 +336,5 @@ def refined(measured: Measures, region: Region, points: CellPoints, field: Field
     plausible = depth * measured.depth > 0.0 and abs(depth) <= 4.0 * abs(measured.depth)
     if not (fit.success and plausible and sd < 0.5 * abs(depth)):
         return measured
-    curvature = 4.0 * abs(depth) / (fit.x[2] * radius) ** 2 * 1000.0
+    curvature = 2.0 * abs(depth) / (fit.x[2] * radius) ** 2 * 1000.0
     return dataclasses.replace(measured, depth=depth, depth_ci95=NORMAL_95 * sd, curvature=curvature)

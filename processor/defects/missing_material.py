@@ -1,8 +1,9 @@
 """Points that scanners should have on each cell of the design's surface.
 
-A station is expected to see a cell if the incidence is not too oblique, if it saw other parts of the same face, and if
-its rays in this direction met nothing before the cell. The number of points follows from the station's density of
-points by solid angle. Cells behind an obstacle are not expected.
+A station is expected to see a cell if the incidence is not too oblique, if it saw other parts of the same face, if its
+rays in this direction met nothing before the cell, and if no other face of the design hides the cell, as one does where
+bodies touch. The number of points follows from the station's density of points by solid angle. On a face that hardly
+any point lies on, as of a part that is gone, those points are expected that were measured through it.
 """
 
 from __future__ import annotations
@@ -14,13 +15,18 @@ import numpy.typing as npt
 from scipy import ndimage
 
 from processor.defects.alignment import chart_of_cells
-from processor.defects.observations import CHUNK, Pairs, Stations
+from processor.defects.observations import CHUNK, Pairs, Stations, cells_at
 from processor.defects.surface_charts import DesignSurface
-from processor.geometry import rigid
+from processor.geometry import mesh_distance, rigid
 from processor.model import Floats, Ints, Scene
 
 LEAST_COS = 0.34  # of incidence
 NEARER_MM = 100.0  # than the surface: an obstacle
+BEYOND_MM = 20.0  # least distance of a point behind a face that it was measured through
+BEFORE_MM = 1.0  # distance of a face of the design that hides a cell
+SEEN_SHARE = 0.5  # of the points expected, up to which a cell may be hidden
+LEAST_POINTS = 1e-6  # expected; less is the rounding of sums
+GRID_SHARE = 0.01  # voxel by the design's size, for lines of sight
 LEAST_BIN_RAD = 0.003
 BIN_STEPS = 5.0  # angular steps of a scanner in a bin of directions
 FACE_SHARE = 0.2  # of a face's cells seen by a station, from which on the rest is expected
@@ -34,38 +40,82 @@ def expected(
 ) -> Floats:
     """Return the number of points (cells,) that all stations together should have on each cell."""
     cells = len(surface.share)
-    points = np.zeros(cells)
-    chart = chart_of_cells(surface)
-    charts = len(surface.charts.kind)
-    area = surface.share * surface.charts.cell_mm**2
-    whole = np.bincount(chart, surface.share > 0.5, charts)
-    rows_of = _rows(pairs, len(stations.names))
+    parts = []
+    for k, rows in enumerate(_rows(pairs, len(stations.names))):
+        if np.isfinite(stations.positions[k]).all() and len(rows):
+            count = np.zeros(cells)
+            count[pairs.cell[rows]] = (pairs.count + pairs.stray)[rows]
+            parts.append((k, *_of_station(scene, T_design_project, k, stations, count, surface)))
+    points, counted = np.zeros(cells), np.bincount(pairs.cell, pairs.count + pairs.stray, cells)
+    for _, cell, number in parts:
+        points[cell] += number
+    empty = counted < SEEN_SHARE * points
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
+    for k, cell, number in parts:
+        rows = np.flatnonzero(empty[cell])
+        starts = surface.centres[cell[rows]] + BEFORE_MM * surface.outward[cell[rows]]
+        ends = np.repeat(stations.positions[k : k + 1], len(rows), axis=0)
+        rows = rows[np.unique(mesh_distance.crossings(grid, starts, ends, True)[0])]
+        points[cell[rows]] -= number[rows]
+    points = np.where(points > LEAST_POINTS, points, 0.0)
+    return np.maximum(points, _through(scene, T_design_project, counted, surface, stations))
+
+
+def _through(
+    scene: Scene, T_design_project: Floats, counted: Ints, surface: DesignSurface, stations: Stations
+) -> Floats:
+    """Return the number (cells,) of points measured through cells of faces that hardly any point lies on."""
+    through = np.zeros(len(surface.share))
+    chart, charts = chart_of_cells(surface), len(surface.charts.kind)
+    share = np.bincount(chart, (counted > 0) & (surface.share > 0.5), charts)
+    unseen = share < FACE_SHARE * np.maximum(np.bincount(chart, surface.share > 0.5, charts), 1)
+    facets = np.flatnonzero(unseen[surface.chart_of])
+    if not len(facets):
+        return through
+    faces, normals = surface.faces[facets], surface.normals[facets]
+    size = float(np.linalg.norm(np.ptp(surface.vertices[faces].reshape(-1, 3), axis=0)))
+    grid = mesh_distance.facet_grid(surface.vertices, faces, normals, GRID_SHARE * size)
     for k, position in enumerate(stations.positions):
-        if not np.isfinite(position).all() or not len(rows_of[k]):
-            continue
-        observed = pairs.cell[rows_of[k]]
-        faces = np.bincount(chart[observed], minlength=charts) >= FACE_SHARE * np.maximum(whole, 1)
-        cell = np.flatnonzero(faces[chart] & (surface.share > 0.05))
-        arm = surface.centres[cell] - position
-        distance = np.linalg.norm(arm, axis=1)
-        cosine = -np.einsum("ni,ni->n", arm, surface.outward[cell]) / distance
-        steep = cosine > LEAST_COS
-        cell, arm, distance, cosine = cell[steep], arm[steep], distance[steep], cosine[steep]
-        if not len(cell):
-            continue
-        angle = area[cell] * cosine / distance**2
-        count = np.zeros(cells)
-        count[observed] = (pairs.count + pairs.stray)[rows_of[k]]
-        occupied = count[cell] > 0
-        if occupied.sum() < FEWEST_CELLS:
-            continue
-        density = float(np.median(count[cell][occupied] / angle[occupied]))
-        bin_rad = max(LEAST_BIN_RAD, BIN_STEPS / np.sqrt(density))
-        nearest, inside = _nearest_ranges(scene, T_design_project, k, stations, bin_rad, arm)
-        slack = NEARER_MM + 3.0 * bin_rad * distance * np.sqrt(1.0 - cosine**2) / cosine
-        clear = inside & ~(nearest < distance - slack)
-        points[cell[clear]] += density * angle[clear]
-    return points
+        for points in _points_of(scene, T_design_project, k) if np.isfinite(position).all() else ():
+            ray = position - points
+            length = np.linalg.norm(ray, axis=1)[:, None]
+            starts, ends = points + BEYOND_MM * ray / length, np.repeat(position[None], len(points), axis=0)
+            row, crossed, part = mesh_distance.crossings(grid, starts, ends, False)
+            steep = np.einsum("ni,ni->n", ray[row], normals[crossed]) > LEAST_COS * length[row, 0]
+            row, crossed, part = row[steep], crossed[steep], part[steep]
+            places = starts[row] + part[:, None] * (ends[row] - starts[row])
+            cell = cells_at(surface, surface.chart_of[facets[crossed]], places)
+            through += np.bincount(cell, minlength=len(through))
+    return through
+
+
+def _of_station(
+    scene: Scene, T_design_project: Floats, station: int, stations: Stations, count: Floats, surface: DesignSurface
+) -> tuple[Ints, Floats]:
+    """Return cells (n,) that no scanned obstacle hides from a station, and the numbers (n,) of points expected there.
+
+    ``count`` (cells,) is the number of points that the station has on each cell.
+    """
+    chart, charts = chart_of_cells(surface), len(surface.charts.kind)
+    whole = np.bincount(chart, surface.share > 0.5, charts)
+    faces = np.bincount(chart, count > 0, charts) >= FACE_SHARE * np.maximum(whole, 1)
+    cell = np.flatnonzero(faces[chart] & (surface.share > 0.05))
+    arm = surface.centres[cell] - stations.positions[station]
+    distance = np.linalg.norm(arm, axis=1)
+    cosine = -np.einsum("ni,ni->n", arm, surface.outward[cell]) / distance
+    steep = cosine > LEAST_COS
+    cell, arm, distance, cosine = cell[steep], arm[steep], distance[steep], cosine[steep]
+    angle = surface.share[cell] * surface.charts.cell_mm**2 * cosine / distance**2
+    occupied = count[cell] > 0
+    if occupied.sum() < FEWEST_CELLS:
+        return np.empty(0, np.int64), np.empty(0)
+    density = float(np.median(count[cell][occupied] / angle[occupied]))
+    bin_rad = max(LEAST_BIN_RAD, BIN_STEPS / np.sqrt(density))
+    nearest, inside = _nearest_ranges(scene, T_design_project, station, stations, bin_rad, arm)
+    slack = NEARER_MM + 3.0 * bin_rad * distance * np.sqrt(1.0 - cosine**2) / cosine
+    clear = inside & ~(nearest < distance - slack)
+    return cell[clear], density * angle[clear]
 
 
 def _rows(pairs: Pairs, stations: int) -> list[Ints]:

@@ -114,8 +114,17 @@ def fitting_cell(observed: Observed, surface: DesignSurface, points: float, boun
 
 def cells_of(observed: Observed, surface: DesignSurface) -> Ints:
     """Return the cell (n,) of each point; points beyond their face's grid are in the nearest cell."""
-    charts, chart = surface.charts, observed.chart
-    at = np.floor((observed.uv - charts.low[chart]) / charts.cell_mm).astype(np.int64)
+    return _cells(surface, observed.chart, observed.uv)
+
+
+def cells_at(surface: DesignSurface, chart: Ints, places: Floats) -> Ints:
+    """Return the cell (n,) of places (n, 3) on the faces of charts (n,)."""
+    return _cells(surface, chart, layout(surface.charts, chart, places))
+
+
+def _cells(surface: DesignSurface, chart: Ints, uv: Floats) -> Ints:
+    charts = surface.charts
+    at = np.floor((uv - charts.low[chart]) / charts.cell_mm).astype(np.int64)
     at = np.clip(at, 0, charts.shape[chart] - 1)
     cell: Ints = charts.first[chart] + at[:, 0] * charts.shape[chart, 1] + at[:, 1]
     return cell

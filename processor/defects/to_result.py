@@ -12,15 +12,19 @@ import numpy as np
 from processor.defects import classes, measures, pictures
 from processor.defects.alignment import Alignment
 from processor.defects.classes import Classification
-from processor.defects.component_shapes import ComponentShape, SignificantShape, front_of
+from processor.defects.component_shapes import ComponentShape, SignificantShape, front_of, with_corners
 from processor.defects.deviation_field import Field
 from processor.defects.measures import CellPoints, Measures
 from processor.defects.params import Params
-from processor.defects.regions import Region
+from processor.defects.places import profiles, waves
+from processor.defects.places.profiles import Profile
+from processor.defects.places.waves import Lobe
+from processor.defects.regions import Region, unrolled
 from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Result, Windows
 from processor.defects.scan_statistic import Levels
 from processor.defects.shape_models import Frame
-from processor.defects.surface_charts import DesignSurface
+from processor.defects.surface_charts import PLANE, DesignSurface
+from processor.geometry.mesh_distance import Bools
 from processor.model import NORMAL_95, Floats, Ints, Reason, Status, reason
 
 CHANCE_MM2 = 1e8  # the area that false alarms are counted on
@@ -28,6 +32,8 @@ CURVE_STRIPS = 40
 SMALL_CELLS = 8.0  # of diameter, below which a bump is fitted to points instead of cells
 SHALLOW_SHARE = 0.1  # of the amplitude of a component's shape, as the model may be wrong by
 THROUGH_SHARE = 0.7  # of the points expected on a crack, below which rays went through
+SIDE_SHARE = 0.2  # of a plate's half width, that counts as its side
+HELD_SHARE = 0.2  # of the largest deviation, up to which a side stayed in place
 STEP_SHARE = 0.02  # of a step's height, above which a place belongs to it
 
 
@@ -144,8 +150,29 @@ def _shape_defects(search: Search) -> Iterator[Defect]:
     for component, shapes in sorted(search.significant.items()):
         rows = front_of(surface, component, search.field)
         rows = rows[surface.share[rows] > 0.5]
-        for shape in shapes if len(rows) else ():
+        for shape in _of_held_plate(search, rows, shapes, frames[component]) if len(rows) else ():
             yield _shape_defect(search, component, rows, shape, frames[component])
+
+
+def _of_held_plate(search: Search, rows: Ints, shapes: list[SignificantShape], frame: Frame) -> list[SignificantShape]:
+    """Return one shape for a plate that is bent or twisted but stays in place along one side, as it is welded there.
+
+    About the plate's middle this is a sum of shapes; the depth is that of the sum. ``rows`` are cells of its front.
+    """
+    bent = [judged for judged in shapes if judged.shape.kind in ("bend", "twist")]
+    rigid_motion = [judged for judged in shapes if judged.shape.kind == "misalignment"]
+    if not (len(bent) == 1 and len(rigid_motion) == 1 and len(shapes) == 2):
+        return shapes
+    points, outward = with_corners(search.surface, rows)
+    total = np.sum([judged.shape.values(frame, points, outward) for judged in shapes], axis=0)
+    local = frame.local(points) / frame.half
+    peak = float(total[int(np.argmax(np.abs(total)))])
+    sides = [way * local[:, axis] > 1.0 - SIDE_SHARE for axis in (0, 1) for way in (-1.0, 1.0)]
+    held = min(float(np.sqrt(np.mean(total[side] ** 2))) for side in sides if side.any())
+    if held > HELD_SHARE * abs(peak):
+        return shapes
+    ci95 = float(np.hypot(bent[0].ci95, rigid_motion[0].ci95))
+    return [dataclasses.replace(bent[0], peak=peak, ci95=ci95)]
 
 
 def _shape_defect(search: Search, component: int, rows: Ints, judged: SignificantShape, frame: Frame) -> Defect:
@@ -202,18 +229,81 @@ def _curvature(judged: SignificantShape, half: Floats) -> float:
 
 
 def _place_defects(search: Search) -> Iterator[Defect]:
-    """Yield a defect for each place that deviates or is missing."""
+    """Yield a defect for each place that deviates or is missing; half waves in a row are one."""
     amplitudes = {number: max(abs(shape.peak) for shape in shapes) for number, shapes in search.significant.items()}
+    claimed = np.zeros(len(search.surface.share), bool)
+    for group in search.places:
+        claimed[group[0].cells] = True
+    found: list[tuple[Region, Defect]] = []
     for group in search.places:
         component = int(search.surface.charts.component[group[0].chart])
-        values = _place_values(search, group[0], component, amplitudes.get(component, 0.0))
+        values = _place_values(search, group[0], component, amplitudes.get(component, 0.0), claimed)
         if values is not None:
             cells = np.unique(np.concatenate([region.cells for region in group]))
-            yield Defect(values=values, component=component, cells=cells, field=search.residuals)
+            found.append((group[0], Defect(values=values, component=component, cells=cells, field=search.residuals)))
+    in_wave: set[int] = set()
+    waving = [
+        k for k, (region, defect) in enumerate(found) if region.sign and _may_wave(search.surface, region, defect)
+    ]
+    for rows in waves.waves([_lobe(search.surface, *found[k]) for k in waving]):
+        lobes = [waving[row] for row in rows]
+        in_wave.update(lobes)
+        yield _wave([found[k][1] for k in lobes])
+    for k, (_, defect) in enumerate(found):
+        if k not in in_wave:
+            yield defect
 
 
-def _place_values(search: Search, region: Region, component: int, amplitude: float) -> dict[str, Any] | None:
-    """Measure and classify a place on a component whose shape has an ``amplitude`` in mm; None if it is no defect."""
+def _may_wave(surface: DesignSurface, region: Region, defect: Defect) -> bool:
+    kinds = (DefectClass.DENT, DefectClass.BULGE, DefectClass.BEND, DefectClass.UNKNOWN)
+    flat = bool(surface.charts.kind[region.chart] == PLANE)
+    return flat and region.sign != 0 and defect.values["defect_class"] in kinds
+
+
+def _lobe(surface: DesignSurface, region: Region, defect: Defect) -> Lobe:
+    uv = unrolled(surface, region)
+    return Lobe(
+        chart=region.chart,
+        uv=uv,
+        middle=uv.mean(axis=0),
+        depth=float(defect.values["depth_max"]),
+        width=float(min(defect.values["extent"])),
+    )
+
+
+def _wave(lobes: list[Defect]) -> Defect:
+    """Return one defect of half waves in their order: the depth is the largest amplitude."""
+    deepest = max(lobes, key=lambda lobe: abs(lobe.values["depth_max"]))
+    centres = np.array([lobe.values["centre"] for lobe in lobes])
+    span = centres[-1] - centres[0]
+    along = span / np.linalg.norm(span)
+    outward = deepest.values["axes"][2]
+    half = 0.5 * (np.linalg.norm(span) / (len(lobes) - 1))
+    sums = {key: float(sum(abs(lobe.values[key]) for lobe in lobes)) for key in ("area_mm2", "volume_mm3")}
+    values = deepest.values | sums | {
+        "defect_class": DefectClass.WAVINESS,
+        "otherwise": deepest.values["defect_class"],
+        "confidence": max(deepest.values["confidence"], classes.BORDER_CONFIDENCE),
+        "centre": 0.5 * (centres[0] + centres[-1]),
+        "axes": np.stack([along, np.cross(outward, along), outward]),
+        "extent": np.array([np.linalg.norm(span) + 2.0 * half, max(max(lobe.values["extent"]) for lobe in lobes)]),
+        "depth_max": abs(deepest.values["depth_max"]),
+        "depth_mean": sums["volume_mm3"] / sums["area_mm2"],
+        "volume_ci95": float(np.sqrt(sum(lobe.values["volume_ci95"] ** 2 for lobe in lobes))),
+        "z": max(lobe.values["z"] for lobe in lobes),
+        "chance": min(lobe.values["chance"] for lobe in lobes),
+    }  # fmt: skip
+    cells = np.unique(np.concatenate([lobe.cells for lobe in lobes]))
+    return Defect(values=values, component=deepest.component, cells=cells, field=deepest.field)
+
+
+def _place_values(
+    search: Search, region: Region, component: int, amplitude: float, claimed: Bools
+) -> dict[str, Any] | None:
+    """Measure and classify a place on a component whose shape has an ``amplitude`` in mm; None if it is no defect.
+
+    ``claimed`` (cells,) marks the cells of all places.
+    """
     surface, cell = search.surface, search.surface.charts.cell_mm
     middle = int(region.cells[len(region.cells) // 2])
     thickness = measures.thickness_at(surface, surface.centres[middle], surface.outward[middle], component)
@@ -238,6 +328,17 @@ def _place_values(search: Search, region: Region, component: int, amplitude: flo
             return None  # significant only together with the defect beside it
         if crack:
             measured, reasons = _crack_depth(search, region, measured, thickness)
+        else:
+            classification, measured, reasons = _by_profile(
+                search, region, measured, classification, assumed, inflation, claimed
+            )
+    return _row_of(measured, classification, component, region, reasons)
+
+
+def _row_of(
+    measured: Measures, classification: Classification, component: int, region: Region, reasons: tuple[Reason, ...]
+) -> dict[str, Any]:
+    """Return the values of the row of a place."""
     return _row(
         classification,
         component,
@@ -257,6 +358,31 @@ def _place_values(search: Search, region: Region, component: int, amplitude: flo
         z=region.z,
         chance=region.chance * CHANCE_MM2,
     )
+
+
+def _by_profile(
+    search: Search,
+    region: Region,
+    measured: Measures,
+    classification: Classification,
+    thickness: float,
+    inflation: float,
+    claimed: Bools,
+) -> tuple[Classification, Measures, tuple[Reason, ...]]:
+    """Return class, measures and reasons of a place by its profile; unchanged where that is a bump."""
+    cells = measures.cells_about(region, search.residuals, search.surface, claimed)
+    fitted = None if cells is None else profiles.fit(cells, region.sign)
+    if fitted is None or fitted.profile is Profile.BUMP:
+        return classification, measured, ()
+    registration = float(np.hypot(
+        search.alignment.sd(measured.centre[None], measured.axes[2:])[0], search.residuals.stations_sd(region.cells)
+    ))  # fmt: skip
+    measured = dataclasses.replace(
+        measured, depth=-fitted.depth, depth_ci95=NORMAL_95 * float(np.hypot(fitted.sd * inflation, registration))
+    )
+    classification = classes.of_profile(fitted, thickness, classification)
+    is_crack = classification.defect_class is DefectClass.CRACK
+    return classification, measured, (reason("defects.depth-bound"),) if is_crack else ()
 
 
 def _crack_depth(

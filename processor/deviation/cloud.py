@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -17,7 +17,9 @@ MOST_POINTS = 3_000_000  # of a scan; more are thinned evenly
 class ScanCloud:
     """Points (n, 3) of a scan less ``origin`` (3,), without outliers, in a grid's order, and scanners (n, 3).
 
-    The points ``removed`` (m, 3) as outliers have the scanners ``removed_scanner`` (m, 3).
+    The points ``removed`` (m, 3) as outliers have the scanners ``removed_scanner`` (m, 3). ``source`` (n + m,) is the
+    row in ``sources`` of the scan that a point is from, or of the station if the scene is one scan. Scans that
+    stitching did not place are not in it: ``unplaced`` names them.
     """
 
     points: Floats
@@ -28,7 +30,24 @@ class ScanCloud:
     spacing_mm: float
     read: int
     kept: int
+    source: Ints
+    sources: tuple[str, ...]
     unposed: int = 0  # scans without a pose
+    unplaced: tuple[str, ...] = ()
+
+    def of(self, sources: Ints) -> ScanCloud:
+        """Return the points of some sources alone."""
+        used = np.isin(self.source, sources)
+        rows, out = np.flatnonzero(used[: len(self.points)]), np.flatnonzero(used[len(self.points) :])
+        return replace(
+            self,
+            points=self.points[rows],
+            scanner=None if self.scanner is None else self.scanner[rows],
+            removed=self.removed[out],
+            removed_scanner=None if self.removed_scanner is None else self.removed_scanner[out],
+            source=self.source[used],
+            kept=len(rows),
+        )
 
 
 def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) -> ScanCloud:
@@ -36,7 +55,7 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
 
     Raises InputError for too few points.
     """
-    scene = merging.stitched(scene, stitched)
+    whole, scene = scene, merging.stitched(scene, stitched)
     unposed = sum(not scan.T_project_scan.size for scan in scene.scans)
     cloud = merging.merged(scene, with_scanner=True)
     if len(cloud.points) < merging.FEWEST_POINTS:
@@ -54,6 +73,8 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
     rows, out = np.flatnonzero(inlier)[::step], np.flatnonzero(~inlier)[::step]
     kept = int(inlier.sum())
 
+    source, sources = _sources(scene)
+
     def scanner(at: Ints) -> Floats | None:
         return None if cloud.scanner is None else cloud.scanner[grid.order[at]]
 
@@ -66,8 +87,20 @@ def of_scene(scene: Scene, neighbours: int, ratio: float, stitched: Any = None) 
         spacing_mm=spacing * np.sqrt(kept / len(rows)),
         read=grid.count,
         kept=kept,
+        source=source[grid.order[np.concatenate([rows, out])]],
+        sources=sources,
         unposed=unposed,
+        unplaced=tuple(scan.name for scan in whole.scans if all(scan.name != used.name for used in scene.scans)),
     )
+
+
+def _sources(scene: Scene) -> tuple[Ints, tuple[str, ...]]:
+    """Return the scan (n,) of each point in the order of the scans, or its station in a single one, and their names."""
+    scans = scene.scans
+    if len(scans) == 1 and len(scans[0].point_station) and scene.stations is not None:
+        station = scans[0].point_station.astype(np.int64)
+        return np.where(station < 0, len(scene.stations.ids), station), (*scene.stations.ids, "-")
+    return np.repeat(np.arange(len(scans)), [len(scan.points) for scan in scans]), tuple(scan.name for scan in scans)
 
 
 def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:

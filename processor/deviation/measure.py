@@ -11,6 +11,7 @@ from processor.deviation import stable_fit, surface_movement, to_result
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
+from processor.deviation.placement import Placement, place
 from processor.deviation.result import ErrorSource, Result
 from processor.deviation.stable_fit import Fits
 from processor.deviation.surface_movement import Cloud
@@ -52,13 +53,30 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     surface = mesh_distance.of_design(vertices, scene.structure.faces)
     curved = mesh_distance.of_surface(surface)
     given = rigid.transform(np.eye(3), scan.origin - origin)
-    placed = surface_registration.place(scan.points, surface, given, params.register, scan.scanner)
+    placement = place(scan, surface, given, params.register)
+    scan, placed = placement.scan, placement.placed
     if placed.registration is not Registration.AS_GIVEN:
         placed = replace(placed, T=_fitted_pose(scan, curved, placed, params))
     measured = _measured(scan, curved, placed.T, params)
     rigid_fits = _fits(measured, params)
     distance, error, source = distances(measured, rigid_fits, placed, params)
-    return _result(scan, placed, measured, distance, rigid_fits, origin, params, (error, source))
+    result = _result(scan, placed, measured, distance, rigid_fits, origin, params, (error, source))
+    return _doubted(result, placement)
+
+
+def _doubted(result: Result, placement: Placement) -> Result:
+    """Put first why a result is not sure: the scans that were left out, or that the scan does not lie at the design."""
+    status = result.status
+    if not placement.lies and placement.placed.registration is Registration.COARSE:
+        first, status = reason("deviation.not-at-design"), Status.FAILED
+    elif placement.left_out:
+        names = ", ".join(one.name for one in placement.left_out)
+        points = sum(one.points for one in placement.left_out)
+        first = reason("deviation.scans-elsewhere", scans=names, points=points, read=result.points_read)
+        status = Status.WEAK if status is Status.OK else status
+    else:
+        return result
+    return replace(result, status=status, reasons=(first, *result.reasons))
 
 
 def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, most: int = 0) -> Measured:

@@ -26,6 +26,7 @@ Bools = npt.NDArray[np.bool_]
 
 BLOCKS_ALONG = 40.0  # blocks along the extent of the structure
 BLOCK_DIAMETERS = 3.0  # least side of a block
+LEVELS = 3  # sizes of blocks, each twice the last: a movement that grows gradually shows in large ones first
 LEAST_STRENGTH = 0.005  # share of a block's points along a direction, below which its curvature would count as a face
 TRIALS, BLOCKS_A_TRIAL, REFINED = 400, 3, 6
 ITERATIONS, CONVERGED_MM = 30, 1e-6
@@ -76,7 +77,8 @@ UNDETERMINED = RigidFit(np.full((4, 4), np.nan), np.full((6, 6), np.nan), float(
 class _Blocks:
     """Observations (m,) of block translations: value = design (m, 6) x motion, with variance, area, block and centre.
 
-    Motions are about ``middle`` (3,), rotations in units of 1 / ``arm``.
+    Motions are about ``middle`` (3,), rotations in units of 1 / ``arm``. ``first_point`` is a core point of each block,
+    ``of_point`` (k,) the block of each core point.
     """
 
     value: Floats
@@ -88,6 +90,8 @@ class _Blocks:
     middle: Floats
     arm: float
     side: float
+    first_point: Ints
+    of_point: Ints
 
 
 def fits(core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, seed: int) -> Fits:
@@ -103,13 +107,21 @@ def fits(core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, 
     blocks = _blocks(*places, moved.along[known], np.sqrt(overlap) * error, diameter_mm)
     if int(blocks.block.max()) + 1 < FEWEST_CLUSTERS:
         return nothing
-    variance = blocks.variance + _short_range(blocks)
+    wavy = _short_range(blocks)
+    variance = blocks.variance + wavy
     best = _solved(blocks, 1.0 / variance)
     limit = np.maximum(AGREES * np.sqrt(variance), Z95 * float(np.median(error)))
     stable = _consensus(blocks, best, limit, seed)
-    stable, sd = _refined(blocks, stable, variance, limit)
+    levels = [_Level(blocks, blocks.block, _scaled(blocks, stable, np.sqrt(variance), limit))]
+    for level in range(1, LEVELS):
+        larger = _blocks(*places, moved.along[known], np.sqrt(overlap) * error, diameter_mm, 2.0**level)
+        parent = larger.of_point[blocks.first_point][blocks.block]
+        inside = np.bincount(parent, minlength=int(larger.block.max()) + 1)[larger.block]
+        sd = np.sqrt(larger.variance + wavy / inside)
+        levels.append(_Level(larger, parent, _scaled(larger, stable, sd, np.full(len(sd), np.median(limit)))))
+    stable = _reweighted(levels, stable)
     share = float(blocks.area[_worst(blocks, stable[None], limit)[0] <= 1.0].sum() / blocks.area.sum())
-    worst = _worst(blocks, stable[None], sd)[0]
+    worst, sd = _largest(levels, stable), levels[0].sd
     weight = _tukey(worst)
     z = np.abs(blocks.value - blocks.design @ stable) / sd
     slope = np.where(z < worst, weight, _tukey_slope(z))
@@ -120,12 +132,24 @@ def fits(core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, 
     )
 
 
-def _blocks(points: Floats, normals: Floats, along: Floats, error: Floats, diameter: float) -> _Blocks:
+@dataclass(frozen=True)
+class _Level:
+    """Blocks of one size, the ``parent`` (m,) of them that each smallest observation is in, and their sd (m,)."""
+
+    blocks: _Blocks
+    parent: Ints
+    sd: Floats
+
+
+def _blocks(
+    points: Floats, normals: Floats, along: Floats, error: Floats, diameter: float, times: float = 1.0
+) -> _Blocks:
     """Combine movements in blocks: weighted least squares of a translation, along its principal directions."""
     middle, extent = points.mean(axis=0), np.ptp(points, axis=0)
     arm = max(0.5 * float(np.linalg.norm(extent)), 1e-6)
-    side = max(BLOCK_DIAMETERS * diameter, float(extent.max()) / BLOCKS_ALONG)
-    block = np.unique(_cells(points, side), axis=0, return_inverse=True)[1].reshape(-1)
+    side = times * max(BLOCK_DIAMETERS * diameter, float(extent.max()) / BLOCKS_ALONG)
+    _, first, block = np.unique(_cells(points, side), axis=0, return_index=True, return_inverse=True)
+    block = block.reshape(-1)
     count = np.bincount(block)
     centre = np.stack([np.bincount(block, points[:, i]) for i in range(3)], axis=1) / count[:, None]
     J = np.hstack([np.cross(points - middle, normals) / arm, normals])
@@ -147,7 +171,7 @@ def _blocks(points: Floats, normals: Floats, along: Floats, error: Floats, diame
     area = count[row] * strength / np.bincount(row, strength, len(count))[row]
     return _Blocks(
         value=value, design=design, variance=1.0 / strength, area=area, block=row, centre=centre, middle=middle,
-        arm=arm, side=side,
+        arm=arm, side=side, first_point=first, of_point=block,
     )  # fmt: skip
 
 
@@ -191,7 +215,8 @@ def _consensus(blocks: _Blocks, best: Floats, limit: Floats, seed: int) -> Float
     trials = np.vstack([best, trials])
     first = np.argsort(-_scores(blocks, trials, limit), kind="stable")[:REFINED]
     candidates = [best, *(trials[k] for k in first)]
-    refined = np.array([_reweighted(blocks, x, limit / AGREES) for x in candidates])
+    level = _Level(blocks, blocks.block, limit / AGREES)
+    refined = np.array([_reweighted([level], x) for x in candidates])
     return np.asarray(refined[np.argmax(_scores(blocks, refined, limit))])
 
 
@@ -209,21 +234,31 @@ def _scores(blocks: _Blocks, motions: Floats, limit: Floats) -> Floats:
     return scores
 
 
-def _reweighted(blocks: _Blocks, motion: Floats, sd: Floats) -> Floats:
+def _reweighted(levels: list[_Level], motion: Floats) -> Floats:
+    """Refine a motion (6,): blocks lose weight if they, or the larger blocks they are in, do not agree with it."""
+    blocks, sd = levels[0].blocks, levels[0].sd
     for _ in range(ITERATIONS):
-        last, motion = motion, _solved(blocks, _tukey(_worst(blocks, motion[None], sd)[0]) / sd**2)
+        last, motion = motion, _solved(blocks, _tukey(_largest(levels, motion)) / sd**2)
         if np.abs(motion - last).max() < CONVERGED_MM:
             break
     return motion
 
 
-def _refined(blocks: _Blocks, motion: Floats, variance: Floats, limit: Floats) -> tuple[Floats, Floats]:
-    """Refine a motion (6,) with the residuals' own scale; also return their standard deviations (m,)."""
-    z = (blocks.value - blocks.design @ motion) / np.sqrt(variance)
+def _largest(levels: list[_Level], motion: Floats) -> Floats:
+    """Return the largest residual (m,) in sd of a motion (6,) in any block that each smallest observation is in."""
+    largest: Floats = np.zeros(len(levels[0].parent))
+    for level in levels:
+        worst = np.zeros(int(level.blocks.block.max()) + 1)
+        worst[level.blocks.block] = _worst(level.blocks, motion[None], level.sd)[0]
+        largest = np.maximum(largest, worst[level.parent])
+    return largest
+
+
+def _scaled(blocks: _Blocks, motion: Floats, sd: Floats, limit: Floats) -> Floats:
+    """Return standard deviations (m,) raised to the scale of the residuals of the blocks that agree with a motion."""
+    z = (blocks.value - blocks.design @ motion) / sd
     near = _worst(blocks, motion[None], limit)[0] <= 1.0
-    scale = max(1.0, float(np.sqrt(np.median(z[near] ** 2) / CHI2_MEDIAN))) if near.any() else 1.0
-    sd = scale * np.sqrt(variance)
-    return _reweighted(blocks, motion, sd), sd
+    return sd * (max(1.0, float(np.sqrt(np.median(z[near] ** 2) / CHI2_MEDIAN))) if near.any() else 1.0)
 
 
 def _tukey(z: Floats) -> Floats:

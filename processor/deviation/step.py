@@ -7,13 +7,14 @@ Method ``default`` holds each scanned point against the design's surface; ``pape
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 from processor.deviation import baseline, cloud, measure
 from processor.deviation.params import METHODS, Params
 from processor.deviation.result import Result
 from processor.geometry import merging
-from processor.model import InputError, Scene, UsageError
+from processor.model import InputError, Scene, Status, UsageError, reason
 
 __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "run"]
 
@@ -42,6 +43,10 @@ def run(scene: Scene, params: Params, earlier: Mapping[str, Any] | None = None) 
         )
     vertices, origin = merging.local_design(scene.structure)
     scan = cloud.of_scene(scene, params.neighbours, params.outlier_ratio, (earlier or {}).get("stitch"))
-    if params.method == "paper":
-        return baseline.measure(scene, scan, vertices, origin, params)
-    return measure.measure(scene, scan, vertices, origin, params)
+    method = baseline.measure if params.method == "paper" else measure.measure
+    result = method(scene, scan, vertices, origin, params)
+    if not scan.unplaced:
+        return result
+    first = reason("deviation.scans-unplaced", scans=", ".join(scan.unplaced))
+    status = Status.WEAK if result.status is Status.OK else result.status
+    return replace(result, status=status, reasons=(first, *result.reasons))

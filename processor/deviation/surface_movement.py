@@ -6,13 +6,13 @@ so that the curvature of a tube does not count as roughness, and the two sides o
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import assignment, local_translation
+from processor.deviation import assignment, enclosure, local_translation
 from processor.deviation.assignment import OnSurface
 from processor.deviation.local_translation import Movement
 from processor.geometry import m3c2, mesh_distance
@@ -49,9 +49,12 @@ def movement(
 
     Outlier removal takes more points from the outside of a surface than from its inside, where other points are near.
     The last fit therefore uses those again that lie on the surface. Also returns the share of points on the surface.
+    Core points within another body of the design have no movement.
     """
     surface = curved.surface
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
+    within = enclosure.enclosed(core.points, core.normals, grid, surface.faces)
+    core = replace(core, normals=np.where(within[:, None], np.nan, core.normals))
     seen = assignment.assigned(cloud.points, cloud.scanner, curved, grid)
     near = np.abs(seen.distance) <= depth_mm
     on_surface = float(near[~cloud.doubtful].mean())

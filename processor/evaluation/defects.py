@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from processor.defects.result import DefectClass, Defects, Result
+from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
 from processor.model import Better, DefectTruth, Floats, Ints, Metric, Scene, Statistic, Truth
 
 DEPTH_SHARE = 0.10
@@ -66,6 +67,9 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         Metric("defects", "false alarms", float(false), Statistic.COUNT, limit=float(most)),
         Metric("defects", "surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
     ]
+    if truth.pose is not None and result.T_design_project.size and result.covariance.size:
+        pulls = pose_pulls(result.T_design_project, truth.pose.T_design_project, result.covariance)
+        metrics += covered_pulls("defects", "poses", pulls)
     if (rows >= 0).any():
         metrics += _classes_and_depths(result.defects, truth.defects, rows, limited)
     return metrics
@@ -87,7 +91,7 @@ def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints, limite
     bound: npt.NDArray[np.bool_] = np.zeros(len(rows), np.bool_)
     bound[matches] = defects.depth_is_bound[rows[matches]]
     error, allowed = depth_errors(defects, truth, rows)
-    measured = matches & ~bound
+    measured = matches & ~bound & np.isfinite(error)  # parts that are gone have no depth
     size = np.abs(error[measured])
     wrong = float((np.array(defects.defect_class)[rows[matches]] != np.array(truth.classes)[matches]).mean())
     most_wrong = 100.0 * (1.0 - CLASS_SHARE) + 1e-9 if limited else NAN
@@ -98,4 +102,19 @@ def _classes_and_depths(defects: Defects, truth: DefectTruth, rows: Ints, limite
         Metric("defects", "depth error", float(np.median(size)) if len(size) else NAN, Statistic.MEDIAN, unit="mm"),
         Metric("defects", "depth error", float(size.max(initial=0.0)), Statistic.MAX, unit="mm"),
         Metric("defects", "depths that are bounds alone", float(bound.sum()), Statistic.COUNT),
+        *covered("defects", "depths", error[measured], defects.depth_ci95[rows[measured]]),
+        *_volumes_and_areas(defects, truth, rows, measured),
+    ]
+
+
+def _volumes_and_areas(
+    defects: Defects, truth: DefectTruth, rows: Ints, measured: npt.NDArray[np.bool_]
+) -> list[Metric]:
+    """Return volumes against their intervals, and areas, which have none, in shares of the true ones."""
+    found, true = rows[measured], truth.volume_mm3[measured]
+    volume = np.abs(defects.volume_mm3[found]) - np.abs(true)
+    area = defects.area_mm2[found] / truth.area_mm2[measured] - 1.0
+    return [
+        *covered("defects", "volumes", volume, defects.volume_ci95[found], unit="mm3"),
+        *signed("defects", "areas", 100.0 * area, unit="%"),
     ]

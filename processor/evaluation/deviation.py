@@ -6,15 +6,20 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from processor.deviation.result import Result
-from processor.evaluation.error_statistics import signed
+from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
 from processor.geometry import principal, rigid
-from processor.model import Floats, Metric, Scene, Statistic, StructureTruth, Truth
+from processor.model import Floats, Metric, Scene, Statistic, Status, StructureTruth, Truth
 
 NEIGHBOURS = 24
 REACH_MM = 500.0  # of a core point: a movement is smooth
 LEAST_MM = 50.0  # nearer points count the same
 NAN = float("nan")
 OTHER_POSE = "not compared with the truth: the pose found is another of those that fit about as well, turned by"
+STABLE_MM = 1e-6  # of the largest movement of a structure that is as designed
+LODS = 2.0  # levels of detection beyond which a movement has to be found
+LEAST_SHARE = 0.2  # of a structure's surface that did not move
+MOST_FALSE, MOST_MISSED = 6.0, 10.0  # %
+STABLE_POSE_MM, STABLE_POSE_MRAD, AS_DESIGNED_MM = 0.5, 0.05, 0.05
 BEYOND_LIMIT = 5.0  # % of core points farther from the truth than their level of detection
 
 
@@ -29,9 +34,10 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         return []
     if any(not scan.T_project_scan.size for scan in scene.scans) and len(scene.scans) > 1:
         return []
-    if result.status == "ambiguous" and (turn := _otherwise(result)) is not None:
+    true_pose = np.eye(4) if truth.pose is None else truth.pose.T_design_project
+    if result.status == "ambiguous" and (turn := _otherwise(result, true_pose)) is not None:
         return [Metric("deviation", OTHER_POSE, turn, unit="deg")]
-    true = true_deviation(result, truth.structure)
+    true = true_deviation(result, truth.structure, true_pose)
     error = result.core.distance - true
     known = np.isfinite(error) & np.isfinite(result.core.lod95)
     if not known.any():
@@ -45,22 +51,90 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
             beyond,
             Statistic.SHARE,
             unit="%",
-            limit=BEYOND_LIMIT if result.method == "default" else NAN,
+            limit=BEYOND_LIMIT if _limited(result) else NAN,
         ),
         Metric("deviation", "deviation error", float(np.median(size)), Statistic.MEDIAN, unit="mm"),
         Metric("deviation", "deviation error", float(np.quantile(size, 0.95)), Statistic.P95, unit="mm"),
         Metric("deviation", "deviation error", float(np.mean(error[known])), Statistic.MEAN, unit="mm"),
         Metric("deviation", "true deviation", float(np.sqrt(np.mean(true[known] ** 2))), Statistic.RMS, unit="mm"),
         Metric("deviation", "LOD95", float(np.median(result.core.lod95[known])), Statistic.MEDIAN, unit="mm"),
-        *signed("deviation", "deviations", error[known]),
+        *covered("deviation", "deviations", error, result.core.lod95),
+        *_extremes(result, true[known], result.core.distance[known]),
+        *_moved_and_not(result, truth.structure),
+        *([] if truth.pose is None else _pose(result, truth.structure, true_pose)),
     ]
 
 
-def _otherwise(result: Result) -> float | None:
-    """By what the pose found is turned, degrees, where it is another one than the design's; else nothing."""
+def _extremes(result: Result, true: Floats, found: Floats) -> list[Metric]:
+    """Coverage of the least and the greatest deviation, against the true extremes of the core points (k,)."""
+    if not (result.min_ci95.size and result.max_ci95.size):
+        return []
+    errors = np.array([found.min() - true.min(), found.max() - true.max()])
+    half = np.array([np.ptp(result.min_ci95), np.ptp(result.max_ci95)]) / 2.0
+    return covered("deviation", "least and greatest deviations", errors, half)
+
+
+def _pose(result: Result, truth: StructureTruth, true_pose: Floats) -> list[Metric]:
+    """Error of the pose of a structure that is not in the design's frame, at the middle of what did not move.
+
+    The covariance is that of the fit, which has the true pose where enough of the structure did not move.
+    """
+    size = np.linalg.norm(truth.displacement, axis=1)
+    still = size < STABLE_MM
+    in_part = bool(LEAST_SHARE < still.mean() < 1.0)
+    middle = truth.points[still if still.any() else slice(None)].mean(axis=0)
+    off = result.T_design_scan @ rigid.invert(true_pose)
+    shift, turn = rigid.apply(off, middle[None])[0] - middle, rigid.vector_from_rotation(off[:3, :3])
+    shift_limit, turn_limit = (STABLE_POSE_MM, STABLE_POSE_MRAD) if in_part and _limited(result) else (NAN, NAN)
+    wrong = result.status == Status.OK and _otherwise(result, true_pose) is not None
+    metrics = [
+        Metric("deviation", "wrong poses called ok", float(wrong), Statistic.COUNT, limit=0.0),
+        Metric("deviation", "pose, shift of the middle", float(np.linalg.norm(shift)), unit="mm", limit=shift_limit),
+        Metric("deviation", "pose, turn", 1e3 * float(np.linalg.norm(turn)), unit="mrad", limit=turn_limit),
+    ]
+    if result.covariance.size and still.mean() > LEAST_SHARE:
+        metrics += covered_pulls("deviation", "poses", pose_pulls(result.T_design_scan, true_pose, result.covariance))
+    return metrics
+
+
+def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:
+    """Return what was found of steel that moved and of steel that did not, in the true frame of the design.
+
+    A core point moved where the movement along its normal is over twice its LOD95. Limits are for structures of which
+    one part moved, and for the mean of those exactly as designed.
+    """
+    nearest = cKDTree(truth.points).query(result.core.points + result.origin)[1]
+    displacement = truth.displacement[nearest]
+    still = np.linalg.norm(displacement, axis=1) < STABLE_MM
+    along = np.abs(np.einsum("ki,ki->k", displacement, result.core.normals))
+    lod95, found = result.core.lod95, np.abs(result.core.distance)
+    known, limited = np.isfinite(found) & np.isfinite(lod95), _limited(result)
+    if still.all() and known.any():
+        mean = abs(float(result.core.distance[known].mean()))
+        limit = AS_DESIGNED_MM if limited else NAN
+        return [Metric("deviation", "mean of steel as designed", mean, unit="mm", limit=limit)]
+    moved = known & (along > LODS * lod95)
+    if not LEAST_SHARE < still.mean() < 1.0 or not moved.any():
+        return []
+    false = 100.0 * float(np.mean((found > lod95)[known & still]))
+    missed = 100.0 * float(np.mean((found <= lod95)[moved]))
+    limits = (MOST_FALSE, MOST_MISSED) if limited else (NAN, NAN)
+    return [
+        Metric("deviation", "unmoved steel beyond LOD95", false, Statistic.SHARE, unit="%", limit=limits[0]),
+        Metric("deviation", "moved steel within LOD95", missed, Statistic.SHARE, unit="%", limit=limits[1]),
+    ]
+
+
+def _limited(result: Result) -> bool:
+    """Whether limits are for this method; figures of the baseline have none."""
+    return result.method == "default"
+
+
+def _otherwise(result: Result, true_pose: Floats) -> float | None:
+    """By what the pose found is turned, degrees, where it is another one than the true one; else nothing."""
     if not len(result.core):
         return None
-    T = result.T_design_scan
+    T = result.T_design_scan @ rigid.invert(true_pose)
     centre = result.origin + result.core.points.mean(axis=0)
     size = float(np.linalg.norm(np.ptp(result.core.points, axis=0)))
     if not principal.differ(T, np.eye(4), centre, size):
@@ -68,7 +142,7 @@ def _otherwise(result: Result) -> float | None:
     return float(np.degrees(rigid.rotation_angle(T[:3, :3])))
 
 
-def true_deviation(result: Result, truth: StructureTruth) -> Floats:
+def true_deviation(result: Result, truth: StructureTruth, true_pose: Floats) -> Floats:
     """Movement (k,) along the normal of each core point by the nearest points of the truth, NaN where none is near."""
     places = truth.points - result.origin
     distance, index = cKDTree(places).query(
@@ -86,7 +160,7 @@ def true_deviation(result: Result, truth: StructureTruth) -> Floats:
     right = np.einsum("nk,nki,nkj->nij", weight, basis, truth.displacement[at])
     moved = np.linalg.solve(normal, right)[:, 0]
     moved[~near.any(axis=1)] = np.nan
-    T = rigid.with_origin(result.T_design_scan, -result.origin)
+    T = rigid.with_origin(result.T_design_scan @ rigid.invert(true_pose), -result.origin)
     T = rigid.transform(T[:3, :3], T[:3, 3] - result.origin)
     found: Floats = np.einsum(
         "ni,ni->n", rigid.apply(T, result.core.points + moved) - result.core.points, result.core.normals

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.model import Floats, Metric, Statistic
+from processor.geometry import rigid
+from processor.model import NORMAL_95, Floats, Metric, Statistic
 
 
 def signed(step: str, quantity: str, errors: Floats, bound: Floats | None = None, unit: str = "mm") -> list[Metric]:
@@ -31,3 +32,43 @@ def signed(step: str, quantity: str, errors: Floats, bound: Floats | None = None
             rms = float(np.sqrt(np.mean((found[bounded] / least[bounded]) ** 2)))
             figures.append((Statistic.EFFICIENCY, 1.0 / rms if rms > 0.0 else nan, ""))
     return [Metric(step, quantity, value, statistic, unit=own) for statistic, value, own in figures]
+
+
+def covered(step: str, quantity: str, errors: Floats, half_widths: Floats, unit: str = "mm") -> list[Metric]:
+    """Share of errors within the half-widths of their 95 % intervals, with the figures of :func:`signed`.
+
+    Errors without an interval (NaN) are left out. A quantity that has intervals always has this share.
+    """
+    known = np.isfinite(errors) & np.isfinite(half_widths)
+    if not known.any():
+        return []
+    share = 100.0 * float(np.mean(np.abs(errors[known]) <= half_widths[known]))
+    return [
+        Metric(step, quantity, share, Statistic.COVERAGE, unit="%"),
+        *signed(step, quantity, errors[known], unit=unit),
+    ]
+
+
+def pose_pulls(T: Floats, true: Floats, covariance: Floats) -> Floats:
+    """Return the errors (6,) of a pose T_a_b in standard deviations: turns about and shifts along the axes of a.
+
+    ``T`` and ``true`` are 4 x 4, the covariance (6, 6) is of the left perturbation of T; where its variance is not
+    positive, the error is NaN. A scale within T is no part of the error.
+    """
+    off = T @ rigid.invert(true)
+    R = off[:3, :3] / np.cbrt(np.linalg.det(off[:3, :3]))
+    variance = np.diag(covariance)
+    error = np.concatenate([rigid.vector_from_rotation(R), off[:3, 3]])
+    return np.asarray(error / np.sqrt(np.where(variance > 0.0, variance, np.nan)))
+
+
+def covered_pulls(step: str, quantity: str, pulls: Floats) -> list[Metric]:
+    """Share of errors within their 95 % intervals, of errors in standard deviations; without figures in a unit."""
+    known = pulls[np.isfinite(pulls)]
+    if not len(known):
+        return []
+    share = 100.0 * float(np.mean(np.abs(known) <= NORMAL_95))
+    return [
+        Metric(step, quantity, share, Statistic.COVERAGE, unit="%"),
+        Metric(step, quantity, float(len(known)), Statistic.NUMBER),
+    ]

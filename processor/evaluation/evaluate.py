@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from processor import pipeline
+from processor.evaluation import truth_json
 from processor.evaluation.space_frame import true_rows
 from processor.model import Floats, InputError, Metric, Scene, Truth
 from processor.pipeline import Execution
@@ -50,8 +51,11 @@ def evaluate(path: Path, execution: Execution) -> ErrorReport:
     Raises InputError for a truth that cannot be read, or is that of another scene.
     """
     source = folder.truth_file(path)
-    truth = None if source is None else store.read_truth(source, labels=execution.stored is None)
-    return ErrorReport() if source is None or truth is None else against(truth, execution, str(source))
+    if source is None:
+        truth = truth_json.read(path) if path.is_dir() else None
+    else:
+        truth = store.read_truth(source, labels=execution.stored is None)
+    return ErrorReport() if truth is None else against(truth, execution, str(source or path / truth_json.NAME))
 
 
 def against(truth: Truth, execution: Execution, source: str) -> ErrorReport:

@@ -8,11 +8,12 @@ without a result have no weight in the adjustment, and so none here.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
 
-from processor.evaluation.error_statistics import signed
+from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
 from processor.geometry import rigid
 from processor.geometry.polyline import Polyline
 from processor.model import NORMAL_95, ArchDesign, ArchTruth, Floats, Metric, Scene, Statistic, Status, Truth
@@ -23,6 +24,22 @@ from processor.preassembly.result import Result
 WRONG_POSE_RAD = 0.1
 TRUE_SPLICING = "splicing error of the true key points"
 TRUE_LINEAR = "linear error of the true edges"
+AS_DESIGNED_MM = 0.01  # key points this near to the design's are those of perfect parts
+
+
+class TrueAssembly(NamedTuple):
+    """The true parts, assembled by the objective; NaN where the objective has no weight.
+
+    ``gaps`` (j, 8, 3); departures (s, 3) of the edges from the design's at chainages (s,), part by part, left before
+    right; ``span`` is the distance of the bottom's middles at both ends of the bridge less the design's;
+    ``motions`` (c, 4, 4) move the parts from the truth's poses.
+    """
+
+    gaps: Floats
+    departures: Floats
+    chainage: Floats
+    span: float
+    motions: Floats
 
 
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
@@ -105,15 +122,57 @@ def _gaps_by_objective(design: ArchDesign, result: Result, truth: ArchTruth, tru
     for j, there in enumerate(known):
         if not there.all():
             ends[j, 1] = ends[j + 1, 0] = np.nan
-    gaps, linear = by_objective(design, ends, edges, result.adjustment.weight)
-    error = (result.joints.gaps - gaps)[known]
+    assembly = by_objective(design, ends, edges, result.adjustment.weight)
+    error = (result.joints.gaps - assembly.gaps)[known]
     share = 100.0 * float((np.abs(error) <= result.joints.gap_ci95[known]).mean())
+    linear = np.linalg.norm(assembly.departures, axis=1)
     return [
         Metric("preassemble", "gaps against the truth's", float(np.sqrt(np.mean(error**2))), Statistic.RMS, unit="mm"),
         Metric("preassemble", "gaps", share, Statistic.COVERAGE, unit="%"),
-        *_mean_max_coverage(result, gaps[known], linear),
+        *_mean_max_coverage(result, assembly.gaps[known], linear),
         *signed("preassemble", "gaps", error),
+        *_of_the_chain(design, result, truth, assembly, rows),
     ]
+
+
+def _of_the_chain(
+    design: ArchDesign, result: Result, truth: ArchTruth, assembly: TrueAssembly, rows: list[int]
+) -> list[Metric]:
+    """Coverage of span, edges, closure and poses; ``rows`` of the truth are those of the components.
+
+    Span and poses of a part as built are relative to how it fits the design, which has no truth where the part differs
+    from it: poses and closure have a truth for perfect parts alone, whose closure is zero.
+    """
+    stated = result.adjustment
+    if stated is None:
+        return []
+    metrics = covered("preassemble", "spans", np.array([stated.span_departure - assembly.span]),
+                      np.array([stated.span_ci95]))  # fmt: skip
+    if len(stated.linear_offset) == len(assembly.departures) and np.allclose(
+        result.linear.chainage, assembly.chainage, atol=1.0
+    ):
+        x, left, z = assembly.departures.T
+        true = np.stack([left, np.copysign(np.hypot(x, z), z)], axis=1)
+        metrics += covered("preassemble", "edges", stated.linear_offset - true, stated.linear_offset_ci95)
+    ends, at = truth.key_points_bridge[rows], design.joint_points
+    off = np.concatenate([(ends[1:, 0] - at).ravel(), (ends[:-1, 1] - at).ravel()])
+    if np.isfinite(off).all() and np.abs(off).max() < AS_DESIGNED_MM:
+        if stated.closure.size:
+            metrics += covered_pulls(
+                "preassemble", "closures", NORMAL_95 * (stated.closure / stated.closure_ci95).ravel()
+            )
+        metrics += covered_pulls("preassemble", "poses", _pose_pulls(result, truth, assembly, rows))
+    return metrics
+
+
+def _pose_pulls(result: Result, truth: ArchTruth, assembly: TrueAssembly, rows: list[int]) -> Floats:
+    """Errors (6 c,) of the assembled poses in standard deviations, in the bridge's frame."""
+    pulls = []
+    for i, row in enumerate(rows):
+        T, covariance = result.components.T_bridge_scan[i], result.components.covariance[i]
+        if np.isfinite(T).all() and np.isfinite(covariance).all():
+            pulls.append(pose_pulls(T, assembly.motions[i] @ truth.T_bridge_scan[row], covariance))
+    return np.concatenate(pulls) if pulls else np.empty(0)
 
 
 def _mean_max_coverage(result: Result, gaps: Floats, linear: Floats) -> list[Metric]:
@@ -125,13 +184,15 @@ def _mean_max_coverage(result: Result, gaps: Floats, linear: Floats) -> list[Met
     size = np.abs(gaps)
     true = np.array([size.mean(), size.max(), _over(np.mean, linear), _over(np.max, linear)])
     share = float((np.abs(stated - true) <= result.errors_ci95[:4]).mean())
-    return [Metric("preassemble", "mean and largest errors", 100.0 * share, Statistic.COVERAGE, unit="%")]
+    return [
+        Metric("preassemble", "mean and largest errors", 100.0 * share, Statistic.COVERAGE, unit="%"),
+        Metric("preassemble", "mean and largest errors", float(len(true)), Statistic.NUMBER),
+    ]
 
 
-def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: float) -> tuple[Floats, Floats]:
+def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: float) -> TrueAssembly:
     """Minimise the sum of squared gaps plus ``weight`` times that of the edges' departures over the parts' motions.
 
-    Return the gaps (j, 8, 3) at the minimum, and the distances (s,) of the edges from the design's at all chainages.
     ``key_points`` (c, 2, 8, 3) and ``edges`` (c, 2, e, 3) of the parts are near their places in the design, in the
     bridge's frame. Joints and edges with NaN have no weight; parts are then constrained along their chords as in the
     adjustment.
@@ -146,9 +207,7 @@ def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: 
     hold = 0.0 if joined.all() else np.sqrt(HOLD)
 
     def placed(x: Floats, i: int, points: Floats) -> Floats:
-        R = rigid.rotation_from_vector(1e-3 * x[6 * i : 6 * i + 3])
-        at: Floats = (points - middles[i]) @ R.T + middles[i] + x[6 * i + 3 : 6 * i + 6]
-        return at
+        return rigid.apply(_motion(x, i, middles[i]), points)
 
     def gaps(x: Floats) -> Floats:
         pairs = range(len(lines) - 1)
@@ -162,16 +221,35 @@ def by_objective(design: ArchDesign, key_points: Floats, edges: Floats, weight: 
         along = np.einsum("ci,ci->c", chords, x.reshape(-1, 6)[:, 3:])
         return np.concatenate([gaps(x)[joined].ravel(), np.sqrt(weight) * departures(x).ravel(), hold * along])
 
-    solution = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12)
-    return gaps(solution.x), np.linalg.norm(departures(solution.x), axis=1)
+    solution = least_squares(objective, np.zeros(6 * len(lines)), xtol=1e-12, ftol=1e-12, gtol=1e-12).x
+    before = np.cumsum([[0.0, 0.0], *([left.length, right.length] for left, right in lines)], axis=0)
+    outer = [(0, placed(solution, 0, edges[0][:, 0]), 0), (-1, placed(solution, len(lines) - 1, edges[-1][:, -1]), -1)]
+    as_built = [points.mean(axis=0) for _, points, _ in outer]
+    as_designed = [np.mean([line.vertices[end] for line in lines[part]], axis=0) for part, _, end in outer]
+    return TrueAssembly(
+        gaps=gaps(solution),
+        departures=departures(solution),
+        chainage=np.concatenate([before[i, k] + _chainages(lines[i][k]) for i, k in at_chainages] or [np.empty(0)]),
+        span=float(np.linalg.norm(as_built[1] - as_built[0]) - np.linalg.norm(as_designed[1] - as_designed[0])),
+        motions=np.stack([_motion(solution, i, middle) for i, middle in enumerate(middles)]),
+    )
+
+
+def _motion(x: Floats, i: int, middle: Floats) -> Floats:
+    """Motion (4, 4) of part i by the parameters of the objective: a turn about its middle, mrad, and a shift, mm."""
+    R = rigid.rotation_from_vector(1e-3 * x[6 * i : 6 * i + 3])
+    return rigid.transform(R, middle - R @ middle + x[6 * i + 3 : 6 * i + 6])
 
 
 def _at_chainages(edge: Floats, line: Polyline) -> Floats:
     """Points of an edge as built at the design's chainages."""
-    arc = line.nearest(edge)[0]
-    count = max(1, int(line.length / errors.INTERVAL_MM))
-    at = errors.INTERVAL_MM * (np.arange(count) + 0.5)
+    arc, at = line.nearest(edge)[0], _chainages(line)
     return np.stack([np.interp(at, arc, edge[:, k]) for k in range(3)], axis=1)
+
+
+def _chainages(line: Polyline) -> Floats:
+    """Chainages of the linear error along one edge of a part."""
+    return np.asarray(errors.INTERVAL_MM * (np.arange(max(1, int(line.length / errors.INTERVAL_MM))) + 0.5))
 
 
 def _true_linear_error(

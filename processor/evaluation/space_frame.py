@@ -6,14 +6,17 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.evaluation.error_statistics import signed
+from processor.evaluation.error_statistics import covered, signed
+from processor.geometry import rigid
 from processor.model import NORMAL_95, Better, Floats, FrameTruth, Ints, Metric, Scene, Statistic, Truth
-from processor.space_frame.result import Balls, Flag, Result
+from processor.space_frame.design.matching import robust_fit
+from processor.space_frame.result import Balls, Flag, MovementGauge, Result
 from processor.space_frame.spheres import isolated
 
 NAN = float("nan")
 WRONG_MM = 10.0  # a centre farther off is that of another ball
 FOUND_MM = 3.0  # a node this near to the true one is found
+OTHER_SIZE_MM = 2.0  # tolerances of blanks are less, steps between sizes more
 LOWEST_MM = 3.0  # an unflagged lowest point farther off is a wrong answer
 NEAR = f"nodes found within {FOUND_MM:g} mm"
 WRONG_CENTRE = f"balls called ok, centre over {WRONG_MM:g} mm off"
@@ -70,8 +73,47 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *signed("spheres", "centres", off[ok], bound[ok, :3]),
         *signed("spheres", "radii", radius[ok], bound[ok, 3]),
         *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
+        *_movements(scene, result, true, rows[ok], matches[ok]),
+        *_sizes(balls, true, rows, matches, result.method == "ray"),
     ]
     return metrics
+
+
+def _sizes(balls: Balls, true: FrameTruth, rows: Ints, matches: Ints, limited: bool) -> list[Metric]:
+    """Return numbers of right sizes called wrong, and of wrong sizes that are not, by the design's radii."""
+    nominal = balls.nominal_radii[rows] if len(balls.nominal_radii) else np.full(len(rows), NAN)
+    known = np.isfinite(nominal)
+    if not known.any():
+        return []
+    wrong = np.abs(true.radii[matches] - nominal)[known] > OTHER_SIZE_MM
+    called = balls.flagged(Flag.WRONG_SIZE)[rows][known]
+    limit = 0.0 if limited else NAN
+    return [
+        Metric("spheres", "right sizes called wrong", float((called & ~wrong).sum()), Statistic.COUNT, limit=limit),
+        Metric("spheres", "wrong sizes called right", float((wrong & ~called).sum()), Statistic.COUNT),
+    ]
+
+
+def _movements(scene: Scene, result: Result, true: FrameTruth, rows: Ints, matches: Ints) -> list[Metric]:
+    """Return movements of balls ``rows`` (m,) against the true ones, relative to the same datum.
+
+    By a best fit, the truth is fitted as the balls are: by the robust fit of the same nodes.
+    """
+    balls, design = result.balls, scene.frame
+    if design is None or not len(balls.movement) or not np.isfinite(balls.movement[rows]).any():
+        return []
+    known = {int(id_): k for k, id_ in enumerate(design.ids)}
+    nominal = np.array([design.centres[known[int(balls.ids[row])]] for row in rows]).reshape(-1, 3)
+    places = true.centres[matches]
+    if result.movement_reference is not None and result.movement_reference.gauge is MovementGauge.BEST_FIT:
+        middle = places.mean(axis=0)
+        places = rigid.apply(robust_fit(places - middle, nominal)[0], places - middle)
+    vector = places - nominal
+    size = np.linalg.norm(vector, axis=1)
+    return [
+        *covered("spheres", "movements", balls.movement[rows] - vector, balls.movement_ci95[rows]),
+        *covered("spheres", "sizes of movements", balls.movement_size[rows] - size, balls.movement_size_ci95[rows]),
+    ]
 
 
 def true_rows(scene: Scene, balls: Balls, true: FrameTruth) -> Ints:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.evaluation.error_statistics import covered_pulls, pose_pulls
 from processor.geometry import rigid
-from processor.model import NORMAL_95, Floats, Metric, Scene, Statistic, Status, Truth
+from processor.model import Floats, Metric, Scene, StationTruth, Statistic, Status, Truth
 from processor.stitching import frames
 from processor.stitching.result import Result
 
@@ -63,11 +64,32 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     if result.by_control:
         error = float(np.linalg.norm(T[:, :3, 3] - true[:, :3, 3], axis=1)[fit].max())
         metrics.append(Metric("stitch", "station positions by control points", error, Statistic.MAX, unit="mm"))
-    pulls = pulls_of(result, rows, true)
-    if len(pulls):
-        share = 100.0 * float((np.abs(pulls) < NORMAL_95).mean())
-        metrics.append(Metric("stitch", "pose components", share, Statistic.COVERAGE, unit="%"))
-    return metrics
+    return [
+        *metrics,
+        *covered_pulls("stitch", "pose components", pulls_of(result, rows, true)),
+        *covered_pulls("stitch", "poses of pairs", _pulls_of_pairs(result, known)),
+        *covered_pulls("stitch", "scales", _pulls_of_scales(result, truth.stations)),
+    ]
+
+
+def _pulls_of_scales(result: Result, truth: StationTruth) -> Floats:
+    """Return errors by standard deviations (m,) of the scales of the pairs, of stations with scales of their own."""
+    ppm = truth.scale_ppm if len(truth.scale_ppm) else np.zeros(len(truth.ids))
+    scale = dict(zip(truth.ids, 1.0 + 1e-6 * ppm, strict=True))
+    pairs = result.pairs
+    if not (np.isfinite(pairs.scale) & (pairs.scale_sd > 0.0)).any():
+        return np.empty(0)
+    true = np.array([scale.get(a, NAN) / scale.get(b, NAN) for a, b in zip(pairs.a, pairs.b, strict=True)])
+    return np.asarray((pairs.scale - true) / np.where(pairs.scale_sd > 0.0, pairs.scale_sd, NAN))
+
+
+def _pulls_of_pairs(result: Result, known: dict[str, Floats]) -> Floats:
+    """Return errors by standard deviations (m,) of the poses of the pairs that were used."""
+    pulls, pairs = [], result.pairs
+    for i, (a, b) in enumerate(zip(pairs.a, pairs.b, strict=True)):
+        if pairs.used[i] and a in known and b in known and np.isfinite(pairs.covariance[i]).all():
+            pulls.append(pose_pulls(pairs.T_a_b[i], rigid.invert(known[a]) @ known[b], pairs.covariance[i]))
+    return np.concatenate(pulls) if pulls else np.empty(0)
 
 
 def pulls_of(result: Result, rows: list[int], true: Floats) -> Floats:

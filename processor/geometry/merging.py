@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 
 from processor.geometry import mesh_distance, rigid
-from processor.model import Floats, InputError, Scan, Scene, StructureDesign
+from processor.model import Floats, InputError, Scan, Scene, Status, StructureDesign
 
 ORIGIN_STEP_MM = 1000.0
+UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
 FEWEST_POINTS = 100  # of a scan that is compared with a design
 
 
@@ -54,10 +55,17 @@ def _pose(scan: Scan) -> Floats:
 
 
 def stitched(scene: Scene, result: Any) -> Scene:
-    """Give the scans the poses of a ``result`` of step stitch, if there is one; leave out those it did not place."""
+    """Give the scans the poses of a ``result`` of step stitch, if there is one; leave out those it did not place.
+
+    A scan whose pose is ambiguous is not placed.
+    """
     if result is None:
         return scene
-    T = dict(zip(result.scans.name, result.scans.T_project_scan, strict=True))
+    table = result.scans
+    T = {
+        name: np.full((4, 4), np.nan) if status in UNPLACED else pose
+        for name, status, pose in zip(table.name, table.status, table.T_project_scan, strict=True)
+    }
     scans = tuple(
         replace(scan, T_project_scan=T[scan.name]) if scan.name in T else scan
         for scan in scene.scans

@@ -379,6 +379,66 @@ def nearest_visible(grid: FacetGrid, points: Floats, scanners: Floats, station: 
 
 
 @njit(cache=True, nogil=True)
+def crossings(grid: FacetGrid, starts: Floats, ends: Floats, once: bool) -> tuple[Ints, Ints, Floats]:
+    """Return where lines from ``starts`` (n, 3) to ``ends`` (n, 3) cross facets: row, facet, and share of the line.
+
+    Lines that start outside of the grid cross none. With ``once``, one crossing of a line is enough. The voxels on a
+    line are visited in order (Amanatides and Woo 1987).
+    """
+    rows, facets = [np.int64(0) for _ in range(0)], [np.int64(0) for _ in range(0)]
+    shares = [0.0 for _ in range(0)]
+    at, step, after, every = np.empty(3, np.int64), np.empty(3, np.int64), np.empty(3), np.empty(3)
+    for row in range(len(starts)):
+        start, ray = starts[row], ends[row] - starts[row]
+        inside, before, searched = True, 0.0, True
+        for k in range(3):
+            place = (start[k] - grid.low[k]) / grid.size
+            at[k] = int(np.floor(place))
+            inside = inside and 0 <= at[k] < grid.shape[k]
+            step[k] = 1 if ray[k] > 0.0 else -1
+            moves = abs(ray[k]) > 1e-12
+            every[k] = grid.size / abs(ray[k]) if moves else np.inf
+            after[k] = (at[k] + 1 - place if ray[k] > 0.0 else place - at[k]) * every[k] if moves else np.inf
+        while inside and searched and before <= 1.0:
+            voxel = (at[0] * grid.shape[1] + at[1]) * grid.shape[2] + at[2]
+            k = int(np.argmin(after))
+            for index in range(grid.start[voxel], grid.start[voxel + 1]):
+                share = _crossing(grid.corners[grid.facet[index]], start, ray)
+                if 0.0 < share < 1.0 and before <= share < after[k]:  # a facet is in several voxels
+                    rows.append(row)
+                    facets.append(grid.facet[index])
+                    shares.append(share)
+                    if once:
+                        searched = False
+                        break
+            before = after[k]
+            at[k] += step[k]
+            after[k] += every[k]
+            inside = 0 <= at[k] < grid.shape[k]
+    return np.array(rows, np.int64), np.array(facets, np.int64), np.array(shares, np.float64)
+
+
+@njit(cache=True, nogil=True)
+def _crossing(corner: Floats, start: Floats, ray: Floats) -> Any:
+    """Return the share of a ray (3,) at which it crosses a triangle (3, 3), -1 if it does not."""
+    e1x, e1y, e1z = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
+    e2x, e2y, e2z = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
+    px, py, pz = ray[1] * e2z - ray[2] * e2y, ray[2] * e2x - ray[0] * e2z, ray[0] * e2y - ray[1] * e2x
+    determinant = e1x * px + e1y * py + e1z * pz
+    if determinant == 0.0:
+        return -1.0
+    ax, ay, az = start[0] - corner[0, 0], start[1] - corner[0, 1], start[2] - corner[0, 2]
+    u = (ax * px + ay * py + az * pz) / determinant
+    if u < 0.0 or u > 1.0:
+        return -1.0
+    qx, qy, qz = ay * e1z - az * e1y, az * e1x - ax * e1z, ax * e1y - ay * e1x
+    v = (ray[0] * qx + ray[1] * qy + ray[2] * qz) / determinant
+    if v < 0.0 or u + v > 1.0:
+        return -1.0
+    return (e2x * qx + e2y * qy + e2z * qz) / determinant
+
+
+@njit(cache=True, nogil=True)
 def _touching(grid: FacetGrid, points: Floats, within: float) -> tuple[Ints, Ints]:
     """Pairs of points and facets that come within a distance of each other."""
     low, size, shape = grid.low, grid.size, grid.shape

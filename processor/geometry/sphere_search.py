@@ -1,41 +1,65 @@
 """Search for balls in a whole cloud, without a design or a crop.
 
-Spheres are proposed by four points drawn from one neighbourhood, of many sizes. A ball is accepted if the points within
-the noise of its surface far outnumber those beside it, which no plane, edge, tube or volume achieves.
+Patches of the cloud at every scale propose spheres: a patch about as wide as a ball holds most of its visible surface
+and little else, however small a share of the cloud the ball is. Each scale uses the cloud thinned to a cell, so that
+the lines of a scanner weigh no more than the space between them. A ball is accepted if the points within the noise of
+its surface far outnumber those beside it, and the cloud's own normals are those of the ball.
 """
+# Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
+from numba import njit
 from scipy.spatial import cKDTree
 
+from processor.geometry import point_grid
+from processor.geometry.parallel import over_ranges
 from processor.geometry.sphere import (
     RobustFit,
     Sphere,
-    algebraic,
     canonical_order,
     robust_fit,
     sphere_cells,
-    through_four,
     visible_fraction,
 )
-from processor.model import Floats
+from processor.model import Floats, Ints
 
-SUBSAMPLE = 8000  # points for proposals and their scores; all points only for the final fit
-SEEDS = 300
-SETS_PER_SIZE = 2
-SIZES = 8  # of neighbourhoods, from 16 points to most of the cloud
+MAD = 1.4826
 LEAST_POINTS = 40  # on a ball; with fewer, balls occur anywhere by chance
-REFINED = 40  # best proposals, which are refined
+STEP = 1.5  # between scales
+FINEST = 20  # neighbours of a point within the smallest scale
+CELLS = 8.0  # of a thinned cloud, in a patch's radius
+LEAST_CELLS = 24  # of a patch
+MOST_PATCHES = 50_000  # of one scale
+APART = 0.7  # of patches, in their radii
+SETS = 48  # of four points, of each patch
+BAND = 0.1  # half-width of a proposal's surface, in radii
+SMALLEST, LARGEST = 0.6, 1.6  # radius of a proposal, in patch radii
+FLAT = 0.04  # thickness of a patch, in its radii, below which it is a plane or an edge
+REFINED = 40  # best proposals of each scale, which are tried
+REFINEMENTS = 3
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
 ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
 FACING = 0.975  # median cosine between the cloud's own normals and the ball's
+ROUGHLY_FACING = 0.9  # the same of a proposal
 MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
+ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
+NEAR = 1.7  # radii of a proposal: points about its centre that a ball is fitted to
+AROUND = 1.4  # radii of a ball: its surroundings
+LIKELY_MM = 1500.0  # larger balls are searched for only where there is none below
+SMALL = 0.005  # residuals in radii: a ball even if they are its own shape
+WHITE = 0.5  # sd of residuals by the differences of neighbours, over that of all
 LEAST_VISIBLE = 0.08  # share of the sphere
 LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
+LARGEST_HALF_SD = 0.15  # the same by half of the points
 RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
+EVIDENCE_CELLS = 12.0  # of a thinned cloud, in a ball's radius
 
 
 @dataclass(frozen=True)
@@ -46,84 +70,12 @@ class Ball:
     inlier_share: float
 
 
-def local_noise(points: Floats, neighbours: int = 24, sample: int = 400) -> float:
-    """Noise in mm across the surface of points (n, 3), n > 6, from quadrics fitted to neighbourhoods.
+class Cloud(NamedTuple):
+    """Points (n, 3) in canonical order, their tree, and the position each was seen from (n, 3), or None."""
 
-    It is a low quantile of the standard deviations: up to half of the neighbourhoods may lie at edges or mixed pixels.
-    """
-    k = min(neighbours, len(points))
-    if k <= 6:
-        return float("nan")
-    tree = cKDTree(points)
-    query = points[:: max(1, len(points) // sample)]
-    near = points[tree.query(query, k=k)[1]]
-    near = near - near.mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(np.einsum("mki,mkj->mij", near, near))[1]
-    frame = np.einsum("mki,mij->mkj", near, axes)
-    size = np.maximum(np.abs(frame[:, :, 1:]).max(axis=(1, 2)), 1e-300)
-    z, x, y = (frame[:, :, i] / size[:, None] for i in range(3))
-    A = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=2)
-    Q, _ = np.linalg.qr(A)
-    left = z - np.einsum("mki,mi->mk", Q, np.einsum("mki,mk->mi", Q, z))
-    sd = size * np.sqrt(np.sum(left**2, axis=1) / (k - 6))
-    return float(np.quantile(sd, 0.35))
-
-
-def find_ball(
-    points: Floats,
-    rng: np.random.Generator,
-    least_points: int = LEAST_POINTS,
-    radius_mm: float | None = None,
-    scanner: Floats | None = None,
-) -> Ball | None:
-    """Find the clearest ball among points (n, 3), mm, or None.
-
-    ``radius_mm`` fixes the radius; ``scanner`` (n, 3) is the position each point was seen from. Work is bounded:
-    proposals come from at most SUBSAMPLE points, so that a ball of a few points in millions is not found. Points are
-    put in canonical order, so that the result does not depend on theirs.
-    """
-    if len(points) < least_points:
-        return None
-    order = canonical_order(points)
-    origin = points.mean(axis=0)
-    cloud = points[order] - origin
-    few = cloud
-    if len(cloud) > SUBSAMPLE:
-        few = cloud[np.sort(rng.choice(len(cloud), SUBSAMPLE, replace=False))]
-    extent = float(np.linalg.norm(np.ptp(cloud, axis=0)))
-    noise = max(local_noise(cloud), 1e-6 * extent)
-    tau = 3.0 * noise
-    centres, radii = _proposals(few, rng)
-    fits = (radii > 4.0 * tau) & (radii < extent)
-    if radius_mm is not None:
-        fits &= np.abs(radii - radius_mm) < RADIUS_BAND * radius_mm
-    centres, radii = centres[fits], radii[fits]
-    best = np.argsort(-_scores(few, centres, radii, tau), kind="stable")[:REFINED]
-    refined = [_refined(few, Sphere(centres[i], float(radii[i]), np.zeros((4, 4))), tau) for i in best]
-    candidates = sorted(
-        ((_score(few, ball, tau), i) for i, ball in enumerate(refined) if ball is not None), key=lambda c: (-c[0], c[1])
-    )
-    seen_from = None if scanner is None else scanner[order] - origin
-    for _, i in candidates:
-        start = refined[i]
-        if start is None:
-            continue
-        if few is not cloud:
-            # All points are used only for a ball that is accepted among the subsample.
-            trial = robust_fit(few, start, 2.0 * noise, radius_mm)
-            if trial is None or not _stands_out(few, trial, noise, 8):
-                continue
-            start = trial.sphere
-        near = np.flatnonzero(start.residuals(cloud) < 0.6 * start.radius)
-        fit = robust_fit(cloud[near], start, 2.0 * noise, radius_mm, None if seen_from is None else seen_from[near])
-        if fit is not None and fit.sphere.radius <= extent and _stands_out(cloud[near], fit, noise, least_points):
-            off = fit.sphere.residuals(cloud[near])
-            share = float(fit.inliers.sum() / max(int(np.count_nonzero(off <= 0.4 * fit.sphere.radius)), 1))
-            inliers = np.zeros(len(points), bool)
-            inliers[order[near]] = fit.inliers
-            ball = Sphere(fit.sphere.centre + origin, fit.sphere.radius, fit.sphere.covariance)
-            return Ball(RobustFit(ball, inliers, fit.scale, fit.converged), min(1.0, share))
-    return None
+    points: Floats
+    tree: cKDTree
+    scanner: Floats | None
 
 
 def find_balls(
@@ -134,111 +86,368 @@ def find_balls(
     radius_mm: float | None = None,
     scanner: Floats | None = None,
 ) -> list[Ball]:
-    """Find up to ``most`` balls one after another, as :func:`find_ball`; inliers are of all points (n,).
+    """Find up to ``most`` balls among points (n, 3), mm, the clearest first; inliers are of all points (n,).
 
-    Points within 1.5 radii of a ball are not searched again, and balls never overlap, so that mixed pixels and mounts
-    around a ball do not make a second one.
+    ``radius_mm`` fixes the radius; ``scanner`` (n, 3) is the position each point was seen from. Balls never overlap, so
+    that mixed pixels and mounts around a ball do not make a second one. Work is bounded: at most MOST_PATCHES patches
+    of a scale are looked at. The result does not depend on the order of the points.
     """
-    left = np.arange(len(points))
+    if len(points) < least_points:
+        return []
+    order = canonical_order(points)
+    origin = points.mean(axis=0)
+    cloud = points[order] - origin
+    seen_from = None if scanner is None else scanner[order] - origin
+    whole = Cloud(cloud, cKDTree(cloud), seen_from)
+    scales = _scales(whole, radius_mm)
     balls: list[Ball] = []
-    for _ in range(2 * most):
+    for some in (scales[scales <= LIKELY_MM], scales[scales > LIKELY_MM]):
+        if not balls:
+            proposals = [one for scale in some for one in _proposals(cloud, scale, rng, radius_mm)]
+            balls = _clearest(whole, proposals, most, least_points, radius_mm)
+    return [_in_place(ball, order, origin) for ball in balls]
+
+
+def _clearest(
+    cloud: Cloud, proposals: list[tuple[float, Sphere]], most: int, least_points: int, radius_mm: float | None
+) -> list[Ball]:
+    """Accept balls among proposals with scores, the best first."""
+    balls: list[Ball] = []
+    for _, start in sorted(proposals, key=lambda one: -one[0]):
         if len(balls) == most:
             break
-        candidate = find_ball(points[left], rng, least_points, radius_mm, None if scanner is None else scanner[left])
-        if candidate is None:
-            break
-        ball = candidate.fit.sphere
-        inliers = np.zeros(len(points), bool)
-        inliers[left[candidate.fit.inliers]] = True
-        if all(
-            np.linalg.norm(ball.centre - other.fit.sphere.centre) > 0.9 * (ball.radius + other.fit.sphere.radius)
-            for other in balls
-        ):
-            fit = RobustFit(ball, inliers, candidate.fit.scale, candidate.fit.converged)
-            balls.append(Ball(fit, candidate.inlier_share))
-            left = left[ball.residuals(points[left]) > 0.5 * ball.radius]
-        else:
-            left = left[~inliers[left]]
+        if any(_overlap(start, other.fit.sphere) for other in balls):
+            continue
+        ball = _accepted(cloud, start, least_points, radius_mm)
+        if ball is not None and not any(_overlap(ball.fit.sphere, other.fit.sphere) for other in balls):
+            balls.append(ball)
     return balls
 
 
-def _proposals(points: Floats, rng: np.random.Generator) -> tuple[Floats, Floats]:
-    n = len(points)
-    seeds = rng.choice(n, min(SEEDS, n), replace=False)
-    sizes = np.unique(np.geomspace(min(16, n), max(min(16, n), 0.8 * n), SIZES).astype(int))
-    quads = []
-    for seed in seeds:
-        nearest = np.argsort(np.sum((points - points[seed]) ** 2, axis=1), kind="stable")
-        draws = rng.random((len(sizes), SETS_PER_SIZE, 4)) * sizes[:, None, None]
-        quads.append(nearest[draws.astype(np.int64)].reshape(-1, 4))
-    return through_four(points[np.vstack(quads)])
+def _overlap(a: Sphere, b: Sphere) -> bool:
+    return bool(np.linalg.norm(a.centre - b.centre) < 0.9 * (a.radius + b.radius))
 
 
-def _scores(points: Floats, centres: Floats, radii: Floats, tau: float) -> Floats:
-    """Score (m,): points at the surface less half of those beside it, over every k-th point; 0 for a volume."""
-    some = points[:: max(1, len(points) // 3000)]
-    squares = np.sum(some**2, axis=1)
-    scores = np.empty(len(radii))
-    for i in range(0, len(radii), 256):
-        c = centres[i : i + 256]
-        square = squares - 2.0 * c @ some.T + np.sum(c**2, axis=1)[:, None]
-        off = np.abs(np.sqrt(np.maximum(square, 0.0)) - radii[i : i + 256, None])
-        scores[i : i + 256] = 1.5 * (off <= tau).sum(axis=1) - 0.5 * (off <= 3.0 * tau).sum(axis=1)
-    return scores
+def _in_place(ball: Ball, order: Ints, origin: Floats) -> Ball:
+    inliers = np.zeros(len(order), bool)
+    inliers[order] = ball.fit.inliers
+    sphere = Sphere(ball.fit.sphere.centre + origin, ball.fit.sphere.radius, ball.fit.sphere.covariance)
+    return Ball(RobustFit(sphere, inliers, ball.fit.scale, ball.fit.converged), ball.inlier_share)
 
 
-def _score(points: Floats, ball: Sphere, tau: float) -> float:
-    off = np.abs(ball.residuals(points))
-    return 1.5 * np.count_nonzero(off <= tau) - 0.5 * np.count_nonzero(off <= 3.0 * tau)
+# --- proposals -------------------------------------------------------------------------------------------------------
 
 
-def _refined(points: Floats, ball: Sphere, tau: float) -> Sphere | None:
-    """Algebraic fits to the points near the surface, in a band that narrows to tau."""
-    for band in (2.0, 1.5, 1.0, 1.0):
-        near = np.abs(ball.residuals(points)) <= band * tau
-        fitted = algebraic(points[near])
-        if fitted is None:
+def _scales(cloud: Cloud, radius_mm: float | None) -> Floats:
+    """Radii of patches: a fixed radius alone, or all from the densest place's points to half of the cloud."""
+    if radius_mm is not None:
+        return np.array([radius_mm])
+    points = cloud.points
+    extent = float(np.linalg.norm(np.ptp(points, axis=0)))
+    some = points[:: max(1, len(points) // 2000)]
+    away = cloud.tree.query(some, k=min(FINEST, len(points)))[0][:, -1]
+    finest = max(float(np.quantile(away, 0.02)), 1e-4 * extent)
+    if not finest < 0.5 * extent:
+        return np.empty(0)
+    count = int(np.log(0.5 * extent / finest) / np.log(STEP)) + 1
+    scales: Floats = finest * np.power(STEP, np.arange(count, dtype=np.float64))
+    return scales
+
+
+def thinned(points: Floats, cell: float) -> Ints:
+    """Rows of the first point in every cell of a grid of this edge."""
+    lower = points.min(axis=0)
+    size = max(cell, float(np.ptp(points, axis=0).max()) / (1 << 20))  # 21 bits an axis
+    i, j, k = np.floor((points - lower) / size).astype(np.int64).T
+    return np.sort(np.unique(i << 42 | j << 21 | k, return_index=True)[1])
+
+
+def _proposals(
+    cloud: Floats, scale: float, rng: np.random.Generator, radius_mm: float | None
+) -> list[tuple[float, Sphere]]:
+    """Spheres of one scale with their scores, the best of each place."""
+    few = cloud[thinned(cloud, scale / CELLS)]
+    seeds = few[thinned(few, APART * scale)]
+    if len(seeds) > MOST_PATCHES:
+        seeds = seeds[np.sort(rng.choice(len(seeds), MOST_PATCHES, replace=False))]
+    cells = point_grid.of_points(few, scale).cells
+    spheres, scores = np.zeros((len(seeds), 4)), np.zeros(len(seeds))
+    band = (SMALLEST * scale, LARGEST * scale)
+    if radius_mm is not None:
+        band = ((1.0 - RADIUS_BAND) * radius_mm, (1.0 + RADIUS_BAND) * radius_mm)
+    draws = rng.random((SETS, 4))
+    over_ranges(partial(_propose, cells, seeds, scale, band, draws, spheres, scores), len(seeds), least=64)
+    found: list[tuple[float, Sphere]] = []
+    tree = cKDTree(few)
+    for row in np.argsort(-scores, kind="stable")[: 4 * REFINED].tolist():
+        if len(found) == REFINED or scores[row] < LEAST_CELLS / 3.0:
+            break
+        start = Sphere(spheres[row, :3], float(spheres[row, 3]), np.zeros((4, 4)))
+        if any(np.linalg.norm(start.centre - other.centre) < 0.3 * start.radius for _, other in found):
+            continue
+        near = few[np.sort(np.array(tree.query_ball_point(start.centre, 1.5 * start.radius), np.int64))]
+        if _denser(near, start, 0.6 * STANDS_OUT):
+            found.append((_score(near, start), start))
+    return found
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _propose(cells, seeds, scale, band, draws, spheres, scores, first, last):  # type: ignore[no-untyped-def]
+    """Fill the best sphere (4,) through four points of the patch about each seed, and its score; 0 = none."""
+    rows = np.empty(4096, np.int64)
+    for s in range(first, last):
+        count = _patch(cells, seeds[s], scale, rows)
+        if count < LEAST_CELLS:
+            continue
+        patch = np.empty((count, 3))
+        for i in range(count):
+            for a in range(3):
+                patch[i, a] = cells.points[rows[i], a] - seeds[s, a]
+        if _thickness(patch) < FLAT * scale:
+            continue
+        for q in range(len(draws)):
+            sphere = _through(patch, draws[q], count)
+            if not band[0] <= sphere[3] <= band[1]:
+                continue
+            score = 0.0
+            width = BAND * sphere[3]
+            for i in range(count):
+                x, y, z = patch[i, 0] - sphere[0], patch[i, 1] - sphere[1], patch[i, 2] - sphere[2]
+                off = abs(np.sqrt(x * x + y * y + z * z) - sphere[3]) / width
+                score += 1.0 - off * off if off < 1.0 else -0.5 if off < 3.0 else 0.0
+            if score > scores[s]:
+                scores[s] = score
+                spheres[s] = sphere
+        if scores[s] > 0.0:
+            _refine(patch, spheres[s])
+            for a in range(3):
+                spheres[s, a] += seeds[s, a]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _patch(cells, place, reach, rows):  # type: ignore[no-untyped-def]
+    """Fill the rows of the points within ``reach`` of a place; returns their number."""
+    n = 0
+    low, high = np.empty(3, np.int64), np.empty(3, np.int64)
+    for a in range(3):
+        end = point_grid.SIDE * cells.extent[a] - 1
+        low[a] = min(max(int((place[a] - reach - cells.lower[a]) / cells.size), 0), end)
+        high[a] = min(max(int((place[a] + reach - cells.lower[a]) / cells.size), 0), end)
+    for i in range(low[0], high[0] + 1):
+        for j in range(low[1], high[1] + 1):
+            for k in range(low[2], high[2] + 1):
+                block = point_grid.block_at(cells, i >> 2, j >> 2, k >> 2)
+                if block < 0:
+                    continue
+                cell = (i & 3) * 16 + (j & 3) * 4 + (k & 3)
+                for row in range(cells.starts[block, cell], cells.starts[block, cell + 1]):
+                    x, y, z = (
+                        cells.points[row, 0] - place[0],
+                        cells.points[row, 1] - place[1],
+                        cells.points[row, 2] - place[2],
+                    )
+                    if x * x + y * y + z * z <= reach * reach and n < len(rows):
+                        rows[n] = row
+                        n += 1
+    return n
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _thickness(patch):  # type: ignore[no-untyped-def]
+    """Least standard deviation of points (n, 3) along any direction."""
+    mean, C = np.zeros(3), np.zeros((3, 3))
+    for i in range(len(patch)):
+        for a in range(3):
+            mean[a] += patch[i, a] / len(patch)
+    for i in range(len(patch)):
+        for a in range(3):
+            for b in range(3):
+                C[a, b] += (patch[i, a] - mean[a]) * (patch[i, b] - mean[b]) / len(patch)
+    return np.sqrt(max(np.linalg.eigvalsh(C)[0], 0.0))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _through(patch, draw, count):  # type: ignore[no-untyped-def]
+    """Sphere (x, y, z, r) through four points drawn from a patch; r = -1 where they lie in one plane."""
+    p = np.empty((4, 3))
+    for m in range(4):
+        row = int(draw[m] * count)
+        for a in range(3):
+            p[m, a] = patch[row, a]
+    M, right = np.empty((3, 3)), np.empty(3)
+    size = 0.0
+    for m in range(3):
+        right[m] = 0.0
+        for a in range(3):
+            M[m, a] = p[m + 1, a] - p[0, a]
+            right[m] += 0.5 * M[m, a] * M[m, a]
+        size = max(size, np.sqrt(2.0 * right[m]))
+    c = np.empty(3)
+    for a in range(3):
+        b, d = (a + 1) % 3, (a + 2) % 3
+        c[a] = 0.0
+        for m in range(3):
+            n, o = (m + 1) % 3, (m + 2) % 3
+            c[a] += right[m] * (M[n, b] * M[o, d] - M[n, d] * M[o, b])
+    det = (
+        M[0, 0] * (M[1, 1] * M[2, 2] - M[1, 2] * M[2, 1])
+        - M[0, 1] * (M[1, 0] * M[2, 2] - M[1, 2] * M[2, 0])
+        + M[0, 2] * (M[1, 0] * M[2, 1] - M[1, 1] * M[2, 0])
+    )
+    sphere = np.full(4, -1.0)
+    if abs(det) > 1e-9 * size**3:
+        c /= det
+        for a in range(3):
+            sphere[a] = p[0, a] + c[a]
+        sphere[3] = np.sqrt(c[0] ** 2 + c[1] ** 2 + c[2] ** 2)
+    return sphere
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _refine(patch, sphere):  # type: ignore[no-untyped-def]
+    """Algebraic fits to the points of a patch near a sphere (x, y, z, r), in place."""
+    row = np.empty(4)
+    for _ in range(REFINEMENTS):
+        radius = sphere[3]
+        H, right = np.zeros((4, 4)), np.zeros(4)
+        for i in range(len(patch)):
+            square, off2 = 0.0, 0.0
+            for a in range(3):
+                row[a] = -2.0 * patch[i, a] / radius
+                square += (patch[i, a] / radius) ** 2
+                off2 += (patch[i, a] - sphere[a]) ** 2
+            row[3] = 1.0
+            if abs(np.sqrt(off2) - radius) < BAND * radius:
+                for a in range(4):
+                    right[a] -= row[a] * square
+                    for b in range(4):
+                        H[a, b] += row[a] * row[b]
+        for a in range(4):
+            H[a, a] += 1e-9
+        x = np.linalg.solve(H, right)
+        under = x[0] * x[0] + x[1] * x[1] + x[2] * x[2] - x[3]
+        if not under > 0.25 or under > 4.0:
+            return
+        for a in range(3):
+            sphere[a] = x[a] * radius
+        sphere[3] = np.sqrt(under) * radius
+
+
+def _score(points: Floats, ball: Sphere) -> float:
+    """Points at the surface less those beside it, weighted by the square of the distance."""
+    off = np.abs(ball.residuals(points)) / (BAND * ball.radius)
+    return float(np.sum(np.maximum(1.0 - off**2, 0.0)) - 0.5 * np.count_nonzero((off > 1.0) & (off <= 3.0)))
+
+
+# --- evidence --------------------------------------------------------------------------------------------------------
+
+
+def _accepted(cloud: Cloud, start: Sphere, least_points: int, radius_mm: float | None) -> Ball | None:
+    """Fit a sphere to the points near a proposal, first thinned ones, and return it if it is a ball."""
+    points, tree, scanner = cloud
+    near, fit = np.empty(0, np.int64), None
+    for least in (LEAST_CELLS, least_points):
+        near = np.sort(np.array(tree.query_ball_point(start.centre, NEAR * start.radius), np.int64))
+        if len(near) < least_points:
             return None
-        ball = fitted
-    return ball
+        if fit is None:
+            near = near[thinned(points[near], start.radius / EVIDENCE_CELLS)]
+        off = np.abs(start.residuals(points[near]))
+        close = off < BAND * start.radius
+        if np.count_nonzero(close) < least // 2 or _facing(points[near], close, start) < ROUGHLY_FACING:
+            return None
+        scale = 2.0 * MAD * float(np.median(off[close]))
+        fit = robust_fit(points[near], start, scale, radius_mm, None if scanner is None else scanner[near])
+        if fit is None or not _stands_out(points[near], fit, least):
+            return None
+        moved = float(np.linalg.norm(fit.sphere.centre - start.centre))
+        if moved + AROUND * fit.sphere.radius > NEAR * start.radius:
+            return None  # its surroundings were not looked at
+        start = fit.sphere
+    if fit is None:
+        return None
+    around = int(np.count_nonzero(fit.sphere.residuals(points[near]) <= 0.4 * fit.sphere.radius))
+    share = float(fit.inliers.sum() / max(around, 1))
+    inliers = np.zeros(len(points), bool)
+    inliers[near] = fit.inliers
+    return Ball(RobustFit(fit.sphere, inliers, fit.scale, fit.converged), min(1.0, share))
 
 
-def _stands_out(points: Floats, fit: RobustFit, noise: float, least_points: int) -> bool:
+def _stands_out(points: Floats, fit: RobustFit, least_points: int) -> bool:
     """Whether a fit is a ball: converged, enough of it visible, smooth, round, and far denser than its surroundings."""
     ball = fit.sphere
-    if not fit.converged or np.count_nonzero(fit.inliers) < least_points or noise > ROUGHEST * ball.radius:
+    if not fit.converged or np.count_nonzero(fit.inliers) < least_points or fit.scale > ROUGHEST * ball.radius:
         return False
-    off = ball.residuals(points)
     if visible_fraction(points[fit.inliers], ball.centre) < LEAST_VISIBLE:
         return False
     if not np.sqrt(np.diag(ball.covariance).max()) <= LARGEST_SD * ball.radius:
         return False
-    if _misfit(points[fit.inliers], off[fit.inliers], ball, fit.scale) > MISFIT * fit.scale:
+    if not _redundant(points[fit.inliers], fit):
         return False
-    if _facing(points, fit) < FACING:
+    off = ball.residuals(points)
+    departure = _misfit(points[fit.inliers], off[fit.inliers], ball, fit.scale)
+    if departure > max(MISFIT * fit.scale, ROUND * ball.radius):
         return False
-    # Density in shells of equal width at, outside and inside the surface, by the noise of this fit.
-    width = 3.0 * max(fit.scale, noise)
+    rows = thinned(points, ball.radius / EVIDENCE_CELLS)
+    if _facing(points[rows], fit.inliers[rows], ball) < FACING:
+        return False
+    return _denser(points[rows], ball, STANDS_OUT, fit.scale) and _white(points[fit.inliers], off[fit.inliers], ball)
+
+
+def _denser(points: Floats, ball: Sphere, times: float, scale: float | None = None) -> bool:
+    """Whether a shell at the surface has some times the points of those of equal width outside and inside it."""
+    off = ball.residuals(points)
+    if scale is None:
+        close = np.abs(off[np.abs(off) < BAND * ball.radius])
+        scale = MAD * float(np.median(close)) if len(close) else 0.0
+    width = 3.0 * scale
     at = np.count_nonzero(np.abs(off) <= width)
     outside = np.count_nonzero((off > width) & (off <= 3.0 * width))
     inside = np.count_nonzero((off < -width) & (off >= -3.0 * width))
-    return bool(at >= STANDS_OUT * max(outside, inside))
+    return bool(at >= max(times * max(outside, inside), 1))
 
 
-def _facing(points: Floats, fit: RobustFit) -> float:
+def _redundant(points: Floats, fit: RobustFit) -> bool:
+    """Whether either half of the points (n, 3) determines the sphere, whichever way they are parted.
+
+    Two lines of a scanner on any round body lie on a sphere: one line predicts nothing about the other.
+    """
+    ball = fit.sphere
+    radial = (points - ball.centre) / np.linalg.norm(points - ball.centre, axis=1)[:, None]
+    J = np.column_stack([radial, np.ones(len(radial))])[:, : 4 if ball.covariance[3, 3] > 0.0 else 3]
+    least = (fit.scale / (LARGEST_HALF_SD * ball.radius)) ** 2
+    for axis in np.linalg.svd(radial - radial.mean(axis=0), full_matrices=False)[2]:
+        along = radial @ axis
+        middle = float(np.median(along))
+        for half in (J[along <= middle], J[along >= middle]):
+            if np.linalg.eigvalsh(half.T @ half)[0] < least:
+                return False
+    return True
+
+
+def _white(points: Floats, residual: Floats, ball: Sphere) -> bool:
+    """Whether residuals (n,) are noise: those of neighbours differ (von Neumann 1941), or they are small."""
+    sd = float(np.sqrt(np.mean(residual**2)))
+    if sd <= SMALL * ball.radius:
+        return True
+    nearest = cKDTree(points).query(points, k=2)[1][:, 1]
+    return float(np.sqrt(np.mean((residual - residual[nearest]) ** 2) / 2.0)) >= WHITE * sd
+
+
+def _facing(points: Floats, on: npt.NDArray[np.bool_], ball: Sphere) -> float:
     """Median cosine between the normals of neighbourhoods of points (n, 3), on the ball or not, and its radii.
 
     Tubes, edges and volumes that only cross the surface have other normals. A neighbourhood is about a tenth of the
     ball's points, so that it is wide compared with the noise at any density.
     """
-    stride = max(1, int(fit.inliers.sum()) // 2000)
-    some, on = points[::stride], fit.inliers[::stride]
-    query = some[on][:: max(1, int(on.sum()) // 200)]
-    k = min(len(some), max(8, int(on.sum()) // 10))
-    near = some[cKDTree(some).query(query, k=k)[1]]
+    query = points[on][:: max(1, int(on.sum()) // 200)]
+    if not len(query):
+        return 0.0
+    k = min(len(points), max(8, int(on.sum()) // 10))
+    near = points[cKDTree(points).query(query, k=k)[1]]
     near = near - near.mean(axis=1, keepdims=True)
     normal = np.linalg.eigh(np.einsum("mki,mkj->mij", near, near))[1][:, :, 0]
-    radial = query - fit.sphere.centre
+    radial = query - ball.centre
     return float(np.median(np.abs(np.sum(normal * radial, axis=1)) / np.linalg.norm(radial, axis=1)))
 
 

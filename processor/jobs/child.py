@@ -1,7 +1,8 @@
 """Child side of a job: limited memory, end with the parent process, jobs served one after another.
 
-``python -m processor.jobs.child MEMORY_MB MODULE ARGUMENT...`` runs a module as ``python -m`` does, within the limit
-(0: none). Standard input is a pipe that stays open as long as the parent process lives.
+``python -m processor.jobs.child MEMORY_MB MODULE ARGUMENT...`` runs a module as ``python -m`` does, or a script where
+MODULE ends in ``.py``, within the limit (0: none). Standard input is a pipe that stays open as long as the parent
+process lives.
 """
 
 from __future__ import annotations
@@ -101,9 +102,12 @@ def _receive(messages: SimpleQueue[bytes]) -> None:
 
 
 def main() -> None:
-    """Run the module of the command line."""
+    """Run the module or script of the command line."""
     guard(int(sys.argv[1]))
     sys.argv[:] = sys.argv[2:]
+    if sys.argv[0].endswith(".py"):
+        runpy.run_path(sys.argv[0], run_name="__main__")
+        return
     runpy.run_module(sys.argv[0], run_name="__main__", alter_sys=True)
 
 

@@ -23,6 +23,7 @@ __all__ = ["KIND", "METHODS", "NAME", "NEEDS", "Params", "Result", "applies", "r
 
 NAME = "stitch"
 NEEDS: tuple[str, ...] = ()
+PLACES = True  # steps that need this one do not run without the poses of its scans
 KIND = "structure"
 LEAST_POINTS = 100
 

@@ -9,10 +9,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from processor.model import Better, Metric, Statistic
+from processor.model import Better, Metric, Statistic, Word
 
 HASH_DIGITS = 16
 SEED_DIGITS = 7  # of a fresh seed, in base 16
+
+
+class Origin(Word):
+    """Who makes a scene."""
+
+    OWN = "designgen"
+    FOREIGN = "foreign generators"  # scripts that share no code with designgen and the processor
 
 
 @dataclass(frozen=True)
@@ -20,13 +27,14 @@ class Case:
     """A scene without its seed, and what is run on it; ``settings`` are those of ``designgen make --set``."""
 
     name: str
-    recipe: str  # a recipe of designgen, or the stem of a file
+    recipe: str  # a recipe of designgen or a foreign generator, or the stem of a file
     recipe_text: str
     from_file: bool
     settings: tuple[str, ...]
     steps: tuple[str, ...]
     methods: tuple[str, ...]
     params: Mapping[str, Any] = field(default_factory=dict)
+    origin: Origin = Origin.OWN
 
     @property
     def recipe_sha256(self) -> str:
@@ -61,8 +69,9 @@ class Cell:
         """Return what is needed to run this cell, as JSON can hold it."""
         case = self.case
         return {
+            "origin": case.origin,
             "recipe": case.recipe,
-            "recipe_text": case.recipe_text if case.from_file else "",
+            "recipe_text": case.recipe_text if case.from_file or case.origin is Origin.FOREIGN else "",
             "settings": list(case.settings),
             "steps": list(case.steps),
             "methods": list(case.methods),

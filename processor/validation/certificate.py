@@ -22,7 +22,8 @@ from typing import Any
 from processor.language.messages import NO_NUMBER, text
 from processor.model import Statistic
 from processor.report import templates
-from processor.validation.cells import Case
+from processor.validation.cells import Case, Origin
+from processor.validation.coverage import Coverage
 from processor.validation.history import Row
 from processor.validation.matrix import Matrix
 from processor.validation.software import Software
@@ -58,8 +59,9 @@ NOT_SHOWN = (
         "density, and not for values between or beyond them."
     ),
     text(
-        "Truth and scans come from one generator: effects that its models of steel and scanner lack are in no row. It "
-        "shares no geometry with the processor."
+        "Truth and scans of a scene come from one generator: effects that its models of steel and scanner lack are in "
+        "no row of it. designgen shares no geometry with the processor. Foreign generators share no code with either, "
+        "but come with the same software; their figures and those of designgen are never pooled."
     ),
     text(
         "u_p pools errors within scenes, which may have a common part; where scenes differ by more than the errors "
@@ -75,6 +77,7 @@ _Rows = dict[tuple[str, str], Row]  # of one scene, by quantity and statistic
 class Line:
     """One quantity of one method on one kind of scene; NaN if it is not known. Lengths in ``unit``."""
 
+    origin: Origin
     recipe: str
     settings: tuple[str, ...]
     scanner: str
@@ -107,12 +110,26 @@ class Certificate:
     matrix_sha256: str
     recipes: Mapping[str, str]  # name -> hash of the recipe's text
     lines: tuple[Line, ...] = ()
+    coverage: tuple[Coverage, ...] = ()
+
+    def of_origin(self, origin: Origin) -> tuple[tuple[Line, ...], tuple[Coverage, ...]]:
+        """Return the lines and the coverage of the scenes of one origin."""
+        return (
+            tuple(line for line in self.lines if line.origin == origin),
+            tuple(one for one in self.coverage if one.origin == origin),
+        )
 
 
 def make(
-    night: str, rows: Sequence[Row], nights: Sequence[str], cases: Sequence[Case], software: Software, matrix: Matrix
+    night: str,
+    rows: Sequence[Row],
+    nights: Sequence[str],
+    software: Software,
+    matrix: Matrix,
+    coverage: Sequence[Coverage] = (),
 ) -> Certificate:
     """Make the certificate from the figures of ``nights``, all made by the present software."""
+    cases = list({entry.case.key: entry.case for entry in matrix.entries}.values())
     of_case = {case.key: case for case in cases}
     # A fixed seed is one scene, however many nights it was run in.
     scenes: dict[tuple[str, str, str], dict[int, _Rows]] = defaultdict(lambda: defaultdict(dict))
@@ -130,7 +147,16 @@ def make(
         lines += [_line(of_case[case], step, method, quantity, list(by_seed.values())) for quantity in quantities]
     order = {case.key: i for i, case in enumerate(cases)}
     by_title = {(case.recipe, case.settings): order[case.key] for case in reversed(cases)}
-    lines.sort(key=lambda line: (line.step, by_title[line.recipe, line.settings], line.method, line.quantity))
+    origins = list(Origin)
+    lines.sort(
+        key=lambda line: (
+            origins.index(line.origin),
+            line.step,
+            by_title[line.recipe, line.settings],
+            line.method,
+            line.quantity,
+        )
+    )
     return Certificate(
         night=night,
         nights=tuple(nights),
@@ -140,6 +166,7 @@ def make(
         matrix_sha256=matrix.sha256,
         recipes={case.recipe: case.recipe_sha256 for case in cases},
         lines=tuple(line for line in lines if line.scenes),
+        coverage=tuple(coverage),
     )
 
 
@@ -167,6 +194,7 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[_R
     known_u_b = u_b if math.isfinite(u_b) else (u_p / math.sqrt(total) if total > 1 else math.nan)
     scanner, noise, density = conditions(case)
     return Line(
+        origin=case.origin,
         recipe=case.recipe,
         settings=case.settings,
         scanner=scanner,
@@ -189,7 +217,13 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[_R
 
 
 def conditions(case: Case) -> tuple[str, str, str]:
-    """Return the names of scanner, noise and density of a case, from its recipe and settings."""
+    """Return the names of scanner, noise and density of a case, from its recipe and settings.
+
+    Those of a foreign generator are in its settings, or its own defaults.
+    """
+    if case.origin is Origin.FOREIGN:
+        given = dict(setting.split("=", 1) for setting in case.settings)
+        return "default", given.get("noise", "default"), given.get("spacing", given.get("step_mrad", "default"))
     recipe: dict[str, Any] = tomllib.loads(case.recipe_text)
     for setting in case.settings:
         key, _, text = setting.partition("=")
@@ -234,7 +268,7 @@ def as_html(certificate: Certificate, lang: str = "en") -> str:
     environment = templates.environment("validation", lang)
     environment.filters["shown"] = _shown
     page: str = environment.get_template("certificate.html").render(
-        certificate=certificate, method=METHOD, not_shown=NOT_SHOWN, lang=lang
+        certificate=certificate, origins=tuple(Origin), method=METHOD, not_shown=NOT_SHOWN, lang=lang
     )
     return page + "\n"
 

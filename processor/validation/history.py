@@ -21,14 +21,17 @@ from typing import Any
 from processor.language.messages import Text
 from processor.model import InputError
 from processor.store.codec import value_from_json, value_to_json
-from processor.validation.cells import Cell, Figure, Outcome, figures_of
+from processor.validation.cells import Cell, Figure, Origin, Outcome, figures_of
 from processor.validation.software import Software
 
-VERSION = 2
-# Columns added since. Earlier figures have no statistic: certificates are of the present software.
-ADDED = ("figures.quantity", "figures.statistic", "figures.better", "nights.message")
+VERSION = 3
+# Columns added by version. Earlier figures have no statistic: certificates are of the present software.
+ADDED = {2: ("figures.quantity", "figures.statistic", "figures.better", "nights.message"), 3: ("cells.origin",)}
 ADD = "ALTER TABLE {} ADD COLUMN {} TEXT NOT NULL DEFAULT ''"
-UPGRADES = {1: tuple(ADD.format(*name.split(".")) for name in ADDED)}
+UPGRADES = {
+    version: tuple(ADD.format(*name.split(".")) for later in ADDED if later > version for name in ADDED[later])
+    for version in range(1, VERSION)
+}
 BUSY_S = 60.0
 SCHEMA = """
 CREATE TABLE nights (
@@ -46,7 +49,7 @@ CREATE TABLE cells (
   night TEXT NOT NULL REFERENCES nights ON DELETE CASCADE, cell TEXT NOT NULL, case_ TEXT NOT NULL,
   title TEXT NOT NULL, recipe TEXT NOT NULL, recipe_sha256 TEXT NOT NULL, settings TEXT NOT NULL,
   seed INTEGER NOT NULL, fixed INTEGER NOT NULL, input_sha256 TEXT NOT NULL, failed TEXT NOT NULL,
-  seconds REAL NOT NULL, peak_mb REAL NOT NULL,
+  seconds REAL NOT NULL, peak_mb REAL NOT NULL, origin TEXT NOT NULL DEFAULT '',
   PRIMARY KEY (night, cell)
 ) WITHOUT ROWID;
 CREATE TABLE figures (
@@ -84,6 +87,7 @@ class Row:
     quantity: str = ""
     statistic: str = ""
     better: str = ""
+    origin: str = Origin.OWN
 
 
 @dataclass(frozen=True)
@@ -173,10 +177,12 @@ class History:
         with self._transaction():
             self.db.execute("DELETE FROM cells WHERE night = ? AND cell = ? AND failed != ''", [night, cell.key])
             added = self.db.execute(
-                "INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
+                "INSERT INTO cells (night, cell, case_, title, recipe, recipe_sha256, settings, seed, fixed,"
+                " input_sha256, failed, seconds, peak_mb, origin)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?) ON CONFLICT DO NOTHING",
                 [night, cell.key, case.key, cell.title, case.recipe, case.recipe_sha256, _json(case.settings),
                  cell.seed, int(cell.fixed), str(outcome.results.get("input_sha256", "")), outcome.failed,
-                 outcome.seconds, outcome.peak_mb],
+                 outcome.seconds, outcome.peak_mb, str(case.origin)],
             )  # fmt: skip
             if added.rowcount:
                 self.db.executemany(
@@ -247,10 +253,14 @@ class History:
         keys = ("night", "case", "recipe", "seed", "input_sha256", "unit", "quantity", "statistic", "better")
         return [
             Row(
-                name=(step, method, name), value=_number(value), fixed=bool(fixed), **dict(zip(keys, rest, strict=True))
+                name=(step, method, name),
+                value=_number(value),
+                fixed=bool(fixed),
+                origin=origin or Origin.OWN,
+                **dict(zip(keys, rest, strict=True)),
             )
-            for step, method, name, value, fixed, *rest in self.db.execute(
-                "SELECT step, method, name, value, fixed,"
+            for step, method, name, value, fixed, origin, *rest in self.db.execute(
+                "SELECT step, method, name, value, fixed, origin,"
                 " night, case_, recipe, seed, input_sha256, unit, quantity, statistic, better"
                 " FROM figures JOIN cells USING (night, cell) WHERE night BETWEEN ? AND ?"
                 " ORDER BY night, case_, seed, step, method, name",

@@ -8,12 +8,18 @@ from xml.etree import ElementTree as ET
 
 from processor.validation.cells import Figure
 from processor.validation.changes import ALARMS, Detected
+from processor.validation.coverage import Coverage
+from processor.validation.coverage import missed as beyond_limits
 
 
 def xml(
-    night: str, cells: Sequence[Mapping[str, Any]], missed: Mapping[str, Sequence[Figure]], detected: Detected
+    night: str,
+    cells: Sequence[Mapping[str, Any]],
+    missed: Mapping[str, Sequence[Figure]],
+    detected: Detected,
+    intervals: Sequence[Coverage] = (),
 ) -> bytes:
-    """Write cells (failed ones as errors, figures beyond their limits as failures) and regressions."""
+    """Write cells (failed ones as errors, figures beyond their limits as failures), intervals and regressions."""
     root = ET.Element("testsuites", name="processor validate")
     suite = ET.SubElement(root, "testsuite", name=f"accuracy.{night}")
     failures = errors = 0
@@ -28,6 +34,15 @@ def xml(
             lines = [f"{f.step} ({f.method}), {f.name}: {f.value:g} {f.unit}, limit {f.limit:g}" for f in beyond]
             ET.SubElement(case, "failure", message=_clean(lines[0])).text = _clean("\n".join(lines))
     _counts(suite, len(cells), failures, errors, sum(cell["seconds"] for cell in cells))
+    if intervals:
+        wrong = beyond_limits(intervals)
+        suite = ET.SubElement(root, "testsuite", name=f"intervals.{night}")
+        for one in intervals:
+            case = _case(suite, f"intervals.{one.origin}.{one.step}.{one.method}", one.quantity, 0.0)
+            if one in wrong:
+                text = f"{one.holds}: {one.share:.1f} % of {one.number} errors within, {one.worst:.1f} % in a scene"
+                ET.SubElement(case, "failure", message=_clean(text))
+        _counts(suite, len(intervals), len(wrong), 0, 0.0)
     suite = ET.SubElement(root, "testsuite", name=f"changes.{night}")
     alarms = detected.of(*ALARMS)
     for change in alarms:

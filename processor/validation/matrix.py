@@ -15,6 +15,17 @@ Example::
     params.spheres.radius_mm = 50.0        # as in a parameter file
     full = true                # only with --full
 
+    [[cell]]
+    generator = "arch_bridge"  # a script of designgen/foreign, or a .py file beside the matrix, in place of a recipe
+    steps = ["preassemble"]
+    set.waviness = 0.5
+
+    [coverage]                 # limits of 95 % intervals, %: of all errors of a quantity, and of a single scene
+    low = 92
+    high = 98
+    scene = 85
+    least = 50                 # errors; fewer are not judged
+
     [aim]                      # the better direction of a figure, "low" or "high", or the best value
     "share of the sky" = "high"
 """
@@ -32,7 +43,8 @@ from pathlib import Path
 from typing import Any
 
 from processor.model import InputError, UsageError
-from processor.validation.cells import Case, Cell, fresh_seed
+from processor.validation.cells import Case, Cell, Origin, fresh_seed
+from processor.validation.coverage import Limits
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -40,8 +52,8 @@ else:
     import tomli as tomllib
 
 DEFAULT = Path(__file__).with_name("default.toml")
-TOP_KEYS = {"name", "about", "fixed_seeds", "fresh_seeds", "aim", "cell"}
-CELL_KEYS = {"name", "recipe", "steps", "methods", "seeds", "fresh", "set", "params", "full"}
+TOP_KEYS = {"name", "about", "fixed_seeds", "fresh_seeds", "aim", "coverage", "cell"}
+CELL_KEYS = {"name", "recipe", "generator", "steps", "methods", "seeds", "fresh", "set", "params", "full"}
 AIMS = ("low", "high")
 MOST_SEED = 2**63
 MOST_CELLS = 10_000
@@ -64,6 +76,7 @@ class Matrix:
     sha256: str
     entries: tuple[Entry, ...]
     aim: Mapping[str, str | float]
+    coverage: Limits = Limits()
 
     def cells(self, number: int) -> tuple[Cell, ...]:
         """Return the cells of the night of that number, fixed seeds first, each key once."""
@@ -108,15 +121,25 @@ def read(path: Path, full: bool) -> Matrix:
             raise UsageError(f"{where}: more than {MOST_CELLS} cells; set fewer values or seeds")
     if not entries:
         raise UsageError(f"{path}: every cell of it is for --full")
-    return Matrix(str(table.get("name", path.stem)), hashlib.sha256(raw).hexdigest(), tuple(entries), aim)
+    return Matrix(
+        name=str(table.get("name", path.stem)),
+        sha256=hashlib.sha256(raw).hexdigest(),
+        entries=tuple(entries),
+        aim=aim,
+        coverage=_limits(table.get("coverage", {}), f"{path}: coverage"),
+    )
 
 
 def _entries(cell: dict[str, Any], path: Path, where: str, fixed: tuple[int, ...], fresh: int) -> list[Entry]:
     from processor import pipeline
 
-    recipe = cell.get("recipe")
+    foreign = "generator" in cell
+    if foreign and "recipe" in cell:
+        raise UsageError(f"{where}: recipe and generator exclude each other")
+    recipe = cell.get("generator" if foreign else "recipe")
     if not isinstance(recipe, str) or not recipe:
-        raise UsageError(f"{where}: expected recipe = a name or a TOML file, got {recipe!r}")
+        expected = "generator = a name or a Python file" if foreign else "recipe = a name or a TOML file"
+        raise UsageError(f"{where}: expected {expected}, got {recipe!r}")
     steps, methods = (_names(cell.get(key, []), f"{where}: {key}") for key in ("steps", "methods"))
     if not steps:
         raise UsageError(f"{where}: expected steps = the names of those to run")
@@ -127,7 +150,7 @@ def _entries(cell: dict[str, Any], path: Path, where: str, fixed: tuple[int, ...
         pipeline.plan(steps, methods, params, None)
     except UsageError as error:
         raise UsageError(f"{where}: {error}") from None
-    text, from_file = _recipe(recipe, path, where)
+    text, from_file = _generator(recipe, path, where) if foreign else _recipe(recipe, path, where)
     seeds = _seeds(cell["seeds"], f"{where}: seeds") if "seeds" in cell else fixed
     fresh = _count(cell.get("fresh", fresh), f"{where}: fresh")
     stem = Path(recipe).stem if from_file else recipe
@@ -145,6 +168,7 @@ def _entries(cell: dict[str, Any], path: Path, where: str, fixed: tuple[int, ...
                 steps=steps,
                 methods=methods,
                 params=params,
+                origin=Origin.FOREIGN if foreign else Origin.OWN,
             ),
             seeds,
             fresh,
@@ -177,15 +201,28 @@ def _as_toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False)  # the same for numbers, texts, truth values and lists of these
 
 
+def _generator(name: str, path: Path, where: str) -> tuple[str, bool]:
+    """Return the script of a foreign generator, and whether it is a file of the user."""
+    from_file = name.endswith(".py")
+    file = path.parent / name if from_file else _installed(where) / "foreign" / f"{name}.py"
+    try:
+        return file.read_text("utf-8"), from_file
+    except (OSError, UnicodeDecodeError) as error:
+        raise UsageError(f"{where}: no generator {name!r}: {error}") from error
+
+
+def _installed(where: str) -> Path:
+    """Return the folder of designgen, which is not imported."""
+    spec = importlib.util.find_spec("designgen")
+    if spec is None or not spec.submodule_search_locations:
+        raise UsageError(f"{where}: scenes are made by designgen, which is not installed")
+    return Path(spec.submodule_search_locations[0])
+
+
 def _recipe(recipe: str, path: Path, where: str) -> tuple[str, bool]:
-    """Return the recipe's text, and whether it is a file of the user. The generator is not imported."""
-    if recipe.endswith(".toml"):
-        file, from_file = path.parent / recipe, True
-    else:
-        spec = importlib.util.find_spec("designgen")
-        if spec is None or not spec.submodule_search_locations:
-            raise UsageError(f"{where}: scenes are made by designgen, which is not installed")
-        file, from_file = Path(spec.submodule_search_locations[0]) / "recipes" / f"{recipe}.toml", False
+    """Return the recipe's text, and whether it is a file of the user."""
+    from_file = recipe.endswith(".toml")
+    file = path.parent / recipe if from_file else _installed(where) / "recipes" / f"{recipe}.toml"
     try:
         return file.read_text("utf-8"), from_file
     except (OSError, UnicodeDecodeError) as error:
@@ -216,6 +253,13 @@ def _seeds(value: Any, where: str) -> tuple[int, ...]:
     if not isinstance(value, list) or not all(type(seed) is int and 0 <= seed < MOST_SEED for seed in value):
         raise UsageError(f"{where}: expected a list of whole numbers from 0, got {value!r}")
     return tuple(dict.fromkeys(value))
+
+
+def _limits(value: Any, where: str) -> Limits:
+    if not isinstance(value, dict) or not all(isinstance(n, int | float) for n in value.values()):
+        raise UsageError(f"{where}: expected numbers low, high, scene and least, got {value!r}")
+    _check_keys(value, {"low", "high", "scene", "least"}, where)
+    return Limits(**value)
 
 
 def _count(value: Any, where: str) -> int:

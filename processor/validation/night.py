@@ -18,10 +18,11 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+from processor import pipeline
 from processor.jobs.runner import locked
 from processor.model import UsageError
 from processor.store.atomic_file import replacing
-from processor.validation import certificate, changes, junit, software, summary
+from processor.validation import certificate, changes, coverage, junit, software, summary
 from processor.validation.cells import Cell, Outcome
 from processor.validation.history import History
 from processor.validation.matrix import Matrix
@@ -120,13 +121,17 @@ def _report(
     detected = changes.find(rows, night, history.worse(night), matrix.aim)
     done = tuple(cell for cell in history.cells(night) if cell["cell"] in wanted)
     missed = {key: figures for key, figures in history.missed(night).items() if key in wanted}
-    report = Summary(night=night, software=present, cells=done, missed=missed, detected=detected)
     same = [each.night for each in nights if each.code == present.code]
-    cases = list({entry.case.key: entry.case for entry in matrix.entries}.values())
-    certified = certificate.make(night, rows, same, cases, present, matrix)
+    judged = {(name, module.Params().method) for name, module in pipeline.step_modules().items()}
+    cases = {entry.case.key for entry in matrix.entries}
+    intervals = coverage.pooled([row for row in rows if row.case in cases], same, judged, matrix.coverage)
+    report = Summary(
+        night=night, software=present, cells=done, missed=missed, detected=detected, coverage=tuple(intervals)
+    )
+    certified = certificate.make(night, rows, same, present, matrix, intervals)
     files = {
         "summary.json": _json(report.as_object()).encode(),
-        "junit.xml": junit.xml(night, done, missed, detected),
+        "junit.xml": junit.xml(night, done, missed, detected, intervals),
         "certificate.json": certificate.as_json(certified).encode(),
         "certificate.html": certificate.as_html(certified, lang).encode(),
         "line.txt": f"{report.line}\n".encode(),

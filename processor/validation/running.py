@@ -15,7 +15,7 @@ from typing import Any
 from processor.jobs import process, runner
 from processor.jobs.child import Lost
 from processor.jobs.process import Cause, Ended
-from processor.validation.cells import Cell, Outcome
+from processor.validation.cells import Cell, Origin, Outcome
 
 # Runs cells and yields each with its outcome as it comes; closing the generator stops those under way.
 Runner = Callable[[Sequence[Cell]], Generator[tuple[Cell, Outcome], None, None]]
@@ -65,14 +65,7 @@ def do(
 
 def _results(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) -> dict[str, Any]:
     """Return results.json of a cell made in a folder. Raises _FailedError if a command fails."""
-    recipe, scene, results = spec["recipe"], folder / "scene.h5", folder / "results"
-    if spec["recipe_text"]:
-        recipe = folder / f"{recipe}.toml"
-        recipe.write_text(spec["recipe_text"], "utf-8")
-    settings = [word for setting in spec["settings"] for word in ("--set", setting)]
-    made = command("designgen", "make", str(recipe), "-o", str(scene), "--seed", str(spec["seed"]), *settings)
-    if made.cause is not Cause.EXIT or made.code != 0:
-        raise _FailedError(_reason("designgen make", made))
+    scene, results = _scene(spec, folder, command), folder / "results"
     options = ["--steps", ",".join(spec["steps"])]
     options += ["--method", ",".join(spec["methods"])] if spec["methods"] else []
     if spec["params"]:
@@ -86,6 +79,21 @@ def _results(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) 
     except (OSError, ValueError) as error:
         raise _FailedError(f"processor run: ended with code {ran.code} and without results ({error})") from error
     return content
+
+
+def _scene(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) -> Path:
+    """Make the scene of a cell in a folder: a scene file, or by a foreign generator a scan folder."""
+    recipe, foreign = spec["recipe"], spec["origin"] == Origin.FOREIGN
+    if spec["recipe_text"]:
+        recipe = folder / f"{recipe}.{'py' if foreign else 'toml'}"
+        recipe.write_text(spec["recipe_text"], "utf-8")
+    scene = folder / ("scene" if foreign else "scene.h5")
+    words = (str(recipe), str(scene)) if foreign else ("designgen", "make", str(recipe), "-o", str(scene))
+    settings = [word for setting in spec["settings"] for word in ("--set", setting)]
+    made = command(*words, "--seed", str(spec["seed"]), *settings)
+    if made.cause is not Cause.EXIT or made.code != 0:
+        raise _FailedError(_reason(spec["recipe"] if foreign else "designgen make", made))
+    return scene
 
 
 def _reason(program: str, ended: Ended) -> str:

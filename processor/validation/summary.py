@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,10 @@ from processor.model import Statistic
 from processor.report import templates
 from processor.report.all_tables import figure_name
 from processor.validation import changes
-from processor.validation.cells import Figure
+from processor.validation import coverage as intervals
+from processor.validation.cells import Figure, Origin
 from processor.validation.changes import ALARMS, Change, ChangeKind, Detected, Direction
+from processor.validation.coverage import Coverage
 from processor.validation.history import Name, Night, Row
 from processor.validation.software import Software
 
@@ -37,13 +39,14 @@ TEST = text(
 
 @dataclass(frozen=True)
 class Summary:
-    """Cells of a night, figures beyond their limits by cell (``missed``), and changes (``detected``)."""
+    """Cells of a night, figures beyond their limits by cell (``missed``), changes (``detected``), and coverage."""
 
     night: str
     software: Software
     cells: tuple[Mapping[str, Any], ...]
     missed: Mapping[str, Sequence[Figure]]
     detected: Detected
+    coverage: tuple[Coverage, ...] = ()
 
     @property
     def failed(self) -> list[Mapping[str, Any]]:
@@ -53,7 +56,12 @@ class Summary:
     @property
     def passed(self) -> bool:
         """Whether no limit was missed and nothing got worse."""
-        return not self.missed and not self.detected.of(*ALARMS)
+        return not self.missed and not self.wrong_intervals and not self.detected.of(*ALARMS)
+
+    @property
+    def wrong_intervals(self) -> list[Coverage]:
+        """The quantities whose 95 % intervals hold too little or too much."""
+        return intervals.missed(self.coverage)
 
     @property
     def line(self) -> Text:
@@ -66,6 +74,11 @@ class Summary:
         parts.append(text("{cells} {cells:?cell|cells}, {figures} {figures:?figure|figures}", **counts))
         parts += [text("{cells} {cells:?cell|cells} failed", cells=failed)] if failed else []
         parts.append(text("{count} {count:?limit|limits} missed", count=misses) if misses else text("limits kept"))
+        for origin in Origin:
+            wrong = [one for one in self.wrong_intervals if one.origin == origin]
+            if wrong:
+                parts.append(text("intervals of {count} quantities do not hold, scenes of {origin}",
+                                  count=len(wrong), origin=origin))  # fmt: skip
         parts += [
             text("{count} {direction}: {changes}", count=len(changed), direction=direction, changes=_listed(changed))
             for kinds, direction in ((ALARMS, Direction.WORSE), ((ChangeKind.IMPROVEMENT,), Direction.BETTER))
@@ -106,6 +119,7 @@ class Summary:
                 for cell, figures in self.missed.items()
                 for f in figures
             ],
+            "coverage": [asdict(one) for one in self.coverage],
             "changes": [change_object(change) for change in self.detected.of(*ChangeKind)],
             "test": {
                 "about": str(TEST),
@@ -170,20 +184,24 @@ def _finite(value: float) -> float | None:
 def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], lang: str = "en") -> str:
     """Return the page in a language: the nights, the latest first, and every figure over the nights."""
     shown = [night.night for night in nights][-SPARK_NIGHTS:]
-    course: dict[Name, dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
-    last: dict[Name, Row] = {}
+    course: dict[tuple[int, Name], dict[str, list[float]]] = defaultdict(lambda: defaultdict(list))
+    last: dict[tuple[int, Name], Row] = {}
+    origins = list(Origin)
     for row in rows:
-        course[row.name][row.night].append(row.value)
-        last[row.name] = row
+        key = (origins.index(Origin(row.origin)), row.name)
+        course[key][row.night].append(row.value)
+        last[key] = row
     change_of = {change.name: change for change in summary.detected.changes}
     figures = []
-    for name in sorted(course):
-        if summary.night not in course[name]:
+    for key in sorted(course):
+        if summary.night not in course[key]:
             continue
-        levels = [_middle(course[name].get(night, [])) for night in shown]
-        change, row = change_of.get(name), last[name]
+        levels = [_middle(course[key].get(night, [])) for night in shown]
+        name = key[1]
+        change, row = change_of.get(name), last[key]
         figures.append(
             {
+                "origin": origins[key[0]],
                 "step": label(name[0]),
                 "method": name[1],
                 "name": _figure(name, row.quantity, row.statistic),

@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor.evaluation import preassembly as preassembly_evaluation
 from processor.geometry import rigid
@@ -39,7 +39,7 @@ CHECKED = {
 
 def figures(recipe, settings, seed):
     """All figures of one bridge."""
-    scene, truth = make("bench", recipes.overridden(recipes.load(recipe)[1], settings), seed)
+    scene, truth = make("bench", recipe_files.overridden(recipe_files.load(recipe)[1], settings), seed)
     started = time.monotonic()
     result = preassembly_step.run(scene, preassembly_step.Params(seed=seed))
     found = {"seconds": time.monotonic() - started, "points": sum(len(scan.points) for scan in scene.scans)}

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.result import Flag
@@ -42,7 +42,7 @@ PARAMS = {"shifted": {"radii_mm": (47.0, 52.0, 63.0, 74.0)}, "no-catalogue": {"c
 def scene_of(case, seed, settings=()):
     """The scene and truth of a case."""
     recipe, own = CASES[case]
-    return make(case, recipes.overridden(recipes.load(recipe)[1], [*own, *settings]), seed)
+    return make(case, recipe_files.overridden(recipe_files.load(recipe)[1], [*own, *settings]), seed)
 
 
 def errors(scene, result, truth):

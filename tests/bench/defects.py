@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.asbuilt import defects as asbuilt_defects
 from designgen.scenes.make import make
 from processor.defects import step as defects_step
@@ -32,13 +32,13 @@ CRACK_MM = 8.0  # width of a crack of size 1
 
 def scene_of(scanner: str, size: float, seed: int, step_mrad: float = 0.8, stations: int = 5) -> tuple[Any, Any]:
     """Make a row of plates, one with a defect of each class and one undamaged; size 0: all are undamaged."""
-    recipe = recipes.load("plates-defects")[1]
+    recipe = recipe_files.load("plates-defects")[1]
     if not size:
         recipe["structure"]["components"] = ["none"] * 12
     settings = [f"scan.scanner={scanner}", f"scan.step_mrad={step_mrad}", f"scan.stations={stations}"]
     if size:
         settings += [f"asbuilt.size={size}", f"asbuilt.crack_width_mm={CRACK_MM * size}"]
-    recipe = recipes.overridden(recipe, settings)
+    recipe = recipe_files.overridden(recipe, settings)
     recipe["seed"] = seed
     return make(f"{scanner} {size:g}", recipe)
 

@@ -35,7 +35,7 @@ def rib():
     for patch in arch_part.ray_patches(part):
         builder.patch(0, patch)
     middle = part.key_points(0.5 * (part.s0 + part.s1)).mean(axis=0)
-    return builder.done(), survey.levelled(middle + np.array([0.0, 2500.0, 0.0]), 0.0)
+    return builder.to_surfaces(), survey.levelled_pose(middle + np.array([0.0, 2500.0, 0.0]), 0.0)
 
 
 def roof():
@@ -43,7 +43,7 @@ def roof():
     builder = Builder()
     frame = space_frame.build(space_frame.Params(nodes_x=9, nodes_y=9))
     frame_surfaces.add_frame(builder, frame)
-    return builder.done(), survey.levelled(np.array([11_000.0, 13_000.0, 1_600.0]), 0.0)
+    return builder.to_surfaces(), survey.levelled_pose(np.array([11_000.0, 13_000.0, 1_600.0]), 0.0)
 
 
 def truss():
@@ -52,7 +52,7 @@ def truss():
     for part, one in enumerate(truss_bridge.build(truss_bridge.Params())):
         for patch in one.patches:
             builder.patch(part, patch)
-    return builder.done(), survey.levelled(np.array([3_000.0, -5_000.0, 1_600.0]), 0.0)
+    return builder.to_surfaces(), survey.levelled_pose(np.array([3_000.0, -5_000.0, 1_600.0]), 0.0)
 
 
 def ours(surfaces, T, params):
@@ -60,7 +60,7 @@ def ours(surfaces, T, params):
     took = []
     for round_ in range(ROUNDS + 1):
         started = time.perf_counter(), time.process_time()
-        found = returns.scan(surfaces, T, scanner.Scanner(), params, round_, "S1")
+        found = returns.scan_station(surfaces, T, scanner.Scanner(), params, round_, "S1")
         took.append((time.perf_counter() - started[0], time.process_time() - started[1]))
     return *np.median(took[1:], axis=0).tolist(), len(found.returns.points)  # the first compiles
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor.evaluation import preassembly as preassembly_evaluation
 from processor.preassembly import step as preassembly_step
@@ -34,7 +34,9 @@ def bridges(sets, seeds, sigmas, spacing, methods):
             found = {method: [] for method in methods}
             for seed in seeds:
                 settings = [f"scan.sigma_mm={float(sigma)}", f"scan.spacing_mm={float(spacing)}"]
-                scene, truth = make(name, recipes.overridden(recipes.load(f"arch-{name.lower()}")[1], settings), seed)
+                scene, truth = make(
+                    name, recipe_files.overridden(recipe_files.load(f"arch-{name.lower()}")[1], settings), seed
+                )
                 started = time.monotonic()
                 if set(methods) & set(PAPER_METHODS):
                     scans = [own[0] for own in preassembly_step.scans_in_order(scene, scene.arch)]
@@ -85,7 +87,7 @@ def balls(seeds):
     for method in space_frame_step.METHODS:
         errors = []
         for seed in seeds:
-            scene, truth = make("balls-100", recipes.load("balls-100")[1], seed)
+            scene, truth = make("balls-100", recipe_files.load("balls-100")[1], seed)
             result = space_frame_step.run(
                 scene, dataclasses.replace(space_frame_step.Params(), method=method, seed=seed)
             )

@@ -29,7 +29,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor.evaluation import stitching
 from processor.evaluation import stitching as stitching_evaluation
@@ -45,8 +45,8 @@ SHOWN = ("position_mm", "rotation_mrad", "within_95", "pull_rms", "wall_s", "cpu
 @functools.lru_cache(maxsize=1)
 def made(recipe, settings, seed):
     """Scene and truth; kept, as the starts of a process all turn the same one."""
-    name, found = recipes.load(recipe)
-    return make(name, recipes.overridden(found, [f"seed={seed}", *settings]))
+    name, found = recipe_files.load(recipe)
+    return make(name, recipe_files.overridden(found, [f"seed={seed}", *settings]))
 
 
 def measured(scene, truth, params):

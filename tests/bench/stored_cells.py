@@ -14,7 +14,7 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
 
@@ -31,7 +31,7 @@ CASES = (
 def figures(task):
     """Return all figures of one scene: rows of method, name, value and unit."""
     (recipe, settings, step, methods), seed = task
-    scene, truth = make(recipe, recipes.overridden(recipes.load(recipe)[1], settings), seed)
+    scene, truth = make(recipe, recipe_files.overridden(recipe_files.load(recipe)[1], settings), seed)
     module = pipeline.step_modules()[step]
     check = importlib.import_module(f"processor.evaluation.{pipeline.package_of(step)}").check
     rows = []

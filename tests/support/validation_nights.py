@@ -18,9 +18,14 @@ SOFTWARE = Software("code-1", "c0ffee" * 6, {"steel-scan-check": "0.1.0", "numpy
 
 
 def case(
-    name="made", settings=(), methods=("ray",), steps=("spheres",), text='[scan]\nmode = "surface"\nsigma_mm = 1.0\n'
+    name="made",
+    settings=(),
+    methods=("ray",),
+    steps=("spheres",),
+    text='[scan]\nmode = "surface"\nsigma_mm = 1.0\n',
+    origin=cells.Origin.OWN,
 ):
-    return cells.Case(name, name, text, True, tuple(settings), tuple(steps), tuple(methods))
+    return cells.Case(name, name, text, True, tuple(settings), tuple(steps), tuple(methods), origin=origin)
 
 
 def matrix(*cases, seeds=(1, 2, 3), fresh=1, aim=None):

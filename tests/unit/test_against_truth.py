@@ -13,7 +13,7 @@ from processor.preassembly.chain import adjustment
 from processor.preassembly.ends import bottom_edges, joint_end
 from processor.preassembly.ends.joint_frame import joint_frame
 from processor.preassembly.parts.member import Member
-from processor.preassembly.result import Adjustment, Components, Joints, Result
+from processor.preassembly.result import Adjustment, Components, Joints, Linear, Result
 from tests.support import arch_clouds
 
 DESIGN = arch_clouds.design()
@@ -36,6 +36,13 @@ def as_built(seed=5):
         both = (part.bottom_edge_left, part.bottom_edge_right)
         edges.append([rigid.apply(turn, edge - middle) + middle for edge in both])
     return np.array(ends), np.array(edges)
+
+
+def as_designed():
+    """Key points and bottom edges of perfect parts."""
+    joints = [np.full((8, 3), np.nan), *DESIGN.joint_points, np.full((8, 3), np.nan)]
+    edges = [[part.bottom_edge_left, part.bottom_edge_right] for part in DESIGN.parts]
+    return np.array([joints[i : i + 2] for i in range(5)]), np.array(edges)
 
 
 def member(i, ends, edges, unseen, without):
@@ -70,13 +77,37 @@ def member(i, ends, edges, unseen, without):
     return Member((own[0], own[1]), measured, middle, np.zeros((6, 6)))
 
 
-def checked(unseen, without):
+def stated(members, adjusted, edges, off):
+    """The span, edges and closure that an adjustment of exact members states, each off by ``off`` of its interval."""
+    middle = [rigid.apply(adjusted.motions[i], edges[i].mean(axis=0)[[i and -1]])[0] for i in (0, -1)]
+    at = [np.mean([part.bottom_edge_left[i], part.bottom_edge_right[i]], axis=0) for i, part in
+          ((0, DESIGN.parts[0]), (-1, DESIGN.parts[-1]))]  # fmt: skip
+    span = np.linalg.norm(middle[1] - middle[0]) - np.linalg.norm(at[1] - at[0])
+    departures = np.vstack(adjusted.departures)
+    return Adjustment(
+        weight=WEIGHT,
+        span_departure=span + 0.2 * off,
+        span_ci95=0.2,
+        linear_offset=departures + 0.1 * off,
+        linear_offset_ci95=np.full(departures.shape, 0.1),
+        closure=np.full((2, 3), 0.3 * off),
+        closure_ci95=np.full((2, 3), 0.3),
+    )
+
+
+def checked(unseen, without, off=0.0, built=as_built):
     """Checks of the answer from exact members; ``without`` are parts that were not placed."""
-    ends, edges = as_built()
+    ends, edges = built()
     members = [member(i, ends, edges, unseen, without) for i in range(5)]
     adjusted = adjustment.adjust(members, DESIGN.joint_points, FRAMES, WEIGHT)
     pose = np.tile(np.eye(4), (5, 1, 1))
     pose[list(without)] = np.nan
+    lengths = np.cumsum([[0.0, 0.0], *([Polyline.through(e).length for e in (part.bottom_edge_left,
+                         part.bottom_edge_right)] for part in DESIGN.parts)], axis=0)  # fmt: skip
+    chainage = np.concatenate([
+        one.edges.chainage + np.array([lengths[i][("left", "right").index(side)] for side in one.edges.side])
+        for i, one in enumerate(members)
+    ])  # fmt: skip
     result = Result(
         "ok", "adjustment",
         components=Components(
@@ -87,7 +118,8 @@ def checked(unseen, without):
             name=DESIGN.joint_names, left=DESIGN.joint_left, right=DESIGN.joint_right, gaps=adjusted.gaps,
             gap_ci95=np.where(np.isfinite(adjusted.gaps), 0.05, np.nan), verdict=("indeterminate",) * 4,
         ),
-        adjustment=Adjustment(weight=WEIGHT),
+        linear=Linear(chainage=chainage, edge=[side for one in members for side in one.edges.side]),
+        adjustment=stated(members, adjusted, edges, off),
     )  # fmt: skip
     truth = ArchTruth(arch_clouds.NAMES, np.tile(np.eye(4), (5, 1, 1)), ends, ends, edges)
     scene = Scene("b", "arch-bridge", arch=DESIGN)
@@ -101,3 +133,16 @@ def test_gaps_are_held_against_what_the_answer_could_know(unseen, without, joint
     assert found["gaps, number"] == 24 * joints
     assert found["gaps against the truth's, rms"] < 0.03
     assert found["gaps within their 95 % intervals"] > 95.0
+
+
+@pytest.mark.parametrize(("off", "share"), [(0.5, 100.0), (1.5, 0.0)])
+def test_every_interval_of_a_chain_has_its_coverage(off, share):
+    """Quantities off by half of their intervals are within them, by one and a half they are not."""
+    found = checked((), (), off)
+    assert found["spans within their 95 % intervals"] == share
+    assert found["edges within their 95 % intervals"] == pytest.approx(share, abs=1.0)
+    assert found["edges, number"] > 100
+    assert "closures within their 95 % intervals" not in found  # of parts as built it has no truth
+    perfect = checked((), (), off, as_designed)
+    assert perfect["closures within their 95 % intervals"] == share
+    assert perfect["spans within their 95 % intervals"] == share

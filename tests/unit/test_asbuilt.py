@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.asbuilt import defects, imperfections
-from designgen.designs import arch_bridge, arch_part, plate_row, stadium_roof, structure, truss_bridge
+from designgen.designs import arch_bridge, arch_part, box_and_tube, plate_row, stadium_roof, truss_bridge
 from designgen.randomness import generator
 from designgen.scanning import sampler
 from designgen.scenes.make import make
@@ -97,7 +97,7 @@ def test_corners_of_an_end_move_each_on_its_own():
 @pytest.mark.parametrize("name", ["arch-east", "arch-west"])
 def test_real_bridges_gape_as_in_the_source_paper(name):
     """Tables 4 to 7 of paper 000: the mean of |d| is 15 to 17 mm, the largest 58."""
-    scene, truth = make(name, recipes.overridden(recipes.load(name)[1], ["scan.step_mrad=40"]))
+    scene, truth = make(name, recipe_files.overridden(recipe_files.load(name)[1], ["scan.step_mrad=40"]))
     gaps = np.abs(truth.arch.key_points_bridge[1:, 0] - truth.arch.key_points_bridge[:-1, 1])
     assert 10.0 < gaps.mean() < 22.0
     assert 35.0 < gaps.max() < 85.0
@@ -153,7 +153,7 @@ def test_dents_waves_and_missing_pieces_are_where_the_truth_says():
 
 def test_the_truth_of_a_warm_bridge_maps_back_to_the_design():
     settings = ["scan.spacing_mm=60", "asbuilt.temperature_C=45", "asbuilt.length_mm=3"]
-    scene, truth = make("x", recipes.overridden(recipes.load("arch-s1")[1], settings), 5)
+    scene, truth = make("x", recipe_files.overridden(recipe_files.load("arch-s1")[1], settings), 5)
     assert scene.temperature_C == 45.0
     grown = 1.0 + 12e-6 * 25.0
     for i in range(5):
@@ -238,11 +238,11 @@ def test_plates_that_vary_a_little_are_built():
 @pytest.mark.parametrize("setting", ["asbuilt.sag_mm=5", "asbuilt.nonsense=5", "asbuilt=5"])
 @pytest.mark.parametrize("name", ["arch-s1", "frame-small", "truss-bridge", "plates-defects", "stadium-roof"])
 def test_what_a_kind_cannot_be_built_with_is_refused(name, setting):
-    recipe = {key: value for key, value in recipes.load(name)[1].items() if key != "asbuilt"}
-    recipe = recipes.overridden(recipe, [setting])
+    recipe = {key: value for key, value in recipe_files.load(name)[1].items() if key != "asbuilt"}
+    recipe = recipe_files.overridden(recipe, [setting])
     if (name, setting) == ("stadium-roof", "asbuilt.sag_mm=5"):
         settings = ["asbuilt.ripples=2", "structure.trusses=4", "scan.spacing_mm=500"]
-        truth = make("x", recipes.overridden(recipe, settings))[1].as_built
+        truth = make("x", recipe_files.overridden(recipe, settings))[1].as_built
         assert truth.what == ("sag at the middle", "lean at the top", "ripple at the middle", "ripples around")
         np.testing.assert_array_equal(truth.value, [5.0, 12.0, 8.0, 2.0])
         return
@@ -251,7 +251,7 @@ def test_what_a_kind_cannot_be_built_with_is_refused(name, setting):
 
 
 def test_a_structure_moves_by_its_field():
-    recipe = recipes.overridden(recipes.load("stadium-roof")[1], ["scan.sigma_mm=0", "structure.trusses=4"])
+    recipe = recipe_files.overridden(recipe_files.load("stadium-roof")[1], ["scan.sigma_mm=0", "structure.trusses=4"])
     scene, truth = make("x", recipe)
     field = truth.structure
     assert 20.0 < np.linalg.norm(field.displacement, axis=1).max() < 60.0
@@ -284,7 +284,7 @@ def test_a_structure_moves_by_its_field():
 def test_structures_in_cad_keep_to_the_closed_form(components):
     import cadquery as cq
 
-    solid = structure.solid(components)
+    solid = box_and_tube.solid(components)
     assert solid.isValid()
     bodies = [body for one in components for body in one.bodies]
     assert solid.Volume() == pytest.approx(sum(_volume(body) for body in bodies), rel=1e-6)
@@ -294,26 +294,26 @@ def test_structures_in_cad_keep_to_the_closed_form(components):
         for patch in body.patches():
             for point in patch.at(rng.uniform(size=3), rng.uniform(size=3)):
                 assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02
-    vertices, faces = structure.mesh_of(components)
+    vertices, faces = box_and_tube.mesh_of(components)
     mesh = trimesh.Trimesh(vertices, faces)
     assert mesh.area == pytest.approx(sum(_area(body) for body in bodies), rel=2e-3)
 
 
 def _volume(body):
-    if isinstance(body, structure.Tube):
+    if isinstance(body, box_and_tube.Tube):
         return np.pi * body.radius**2 * np.linalg.norm(body.end - body.start)
     return float(np.prod(body.size))
 
 
 def _area(body):
-    if isinstance(body, structure.Tube):
+    if isinstance(body, box_and_tube.Tube):
         return 2.0 * np.pi * body.radius * np.linalg.norm(body.end - body.start)
     a, b, c = body.size
     return 2.0 * (a * b + b * c + c * a)
 
 
 def test_nine_scans_of_a_truss_come_from_six_stations():
-    recipe = recipes.overridden(recipes.load("truss-bridge")[1], ["scan.step_mrad=20"])
+    recipe = recipe_files.overridden(recipe_files.load("truss-bridge")[1], ["scan.step_mrad=20"])
     scene, truth = make("x", recipe)
     assert len(scene.scans) == 9
     places = np.array([T[:3, 3] for T in truth.stations.T_project_station])

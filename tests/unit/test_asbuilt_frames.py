@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.asbuilt import imperfections
 from designgen.designs import space_frame
 from designgen.randomness import generator
@@ -90,7 +90,9 @@ def test_a_warm_frame_is_larger_in_all_its_parts():
     assert own.sum() > 100
     np.testing.assert_allclose(away[own], 30.0 * grown, atol=1e-6)
     # The scene's design stays as it is at 20 C.
-    recipe = recipes.overridden(recipes.load("frame-small")[1], ["scan.spacing_mm=50", "asbuilt.temperature_C=120"])
+    recipe = recipe_files.overridden(
+        recipe_files.load("frame-small")[1], ["scan.spacing_mm=50", "asbuilt.temperature_C=120"]
+    )
     scene, truth = make("x", recipe)
     assert set(scene.frame.tube_diameters) == {60.0}
     np.testing.assert_allclose(truth.frame.radii, scene.frame.radii * grown)

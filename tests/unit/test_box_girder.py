@@ -11,7 +11,7 @@ import trimesh
 from click.testing import CliRunner
 
 from designgen import cli as designgen_cli
-from designgen import recipes
+from designgen import recipe_files
 from designgen.designs import arch_bridge
 from designgen.scenes.make import make as make_scene
 from processor.evaluation import preassembly as preassembly_evaluation
@@ -137,7 +137,7 @@ def exported(tmp_path, scene, truth, *options):
 
 
 def made(settings=(), seed=1):
-    return make_scene("bridge", recipes.overridden(recipes.load("arch-s1")[1], list(settings)), seed)
+    return make_scene("bridge", recipe_files.overridden(recipe_files.load("arch-s1")[1], list(settings)), seed)
 
 
 def test_a_folder_without_meshes_comes_back(tmp_path):
@@ -179,7 +179,7 @@ def test_a_thickness_in_the_design_is_used(tmp_path):
 def test_only_an_arch_bridge_goes_without_meshes(tmp_path):
     from designgen.export import folder as export_folder
 
-    scene, truth = make_scene("f", recipes.load("frame-small")[1], 1)
+    scene, truth = make_scene("f", recipe_files.load("frame-small")[1], 1)
     store.write_scene(tmp_path / "f.h5", scene, truth, {})
     with pytest.raises(UsageError, match="only an arch bridge"):
         export_folder.export(tmp_path / "f.h5", tmp_path / "out", "ply", with_truth=True, with_meshes=False)

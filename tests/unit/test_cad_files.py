@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.cad import files as cad_files
 from designgen.designs import arch_bridge, arch_part
 from designgen.export import solids
@@ -157,7 +157,7 @@ def test_real_files_in_inches(name, tmp_path):
 
 
 def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
-    recipe = recipes.load("arch-s1")[1]
+    recipe = recipe_files.load("arch-s1")[1]
     files = solids.write_design(recipe, tmp_path / "design")
     bridge = {k: tuple(v) if isinstance(v, list) else v for k, v in recipe["bridge"].items()}
     parts = arch_bridge.build(arch_bridge.Params(**bridge))
@@ -169,7 +169,7 @@ def test_designs_go_out_as_step_and_keep_their_volumes(tmp_path):
         solids.write_step(path, {part.name: arch_part.solid(part)})
         assert path.read_bytes() == first
     for name, bodies in (("plates-defects", 13), ("truss-bridge", None)):
-        (path,) = solids.write_design(recipes.load(name)[1], tmp_path / name)
+        (path,) = solids.write_design(recipe_files.load(name)[1], tmp_path / name)
         found = cad_files.read(path).bodies
         assert bodies is None or len(found) == bodies
         assert all(body.solid for body in found)
@@ -398,7 +398,7 @@ def test_a_large_sphere_takes_seconds_and_says_its_deviation(tmp_path):
 
 @pytest.mark.parametrize("name", ["plates-defects", "frame-small"])
 def test_georeferenced_designs_lie_where_their_scene_has_them(name, tmp_path):
-    origin, recipe = [5.0e8, 4.3e9, 1.0e5], recipes.load(name)[1]
+    origin, recipe = [5.0e8, 4.3e9, 1.0e5], recipe_files.load(name)[1]
     if name == "frame-small":
         recipe["frame"] |= {"nodes_x": 2, "nodes_y": 2, "layers": 1}
     corners = []

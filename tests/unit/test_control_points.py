@@ -6,7 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor.geometry import rigid
 from processor.model import Control, InputError
@@ -24,7 +24,7 @@ SHIFT_MM = 2.0  # sd an axis of each station's own
 
 @pytest.fixture(scope="module")
 def roof():
-    return make("roof", recipes.overridden(recipes.load("frame-1040")[1], ROOF), 5)
+    return make("roof", recipe_files.overridden(recipe_files.load("frame-1040")[1], ROOF), 5)
 
 
 def shifted(scene, seed, common=COMMON_MM, own=SHIFT_MM):

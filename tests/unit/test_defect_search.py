@@ -501,3 +501,91 @@ def test_the_pieces_of_a_crack_are_one_and_what_lies_beside_it_is_not():
     np.testing.assert_array_equal(first[0].cells, np.unique(joined))
     assert sorted(len(group) for group in others) == [1, 1]
     assert {id(group[0]) for group in others} == {id(beside), id(raised)}
+
+
+# --- what should have been seen ------------------------------------------------------------------------------------
+
+
+def plates_on_a_wall(gone, gap=0.0):
+    """Expected and missing places of a wall with two plates on it, the points from one station in front of it."""
+    wall = box((0.0, 0.0, 0.0), (2000.0, 20.0, 1000.0))
+    plates = [box((x, -10.0 - gap, 300.0), (x + 400.0, -gap, 700.0)) for x in (300.0, 1300.0)]
+    solids = [wall, *plates]
+    vertices = np.vstack([corners for corners, _ in solids])
+    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
+    built = solids[:-1] if gone else solids
+    rng = np.random.default_rng(1)
+    station = np.array([1000.0, -4000.0, 500.0])
+    x, z = rng.uniform(0.0, 2000.0, 200_000), rng.uniform(0.0, 1000.0, 200_000)
+    y = np.zeros(len(x))
+    for corners, _ in built[1:]:
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        y = np.where((x > low[0]) & (x < high[0]) & (z > low[2]) & (z < high[2]), low[1], y)
+    points = np.stack([x, y + rng.normal(0.0, 0.3, len(x)), z], axis=1)
+    scene = Scene(
+        "wall", "structure", (Scan("S1", points, position=station, T_project_scan=np.eye(4)),),
+        structure=StructureDesign("wall", vertices, faces),
+    )  # fmt: skip
+    return defects_step.run(scene, defects_step.Params(align=False, registration_error_mm=0.01))
+
+
+@pytest.mark.parametrize("gap", [-0.1, 0.0, 0.1])
+def test_faces_that_touch_another_body_are_not_missing(gap):
+    assert found(plates_on_a_wall(gone=False, gap=gap)) == []
+
+
+def test_lines_of_sight_end_at_facets():
+    """Lines from a wide plate to a far place cross a narrow plate 600 mm before it, or pass beside it."""
+    near, far = box((0.0, 0.0, 0.0), (1000.0, 10.0, 1000.0)), box((-500.0, 600.0, -500.0), (1500.0, 610.0, 1500.0))
+    vertices, faces = np.vstack([near[0], far[0]]), np.vstack([near[1], far[1] + 8])
+    surface = surface_charts.of_mesh(vertices, faces, 100.0)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 30.0)
+    rng = np.random.default_rng(3)
+    starts = np.stack([rng.uniform(-450, 1450, 400), np.full(400, 599.0), rng.uniform(-450, 1450, 400)], axis=1)
+    ends = np.repeat([[500.0, -6000.0, 450.0]], 400, axis=0)
+    shares = {y: (599.0 - y) / 6599.0 for y in (10.0, 0.0)}
+    at = [starts + share * (ends - starts) for share in shares.values()]
+    crossed = np.array([((p[:, [0, 2]] > 0.0) & (p[:, [0, 2]] < 1000.0)).all(axis=1) for p in at])
+    row, _, share = mesh_distance.crossings(grid, starts, ends, False)
+    across = np.array([np.isclose(share, expected) for expected in shares.values()])
+    for k in range(2):
+        assert 0 < crossed[k].sum() < 400
+        np.testing.assert_array_equal(np.sort(row[across[k]]), np.flatnonzero(crossed[k]))
+    sides = crossed.any(axis=0)
+    assert set(mesh_distance.crossings(grid, starts, ends, True)[0]) >= set(np.flatnonzero(sides).tolist())
+
+
+def girder_with_brackets(gone):
+    """A web with brackets standing off it, seen from two stations above and below; the last bracket may be gone."""
+    solids = [box((0.0, 0.0, 0.0), (3000.0, 14.0, 1400.0))]
+    solids += [box((x, -140.0, 700.0), (x + 400.0, 0.0, 714.0)) for x in (300.0, 1300.0, 2300.0)]
+    vertices = np.vstack([corners for corners, _ in solids])
+    faces = np.vstack([own + 8 * i for i, (_, own) in enumerate(solids)])
+    built = trimesh.util.concatenate(
+        [trimesh.Trimesh(corners, own, process=False) for corners, own in (solids[:-1] if gone else solids)]
+    )
+    scans = []
+    for seed, station in enumerate(([1500.0, -3500.0, 2500.0], [1500.0, -3500.0, -1200.0])):
+        position = np.array(station)
+        points, facet = trimesh.sample.sample_surface(built, 400_000, seed=seed)
+        points, normal = np.asarray(points), np.asarray(built.face_normals)[facet]
+        front = np.einsum("ni,ni->n", position - points, normal) > 0.0
+        points, normal = points[front], normal[front]
+        surface = surface_charts.of_mesh(np.asarray(built.vertices), np.asarray(built.faces).astype(np.int64), 100.0)
+        grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 50.0)
+        hidden = mesh_distance.crossings(grid, points + normal, np.repeat(position[None], len(points), axis=0), True)[0]
+        points = np.delete(points, hidden, axis=0)
+        ray = (points - position) / np.linalg.norm(points - position, axis=1)[:, None]
+        points = points + np.random.default_rng(seed).normal(0.0, 0.3, len(points))[:, None] * ray
+        scans.append(Scan(f"S{seed}", points, position=position, T_project_scan=np.eye(4)))
+    design = StructureDesign("girder", vertices, faces)
+    return Scene("girder", "structure", tuple(scans), structure=design)
+
+
+def test_a_part_that_is_gone_is_missing_where_scanners_see_through_it():
+    params = defects_step.Params(align=False, registration_error_mm=0.01)
+    whole = defects_step.run(girder_with_brackets(gone=False), params)
+    assert found(whole) == []
+    result = defects_step.run(girder_with_brackets(gone=True), params)
+    assert result.defects.defect_class == ("missing-part",)
+    np.testing.assert_allclose(result.defects.centre[0], [2500.0, -70.0, 707.0], atol=60.0)

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.asbuilt import defects
-from designgen.designs import plate_row, structure_types
+from designgen.designs import plate_row, structure_registry
 from designgen.scenes import structure as scenes_structure
 from processor.model import UsageError
 
@@ -23,8 +23,8 @@ def row_of(row, kinds, sizes, seed=1):
     """Components as designed, faces as built with the component of each, and the truth."""
     structure = {"type": "plate-row", "components": list(kinds), **row}
     recipe = {"kind": "structure", "structure": structure, "asbuilt": sizes}
-    components = structure_types.design(recipe)
-    return components, *scenes_structure.BUILDERS["plate-row"](components, recipe, seed)[::2]
+    components = structure_registry.design(recipe)
+    return components, *scenes_structure.built_faces("plate-row", components, recipe, seed)[::2]
 
 
 def volume(patches):
@@ -211,7 +211,7 @@ def test_an_unknown_defect_is_refused():
 
 def test_named_recipes_fit():
     for name in ("plates-defects", "girders-defects"):
-        recipe = recipes.load(name)[1]
+        recipe = recipe_files.load(name)[1]
         row = {key: value for key, value in recipe["structure"].items() if key not in ("type", "components")}
         _, _, truth = row_of(row, defects.CLASSES, {})
         assert truth.classes == defects.CLASSES

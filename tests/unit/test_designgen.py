@@ -13,7 +13,7 @@ from click.testing import CliRunner
 from scipy.integrate import quad
 
 import designgen
-from designgen import batch, curves, recipes
+from designgen import batch, curves, recipe_files
 from designgen.cli import commands
 from designgen.designs import arch_bridge, arch_mesh, arch_part, bolt_ball, space_frame
 from designgen.export import folder as export_folder
@@ -51,7 +51,7 @@ def test_curves_against_quadrature(name):
 
 @pytest.fixture(scope="module", params=["arch-s1", "arch-d1", "arch-d2", "arch-d3"])
 def parts(request):
-    bridge = recipes.load(request.param)[1]["bridge"]
+    bridge = recipe_files.load(request.param)[1]["bridge"]
     bridge["joints"] = tuple(bridge["joints"])
     return arch_bridge.build(arch_bridge.Params(**bridge))
 
@@ -170,7 +170,7 @@ def test_noise_and_outliers_are_what_was_asked_for():
 
 
 def test_truth_belongs_to_its_scan_and_seeds_repeat():
-    recipe = recipes.overridden(recipes.load("arch-s1")[1], ["scan.spacing_mm=80", "scan.sigma_mm=0"])
+    recipe = recipe_files.overridden(recipe_files.load("arch-s1")[1], ["scan.spacing_mm=80", "scan.sigma_mm=0"])
     scene, truth = make("x", recipe, 5)
     again, _ = make("x", recipe, 5)
     other, _ = make("x", recipe, 6)
@@ -211,7 +211,7 @@ def test_truth_belongs_to_its_scan_and_seeds_repeat():
 )
 def test_impossible_recipes_are_refused_by_key(setting, said):
     with pytest.raises(UsageError) as refused:
-        make("x", recipes.overridden(recipes.load("arch-s1")[1], [setting]))
+        make("x", recipe_files.overridden(recipe_files.load("arch-s1")[1], [setting]))
     assert said in str(refused.value)
 
 
@@ -227,12 +227,12 @@ def test_impossible_recipes_are_refused_by_key(setting, said):
 )
 def test_impossible_frames_are_refused_by_key(setting, said):
     with pytest.raises(UsageError) as refused:
-        make("x", recipes.overridden(recipes.load("frame-small")[1], [setting]))
+        make("x", recipe_files.overridden(recipe_files.load("frame-small")[1], [setting]))
     assert said in str(refused.value)
 
 
 def test_an_exported_folder_holds_design_and_truth(tmp_path):
-    recipe = recipes.overridden(recipes.load("frame-small")[1], ["scan.spacing_mm=40"])
+    recipe = recipe_files.overridden(recipe_files.load("frame-small")[1], ["scan.spacing_mm=40"])
     scene, truth = make("roof", recipe)
     store.write_scene(tmp_path / "s.h5", scene, truth, {"parameters": recipe})
     export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True, step=True)
@@ -305,7 +305,7 @@ def test_the_list_has_columns():
     lines = CliRunner().invoke(commands, ["list"]).output.splitlines()
     assert lines[0] == "component types"
     entries = [line for line in lines if line.startswith("  ")]
-    assert set(recipes.named()) < {line.split()[0] for line in entries}
+    assert set(recipe_files.named()) < {line.split()[0] for line in entries}
     column = max(len(line.split()[0]) for line in entries) + 4
     assert all(line[column - 1] == " " and line[column] != " " for line in entries)
 

@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 import pytest
 
-from designgen import batch, recipes
+from designgen import batch, recipe_files
 from processor.jobs import process as processes
 from processor.jobs import runner
 from processor.jobs.child import Loss, Lost
@@ -120,7 +120,7 @@ def test_every_combination_in_the_order_given(tmp_path):
 
 
 def test_more_seeds_later_leave_the_numbers_as_they_were(tmp_path):
-    name, recipe = recipes.load("frame-small")
+    name, recipe = recipe_files.load("frame-small")
     varied = {"scan.spacing_mm": ["60", "80"], "scan.sigma_mm": ["0", "1"]}
     few, many = (batch.plan(tmp_path, name, recipe, varied, 4, count) for count in (2, 5))
     assert many[:8] == few
@@ -166,8 +166,8 @@ def test_a_changed_parameter_is_made_again_and_said(made, tmp_path):
 def test_other_software_is_made_again(made, tmp_path, monkeypatch):
     monkeypatch.setattr(batch, "__version__", "9.9")
     folder = copied(made, tmp_path / "set")
-    name, recipe = recipes.load("frame-small")
-    job = batch.plan(folder, name, recipes.overridden(recipe, ["scan.spacing_mm=60"]), {}, 7, 1)[0]
+    name, recipe = recipe_files.load("frame-small")
+    job = batch.plan(folder, name, recipe_files.overridden(recipe, ["scan.spacing_mm=60"]), {}, 7, 1)[0]
     outcome = batch.run_job(job)
     assert outcome.made
     assert outcome.replaced == "was made with other software; made again"
@@ -370,7 +370,7 @@ def test_a_failed_scene_leaves_no_older_one_under_its_name(made, tmp_path):
 
 def test_a_job_with_other_software_than_its_worker_touches_nothing(made, tmp_path):
     folder = copied(made, tmp_path / "set")
-    name, recipe = recipes.load("frame-small")
+    name, recipe = recipe_files.load("frame-small")
     job = batch.plan(folder, name, recipe, {}, 7, 1)[0]
     job.software["numpy"] = "0.1"
     outcome = batch.run_job(job)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.deviation import assignment
+from processor.deviation import assignment, enclosure
 from processor.deviation import step as deviation_step
 from processor.geometry import mesh_distance
 from processor.model import Scan, Scene, StructureDesign
@@ -87,3 +87,30 @@ def test_the_nearest_face_is_taken_and_its_clearance_is_the_distance_of_the_next
     below = assignment.assigned(points, np.tile([0.0, 0.0, -5000.0], (5, 1)), curved, grid)
     assert surface.normals[below.facet[2], 2] == pytest.approx(-1.0)
     assert not np.isfinite(below.clearance[2])
+
+
+def test_what_is_within_another_body_or_in_contact_with_it_is_enclosed():
+    def box(size, at):
+        return trimesh.creation.box(size, trimesh.transformations.translation_matrix(at))
+
+    hollow = box((300, 300, 300), (0, 3000, 0))
+    hollow.invert()  # the cavity of the next
+    bodies = [box((2000, 100, 100), (0, 0, 0)), box((100, 100, 900), (0, 0, 430)), box((200, 100, 20), (900, 0, 60)),
+              box((320, 320, 320), (0, 3000, 0)), hollow]  # fmt: skip
+    mesh = trimesh.util.concatenate(bodies)
+    vertices, faces = np.array(mesh.vertices), np.array(mesh.faces, np.int64)
+    surface = mesh_distance.of_design(vertices, faces)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 20.0)
+    points = np.array(
+        [[0, 0, 50], [500, 0, 50], [0, 50, 0], [0, 0, -20], [900, 0, 50], [900, 0, 50], [900, 0, 70], [150, 3000, 0]],
+        float,
+    )
+    normals = np.array(
+        [[0, 0, 1], [0, 0, 1], [0, 1, 0], [0, 0, -1], [0, 0, 1], [0, 0, -1], [0, 0, 1], [-1, 0, 0]], float
+    )
+    inside = enclosure.enclosed(points, normals, grid, surface.faces)
+    # Of the beam below the post; beside it; its side; the post's end; beam and plate in contact; the plate; the cavity.
+    np.testing.assert_array_equal(inside, [True, False, False, True, True, True, False, False])
+    opened = surface.faces[1:]  # a beam without one facet is no body
+    assert not enclosure.closed_bodies(opened)[:11].any()
+    assert enclosure.closed_bodies(opened)[11:].all()

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
 from processor.deviation import baseline
@@ -23,6 +23,7 @@ from processor.model import (
     Scan,
     Scene,
     Stations,
+    Status,
     StepRun,
     StructureDesign,
     StructureTruth,
@@ -85,7 +86,11 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
     fitted = deviation_step.run(scene, deviation_step.Params(register="fine"))
     assert fitted.registration == "fine"
     assert abs(np.nanmean(fitted.core.distance[result.core.normals[:, 1] > 0.9])) < 0.7  # the best fit has it
-    assert codes(fitted) == ["deviation.stable-fit"]
+    assert codes(fitted) == ["deviation.no-stable-half", "deviation.stable-fit"]  # it is bent all along
+    assert fitted.status == "weak"
+    best = deviation_step.run(scene, deviation_step.Params(register="fine", fit="all"))
+    assert codes(best)[1:] == ["deviation.best-fit", "deviation.stable-fit-would-move"]
+    assert np.linalg.norm(best.best_fit_shift) < 0.05
     assert metrics(scene, fitted, truth)["core points farther from the truth than their LOD95"].value < 5.0
 
 
@@ -143,13 +148,94 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
         Scan("a", points[::2]), Scan("b", rigid.apply(rigid.invert(T), points[1::2])), Scan("c", points + 3000.0),
     )  # fmt: skip
     several = Scene("bracket", "structure", scans, structure=scene.structure, units="mm")
-    table = SimpleNamespace(name=("a", "b", "c"), T_project_scan=np.array([np.eye(4), T, np.full((4, 4), np.nan)]))
+    table = SimpleNamespace(
+        name=("a", "b", "c"),
+        status=(Status.OK, Status.WEAK, Status.FAILED),
+        T_project_scan=np.array([np.eye(4), T, np.full((4, 4), np.nan)]),
+    )
     stitched = SimpleNamespace(scans=table)
     result = deviation_step.run(several, deviation_step.Params(), earlier={"stitch": stitched})
     assert result.points_read == len(points)
-    assert result.status == "ok"
+    assert result.status == "weak"
+    assert codes(result)[0] == "deviation.scans-unplaced"
+    assert result.reasons[0].values["scans"] == "c"
     assert abs(np.nanmean(result.core.distance)) < 0.05
     assert "deviation.unposed-scans" in codes(deviation_step.run(several, deviation_step.Params(register="none")))
+
+
+@pytest.mark.parametrize("wrong", [1, 2])
+@pytest.mark.parametrize("elsewhere", [False, True])
+def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
+    """Of three scans as they stand, of a third of the points each, one or two are in frames of their own."""
+    scene, _ = scene_of(11, lambda p: 0.0 * p)
+    points = scene.scans[0].points
+    frame = rigid.transform(rigid.rotation_from_vector(np.array([0.0, 0.0, 0.5])), np.array([30_000.0, 0.0, 0.0]))
+    common = frame if elsewhere else np.eye(4)  # the other scans are at the design, or together in another frame
+    scans = []
+    for k in range(3):
+        angle, shift = (np.array([0.1, -0.2, 0.8 + k]), np.array([300.0, 200.0 + 9e3 * k, 500.0]))
+        T = rigid.transform(rigid.rotation_from_vector(angle), shift) if k < wrong else common
+        scans.append(Scan(f"scan-{k}", rigid.apply(T, points[k::3])))
+    several = Scene("bracket", "structure", tuple(scans), structure=scene.structure, units="mm")
+    result = deviation_step.run(several, deviation_step.Params())
+    if elsewhere and wrong == 2:
+        assert result.status != "ok"  # nothing says which of three scans is right
+        assert codes(result)[0] == "deviation.scans-elsewhere"
+        return
+    assert result.status == "weak"
+    assert codes(result)[0] == "deviation.scans-elsewhere"
+    assert result.reasons[0].values["scans"] == ", ".join(f"scan-{k}" for k in range(wrong))
+    assert result.reasons[0].values["points"] == pytest.approx(20_000 * wrong, rel=0.01)
+    assert result.registration == ("coarse" if elsewhere else "as given")
+    assert result.significant_share < 0.07
+    assert np.isfinite(result.core.lod95).mean() > 0.9
+
+
+def test_a_station_of_a_merged_scan_is_named_too():
+    scene, _ = scene_of(15, lambda p: 0.0 * p, count=30_000)
+    points = scene.scans[0].points.copy()
+    station = (np.arange(len(points)) % 3).astype(np.int32)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.1, -0.2, 0.8])), np.array([300.0, 200.0, 500.0]))
+    points[station == 1] = rigid.apply(T, points[station == 1])
+    merged = Scan("merged", points, point_station=station)
+    stations = Stations(("S1", "S2", "S3"), np.array([[9e3, 9e3, 9e3], [-9e3, 9e3, -9e3], [0.0, -9e3, 9e3]]))
+    result = deviation_step.run(
+        dataclasses.replace(scene, scans=(merged,), stations=stations), deviation_step.Params(register="none")
+    )
+    assert result.status == "weak"
+    assert result.reasons[0].values["scans"] == "S2"
+    assert result.points_kept < 21_000
+
+
+def test_a_scan_of_something_else_fails():
+    scene, _ = scene_of(13, lambda p: 0.0 * p, count=20_000)
+    T = rigid.transform(rigid.rotation_from_vector(np.array([0.3, 0.2, 1.0])), np.array([90_000.0, 0.0, 0.0]))
+    rng = np.random.default_rng(1)
+    ground = np.column_stack(
+        [rng.uniform(-9e3, 9e3, 20_000), rng.uniform(-6e3, 6e3, 20_000), rng.uniform(0, 3e3, 20_000)]
+    )
+    other = dataclasses.replace(scene, scans=(Scan("yard", rigid.apply(T, ground)),))
+    result = deviation_step.run(other, deviation_step.Params())
+    assert result.status == "failed"
+    assert codes(result)[0] == "deviation.not-at-design"
+
+
+def test_after_a_stitch_that_failed_later_steps_do_not_run(tmp_path, monkeypatch):
+    scene, _ = scene_of(12, count=5000)
+    jobs = pipeline.plan(("stitch", "deviation", "defects"), (), {}, 0)
+    stitching = jobs[0].module
+    for status in (Status.FAILED, Status.AMBIGUOUS):
+        monkeypatch.setattr(
+            stitching, "run", lambda *_, status=status: stitching.Result(status=status, method="automatic")
+        )
+        found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
+        for run in found.runs[1:]:
+            assert run.result.status == "failed"
+            assert codes(run.result) == ["pipeline.scans-not-placed"]
+            assert run.result.reasons[0].values["step"] == "stitch"
+    results_folder.write(tmp_path / "out", found, ErrorReport())
+    written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]
+    assert written["deviation"]["status"] == written["defects"]["status"] == "failed"
 
 
 def test_what_is_no_structure_and_what_has_no_design():
@@ -313,7 +399,7 @@ def test_it_is_written_as_the_interface_says(tmp_path):
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [1, 2, 3])
 def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
-    scene, truth = make("roof", recipes.overridden(recipes.load("stadium-roof")[1], [f"seed={seed}"]))
+    scene, truth = make("roof", recipe_files.overridden(recipe_files.load("stadium-roof")[1], [f"seed={seed}"]))
     result = deviation_step.run(scene, deviation_step.Params())
     assert all(one.passed for one in deviation_evaluation.check(scene, result, truth))
     assert np.isfinite(result.core.lod95).mean() > 0.95

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen.designs import structure
-from designgen.scanning import footprints, scanner
+from designgen.designs import box_and_tube
+from designgen.scanning import edge_footprints, scanner, survey
 from designgen.scanning import returns as scanning_returns
 from designgen.scanning.ray_kernels import Beam
 from designgen.scanning.raycast import Grid
@@ -17,14 +17,14 @@ QUIET = scanner.Scanner(**{**scanner.preset("plain-2mm"), "noise_mm": 0.0})
 
 def mark_every_ray(monkeypatch):
     """Cut every ray of a strip into sub-rays."""
-    mark = footprints.mark
+    mark = edge_footprints.mark_edges
 
     def every(surface, t, thin, used, margin, *rest):
         edge, near = mark(surface, t, thin, used, margin, *rest)
         edge[margin.side : margin.side + used] = True
         return edge, near
 
-    monkeypatch.setattr(footprints, "mark", every)
+    monkeypatch.setattr(edge_footprints, "mark_edges", every)
 
 
 def test_nothing_thin_between_the_rays_is_overlooked(monkeypatch):
@@ -35,12 +35,12 @@ def test_nothing_thin_between_the_rays_is_overlooked(monkeypatch):
         at, axis = rng.uniform(-6000.0, 6000.0, 3), rng.normal(size=3)
         builder.cone(i, "rod", at, axis / np.linalg.norm(axis), (3.0, 3.0), 900.0)
         builder.sphere(i, "bead", rng.uniform(-6000.0, 6000.0, 3), 6.0, [])
-    surfaces = builder.done()
+    surfaces = builder.to_surfaces()
     device = dataclasses.replace(QUIET, divergence_mrad=0.8, beam_exit_mm=3.0)
     params = scanner.Params(step_mrad=4.0, specular=0.0)
-    found = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    found = scanning_returns.scan_station(surfaces, np.eye(4), device, params, 0, "S1").returns
     mark_every_ray(monkeypatch)
-    every = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    every = scanning_returns.scan_station(surfaces, np.eye(4), device, params, 0, "S1").returns
     assert (every.source == scanning_returns.MIXED).sum() > 300
     np.testing.assert_array_equal(found.points, every.points)
     np.testing.assert_array_equal(found.source, every.source)
@@ -54,7 +54,7 @@ def before_a_wall():
     builder.polygon(0, "half", half)
     builder.polygon(1, "wall", np.vstack([wall, [-3000.0, 7000.0, 900.0]]))
     device = dataclasses.replace(QUIET, divergence_mrad=4.0, beam_exit_mm=8.0)  # 12 mm at the half plane: 3 mrad
-    return builder.done(), device
+    return builder.to_surfaces(), device
 
 
 OUTERMOST = 0.7 * np.cos(np.radians(30.0))  # of the middle to an edge upright: the six stand at 30, 90 degrees, ...
@@ -64,7 +64,7 @@ OUTERMOST = 0.7 * np.cos(np.radians(30.0))  # of the middle to an edge upright: 
 def test_mixed_pixels_reach_as_far_from_an_edge_as_the_beam(step_mrad):
     surfaces, device = before_a_wall()
     params = scanner.Params(step_mrad=step_mrad, specular=0.0)
-    returns = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    returns = scanning_returns.scan_station(surfaces, np.eye(4), device, params, 0, "S1").returns
     columns = round(2.0 * np.pi / (1e-3 * step_mrad))
     lowest, step = np.radians(-60.0), 1e-3 * step_mrad
     turn = 2.0 * np.pi * returns.column / columns - 0.5 * np.pi  # of the edge at x = 0, to the left
@@ -91,7 +91,7 @@ def test_a_ray_within_an_edge_is_as_far_as_the_mean_of_its_sub_rays():
     surfaces, device = before_a_wall()
     device = dataclasses.replace(device, divergence_mrad=6.0, beam_exit_mm=20.0)  # 22 mm at the half plane
     params = scanner.Params(step_mrad=0.25, specular=0.0)
-    returns = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    returns = scanning_returns.scan_station(surfaces, np.eye(4), device, params, 0, "S1").returns
     columns, step = round(2.0 * np.pi / 2.5e-4), 2.5e-4
     azimuth, elevation = 2.0 * np.pi * returns.column / columns, np.radians(-60.0) + step * returns.row
     x = 4000.0 / np.tan(azimuth)
@@ -126,12 +126,12 @@ def large_faces():
         middle *= rng.uniform(2000.0, 9000.0) / np.linalg.norm(middle)
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         size = rng.uniform(150.0, 2500.0, 3)
-        for patch in structure.Box(middle, axes, size).patches():
+        for patch in box_and_tube.Box(middle, axes, size).patches():
             builder.patch(i, patch)
         builder.sphere(i, "ball", rng.uniform(-5000.0, 5000.0, 3), 120.0, [])
-    for patch in structure.Box(np.array([30.0, -20.0, 6000.0]), np.eye(3), np.full(3, 900.0)).patches():
+    for patch in box_and_tube.Box(np.array([30.0, -20.0, 6000.0]), np.eye(3), np.full(3, 900.0)).patches():
         builder.patch(40, patch)
-    return builder.done()
+    return builder.to_surfaces()
 
 
 WIDE = dataclasses.replace(QUIET, divergence_mrad=18.0, beam_exit_mm=5.0, threshold=0.0)
@@ -139,9 +139,9 @@ WIDE = dataclasses.replace(QUIET, divergence_mrad=18.0, beam_exit_mm=5.0, thresh
 
 def test_no_mixed_pixel_of_a_beam_three_times_the_step_is_overlooked(monkeypatch):
     surfaces, params = large_faces(), scanner.Params(step_mrad=6.0, specular=0.0, sub_rays=19)
-    found = scanning_returns.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
+    found = scanning_returns.scan_station(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
     mark_every_ray(monkeypatch)
-    every = scanning_returns.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
+    every = scanning_returns.scan_station(surfaces, np.eye(4), WIDE, params, 0, "S1").returns
     assert (every.source == scanning_returns.MIXED).sum() > 10_000
     assert (every.source == scanning_returns.SURFACE).sum() > 10_000
     np.testing.assert_array_equal(found.row, every.row)
@@ -154,11 +154,35 @@ def test_a_scan_does_not_depend_on_its_strips(monkeypatch):
     found = []
     for strip in (64, 16, 7):
         monkeypatch.setattr(scanning_returns, "STRIP", strip)
-        found.append(scanning_returns.scan(surfaces, np.eye(4), WIDE, params, 0, "S1").returns)
+        found.append(scanning_returns.scan_station(surfaces, np.eye(4), WIDE, params, 0, "S1").returns)
     assert (found[0].source == scanning_returns.MIXED).sum() > 10_000
     for other in found[1:]:
         for column in ("row", "column", "points", "source", "part", "range_error_mm"):
             np.testing.assert_array_equal(getattr(other, column), getattr(found[0], column))
+
+
+def test_mixed_pixels_do_not_depend_on_where_azimuth_begins():
+    """Balls all around, seen by a scanner turned by whole columns: other balls lie over the seam of the azimuth."""
+    builder = Builder()
+    for i, azimuth in enumerate(np.radians(np.arange(0.0, 360.0, 4.0))):
+        unit = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+        for z in (-800.0, 0.0, 900.0):
+            builder.sphere(i, "ball", (4000.0 + 700.0 * (i % 3)) * unit + [0.0, 0.0, z], 130.0, [])
+    surfaces, params = builder.to_surfaces(), scanner.Params(step_mrad=6.0, specular=0.0)
+    columns = round(2.0 * np.pi / 6e-3)
+    scans = []
+    for turned in (0, 5, 8, 10, 350):
+        T = survey.levelled_pose(np.zeros(3), 2.0 * np.pi * turned / columns)
+        returns = scanning_returns.scan_station(surfaces, T, WIDE, params, 0, "S1").returns
+        column = (returns.column + turned) % columns
+        order = np.lexsort((returns.row, column))
+        ranges = np.linalg.norm(returns.points, axis=1)
+        scans.append([values[order] for values in (column, returns.row, returns.source, ranges)])
+    assert (scans[0][2] == scanning_returns.MIXED).sum() > 5_000
+    for scan in scans[1:]:
+        for values, expected in zip(scan[:3], scans[0][:3], strict=True):
+            np.testing.assert_array_equal(values, expected)
+        np.testing.assert_allclose(scan[3], scans[0][3], atol=1e-6)
 
 
 @pytest.mark.slow
@@ -167,13 +191,13 @@ def test_a_beam_on_two_plates_gives_a_mixed_pixel_by_the_device():
     corners = np.array([[-3000.0, 0.0, -3000.0], [0.0, 0.0, -3000.0], [0.0, 0.0, 3000.0], [-3000.0, 0.0, 3000.0]])
     builder.polygon(0, "near", corners + np.array([0.0, 5000.0, 0.0]))
     builder.polygon(1, "far", np.abs(corners) * [1, 1, 0] + corners * [0, 0, 1] + np.array([0.0, 7000.0, 0.0]))
-    surfaces = builder.done()
+    surfaces = builder.to_surfaces()
     params = scanner.Params(step_mrad=0.4, specular=0.0, sub_rays=19)
     depth = {}
     for behaviour in ("phase", "pulse"):
         device = dataclasses.replace(QUIET, behaviour=behaviour, divergence_mrad=0.8, encoder_urad=100.0)
         device = dataclasses.replace(device, separation_mm=500.0)
-        returns = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+        returns = scanning_returns.scan_station(surfaces, np.eye(4), device, params, 0, "S1").returns
         edge = (
             (returns.source == scanning_returns.MIXED)
             & (np.abs(returns.points[:, 0]) < 10.0)
@@ -194,12 +218,18 @@ def marked(surface, t, reach, side=0, used=None, across=0.01, level=1.0):
     """Mark the rays of a grid of steps of 10 mrad whose footprints reach so far, rad; nothing is thin."""
     rows = surface.shape[1]
     beside = np.full(rows, side, np.int32)
-    margin = footprints.Margin(
-        side=side, cast=beside, marked=beside, whole=np.zeros(rows, bool), level=np.full(rows, level)
+    margin = edge_footprints.Margin(
+        side=side,
+        cast_columns=beside,
+        edge_columns=beside,
+        whole_rows=np.zeros(rows, bool),
+        cos_elevation=np.full(rows, level),
     )
     grid = Grid(step=0.01, lowest=0.0, rows=rows, columns=2.0 * np.pi / across)
     used = len(surface) - 2 * side if used is None else used
-    return footprints.mark(surface, t, np.full(t.shape, np.inf), used, margin, grid, Beam(0.0, reach), 1.0, 1.0)
+    return edge_footprints.mark_edges(
+        surface, t, np.full(t.shape, np.inf), used, margin, grid, Beam(0.0, reach), 1.0, 1.0
+    )
 
 
 def test_edges_are_where_a_neighbour_is_on_another_surface():
@@ -244,12 +274,12 @@ def test_nothing_is_nearer_than_the_nearest_range():
         ([200.0, 200.0, 10.0], np.hypot(100.0 * np.sqrt(2.0), 10.0)),
     ]
     for place, expected in cases:
-        assert footprints.nearest_mm(plate.done(), np.array(place)) == pytest.approx(expected)
+        assert edge_footprints.nearest_mm(plate.to_surfaces(), np.array(place)) == pytest.approx(expected)
     ball = Builder()
     ball.sphere(0, "ball", np.array([300.0, 400.0, 0.0]), 120.0, [])
-    assert footprints.nearest_mm(ball.done(), np.zeros(3)) == pytest.approx(380.0)
-    assert footprints.nearest_mm(ball.done(), np.array([300.0, 400.0, 50.0])) == 0.0
-    assert footprints.nearest_mm(Builder().done(), np.zeros(3)) == np.inf
+    assert edge_footprints.nearest_mm(ball.to_surfaces(), np.zeros(3)) == pytest.approx(380.0)
+    assert edge_footprints.nearest_mm(ball.to_surfaces(), np.array([300.0, 400.0, 50.0])) == 0.0
+    assert edge_footprints.nearest_mm(Builder().to_surfaces(), np.zeros(3)) == np.inf
 
 
 @pytest.mark.slow
@@ -258,8 +288,8 @@ def test_a_beam_many_times_the_step_is_cut_in_every_row(monkeypatch):
     surfaces = large_faces()
     device = dataclasses.replace(WIDE, divergence_mrad=600.0)
     params = scanner.Params(step_mrad=10.0, specular=0.0, sub_rays=19)
-    found = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    found = scanning_returns.scan_station(surfaces, np.eye(4), device, params, 0, "S1").returns
     mark_every_ray(monkeypatch)
-    every = scanning_returns.scan(surfaces, np.eye(4), device, params, 0, "S1").returns
+    every = scanning_returns.scan_station(surfaces, np.eye(4), device, params, 0, "S1").returns
     np.testing.assert_array_equal(found.points, every.points)
     assert (every.source == scanning_returns.MIXED).mean() > 0.5

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.export import folder as export_folder
 from designgen.scanning import picking
 from designgen.scenes.make import make
@@ -74,13 +74,15 @@ def test_picks_that_cannot_be_made_are_refused(params, said):
     "scan", [{"mode": "surface"}, {"mode": "rays", "step_mrad": 20.0, "stations": 3, "merged": True}]
 )
 def test_only_scans_of_one_station_each_have_picks(scan):
-    recipe = dict(recipes.load("truss-bridge-picks")[1], scan=scan)
+    recipe = dict(recipe_files.load("truss-bridge-picks")[1], scan=scan)
     with pytest.raises(UsageError, match="picks: points are picked in scans"):
         make("t", recipe, 1)
 
 
 def test_picks_go_through_the_folder_and_tie_the_scans(tmp_path):
-    scene, truth = make("t", recipes.overridden(recipes.load("truss-bridge-picks")[1], [*COARSE, "picks.points=6"]), 1)
+    scene, truth = make(
+        "t", recipe_files.overridden(recipe_files.load("truss-bridge-picks")[1], [*COARSE, "picks.points=6"]), 1
+    )
     store.write_scene(tmp_path / "t.h5", scene, truth, {})
     export_folder.export(tmp_path / "t.h5", tmp_path / "out", "ply", with_truth=False)
     read = folder.read_input(tmp_path / "out")

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.designs import arch_bridge, arch_mesh
 from designgen.scanning import sampler
 from designgen.scenes.make import make
@@ -391,7 +391,7 @@ def test_no_random_pose_is_wrong_and_called_ok():
 @pytest.mark.slow
 def test_a_rib_of_even_curvature_is_not_laid_half_a_turn_round():
     """The right attitude converges 1.8 m off along the arch here, with a larger misfit than the wrong one."""
-    recipe = recipes.overridden(recipes.load("arch-d3")[1], ["scan.sigma_mm=1.0", "scan.spacing_mm=5.0"])
+    recipe = recipe_files.overridden(recipe_files.load("arch-d3")[1], ["scan.sigma_mm=1.0", "scan.spacing_mm=5.0"])
     scene, truth = make("d3", recipe, 1)
     part = scene.arch.parts[2]
     scan = next(scan for scan in scene.scans if scan.component == part.name)

@@ -12,7 +12,7 @@ import pytest
 from click.testing import CliRunner
 
 from designgen import cli as designgen_cli
-from designgen import recipes
+from designgen import recipe_files
 from designgen.export import FORMATS, e57, formats
 from designgen.export import folder as export_folder
 from designgen.scenes.make import make as make_scene
@@ -268,7 +268,7 @@ def test_a_station_that_saw_nothing_is_left_out_and_said(format_, tmp_path):
 @pytest.mark.parametrize("spherical", [pytest.param(False, marks=pytest.mark.slow), True])
 def test_an_arch_bridge_comes_back_from_e57_with_its_components(spherical, tmp_path):
     settings = ["scan.step_mrad=15", "scan.stations=2", "scan.clutter=0"]
-    scene, truth = make_scene("bridge", recipes.overridden(recipes.load("arch-s1-rays")[1], settings))
+    scene, truth = make_scene("bridge", recipe_files.overridden(recipe_files.load("arch-s1-rays")[1], settings))
     scans = [dataclasses.replace(scan, sigma_mm=1.0 + i) for i, scan in enumerate(scene.scans)]
     scans[0] = dataclasses.replace(scans[0], station="foot1/S1")
     store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, scans=tuple(scans)), truth, {})

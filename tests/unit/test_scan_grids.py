@@ -7,7 +7,7 @@ import pye57
 import pytest
 from pye57 import libe57
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.export import e57, formats
 from designgen.export import folder as export_folder
 from designgen.scenes.make import make
@@ -274,8 +274,8 @@ def test_stitching_finds_the_same_ends_in_files_as_in_the_scene(room, tmp_path):
 @pytest.mark.slow
 def test_stitching_is_as_good_from_files_as_from_the_scene(tmp_path):
     """Of the truss each scan sees other sides of the bars: without the grid they lie decimetres off, or end for end."""
-    name, recipe = recipes.load("truss-bridge")
-    scene, truth = make(name, recipes.overridden(recipe, ["scan.step_mrad=8"]))
+    name, recipe = recipe_files.load("truss-bridge")
+    scene, truth = make(name, recipe_files.overridden(recipe, ["scan.step_mrad=8"]))
     store.write_scene(tmp_path / "s.h5", scene, truth, {})
 
     def worst_mm(path):

@@ -9,7 +9,7 @@ import scipy.stats
 import trimesh
 from scipy.optimize import brentq, minimize_scalar
 
-from designgen.designs import arch_bridge, arch_part, space_frame, structure
+from designgen.designs import arch_bridge, arch_part, box_and_tube, space_frame
 from designgen.designs.patch import Patch
 from designgen.scanning import clutter, frame_surfaces, ray_kernels, raycast, scanner, survey
 from designgen.scanning import returns as scanning_returns
@@ -35,11 +35,11 @@ def surfaces_of(frame, things=0):
     frame_surfaces.add_frame(builder, frame)
     low, high = frame.centres.min(axis=0), frame.centres.max(axis=0)
     clutter.add_below_roof(builder, low, high, things, np.random.default_rng(0))
-    return builder.done()
+    return builder.to_surfaces()
 
 
 def standing(*position):
-    return survey.levelled(np.array(position, np.float64), 0.4)
+    return survey.levelled_pose(np.array(position, np.float64), 0.4)
 
 
 def named(surfaces, returns, name):
@@ -58,7 +58,12 @@ def seen():
     T = standing(2500.0, 2800.0, 1600.0)
     surfaces = surfaces_of(frame)
     params = scanner.Params(step_mrad=1.0)
-    return frame, surfaces, T, scanning_returns.scan(surfaces, T, device, params, 3, "S1", keep_hits=True).returns
+    return (
+        frame,
+        surfaces,
+        T,
+        scanning_returns.scan_station(surfaces, T, device, params, 3, "S1", keep_hits=True).returns,
+    )
 
 
 def test_hits_lie_on_spheres_tubes_and_sleeves(seen):
@@ -133,9 +138,11 @@ def test_another_caster_sees_the_same():
         corners = centre + np.array([[-600.0, 300.0, -200.0], [600.0, 300.0, -200.0], [600.0, 350.0, 300.0]])
         builder.polygon(i, "plate", corners)
         meshes.append(trimesh.Trimesh(corners, [[0, 1, 2]]))
-    surfaces = builder.done()
+    surfaces = builder.to_surfaces()
     T = standing(0.0, 0.0, 0.0)
-    found = scanning_returns.scan(surfaces, T, QUIET, scanner.Params(step_mrad=2.0), 0, "S1", keep_hits=True).returns
+    found = scanning_returns.scan_station(
+        surfaces, T, QUIET, scanner.Params(step_mrad=2.0), 0, "S1", keep_hits=True
+    ).returns
     scene = open3d.t.geometry.RaycastingScene()
     owner = []
     for number, mesh in enumerate(meshes):
@@ -185,10 +192,12 @@ def test_hits_on_an_arch_part_lie_on_its_parabola():
     builder = Builder()
     for patch in arch_part.ray_patches(part):
         builder.patch(0, patch)
-    surfaces = builder.done()
+    surfaces = builder.to_surfaces()
     middle = part.key_points(0.5 * (part.s0 + part.s1)).mean(axis=0)
     T = standing(*(middle + np.array([-500.0, 6000.0, 2500.0])))
-    returns = scanning_returns.scan(surfaces, T, QUIET, scanner.Params(step_mrad=4.0), 0, "S1", keep_hits=True).returns
+    returns = scanning_returns.scan_station(
+        surfaces, T, QUIET, scanner.Params(step_mrad=4.0), 0, "S1", keep_hits=True
+    ).returns
     hits = in_scene(T, returns.hits)
     L, f = params.span_mm, params.rise_mm
     left = named(surfaces, returns, "outer-left")
@@ -249,7 +258,7 @@ def test_clean_ranges_have_the_specified_noise_at_every_incidence(name):
     device, params = without_systematics(name), scanner.Params(scanner=name, step_mrad=0.9)
     frame = frame_of_balls()
     surfaces, T = surfaces_of(frame, things=9), standing(2500.0, 2800.0, 1600.0)
-    returns = scanning_returns.scan(surfaces, T, device, params, 1, "S1", keep_hits=True).returns
+    returns = scanning_returns.scan_station(surfaces, T, device, params, 1, "S1", keep_hits=True).returns
     clean = returns.source == scanning_returns.SURFACE
     R = np.linalg.norm(returns.hits[clean], axis=1)
     error = np.linalg.norm(returns.points[clean], axis=1) - R  # not what the scanner says of it, but where points are
@@ -270,7 +279,7 @@ TUBE = (np.array([3000.0, -2500.0, 1500.0]), np.array([3400.0, 2500.0, 2200.0]),
 
 def tube_of_patches(start, end, radius):
     builder = Builder()
-    for patch in structure.Tube(start, end, radius).patches():
+    for patch in box_and_tube.Tube(start, end, radius).patches():
         builder.patch(0, patch)
     return builder
 
@@ -285,7 +294,9 @@ def test_noise_on_a_net_follows_the_surface_and_not_its_facets():
     device, params = without_systematics("phase"), scanner.Params(step_mrad=0.35)
     start, end, radius = TUBE
     T = standing(0.0, 0.0, 1600.0)
-    returns = scanning_returns.scan(tube_of_patches(*TUBE).done(), T, device, params, 1, "S1", keep_hits=True).returns
+    returns = scanning_returns.scan_station(
+        tube_of_patches(*TUBE).to_surfaces(), T, device, params, 1, "S1", keep_hits=True
+    ).returns
     clean = returns.source == scanning_returns.SURFACE
     hits = returns.hits[clean]
     R = np.linalg.norm(hits, axis=1)
@@ -308,7 +319,7 @@ def test_mixed_pixels_on_a_net_lie_where_they_do_on_the_exact_tube():
         corners = np.array([[2500.0, 300.0, 0.0], [2500.0, 300.0, 1790.0], [2500.0, -600.0, 1600.0]])
         builder.polygon(1, "sheet", corners)
         params = scanner.Params(step_mrad=0.5, specular=0.0)
-        found.append(scanning_returns.scan(builder.done(), np.eye(4), device, params, 0, "S1").returns)
+        found.append(scanning_returns.scan_station(builder.to_surfaces(), np.eye(4), device, params, 0, "S1").returns)
     theirs, ours = (
         {
             (r, c): np.linalg.norm(p)
@@ -345,7 +356,7 @@ def test_rays_meet_cones_where_bisection_does():
         ray /= np.linalg.norm(ray)
         builder = Builder()
         builder.cone(0, "c", start, axis, (float(radii[0]), float(radii[1])), float(length))
-        shapes = builder.done()
+        shapes = builder.to_surfaces()
         found = ray_kernels.hit(1, shapes.numbers[0], shapes.cuts, 0, 0, *ray)
 
         def off(t, start=start, axis=axis, radii=radii, length=length, ray=ray):
@@ -384,7 +395,7 @@ def test_large_and_slim_triangles_are_met_wherever_they_are():
         builder.polygon(i, "face", corners)
     device = dataclasses.replace(QUIET, min_range_mm=0.0, max_range_mm=1e6, divergence_mrad=0.0)
     params = scanner.Params(step_mrad=12.0, sub_rays=1)
-    returns = scanning_returns.scan(builder.done(), np.eye(4), device, params, 0, "S1").returns
+    returns = scanning_returns.scan_station(builder.to_surfaces(), np.eye(4), device, params, 0, "S1").returns
     grid = raycast.Grid(0.012, np.radians(-60.0), int(np.radians(150.0) / 0.012), round(2.0 * np.pi / 0.012))
     row, column = (x.ravel() for x in np.meshgrid(np.arange(grid.rows), np.arange(grid.columns), indexing="ij"))
     rays, nearest = grid.directions(row, column), np.full(len(row), np.inf)
@@ -419,9 +430,9 @@ def test_only_flat_faces_are_met_on_their_nets():
     cases = [(flat, two), (flat, many), (dented, two), (wavy, many), (flat, two)]
     for i, (at, knots) in enumerate(cases):
         builder.patch(i, Patch("face", at, knots, two))
-    for patch in structure.Tube(*TUBE).patches():
+    for patch in box_and_tube.Tube(*TUBE).patches():
         builder.patch(len(cases), patch)
-    surfaces = builder.done()
+    surfaces = builder.to_surfaces()
     on_net = [set(surfaces.patch[surfaces.part == i]) == {-1} for i in range(len(cases) + 1)]
     assert on_net == [True, True, False, False, True, False]
 
@@ -440,8 +451,8 @@ def test_grazing_rays_stay_near_their_net():
     knots = np.linspace(0.0, 1.0, 12)
     builder.patch(0, Patch("wavy", at, knots, knots))
     T = standing(0.0, 0.0, 6.0)
-    returns = scanning_returns.scan(
-        builder.done(), T, QUIET, scanner.Params(step_mrad=0.1), 0, "S1", keep_hits=True
+    returns = scanning_returns.scan_station(
+        builder.to_surfaces(), T, QUIET, scanner.Params(step_mrad=0.1), 0, "S1", keep_hits=True
     ).returns
     assert asked[0] < 1.0 + 4.0 / 11.0 + 1e-3
     x, y, z = in_scene(T, returns.hits).T
@@ -456,8 +467,8 @@ def test_what_is_too_near_hides_what_is_behind_it():
     builder.polygon(0, "plate", plate + np.array([0.0, 3000.0, 0.0]))
     builder.sphere(1, "head", np.array([0.0, 200.0, 0.0]), 50.0, [])
     device = dataclasses.replace(QUIET, divergence_mrad=1.0, min_range_mm=300.0)
-    points = scanning_returns.scan(
-        builder.done(), np.eye(4), device, scanner.Params(step_mrad=1.0), 0, "S1"
+    points = scanning_returns.scan_station(
+        builder.to_surfaces(), np.eye(4), device, scanner.Params(step_mrad=1.0), 0, "S1"
     ).returns.points
     away = np.degrees(np.arccos(points[:, 1] / np.linalg.norm(points, axis=1)))
     assert away.min() > np.degrees(np.arcsin(50.0 / 200.0)) - 0.1
@@ -487,7 +498,9 @@ def test_what_is_behind_is_not_seen_and_ranges_are_limited():
     builder.sphere(2, "too far", np.array([0.0, -90_000.0, 0.0]), 500.0, [])
     builder.sphere(3, "too near", np.array([0.0, -200.0, 0.0]), 50.0, [])
     device = dataclasses.replace(QUIET, max_range_mm=80_000.0)
-    returns = scanning_returns.scan(builder.done(), np.eye(4), device, scanner.Params(step_mrad=2.0), 0, "S1").returns
+    returns = scanning_returns.scan_station(
+        builder.to_surfaces(), np.eye(4), device, scanner.Params(step_mrad=2.0), 0, "S1"
+    ).returns
     assert set(returns.part) == {0}
 
 
@@ -495,13 +508,15 @@ def test_weak_signals_are_lost_and_some_returns_stray():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
     params = scanner.Params(step_mrad=1.5)
-    every = scanning_returns.scan(surfaces, T, QUIET, params, 1, "S1").returns
-    dim = scanning_returns.scan(surfaces, T, dataclasses.replace(QUIET, threshold=0.5), params, 1, "S1").returns
+    every = scanning_returns.scan_station(surfaces, T, QUIET, params, 1, "S1").returns
+    dim = scanning_returns.scan_station(surfaces, T, dataclasses.replace(QUIET, threshold=0.5), params, 1, "S1").returns
     # Speckle of eight looks multiplies the signal: the share that stays is a gamma law's.
     stays = scipy.stats.gamma.sf(0.5 / every.intensity, 8.0, scale=1.0 / 8.0)
     assert len(dim.points) == pytest.approx(stays.sum(), abs=5.0 * np.sqrt((stays * (1.0 - stays)).sum()))
     assert np.median(dim.incidence_cos) > np.median(every.incidence_cos) + 0.05  # steel shines away from the scanner
-    stray = scanning_returns.scan(surfaces, T, dataclasses.replace(QUIET, flying_share=0.02), params, 1, "S1").returns
+    stray = scanning_returns.scan_station(
+        surfaces, T, dataclasses.replace(QUIET, flying_share=0.02), params, 1, "S1"
+    ).returns
     outliers = stray.source == scanning_returns.OUTLIER
     assert outliers.mean() == pytest.approx(0.02, abs=0.002)
     assert (stray.part[outliers] == -1).all()
@@ -515,7 +530,7 @@ def test_a_station_is_wrong_by_what_its_truth_says():
     surfaces = surfaces_of(frame_of_balls())
     T = standing(2500.0, 2800.0, 1600.0)
     device = dataclasses.replace(QUIET, offset_mm=2.0, scale_ppm=50.0, tilt_urad=100.0)
-    found = scanning_returns.scan(
+    found = scanning_returns.scan_station(
         surfaces, T, device, scanner.Params(step_mrad=2.0, sub_rays=1), 7, "S1", keep_hits=True
     )
     hits, points = found.returns.hits, found.returns.points
@@ -580,8 +595,8 @@ def test_patches_of_steep_dents_are_met_exactly():
     builder = Builder()
     knots = np.linspace(0.0, 1.0, 60)
     builder.patch(0, Patch("dented", at, knots, knots))
-    returns = scanning_returns.scan(
-        builder.done(), np.eye(4), QUIET, scanner.Params(step_mrad=1.0), 0, "S1", keep_hits=True
+    returns = scanning_returns.scan_station(
+        builder.to_surfaces(), np.eye(4), QUIET, scanner.Params(step_mrad=1.0), 0, "S1", keep_hits=True
     ).returns
     x, y, z = returns.hits.T
     np.testing.assert_allclose(y, 4000.0 + 40.0 * np.exp(-(x * x + z * z) / 150.0**2), atol=1e-4)

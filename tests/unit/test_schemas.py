@@ -6,7 +6,7 @@ from pathlib import Path
 import jsonschema
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.export import folder as export_folder
 from designgen.scenes.make import make
 from processor.limits import standards
@@ -69,8 +69,8 @@ def test_the_stored_scan_folder_is_valid():
 
 @pytest.mark.parametrize("name", RECIPES)
 def test_exported_folders_are_valid(name, tmp_path):
-    _, recipe = recipes.load(name)
-    scene, truth = make(name, recipes.overridden(recipe, RECIPES[name]))
+    _, recipe = recipe_files.load(name)
+    scene, truth = make(name, recipe_files.overridden(recipe, RECIPES[name]))
     store.write_scene(tmp_path / "scene.h5", scene, truth, {})
     export_folder.export(tmp_path / "scene.h5", tmp_path / "folder", "ply", with_truth=False)
     assert problems_of_folder(tmp_path / "folder") == []

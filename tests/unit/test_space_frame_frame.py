@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline
 from processor.evaluation import space_frame
@@ -22,7 +22,7 @@ ROOF = ["frame.nodes_x=6", "frame.nodes_y=5", "scan.stations=[2,2]", "scan.clutt
 
 @pytest.fixture(scope="module")
 def roof():
-    return make("roof", recipes.overridden(recipes.load("frame-1040")[1], ROOF), 3)
+    return make("roof", recipe_files.overridden(recipe_files.load("frame-1040")[1], ROOF), 3)
 
 
 def errors(result, truth, rows=slice(None)):
@@ -136,7 +136,7 @@ SQUARE = [
 
 @pytest.fixture(scope="module")
 def square():
-    return make("square", recipes.overridden(recipes.load("frame-1040")[1], SQUARE), 3)
+    return make("square", recipe_files.overridden(recipe_files.load("frame-1040")[1], SQUARE), 3)
 
 
 def elsewhere(frame, without=(), extra=(), radius=50.0):

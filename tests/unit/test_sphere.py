@@ -14,7 +14,8 @@ from processor.geometry.sphere import (
     trials_needed,
     visible_fraction,
 )
-from processor.geometry.sphere_search import LEAST_POINTS, find_balls, local_noise
+from processor.geometry.sphere_search import LEAST_POINTS, find_balls
+from tests.support import street_clouds
 
 NOWHERE = np.zeros((4, 4))
 UTM = np.array([500_000_000.0, 4_300_000_000.0, 50_000.0])
@@ -268,13 +269,6 @@ def test_robust_fit_says_when_points_are_too_few():
 # --- the search ----------------------------------------------------------------------------------------------------
 
 
-def test_local_noise_of_a_curved_surface():
-    rng = np.random.default_rng(15)
-    directions = cap(rng, 3000, 1.0)
-    noise = local_noise(directions * (60.0 + rng.normal(0.0, 0.3, 3000))[:, None])
-    assert noise == pytest.approx(0.3, rel=0.2)
-
-
 def test_search_finds_every_ball_and_no_other():
     rng = np.random.default_rng(16)
     centres = np.array([[0.0, 0.0, 0.0], [400.0, 0.0, 50.0], [100.0, 500.0, -20.0]])
@@ -336,6 +330,27 @@ NO_BALLS = {
 def test_search_invents_no_ball(shape, seed):
     points = NO_BALLS[shape](np.random.default_rng(seed))
     assert find_balls(points, np.random.default_rng(seed), most=10) == []
+
+
+CENTRES = {"near": (2500.0, 600.0, -200.0), "far": (-1800.0, 2700.0, 100.0), "low": (400.0, -2600.0, -350.0)}
+
+
+@pytest.mark.parametrize("radius", [None, 300.0])
+@pytest.mark.parametrize("place", CENTRES)
+def test_a_ball_of_a_hundredth_of_a_street_is_found(place, radius):
+    centre = np.array(CENTRES[place])
+    points, on = street_clouds.street(np.random.default_rng(len(place)), centre, 300.0)
+    assert 200 <= on.sum() < 0.02 * len(points)
+    (one,) = find_balls(points, np.random.default_rng(0), most=10, radius_mm=radius)
+    assert np.linalg.norm(one.fit.sphere.centre - centre) < 10.0
+    assert one.fit.sphere.radius == pytest.approx(300.0, abs=10.0)
+    assert one.fit.inliers[on].mean() > 0.9
+
+
+def test_a_street_without_a_ball_has_none():
+    points, _ = street_clouds.street(np.random.default_rng(4), None, 300.0)
+    assert find_balls(points, np.random.default_rng(0), most=10) == []
+    assert find_balls(points, np.random.default_rng(0), most=10, radius_mm=300.0) == []
 
 
 # --- crops ---------------------------------------------------------------------------------------------------------

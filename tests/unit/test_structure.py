@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from designgen import recipes
+from designgen import recipe_files
 from designgen.asbuilt import defects
-from designgen.designs import plate_row, stadium_roof, structure, truss_bridge
+from designgen.designs import box_and_tube, plate_row, stadium_roof, truss_bridge
 from designgen.scenes.make import make
 
 
@@ -27,7 +27,7 @@ def signed_volume(patches, about):
 def test_boxes_look_outward_in_frames_of_either_hand():
     R, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
     for axes in (R, R * [[-1.0], [1.0], [1.0]]):
-        box = structure.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
+        box = box_and_tube.Box(np.array([100.0, -50.0, 7.0]), axes, np.array([3.0, 5.0, 7.0]))
         assert signed_volume(box.patches(), np.zeros(3)) == pytest.approx(105.0)
         knots = tuple(np.array([0.0, 0.3, 1.0]) for _ in range(3))
         assert signed_volume(box.patches(knots), np.zeros(3)) == pytest.approx(105.0)
@@ -66,7 +66,7 @@ def test_tubes_and_their_truth_look_away_from_the_axis():
         radial -= np.outer(radial @ unit, unit)
         assert (np.einsum("ij,ij->i", np.cross(b - a, c - a), radial) > 0.0).all()
     settings = ["structure.trusses=4", "scan.spacing_mm=500"]
-    _, truth = make("x", recipes.overridden(recipes.load("stadium-roof")[1], settings))
+    _, truth = make("x", recipe_files.overridden(recipe_files.load("stadium-roof")[1], settings))
     at = 0
     for tube in tubes:
         unit = (tube.end - tube.start) / np.linalg.norm(tube.end - tube.start)
@@ -85,7 +85,7 @@ def test_tubes_and_their_truth_look_away_from_the_axis():
 
 def test_no_point_of_the_truth_lies_inside_a_tube():
     """Nor is one left out elsewhere: of a chord between joints all points are there, 8 around each 250 mm at most."""
-    _, truth = make("x", recipes.overridden(recipes.load("stadium-roof")[1], ["scan.spacing_mm=1000"]))
+    _, truth = make("x", recipe_files.overridden(recipe_files.load("stadium-roof")[1], ["scan.spacing_mm=1000"]))
     points, moved = truth.structure.points, truth.structure.displacement
     components = stadium_roof.build(stadium_roof.Params())
     tubes = [body for one in components for body in one.bodies]
@@ -104,7 +104,7 @@ def test_no_point_of_the_truth_lies_inside_a_tube():
 
 def inside_by(body, points):
     """How far inside a body points lie, by its corners or its axis alone."""
-    if isinstance(body, structure.Tube):
+    if isinstance(body, box_and_tube.Tube):
         n = body.end - body.start
         t = (points - body.start) @ n / (n @ n)
         radius = np.linalg.norm(np.cross(points - body.start, n), axis=1) / np.linalg.norm(n)
@@ -119,10 +119,10 @@ def inside_by(body, points):
 
 @pytest.mark.parametrize("name", ["stadium-roof", pytest.param("truss-bridge", marks=pytest.mark.slow)])
 def test_no_point_of_a_sample_lies_inside_a_body(name):
-    table = {key: value for key, value in recipes.load(name)[1].items() if key not in ("scan", "asbuilt")}
+    table = {key: value for key, value in recipe_files.load(name)[1].items() if key not in ("scan", "asbuilt")}
     settings = ["scan.mode=surface", "scan.spacing_mm=60", "scan.sigma_mm=0"]
     settings += ["structure.trusses=6"] if name == "stadium-roof" else []
-    made, truth = make("x", recipes.overridden(table, settings))
+    made, truth = make("x", recipe_files.overridden(table, settings))
     points, part = made.scans[0].points, truth.labels[0].part
     module = stadium_roof if name == "stadium-roof" else truss_bridge
     components = module.build(module.Params(**({"trusses": 6} if name == "stadium-roof" else {})))

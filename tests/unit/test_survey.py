@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from designgen import recipes, sequences
-from designgen.designs import structure_types
+from designgen import recipe_files, sequences
+from designgen.designs import structure_registry
 from designgen.scanning import scanner, survey
 from designgen.scanning.surfaces import Builder
 from designgen.scenes import make, structure
@@ -29,11 +29,14 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
 
     def places(n):
         params = scanner.Params(stations=(n,))
-        found = [survey.below(low, high, params, 3), survey.around(AXES, low, HALF, params, 3, "p/")]
+        found = [
+            survey.stations_below_box(low, high, params, 3),
+            survey.stations_around_box(AXES, low, HALF, params, 3, "p/"),
+        ]
         for name in ("stadium-roof", "truss-bridge", "plates-defects"):
-            recipe = recipes.load(name)[1]
-            components = structure_types.design(recipe)
-            patches, _, _ = structure.BUILDERS[recipe["structure"]["type"]](components, recipe, 1)
+            recipe = recipe_files.load(name)[1]
+            components = structure_registry.design(recipe)
+            patches, _, _ = structure.built_faces(recipe["structure"]["type"], components, recipe, 1)
             found.append(structure._places(recipe["structure"]["type"], patches, params, 3))
         return found
 
@@ -44,14 +47,14 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
 
 def test_stations_stand_within_their_area():
     low, high = np.array([0.0, 0.0, 6000.0]), np.array([30_000.0, 20_000.0, 8000.0])
-    at = np.array([T[:2, 3] for T in survey.below(low, high, scanner.Params(stations=(12,)), 3).values()])
+    at = np.array([T[:2, 3] for T in survey.stations_below_box(low, high, scanner.Params(stations=(12,)), 3).values()])
     assert (at >= low[:2]).all()
     assert (at <= high[:2]).all()
     quarters = (at > high[:2] / 2.0) @ [1, 2]
     assert (np.bincount(quarters, minlength=4) >= 2).all()
     near = np.linalg.norm(at[:, None] - at, axis=2) + 1e9 * np.eye(12)
     assert near.min() > 2000.0  # 600 m2 for 12: 7 m apart were a grid's
-    grid = survey.below(low, high, scanner.Params(stations=(2, 3)), 3)
+    grid = survey.stations_below_box(low, high, scanner.Params(stations=(2, 3)), 3)
     cells = [(int(T[0, 3] // 15_000.0), int(T[1, 3] // (20_000.0 / 3.0))) for T in grid.values()]
     assert cells == [(i, j) for i in range(2) for j in range(3)]
 
@@ -87,11 +90,11 @@ def test_all_sides_are_seen_as_well_as_from_evenly_spread_places(count, half):
 
 def test_a_station_more_leaves_the_scans_of_the_others():
     settings = ["frame.nodes_x=3", "frame.nodes_y=3", "scan.mode=rays", "scan.step_mrad=8", "scan.clutter=3"]
-    table = {key: value for key, value in recipes.load("frame-small")[1].items() if key != "scan"}
+    table = {key: value for key, value in recipe_files.load("frame-small")[1].items() if key != "scan"}
     table["asbuilt"] = {"node_movement_mm": 3.0}
 
     def made(count):
-        return make.make("x", recipes.overridden(table, [*settings, f"scan.stations={count}"]))
+        return make.make("x", recipe_files.overridden(table, [*settings, f"scan.stations={count}"]))
 
     (few, few_truth), (more, more_truth) = made(3), made(4)
     assert [scan.name for scan in more.scans] == ["S1", "S2", "S3", "S4"]
@@ -118,16 +121,16 @@ def test_a_station_more_leaves_the_scans_of_the_others():
 def test_keys_that_a_kind_does_not_use_are_refused(name, setting, said):
     key = setting.partition("=")[0]
     with pytest.raises(UsageError) as refused:
-        make.make("x", recipes.overridden(recipes.load(name)[1], [setting]))
+        make.make("x", recipe_files.overridden(recipe_files.load(name)[1], [setting]))
     assert str(refused.value).startswith(f"{key}: ")
     assert said in str(refused.value)
     assert f" {key.removeprefix('scan.')}," not in str(refused.value).partition("there are")[2] + ","
 
 
 def test_a_stadium_is_scanned_from_within():
-    table = {key: value for key, value in recipes.load("stadium-roof")[1].items() if key != "scan"}
+    table = {key: value for key, value in recipe_files.load("stadium-roof")[1].items() if key != "scan"}
     with pytest.raises(UsageError, match=r"scan\.distance_mm: not used for kind stadium-roof"):
-        make.make("x", recipes.overridden(table, ["scan.mode=rays", "scan.distance_mm=4000.0"]))
+        make.make("x", recipe_files.overridden(table, ["scan.mode=rays", "scan.distance_mm=4000.0"]))
 
 
 def poles_of(monkeypatch, name, settings):
@@ -142,7 +145,7 @@ def poles_of(monkeypatch, name, settings):
         cone(builder, part, surface, start, axis, radii, length, *rest)
 
     monkeypatch.setattr(Builder, "cone", noting)
-    made, truth = make.make("x", recipes.overridden(recipes.load(name)[1], settings))
+    made, truth = make.make("x", recipe_files.overridden(recipe_files.load(name)[1], settings))
     return made, truth, poles
 
 

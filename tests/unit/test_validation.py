@@ -1,7 +1,9 @@
 """The matrix, its cells, the history, the certificate and what a CI server reads: by stubbed cells."""
 
+import dataclasses
 import json
 import math
+import runpy
 import sqlite3
 import subprocess
 import sys
@@ -15,7 +17,7 @@ import pytest
 
 from processor.language.messages import text
 from processor.model import InputError, UsageError
-from processor.validation import cells, certificate, history, matrix, night, software
+from processor.validation import cells, certificate, coverage, history, matrix, night, running, software
 from processor.validation.cells import Outcome
 from processor.validation.history import History
 from tests.support import validation_nights
@@ -83,6 +85,9 @@ def test_a_cell_is_known_by_all_that_is_asked_for(tmp_path):
         ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nseeds = [-1]', "whole numbers from 0"),
         ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nset."a.b" = []', "list of values is empty"),
         ('[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]\nparams.spheres.x = 1', "spheres.x: unknown parameter"),
+        ('[[cell]]\nrecipe = "a"\ngenerator = "b"\nsteps = ["spheres"]', "exclude each other"),
+        ('[[cell]]\ngenerator = "nothing"\nsteps = ["spheres"]', "no generator 'nothing'"),
+        ('coverage.least = "few"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "expected numbers"),
         ('aim.x = "up"\n[[cell]]\nrecipe = "frame-small"\nsteps = ["spheres"]', "low, high or a number"),
     ],
 )
@@ -103,6 +108,14 @@ def test_the_default_matrix_covers_every_step_that_is_there():
 
     covered = {step for entry in matrix.read(matrix.DEFAULT, False).entries for step in entry.case.steps}
     assert covered == set(pipeline.step_modules())
+
+
+def test_foreign_cells_name_settings_that_their_generators_have():
+    foreign = [e.case for e in matrix.read(matrix.DEFAULT, True).entries if e.case.origin is cells.Origin.FOREIGN]
+    assert {case.recipe for case in foreign} == {path.stem for path in (ROOT / "designgen/foreign").glob("[a-z]*.py")}
+    for case in foreign:
+        known = runpy.run_path(str(ROOT / "designgen/foreign" / f"{case.recipe}.py"))["SETTINGS"]
+        assert {setting.split("=")[0] for setting in case.settings} <= set(known), case.name
 
 
 def test_figures_are_told_apart_by_method():
@@ -242,24 +255,26 @@ def test_folders_and_files_that_are_something_else(tmp_path):
         History(tmp_path / "text")
     with closing(sqlite3.connect(tmp_path / "later")) as db:
         db.execute("PRAGMA user_version = 9")
-    with pytest.raises(InputError, match="version 2, found 9"):
+    with pytest.raises(InputError, match="version 3, found 9"):
         History(tmp_path / "later")
     with pytest.raises(UsageError, match="expected a date"):
         night.number_of("tomorrow")
 
 
-def test_a_history_of_version_1_keeps_its_lines(tmp_path):
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_history_of_an_earlier_version_keeps_its_nights(tmp_path, version):
     path, line = tmp_path / "history.sqlite", text("{night} {verdict}", night="2026-01-01", verdict=text("ok"))
     with closing(History(path)) as opened:
         opened.begin("2026-01-01", validation_nights.SOFTWARE, "made", "0", "")
         opened.end("2026-01-01", [], line, "now")
         assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", line)]
     with closing(sqlite3.connect(path)) as db:
-        for column in history.ADDED:
+        for column in (name for later, names in history.ADDED.items() if later > version for name in names):
             db.execute("ALTER TABLE {} DROP COLUMN {}".format(*column.split(".")))
-        db.execute("PRAGMA user_version = 1")
+        db.execute(f"PRAGMA user_version = {version}")
     with closing(History(path)) as opened:
-        assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", None)]
+        kept = line if version > 1 else None
+        assert [(one.line, one.message) for one in opened.nights()] == [("2026-01-01 ok", kept)]
 
 
 KILLED = """
@@ -364,6 +379,73 @@ def test_the_bias_of_equal_scenes_has_the_standard_error_of_their_mean(tmp_path)
     assert line["coverage"] is None
 
 
+def test_figures_of_own_and_foreign_scenes_are_never_pooled(tmp_path):
+    """Own intervals hold 95 % of 200 errors, foreign ones 60 %; those of another method and of few are not judged."""
+    shares = {"made": (96.0, 94.0), "apart": (90.0, 30.0)}
+
+    def of(cell):
+        share = shares[cell.case.recipe][cell.seed % 2]
+        return {
+            "radii, bias": 0.1 if cell.case.recipe == "made" else 0.9,
+            "radii, standard deviation": 0.2,
+            "radii, number": (100.0, None, ""),
+            "radii within their 95 % intervals": (share, None, "%"),
+            "centres, number": (12.0, None, ""),
+            "centres within their 95 % intervals": (0.0, None, "%"),
+            "ransac | radii, number": (100.0, None, ""),
+            "ransac | radii within their 95 % intervals": (8.0, None, "%"),
+        }
+
+    apart = validation_nights.case("apart", text="no TOML", origin=cells.Origin.FOREIGN)
+    asked = validation_nights.matrix(validation_nights.case(), apart, seeds=(1, 2), fresh=0)
+    report = run(tmp_path / "out", asked, of)
+    assert not report.passed
+    assert "intervals of 1 quantities do not hold, scenes of foreign generators" in str(report.line)
+    found = json.loads((tmp_path / "out" / "certificate.json").read_text("utf-8"))
+    lines = [(line["origin"], line["bias"]) for line in found["lines"] if line["method"] == "ray"]
+    assert lines == [("designgen", pytest.approx(0.1)), ("foreign generators", pytest.approx(0.9))]
+    judged = {(one["origin"], one["quantity"]): one for one in found["coverage"]}
+    assert len(judged) == 4  # not those of another method than the one that is used where none is named
+    own, other = judged["designgen", "radii"], judged["foreign generators", "radii"]
+    assert (own["share"], own["worst"], own["number"], own["holds"]) == (95.0, 94.0, 200, "as stated")
+    assert (other["share"], other["worst"], other["holds"]) == (60.0, 30.0, "too narrow")
+    assert judged["designgen", "centres"]["holds"] == "too few errors"
+    page = (tmp_path / "out" / "certificate.html").read_text("utf-8")
+    assert page.index("Scenes of designgen") < page.index("Scenes of foreign generators")
+    suites = {suite.get("name"): suite for suite in ET.parse(tmp_path / "out" / "junit.xml").getroot()}
+    assert suites[f"intervals.{NIGHT}"].get("failures") == "1"
+
+
+@pytest.mark.parametrize(
+    ("share", "scene", "holds"), [(97.9, 86.0, "as stated"), (98.5, 97.0, "too wide"), (93.0, 84.0, "too narrow")]
+)
+def test_the_written_limits_of_coverage(share, scene, holds):
+    limits, name = coverage.Limits(), ("spheres", "ray")
+    rows = [
+        history.Row(
+            "n",
+            "c",
+            "r",
+            fixed=True,
+            input_sha256="",
+            name=(*name, "x"),
+            quantity="q",
+            seed=seed,
+            value=value,
+            unit="",
+            statistic=statistic,
+        )
+        for seed, n, s in ((1, 50.0, scene), (2, 4950.0, (5000.0 * share - 50.0 * scene) / 4950.0))
+        for statistic, value in (("coverage", s), ("number", n))
+    ]
+    (found,) = coverage.pooled(rows, ["n"], {name}, limits)
+    assert (found.share, found.worst, found.holds) == (pytest.approx(share), scene, holds)
+    assert coverage.pooled(rows, ["other"], {name}, limits) == ()
+    bands = [dataclasses.replace(row, quantity="mean and largest errors") for row in rows]  # of 95 % or more
+    (found,) = coverage.pooled(bands, ["n"], {name}, limits)
+    assert found.holds == ("as stated" if holds == "too wide" else holds)
+
+
 def test_conditions_of_scans_without_rays():
     assert certificate.conditions(validation_nights.case())[1:] == ("1.0 mm", "? mm")
 
@@ -386,6 +468,27 @@ name = "impossible"
 steps = ["spheres"]
 seeds = [1]
 set."scan.mode" = "magic"
+"""
+FOREIGN = """
+fresh_seeds = 0
+[[cell]]
+generator = "mine.py"
+steps = ["stitch"]
+seeds = [7]
+set.size = 3
+"""
+GENERATOR = """
+import json, pathlib, sys
+folder, words = pathlib.Path(sys.argv[1]), sys.argv[2:]
+assert words == ["--seed", "7", "--set", "size=3"], words
+folder.mkdir()
+for name in ("a", "b"):
+    points = [f"{i % 7} {i // 7 % 7} {i // 49}" for i in range(343)]
+    (folder / f"{name}.xyz").write_text("\\n".join(points))
+eye = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]
+truth = {"format": "processor-truth", "stations": {"ids": ["a", "b"], "T_project_station": [eye, eye],
+         "zero_offset_mm": [0, 0], "scale_ppm": [0, 0], "tilt": [[0, 0], [0, 0]]}}
+(folder / "truth.json").write_text(json.dumps(truth))
 """
 RECIPE = """
 about = "two by two balls"
@@ -430,3 +533,17 @@ def test_a_real_cell_through_the_command_line(tmp_path):
     checked = json.loads((folder / "results.json").read_text("utf-8"))
     assert checked["parameters"][0]["tau_mm"] == 3.0
     assert not (tmp_path / "out" / ".making").exists()
+
+
+def test_a_generator_beside_the_matrix(tmp_path):
+    """A script that writes a scan folder and truth.json; its cell has the checks of that truth."""
+    (tmp_path / "mine.py").write_text(GENERATOR, "utf-8")
+    (tmp_path / "m.toml").write_text(FOREIGN, "utf-8")
+    (cell,) = matrix.read(tmp_path / "m.toml", False).cells(1)
+    assert (cell.case.origin, cell.case.recipe) == (cells.Origin.FOREIGN, "mine")
+    found = running.do(cell, scratch=str(tmp_path))
+    assert not found.failed
+    assert [figure.name for figure in cells.figures_of(found.results)][:1] == ["scans not placed"]
+    (tmp_path / "mine.py").write_text("import sys; sys.exit('no idea')", "utf-8")
+    (cell,) = matrix.read(tmp_path / "m.toml", False).cells(1)
+    assert running.do(cell, scratch=str(tmp_path)).failed == "mine: exit code 1: no idea"

@@ -11,7 +11,7 @@ from processor.deviation.result import Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.geometry.m3c2 import Z95
 from processor.language.messages import Message, text
-from processor.model import Floats, Ints, Scene, StepRun
+from processor.model import Floats, Ints, Scene, Status, StepRun
 from processor.pipeline import Execution
 from processor.report import surface_view
 from processor.report.deviation import csv, figures
@@ -47,7 +47,9 @@ def _summary(result: Result) -> tuple[Message, Message]:
         measured=result.core_points_measured,
         core=result.core_points,
     )
-    return head, body
+    if result.status is Status.OK:
+        return head, body
+    return head, text("{reason}. {rest}", reason=result.reasons[:1], rest=body)
 
 
 def _half(interval: Floats) -> float:

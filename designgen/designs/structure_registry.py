@@ -7,15 +7,11 @@ from types import ModuleType
 from typing import Any
 
 from designgen.designs import plate_row, stadium_roof, truss_bridge
-from designgen.designs.structure import Component
+from designgen.designs.box_and_tube import Component
 from designgen.reading import filled
 from processor.model import UsageError
 
-TYPES: dict[Any, ModuleType] = {
-    "stadium-roof": stadium_roof,
-    "truss-bridge": truss_bridge,
-    "plate-row": plate_row,
-}
+TYPES: dict[Any, ModuleType] = {"stadium-roof": stadium_roof, "truss-bridge": truss_bridge, "plate-row": plate_row}
 
 
 def params(recipe: Mapping[str, Any]) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 from designgen.reading import filled
 from designgen.scanning import sampler, scanner
@@ -14,8 +14,10 @@ from processor.model import UsageError
 
 @dataclass(frozen=True)
 class ByRays:
-    """A scan by rays of a device."""
+    """A scan by rays of a device; spacing and noise differ from point to point."""
 
+    spacing_mm: ClassVar[float] = float("nan")
+    sigma_mm: ClassVar[float] = float("nan")
     params: scanner.Params
     device: scanner.Scanner
 
@@ -23,7 +25,7 @@ class ByRays:
 Scanning = sampler.Params | ByRays
 
 # Keys of [scan] that only some kinds of scene use.
-OF_SOME_KINDS = {
+KEYS_BY_KIND = {
     "inner_depth_mm": ("arch-bridge",),
     "member_reach_mm": ("space-frame",),
     "distance_mm": ("arch-bridge", "structure"),
@@ -35,10 +37,10 @@ OF_SOME_KINDS = {
     "origin_mm": ("space-frame", "structure"),
 }
 # Keys that a type of structure does not use: a stadium is scanned from inside.
-NOT_OF_TYPES = {"stadium-roof": ("distance_mm",)}
+UNUSED_KEYS_BY_TYPE = {"stadium-roof": ("distance_mm",)}
 
 
-def read(recipe: Mapping[str, Any]) -> Scanning:
+def scan_settings_of(recipe: Mapping[str, Any]) -> Scanning:
     """Read the sections ``scan`` and ``scanner`` of a recipe. Raises UsageError that names the key at fault."""
     table = recipe.get("scan", {})
     mode = table.get("mode", sampler.MODE) if isinstance(table, Mapping) else sampler.MODE
@@ -62,10 +64,10 @@ def read(recipe: Mapping[str, Any]) -> Scanning:
 def _check_used(recipe: Mapping[str, Any], params: type) -> None:
     """Raise UsageError for a key of ``scan`` that the recipe's kind of scene does not use."""
     kind, section = recipe.get("kind"), recipe.get("structure")
-    unused = {key for key, kinds in OF_SOME_KINDS.items() if kind not in kinds}
-    if kind == "structure" and isinstance(section, Mapping) and section.get("type") in NOT_OF_TYPES:
+    unused = {key for key, kinds in KEYS_BY_KIND.items() if kind not in kinds}
+    if kind == "structure" and isinstance(section, Mapping) and section.get("type") in UNUSED_KEYS_BY_TYPE:
         kind = section["type"]
-        unused.update(NOT_OF_TYPES[kind])
+        unused.update(UNUSED_KEYS_BY_TYPE[kind])
     for key in recipe.get("scan", {}):
         if key in unused:
             there = ", ".join(f.name for f in dataclasses.fields(params) if f.name not in unused)

@@ -27,17 +27,17 @@ class Margin(NamedTuple):
     """The columns on either side of a strip that determine its edges: at most ``side``, fewer in most rows."""
 
     side: int
-    cast: Labels  # (rows,) columns to cast
-    marked: Labels  # (rows,) columns among these whose edges the strip's footprints may reach
-    whole: Bools  # (rows,) rows whose footprints may extend further
-    level: Floats  # (rows,) cosine of the elevation
+    cast_columns: Labels  # (rows,) columns to cast
+    edge_columns: Labels  # (rows,) columns among these whose edges the strip's footprints may reach
+    whole_rows: Bools  # (rows,) rows whose footprints may extend further
+    cos_elevation: Floats  # (rows,)
 
 
 def nearest_mm(surfaces: Surfaces, place: Floats) -> float:
     """Return a lower bound of the range from a place (3,) to any shape, mm; exact for triangles, infinite if none."""
-    away = np.linalg.norm(surfaces.piece_centre - place, axis=1) - surfaces.piece_radius
+    ranges = np.linalg.norm(surfaces.piece_centre - place, axis=1) - surfaces.piece_radius
     flat = surfaces.kind == TRIANGLE
-    nearest = away[~flat[surfaces.piece_shape]].min(initial=np.inf)
+    nearest = ranges[~flat[surfaces.piece_shape]].min(initial=np.inf)
     a, b, c = np.moveaxis(surfaces.numbers[flat, :9].reshape(-1, 3, 3) - place, 1, 0)
     for start, end in ((a, b), (b, c), (c, a)):
         along = end - start
@@ -55,14 +55,19 @@ def nearest_mm(surfaces: Surfaces, place: Floats) -> float:
 
 def margin(grid: Grid, reach: float) -> Margin:
     """Return the margin of a grid's strips if no footprint extends over an edge by more than ``reach``, rad."""
-    across, levels = 2.0 * np.pi / grid.columns, grid.levels()
-    columns = np.array([columns_over(reach, level, across) for level in levels], np.int32)
-    # Rows in which columns_over, without its limit, is more than MOST_CELLS.
-    whole = levels < reach * np.hypot(1.0, 1.0 / (MOST_CELLS * across))
+    across, cosines = 2.0 * np.pi / grid.columns, grid.cos_elevations()
+    columns = np.array([columns_over(reach, cosine, across) for cosine in cosines], np.int32)
     rows = cells(reach / grid.step)
-    marked = np.array([columns[max(0, i - rows) : i + rows + 1].max() for i in range(grid.rows)], np.int32)
-    beside = np.array([marked[max(0, i - 1) : i + 2].max() + 1 for i in range(grid.rows)], np.int32)
-    return Margin(side=int(beside.max()), cast=beside, marked=marked, whole=whole, level=levels)
+    edge_columns = np.array([columns[max(0, i - rows) : i + rows + 1].max() for i in range(grid.rows)], np.int32)
+    cast_columns = np.array([edge_columns[max(0, i - 1) : i + 2].max() + 1 for i in range(grid.rows)], np.int32)
+    return Margin(
+        side=int(cast_columns.max()),
+        cast_columns=cast_columns,
+        edge_columns=edge_columns,
+        # Rows in which columns_over, without its limit, is more than MOST_CELLS.
+        whole_rows=cosines < reach * np.hypot(1.0, 1.0 / (MOST_CELLS * across)),
+        cos_elevation=cosines,
+    )
 
 
 @njit(cache=True, nogil=True)
@@ -72,23 +77,23 @@ def cells(ratio):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def columns_over(reach, level, across):  # type: ignore[no-untyped-def]
-    """Return the columns, ``across`` rad apart, covered beyond an edge at an elevation of cosine ``level``."""
-    if level <= reach:
+def columns_over(reach, cosine, across):  # type: ignore[no-untyped-def]
+    """Return the columns, ``across`` rad apart, covered beyond an edge by ``reach``, rad, at an elevation's cosine."""
+    if cosine <= reach:
         return MOST_CELLS
-    return cells(reach / np.sqrt(level * level - reach * reach) / across)
+    return cells(reach / np.sqrt(cosine * cosine - reach * reach) / across)
 
 
 @njit(cache=True, nogil=True)
-def mark(surface, t, thin, used, margin, grid, beam, offset, least):  # type: ignore[no-untyped-def]
-    """Mark the rays (columns, rows) of a strip whose footprints may meet several surfaces; also the range they meet.
+def mark_edges(surface, t, thin, used, margin, grid, beam, offset, least):  # type: ignore[no-untyped-def]
+    """Mark the rays (columns, rows) of a strip whose footprints may meet several surfaces; also their least range, mm.
 
-    ``surface`` and ``t`` (columns, rows) are the number and range of the surface that each ray meets, -1 and infinite
-    for none; ``thin`` is the range at which a footprint may touch a shape too thin for the rays. The ``used`` columns
-    of the strip have ``margin.side`` columns on either side. Sub-rays lie within ``offset`` radii of the ``beam``;
-    nothing is nearer than ``least``. Outside of the strip the results are False and infinite.
+    ``surface`` and ``t`` (columns, rows) are the number and range (mm) of the surface that each ray meets, -1 and
+    infinite for none; ``thin`` is the range at which a footprint may touch a shape too thin for the rays. The ``used``
+    columns of the strip have ``margin.side`` columns on either side. Sub-rays lie within ``offset`` radii of the
+    ``beam``; nothing is nearer than ``least``, mm. Outside of the strip the results are False and infinite.
     """
-    side, marked, whole, level = margin.side, margin.marked, margin.whole, margin.level
+    side, edge_columns, whole_rows = margin.side, margin.edge_columns, margin.whole_rows
     across = 2.0 * np.pi / grid.columns
     columns, rows = surface.shape
     edge, near = np.zeros((columns, rows), np.bool_), np.full((columns, rows), np.inf)
@@ -102,7 +107,7 @@ def mark(surface, t, thin, used, margin, grid, beam, offset, least):  # type: ig
             high[i] = max(surface[before, i], surface[j, i], surface[after, i])
             close[i] = min(t[before, i], t[j, i], t[after, i], thin[before, i], thin[j, i], thin[after, i])
         for i in range(rows):
-            if beside > marked[i]:
+            if beside > edge_columns[i]:
                 continue
             below, above = max(0, i - 1), min(rows - 1, i + 1)
             nearest = min(close[below], close[i], close[above])
@@ -110,14 +115,14 @@ def mark(surface, t, thin, used, margin, grid, beam, offset, least):  # type: ig
             nearest = max(nearest, least)
             if beside == 0:
                 near[j, i] = min(near[j, i], nearest)
-                if whole[i] or np.isfinite(thin[j, i]):
+                if whole_rows[i] or np.isfinite(thin[j, i]):
                     edge[j, i] = True
             if not differs and i > 0:  # the surface below the lowest row is unknown
                 continue
             reach = offset * (beam.half_divergence + beam.exit_radius / nearest)
             over = cells(reach / grid.step)
             for b in range(max(0, i - over), min(rows, i + over + 1)):
-                sideways = columns_over(reach, level[b], across)
+                sideways = columns_over(reach, margin.cos_elevation[b], across)
                 for a in range(max(side, j - sideways), min(side + used, j + sideways + 1)):
                     edge[a, b] = True
                     near[a, b] = min(near[a, b], nearest)

@@ -20,6 +20,12 @@ else:
 Recipe = dict[str, Any]
 
 
+def packaged(file: str) -> dict[str, Any]:
+    """Return the content of a TOML file in the package."""
+    content: dict[str, Any] = tomllib.loads((resources.files("designgen") / file).read_text("utf-8"))
+    return content
+
+
 def named() -> dict[str, Recipe]:
     """Return all named recipes, by name."""
     folder = resources.files("designgen") / "recipes"
@@ -32,13 +38,13 @@ def load(name_or_path: str | PathLike[str]) -> tuple[str, Recipe]:
 
     Raises UsageError for an unknown name, InputError for a file that cannot be read.
     """
-    known = named()
+    recipes = named()
     name = str(name_or_path)
-    if name in known:
-        return name, known[name]
+    if name in recipes:
+        return name, recipes[name]
     path = Path(name)
     if path.suffix != ".toml":
-        raise UsageError(f"no recipe {name!r}; there are {', '.join(known)}, or give a .toml file")
+        raise UsageError(f"no recipe {name!r}; there are {', '.join(recipes)}, or give a .toml file")
     try:
         return path.stem, tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:

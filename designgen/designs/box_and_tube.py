@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -78,39 +79,46 @@ class Tube:
     end: Floats
     radius: float
 
+    @cached_property
+    def axis(self) -> Floats:
+        """Vector (3,) from start to end."""
+        return self.end - self.start
+
+    @cached_property
+    def length(self) -> float:
+        """Length of the axis, mm."""
+        return float(np.linalg.norm(self.axis))
+
+    @cached_property
+    def unit(self) -> Floats:
+        """Direction (3,) of the axis."""
+        return self.axis / self.length
+
     def patches(self, step_mm: float = 500.0, around: int = 48) -> list[Patch]:
         """Return the lateral surface, its net oriented outward; the ends lie inside of other tubes."""
-        axis = self.end - self.start
-        length = float(np.linalg.norm(axis))
-        unit = axis / length
-        side = perpendicular(unit)
-        other = np.cross(side, unit)
+        side = perpendicular(self.unit)
+        second_side = np.cross(side, self.unit)
 
         def at(p: Floats, q: Floats) -> Floats:
-            turn = 2.0 * np.pi * q
-            ring: Floats = np.outer(np.cos(turn), side) + np.outer(np.sin(turn), other)
-            return self.start + np.outer(p, axis) + self.radius * ring
+            angle = 2.0 * np.pi * q
+            ring: Floats = np.outer(np.cos(angle), side) + np.outer(np.sin(angle), second_side)
+            return self.start + np.outer(p, self.axis) + self.radius * ring
 
-        return [
-            Patch("tube", at, np.linspace(0.0, 1.0, int(np.ceil(length / step_mm)) + 1), np.linspace(0, 1, around + 1))
-        ]
+        along = np.linspace(0.0, 1.0, int(np.ceil(self.length / step_mm)) + 1)
+        return [Patch("tube", at, along, np.linspace(0, 1, around + 1))]
 
     def solid(self) -> cq.Solid:
         """Return the CadQuery solid."""
         import cadquery as cq
 
-        axis = self.end - self.start
-        length = float(np.linalg.norm(axis))
-        return cq.Solid.makeCylinder(self.radius, length, cq.Vector(*self.start), cq.Vector(*(axis / length)))
+        return cq.Solid.makeCylinder(self.radius, self.length, cq.Vector(*self.start), cq.Vector(*self.unit))
 
     def depth(self, points: Floats) -> Floats:
         """Return the depth (n,) of points (n, 3) below the surface, mm; negative outside."""
-        axis = self.end - self.start
-        length = float(np.linalg.norm(axis))
         arm = points - self.start
-        along = arm @ (axis / length)
-        away = np.linalg.norm(arm - np.outer(along, axis / length), axis=1)
-        result: Floats = np.minimum(self.radius - away, np.minimum(along, length - along))
+        along = arm @ self.unit
+        radial = np.linalg.norm(arm - np.outer(along, self.unit), axis=1)
+        result: Floats = np.minimum(self.radius - radial, np.minimum(along, self.length - along))
         return result
 
     def bounds(self) -> tuple[Floats, Floats]:

@@ -1,0 +1,106 @@
+"""Coverage of the 95 % intervals of a night's results, pooled over scenes of one origin.
+
+Every quantity with intervals is judged by the written limits: the share of all its errors that lie within their
+intervals, and the least share of a single scene. Scenes of designgen and those of foreign generators are never pooled.
+"""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass
+
+from processor.model import Statistic, Word
+from processor.validation.cells import Origin
+from processor.validation.history import Row
+
+AT_LEAST = ("mean and largest errors",)  # quantities whose intervals are stated to hold 95 % or more
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of coverage, %: ``low`` to ``high`` of all errors together, ``scene`` the least of one scene.
+
+    Shares of fewer than ``least`` errors are not judged: those of 50 have a standard error of 3 %.
+    """
+
+    low: float = 92.0
+    high: float = 98.0
+    scene: float = 85.0
+    least: int = 50
+
+
+class Holds(Word):
+    """Whether intervals hold what they state."""
+
+    YES = "as stated"
+    NARROW = "too narrow"
+    WIDE = "too wide"
+    FEW = "too few errors"
+
+
+@dataclass(frozen=True)
+class Coverage:
+    """Intervals of one quantity over the scenes of one origin: ``share`` of all errors, ``worst`` scene, in %."""
+
+    origin: Origin
+    step: str
+    method: str
+    quantity: str
+    scenes: int
+    number: int
+    share: float
+    worst: float
+    holds: Holds
+
+
+def pooled(
+    rows: Sequence[Row], nights: Collection[str], methods: Collection[tuple[str, str]], limits: Limits
+) -> tuple[Coverage, ...]:
+    """Pool the rows of ``nights``; a fixed seed counts once. ``methods``: steps with the method that is judged."""
+    shares: dict[tuple[str, str, str, str], dict[tuple[str, int], float]] = defaultdict(dict)
+    numbers: dict[tuple[str, str, str, str], dict[tuple[str, int], float]] = defaultdict(dict)
+    of = {Statistic.COVERAGE: shares, Statistic.NUMBER: numbers}
+    for row in rows:
+        if row.night in nights and row.name[:2] in methods and row.statistic in of:
+            key = (row.origin, row.name[0], row.name[1], row.quantity)
+            of[Statistic(row.statistic)][key][row.case, row.seed] = row.value
+    found = []
+    for key in sorted(shares):
+        scenes = [(share, numbers[key].get(scene, 0.0)) for scene, share in shares[key].items() if share == share]
+        number = sum(n for _, n in scenes)
+        if number:
+            found.append(_judged(key, scenes, int(number), limits))
+    return tuple(found)
+
+
+def _judged(
+    key: tuple[str, str, str, str], scenes: Sequence[tuple[float, float]], number: int, limits: Limits
+) -> Coverage:
+    share = sum(s * n for s, n in scenes) / number
+    worst = min(s for s, n in scenes if n)
+    least = min((s for s, n in scenes if n >= limits.least), default=100.0)
+    holds = Holds.YES
+    if number < limits.least:
+        holds = Holds.FEW
+    elif share < limits.low or least < limits.scene:
+        holds = Holds.NARROW
+    elif share > limits.high and key[3] not in AT_LEAST:
+        holds = Holds.WIDE
+    origin, step, method, quantity = key
+    return Coverage(
+        origin=Origin(origin),
+        step=step,
+        method=method,
+        quantity=quantity,
+        scenes=sum(bool(n) for _, n in scenes),
+        number=number,
+        share=share,
+        worst=worst,
+        holds=holds,
+    )
+
+
+def missed(found: Sequence[Coverage]) -> list[Coverage]:
+    """Return what is beyond the limits."""
+    return [one for one in found if one.holds in (Holds.NARROW, Holds.WIDE)]
