@@ -16,8 +16,6 @@ from scipy.special import stdtrit
 
 from processor.model import NORMAL_95, Floats, Ints
 
-LEAST_OF_BLOCK = 4  # points of a patch whose mean is used
-
 
 class ClusterCovariance(NamedTuple):
     """Covariance (k, k) of coefficients and degrees of freedom (k,) of their variances; NaN, 0 where undetermined."""
@@ -79,15 +77,22 @@ def widening(freedom: Floats | float) -> Floats:
 
 def patches(place: Floats, residual: Floats, size_mm: float) -> Patches:
     """Mean residuals over square patches (cubes) of ``size_mm`` of points at ``place`` (n, d)."""
-    index = np.floor(place / size_mm).astype(np.int64)
-    number = np.unique(index, axis=0, return_inverse=True)[1].reshape(-1)
+    number = cubes(place, size_mm)
     count = int(number.max(initial=-1)) + 1
     points = np.bincount(number, minlength=count).astype(np.float64)
     mean = np.bincount(number, residual, count) / points
     within = float(((residual - mean[number]) ** 2).sum()) / max(len(residual) - count, 1)
-    full = points >= LEAST_OF_BLOCK
     centre = _sums(place, number, count) / points[:, None]
-    return Patches(mean[full], points[full], centre[full], within)
+    return Patches(mean, points, centre, within)
+
+
+def cubes(place: Floats, size_mm: float) -> Ints:
+    """Return the number (n,), from 0, of the square or cube of ``size_mm`` with each point at ``place`` (n, d)."""
+    index = np.floor(place / size_mm).astype(np.int64)
+    index -= index.min(axis=0, initial=0)
+    key = np.ravel_multi_index(tuple(index.T), tuple(index.max(axis=0, initial=0) + 1))
+    number: Ints = np.unique(key, return_inverse=True)[1].reshape(-1).astype(np.int64)
+    return number
 
 
 def variance_by_scale(place: Floats, residual: Floats, sizes_mm: Sequence[float]) -> Floats:

@@ -5,8 +5,7 @@ cell of a face the stations' mean residuals scatter by more than point noise exp
 part, is the variance between stations (DerSimonian and Laird 1986). Many points of few stations then weigh no more than
 the number of stations justifies.
 
-Lack of fit: variance between the cell means of a fit's residuals, and the amplitude of the next (third-order) Legendre
-term.
+Lack of fit: variance between the cell means of a fit's residuals.
 """
 
 from __future__ import annotations
@@ -88,24 +87,3 @@ def lack_of_fit_variance(fits: Sequence[tuple[Floats, Ints]], coefficients: int)
         return 0.0
     noise = within / inside
     return max((between - freedom * noise) / points, 0.0)
-
-
-def third_order(basis: Floats, residual: Floats) -> Floats:
-    """Amplitudes of two third-order terms of a face, and their variances by noise: (2, 2), a row a term.
-
-    The terms are the third Legendre polynomial along the part, 1 at the joint, constant across the face and linear
-    across it: the simplest shapes beyond the fitted basis. ``basis`` (n, 8), see
-    :func:`processor.preassembly.ends.faces.basis`, and ``residual`` (n,) are of the points of the face's zone. In an
-    evenly sampled zone the terms are orthogonal to the basis: variance 7 sigma^2 / n.
-    """
-    t = 1.0 - 2.0 * np.abs(basis[:, 1])
-    terms = (0.5 * (5.0 * t**3 - 3.0 * t))[:, None] * np.stack([np.ones_like(t), basis[:, 2]], axis=1)
-    orthogonal = terms - basis @ np.linalg.lstsq(basis, terms, rcond=None)[0]
-    inverse = np.linalg.inv(orthogonal.T @ orthogonal)
-    noise = float(residual @ residual) / max(len(residual) - basis.shape[1], 1)
-    return np.stack([inverse @ (orthogonal.T @ residual), noise * np.diag(inverse)], axis=1)
-
-
-def excess_variance(amplitudes: Floats) -> float:
-    """Variance of amplitudes beyond noise; ``amplitudes`` (n, 2) are each with its variance by noise."""
-    return max(float(np.mean(amplitudes[:, 0] ** 2 - amplitudes[:, 1])), 0.0)

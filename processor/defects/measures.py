@@ -220,7 +220,7 @@ def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: fl
     inside = tree.query_ball_point(at[k], max(FIT_SHARE * radius, 1.9 * cell))
     if len(inside) < FEWEST_CELLS:
         inside = tree.query(at[k], k=FEWEST_CELLS)[1].tolist()
-    top, sd = _vertex((at[inside] - at[k]) / radius, value[inside], weight[inside], region.sign)
+    top, sd = _vertex((at[inside] - at[k]) / radius, value[inside], weight[inside], region.sign, cell / radius)
     sd *= inflation
     curvature = _curvature(at, value, weight, tree.query_ball_point(at[k], CURVE_SHARE * radius), at[k])
     if not abs(top - mean) < max(0.3 * abs(mean), 4.0 * sd) or sd > abs(mean):
@@ -228,10 +228,11 @@ def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: fl
     return Depth(depth=-top, sd=sd, curvature=curvature, mean_sd=mean_sd)
 
 
-def _vertex(at: Floats, value: Floats, weight: Floats, sign: int) -> tuple[float, float]:
+def _vertex(at: Floats, value: Floats, weight: Floats, sign: int, side: float) -> tuple[float, float]:
     """Return the value at the vertex of a paraboloid fitted to places (n, 2), and its sd from noise; NaN without one.
 
-    With enough places a term of the fourth order is added.
+    With enough places a term of the fourth order is added. Values are means of cells of a ``side``, which exceed those
+    at their middles by side^2 / 24 times the sum of the second derivatives.
     """
     x, y = at.T
     columns = np.stack([np.ones(len(x)), x, y, x * x, x * y, y * y], axis=1)
@@ -245,7 +246,7 @@ def _vertex(at: Floats, value: Floats, weight: Floats, sign: int) -> tuple[float
     step = -np.linalg.solve(H, c[1:3])
     step *= min(1.0, 0.5 * FIT_SHARE / max(float(np.linalg.norm(step)), 1e-12))
     row = np.array([1.0, *step, step[0] ** 2, step[0] * step[1], step[1] ** 2, (step @ step) ** 2])[: len(c)]
-    return float(row @ c), float(np.sqrt(row @ inverse @ row))
+    return float(row @ c - side**2 / 24.0 * np.trace(H)), float(np.sqrt(row @ inverse @ row))
 
 
 def _curvature(at: Floats, value: Floats, weight: Floats, inside: list[int], middle: Floats) -> float:

@@ -36,11 +36,13 @@ HALF = 0.5  # of the steel: the least that a stable fit is to rest on
 class Measured:
     """Core points with their movements, at a diameter and a spacing of core points and a depth to either side, mm.
 
-    ``on_surface`` is the share of the scan's points that are within the depth.
+    ``shared`` (k,) is the standard deviation of what the points of one station have in common. ``on_surface`` is the
+    share of the scan's points that are within the depth.
     """
 
     core: Samples
     moved: Movement
+    shared: Floats
     diameter: float
     spacing: float
     depth: float
@@ -59,6 +61,8 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
         placed = replace(placed, T=_fitted_pose(scan, curved, placed, params))
     measured = _measured(scan, curved, placed.T, params)
     rigid_fits = _fits(measured, params)
+    if placed.registration is not Registration.AS_GIVEN and rigid_fits.determined:
+        measured, rigid_fits, placed = _corrected(measured, rigid_fits, placed, params)
     distance, error, source = distances(measured, rigid_fits, placed, params)
     result = _result(scan, placed, measured, distance, rigid_fits, origin, params, (error, source))
     return _doubted(result, placement)
@@ -90,6 +94,7 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
         rigid.apply(T, points),
         None if scanner is None else rigid.apply(T, scanner),
         np.arange(len(points)) >= len(scan.points),
+        scan.source[: len(scan.points) : step] if most else scan.source,
     )
     surface = curved.surface
     spacing = scan.spacing_mm * np.sqrt(step)
@@ -98,9 +103,9 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
     core_spacing = params.core_spacing_mm or max(CORE_SHARE * diameter, float(np.sqrt(area / MOST_CORE)))
     core = mesh_distance.sampled(surface.vertices, surface.faces, core_spacing)
     depth = params.max_depth_mm or _depth(cloud.points, surface)
-    moved, share = surface_movement.movement(cloud, core, curved, diameter, depth)
+    moved, share, shared = surface_movement.movement(cloud, core, curved, diameter, depth)
     return Measured(
-        core=core, moved=moved, diameter=diameter, spacing=core_spacing, depth=depth, on_surface=share
+        core=core, moved=moved, shared=shared, diameter=diameter, spacing=core_spacing, depth=depth, on_surface=share,
     )  # fmt: skip
 
 
@@ -119,6 +124,19 @@ def _fitted_pose(scan: ScanCloud, curved: CurvedFacets, placed: Placed, params: 
     return T
 
 
+def _corrected(measured: Measured, fits: Fits, placed: Placed, params: Params) -> tuple[Measured, Fits, Placed]:
+    """Move a scan by what is left of the fit that is wanted, which was found with fewer points."""
+    motion = fits.of(params.fit).motion
+    core, back = measured.core, rigid.invert(motion)
+    left = np.einsum("ni,ni->n", rigid.apply(motion, core.points) - core.points, core.normals)
+    best, stable = (replace(fit, motion=back @ fit.motion) for fit in (fits.best, fits.stable))
+    return (
+        replace(measured, moved=replace(measured.moved, along=measured.moved.along - left)),
+        replace(fits, best=best, stable=stable),
+        replace(placed, T=back @ placed.T),
+    )
+
+
 def distances(measured: Measured, fits: Fits, placed: Placed, params: Params) -> tuple[Distances, float, ErrorSource]:
     """Distances at core points with LOD95, the registration error in it (one sd, mm), and its source."""
     moved = measured.moved
@@ -134,9 +152,15 @@ def distances(measured: Measured, fits: Fits, placed: Placed, params: Params) ->
         source = ErrorSource.COVARIANCE
     else:
         error, source = 0.0, ErrorSource.UNKNOWN
-    lod95 = m3c2.Z95 * (moved.sd / np.sqrt(np.maximum(moved.count, 1)) + error)
+    number = np.maximum(moved.count, 1)
+    lod95 = m3c2.Z95 * (np.sqrt(measured.shared**2 + moved.sd**2 / number) + error)
     found = Distances(
-        distance=moved.along, lod95=lod95, n1=moved.count, n2=moved.count, std1=np.zeros(len(lod95)), std2=moved.sd
+        distance=moved.along,
+        lod95=lod95,
+        n1=moved.count,
+        n2=moved.count,
+        std1=measured.shared * np.sqrt(number),
+        std2=moved.sd,
     )
     return found, error, source
 

@@ -40,7 +40,7 @@ class CorePoints(Rows):
     """Core points of the design's surface, design frame less the result's origin, and M3C2 at each; NaN = no value.
 
     A distance outward is positive. By method ``default``, ``n1`` is the number of the surface's places that points
-    were compared with, and ``std1`` is 0.
+    were compared with, and ``std1`` / sqrt(``n1``) the standard deviation of what stations have in common.
     """
 
     points: Floats = column("k", 3, unit="mm")

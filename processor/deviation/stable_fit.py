@@ -119,7 +119,7 @@ def fits(core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, 
         inside = np.bincount(parent, minlength=int(larger.block.max()) + 1)[larger.block]
         sd = np.sqrt(larger.variance + wavy / inside)
         levels.append(_Level(larger, parent, _scaled(larger, stable, sd, np.full(len(sd), np.median(limit)))))
-    stable = _reweighted(levels, stable)
+    stable, small = _reweighted(levels, stable), _reweighted(levels[:1], stable)
     share = float(blocks.area[_worst(blocks, stable[None], limit)[0] <= 1.0].sum() / blocks.area.sum())
     worst, sd = _largest(levels, stable), levels[0].sd
     weight = _tukey(worst)
@@ -127,7 +127,8 @@ def fits(core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, 
     slope = np.where(z < worst, weight, _tukey_slope(z))
     return Fits(
         best=_fit(blocks, best, 1.0 / variance, 1.0 / variance, 1.0, places),
-        stable=_fit(blocks, stable, weight / sd**2, slope / sd**2, share, places),
+        # What the larger blocks changed shows what is left of movements too small for any block.
+        stable=_fit(blocks, stable, weight / sd**2, slope / sd**2, share, places, stable - small),
         limit_mm=float(np.median(limit)),
     )
 
@@ -274,15 +275,25 @@ def _tukey_slope(z: Floats) -> Floats:
 
 
 def _fit(
-    blocks: _Blocks, motion: Floats, weight: Floats, slope: Floats, share: float, places: tuple[Floats, Floats]
+    blocks: _Blocks,
+    motion: Floats,
+    weight: Floats,
+    slope: Floats,
+    share: float,
+    places: tuple[Floats, Floats],
+    bias: Floats | float = 0.0,
 ) -> RigidFit:
-    """Return a motion (6,) in the core points' frame with its covariance: the largest of sandwiches over clusters."""
+    """Return a motion (6,) in the core points' frame with its covariance: the largest of sandwiches over clusters.
+
+    The square of a ``bias`` (6,) is added to the covariance.
+    """
     H = blocks.design
     normal = H.T @ (slope[:, None] * H)
     bread = np.linalg.pinv(normal, rcond=1.0 / MOST_CONDITION, hermitian=True)
     gradient = H * (weight * (blocks.value - H @ motion))[:, None]
     used = weight > 0.0
     scaling = np.diag(np.repeat([1.0 / blocks.arm, 1.0], 3))
+    square = np.outer(bias + np.zeros(6), bias + np.zeros(6))
     covariance, error, side = np.full((6, 6), np.nan), -1.0, 1.0
     while True:
         cell = np.unique(_cells(blocks.centre[blocks.block[used]] / blocks.side, side), axis=0, return_inverse=True)[1]
@@ -291,7 +302,8 @@ def _fit(
         if number < FEWEST_CLUSTERS:
             break
         sums = np.stack([np.bincount(cell, gradient[used, k], number) for k in range(6)], axis=1)
-        at_middle = scaling @ (bread @ (sums.T @ sums * (number / (number - 6.0))) @ bread) @ scaling
+        sandwich = bread @ (sums.T @ sums * (number / (number - 6.0))) @ bread
+        at_middle = scaling @ (sandwich + square) @ scaling
         at_origin = rigid.about_origin(at_middle, blocks.middle)
         along = _error_along(at_origin, *places)
         if along > error:

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import assignment, enclosure, local_translation
+from processor.deviation import assignment, enclosure, local_translation, station_offsets
 from processor.deviation.assignment import OnSurface
 from processor.deviation.local_translation import Movement
 from processor.geometry import m3c2, mesh_distance
@@ -27,20 +27,25 @@ RETURNS = 3.0  # standard deviations from the surface within which a point remov
 
 @dataclass(frozen=True)
 class Cloud:
-    """Points (n, 3) of a scan, the positions (n, 3) they were seen from, if known, and which (n,) may be outliers."""
+    """Points (n, 3) of a scan, the positions (n, 3) they were seen from, if known, and which (n,) may be outliers.
+
+    ``station`` (n,) is the number of the scan or station that a point is from.
+    """
 
     points: Floats
     scanner: Floats | None
     doubtful: npt.NDArray[np.bool_]
+    station: Ints
 
     def of(self, rows: Ints) -> Cloud:
         """Return the points of some rows alone."""
-        return Cloud(self.points[rows], None if self.scanner is None else self.scanner[rows], self.doubtful[rows])
+        scanner = None if self.scanner is None else self.scanner[rows]
+        return Cloud(self.points[rows], scanner, self.doubtful[rows], self.station[rows])
 
 
 def movement(
     cloud: Cloud, core: Samples, curved: CurvedFacets, diameter_mm: float, depth_mm: float
-) -> tuple[Movement, float]:
+) -> tuple[Movement, float, Floats]:
     """Fit movements at core points to a scan in the design's frame.
 
     Three fits: the first gives the scatter of the points, the second movements from points whose face is decided for
@@ -48,8 +53,9 @@ def movement(
     moved sideways does not appear smaller, and the side of a beam that moved is not taken for its top.
 
     Outlier removal takes more points from the outside of a surface than from its inside, where other points are near.
-    The last fit therefore uses those again that lie on the surface. Also returns the share of points on the surface.
-    Core points within another body of the design have no movement.
+    The last fit therefore uses those again that lie on the surface. Core points within another body of the design have
+    no movement. Also returns the share of points on the surface, and the standard deviation (k,) of what stations have
+    in common at each core point.
     """
     surface = curved.surface
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
@@ -64,7 +70,7 @@ def movement(
     first = _fitted(core, surface, seen.of(sure), seen.distance[sure], diameter_mm)
     known = np.flatnonzero(np.isfinite(first.along))
     if not len(known):
-        return first, on_surface
+        return first, on_surface, np.zeros(len(core.points))
     nearest = known[cKDTree(core.points[known]).query(seen.feet, workers=-1)[1]]
     noise = float(np.quantile(first.sd[known], NOISE_SHARE))
     raw = np.maximum(np.hypot(first.along, first.sd), noise)[nearest]
@@ -81,7 +87,12 @@ def movement(
     rows = np.flatnonzero(used)
     # The movement found, and what is left of it, along the facet's normal.
     distance = before.distance[rows] + np.einsum("ni,ni->n", surface.normals[before.facet[rows]], shift[rows])
-    return _fitted(core, surface, before.of(rows), distance, diameter_mm), on_surface
+    last = _fitted(core, surface, before.of(rows), distance, diameter_mm)
+    facing = surface.normals[before.facet[rows]]
+    shared = station_offsets.shared_sd(
+        core, last, before.feet[rows], facing, distance, cloud.station[rows], diameter_mm
+    )  # fmt: skip
+    return last, on_surface, shared
 
 
 def _fitted(

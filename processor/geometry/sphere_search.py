@@ -36,7 +36,7 @@ STEP = 1.5  # between scales
 FINEST = 20  # neighbours of a point within the smallest scale
 CELLS = 8.0  # of a thinned cloud, in a patch's radius
 LEAST_CELLS = 24  # of a patch
-MOST_PATCHES = 50_000  # of one scale
+MOST_PATCHES = 100_000  # of one scale
 APART = 0.7  # of patches, in their radii
 SETS = 48  # of four points, of each patch
 BAND = 0.1  # half-width of a proposal's surface, in radii
@@ -46,7 +46,7 @@ REFINED = 40  # best proposals of each scale, which are tried
 REFINEMENTS = 3
 STANDS_OUT = 3.5  # times as dense at the surface as beside it; a tube reaches 2.4
 ROUGHEST = 0.05  # noise over radius, above which a ball is not distinguishable from a cluster of points
-FACING = 0.975  # median cosine between the cloud's own normals and the ball's
+FACING = 0.985  # median cosine between the cloud's own normals and the ball's
 ROUGHLY_FACING = 0.9  # the same of a proposal
 MISFIT = 0.5  # of the scale: cell means of residuals on a ball are noise alone
 ROUND = 0.02  # of the radius: nothing but a ball departs from a sphere by less
@@ -55,6 +55,7 @@ AROUND = 1.4  # radii of a ball: its surroundings
 LIKELY_MM = 1500.0  # larger balls are searched for only where there is none below
 SMALL = 0.005  # residuals in radii: a ball even if they are its own shape
 WHITE = 0.5  # sd of residuals by the differences of neighbours, over that of all
+EXPLAINED = 0.3  # share of the residuals' squares that an ellipsoid may explain
 LEAST_VISIBLE = 0.08  # share of the sphere
 LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
 LARGEST_HALF_SD = 0.15  # the same by half of the points
@@ -391,7 +392,10 @@ def _stands_out(points: Floats, fit: RobustFit, least_points: int) -> bool:
     rows = thinned(points, ball.radius / EVIDENCE_CELLS)
     if _facing(points[rows], fit.inliers[rows], ball) < FACING:
         return False
-    return _denser(points[rows], ball, STANDS_OUT, fit.scale) and _white(points[fit.inliers], off[fit.inliers], ball)
+    if not _denser(points[rows], ball, STANDS_OUT, fit.scale):
+        return False
+    on = points[fit.inliers]
+    return _is_noise(on, off[fit.inliers], ball)
 
 
 def _denser(points: Floats, ball: Sphere, times: float, scale: float | None = None) -> bool:
@@ -425,13 +429,21 @@ def _redundant(points: Floats, fit: RobustFit) -> bool:
     return True
 
 
-def _white(points: Floats, residual: Floats, ball: Sphere) -> bool:
-    """Whether residuals (n,) are noise: those of neighbours differ (von Neumann 1941), or they are small."""
+def _is_noise(points: Floats, residual: Floats, ball: Sphere) -> bool:
+    """Whether residuals (n,) of points (n, 3) are noise and not the shape of another body, or are small.
+
+    Those of neighbours differ (von Neumann 1941), and an ellipsoid explains little of them.
+    """
     sd = float(np.sqrt(np.mean(residual**2)))
     if sd <= SMALL * ball.radius:
         return True
     nearest = cKDTree(points).query(points, k=2)[1][:, 1]
-    return float(np.sqrt(np.mean((residual - residual[nearest]) ** 2) / 2.0)) >= WHITE * sd
+    if np.sqrt(np.mean((residual - residual[nearest]) ** 2) / 2.0) < WHITE * sd:
+        return False
+    x, y, z = ((points - ball.centre) / ball.radius).T
+    A = np.column_stack([np.ones_like(x), x, y, z, x * x, y * y, x * y, y * z, z * x])
+    left = residual - A @ np.linalg.lstsq(A, residual, rcond=None)[0]
+    return bool(np.sum(left**2) >= (1.0 - EXPLAINED) * np.sum(residual**2))
 
 
 def _facing(points: Floats, on: npt.NDArray[np.bool_], ball: Sphere) -> float:

@@ -171,7 +171,7 @@ def blind(source: Source, params: members.Params) -> Start | None:
         return None
     rows = np.full(len(graph.nodes), -1, np.int64)
     start = _measured(source, graph.nodes, graph.pairs, rows, params)
-    start = replace(start, balls=joint_kind.balls(source, start.measured, params.threads))
+    start = replace(start, balls=joint_kind.balls(source, start.measured, start.positions, params.threads))
     others = int((~start.balls & members.meeting(start.measured, params.largest_scatter_mm)).sum())
     return replace(start, reasons=(reason("spheres.other-joints", joints=others),)) if others else start
 

@@ -114,3 +114,29 @@ def test_what_is_within_another_body_or_in_contact_with_it_is_enclosed():
     opened = surface.faces[1:]  # a beam without one facet is no body
     assert not enclosure.closed_bodies(opened)[:11].any()
     assert enclosure.closed_bodies(opened)[11:].all()
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.3])
+def test_stations_that_differ_widen_the_level_of_detection(offset):
+    """Five stations see both of a box's large faces from one side; the truth is that of a box as designed."""
+    rng = np.random.default_rng(8)
+    mesh = trimesh.creation.box((600.0, 600.0, 300.0))
+    points, facet = trimesh.sample.sample_surface(mesh, 40_000, seed=8)
+    normals = mesh.face_normals[facet]
+    stations, scans = rng.integers(0, 5, len(points)), []
+    for k in range(5):
+        some = stations == k
+        off = rng.normal(0.0, SIGMA, some.sum()) + rng.normal(0.0, offset, 6) @ np.vstack(
+            [np.isclose(normals[some] @ axis, 1.0) for axis in (*np.eye(3), *-np.eye(3))]
+        )
+        scans.append(Scan(f"s{k}", np.asarray(points)[some] + off[:, None] * normals[some]))
+    design = StructureDesign("box", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    scene = Scene("box", "structure", tuple(scans), structure=design, units="mm")
+    core = deviation_step.run(scene, deviation_step.Params(registration_error_mm=0.0)).core
+    known = np.isfinite(core.lod95)
+    shared = core.std1[known] / np.sqrt(core.n1[known])
+    if offset == 0.0:
+        assert (shared == 0.0).all()
+    else:
+        assert 0.06 < np.median(shared) < 0.4  # 0.3 / sqrt(5), widened for five stations
+        assert core.distances.significant[known].mean() < 0.1

@@ -140,3 +140,11 @@ def test_voxel_means_by_hand():
     points = np.array([[0.0, 0, 0], [1.0, 0, 0], [10.0, 0, 0], [11.0, 2.0, 0], [30.0, 0, 0]])
     means = neighbors.voxel_means(points, 5.0, least=2)
     np.testing.assert_allclose(means, [[0.5, 0, 0], [10.5, 1.0, 0]])
+
+
+def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
+    rng = np.random.default_rng(0)
+    points = rng.uniform(0.0, 300.0, (2_000, 3)).round(0)  # some coordinates are equal
+    shuffled = points[rng.permutation(len(points))]
+    sorted_points = points[neighbors.by_cell(points, 40.0)]
+    np.testing.assert_array_equal(sorted_points, shuffled[neighbors.by_cell(shuffled, 40.0)])

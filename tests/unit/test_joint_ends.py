@@ -149,6 +149,19 @@ def test_a_face_of_which_one_side_alone_was_seen_may_be_either(further_in):
     assert sd[[0, 1, 4], 2].max() < 0.5
 
 
+def test_waves_of_the_plates_are_in_the_middles_of_the_edges():
+    """Waves of 1 mm that no polynomial of the zone follows, zero at the corners."""
+    rng = np.random.default_rng(7)
+    points = cloud(rng, 8.0)
+    waves = 1.0 * np.sin(2.0 * np.pi * points[:, 0] / 650.0 + 1.2) * np.cos(0.5 * np.pi * points[:, 1] / B)
+    points[:, 2] += np.where(points[:, 2] < T + 1.0, waves, 0.0)  # both sides of the bottom
+    end = fitted(points, rng)
+    off = end.departure[4, 2] - np.sin(1.2)
+    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)
+    assert abs(off) < 0.25
+    assert (np.abs(np.append(off, end.departure[:2, 2])) < 3.0 * np.append(sd[4, 2], sd[:2, 2])).all()
+
+
 def test_the_outermost_layer_of_a_tilted_plate():
     rng = np.random.default_rng(1)
     x, w = rng.uniform(size=4000), rng.uniform(-1.0, 1.0, 4000)
@@ -236,7 +249,9 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
             )
             drawn.append(replace(part, ends=ends, edges=replace(part.edges, departure=departure)))
         found = adjustment.adjust(drawn, joints, np.eye(4)[None], 0.1)
-        gaps.append(found.gaps.ravel())
+        # The true ends are on the design, at the poses found the true gap is that of the motions.
+        there = [rigid.apply(T, joints[0]) for T in found.motions]
+        gaps.append((found.gaps[0] - (there[1] - there[0])).ravel())
         # With the first part on its design, all edges have the error of its registration.
         back = rigid.invert(found.motions[0])
         for edges, departure in zip((one.edges for one in drawn), found.departures, strict=True):
@@ -246,16 +261,12 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
         # Error of the last part's outer end: by its movement and by its registration.
         at = np.array([[6000.0, 0.0, 0.0]])
         moved.append((rigid.apply(found.motions[1], at) - at)[0] - rigid.motion(at)[0] @ wrong[1])
-    assert (
-        np.sqrt(np.diag(stated.gap_covariance[0])).max() < 2.0 * noise
-    )  # of the 0.14 mm that both ends have in common
     pulls = np.array(gaps) / np.sqrt(np.diag(stated.gap_covariance[0]))
-    np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)
+    np.testing.assert_allclose(np.sqrt(np.mean(pulls**2, axis=0)), 1.0, atol=0.2)  # of the gap at the poses found
     drawn_sd = np.std(np.array(at_rest).reshape(400, 48, 2), axis=0)
     np.testing.assert_allclose(drawn_sd, np.sqrt(np.vstack(stated.at_rest_variance)), rtol=0.2)
     halves = span_and_closure.mean_max_ci95(stated.gaps.reshape(-1, 1), np.diag(stated.gap_covariance[0])[:, None])
     assert (np.quantile(largest, 0.95, axis=0) <= halves).all()  # the true gaps are zero
-    assert (np.quantile(largest, 0.95, axis=0) > 0.3 * np.array(halves)).all()
     J, own = rigid.motion(at - parts[1].centre)[0], rigid.motion(at)[0]
     both = J @ stated.motion_with_pose[6:, 6:] @ own.T
     covariance = J @ stated.motion_covariance[6:, 6:] @ J.T + both + both.T + own @ pose @ own.T

@@ -11,8 +11,9 @@ from processor.space_frame import catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.params import Params as PaperParams
 from processor.space_frame.points import sphere_crops
-from processor.space_frame.spheres import baselines
+from processor.space_frame.spheres import baselines, fit_all
 from processor.space_frame.spheres.fit_all import Params, fit_spheres
+from processor.space_frame.spheres.records import Chosen
 from tests.support.ball_clouds import frame, grid_of_balls
 from tests.support.memory_source import InMemory
 
@@ -91,6 +92,21 @@ def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
     assert np.flatnonzero(np.array(found.flag) == "wrong-size").tolist() == [2, 7]
     assert found.reasons[2] == (reason("spheres.other-size", size=60.0, nominal=70.0),)
     assert np.array(found.flag)[np.delete(np.arange(12), [2, 7])].tolist() == ["ok"] * 10
+
+
+def test_a_doubtful_size_is_no_evidence_against_the_nominal_one():
+    nan = np.nan
+    chosen = Chosen(
+        states=np.tile([0.0, 0.0, 0.0, 50.0], (4, 1)),
+        sizes=np.full(4, 50.0),
+        energy=np.array([10.0, 10.0, 10.0, np.inf]),
+        second=np.array([55.0, 55.0, 60.0, nan]),
+        second_energy=np.array([20.0, 40.0, 20.0, np.inf]),
+    )
+    fit_all.keep_nominal(chosen, np.array([55.0, 55.0, 55.0, nan]))
+    assert chosen.sizes.tolist() == [55.0, 50.0, 50.0, 50.0]
+    assert chosen.states[:, 3].tolist() == [55.0, 50.0, 50.0, 50.0]
+    assert chosen.second[:3].tolist() == [50.0, 55.0, 60.0]
 
 
 def test_without_scanners_the_bias_is_said_to_stand(roof):

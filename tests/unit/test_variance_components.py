@@ -5,7 +5,6 @@ import pytest
 from scipy import stats
 
 from processor.adjustment import variance_components
-from processor.preassembly.ends import faces as ends_faces
 
 
 def drawn(rng, stations, apart, cells=40, points=60):
@@ -57,29 +56,3 @@ def test_lack_of_fit_variance():
         [(rng.standard_normal(4000) + steps[cell], cell)], 0
     ) == pytest.approx(float(np.mean(steps**2)), abs=0.05)
     assert variance_components.lack_of_fit_variance([(np.zeros(3), np.arange(3))], 0) == 0.0
-
-
-def faces_of(rng, bent, sigma, count=40, points=4_000):
-    """Residuals of faces that depart by a cubic along the zone, with amplitude ``bent`` at the joint."""
-    found = []
-    for _ in range(count):
-        x, w = rng.uniform(-ends_faces.ZONE_MM, 0.0, points), rng.uniform(-1.0, 1.0, points)
-        amid, across = bent * rng.standard_normal(2)
-        # On 0..1 from the far side of the zone: 20 t^3 - 30 t^2 + 12 t - 1 is what quadratics leave of 20 t^3.
-        out = (amid + across * w) * 20.0 * (1.0 + x / ends_faces.ZONE_MM) ** 3 + sigma * rng.standard_normal(points)
-        basis = ends_faces.basis(x, w)
-        found.append((basis, out - basis @ np.linalg.lstsq(basis, out, rcond=None)[0]))
-    return found
-
-
-def test_third_order_terms_at_the_joint():
-    rng = np.random.default_rng(4)
-    third = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.3, 1.0)])
-    # By hand: the mean square of the polynomial is 1/7, and 1/21 where it goes with w.
-    np.testing.assert_allclose(third[::2, 1], 7.0 / 4_000, rtol=0.1)
-    np.testing.assert_allclose(third[1::2, 1], 21.0 / 4_000, rtol=0.1)
-    # 80 squares of normal numbers: their mean is known to sqrt(2 / 80).
-    assert variance_components.excess_variance(third) == pytest.approx(0.09, rel=3.0 * np.sqrt(2.0 / 80.0))
-    nothing = np.vstack([variance_components.third_order(*one) for one in faces_of(rng, 0.0, 1.0)])
-    assert variance_components.excess_variance(nothing) < 5.0 * np.sqrt(2.0 / 80.0) * nothing[:, 1].max()
-    assert variance_components.excess_variance(np.array([[0.1, 0.02], [0.1, 0.02]])) == 0.0

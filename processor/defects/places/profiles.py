@@ -14,13 +14,15 @@ from functools import partial
 import numpy as np
 from scipy.optimize import least_squares
 
-from processor.model import Floats, Word
+from processor.model import Floats, Ints, Word
 
 MODEL_SHARE = 0.1  # of the depth, by which a place may deviate from the shape of a model
+BLOCK_SHARE = 0.5  # of a place's half size: blocks of residuals that agree
 FEWEST_CELLS = 12
 MOST_CELLS = 1500  # fitted; of more, an even sample
 AT_BORDER = 0.35  # of a place's width, the largest distance from a border of a bent edge
 MARGIN_CHI2 = 20.0  # by which a model must be better than a bump
+EXPONENTS = (1.0, 5.0)  # of a bump (1 - s^2)^p
 LEAST_SIZE, MOST_SIZE = 0.3, 4.0  # of a model, by the half size of the place
 
 
@@ -82,7 +84,7 @@ def fit(cells: PlaceCells, sign: int) -> Fit | None:
             continue
         chi2 = 2.0 * float(solved.cost)
         if profile not in best or chi2 < best[profile][0]:
-            depth_sd = _sd(solved.jac * sd[:, None], value - model(uv, solved.x))
+            depth_sd = _sd(solved.jac * sd[:, None], value - model(uv, solved.x), _blocks(uv, cells.half))
             found = Fit(profile, float(solved.x[0]), depth_sd, float(solved.x[2]), 0.0)
             best[profile] = chi2, found
             if profile is Profile.BUMP:
@@ -100,32 +102,32 @@ Model = Callable[[Floats, Floats], Floats]
 
 
 def _models(cells: PlaceCells, top: float) -> Iterator[tuple[Profile, int, Floats, Model]]:
-    """Yield profiles, axes, starts of the parameters (depth, place, reach, middle across, half width), models."""
+    """Yield profiles, axes, starts of the parameters (depth, place, reach, middle across, half width, exponent)."""
     centre, half = cells.centre, cells.half
-    yield Profile.BUMP, 0, np.array([top, centre[0], 1.3 * half[0], centre[1], 1.3 * half[1]]), _bump_model
+    yield Profile.BUMP, 0, np.array([top, centre[0], 1.3 * half[0], centre[1], 1.3 * half[1], 2.0]), _bump_model
     for axis, other in ((0, 1), (1, 0)):
         for way, border in ((1.0, cells.low[axis]), (-1.0, cells.high[axis])):
             end = centre[axis] - way * half[axis]
             if abs(end - border) < AT_BORDER * 2.0 * half[axis] + cells.cell_mm:
-                start = np.array([top, border, 2.0 * half[axis], centre[other], 1.2 * half[other]])
+                start = np.array([top, border, 2.0 * half[axis], centre[other], 1.2 * half[other], 2.0])
                 yield Profile.EDGE, axis, start, partial(_edge_model, axis, way, float(border))
-            start = np.array([top, end, 2.0 * half[axis], centre[other], 1.1 * half[other]])
+            start = np.array([top, end, 2.0 * half[axis], centre[other], 1.1 * half[other], 2.0])
             yield Profile.STEP, axis, start, partial(_step_model, axis, way, cells.cell_mm)
 
 
 def _bump_model(uv: Floats, x: Floats) -> Floats:
-    return np.asarray(x[0] * _bump(np.hypot((uv[:, 0] - x[1]) / x[2], (uv[:, 1] - x[3]) / x[4])))
+    return np.asarray(x[0] * _bump(np.hypot((uv[:, 0] - x[1]) / x[2], (uv[:, 1] - x[3]) / x[4]), x[5]))
 
 
 def _edge_model(axis: int, way: float, border: float, uv: Floats, x: Floats) -> Floats:
     lever = np.clip(1.0 - way * (uv[:, axis] - border) / x[2], 0.0, 1.0)
-    return np.asarray(x[0] * lever * _bump((uv[:, 1 - axis] - x[3]) / x[4]))
+    return np.asarray(x[0] * lever * _bump((uv[:, 1 - axis] - x[3]) / x[4], x[5]))
 
 
 def _step_model(axis: int, way: float, cell_mm: float, uv: Floats, x: Floats) -> Floats:
     behind = np.clip(way * (uv[:, axis] - x[1]) / cell_mm + 0.5, 0.0, 1.0)  # means of cells on the line
     across = np.maximum(1.0 - ((uv[:, 1 - axis] - x[3]) / x[4]) ** 8, 0.0)
-    return np.asarray(x[0] * behind * _bump((uv[:, axis] - x[1]) / x[2]) * across)
+    return np.asarray(x[0] * behind * _bump((uv[:, axis] - x[1]) / x[2], x[5]) * across)
 
 
 def _shown(uv: Floats, x: Floats, axis: int, cell_mm: float) -> bool:
@@ -137,21 +139,31 @@ def _shown(uv: Floats, x: Floats, axis: int, cell_mm: float) -> bool:
 
 
 def _bounds(start: Floats, cells: PlaceCells, top: float) -> tuple[Floats, Floats]:
-    """Return the least and the largest parameters (5,)."""
+    """Return the least and the largest parameters (6,)."""
     least, most = LEAST_SIZE * start[[2, 4]], MOST_SIZE * start[[2, 4]]
     room = np.array([start[2] + cells.cell_mm, start[4] + cells.cell_mm])
-    lower = np.array([0.2 * top, start[1] - room[0], least[0], start[3] - room[1], least[1]])
-    upper = np.array([5.0 * top, start[1] + room[0], most[0], start[3] + room[1], most[1]])
+    lower = np.array([0.2 * top, start[1] - room[0], least[0], start[3] - room[1], least[1], EXPONENTS[0]])
+    upper = np.array([5.0 * top, start[1] + room[0], most[0], start[3] + room[1], most[1], EXPONENTS[1]])
     return lower, upper
 
 
-def _bump(s: Floats) -> Floats:
-    value: Floats = np.maximum(1.0 - s**2, 0.0) ** 2
+def _bump(s: Floats, exponent: float) -> Floats:
+    value: Floats = np.maximum(1.0 - s**2, 0.0) ** exponent
     return value
 
 
-def _sd(J: Floats, residual: Floats) -> float:
-    """Return the sd of the first parameter by its Jacobian (n, k) and the residuals (n,), mm."""
-    freedom = max(len(residual) - J.shape[1], 1)
+def _blocks(uv: Floats, half: Floats) -> Ints:
+    """Return the block (n,) of cells (n, 2), a few across a place, in which a model misses in the same sense."""
+    block: Ints = np.unique(np.floor(uv / (BLOCK_SHARE * half)), axis=0, return_inverse=True)[1].reshape(-1)
+    return block
+
+
+def _sd(J: Floats, residual: Floats, block: Ints) -> float:
+    """Return the sd of the first parameter by its Jacobian (n, k), residuals (n,) and their blocks (n,), mm.
+
+    A sandwich over blocks (Liang and Zeger 1986): where the place is not quite of the model's shape, residuals agree.
+    """
     inverse = np.linalg.pinv(J.T @ J)
-    return float(np.sqrt(max(inverse[0, 0], 0.0) * (residual @ residual) / freedom))
+    count = int(block.max()) + 1
+    pull = np.stack([np.bincount(block, J[:, k] * residual, count) for k in range(J.shape[1])], axis=1) @ inverse[0]
+    return float(np.sqrt(pull @ pull * count / max(count - J.shape[1], 1)))

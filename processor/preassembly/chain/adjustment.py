@@ -36,9 +36,9 @@ class Adjusted:
     """Motions T (c, 4, 4) of the registered parts, with covariance (6 c, 6 c) about the parts' centres, and the gaps.
 
     ``motion_with_pose`` (6 c, 6 c) is the covariance of the motions with the parts' registrations.
-    ``gaps`` (j, 8, 3) in bridge axes with covariance (j, 24, 24); ``departures`` (k, 2) a part, sideways and up, after
-    the adjustment, with variances (k, 2); ``at_rest_variance`` (k, 2) are those with the whole bridge moved so that the
-    first part lies where its registration has it.
+    ``gaps`` (j, 8, 3) at these motions in bridge axes, with covariance (j, 24, 24). ``departures`` (k, 2) a part,
+    sideways and up, are after the adjustment, with variances (k, 2). ``at_rest_variance`` (k, 2) are those with the
+    whole bridge moved so that the first part lies where its registration has it.
     """
 
     motions: Floats
@@ -96,7 +96,8 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
     for j, row in enumerate(observed.gap_row):
         if row >= 0:
             gaps[j] = residual[row : row + 24].reshape(8, 3)
-            gap_covariance[j] = covariance[row : row + 24, row : row + 24]
+            # Of the gap at the poses found: the ends' errors that the motions follow are in it.
+            gap_covariance[j] = observed.covariance[row : row + 24, row : row + 24]
     departures, variances, at_rest = [], [], []
     for member, rows in zip(members, observed.edge_rows, strict=True):
         departure, variance, at_rest_variance = (np.full(member.edges.departure.shape, np.nan) for _ in range(3))

@@ -1,22 +1,26 @@
 """The outer faces of a part, and their departures from the design near a joint.
 
 A face's departure is ``c0 + c1 x + c2 w + c3 x w + c4 x^2 + c5 x^2 w + c6 (w^2 - 1) + c7 x (w^2 - 1)``: x along the
-bridge from the joint in units of ZONE_MM, w across the face from -1 to 1.
+bridge from the joint in units of ZONE_MM, w across the face from -1 to 1. What these terms do not follow, waves of the
+plate, is estimated at NODES of the joint by kriging.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
+from processor.adjustment import clusters, kriging
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.model import Floats, Ints, Reason, Word, reason
-from processor.preassembly.ends import plate_sides
+from processor.preassembly.ends import plate_sides, viewpoints
 from processor.preassembly.ends.joint_frame import EndPlace, end_place
 from processor.preassembly.ends.plate_sides import Bools
+from processor.preassembly.ends.viewpoints import Thickness
 
 
 class PlateFace(Word):
@@ -35,6 +39,8 @@ FACES = (  # axis and sense of the normal
     (PlateFace.LEFT, 1, 1.0),
 )
 FACE = 8  # coefficients of a face
+NODES = (-1.0, 0.0, 1.0)  # places w at the joint where a face's waves are estimated
+PATCH_MM, PATCH_SPACINGS = 50.0, 3.0  # least size of a patch, whose mean departure is one observation of the waves
 ALONG = 0.9  # cosine between a facet's normal and an axis, above which the facet is of a face across that axis
 NEAR_MM = 500.0  # of a joint, beyond the facet nearest to it
 ZONE_MM = 500.0
@@ -77,14 +83,28 @@ class UsedPoints:
 
 @dataclass(frozen=True)
 class FaceFit:
-    """Coefficients (8,) of a face, their covariance by point noise, and the points used.
+    """Coefficients (8,) of a face and its waves (3,) at NODES by every hypothesis of the waves, and the points used.
 
-    ``single_layer``: no second layer was found inside the face, so the side of the plate is known by its shape alone.
+    ``coefficients`` (11,) are averaged over the hypotheses with their prior weights. ``plate`` is None where its inner
+    side was not seen. ``single_layer``: no second layer
+    was found inside the face, so the side of the plate is known by its shape alone.
     """
 
     coefficients: Floats
-    covariance: Floats
+    hypotheses: kriging.Hypotheses
     used: UsedPoints
+    plate: Thickness | None
+    single_layer: bool
+
+
+class _Sheets(NamedTuple):
+    """Points on an outer face: rows, heights above the design, cells; and those behind it, if it has two layers."""
+
+    rows: Ints
+    out: Floats
+    cell: Ints
+    behind: Ints
+    behind_out: Floats
     single_layer: bool
 
 
@@ -114,21 +134,49 @@ def outer_faces(surface: MeshSurface, joints: Sequence[Floats]) -> MeshSurface:
 def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] | Reason:
     """Fit the four faces to the points of the joint's zone, ``local`` (n, 3) in its frame; or the reason why not."""
     faces = _on_faces(part, local, place)
-    centred = [out - np.median(out) for _, out, _, _ in faces if len(out)]
+    centred = [sheets.out - np.median(sheets.out) for sheets in faces if len(sheets.out)]
     margin = 3.0 * _noise(np.concatenate(centred or [np.empty(0)])) + 2.0
     fits = []
-    for (name, axis, _), (rows, out, cell, single_layer) in zip(FACES, faces, strict=True):
+    for (name, axis, _), (rows, out, cell, behind, behind_out, single_layer) in zip(FACES, faces, strict=True):
         across = 1 if axis == 2 else 2
         clear = np.abs(local[rows, across]) < place.half[across] - margin
         clear &= -place.outward * local[rows, 0] > margin
         rows = rows[clear]
         columns = basis(local[rows, 0], local[rows, across] / place.half[across])
-        coefficients, covariance, residual, inliers = _least_squares(columns, out[clear])
+        coefficients, residual, inliers = _least_squares(columns, out[clear])
         if not len(coefficients):
             return reason("preassemble.few-points-on-face", face=name)
         used = UsedPoints(columns[inliers], residual, part.station[rows][inliers], cell[clear][inliers])
-        fits.append(FaceFit(coefficients, covariance, used, single_layer))
+        hypotheses = _with_waves(coefficients, used, local[rows][inliers][:, [0, across]], place.half[across])
+        mean = kriging.average(hypotheses).mean
+        level = basis(local[behind, 0], local[behind, across] / place.half[across]) @ mean[:FACE]
+        inner = _inner_side(local[behind], level - behind_out, place, across)
+        both = np.concatenate([rows[inliers], behind[inner]])
+        height = np.concatenate([out[clear][inliers], behind_out[inner]])
+        terms = basis(local[both, 0], local[both, across] / place.half[across])[:, : viewpoints.TERMS]
+        marked = np.arange(len(both)) >= int(inliers.sum())
+        plate = viewpoints.thickness(terms, local[both][:, [0, across]], height, marked)
+        fits.append(FaceFit(mean, hypotheses, used, plate, single_layer))
     return fits
+
+
+def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, half: float) -> kriging.Hypotheses:
+    """Estimate a face with its waves by points ``at`` (n, 2), along and across the face of half the width ``half``."""
+    spacing = np.sqrt(2.0 * half * ZONE_MM / len(at))
+    found = clusters.patches(at, used.residual, max(PATCH_MM, PATCH_SPACINGS * float(spacing)))
+    trend = basis(found.centre[:, 0], found.centre[:, 1] / half)
+    noise = max(found.noise, FLOOR_MM**2)
+    means = kriging.Means(found.centre, found.mean, noise / found.number, trend)
+    nodes = np.stack([np.zeros(len(NODES)), half * np.array(NODES)], axis=1)
+    hypotheses = kriging.by_hypotheses(means, nodes)
+    hypotheses.means[:, :FACE] += coefficients
+    return hypotheses
+
+
+def departures(x: Floats, w: Floats) -> Floats:
+    """Terms (n, 11) of a face's departure: those of :func:`basis` and the parabola through the waves at NODES."""
+    waves = np.stack([0.5 * w * (w - 1.0), 1.0 - w * w, 0.5 * w * (w + 1.0)], axis=1)
+    return np.hstack([basis(x, w), waves])
 
 
 def basis(x: Floats, w: Floats) -> Floats:
@@ -138,8 +186,8 @@ def basis(x: Floats, w: Floats) -> Floats:
     return np.stack([np.ones_like(scaled), scaled, w, scaled * w, scaled**2, scaled**2 * w, bow, scaled * bow], axis=1)
 
 
-def _on_faces(part: RegisteredPart, local: Floats, place: EndPlace) -> list[tuple[Ints, Floats, Ints, bool]]:
-    """Points on each of FACES: rows, heights above the design, cells, and whether they are a single layer."""
+def _on_faces(part: RegisteredPart, local: Floats, place: EndPlace) -> list[_Sheets]:
+    """Points on each of FACES."""
     turn = place.T_bridge_joint[:3, :3]
     nearest = part.surface.distances(part.points, REACH_MM)[0]
     face, residual, beyond = part.outer.distances(part.points, 2.0 * REACH_MM)
@@ -157,8 +205,17 @@ def _on_faces(part: RegisteredPart, local: Floats, place: EndPlace) -> list[tupl
         cell = (column * CELLS[1] + row).astype(np.int64)
         layer = plate_sides.outer_surface(out, np.stack([np.ones_like(x), x, w, x * w], axis=1), cell)
         single_layer = len(rows) - int(layer.sum()) < plate_sides.SECOND_SHARE * len(rows)
-        faces.append((rows[layer], out[layer], cell[layer], single_layer))
+        faces.append(_Sheets(rows[layer], out[layer], cell[layer], rows[~layer], out[~layer], single_layer))
     return faces
+
+
+def _inner_side(local: Floats, depth: Floats, place: EndPlace, across: int) -> Bools:
+    """Mark points (n, 3) at ``depth`` (n,) behind an outer face that are of the inner side of its plate."""
+    inner = (depth > plate_sides.THINNEST_MM) & (depth < plate_sides.REACH_MM)
+    inner &= np.abs(local[:, across]) < place.half[across] - np.minimum(REACH_MM, 0.5 * place.half[across])
+    inner &= -place.outward * local[:, 0] > plate_sides.LAYER_MM
+    inner[inner] = plate_sides.outer_layer(-depth[inner])
+    return inner
 
 
 def _noise(residual: Floats) -> float:
@@ -167,19 +224,17 @@ def _noise(residual: Floats) -> float:
     return float(1.4826 * np.median(np.abs(residual - middle))) if len(residual) else 0.0
 
 
-def _least_squares(basis: Floats, value: Floats) -> tuple[Floats, Floats, Floats, Bools]:
-    """Coefficients (k,), covariance (k, k), residuals of the inliers, and a mark of these; empty for too few points."""
+def _least_squares(basis: Floats, value: Floats) -> tuple[Floats, Floats, Bools]:
+    """Coefficients (k,), residuals of the inliers, and a mark of these; empty for too few points."""
     used = np.ones(len(value), bool)
     coefficients: Floats = np.empty(0, np.float64)
     for _ in range(6):
         if used.sum() < LEAST_POINTS:
-            return np.empty(0), np.empty((0, 0)), np.empty(0), used
+            return np.empty(0), np.empty(0), used
         coefficients = np.asarray(np.linalg.lstsq(basis[used], value[used], rcond=None)[0], np.float64)
         residual = value - basis @ coefficients
         now = np.abs(residual) < 4.5 * max(_noise(residual[used]), FLOOR_MM)
         if (now == used).all():
             break
         used = now
-    residual = value[used] - basis[used] @ coefficients
-    variance = float(residual @ residual) / max(len(residual) - len(coefficients), 1)
-    return coefficients, variance * np.linalg.inv(basis[used].T @ basis[used]), residual, used
+    return coefficients, value[used] - basis[used] @ coefficients, used

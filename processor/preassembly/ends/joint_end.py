@@ -3,8 +3,8 @@
 In the joint's zone each outer face departs from the design by a plane in x (along the bridge from the joint) and w
 (across the face), a warp x w, and bending terms x^2, x^2 w, w^2 - 1 and x (w^2 - 1). The ring departs by a plane in u
 and v and bending terms, see :mod:`processor.preassembly.ends.ring`. A corner is where its two faces and the ring meet,
-as built; its covariance is that of these 40 coefficients, so points of one corner are correlated. Terms of third order
-are not fitted; their variance at the joint is estimated from all ends and added.
+as built; its covariance is that of these 40 coefficients, so points of one corner are correlated. Waves of a face, what
+its 8 coefficients do not follow, are estimated at its corners and its middle by kriging.
 
 Departure and noise are separated for all ends of a bridge together, see :mod:`processor.adjustment.model_averaging`:
 the sizes of the other ends' departures set the weights of the hypotheses for each end.
@@ -19,19 +19,20 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import block_diag
 
-from processor.adjustment import model_averaging, variance_components
+from processor.adjustment import kriging, model_averaging, variance_components
 from processor.adjustment.model_averaging import SIZES_MM, Bools, Estimate
 from processor.geometry import rigid
 from processor.geometry.mesh_distance import MeshSurface
 from processor.model import NORMAL_95, Floats, Ints, Reason, reason
 from processor.preassembly.ends import faces as ends_faces
-from processor.preassembly.ends import plate_sides
+from processor.preassembly.ends import plate_sides, viewpoints
 from processor.preassembly.ends import ring as ends_ring
 from processor.preassembly.ends.faces import (
     FACE,
     FACES,
     FLOOR_MM,
     LEAST_POINTS,
+    NODES,
     REACH_MM,
     ZONE_MM,
     FaceFit,
@@ -40,6 +41,7 @@ from processor.preassembly.ends.faces import (
     UsedPoints,
 )
 from processor.preassembly.ends.joint_frame import EndPlace
+from processor.preassembly.ends.viewpoints import Thickness, Variances
 
 # Sizes of bending terms, the finest for scans without noise, and their prior weights: ends are cut by a plane.
 BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
@@ -53,8 +55,9 @@ ITERATIONS = 4  # of a corner's place on its faces
 # follow most of it; the rest lies, uniformly distributed, within 0.005 of the departure.
 SECOND_ORDER = 0.005 / np.sqrt(3.0)
 COUNT = len(FACES) * FACE + RING
-AT_JOINT = [FACE * face + term for face in range(len(FACES)) for term in (0, 2)]  # a face's level and tilt at the joint
 OF_FACES, OF_RING = slice(0, COUNT - RING), slice(COUNT - RING, COUNT)
+LEVELS = [FACE * face for face in range(len(FACES))]
+WAVES = slice(COUNT, COUNT + len(FACES) * len(NODES))  # after the coefficients, face by face
 # P1..P4, bottom left, bottom right, top right, top left: u, v, and the numbers of their upright and their level face.
 CORNERS = ((1.0, -1.0, 3, 0), (-1.0, -1.0, 1, 0), (-1.0, 1.0, 1, 2), (1.0, 1.0, 3, 2))
 
@@ -83,17 +86,19 @@ class PlateSides(NamedTuple):
 
 @dataclass(frozen=True)
 class FittedEnd:
-    """The 40 coefficients of faces and ring as fitted, before model averaging, with their covariance.
+    """The faces of an end with their waves, and its ring, as fitted before model averaging.
 
-    ``motion`` (40, 6) is their derivative by a motion of the part, ``pose`` (6, 6) the covariance of its registration.
+    ``shared`` (40, 40) is the covariance of their coefficients by errors that points of a station share. ``motion``
+    (40, 6) is their derivative by a motion of the part, ``pose`` (6, 6) the covariance of its registration.
     """
 
-    coefficients: Floats
-    covariance: Floats
+    faces: tuple[kriging.Hypotheses, ...]
+    ring: kriging.Kriged
+    shared: Floats
     motion: Floats
     pose: Floats
     place: EndPlace
-    third_order: Floats  # (8, 2) of the four faces, see variance_components.third_order
+    plates: tuple[Thickness | None, ...]  # of the faces; none where the points' stations are known
     sides: PlateSides
 
     @property
@@ -142,25 +147,36 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
     ring, on_ring = _fit_ring(local, part.station, faces, place, thickness, sigma)
     if not len(ring.coefficients):
         return unknown(reason("preassemble.few-points-on-end-face"))
-    blocks = _full_covariances([(f.covariance, f.used) for f in faces], part.between_stations)
-    blocks += _full_covariances([(ring.covariance, on_ring)], part.between_stations)
+    lack_of_fit = variance_components.lack_of_fit_variance([(on_ring.residual, on_ring.cell)], RING)
+    of_sectors = variance_components.group_covariance(on_ring.basis, on_ring.cell, lack_of_fit)
+    stations = [(f.used.basis, f.used.station) for f in faces] + [(on_ring.basis, on_ring.station)]
+    shared = [variance_components.group_covariance(*station, part.between_stations) for station in stations]
     return FittedEnd(
-        coefficients=np.concatenate([*(face.coefficients for face in faces), ring.coefficients]),
-        covariance=block_diag(*blocks),
+        faces=tuple(face.hypotheses for face in faces),
+        ring=kriging.Kriged(ring.coefficients, ring.covariance + of_sectors),
+        shared=block_diag(*shared),
         motion=_motion(place),
         pose=part.pose,
         place=place,
-        third_order=np.vstack([variance_components.third_order(f.used.basis, f.used.residual) for f in faces]),
+        plates=tuple(face.plate for face in faces) if (part.station == part.station[0]).all() else (),
         sides=sides,
     )
 
 
-def estimate(ends: Sequence[FittedEnd]) -> list[JointEnd]:
-    """Estimate the corners of all ends of one bridge by model averaging, in which each end learns from the others."""
+def estimate(ends: Sequence[FittedEnd], between: Sequence[Variances] = ()) -> list[JointEnd]:
+    """Estimate the corners of all ends of one bridge by model averaging, in which each end learns from the others.
+
+    ``between`` are each end's variances between viewpoints, or none.
+    """
     if not ends:
         return []
-    bending = variance_components.excess_variance(np.vstack([end.third_order for end in ends]))
-    return [_corners_of(end, averaged, bending) for end, averaged in zip(ends, _averaged(ends), strict=True)]
+    every = [face for end in ends for face in end.faces]
+    weighted = zip(every, kriging.learned_weights(every), strict=True)
+    faces = [kriging.average(*face) for face in weighted]
+    viewed = between or (viewpoints.NONE,) * len(ends)
+    fitted = [_joined(faces[4 * k : 4 * k + 4], end, viewed[k]) for k, end in enumerate(ends)]
+    averaged = _averaged(ends, fitted)
+    return [_corners_of(*of_end) for of_end in zip(ends, fitted, averaged, strict=True)]
 
 
 def _outer_sides(
@@ -176,7 +192,7 @@ def _outer_sides(
     outer, either = list(faces), np.zeros(len(FACES))
     shown: list[PlateFace] = []
     doubtful: list[PlateFace] = []
-    level = np.eye(1, FACE)[0]
+    level = np.eye(1, FACE + len(NODES))[0]
     for k, ((name, axis, sense), face) in enumerate(zip(FACES, faces, strict=True)):
         plate = float(thickness[axis - 1])
         if not (face.single_layer and face.coefficients[0] < -0.5 * plate < 0.0):
@@ -192,8 +208,11 @@ def _outer_sides(
         else:
             either[k] = plate
             doubtful.append(name)
-        by_plate = face.covariance + PLATE_SD_MM**2 * np.outer(level, level)
-        outer[k] = replace(face, coefficients=face.coefficients + plate * level, covariance=by_plate)
+        moved = face.hypotheses._replace(
+            means=face.hypotheses.means + plate * level,
+            covariances=face.hypotheses.covariances + PLATE_SD_MM**2 * np.outer(level, level),
+        )
+        outer[k] = replace(face, coefficients=face.coefficients + plate * level, hypotheses=moved)
     doubts = (reason("preassemble.inner-side", faces=tuple(doubtful)),) if doubtful else ()
     remarks = (reason("preassemble.by-inner-side", faces=tuple(shown)),) if shown else ()
     return outer, PlateSides(either, doubts, remarks)
@@ -203,34 +222,44 @@ def _inward(local: Floats, face: FaceFit, place: EndPlace, axis: int, sense: flo
     """Distances (n,) of points inward from a face, and a mark of those away from the section's corners."""
     across = 1 if axis == 2 else 2
     half = place.half[across]
-    departure = ends_faces.basis(local[:, 0], local[:, across] / half) @ face.coefficients
+    departure = ends_faces.departures(local[:, 0], local[:, across] / half) @ face.coefficients
     wide = np.abs(local[:, across]) < half - np.minimum(plate_sides.REACH_MM, 0.5 * half)
     return place.half[axis] + departure - sense * local[:, axis], wide
 
 
-def _full_covariances(fits: Sequence[tuple[Floats, UsedPoints]], between_stations: float) -> list[Floats]:
-    """Add to each fit's covariance the errors shared within stations, and within cells by lack of fit."""
-    coefficients = len(fits[0][0])
-    cells = [(used.residual, used.cell) for _, used in fits]
-    lack_of_fit = variance_components.lack_of_fit_variance(cells, coefficients)
-    return [
-        covariance
-        + variance_components.group_covariance(used.basis, used.station, between_stations)
-        + variance_components.group_covariance(used.basis, used.cell, lack_of_fit)
-        for covariance, used in fits
-    ]
+def _joined(faces: Sequence[kriging.Kriged], end: FittedEnd, between: Variances) -> kriging.Kriged:
+    """Coefficients and waves (52,) of an end, and their covariance (52, 52)."""
+    blocks = (*(face.covariance[:FACE, :FACE] for face in faces), end.ring.covariance)
+    covariance = block_diag(*blocks, *(face.covariance[FACE:, FACE:] for face in faces))
+    tilted = (between.level, between.along, between.across, *np.zeros(FACE - 3))
+    ring = (between.ring, between.across, between.across, *np.zeros(RING - 3))
+    covariance[:COUNT, :COUNT] += end.shared
+    if end.plates:
+        covariance[:COUNT, :COUNT] += np.diag([*(tilted * len(FACES)), *ring])
+    for number, face in enumerate(faces):
+        rows = slice(FACE * number, FACE * (number + 1))
+        waves = slice(COUNT + len(NODES) * number, COUNT + len(NODES) * (number + 1))
+        covariance[rows, waves], covariance[waves, rows] = face.covariance[:FACE, FACE:], face.covariance[FACE:, :FACE]
+    coefficients = [*(face.mean[:FACE] for face in faces), end.ring.mean, *(face.mean[FACE:] for face in faces)]
+    return kriging.Kriged(np.concatenate(coefficients), covariance)
 
 
-def _corners_of(end: FittedEnd, averaged: Estimate, bending: float) -> JointEnd:
-    """Key points of an end; ``bending`` is the variance at the joint of terms that are not fitted."""
-    departure, derivative = _key_points(end.place, averaged.mean)
+def _corners_of(end: FittedEnd, fitted: kriging.Kriged, averaged: Estimate) -> JointEnd:
+    """Key points of an end by its coefficients (40,) as averaged; the waves follow what the average changed."""
+    known = slice(0, COUNT)
+    noise = fitted.covariance[known, known] + FLOOR_MM**2 * np.eye(COUNT)
+    gain = np.linalg.solve(noise, fitted.covariance[known, WAVES]).T
+    rest = fitted.covariance[WAVES, WAVES] - gain @ fitted.covariance[known, WAVES]
+    waves = fitted.mean[WAVES] + gain @ (averaged.mean - fitted.mean[known])
+    follow = np.vstack([np.eye(COUNT), gain])
+    covariance = follow @ averaged.covariance @ follow.T
+    covariance[WAVES, WAVES] += rest
+    departure, derivative = _key_points(end.place, np.concatenate([averaged.mean, waves]))
     second_order = np.repeat(SECOND_ORDER * np.linalg.norm(departure.reshape(8, 3), axis=1), 3)
-    covariance = derivative @ averaged.covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
-    at_joint = derivative[:, AT_JOINT]
-    covariance += bending * at_joint @ at_joint.T
-    levels = derivative[:, AT_JOINT[::2]] * end.sides.either / NORMAL_95
+    covariance = derivative @ covariance @ derivative.T + np.diag(FLOOR_MM**2 + second_order**2)
+    levels = derivative[:, LEVELS] * end.sides.either / NORMAL_95
     covariance += levels @ levels.T
-    by_pose = derivative @ averaged.not_followed(end.motion)
+    by_pose = derivative @ follow @ averaged.not_followed(end.motion)
     return JointEnd(departure.reshape(8, 3), covariance, by_pose, end.doubts, end.remarks)
 
 
@@ -284,7 +313,7 @@ def _ring_basis(u: Floats, v: Floats) -> Floats:
     return np.stack([constant, u, v, u * v, bent_u, bent_v, v * bent_u, u * bent_v], axis=1)
 
 
-def _averaged(ends: Sequence[FittedEnd]) -> list[Estimate]:
+def _averaged(ends: Sequence[FittedEnd], fitted: Sequence[kriging.Kriged]) -> list[Estimate]:
     """Average the coefficients (40,) of ends over hypotheses of their departures' sizes.
 
     The levels of the faces have one unknown size, their tilts another, their bends a third; likewise the ring's plane
@@ -302,7 +331,7 @@ def _averaged(ends: Sequence[FittedEnd]) -> list[Estimate]:
     for rows, hypotheses in ((OF_FACES, faces), (OF_RING, ring)):
         prior = np.array([weight for weight, _ in hypotheses])
         sizes = np.array([size for _, size in hypotheses])
-        blocks = [_block(end, rows, sizes) for end in ends]
+        blocks = [_block(end, of_end, rows, sizes) for end, of_end in zip(ends, fitted, strict=True)]
         logs = np.array([model_averaging.log_likelihoods(*block) for block in blocks])
         weights = model_averaging.weights_by_others(logs, prior, _traits(sizes))
         for whole, block, log, weight in zip(averaged, blocks, logs, weights, strict=True):
@@ -321,11 +350,11 @@ def _traits(sizes: Floats) -> Ints:
     return np.stack([np.unique(of, axis=0, return_inverse=True)[1].ravel() for of in (sizes[:, :2], sizes[:, -1:])])
 
 
-def _block(end: FittedEnd, rows: slice, sizes: Floats) -> _Block:
+def _block(end: FittedEnd, fitted: kriging.Kriged, rows: slice, sizes: Floats) -> _Block:
     """Coefficients of an end under hypotheses of their ``sizes`` (h, n)."""
-    noise = end.covariance[rows, rows] + FLOOR_MM**2 * np.eye(sizes.shape[1])
+    noise = fitted.covariance[rows, rows] + FLOOR_MM**2 * np.eye(sizes.shape[1])
     by_pose = end.motion[rows] @ end.pose @ end.motion[rows].T
-    return _Block(end.coefficients[rows], noise, [by_pose + np.diag(size**2) for size in sizes])
+    return _Block(fitted.mean[rows], noise, [by_pose + np.diag(size**2) for size in sizes])
 
 
 def _average_block(block: _Block, logs: Floats, sizes: Floats, prior: Floats, weights: Floats) -> Estimate:
@@ -364,19 +393,19 @@ def _motion(place: EndPlace) -> Floats:
 
 
 def _key_points(place: EndPlace, coefficients: Floats) -> tuple[Floats, Floats]:
-    """Departures (24,) of P1..P8 by the coefficients (40,) of faces and ring, and their derivative (24, 40).
+    """Departures (24,) of P1..P8 by the coefficients and waves (52,) of faces and ring, and their derivative (24, 52).
 
     A corner is where its faces and the ring meet. Each surface is evaluated at the corner as the others place it, by
     fixed-point iteration.
     """
     half = place.half
-    departure, derivative = np.zeros((8, 3)), np.zeros((8, 3, COUNT))
+    departure, derivative = np.zeros((8, 3)), np.zeros((8, 3, len(coefficients)))
     for k, (u, v, upright, level) in enumerate(CORNERS):
         for _ in range(ITERATIONS):
             at_u, at_v = u + departure[k, 1] / half[1], v + departure[k, 2] / half[2]
-            derivative[k, 0, -RING:] = place.outward * _ring_basis(np.array([at_u]), np.array([at_v]))[0]
+            derivative[k, 0, OF_RING] = place.outward * _ring_basis(np.array([at_u]), np.array([at_v]))[0]
             for axis, face, w in ((1, upright, at_v), (2, level, at_u)):
-                derivative[k, axis, FACE * face : FACE * (face + 1)] = _on_face(face, departure[k, 0], w)
+                derivative[k, axis] = _on_face(face, departure[k, 0], w)
             departure[k] = derivative[k] @ coefficients
     for k, (a, b) in enumerate(((0, 1), (1, 2), (2, 3), (3, 0))):  # the middles of the edges
         derivative[4 + k] = 0.5 * (derivative[a] + derivative[b])
@@ -384,15 +413,18 @@ def _key_points(place: EndPlace, coefficients: Floats) -> tuple[Floats, Floats]:
         u, v = (
             0.5 * (CORNERS[a][i] + CORNERS[b][i]) + departure[4 + k, axis] / half[axis] for i, axis in ((0, 1), (1, 2))
         )
-        derivative[4 + k, 0, -RING:] = place.outward * _ring_basis(np.array([u]), np.array([v]))[0]
+        derivative[4 + k, 0, OF_RING] = place.outward * _ring_basis(np.array([u]), np.array([v]))[0]
         axis, w = (2, u) if k % 2 == 0 else (1, v)
-        derivative[4 + k, axis] = 0.0
-        derivative[4 + k, axis, FACE * k : FACE * (k + 1)] = _on_face(k, departure[4 + k, 0], w)
+        derivative[4 + k, axis] = _on_face(k, departure[4 + k, 0], w)
         departure[4 + k] = derivative[4 + k] @ coefficients
-    return departure.ravel(), derivative.reshape(24, COUNT)
+    return departure.ravel(), derivative.reshape(24, len(coefficients))
 
 
 def _on_face(face: int, x: float, w: float) -> Floats:
-    """Return the derivative (8,) of a coordinate on a face, at x and w, by the face's coefficients."""
-    derivative: Floats = FACES[face][2] * ends_faces.basis(np.array([x]), np.array([w]))[0]
+    """Return the derivative (52,) of a coordinate on a face, at x and w, by coefficients and waves."""
+    derivative = np.zeros(WAVES.stop)
+    departures = FACES[face][2] * ends_faces.departures(np.array([x]), np.array([w]))[0]
+    waves = COUNT + len(NODES) * face
+    derivative[FACE * face : FACE * (face + 1)] = departures[:FACE]
+    derivative[waves : waves + len(NODES)] = departures[FACE:]
     return derivative

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import by_cell, thinned
 from processor.geometry.polyline import Polyline
 from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
-from processor.preassembly.ends import bottom_edges, faces, joint_end
+from processor.preassembly.ends import bottom_edges, faces, joint_end, viewpoints
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.faces import RegisteredPart
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
@@ -57,6 +58,16 @@ class MeasuredPart:
         return tuple(one for of_scan in wrong for one in of_scan) if all(wrong) else ()
 
 
+class _Views(NamedTuple):
+    """What errors of unit variance that each view of a part shares do to it.
+
+    ``pose`` (6, 6) is the covariance of its registration, ``left`` the share of the variance that it leaves in a view.
+    """
+
+    pose: Floats
+    left: float
+
+
 @dataclass(frozen=True)
 class FittedPart:
     """A part whose ends are fitted but not estimated yet: ``measured`` has no ends."""
@@ -64,6 +75,7 @@ class FittedPart:
     part: DesignPart
     measured: MeasuredPart
     ends: tuple[FittedEnd | JointEnd | None, ...]
+    views: _Views = field(default_factory=lambda: _Views(np.zeros((6, 6)), 0.0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,21 +159,51 @@ def fit(
         residuals=residuals,
         identities=_identities(placed, part),
     )
-    return FittedPart(part, measured, ends)
+    several = len(np.unique(registered.station)) > 1
+    return FittedPart(part, measured, ends) if several else FittedPart(part, measured, ends, _views(registered, shape))
 
 
 def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[MeasuredPart]:
     """Estimate the ends of all parts together, and add ``systematic`` errors to their covariance."""
-    fitted = [end for part in parts for end in part.ends if isinstance(end, FittedEnd)]
-    estimated = iter(joint_end.estimate(fitted))
+    between = _between_viewpoints(parts)
+    seen = [_as_seen(part, between.level) for part in parts]
+    fitted = [(end, part.views.left) for part in seen for end in part.ends if isinstance(end, FittedEnd)]
+    of_ends = [between._replace(level=left * between.level) for _, left in fitted]
+    estimated = iter(joint_end.estimate([end for end, _ in fitted], of_ends))
     measured = []
-    for part in parts:
+    for part in seen:
         ends = [next(estimated) if isinstance(end, FittedEnd) else end for end in part.ends]
         first, last = (
             None if end is None else systematic_errors.added_to_end(end, systematic, part.part) for end in ends
         )
-        measured.append(replace(part.measured, member=replace(part.measured.member, ends=(first, last))))
+        member = replace(part.measured.member, ends=(first, last))
+        reasons = (*part.measured.reasons, *_viewpoint_remarks(part, between))
+        measured.append(replace(part.measured, member=member, reasons=reasons))
     return measured
+
+
+def _viewpoint_remarks(part: FittedPart, between: viewpoints.Variances) -> Iterator[Reason]:
+    """Yield what is known of differences between the views of a part whose points' stations are not named."""
+    if any(isinstance(end, FittedEnd) and end.plates for end in part.ends):
+        if between.evident:
+            yield reason("preassemble.viewpoints-differ", sd=float(np.sqrt(between.level)))
+        elif not between.known:
+            yield reason("preassemble.viewpoints-not-compared")
+
+
+def _between_viewpoints(parts: Sequence[FittedPart]) -> viewpoints.Variances:
+    """Variances between viewpoints by the plates of all parts."""
+    ends = [end for part in parts for end in part.ends if isinstance(end, FittedEnd)]
+    return viewpoints.variances([plate for end in ends for plate in end.plates if plate is not None])
+
+
+def _as_seen(part: FittedPart, variance: float) -> FittedPart:
+    """Return a part with a ``variance`` between viewpoints in the covariances of its registration and its edges."""
+    pose = part.measured.member.pose + variance * part.views.pose
+    edges = systematic_errors.added_to_edges(part.measured.member.edges, SystematicParams(), variance * part.views.left)
+    measured = replace(part.measured, member=replace(part.measured.member, edges=edges, pose=pose))
+    ends = tuple(replace(end, pose=pose) if isinstance(end, FittedEnd) else end for end in part.ends)
+    return replace(part, measured=measured, ends=ends)
 
 
 def assigned(parts: Sequence[MeasuredPart]) -> list[MeasuredPart]:
@@ -218,6 +260,28 @@ def _edges(
 
 def _design_edges(part: DesignPart) -> tuple[Polyline, Polyline]:
     return Polyline.through(part.bottom_edge_left), Polyline.through(part.bottom_edge_right)
+
+
+def _views(part: RegisteredPart, shape: attitude.Surface) -> _Views:
+    """Propagate errors of views into the registration of a part.
+
+    A view is one side of one half of the part: neither the sides nor the ends of a part are seen from one place.
+    """
+    points = thinned(part.points, surface_registration.POINTS)
+    face, residual, beyond = shape.mesh.distances(points, 60.0)
+    near = on_face(face, beyond) & (np.abs(residual) < surface_registration.GATES_MM[1])
+    points, normals = points[near], shape.mesh.normals[face[near]]
+    middle = points.mean(axis=0)
+    axis = icp.facing(normals, shape.axes)
+    side = (normals @ shape.axes)[np.arange(len(axis)), axis] > 0.0
+    half = (points - middle) @ shape.axes[:, 0] > 0.0
+    view = np.unique(4 * axis + 2 * side + half, return_inverse=True)[1].reshape(-1)
+    J = np.hstack([np.cross(points - middle, normals), normals])
+    sums = np.stack([np.bincount(view, column) for column in J.T], axis=1)
+    inverse = np.linalg.pinv(J.T @ J)
+    rest = np.eye(len(sums)) - sums / np.bincount(view)[:, None] @ inverse @ sums.T
+    pose = rigid.about_origin(inverse @ sums.T @ sums @ inverse, middle)
+    return _Views(pose, min(float(np.mean(rest**2)) * len(rest), 1.0))
 
 
 def _between_stations(points: Floats, station: Ints, shape: attitude.Surface) -> float:

@@ -241,10 +241,7 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         earlier = Chosen(before.states, before.sizes, before.energy, before.second, before.second_energy)
         for new, old in zip(chosen, earlier, strict=True):
             new[~undecided] = old[~undecided]
-    # a doubtful size is no evidence against the nominal one
-    nominal = (chosen.second == problem.expected) & (chosen.second_energy < chosen.energy + AMBIGUOUS)
-    chosen.second[nominal] = chosen.sizes[nominal]
-    chosen.sizes[nominal] = chosen.states[nominal, 3] = problem.expected[nominal]
+    keep_nominal(chosen, problem.expected)
     priors = Priors(problem.centre_weight, chosen.sizes, np.full(len(chosen.sizes), size_weight))
     done = finish(problem.crops, masks, model, setting.model_points, priors, chosen.states, 4.5 * sigma)
     fits = Fits(
@@ -258,6 +255,13 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         numbers=done.numbers,
     )
     return fits, done.residuals
+
+
+def keep_nominal(chosen: Chosen, expected: Floats) -> None:
+    """Take the expected size (k,) where it is the runner-up and is not ruled out, in place."""
+    rows = (chosen.second == expected) & (chosen.second_energy < chosen.energy + AMBIGUOUS)
+    chosen.second[rows] = chosen.sizes[rows]
+    chosen.sizes[rows] = chosen.states[rows, 3] = expected[rows]
 
 
 def typical_variance(noise: Floats, ranges: Floats) -> float:

@@ -10,6 +10,7 @@ decided by the joints that its members lead to.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -36,10 +37,10 @@ LEAST_RATIO = 1.25  # of a ball's radius to that of its thinnest tube
 LUMP = 0.12  # rms departure of a cylinder or box from the nearest sphere, in radii
 BESIDE_MM = 25.0  # points this far from a surface are those of something else
 STRAY, STRAY_OF_LUMP = 0.05, 0.3  # share of points that are on neither, at a ball and at something else
-NARROWEST = 0.2  # of a sleeve, in tube radii
-STEP_MM = 20.0  # of the lengths of sleeve and cone that are tried
-LEAST_STEPS = 2
-CLAMP = 2.2  # tube radii from the node: a clamp reaches no farther
+NECKS = np.array([60.0, 85.0, 110.0, 140.0, 180.0])  # lengths of sleeve and cone together, mm
+SLEEVE_SHARE = 0.45  # of it
+SLEEVE_SPREAD = 0.1  # sd of a sleeve's radius about the usual one, in tube radii
+CLAMP = 1.6  # tube radii from the node: no sleeve begins nearer
 CLEAR_MM = 5.0  # of either
 AXIS_MM = 1.5  # error of an axis at the node
 MISTAKEN = 0.01  # probability that evidence of one kind is wrong as a whole, however many points it has
@@ -47,22 +48,21 @@ UNLIKE = 0.2  # probability that a member joins a ball and something else
 TURNS = 50
 
 
-def balls(source: Source, measured: Measured, threads: int = 0) -> Bools:
+def balls(source: Source, measured: Measured, starts: Floats, threads: int = 0) -> Bools:
     """Return which nodes (k,) have a ball, the most likely assignment of all together; one pass over the source.
 
-    Nodes without a position are undecided by their points.
+    ``starts`` (k, 3) are the places of nodes that no axes fix.
     """
-    nodes, members = measured.nodes, measured.members
-    rows = np.flatnonzero(np.isfinite(nodes.positions).all(axis=1))
+    members = measured.members
+    lost = ~np.isfinite(measured.nodes.positions).all(axis=1, keepdims=True)
+    nodes = replace(measured.nodes, positions=np.where(lost, starts, measured.nodes.positions))
+    noise = float(np.median(members.rms)) if len(members.rms) else 1.0
+    sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + AXIS_MM**2))
+    near = sphere_crops.gather(source, nodes.positions, REACH_MM, threads, POINTS * nodes.count)
+    crops = aimed(near, nodes.positions, np.array(source.scanners, np.float64), threads)
     sphere, neck = np.zeros(nodes.count), np.zeros(nodes.count)
-    if len(rows):
-        ends = occlusion.ends(nodes, members)
-        places = nodes.positions[rows]
-        near = sphere_crops.gather(source, places, REACH_MM, threads, POINTS * len(rows))
-        crops = aimed(near, places, np.array(source.scanners, np.float64), threads)
-        noise = float(np.median(members.rms)) if len(members.rms) else 1.0
-        sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + AXIS_MM**2))
-        over_ranges(partial(_evidence, rows, crops, ends, sd, sphere, neck), len(rows), threads)
+    kernel = partial(_evidence, crops, occlusion.ends(nodes, members), sd, sphere, neck)
+    over_ranges(kernel, nodes.count, threads)
     joined = (members.node_a >= 0) & (members.node_b >= 0)
     pairs = np.unique(np.sort(np.stack([members.node_a, members.node_b], axis=1)[joined], axis=1), axis=0)
     return most_likely(for_a_ball(sphere, neck), pairs.reshape(-1, 2))
@@ -120,26 +120,22 @@ def _bounded(ratio: Floats) -> Floats:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _evidence(rows, crops, ends, sd, sphere, neck, first, last):  # type: ignore[no-untyped-def]
-    """Fill the log likelihood ratios of the nodes in rows ``first`` to ``last``: of a sphere, and of narrowed tubes."""
-    for j in range(first, last):
-        k = rows[j]
-        about = slice(crops.start[j], crops.start[j + 1])
+def _evidence(crops, ends, sd, sphere, neck, first, last):  # type: ignore[no-untyped-def]
+    """Fill the log likelihood ratios of nodes ``first`` to ``last``: of a sphere, and of narrowed tubes."""
+    for k in range(first, last):
+        about = slice(crops.start[k], crops.start[k + 1])
         points, rays = crops.points[about], crops.rays[about]
         own = slice(ends.start[k], ends.start[k + 1])
         feet, axes, tubes = ends.points[own], ends.directions[own], ends.tube_radii[own]
-        if len(tubes) == 0:
+        if len(tubes) == 0 or RADII[-1] < LEAST_RATIO * tubes.min():
             continue
         seen = _beside_members(points, rays, feet, axes, tubes, sd)
-        best, radius = -np.inf, 0.0
-        for r in RADII:
-            if r >= LEAST_RATIO * tubes.min():
-                ratio = _sphere_ratio(points[seen], rays[seen], r, sd)
-                if ratio > best:
-                    best, radius = ratio, r
-        sphere[k] = best - np.log(len(RADII)) if best > -np.inf else 0.0
-        if sphere[k] < 0.0:
-            radius = 0.0  # no ball that could hide the start of a sleeve
+        tried = RADII[RADII / tubes.min() >= LEAST_RATIO]
+        ratios = np.zeros(len(tried))
+        for m in range(len(tried)):
+            ratios[m] = _sphere_ratio(points[seen], rays[seen], tried[m], sd)
+        sphere[k] = _mean_of(ratios)
+        radius = tried[np.argmax(ratios)] if sphere[k] > 0.0 else 0.0
         for m in range(len(tubes)):
             neck[k] += _neck_ratio(points, feet[m], axes[m], tubes[m], max(radius, CLAMP * tubes[m]) + CLEAR_MM, sd)
 
@@ -185,26 +181,33 @@ def _sphere_ratio(points, rays, radius, sd):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _neck_ratio(points, foot, axis, tube, beyond, sd):  # type: ignore[no-untyped-def]
-    """Log likelihood ratio of a member that narrows towards the node to a tube of one radius.
+    """Log likelihood ratio of a tube that ends in a cone and a sleeve to one that goes on towards the node.
 
-    How far the sleeve and the cone reach is unknown: the likelihood is the mean over their lengths.
+    How far cone and sleeve reach is unknown: the likelihood is the mean over their lengths.
     """
-    steps = np.zeros(int((REACH_MM - beyond) / STEP_MM))
-    if len(steps) < LEAST_STEPS:
-        return 0.0
-    inside = 1.0 / ((1.0 - NARROWEST) * tube + sd)
+    totals = np.zeros(len(NECKS))
+    wide = np.sqrt(sd * sd + (SLEEVE_SPREAD * tube) ** 2)
+    stray = 1.0 / (tube + 3.0 * sd)
+    sleeve = occlusion.SLEEVE_OF_TUBE * occlusion.MEDIAN_OF_CORNER * tube
     for i in range(len(points)):
         along, off = _by_axis(points[i], foot, axis)
-        step = int(np.floor((along - beyond) / STEP_MM))
-        if step < 0 or step >= len(steps) or off < NARROWEST * tube or off > tube + 3.0 * sd:
+        if along < beyond or off > tube + 3.0 * sd:
             continue
-        on_tube = _normal(off - tube, sd)
-        narrow = (1.0 - STRAY) * inside + STRAY * on_tube if off < tube + sd else STRAY * on_tube
-        ratio = np.log(narrow / ((1.0 - STRAY) * on_tube + STRAY * inside))
-        steps[step] += ratio if off < tube + sd else min(ratio, 0.0)
-    total = np.cumsum(steps)[LEAST_STEPS - 1 :]
-    most = total.max()
-    return most + np.log(np.mean(np.exp(total - most)))
+        goes_on = (1.0 - STRAY) * _normal(off - tube, sd) + STRAY * stray
+        for m in range(len(NECKS)):
+            share = (along - beyond) / NECKS[m]
+            if share < 1.0:
+                cone = max(share - SLEEVE_SHARE, 0.0) / (1.0 - SLEEVE_SHARE)
+                narrow = (1.0 - STRAY) * _normal(off - sleeve - (tube - sleeve) * cone, wide) + STRAY * stray
+                totals[m] += np.log(narrow / goes_on)
+    return _mean_of(totals)
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _mean_of(logs):  # type: ignore[no-untyped-def]
+    """Logarithm of the mean of likelihoods by their logarithms."""
+    most = logs.max()
+    return most + np.log(np.mean(np.exp(logs - most)))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -1,0 +1,137 @@
+"""Universal kriging of a face's departures: a trend and what the trend does not follow, of unknown size and length.
+
+Departures are a linear trend plus a Gaussian process (Matern 5/2). Size and correlation length of the process are
+hypotheses. The estimate is the average over them, weighted by their restricted likelihood (Cressie, Statistics for
+Spatial Data, 1993, ch. 3; Harville 1974), so its covariance includes that size and length are not known. Where the
+trend fits, size 0 has nearly all weight and the estimate is that of least squares.
+"""
+
+# Numba infers the types of the kernel's arguments: it stays without annotations.
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from processor.adjustment.model_averaging import weights_by_others
+from processor.model import Floats
+
+SIZES_MM = (0.03, 0.1, 0.3, 1.0, 3.0)
+LENGTHS_MM = (100.0, 200.0, 400.0)
+# A process of size 0 has no length; every other size has all lengths with equal weight.
+HYPOTHESES = ((0.0, LENGTHS_MM[0]), *product(SIZES_MM, LENGTHS_MM))
+PRIOR = np.array([0.5, *(0.5 / (len(HYPOTHESES) - 1),) * (len(HYPOTHESES) - 1)])
+LEAST_SHARE = 1e-4  # a hypothesis of less weight is left out of the average
+
+
+class Means(NamedTuple):
+    """Means (c,) of departures over patches at ``place`` (c, 2), mm, their variances by noise, and the trend (c, k)."""
+
+    place: Floats
+    value: Floats
+    variance: Floats
+    trend: Floats
+
+
+class Kriged(NamedTuple):
+    """Coefficients of the trend and the process at the wanted places (k + m,), with covariance (k + m, k + m)."""
+
+    mean: Floats
+    covariance: Floats
+
+
+class Hypotheses(NamedTuple):
+    """The estimates by every hypothesis: means (h, k + m), covariances (h, k + m, k + m), log likelihoods (h,)."""
+
+    means: Floats
+    covariances: Floats
+    logs: Floats
+
+
+def by_hypotheses(means: Means, at: Floats) -> Hypotheses:
+    """Estimate the trend and the process at places (m, 2) by each of HYPOTHESES."""
+    apart, to_wanted = _distances(means.place, means.place), _distances(at, means.place)
+    among = _distances(at, at)
+    found = []
+    for size, length in HYPOTHESES:
+        covariances = [size**2 * _matern(distance / length) for distance in (apart, to_wanted, among)]
+        found.append(_by_one(means, *covariances))
+    return Hypotheses(*(np.array(column) for column in zip(*found, strict=True)))
+
+
+def learned_weights(every: Sequence[Hypotheses]) -> Floats:
+    """Weights (f, h) of the hypotheses for each of f faces, learned from the other faces."""
+    numbers = np.arange(len(HYPOTHESES))[None]
+    return weights_by_others(np.array([one.logs for one in every]), PRIOR, numbers)
+
+
+def average(found: Hypotheses, weights: Floats = PRIOR) -> Kriged:
+    """Average over hypotheses with prior weights (h,)."""
+    share = weights * np.exp(found.logs - found.logs.max())
+    share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
+    share /= share.sum()
+    mean = np.einsum("h,hk->k", share, found.means)
+    off = found.means - mean
+    within = np.einsum("h,hkl->kl", share, found.covariances)
+    return Kriged(mean, within + np.einsum("h,hk,hl->kl", share, off, off))
+
+
+def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tuple[Floats, Floats, float]:
+    """Mean (k + m,) and covariance (k + m, k + m) by one hypothesis, and its restricted log likelihood.
+
+    ``apart`` (c, c), ``to_wanted`` (m, c) and ``among`` (m, m) are covariances of the process between patches and
+    wanted places.
+    """
+    columns, count = means.trend.shape[1], len(means.value)
+    system = np.hstack([apart + np.diag(means.variance), means.trend, means.value[:, None], to_wanted.T])
+    products = _eliminated(np.ascontiguousarray(system), count)
+    trend, value, wanted = slice(0, columns), columns, slice(columns + 1, None)
+    inverse = np.linalg.inv(products[trend, trend])
+    coefficients = inverse @ products[trend, value]
+    by_trend = products[wanted, trend]
+    rest = products[value, value] - coefficients @ products[trend, value]
+    log = -float(np.log(np.diag(system)).sum()) - 0.5 * float(np.linalg.slogdet(products[trend, trend])[1] + rest)
+    of_process = among - products[wanted, wanted] + by_trend @ inverse @ by_trend.T
+    both = -inverse @ by_trend.T
+    covariance = np.block([[inverse, both], [both.T, of_process]])
+    process = products[wanted, value] - by_trend @ coefficients
+    return np.concatenate([coefficients, process]), covariance, log
+
+
+@njit(cache=True)
+def _eliminated(system, count):  # type: ignore[no-untyped-def]
+    """Products (m, m) of the columns behind a covariance (n, n) in a ``system`` (n, n + m), weighed by its inverse.
+
+    The covariance becomes its Cholesky factor. LAPACK's own depends, in the last digits, on the number of threads.
+    """
+    columns = system.shape[1]
+    for k in range(count):
+        scale = 1.0 / np.sqrt(system[k, k])
+        for j in range(k, columns):
+            system[k, j] *= scale
+        for i in range(k + 1, count):
+            factor = system[k, i]
+            for j in range(i, columns):
+                system[i, j] -= factor * system[k, j]
+    extra = columns - count
+    products = np.zeros((extra, extra))
+    for k in range(count):
+        for i in range(extra):
+            for j in range(extra):
+                products[i, j] += system[k, count + i] * system[k, count + j]
+    return products
+
+
+def _distances(a: Floats, b: Floats) -> Floats:
+    apart: Floats = np.linalg.norm(a[:, None] - b[None], axis=2)
+    return apart
+
+
+def _matern(distance: Floats) -> Floats:
+    scaled = np.sqrt(5.0) * distance
+    correlation: Floats = (1.0 + scaled + scaled**2 / 3.0) * np.exp(-scaled)
+    return correlation

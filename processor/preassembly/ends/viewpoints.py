@@ -1,0 +1,119 @@
+"""What viewpoints disagree by, where nothing is said of them: by the two sides of plates.
+
+A cloud merged from several stations has errors of range, place and turn of each station in it, and each face is seen
+from some of them only. On one face they look like form. But the two sides of a plate are never seen from one place, and
+plates of one thickness are as thick at one end as at another: the variance of their thickness, as measured, is twice
+that between viewpoints. Waves and bends of a plate are the same on both of its sides and cancel. Rolling tolerances are
+in it as well: they cannot be told apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from processor.adjustment import clusters
+from processor.model import Floats
+from processor.preassembly.ends.plate_sides import Bools
+
+TERMS = 3  # of a plate's thickness: its mean, its changes along and across
+ALIKE_MM = 2.0  # plates that differ by less are of one nominal thickness: rolling and viewpoints differ by less
+PATCH_MM, FEWEST_OF_PATCH = 50.0, 4  # size of a patch, and points on either side of it
+FLOOR_MM = 0.004
+RISK = 1e-3  # that noise alone is taken for a difference between viewpoints
+OF_PAIR = 2  # opposite plates of an end are seen from the same two sides: their differences are the same
+
+
+@dataclass(frozen=True)
+class Thickness:
+    """Thickness (3,) of a plate at an end, mm: mean, changes along and across; variances (3,) by noise."""
+
+    value: Floats
+    noise: Floats
+
+
+class Variances(NamedTuple):
+    """Variances between viewpoints, mm^2: of a face's level, its tilt along and across, and the level of an end's ring.
+
+    The registration takes some of a face's share. ``evident``: the levels differ by more than noise, with a risk of
+    RISK. ``known``: two plates or more were compared.
+    """
+
+    level: float = 0.0
+    along: float = 0.0
+    across: float = 0.0
+    ring: float = 0.0
+    evident: bool = False
+    known: bool = False
+
+
+NONE = Variances()
+
+
+def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickness | None:
+    """Measure a plate by points (n,) at ``height`` above the design's outer side; None without an inner side.
+
+    The two sides are compared patch by patch: ``at`` (n, 2) is the place of the points along and across the plate, mm,
+    ``trend`` (n, 3) are the terms there, and ``inner`` (n,) marks the points behind the outer side.
+    """
+    patch = clusters.cubes(at, PATCH_MM)
+    count = int(patch.max(initial=-1)) + 1
+    difference, variance = np.zeros(count), np.zeros(count)
+    enough = np.ones(count, bool)
+    for side, sense in ((~inner, 1.0), (inner, -1.0)):
+        number = np.bincount(patch[side], minlength=count)
+        mean = np.bincount(patch[side], height[side], count) / np.maximum(number, 1)
+        rest = height[side] - mean[patch[side]]
+        noise = float(rest @ rest) / max(int(side.sum()) - int((number > 0).sum()), 1)
+        difference += sense * mean
+        variance += noise / np.maximum(number, 1)
+        enough &= number >= FEWEST_OF_PATCH
+    if enough.sum() < 2 * TERMS:
+        return None
+    total = np.bincount(patch, minlength=count)
+    terms = np.stack([np.bincount(patch, column, count) / total for column in trend.T], axis=1)[enough]
+    terms[:, 1:] -= terms[:, 1:].mean(axis=0)
+    root = np.sqrt(1.0 / np.maximum(variance[enough], FLOOR_MM**2))[:, None]
+    if np.linalg.cond(terms * root) > 1e4:
+        return None
+    solve = np.linalg.pinv(terms * root) * root.T
+    return Thickness(solve @ difference[enough], np.diag(solve @ np.diag(variance[enough]) @ solve.T))
+
+
+def variances(plates: Sequence[Thickness]) -> Variances:
+    """Variances between viewpoints by the plates at all ends of a bridge.
+
+    They are widened for the number of differences they come from, so that 1.96 standard deviations cover what Student's
+    t covers. 0 where no two plates are alike.
+    """
+    if not plates:
+        return NONE
+    value, noise = np.array([one.value for one in plates]), np.array([one.noise for one in plates])
+    level = np.sort(value[:, 0])
+    group = np.cumsum(np.diff(level, prepend=level[0]) > ALIKE_MM)
+    count = np.bincount(group)
+    level = level - (np.bincount(group, level) / count)[group]
+    # The mean of a group takes its share of the noise out of the differences.
+    by_noise = float(noise[:, 0].mean()) * (len(plates) - len(count))
+    freedom = len(plates) - len(count)
+    squares = float((level**2).sum())
+    between = _variance(squares, by_noise, freedom)
+    return Variances(
+        level=between,
+        ring=between,
+        along=_variance(float((value[:, 1] ** 2).sum()), float(noise[:, 1].sum()), len(plates)),
+        across=_variance(float((value[:, 2] ** 2).sum()), float(noise[:, 2].sum()), len(plates)),
+        known=freedom > 0,
+        evident=squares > float(chi2.ppf(1.0 - RISK, max(freedom, 1))) * float(noise[:, 0].mean()),
+    )
+
+
+def _variance(squares: float, by_noise: float, freedom: int) -> float:
+    """Variance on one side of a plate by the sum of squares of differences of its two sides."""
+    if freedom < 1:
+        return 0.0
+    return float(clusters.widening(freedom / OF_PAIR)) * max(squares - by_noise, 0.0) / (2.0 * freedom)

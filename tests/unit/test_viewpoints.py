@@ -1,0 +1,53 @@
+"""What viewpoints disagree by: from the two sides of plates, by draws of known size."""
+
+import numpy as np
+import pytest
+
+from processor.preassembly.ends import viewpoints
+
+
+def plate(rng, apart, thick=24.0, waves=0.0):
+    """Points on both sides of a plate of 500 by 900 mm; each side is off by a draw of ``apart`` mm."""
+    heights, places, inner = [], [], []
+    for side, level in ((False, 0.0), (True, -thick)):
+        at = rng.uniform((-500.0, -450.0), (0.0, 450.0), (3_000, 2))
+        shape = waves * np.sin(2.0 * np.pi * at[:, 0] / 700.0)
+        heights.append(level + shape + apart * rng.standard_normal() + rng.standard_normal(len(at)))
+        places.append(at)
+        inner.append(np.full(len(at), side))
+    at = np.vstack(places)
+    terms = np.stack([np.ones(len(at)), at[:, 0] / 500.0, at[:, 1] / 450.0], axis=1)
+    return viewpoints.thickness(terms, at, np.concatenate(heights), np.concatenate(inner))
+
+
+def test_waves_of_a_plate_do_not_change_its_thickness():
+    rng = np.random.default_rng(0)
+    found = np.array([plate(rng, 0.0, waves=3.0).value for _ in range(20)])
+    assert np.abs(found[:, 0].mean() - 24.0) < 0.03
+    assert found[:, 0].std() < 0.1
+
+
+@pytest.mark.parametrize("apart", [0.1, 0.3])
+def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart):
+    rng = np.random.default_rng(1)
+    found = [
+        viewpoints.variances([plate(rng, apart, thick) for thick in (24.0, 20.0, 30.0) for _ in range(8)])
+        for _ in range(20)
+    ]
+    # Widened for the 10 pairs of opposite plates: (2.23 / 1.96)^2.
+    assert np.mean([one.level for one in found]) == pytest.approx(1.29 * apart**2, rel=0.25)
+    assert all(one.evident for one in found)
+
+
+def test_noise_alone_is_no_difference_between_viewpoints():
+    rng = np.random.default_rng(2)
+    found = [viewpoints.variances([plate(rng, 0.0) for _ in range(16)]) for _ in range(20)]
+    assert not any(one.evident for one in found)
+    assert np.sqrt(np.mean([one.level for one in found])) < 0.02
+
+
+def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
+    at = np.random.default_rng(3).uniform(0.0, 500.0, (1_000, 2))
+    terms = np.stack([np.ones(1_000), *(at / 500.0).T], axis=1)
+    assert viewpoints.thickness(terms, at, np.zeros(1_000), np.zeros(1_000, bool)) is None
+    assert viewpoints.variances([]) == viewpoints.NONE
