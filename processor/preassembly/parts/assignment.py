@@ -75,7 +75,9 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
         share = max(share, _near_share(few, T, shapes[other]))
         if _shows_other(few, (shapes[best], T_best), (shapes[other], T)):
             best, T_best = other, T
-    if share <= surface_registration.LEAST_SHARE:
+    # Surfaces made from design curves are not whole: points of the right part lie off them, too.
+    whole = all(part.source != box_girder.SOURCE for part in shapes.design.parts)
+    if whole and share <= surface_registration.LEAST_SHARE:
         return -1
     return None if best == index else best
 
