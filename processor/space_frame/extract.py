@@ -299,7 +299,7 @@ def _with_nominal_places(nodes: Nodes, positions: Floats) -> Nodes:
     lost = ~np.isfinite(nodes.positions).all(axis=1)
     places, covariance = nodes.positions.copy(), nodes.covariance.copy()
     places[lost], covariance[lost] = positions[lost], NOMINAL_SD_MM**2 * np.eye(3)
-    return Nodes(places, covariance, np.where(lost, 0, nodes.axes), nodes.scatter)
+    return Nodes(places, covariance, np.where(lost, 0, nodes.axis_count), nodes.scatter)
 
 
 # --- design ----------------------------------------------------------------------------------------------------------

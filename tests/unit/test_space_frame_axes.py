@@ -23,17 +23,17 @@ def ends_at(rng, nodes, per_node, sd=0.1, eccentricity=0.0, starts=None, respons
     starts = nodes if starts is None else starts
     if response is None:
         response = np.zeros((len(node), 0, 4, 2))
-    return axis_intersection.incidence(node, starts, points, directions, side, covariance, response)
+    return axis_intersection.axis_ends(node, starts, points, directions, side, covariance, response)
 
 
 def test_axes_meet_where_they_do():
     rng = np.random.default_rng(1)
     nodes = rng.uniform(-5e4, 5e4, (20, 3))
     starts = nodes + rng.uniform(-20.0, 20.0, nodes.shape)
-    met = axis_intersection.meet(ends_at(rng, nodes, 4, sd=1e-9, starts=starts), starts, 0.05)
+    met = axis_intersection.intersect_axes(ends_at(rng, nodes, 4, sd=1e-9, starts=starts), starts, 0.05)
     assert np.abs(met.positions - nodes).max() < 1e-6
     assert met.used.all()
-    assert (met.axes == 4).all()
+    assert (met.axis_count == 4).all()
 
 
 @pytest.mark.parametrize("eccentricity", [0.0, 1.0])
@@ -41,7 +41,7 @@ def test_covariance_is_honest_with_and_without_eccentric_axes(eccentricity):
     rng = np.random.default_rng(2)
     nodes = rng.uniform(-1e4, 1e4, (1500, 3))
     for per_node in (3, 6):
-        met = axis_intersection.meet(ends_at(rng, nodes, per_node, 0.1, eccentricity), nodes, 0.02)
+        met = axis_intersection.intersect_axes(ends_at(rng, nodes, per_node, 0.1, eccentricity), nodes, 0.02)
         error = met.positions - nodes
         pull2 = np.einsum("ki,kij,kj->k", error, np.linalg.inv(met.covariance), error) / 3.0
         assert np.sqrt(np.median(pull2) / 0.789) == pytest.approx(1.0, abs=0.12)  # 0.789 = median of chi2(3) / 3
@@ -54,7 +54,7 @@ def test_an_axis_that_is_a_stranger_is_left_out():
     nodes = rng.uniform(-1e4, 1e4, (50, 3))
     ends = ends_at(rng, nodes, 6, 0.1)
     ends.offsets[::6] += 20.0 * ends.across[::6, 0]
-    met = axis_intersection.meet(ends, nodes, 0.05)
+    met = axis_intersection.intersect_axes(ends, nodes, 0.05)
     assert not met.used[::6].any()
     assert met.used.sum() >= 5 * 50 - 2  # 4.5 sigma: hardly another one
     assert (np.linalg.norm(met.positions - nodes, axis=1) < 1.0).all()
@@ -69,8 +69,8 @@ def test_two_axes_fix_a_point_and_one_or_parallel_ones_do_not():
     side = np.array([across(d)[0] for d in direction])
     covariance = np.tile(np.diag([0.01, 0.01, 1e-9, 1e-9, 0.01]), (5, 1, 1))
     offset = rng.normal(scale=0.1, size=(5, 3))
-    ends = axis_intersection.incidence(node, nodes, offset, direction, side, covariance, np.zeros((5, 0, 4, 2)))
-    met = axis_intersection.meet(ends, nodes, 0.05)
+    ends = axis_intersection.axis_ends(node, nodes, offset, direction, side, covariance, np.zeros((5, 0, 4, 2)))
+    met = axis_intersection.intersect_axes(ends, nodes, 0.05)
     assert np.isfinite(met.positions[0]).all()
     assert met.positions[0, 2] == pytest.approx(0.5 * (offset[0, 2] + offset[1, 2]))  # equal weights, by hand
     assert np.isnan(met.positions[1:]).all()
@@ -85,5 +85,5 @@ def test_a_station_moves_all_axes_of_a_node_alike():
     ends = ends_at(rng, nodes, 6, 0.01, response=response)
     with_noise = ends_at(rng, nodes, 6, 0.01)
     ends = axis_intersection.Incidence(ends.node, ends.offsets, ends.across, with_noise.covariance, ends.response)
-    met = axis_intersection.meet(ends, nodes, 0.01)
+    met = axis_intersection.intersect_axes(ends, nodes, 0.01)
     assert met.covariance[0] == pytest.approx(4.0 * np.eye(3), abs=0.01)

@@ -156,7 +156,7 @@ def test_a_member_that_is_not_there_is_left_out(frame, source):
     far = np.concatenate([frame.nodes, [[0.0, 0.0, 20_000.0]]])
     nodes, _ = measure(source, far, frame.members)
     assert np.isnan(nodes.positions[-1]).all()
-    assert nodes.axes[-1] == 0
+    assert nodes.axis_count[-1] == 0
 
 
 def test_stations_that_are_off_are_seen_and_told(frame):

@@ -125,7 +125,7 @@ def test_a_node_without_points_is_known_from_its_axes_alone(roof):
         nodes,
         positions=np.vstack([nodes.positions, [50000.0, 0.0, 6000.0]]),
         covariance=np.concatenate([nodes.covariance, nodes.covariance[:1]]),
-        axes=np.append(nodes.axes, 4),
+        axis_count=np.append(nodes.axis_count, 4),
         scatter=np.append(nodes.scatter, 0.5),
     )
     found = fit_spheres(source, away, tubes, catalogue.load())

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from processor.space_frame.members import tubes
-from processor.space_frame.members.cylinder import NP, residual
+from processor.space_frame.members import tube_fits
 from processor.space_frame.members.cylinder_fit import Errors
+from processor.space_frame.members.cylinder_model import NP, residual
 from processor.space_frame.points import line_crops
 from tests.support import frame_clouds
 
@@ -22,10 +22,10 @@ def fitted(cloud, station, scanners=STATIONS, bow_share=BOW_SHARE, off_mm=0.0, v
     half = np.array([0.5 * LENGTH + 250.0])
     near = line_crops.corridors(middle, direction, -half, half, 120.0)
     gathered = line_crops.gather([(cloud, station)], 100.0, near, 8192)
-    rough = tubes.rough(gathered, scanners, middle, direction, half - 450.0, half, (15.0, 110.0), 256, 1)
-    cos = tubes.least_cosine(rough, 0.2) if least_cos is None else least_cos
+    rough = tube_fits.rough(gathered, scanners, middle, direction, half - 450.0, half, (15.0, 110.0), 256, 1)
+    cos = tube_fits.least_cosine(rough, 0.2) if least_cos is None else least_cos
     errors = Errors(bow_share, cos, *variance)
-    return rough, tubes.refined(gathered, scanners, rough, half, (15.0, 110.0), 256, errors, 1)
+    return rough, tube_fits.refined(gathered, scanners, rough, half, (15.0, 110.0), 256, errors, 1)
 
 
 def scan(rng, sigma=1.0, count=700, bow=(0.0, 0.0), moved=None, ends=True, stations=STATIONS):
@@ -213,8 +213,8 @@ def test_a_wide_beam_spoils_grazing_rays_and_they_are_left_out():
     cos = -np.einsum("ij,ij->i", away, ray) / np.linalg.norm(away, axis=1)
     spoilt = cloud + np.where(cos < 0.4, 4.0, 0.0)[:, None] * ray  # as the footprint's other part lies behind
     rough, fine = fitted(spoilt, station)
-    assert tubes.least_cosine(rough, 0.2) == pytest.approx(0.4)
-    assert tubes.least_cosine(fitted(cloud, station)[0], 0.2) == pytest.approx(0.2)
+    assert tube_fits.least_cosine(rough, 0.2) == pytest.approx(0.4)
+    assert tube_fits.least_cosine(fitted(cloud, station)[0], 0.2) == pytest.approx(0.2)
     assert fine.radii[0] == pytest.approx(30.0, abs=0.1)
 
 

@@ -16,7 +16,7 @@ CUT_SIGMAS = 4.5  # an axis that misses the others by more is not of this node
 
 
 @dataclass(frozen=True)
-class Incidence:
+class AxisEnds:
     """Ends of members at nodes, a row an end, sorted by node.
 
     ``offsets`` (i, 3) lead from the node's start to the foot on the axis, ``across`` (i, 2, 3) are unit vectors across
@@ -32,36 +32,37 @@ class Incidence:
 
 
 @dataclass(frozen=True)
-class Meeting:
+class Intersections:
     """Nodes (k,) from their axes; ``used`` marks the ends that agree. Positions are NaN without two axes."""
 
     positions: Floats
     covariance: Floats
-    axes: Ints
+    axis_count: Ints
     scatter: Floats
     used: npt.NDArray[np.bool_]
     eccentricity_mm: float  # of axes about their nodes, a standard deviation for each direction across
 
 
-def incidence(
+def axis_ends(
     node: Ints, starts: Floats, points: Floats, directions: Floats, side: Floats, covariance: Floats, response: Floats
-) -> Incidence:
+) -> AxisEnds:
     """Relate axes (i,) to the nodes (k, 3) they run to; one row an end, sorted by node.
 
     ``covariance`` (i, 5, 5) as in :class:`processor.space_frame.members.records.Members`, ``response`` (i, s, 4, 2) as
-    in :class:`processor.space_frame.members.tubes.Fits`.
+    in :class:`processor.space_frame.members.tube_fits.Fits`.
     """
     away = starts[node] - points
     t = np.einsum("ij,ij->i", away, directions)
     across = np.stack([side, np.cross(directions, side)], axis=1)
     C = covariance[:, :4, :4] - np.einsum("isjk,islk->ijl", response, response)
-    turn = C[:, :2, 2:]
-    at = C[:, :2, :2] + t[:, None, None] * (turn + turn.transpose(0, 2, 1)) + (t * t)[:, None, None] * C[:, 2:, 2:]
+    cross_terms = C[:, :2, 2:]
+    both = cross_terms + cross_terms.transpose(0, 2, 1)
+    at = C[:, :2, :2] + t[:, None, None] * both + (t * t)[:, None, None] * C[:, 2:, 2:]
     response_there = response[:, :, :2] + t[:, None, None, None] * response[:, :, 2:]
-    return Incidence(node, t[:, None] * directions - away, across, at, response_there)
+    return AxisEnds(node, t[:, None] * directions - away, across, at, response_there)
 
 
-def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> Meeting:
+def intersect_axes(ends: AxisEnds, starts: Floats, floor_mm: float, rounds: int = 6) -> Intersections:
     """Weighted intersection of the axes of each node (k, 3); an axis that misses the others is left out.
 
     An axis misses its node by its own error and by an eccentricity of one variance for the whole frame, estimated so
@@ -79,37 +80,37 @@ def meet(ends: Incidence, starts: Floats, floor_mm: float, rounds: int = 6) -> M
     square = np.bincount(ends.node[used], (_miss(ends, x)[used] ** 2).sum(axis=1), k)
     with np.errstate(invalid="ignore", divide="ignore"):
         scatter = np.where(count > 1, np.sqrt(square / count), np.nan)
-    return Meeting(
+    return Intersections(
         positions=starts + x,
-        covariance=cov * scale[:, None, None] + _by_stations(ends, used, cov, e2, k),
-        axes=count,
+        covariance=cov * scale[:, None, None] + _station_covariance(ends, used, cov, e2, k),
+        axis_count=count,
         scatter=scatter,
         used=used,
         eccentricity_mm=float(np.sqrt(e2)),
     )
 
 
-def _agreeing(ends: Incidence, e2: float, k: int, floor_mm: float, rounds: int) -> tuple[npt.NDArray[np.bool_], float]:
+def _agreeing(ends: AxisEnds, e2: float, k: int, floor_mm: float, rounds: int) -> tuple[npt.NDArray[np.bool_], float]:
     """Find the axes that agree with the others of their node, and the variance of the eccentricity from those."""
     used = np.ones(len(ends.node), bool)
     for _ in range(rounds):
         x, cov, _, _ = _intersect(ends, used, e2, k)
         miss = _miss(ends, x)
-        size = np.einsum("ij,ijk,ik->i", miss, _inverse2(_with(ends, e2)), miss)
+        size = np.einsum("ij,ijk,ik->i", miss, _inverse2(_total_covariance(ends, e2)), miss)
         count = np.bincount(ends.node[used], minlength=k)
         # The worst axis of a node goes first; the others may agree without it.
-        test = np.nan_to_num(np.where(used, size / np.maximum(_share_left(ends, cov, e2), 0.1), 0.0))
+        test = np.nan_to_num(np.where(used, size / np.maximum(_redundancy(ends, cov, e2), 0.1), 0.0))
         worst = np.zeros(k)
         np.maximum.at(worst, ends.node, test)
         out = used & (test > CUT_SIGMAS**2) & (test == worst[ends.node]) & (count[ends.node] > 2)
         used &= ~out
-        e2 = max(_eccentricity2(ends, used, k, floor_mm), floor_mm**2)
+        e2 = max(_estimate_eccentricity2(ends, used, k, floor_mm), floor_mm**2)
         if not out.any():
             break
     return used, e2
 
 
-def _first_eccentricity2(ends: Incidence, k: int, floor_mm: float) -> float:
+def _first_eccentricity2(ends: AxisEnds, k: int, floor_mm: float) -> float:
     """Variance of the eccentricity from the median miss, of nodes fitted with robust weights."""
     weight: Floats = np.ones(len(ends.node))
     scale2 = 0.0
@@ -135,14 +136,14 @@ def _inverse2(M: Floats) -> Floats:
     return inverse.reshape(-1, 2, 2)
 
 
-def _with(ends: Incidence, e2: float) -> Floats:
+def _total_covariance(ends: AxisEnds, e2: float) -> Floats:
     covariance: Floats = ends.covariance + e2 * np.eye(2)
     return covariance
 
 
-def _by_stations(ends: Incidence, used: npt.NDArray[np.bool_], cov: Floats, e2: float, k: int) -> Floats:
+def _station_covariance(ends: AxisEnds, used: npt.NDArray[np.bool_], cov: Floats, e2: float, k: int) -> Floats:
     """Covariance (k, 3, 3) of nodes by the stations' shifts: they move axes together, without scatter."""
-    weighted = ends.across.transpose(0, 2, 1) @ (_inverse2(_with(ends, e2)) * used[:, None, None])
+    weighted = ends.across.transpose(0, 2, 1) @ (_inverse2(_total_covariance(ends, e2)) * used[:, None, None])
     covariance = np.zeros((k, 3, 3))
     for s in range(ends.response.shape[1]):
         total = np.zeros((k, 3, 3))
@@ -165,25 +166,25 @@ def add_responses(node, weighted, response, across, total):  # type: ignore[no-u
                     total[node[i], a, b] += v * across[i, c, b]
 
 
-def _miss(ends: Incidence, x: Floats) -> Floats:
+def _miss(ends: AxisEnds, x: Floats) -> Floats:
     """Offsets (i, 2) from nodes moved by x (k, 3) to the axes, across them."""
     miss: Floats = np.einsum("ijk,ik->ij", ends.across, ends.offsets - x[ends.node])
     return miss
 
 
-def _share_left(ends: Incidence, cov: Floats, e2: float) -> Floats:
+def _redundancy(ends: AxisEnds, cov: Floats, e2: float) -> Floats:
     """Share (i,) of an axis's variance that remains in its miss, its node being fitted to it."""
     node = ends.across @ cov[ends.node] @ ends.across.transpose(0, 2, 1)
-    share = 1.0 - 0.5 * np.einsum("ijk,ikj->i", _inverse2(_with(ends, e2)), node)
-    known: Floats = np.nan_to_num(share, nan=1.0)
-    return known
+    share = 1.0 - 0.5 * np.einsum("ijk,ikj->i", _inverse2(_total_covariance(ends, e2)), node)
+    redundancy: Floats = np.nan_to_num(share, nan=1.0)
+    return redundancy
 
 
 def _intersect(
-    ends: Incidence, used: npt.NDArray[np.bool_] | Floats, e2: float, k: int
+    ends: AxisEnds, used: npt.NDArray[np.bool_] | Floats, e2: float, k: int
 ) -> tuple[Floats, Floats, Floats, Floats]:
     """Movements (k, 3), covariances, chi squared and degrees of freedom (k,); NaN where axes fix no point."""
-    W = _inverse2(_with(ends, e2)) * used[:, None, None]
+    W = _inverse2(_total_covariance(ends, e2)) * used[:, None, None]
     normal, right, chi2 = np.zeros((k, 3, 3)), np.zeros((k, 3)), np.zeros(k)
     add_ends(ends.node, ends.offsets, ends.across, W, normal, right)
     regular = np.linalg.eigvalsh(normal)[:, 0] > 1e-9
@@ -222,7 +223,7 @@ def add_squares(node, miss, W, chi2):  # type: ignore[no-untyped-def]
             chi2[node[i]] += v
 
 
-def _eccentricity2(ends: Incidence, used: npt.NDArray[np.bool_], k: int, floor_mm: float) -> float:
+def _estimate_eccentricity2(ends: AxisEnds, used: npt.NDArray[np.bool_], k: int, floor_mm: float) -> float:
     """Variance e2 for which chi squared over all nodes has its expectation; a tenth is trimmed on either side."""
     low, high = floor_mm**2, 100.0
 

@@ -1,4 +1,4 @@
-"""Compiled fits of tubes, one after another; see :mod:`processor.space_frame.members.cylinder` for the model."""
+"""Compiled fits of tubes, one after another; see :mod:`processor.space_frame.members.cylinder_model` for the model."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import numpy as np
 from numba import njit
 
 from processor.model import Floats
-from processor.space_frame.members.cylinder import (
+from processor.space_frame.members.cylinder_model import (
     ACROSS_MM,
     GRAZING_COS,
     NP,

@@ -14,7 +14,7 @@ from processor.space_frame.members.cylinder_fit import Errors
 from processor.space_frame.members.linearity import linearity
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.members.segments import segments
-from processor.space_frame.members.tubes import Fits, least_cosine, refined, rough, station_variance
+from processor.space_frame.members.tube_fits import Fits, least_cosine, refined, rough, station_variance
 from processor.space_frame.points.hash_sampling import STEPS_PER_MM, thinned
 from processor.space_frame.points.line_crops import Gathered, corridors, gather
 from processor.space_frame.points.source import Source
@@ -141,7 +141,7 @@ def of_nodes(measured: Measured, kept: npt.NDArray[np.bool_]) -> Measured:
     rows = np.flatnonzero((a >= 0) | (b >= 0))
     columns = {field.name: getattr(members, field.name)[rows] for field in dataclasses.fields(members)}
     columns |= {"node_a": a[rows], "node_b": b[rows]}
-    left = Nodes(nodes.positions[kept], nodes.covariance[kept], nodes.axes[kept], nodes.scatter[kept])
+    left = Nodes(nodes.positions[kept], nodes.covariance[kept], nodes.axis_count[kept], nodes.scatter[kept])
     return replace(measured, nodes=left, members=Members(**columns), lines=measured.lines[rows])
 
 
@@ -158,7 +158,7 @@ def _nodes(fits: Fits, starts: Floats, pairs: Ints, params: Params) -> Nodes:
     node = np.concatenate([pairs[rows, 0], pairs[rows, 1]])
     order = np.argsort(node, kind="stable")
     tube, node = tube[order], node[order]
-    ends = axis_intersection.incidence(
+    ends = axis_intersection.axis_ends(
         node,
         starts,
         fits.points[tube],
@@ -167,8 +167,8 @@ def _nodes(fits: Fits, starts: Floats, pairs: Ints, params: Params) -> Nodes:
         fits.covariance[tube],
         fits.response[tube],
     )
-    met = axis_intersection.meet(ends, starts, params.eccentricity_floor_mm)
-    return Nodes(met.positions, met.covariance, met.axes, met.scatter)
+    met = axis_intersection.intersect_axes(ends, starts, params.eccentricity_floor_mm)
+    return Nodes(met.positions, met.covariance, met.axis_count, met.scatter)
 
 
 def _members(fits: Fits, pairs: Ints) -> Members:

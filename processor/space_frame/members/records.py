@@ -19,7 +19,7 @@ class Nodes(Checked):
 
     positions: Floats = column("k", 3)
     covariance: Floats = column("k", 3, 3)
-    axes: Ints = column("k", dtype=np.int64)  # number that the position rests on
+    axis_count: Ints = column("k", dtype=np.int64)  # axes that the position rests on
     scatter: Floats = column("k")  # distance of the axes from the position, rms, mm; NaN for one axis
 
     @property

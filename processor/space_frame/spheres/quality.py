@@ -87,7 +87,7 @@ def assess(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -
         points=fits.numbers[:, POINTS].astype(np.int64),
         visible_fraction=fits.numbers[:, CELLS] / (BANDS * SECTORS),
         stations=fits.numbers[:, STATIONS].astype(np.int64),
-        axes=nodes.axes,
+        axes=nodes.axis_count,
         rms=fits.numbers[:, RMS],
         scale=fits.numbers[:, SCALE],
         sizes=fits.sizes,
@@ -136,7 +136,8 @@ def _assessments(
     reasons: list[tuple[Reason, ...]] = []
     for i, fitted in enumerate(fits.fitted.tolist()):
         if not fitted:
-            flag, causes = _without_points(int(nodes.axes[i]), bool(axes_known[i]), bool(np.isfinite(expected[i])))
+            axes = int(nodes.axis_count[i])
+            flag, causes = _without_points(axes, bool(axes_known[i]), bool(np.isfinite(expected[i])))
             evidence.append(Evidence.AXES)
         else:
             fused = axes_known[i] and fits.numbers[i, CENTRE_CHI2] > 0.0

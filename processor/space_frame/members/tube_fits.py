@@ -1,4 +1,4 @@
-"""Fits of all tubes, each by itself; see :mod:`processor.space_frame.members.cylinder` for the model."""
+"""Fits of all tubes, each by itself; see :mod:`processor.space_frame.members.cylinder_model` for the model."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
-from processor.space_frame.members.cylinder import GRAZING_COS
 from processor.space_frame.members.cylinder_fit import COS_BINS, ROUGH_COS, Errors, Limits, fit_roughly, refine
+from processor.space_frame.members.cylinder_model import GRAZING_COS
 from processor.space_frame.points.line_crops import Gathered
 
 
