@@ -68,3 +68,4 @@ $(VENV)/.test: pyproject.toml .ci/system-libraries .ci/browser | $(BIN)/python
 
 clean:
 	rm -rf $(VENV) $(OUT) build *.egg-info .coverage .pytest_cache .mypy_cache .ruff_cache
+	find processor designgen -name "*.nb[ci]" -delete

@@ -100,7 +100,7 @@ def checked(unseen, without, off=0.0, built=as_built):
     ends, edges = built()
     members = [member(i, ends, edges, unseen, without) for i in range(5)]
     adjusted = adjustment.adjust(members, DESIGN.joint_points, FRAMES, WEIGHT)
-    pose = np.tile(np.eye(4), (5, 1, 1))
+    pose = np.array(adjusted.motions)  # the scans lie in the bridge's frame
     pose[list(without)] = np.nan
     lengths = np.cumsum([[0.0, 0.0], *([Polyline.through(e).length for e in (part.bottom_edge_left,
                          part.bottom_edge_right)] for part in DESIGN.parts)], axis=0)  # fmt: skip

@@ -84,6 +84,6 @@ def test_a_station_moves_all_axes_of_a_node_alike():
     response[:, 0, 0, 0] = response[:, 0, 1, 1] = 2.0
     ends = ends_at(rng, nodes, 6, 0.01, response=response)
     with_noise = ends_at(rng, nodes, 6, 0.01)
-    ends = axis_intersection.Incidence(ends.node, ends.offsets, ends.across, with_noise.covariance, ends.response)
+    ends = axis_intersection.AxisEnds(ends.node, ends.offsets, ends.across, with_noise.covariance, ends.response)
     met = axis_intersection.intersect_axes(ends, nodes, 0.01)
     assert met.covariance[0] == pytest.approx(4.0 * np.eye(3), abs=0.01)
