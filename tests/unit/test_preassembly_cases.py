@@ -135,6 +135,7 @@ def nested(reasons):
     return [one for outer in reasons for one in (outer, *nested(outer.values.get("reasons", ())))]
 
 
+@pytest.mark.slow  # by day that of test_preassembly
 def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
     parts, design = bridge()
     part = parts[RIB]
@@ -153,19 +154,19 @@ def test_a_symmetric_rib_without_its_mark_is_ambiguous_with_both_poses():
     assert sorted(round(turn) for turn in turns) == [0, 180]
 
 
-def test_parts_of_one_shape_are_told_apart_by_their_mark():
+@pytest.mark.parametrize(("asked", "came"), [(1, 3), pytest.param(0, 4, marks=pytest.mark.slow)])
+def test_parts_of_one_shape_are_told_apart_by_their_mark(asked, came):
     """Rib 3 turned round equals rib 1 but for its mark: it fits rib 1 to the noise."""
     parts, design = bridge()
-    for asked, came in ((1, 3), (0, 4)):
-        found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
-        assert found.status == "failed"
-        there = {"scan": "scan", "part": parts[came].name, "assigned": parts[asked].name}
-        assert found.reasons == (
-            reason("preassemble.scan-of-other", **there),
-            reason("preassemble.mark-of-other", parts=(parts[came].name,)),
-        )
-        found = measured(design, came, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
-        assert (found.status, found.reasons) == ("ok", ())
+    found = measured(design, asked, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
+    assert found.status == "failed"
+    there = {"scan": "scan", "part": parts[came].name, "assigned": parts[asked].name}
+    assert found.reasons == (
+        reason("preassemble.scan-of-other", **there),
+        reason("preassemble.mark-of-other", parts=(parts[came].name,)),
+    )
+    found = measured(design, came, scanned(cloud(parts[came], spacing_mm=14.0, sigma_mm=2.0))[0])
+    assert (found.status, found.reasons) == ("ok", ())
 
 
 def without_the_marks_places(part, points):
@@ -324,6 +325,7 @@ def _back(seed):
     return rigid.invert(random_pose(np.random.default_rng(seed)))
 
 
+@pytest.mark.slow  # by day the foreign bridges of the night have unequal plates
 def test_unequal_plates_meet_at_their_outer_faces():
     parts, _ = bridge()
     thin = dataclasses.replace(parts[1].plates, bottom=16.0, top=16.0, web=12.0)

@@ -138,7 +138,7 @@ def test_scans_of_different_places_are_never_called_ok():
     assert result.status != "ok"
 
 
-@pytest.mark.parametrize("reference", ["S1", "X"])
+@pytest.mark.parametrize("reference", [pytest.param("S1", marks=pytest.mark.slow), "X"])
 def test_a_scan_of_another_place_is_named_first(reference):
     """Also where it is the reference: the others agree with each other."""
     _, scans = four(step_mrad=20.0)
