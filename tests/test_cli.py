@@ -237,7 +237,8 @@ def test_names_from_outside_are_shown_as_text(frame, tmp_path):
 def test_a_bridge_through_the_pipeline(tmp_path):
     scene, truth = arch_clouds.bridge(spacing_mm=20.0, sigma_mm=1.0, seed=2)
     store.write_scene(tmp_path / "b.h5", scene, truth, {})
-    found, report = run_in_process(tmp_path / "b.h5", tmp_path / "out", ("design-aided", "corner"), {"preassemble": {"repetitions": 0}})
+    without_bands = {"preassemble": {"repetitions": 0}}
+    found, report = run_in_process(tmp_path / "b.h5", tmp_path / "out", ("design-aided", "corner"), without_bands)
     answer = found["steps"]["preassemble"]
     assert (answer["status"], answer["method"]) == ("ok", "design-aided")
     assert [c["name"] for c in answer["components"]] == list(arch_clouds.NAMES)
