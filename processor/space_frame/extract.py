@@ -145,6 +145,9 @@ def extract(
     matched = movements = None
     if design is not None and (start.design_row >= 0).any():
         matched, movements = _compare(registered, spheres, shared_offset, design, start.pose, options)
+        if matched.status is Status.AMBIGUOUS:
+            listed = start.pose is not None and len(start.pose.rivals) > 0
+            spheres = quality.with_ambiguous_matching(spheres, start.design_row >= 0, listed)
     of_stations = registered.stations.messages if registered.stations is not None else ()
     return Extracted(
         source=registered.source,
@@ -281,8 +284,10 @@ def _expected(start: Start, design: FrameDesign, origin: Floats, expansion: floa
     rows = start.design_row
     expected = np.where(rows >= 0, design.radii[np.maximum(rows, 0)], np.nan)
     disputed = np.zeros(len(rows), bool)
-    if start.pose is None or not len(start.pose.rivals):
+    if start.pose is None or start.pose.status is Status.OK:
         return expected, disputed
+    if not len(start.pose.rivals):  # the pose is contradicted, and the true one is unknown
+        return np.full(len(rows), np.nan), rows >= 0
     nominal, middle = matching.expanded(design, expansion)
     tree = cKDTree(nominal)
     for T in start.pose.rivals:
@@ -319,7 +324,9 @@ def _compare(
     matched = _matched(pattern, design, pose, options.expansion)
     at, stations = pattern.positions.mean(axis=0), registered.trusted
     common = np.diag([0.0, 0.0, 0.0, *3 * [options.datum_mm**2]]) if stations is None else stations.common(at)
-    covariance = spheres.covariance[rows, :3, :3] + shared_offset[rows]
+    views = spheres.common[rows, :3, :3]
+    common[3:, 3:] += views.mean(axis=0)
+    covariance = spheres.covariance[rows, :3, :3] - views + shared_offset[rows]
     movements = movement(matched, pattern, covariance, design, common, at, expansion=options.expansion)
     assignment, weight = np.full(len(spheres.radii), -1, np.int64), np.zeros(len(spheres.radii))
     assignment[rows], weight[rows] = matched.assignment, matched.weight

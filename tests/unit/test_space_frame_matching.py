@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from designgen.designs import space_frame
-from processor.model import FrameDesign
+from processor.model import FrameDesign, Status
 from processor.space_frame.design import matching
 from processor.space_frame.design.matching import NodePattern, match, match_members
 from processor.space_frame.design.movement import movement
@@ -392,3 +392,40 @@ def test_robust_fit_is_scipys_without_outliers():
     best, _ = Rotation.align_vectors(target - goal, source - middle, weights=weight)
     np.testing.assert_allclose(T[:3, :3], best.as_matrix(), atol=1e-9)
     assert weight.min() > 0.3
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_nodes_that_the_design_lacks_in_the_middle_do_not_hide_the_true_pose(seed):
+    d = design("flat", 5, 6, layers=2)
+    rng = np.random.default_rng(seed)
+    middle = np.argsort(np.linalg.norm(d.centres - d.centres.mean(axis=0), axis=1))
+    extra, missing = middle[[0, 1, 3]], middle[[5, 9]]
+    keep = np.setdiff1d(np.arange(len(d.centres)), missing)
+    lacks = np.setdiff1d(np.arange(len(d.centres)), extra)
+    known = FrameDesign(
+        d.ids[lacks], d.centres[lacks], d.radii[lacks], np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    )
+    R = Rotation.from_euler("z", 20.0 * seed, degrees=True).as_matrix()
+    found = (d.centres[keep] + rng.normal(0.0, 3.0, (len(keep), 3))) @ R.T
+    sized = NodePattern(found, np.zeros(3), d.radii[keep], np.full(len(keep), 0.3))
+    answer = match(NodePattern(found), known, sized=lambda: sized)
+    if answer.status is Status.OK:
+        assert np.abs(answer.T_design_scan[:3, :3] @ R - np.eye(3)).max() < 0.01
+        assert int((answer.assignment >= 0).sum()) == len(d.centres) - 5
+    else:
+        assert answer.status is Status.AMBIGUOUS
+
+
+def test_a_pose_that_the_sizes_contradict_is_ambiguous():
+    d = design("flat", 4, 5)
+    rng = np.random.default_rng(3)
+    row = np.arange(1, len(d.centres))
+    others = NodePattern(d.centres[row] + 7e4, np.zeros(3), d.radii[rng.permutation(row)], np.full(len(row), 0.3))
+    lacks = FrameDesign(
+        d.ids[:-1], d.centres[:-1], d.radii[:-1], np.empty(0, np.int64), np.empty(0, np.int64), np.empty(0)
+    )
+    answer = match(NodePattern(others.positions), lacks, sized=lambda: others)
+    assert answer.status is Status.AMBIGUOUS
+    assert matching.sizes_contradict(others, lacks, answer.assignment)
+    agreeing = NodePattern(others.positions, np.zeros(3), d.radii[row], np.full(len(row), 0.3))
+    assert match(NodePattern(others.positions), lacks, sized=lambda: agreeing).status is Status.OK

@@ -2,8 +2,10 @@
 
 A triangle of three found nodes is mapped onto every triangle of the design with the same sides. Each such pose is then
 tested on successively more of the found nodes around it and fitted to them; poses that few nodes support are dropped.
-One triangle of true nodes gives all poses that map it onto the design: a repetitive pattern gives all its answers.
-The search is deterministic: triangles are tried in a fixed order, from the middle of the cloud outward.
+One triangle of true nodes gives all poses that map it onto the design: a repetitive pattern gives all its answers. A
+triangle with a node that the design lacks gives only wrong ones, so that the number of triangles follows from the share
+of nodes that the best pose leaves over (Fischler and Bolles 1981).
+The search is deterministic: triangles are tried in a fixed order, from the middle of the cloud and then all over it.
 """
 
 from __future__ import annotations
@@ -19,7 +21,8 @@ Bools = npt.NDArray[np.bool_]
 
 NEIGHBOURS = 12  # of a node, for triangles
 CORNERS = 24  # triangles tried at most
-ENOUGH = 2  # triangles with a supported pose: more give no new poses
+ENOUGH = 2  # triangles with a supported pose, at least: more of them give no new poses
+MISSED = 1e-3  # probability that each of the triangles has a node that is not in the design
 FLAT = 0.35  # least sine of a triangle's angle
 STAGES = (12, 36, 108)  # found nodes about the triangle that a pose is tested on, one after another
 FEW, SPREAD = 32, 128  # then nodes all over the cloud
@@ -40,13 +43,15 @@ def poses(nodes: Floats, design: Floats, tolerance_mm: float) -> Floats:
     tree, node_tree = cKDTree(design), cKDTree(nodes)
     around = _neighbours(design, tree)
     middle = np.median(nodes, axis=0)
-    seeds = np.argsort(np.linalg.norm(nodes - middle, axis=1), kind="stable")
+    outward = np.argsort(np.linalg.norm(nodes - middle, axis=1), kind="stable")
     spread = _spread_out(nodes, SPREAD)
+    # Nodes that the design lacks may be neighbours: after the first triangles they are taken from all over the cloud.
+    seeds = dict.fromkeys([*outward[:ENOUGH].tolist(), *spread.tolist(), *outward.tolist()])
     answers: list[Floats] = []
     best, successful, tried = 0, 0, 0
     distance = SAME_SHARE * float(np.min(tree.query(design, k=2)[0][:, 1]))
     for seed in seeds:
-        corner = _corner(nodes, node_tree, int(seed))
+        corner = _corner(nodes, node_tree, seed)
         if corner is None:
             continue
         tried += 1
@@ -61,9 +66,15 @@ def poses(nodes: Floats, design: Floats, tolerance_mm: float) -> Floats:
                 answers.append(pose)
                 best = max(best, count)
         successful += len(T) > 0 and best > 0
-        if successful >= ENOUGH or tried >= CORNERS:
+        if (successful >= ENOUGH and tried >= _needed(best / len(nodes))) or tried >= CORNERS:
             break
     return np.array(answers).reshape(-1, 4, 4)
+
+
+def _needed(share: float) -> float:
+    """Return how many triangles have one of true nodes alone, where nodes are true with probability ``share``."""
+    clean = share**3
+    return 1.0 if clean >= 1.0 else float(np.log(MISSED) / np.log1p(-clean))
 
 
 def _neighbours(points: Floats, tree: cKDTree) -> Ints:

@@ -10,9 +10,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
+import numpy.typing as npt
 from scipy.spatial import cKDTree
 
 from processor.geometry import rigid
@@ -143,14 +144,15 @@ def match(
     """Match found nodes with a design's, each being up to about ``tolerance_mm`` off its nominal place.
 
     ``expansion`` is the factor of all lengths by temperature. Up to half of the nodes may be missing or extra.
-    ``sized`` returns the same nodes with their spheres' radii, where ``nodes`` has none: it is called only where the
-    pattern leaves more than one pose.
+    ``sized`` returns the same nodes with their spheres' radii, where ``nodes`` has none: it is called once at most,
+    where the pattern of the nodes is like itself elsewhere.
     """
     nominal, middle = expanded(design, expansion)
     k, d = len(nodes.positions), len(nominal)
     if k == 0 or d == 0:
         return _failed(k, d, reason("spheres.no-nodes") if k == 0 else reason("spheres.no-design-nodes"))
     problem = _Problem(nodes, design, nominal, middle, tolerance_mm)
+    sized = None if sized is None else cache(sized)
     to_design = rigid.transform(np.eye(3), nodes.origin - middle)
     least = LEAST_SHARE * problem.fewer
     same = _candidate(to_design, problem, fit=False)
@@ -173,7 +175,11 @@ def match(
         return _answer(same, rivals[:1], FrameRelation.SAME, problem, doubts)
     if not every:
         return _failed(k, d, reason("spheres.no-pose"))
-    return _best(every, problem)
+    best = _best(every, problem)
+    leftover = min(len(best.missing), int((best.assignment < 0).sum()))
+    if sized is not None and len(every) > 1 and leftover and sizes_contradict(sized(), design, best.assignment):
+        return replace(best, status=Status.AMBIGUOUS, reasons=(*best.reasons, reason("spheres.sizes-contradict")))
+    return best
 
 
 # --- candidates ------------------------------------------------------------------------------------------------------
@@ -300,10 +306,29 @@ def radius_odds(nodes: NodePattern, design: FrameDesign, assignment: Ints) -> fl
     if not len(nodes.radii) or not len(design.radii):
         return 0.0
     on = (assignment >= 0) & np.isfinite(nodes.radii)
-    off = nodes.radii[on] - design.radii[assignment[on]]
+    return float(_lost_by_radii(nodes, on, design.radii[assignment[on]]).sum())
+
+
+def sizes_contradict(nodes: NodePattern, design: FrameDesign, assignment: Ints) -> bool:
+    """Whether the spheres' sizes agree with a pose no better than with sizes drawn from the design's at random.
+
+    The loss by them is nearer to that of chance than to 0, where that of chance is decisive.
+    """
+    on = (assignment >= 0) & np.isfinite(nodes.radii) if len(nodes.radii) else np.zeros(len(assignment), bool)
+    if not on.any() or not len(design.radii):
+        return False
+    sizes, counts = np.unique(design.radii, return_counts=True)
+    drawn = [_lost_by_radii(nodes, on, size).sum() * count for size, count in zip(sizes, counts, strict=True)]
+    chance = float(np.sum(drawn)) / int(counts.sum())
+    return chance > 2.0 * DECISIVE and radius_odds(nodes, design, assignment) > 0.5 * chance
+
+
+def _lost_by_radii(nodes: NodePattern, on: npt.NDArray[np.bool_], nominal: Floats) -> Floats:
+    """Log odds (n,) that each of some spheres loses by its radius, against nominal radii."""
     sd = np.hypot(nodes.radius_sd[on] if len(nodes.radius_sd) else 0.0, RADIUS_SD_MM)
-    odds = np.minimum(0.5 * (off / np.where(np.isfinite(sd), sd, np.inf)) ** 2, RADIUS_ODDS)
-    return float(np.sum(odds[np.isfinite(odds)]))
+    off = (nodes.radii[on] - nominal) / np.where(np.isfinite(sd), sd, np.inf)
+    odds: Floats = np.minimum(0.5 * off**2, RADIUS_ODDS)
+    return odds[np.isfinite(odds)]
 
 
 def member_odds(nodes: NodePattern, design: FrameDesign, assignment: Ints) -> float:

@@ -35,6 +35,7 @@ from processor.space_frame.spheres.records import (
 )
 from processor.space_frame.spheres.size_selection import choose
 from processor.space_frame.spheres.station_scatter import shift_sd
+from processor.space_frame.spheres.unnamed_views import view_errors
 
 NAN = float("nan")
 MARGIN_MM = 26.0  # of a crop beyond the largest sphere: sleeves are measured there
@@ -86,6 +87,10 @@ class _Setting:
     station_sd: float
     shift: Floats  # (s, 3, 3) covariance of each station's shift
 
+    def size_weight(self, free: bool) -> float:
+        """Weight of a radius about its size, 1 / mm^2; 0 where radii are free."""
+        return 0.0 if free else 1.0 / self.radius_sd**2
+
 
 def fit_spheres(
     source: Source,
@@ -134,7 +139,9 @@ def fit_crops(
         catalogue=catalogue,
         params=params,
     )
-    fits, setting = _rounds(problem, len(scanners), station_covariance)
+    fits, setting, residuals = _rounds(problem, len(scanners), station_covariance)
+    rays = bool(np.any(problem.crops.ranges > 0.0))
+    priors = Priors(problem.centre_weight, fits.sizes, np.full(len(fits.sizes), setting.size_weight(problem.free)))
     offset = (0.0, np.inf)
     if len(catalogue.radii):
         sure = fits.clear
@@ -143,7 +150,8 @@ def fit_crops(
         )
     conditions = quality.Conditions(
         catalogue=catalogue,
-        rays=bool(np.any(problem.crops.ranges > 0.0)),
+        rays=rays,
+        views=None if rays else view_errors(problem.crops, residuals.weights, fits, priors),
         noise=setting.noise,
         radius_sd=setting.radius_sd,
         station_sd=setting.station_sd if station_covariance is None else NAN,
@@ -153,8 +161,8 @@ def fit_crops(
     return quality.assess(fits, nodes, problem.expected, conditions)
 
 
-def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None) -> tuple[Fits, _Setting]:
-    """Alternate fits and the estimates from all of them; returns the last fits and the setting that they used."""
+def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None) -> tuple[Fits, _Setting, Residuals]:
+    """Alternate fits and the estimates from all of them; returns the last fits, their setting, residuals."""
     catalogue, ranges, known = problem.catalogue, problem.crops.ranges, station_covariance is not None
     setting = _Setting(
         noise=np.array([problem.params.sigma_mm**2, 0.0, 0.0]),
@@ -169,7 +177,7 @@ def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None)
     for turn in range(ROUNDS):
         fits, residuals = _fit(problem, setting, fits)
         if turn == ROUNDS - 1 or (turn == 1 and setting.station_sd == 0.0):
-            return fits, setting
+            return fits, setting, residuals
         estimate = _estimated(problem, setting, fits, residuals)
         if known:
             estimate = replace(estimate, station_sd=0.0, shift=setting.shift)
@@ -189,9 +197,8 @@ def _estimated(problem: _Problem, setting: _Setting, fits: Fits, residuals: Resi
     corner = occlusion.measured(problem.ends, crops.start, crops.points, fits.states, threads)
     noise, count = noise_model.noise_model(errors, cosines, crops.ranges, weights, setting.noise)
     limb = noise_model.limb_cosine(errors, cosines, crops.ranges, weights, noise, setting.least_cosine)
-    sure, radius_sd, size_weight = fits.clear, setting.radius_sd, 0.0
+    sure, radius_sd, size_weight = fits.clear, setting.radius_sd, setting.size_weight(problem.free)
     if not problem.free:
-        size_weight = 1.0 / setting.radius_sd**2
         radius_sd = noise_model.radius_scatter(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
@@ -226,7 +233,7 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
         least_cosine=setting.least_cosine,
     )
     model = StochasticModel(setting.noise, setting.shift)
-    size_weight = 0.0 if problem.free else 1.0 / setting.radius_sd**2
+    size_weight = setting.size_weight(problem.free)
     sizes = Sizes(
         sizes=FREE_SIZES if problem.free else np.array(problem.catalogue.radii),
         weight=size_weight,

@@ -26,6 +26,7 @@ from processor.space_frame.spheres.records import (
     Fits,
     Spheres,
 )
+from processor.space_frame.spheres.unnamed_views import OFFSET_MM, SHIFT_MM, ViewErrors
 
 Bools = npt.NDArray[np.bool_]
 
@@ -49,7 +50,8 @@ class Conditions:
 
     ``radius_offset`` is the mean deviation of radii from their sizes and its standard deviation, mm. It may come from
     an offset of all ranges or from the beam's width, so it is not removed: it enters the covariances of radii. Seen
-    from below, the surface is not moved by it. ``limits`` has the tolerance of a sphere's blank, by which a size is
+    from below, the surface is not moved by it. ``views`` are the errors of views that a merged cloud does not name,
+    None = views are named. ``limits`` has the tolerance of a sphere's blank, by which a size is
     wrong where no catalogue decides it.
     """
 
@@ -59,6 +61,7 @@ class Conditions:
     radius_sd: float
     station_sd: float
     radius_offset: tuple[float, float]
+    views: ViewErrors | None
     limits: Tolerance
 
 
@@ -78,6 +81,7 @@ def assess(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -
         radii=state[:, 3],
         lowest=centres - state[:, 3:] * np.array([0.0, 0.0, 1.0]),
         covariance=covariance,
+        common=np.zeros_like(covariance) if conditions.views is None else conditions.views.common,
         lowest_sd=lowest_sd,
         bound=bound,
         bound_lowest_sd=bound_lowest,
@@ -112,6 +116,8 @@ def _states(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) 
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
     common = np.array([0.0, 0.0, 1.0, 1.0]) * conditions.radius_offset[0]
     covariance = fits.covariance * wider[:, None, None] + np.outer(common, common)
+    if conditions.views is not None:
+        covariance = covariance + conditions.views.covariance
     for i in np.flatnonzero(~fits.fitted).tolist():
         state[i, :3] = 0.0
         state[i, 3] = expected[i]
@@ -223,6 +229,16 @@ def _messages(conditions: Conditions) -> tuple[Reason, ...]:
     messages = [reason("spheres.ranges") if conditions.rays else reason("spheres.orthogonal-distances")]
     if conditions.station_sd > 0.0:
         messages.append(reason("spheres.stations-disagree", sd=conditions.station_sd))
+    if conditions.views is not None:
+        messages.append(
+            reason(
+                "spheres.unnamed-views",
+                sd=conditions.views.sd,
+                common=conditions.views.common_sd,
+                shift=SHIFT_MM,
+                offset=OFFSET_MM,
+            )
+        )
     if abs(offset) > SURE * offset_sd:
         messages.append(reason("spheres.radius-offset", offset=offset))
     if len(catalogue.radii) and not catalogue.verified:
@@ -277,6 +293,20 @@ def with_ambiguous_design(spheres: Spheres, rows: Bools) -> Spheres:
     for i in np.flatnonzero(rows).tolist():
         reasons[i] = (*reasons[i], reason("spheres.ambiguous-node"))
     return replace(spheres, reasons=tuple(reasons))
+
+
+def with_ambiguous_matching(spheres: Spheres, rows: Bools, listed: bool) -> Spheres:
+    """Doubt the missing spheres among (k,) whose matching with the design is ambiguous, and the wrong sizes.
+
+    Where all other poses are ``listed``, a size that is wrong by each of them remains so.
+    """
+    doubted = (Flag.NOT_FOUND,) if listed else (Flag.NOT_FOUND, Flag.WRONG_SIZE)
+    flags, reasons = list(spheres.flag), list(spheres.reasons)
+    for i in np.flatnonzero(rows).tolist():
+        if flags[i] in doubted:
+            reasons[i] = (*reasons[i], reason("spheres.ambiguous-matching"))
+            flags[i] = Flag.LOW_CONFIDENCE if flags[i] is Flag.WRONG_SIZE else flags[i]
+    return replace(spheres, flag=tuple(flags), reasons=tuple(reasons))
 
 
 # --- deviation of a radius from the nominal one, by a standard's limits on the blank's diameter ----------------------

@@ -141,6 +141,7 @@ class Spheres(Checked):
     radii: Floats = column("k")
     lowest: Floats = column("k", 3)
     covariance: Floats = column("k", 4, 4)
+    common: Floats = column("k", 4, 4)  # part of the covariance by errors of unnamed views common to all spheres
     lowest_sd: Floats = column("k")
     bound: Floats = column("k", 4, 4)
     bound_lowest_sd: Floats = column("k")

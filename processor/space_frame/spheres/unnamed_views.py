@@ -1,0 +1,151 @@
+"""Errors that the points of one view have in common, where a merged cloud does not name its views.
+
+A view sees normals within a right angle of its direction. Its range offset and the errors of its registration displace
+all of them alike, so that the displacement of a merged surface along its normal is a smooth field over the normals. The
+field is modelled as a Gaussian process with a correlation of exp(cos angle - 1). Its variance is estimated by moments
+from what the fits of all spheres leave (Henderson 1953): means of residuals over cells of the normals against the
+scatter within them. The products of different spheres give the part that is common to all of them.
+
+A shift of all views together, and an offset of all their ranges, look like places and radii: they are not estimated but
+stated. ``SHIFT_MM``: targets are measured to about 1 mm, and a network rests on some 25 sightings of them.
+``OFFSET_MM``: the zero offset of a calibrated scanner, which all of its views have in common.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from processor.geometry.sphere import sphere_cells
+from processor.model import Floats, Ints
+from processor.space_frame.spheres.records import AimedCrops, Fits, Priors
+
+SHIFT_MM, OFFSET_MM = 0.2, 0.2  # sd, of terrestrial scanners; the shift is along each axis
+MEAN_COSINE = 2.0 / 3.0  # of incidence on a sphere: a range moves the surface by less along its normal
+BANDS, SECTORS = 10, 20  # of sphere_cells
+LEAST_POINTS = 30
+LEAST_CELLS = 8
+MOST_SPHERES = 400  # that the variances are estimated from
+
+
+class _Fit(NamedTuple):
+    """The fit of one sphere over the cells (c,) of normals that have points."""
+
+    cells: Ints
+    counts: Floats  # (c,) points
+    means: Floats  # (c,) of residuals, mm
+    scatter: Floats  # (c,) variance of residuals within cells, mm^2
+    J: Floats  # (c, 4) derivatives by centre and radius
+    covariance: Floats  # (4, 4) by noise and priors
+    gain: Floats  # (4, c) change of the state by a displacement of each cell's surface
+
+
+@dataclass(frozen=True)
+class ViewErrors:
+    """Covariances (k, 4, 4) of spheres by errors of views: all, and the part common to all spheres; mm^2.
+
+    ``sd`` is that of a displacement along the normal, mm, and ``common_sd`` its part common to all spheres.
+    """
+
+    covariance: Floats
+    common: Floats
+    sd: float
+    common_sd: float
+
+
+def view_errors(crops: AimedCrops, weights: Floats, fits: Fits, priors: Priors) -> ViewErrors:
+    """Estimate the errors of unnamed views from the fits of k spheres; ``weights`` (n,) > 0 mark the points used."""
+    directions = _directions()
+    kernel = np.exp(directions @ directions.T - 1.0)
+    found = {}
+    for k in np.flatnonzero(fits.fitted).tolist():
+        fit = _fit_of(k, crops, weights, fits, priors)
+        if fit is not None:
+            found[k] = fit
+    rows = [k for k, fit in found.items() if len(fit.cells) >= LEAST_CELLS and fit.counts.sum() >= LEAST_POINTS]
+    chosen = (
+        [found[rows[i]] for i in np.unique(np.linspace(0, len(rows) - 1, MOST_SPHERES).astype(int))] if rows else []
+    )
+    variance, shared = _variances(chosen, kernel)
+    whole, common = np.zeros((len(fits.states), 4, 4)), np.zeros((len(fits.states), 4, 4))
+    for k, fit in found.items():
+        by_field = fit.gain @ kernel[np.ix_(fit.cells, fit.cells)] @ fit.gain.T
+        by_offset = MEAN_COSINE * OFFSET_MM * fit.gain.sum(axis=1)
+        by_class = np.diag([SHIFT_MM**2] * 3 + [0.0]) + np.outer(by_offset, by_offset)
+        whole[k] = variance * by_field + by_class
+        common[k] = shared * by_field + by_class
+    return ViewErrors(whole, common, float(np.sqrt(variance)), float(np.sqrt(shared)))
+
+
+def _directions() -> Floats:
+    """Middles (200, 3) of the cells of :func:`~processor.geometry.sphere.sphere_cells`."""
+    z = np.repeat((np.arange(BANDS) + 0.5) * 2.0 / BANDS - 1.0, SECTORS)
+    turn = np.tile(((np.arange(SECTORS) + 0.5) / SECTORS - 0.5) * 2.0 * np.pi, BANDS)
+    level = np.sqrt(1.0 - z**2)
+    return np.column_stack([level * np.cos(turn), level * np.sin(turn), z])
+
+
+def _fit_of(k: int, crops: AimedCrops, weights: Floats, fits: Fits, priors: Priors) -> _Fit | None:
+    rows = slice(crops.start[k], crops.start[k + 1])
+    on = weights[rows] > 0.0
+    if not on.any():
+        return None
+    points, state = crops.points[rows][on], fits.states[k]
+    away = points - state[:3]
+    distance = np.linalg.norm(away, axis=1)
+    cells, cell = np.unique(sphere_cells(points, state[:3]), return_inverse=True)
+    counts = np.bincount(cell).astype(np.float64)
+    residual = distance - state[3]
+    means = np.bincount(cell, residual) / counts
+    free = max(len(points) - len(cells), 1)
+    within = max(float(np.sum((residual - means[cell]) ** 2)) / free, 1e-6)
+    apart = np.bincount(cell, (residual - means[cell]) ** 2)
+    # Noise differs by incidence: each cell has its own, except where one point shows none.
+    scatter = np.where(counts > 1, apart / np.maximum(counts - 1.0, 1.0), within)
+    normal = np.stack([np.bincount(cell, away[:, i] / distance) / counts for i in range(3)], axis=1)
+    J = np.column_stack([normal, np.ones(len(cells))])
+    by_points = (J * (counts / within)[:, None]).T
+    prior = np.zeros((4, 4))
+    prior[:3, :3] = priors.centre_weight[k]
+    prior[3, 3] = priors.size_weights[k]
+    H = by_points @ J + prior
+    if np.linalg.cond(H) > 1e12:
+        return None
+    covariance = np.linalg.inv(H)
+    # A bias was taken off the state: one step back to where the residuals are least.
+    size = priors.sizes[k] if priors.size_weights[k] > 0.0 else state[3]
+    means = means - J @ covariance @ (by_points @ means - prior @ (state - np.array([0.0, 0.0, 0.0, size])))
+    # The axes that the centre's prior comes from were seen by the same views: they move as a sphere of this size does.
+    held = by_points[:3] @ J[:, :3]
+    moved = np.linalg.pinv(held, rcond=1e-3) @ by_points[:3]
+    gain = covariance @ (by_points + prior @ np.vstack([moved, np.zeros(len(cells))]))
+    return _Fit(cells, counts, means, scatter, J, covariance, gain)
+
+
+def _variances(fits: list[_Fit], kernel: Floats) -> tuple[float, float]:
+    """Variance of the field and its part common to all spheres, mm^2, by moments."""
+    count = len(kernel)
+    squares, expected = 0.0, 0.0
+    total, own = np.zeros(count), 0.0
+    spread, own_spread = np.zeros((count, count)), 0.0
+    for fit in fits:
+        weight = fit.counts  # not over the sphere's own noise: a ratio of estimates is biased
+        left = np.eye(len(fit.cells)) - fit.J @ fit.gain
+        K = kernel[np.ix_(fit.cells, fit.cells)]
+        absorbed = float(np.einsum("c,ci,ij,cj->", weight, fit.J, fit.covariance, fit.J))
+        noise = float(np.sum(fit.scatter)) - absorbed
+        squares += float(weight @ fit.means**2) - noise
+        expected += float(np.einsum("c,ci,ij,cj->", weight, left, K, left, optimize=True))
+        S = np.zeros((count, count))
+        S[np.ix_(fit.cells, fit.cells)] = weight[:, None] * left
+        score = np.zeros(count)
+        score[fit.cells] = weight * fit.means
+        total, own = total + score, own + float(score @ score)
+        spread, own_spread = spread + S, own_spread + float(np.sum((S @ kernel) * S))
+    if not expected > 0.0:
+        return 0.0, 0.0
+    between = float(np.sum((spread @ kernel) * spread)) - own_spread
+    shared = (float(total @ total) - own) / between if len(fits) > 1 and between > 0.0 else 0.0
+    return max(squares / expected, shared, 0.0), max(shared, 0.0)
