@@ -75,6 +75,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
         *_movements(scene, result, true, rows[ok], matches[ok]),
         *_sizes(balls, true, rows, matches, result.method == "ray"),
+        *_tubes(scene, result, truth, of_truth),
     ]
     return metrics
 
@@ -114,6 +115,38 @@ def _movements(scene: Scene, result: Result, true: FrameTruth, rows: Ints, match
         *covered("spheres", "movements", balls.movement[rows] - vector, balls.movement_ci95[rows]),
         *covered("spheres", "sizes of movements", balls.movement_size[rows] - size, balls.movement_size_ci95[rows]),
     ]
+
+
+def _tubes(scene: Scene, result: Result, truth: Truth, of_truth: Ints) -> list[Metric]:
+    """Return errors of tubes against their intervals: of radii, and of axes across at both ends.
+
+    Tubes are built with the design's diameters, and with axes through the centres of the balls they join; scenes with
+    eccentric members have no true axes.
+    """
+    tubes, balls, true = result.tubes, result.balls, truth.frame
+    row = {int(id_): int(k) for id_, k in zip(balls.ids, of_truth, strict=True)}
+    if true is None or not len(tubes):
+        return []
+    a, b = (np.array([row.get(int(id_), -1) for id_ in ids], np.int64) for ids in (tubes.a, tubes.b))
+    joined = np.flatnonzero((a >= 0) & (b >= 0))
+    a, b = a[joined], b[joined]
+    metrics: list[Metric] = []
+    if scene.frame is not None:
+        design = zip(scene.frame.member_a, scene.frame.member_b, scene.frame.tube_diameters, strict=True)
+        radii = {frozenset((int(i), int(j))): 0.5 * float(diameter) for i, j, diameter in design}
+        ends = zip(true.ids[a].tolist(), true.ids[b].tolist(), strict=True)
+        nominal = np.array([radii.get(frozenset(pair), NAN) for pair in ends])
+        metrics += covered("spheres", "radii of tubes", tubes.radii[joined] - nominal, tubes.radius_ci95[joined])
+    if len(joined) and (truth.as_built is None or "eccentricity" not in truth.as_built.what):
+        along = true.centres[b] - true.centres[a]
+        along /= np.linalg.norm(along, axis=1)[:, None]
+        off, half = [], []
+        for place, ci95 in ((tubes.start, tubes.start_ci95), (tubes.end, tubes.end_ci95)):
+            gap = place[joined] - true.centres[a]
+            off.append(gap - np.sum(gap * along, axis=1)[:, None] * along)
+            half.append(ci95[joined])
+        metrics += covered("spheres", "axes of tubes", np.stack(off), np.stack(half))
+    return metrics
 
 
 def true_rows(scene: Scene, balls: Balls, true: FrameTruth) -> Ints:

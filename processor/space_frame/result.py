@@ -111,7 +111,10 @@ class Balls(Rows):
 
 @dataclass(frozen=True)
 class Tubes(Rows):
-    """Members as tubes from ``start`` to ``end`` of their axes, mm, between spheres of ids ``a`` and ``b``."""
+    """Members as tubes from ``start`` to ``end`` of their axes, mm, between spheres of ids ``a`` and ``b``.
+
+    Half-widths of 95 % intervals are of the radius and of the axis across at both ends, along x, y and z.
+    """
 
     a: Ints = column("m", dtype=np.int64)  # -1 = none
     b: Ints = column("m", dtype=np.int64)
@@ -119,6 +122,9 @@ class Tubes(Rows):
     end: Floats = column("m", 3, unit="mm")
     radii: Floats = column("m", json="radius", unit="mm")
     bow: Floats = column("m", unit="mm")  # largest distance of the axis from a straight line
+    radius_ci95: Floats = column("m", unit="mm")
+    start_ci95: Floats = column("m", 3, unit="mm")
+    end_ci95: Floats = column("m", 3, unit="mm")
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from processor.limits import standards
-from processor.model import Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
+from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Scene, Status, Verdict, reason
 from processor.space_frame import catalogue
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.design.matching import Matching
@@ -29,6 +29,8 @@ from processor.space_frame.result import (
     Tubes,
 )
 from processor.space_frame.spheres import baselines
+from processor.space_frame.spheres.records import ViewErrors
+from processor.space_frame.spheres.unnamed_views import of_tubes
 from processor.space_frame.stations.records import Stations
 from processor.space_frame.stations.sightings import control_of
 
@@ -99,7 +101,7 @@ def _result(extracted: Extracted, source: SceneSource, scene: Scene) -> Result:
         balls=balls,
         movement_reference=reference,
         matching=pose,
-        tubes=_tubes(extracted.members, balls.ids, source.origin),
+        tubes=_tubes(extracted.members, balls.ids, source.origin, extracted.spheres.views),
         stations=StationCorrections() if stations is None else _corrections(stations, source),
         datum=() if stations is None else stations.datum,
         control=ControlDeviations() if stations is None else _control(stations),
@@ -173,8 +175,10 @@ def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bo
     )
 
 
-def _tubes(members: Members, ids: Ints, origin: Floats) -> Tubes:
+def _tubes(members: Members, ids: Ints, origin: Floats, views: ViewErrors | None) -> Tubes:
+    """Convert members; errors of unnamed ``views`` are part of the intervals."""
     half = 0.5 * members.lengths[:, None] * members.directions
+    common = np.zeros((len(half), 3, 3)) if views is None else of_tubes(views, members.directions, members.side)
     return Tubes(
         a=np.where(members.node_a >= 0, ids[members.node_a], -1),
         b=np.where(members.node_b >= 0, ids[members.node_b], -1),
@@ -182,7 +186,24 @@ def _tubes(members: Members, ids: Ints, origin: Floats) -> Tubes:
         end=members.points + half + origin,
         radii=members.radii,
         bow=np.hypot(*members.bow.T),
+        radius_ci95=NORMAL_95 * np.sqrt(members.covariance[:, 4, 4] + common[:, 2, 2]),
+        start_ci95=_across(members, -0.5 * members.lengths, common[:, :2, :2]),
+        end_ci95=_across(members, 0.5 * members.lengths, common[:, :2, :2]),
     )
+
+
+def _across(members: Members, t: Floats, common: Floats) -> Floats:
+    """Half-widths (m, 3) of the 95 % intervals of axes across, at ``t`` (m,) along them from their middles.
+
+    ``common`` (m, 2, 2) is a further covariance along side and other.
+    """
+    basis = np.stack([members.side, members.other], axis=2)
+    J = np.zeros((len(t), 2, 4))
+    J[:, 0, 0] = J[:, 1, 1] = 1.0
+    J[:, 0, 2] = J[:, 1, 3] = t
+    C = J @ members.covariance[:, :4, :4] @ np.swapaxes(J, 1, 2) + common
+    half: Floats = NORMAL_95 * np.sqrt(np.maximum(np.einsum("mia,mab,mib->mi", basis, C, basis), 0.0))
+    return half
 
 
 def _corrections(stations: Stations, source: SceneSource) -> StationCorrections:

@@ -1,10 +1,13 @@
 """Merged clouds of frames whose views nobody names: what the views have in common is part of the intervals."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from processor.space_frame.catalogue import of_radii
 from processor.space_frame.spheres import fit_all
+from processor.space_frame.spheres.unnamed_views import of_tubes
 from tests.support import ball_clouds
 from tests.support.memory_source import InMemory
 
@@ -44,3 +47,15 @@ def test_errors_of_views_common_to_all_spheres_are_part_of_the_whole():
     left = found.covariance - found.common
     assert (np.linalg.eigvalsh(left).min(axis=1) > 0.0).all()
     assert (found.common[:, 2, 2] > 0.2**2 - 1e-9).all()
+
+
+def test_tubes_of_a_merged_cloud_hold_shifted_views():
+    """Circles seen from below by four views: what the fit takes up of their shifts is in the intervals."""
+    found = fitted(1, 0.6)
+    axis, side = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
+    (covariance,) = of_tubes(found.views, axis, side)
+    assert (np.linalg.eigvalsh(covariance) > 0.0).all()
+    exact = dataclasses.replace(found.views, sd=0.0)
+    (least,) = of_tubes(exact, axis, side)
+    assert np.sqrt(np.diag(least)) == pytest.approx([0.2, 0.2, 2.0 / 3.0 * 0.2], abs=1e-6)
+    assert (np.diag(covariance) > np.diag(least)).all()

@@ -302,13 +302,15 @@ def _tubes(result: Result) -> list[Table]:
             *tubes.end[i].tolist(),
             float(length[i]),
             float(tubes.radii[i]),
+            float(tubes.radius_ci95[i]),
+            float(max(tubes.start_ci95[i].max(), tubes.end_ci95[i].max())),
             float(tubes.bow[i]),
         )
         for i in range(len(tubes))
     )
     columns = (
         "tube", "ball_a", "ball_b", *(f"start_{one}" for one in COORDINATES), *(f"end_{one}" for one in COORDINATES),
-        "length_mm", "radius_mm", "bow_mm",
+        "length_mm", "radius_mm", "ci95_radius_mm", "ci95_axis_mm", "bow_mm",
     )  # fmt: skip
     note = text("Axes between the ends of the scanned stretch; bow is the largest deviation from a straight line.")
     return [Table(text("Tubes (mm)"), columns, rows, "tubes", note, on_page=False, on_terminal=False)]

@@ -25,8 +25,9 @@ from processor.space_frame.spheres.records import (
     STATIONS,
     Fits,
     Spheres,
+    ViewErrors,
 )
-from processor.space_frame.spheres.unnamed_views import OFFSET_MM, SHIFT_MM, ViewErrors
+from processor.space_frame.spheres.unnamed_views import OFFSET_MM, SHIFT_MM
 
 Bools = npt.NDArray[np.bool_]
 
@@ -105,6 +106,7 @@ def assess(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -
         radius_sd=conditions.radius_sd,
         station_sd=conditions.station_sd,
         messages=_messages(conditions),
+        views=conditions.views,
     )
 
 

@@ -129,6 +129,21 @@ class Fits:
 
 
 @dataclass(frozen=True)
+class ViewErrors:
+    """Covariances (k, 4, 4) of spheres by errors of views: all, and the part common to all spheres; mm^2.
+
+    ``sd`` is that of a displacement along the normal, mm, and ``common_sd`` its part common to all spheres. ``seen``
+    are the points used of all spheres in each of the cells of normals.
+    """
+
+    covariance: Floats
+    common: Floats
+    sd: float
+    common_sd: float
+    seen: Floats
+
+
+@dataclass(frozen=True)
 class Spheres(Checked):
     """Spheres at k nodes, mm: centres less the source's origin.
 
@@ -165,3 +180,4 @@ class Spheres(Checked):
     radius_sd: float = float("nan")  # scatter of radii about their sizes
     station_sd: float = float("nan")  # of each station's place along each axis, from the spheres; NaN = it was given
     messages: tuple[Reason, ...] = described((), reasons="")
+    views: ViewErrors | None = None  # where a merged cloud does not name its views

@@ -13,20 +13,20 @@ stated. ``SHIFT_MM``: targets are measured to about 1 mm, and a network rests on
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from processor.geometry.sphere import sphere_cells
 from processor.model import Floats, Ints
-from processor.space_frame.spheres.records import AimedCrops, Fits, Priors
+from processor.space_frame.spheres.records import AimedCrops, Fits, Priors, ViewErrors
 
 SHIFT_MM, OFFSET_MM = 0.2, 0.2  # sd, of terrestrial scanners; the shift is along each axis
 MEAN_COSINE = 2.0 / 3.0  # of incidence on a sphere: a range moves the surface by less along its normal
 BANDS, SECTORS = 10, 20  # of sphere_cells
 LEAST_POINTS = 30
 LEAST_CELLS = 8
+ACROSS = 0.3  # largest cosine between an axis and the normals of its tube: cells are as wide
 MOST_SPHERES = 400  # that the variances are estimated from
 
 
@@ -42,28 +42,16 @@ class _Fit(NamedTuple):
     gain: Floats  # (4, c) change of the state by a displacement of each cell's surface
 
 
-@dataclass(frozen=True)
-class ViewErrors:
-    """Covariances (k, 4, 4) of spheres by errors of views: all, and the part common to all spheres; mm^2.
-
-    ``sd`` is that of a displacement along the normal, mm, and ``common_sd`` its part common to all spheres.
-    """
-
-    covariance: Floats
-    common: Floats
-    sd: float
-    common_sd: float
-
-
 def view_errors(crops: AimedCrops, weights: Floats, fits: Fits, priors: Priors) -> ViewErrors:
     """Estimate the errors of unnamed views from the fits of k spheres; ``weights`` (n,) > 0 mark the points used."""
     directions = _directions()
     kernel = np.exp(directions @ directions.T - 1.0)
-    found = {}
+    found, seen = {}, np.zeros(len(directions))
     for k in np.flatnonzero(fits.fitted).tolist():
         fit = _fit_of(k, crops, weights, fits, priors)
         if fit is not None:
             found[k] = fit
+            seen[fit.cells] += fit.counts
     rows = [k for k, fit in found.items() if len(fit.cells) >= LEAST_CELLS and fit.counts.sum() >= LEAST_POINTS]
     chosen = (
         [found[rows[i]] for i in np.unique(np.linspace(0, len(rows) - 1, MOST_SPHERES).astype(int))] if rows else []
@@ -76,7 +64,28 @@ def view_errors(crops: AimedCrops, weights: Floats, fits: Fits, priors: Priors) 
         by_class = np.diag([SHIFT_MM**2] * 3 + [0.0]) + np.outer(by_offset, by_offset)
         whole[k] = variance * by_field + by_class
         common[k] = shared * by_field + by_class
-    return ViewErrors(whole, common, float(np.sqrt(variance)), float(np.sqrt(shared)))
+    return ViewErrors(whole, common, float(np.sqrt(variance)), float(np.sqrt(shared)), seen)
+
+
+def of_tubes(views: ViewErrors, axes: Floats, side: Floats) -> Floats:
+    """Covariances (m, 3, 3) of tubes by errors of views: of places along ``side`` and axis x side, and of radii; mm^2.
+
+    ``axes`` and ``side`` (m, 3) are unit vectors. Tubes are seen from where the spheres are: their points have the
+    normals of the spheres' points that are across the axis.
+    """
+    directions = _directions()
+    covariance = np.zeros((len(axes), 3, 3))
+    for m, (axis, first) in enumerate(zip(axes, side, strict=True)):
+        on = (np.abs(directions @ axis) < ACROSS) & (views.seen > 0.0)
+        normal = directions[on] - np.outer(directions[on] @ axis, axis)
+        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+        J = np.column_stack([normal @ first, normal @ np.cross(axis, first), np.ones(len(normal))])
+        weighted = (J * views.seen[on][:, None]).T
+        gain = np.linalg.pinv(weighted @ J, rcond=1e-6) @ weighted
+        by_offset = MEAN_COSINE * OFFSET_MM * gain.sum(axis=1)
+        covariance[m] = views.sd**2 * gain @ np.exp(normal @ normal.T - 1.0) @ gain.T
+        covariance[m] += np.diag([SHIFT_MM**2, SHIFT_MM**2, 0.0]) + np.outer(by_offset, by_offset)
+    return covariance
 
 
 def _directions() -> Floats:
