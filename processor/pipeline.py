@@ -47,7 +47,7 @@ class Execution:
     """What was run on which scene, and everything that made the result."""
 
     scene: Scene
-    runs: tuple[StepRun, ...]  # the answer of each step first, then other methods for comparison
+    runs: tuple[StepRun, ...]  # the result of each step first, then other methods for comparison
     provenance: dict[str, Any]
     stored: Path | None = None  # the scene's file, where its points are still in it
 
@@ -168,7 +168,7 @@ def _applies(module: ModuleType, scene: Scene) -> bool:
 def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None) -> tuple[Job, ...]:
     """Put steps in the order of their needs, with their methods; every name and type is checked.
 
-    The first method named for a step gives the answer; further ones are run for comparison. Without a ``seed`` that
+    The first method named for a step gives the result; further ones are run for comparison. Without a ``seed`` that
     of the parameters holds. Raises UsageError for whatever is not known, saying what is.
     """
     modules = step_modules()

@@ -11,7 +11,7 @@ from designgen import recipe_files
 from designgen.scenes.make import make
 from processor import pipeline, readers
 from processor.model import Scene, StepRun, UsageError
-from processor.report import section
+from processor.report.step_report import step_report
 from processor.store import store
 from tests.support.metrics import metric
 from tests.support.records import assert_equal
@@ -29,7 +29,7 @@ def test_a_step_has_its_names(name):
         assert record.__dataclass_params__.frozen
     assert callable(module.run)
     assert callable(importlib.import_module(f"processor.evaluation.{pipeline.package_of(name)}").check)
-    assert section.of(name).title
+    assert step_report(name).title
 
 
 @pytest.mark.parametrize("name", STEPS)

@@ -40,7 +40,7 @@ def check(context: click.Context, output: Path, as_json: bool) -> None:
     if as_json:
         click.echo(json.dumps({"passed": report.passed, "checks": results["checks"]}, ensure_ascii=False))
     elif metrics:
-        click.echo(report_table.plain_text(all_tables.of_checks(report), most=len(metrics)))
+        click.echo(report_table.plain_text(all_tables.checks_table(report), most=len(metrics)))
     else:
         click.echo("no checks: the input held no truth")
     context.exit(DONE if report.passed else LIMIT_MISSED)

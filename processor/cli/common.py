@@ -44,7 +44,7 @@ def show_results(context: click.Context, output: Path, results: Results, as_json
     if as_json:
         click.echo((output / results_folder.RESULTS).read_text("utf-8"), nl=False)
     else:
-        for table in all_tables.all_of(results.execution, results.report):
+        for table in all_tables.tables_of_run(results.execution, results.report):
             if table.on_terminal:
                 click.echo(report_table.plain_text(table) + "\n")
         click.echo(f"report: {output / 'report.html'}")

@@ -23,7 +23,7 @@ BORDER_CONFIDENCE = 0.95  # of edge loss and missing part, told apart by the bor
 
 @dataclass(frozen=True)
 class Classification:
-    """A class, the confidence in it (0.5 = as good as a coin), and the second most probable class."""
+    """A class, the confidence in it (0.5 = both classes are equally likely), and the second most probable class."""
 
     defect_class: DefectClass
     confidence: float

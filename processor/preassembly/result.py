@@ -206,6 +206,14 @@ class Result(Checked):
         return worst([*self.joints.verdict, *(one.verdict for one in chain if len(one.limits))])
 
     @property
+    def verified(self) -> bool:
+        """Whether all limits that were used are checked against the standard's text, or given by the project."""
+        if self.adjustment is None:
+            return True
+        compared = (*self.adjustment.joints.conformity, *self.adjustment.chain)
+        return all(bool(one.limits.verified.all()) for one in compared)
+
+    @property
     def errors(self) -> tuple[MeanMax, MeanMax, MeanMax]:
         """Splicing error, linear error as assembled and with Foot 1 best-fit to the design."""
         return self.splicing, self.linear.assembled.error, self.linear.best_fit.error

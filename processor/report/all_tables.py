@@ -9,18 +9,18 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, text
 from processor.model import METRIC_NAMES, Metric, Statistic, StepRun
 from processor.pipeline import Execution
-from processor.report import section
+from processor.report.step_report import step_report
 from processor.report.table import Table
 
-__all__ = ["Table", "all_of", "grouped", "of_checks", "of_step"]
+__all__ = ["Table", "checks_table", "grouped", "tables_of_run", "tables_of_step"]
 
 
-def of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
+def tables_of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tables of a step's result, with those of other methods on the same scene."""
-    return section.of(run.step).tables((run, *others), report)
+    return step_report(run.step).tables((run, *others), report)
 
 
-def of_checks(report: ErrorReport) -> Table:
+def checks_table(report: ErrorReport) -> Table:
     """Table of all checks against the truth."""
     rows = tuple(
         (label(m.step), metric_name(m), m.value, m.limit, m.unit, _outcome(m.limit, m.passed)) for m in report.metrics
@@ -47,12 +47,12 @@ def _outcome(limit: float, passed: bool) -> Text:
     return text("passed") if passed else text("MISSED")
 
 
-def all_of(execution: Execution, report: ErrorReport) -> list[Table]:
+def tables_of_run(execution: Execution, report: ErrorReport) -> list[Table]:
     """All tables of a run, the checks last where there are any."""
     tables: list[Table] = []
     for run, others in grouped(execution.runs):
-        tables += of_step(run, others, report)
-    return [*tables, of_checks(report)] if report.metrics else tables
+        tables += tables_of_step(run, others, report)
+    return [*tables, checks_table(report)] if report.metrics else tables
 
 
 def grouped(runs: Sequence[StepRun]) -> list[tuple[StepRun, list[StepRun]]]:

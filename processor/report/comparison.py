@@ -17,7 +17,7 @@ from processor.geometry.m3c2 import FEWEST_FOR_LOD
 from processor.geometry.normal_orientation import CONVENTION, Turned
 from processor.language.messages import NO_NUMBER, Message, messages, text
 from processor.report import results_folder, templates
-from processor.report.deviation import csv
+from processor.report.deviation import core_points_csv
 from processor.report.deviation import figures as deviation_figures
 from processor.report.record_json import reason_json
 
@@ -114,7 +114,7 @@ def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
             deviation_figures.histogram(result.distances, result.unit),
         ]
     with results_folder.replacing_folder(out) as making:
-        table = csv.csv_text(result.origin, result.core, result.distances, result.normals)
+        table = core_points_csv.csv_text(result.origin, result.core, result.distances, result.normals)
         results_folder.write_text(making / TABLE, table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
         results_folder.write_text(making / RECORD, record_text + "\n")

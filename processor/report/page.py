@@ -14,8 +14,9 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, messages, text
 from processor.model import Scene, StepRun, Verdict, Word
 from processor.pipeline import Execution
-from processor.report import all_tables, section, templates, view
-from processor.report.style import Drawn
+from processor.report import all_tables, page_script, templates
+from processor.report.step_report import step_report
+from processor.report.style import CaptionedPngs
 from processor.report.table import headings, numeric, shown
 
 GOOD = "ok"
@@ -40,7 +41,7 @@ NAMES = (
 MOST_ROWS = 2000  # of a table; keeps the page of a roof of 30,000 balls below 12 MB
 
 
-def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], lang: str = "en") -> str:
+def html(execution: Execution, report: ErrorReport, figures: Mapping[str, CaptionedPngs], lang: str = "en") -> str:
     """Render the page, with the figures of each step, in a language of CODES; every text is escaped."""
     environment = templates.environment("report", lang)
     environment.filters["say"] = messages(lang).text
@@ -48,14 +49,14 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn]
     live = {
         run.step: data
         for run, others in all_tables.grouped(execution.runs)
-        if (data := section.of(run.step).live(scene, [run, *others])) is not None
+        if (data := step_report(run.step).interactive_data(scene, [run, *others])) is not None
     }
-    script, digest = view.script()
+    script, digest = page_script.script()
     page: str = environment.get_template("page.html").render(
         title=scene.name,
         about=_about(scene),
         lang=lang,
-        live=view.embedded({"words": messages(lang).of_scripts(script), "steps": messages(lang).rendered(live)}),
+        live=page_script.embedded({"words": messages(lang).of_scripts(script), "steps": messages(lang).rendered(live)}),
         script=script,
         digest=digest,
         verdicts=_verdicts(execution, report),
@@ -91,14 +92,14 @@ def _about(scene: Scene) -> Text:
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
     verdicts: list[dict[str, Any]] = []
     for run, _ in all_tables.grouped(execution.runs):
-        report_of = section.of(run.step)
+        report_of = step_report(run.step)
         head, body = report_of.summary(run.result)
         title = text("{step}: {head}", step=report_of.title, head=head)
         method = text("Method {method}.", method=run.method)
         if body:
             method = text("Method {method}. {text}", method=run.method, text=body)
         verdicts.append({"tone": _tone(run), "head": title, "text": method})
-        verdicts += [{"tone": "", "head": head, "text": body} for head, body in report_of.further(run.result)]
+        verdicts += [{"tone": "", "head": head, "text": body} for head, body in report_of.further_verdicts(run.result)]
     return [*verdicts, _truth(report)]
 
 
@@ -109,10 +110,14 @@ def _truth(report: ErrorReport) -> dict[str, Any]:
     limited = [metric for metric in report.metrics if metric.limit == metric.limit]
     missed = [metric for metric in limited if not metric.passed]
     if not missed:
-        head = text("Truth: {limited} limits kept", limited=len(limited))
+        head = text("Comparison with the truth: {limited} of {limited} accuracy limits kept", limited=len(limited))
         body = text("{free} further figures have no limit", free=len(report.metrics) - len(limited))
         return {"tone": "good", "head": head, "text": body}
-    head = text("Truth: {missed} of {limited} limits missed", missed=len(missed), limited=len(limited))
+    head = text(
+        "Comparison with the truth: {missed} of {limited} accuracy limits missed",
+        missed=len(missed),
+        limited=len(limited),
+    )
     names = [
         text("{step}: {figure}", step=label(metric.step), figure=all_tables.metric_name(metric)) for metric in missed
     ]
@@ -120,10 +125,12 @@ def _truth(report: ErrorReport) -> dict[str, Any]:
 
 
 def _tone(run: StepRun) -> str:
+    """Return the colour class of a step's box: a pass against limits that are not verified is neutral."""
     overall = getattr(run.result, "overall", Verdict.NONE)
     if run.result.status != GOOD or overall is Verdict.FAIL:
         return "bad"
-    return "" if overall is Verdict.INDETERMINATE else "good"
+    provisional = overall is Verdict.INDETERMINATE or not getattr(run.result, "verified", True)
+    return "" if provisional else "good"
 
 
 def _message(result: Any, lang: str) -> str:
@@ -131,14 +138,14 @@ def _message(result: Any, lang: str) -> str:
 
 
 def _sections(
-    execution: Execution, report: ErrorReport, figures: Mapping[str, Drawn], live: Container[str], lang: str
+    execution: Execution, report: ErrorReport, figures: Mapping[str, CaptionedPngs], live: Container[str], lang: str
 ) -> list[dict[str, Any]]:
     sections = []
     for run, others in all_tables.grouped(execution.runs):
-        tables = [table for table in all_tables.of_step(run, others, report) if table.on_page]
+        tables = [table for table in all_tables.tables_of_step(run, others, report) if table.on_page]
         sections.append(
             {
-                "title": section.of(run.step).title,
+                "title": step_report(run.step).title,
                 "message": _message(run.result, lang),
                 "lead": [_table(table, lang) for table in tables if table.file in LEAD],
                 "tables": [_table(table, lang) for table in tables if table.file not in LEAD],
@@ -151,7 +158,7 @@ def _sections(
             }
         )
     if report.metrics:
-        checks = _table(all_tables.of_checks(report), lang)
+        checks = _table(all_tables.checks_table(report), lang)
         sections.append(
             {
                 "title": text("Truth"),

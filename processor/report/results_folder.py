@@ -13,8 +13,9 @@ from pathlib import Path
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, UsageError
 from processor.pipeline import Execution
-from processor.report import all_figures, all_tables, page, results_json, section
+from processor.report import all_figures, all_tables, page, results_json
 from processor.report import table as report_table
+from processor.report.step_report import step_report
 from processor.store import store
 
 RESULTS, RUNS = "results.json", "results.h5"
@@ -55,13 +56,13 @@ def write(out: Path, execution: Execution, report: ErrorReport, lang: str = "en"
         store.write_results(making / RUNS, execution.runs, execution.provenance)
         content = results_json.results_json(execution, report)
         write_text(making / RESULTS, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
-        for table in all_tables.all_of(execution, report):
+        for table in all_tables.tables_of_run(execution, report):
             if table.file:
                 write_text(making / f"{table.file}.csv", report_table.csv_text(table))
         for run, _ in all_tables.grouped(execution.runs):
-            for name, data in section.of(run.step).files(execution, run).items():
+            for name, data in step_report(run.step).files(execution, run).items():
                 write_bytes(making / name, data)
-        drawn = all_figures.of_run(execution, report)
+        drawn = all_figures.draw_figures(execution, report)
         if any(drawn.values()):
             (making / "figures").mkdir()
         for of_step in drawn.values():

@@ -10,7 +10,7 @@ import numpy as np
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report import section
+from processor.report.step_report import step_report
 
 FORMAT, FORMAT_VERSION = "processor-results", "1.0"
 
@@ -58,7 +58,7 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
 
 def step_json(run: StepRun) -> dict[str, Any]:
     """Write one step's result."""
-    return section.of(run.step).written(run.result)
+    return step_report(run.step).written(run.result)
 
 
 def plain(value: Any) -> Any:

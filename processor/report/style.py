@@ -34,7 +34,7 @@ LEAST_SHOWN_MM = 1e-3
 BEHIND_TEXT = {"facecolor": "white", "edgecolor": "none", "pad": 1.0}
 LONGEST_LABEL = 24
 
-Drawn = dict[str, tuple[str | Message, bytes]]  # file name -> (caption, PNG)
+CaptionedPngs = dict[str, tuple[str | Message, bytes]]  # file name -> (caption, PNG)
 
 
 def png(figure: Figure) -> bytes:

@@ -34,7 +34,7 @@ class Region:
     outward: Floats
 
 
-def of_points(
+def surface_view_data(
     title: str | Message,
     method: str,
     points: Floats,

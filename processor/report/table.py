@@ -70,11 +70,12 @@ def csv_text(table: Table) -> str:
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
     writer.writerow(table.columns)
-    writer.writerows([_csv_cell(cell) for cell in row] for row in table.rows)
+    writer.writerows([csv_cell(cell) for cell in row] for row in table.rows)
     return out.getvalue()
 
 
-def _csv_cell(cell: Any) -> Any:
+def csv_cell(cell: Any) -> Any:
+    """Return a cell as CSV files have it: full numbers, and text that no spreadsheet executes."""
     if isinstance(cell, float | np.floating):
         return "" if not math.isfinite(cell) else repr(round(float(cell), 6))
     if isinstance(cell, str | Text | Reason | list | tuple):

@@ -11,7 +11,7 @@ BAD = "</script><script>alert(1)</script>"
 
 
 def rendered(execution):
-    return page.html(execution, ErrorReport(), all_figures.of_run(execution, ErrorReport()))
+    return page.html(execution, ErrorReport(), all_figures.draw_figures(execution, ErrorReport()))
 
 
 class Page(HTMLParser):

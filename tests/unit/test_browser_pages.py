@@ -64,7 +64,7 @@ def test_the_pages_of_nights(tmp_path, lang):
 @pytest.fixture(scope="module")
 def searched(tmp_path_factory):
     execution, report = pages.searched()
-    drawn = all_figures.of_run(execution, report)
+    drawn = all_figures.draw_figures(execution, report)
     folder_of = tmp_path_factory.mktemp("pages")
     for lang in ("en", "zh"):
         (folder_of / f"{lang}.html").write_text(page.html(execution, report, drawn, lang), "utf-8")

@@ -17,7 +17,7 @@ from processor.geometry.m3c2 import Distances
 from processor.model import InputError, Scan, Scene, UsageError
 from processor.report import comparison
 from processor.report.deviation import csv as deviation_csv
-from processor.report.deviation.csv import COLUMNS
+from processor.report.deviation.core_points_csv import COLUMNS
 from processor.store import store
 from tests.support.m3c2_clouds import brute, wavy
 

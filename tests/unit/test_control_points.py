@@ -9,7 +9,7 @@ import pytest
 from designgen import recipe_files
 from designgen.scenes.make import make
 from processor.geometry import rigid
-from processor.model import Control, InputError
+from processor.model import Control, InputError, reason
 from processor.scan_folder import folder
 from processor.space_frame import step as space_frame_step
 from processor.store import store
@@ -60,8 +60,8 @@ def control(scene, seed, sd=0.3, seen_sd=0.4, points=6, wrong=()):
 
 
 def offsets(result, truth):
-    off = result.centres - truth.frame.centres
-    sd = np.sqrt(np.einsum("kii->ki", result.covariance)[:, :3])
+    off = result.balls.centres - truth.frame.centres
+    sd = np.sqrt(np.einsum("kii->ki", result.balls.covariance)[:, :3])
     return off, sd
 
 
@@ -76,18 +76,18 @@ def test_the_shift_all_stations_share_is_found_by_control_points_and_covered_wit
     assert np.abs(np.mean(off, axis=0)).max() < 0.6
     assert np.sqrt(np.mean((off / sd) ** 2)) < 1.6
     assert np.mean(np.abs(off) < 1.96 * sd) > 0.85
-    assert held.datum == "6 control points"
-    assert np.all(held.control_used == 1)
-    assert np.linalg.norm(held.control_off, axis=1).max() < 2.0
+    assert held.datum == (reason("spheres.datum-control", points=6),)
+    assert np.all(held.control.used)
+    assert np.linalg.norm(held.control.off, axis=1).max() < 2.0
     off, sd = offsets(free, truth)
     np.testing.assert_allclose(np.mean(off, axis=0), COMMON_MM, atol=0.4)
     assert np.mean(np.abs(off) < 1.96 * sd) > 0.85
-    assert "no control points" in free.datum
+    assert [item.code for item in free.datum] == ["spheres.datum-stations"]
     # and the movements, in the design's own frame, are sure to what the datum is
     true = truth.frame.centres - scene.frame.centres
     for result in (held, free):
-        assert np.mean(np.abs(result.movement - true) < result.movement_ci95) > 0.85
-    assert np.median(held.movement_ci95) < 0.5 * np.median(free.movement_ci95)
+        assert np.mean(np.abs(result.balls.movement - true) < result.balls.movement_ci95) > 0.85
+    assert np.median(held.balls.movement_ci95) < 0.5 * np.median(free.balls.movement_ci95)
 
 
 # --- files ----------------------------------------------------------------------------------------------------------

@@ -175,7 +175,7 @@ def test_a_hole_seen_from_both_sides_is_one_missing_part_without_a_picture():
     result = defects_step.run(dataclasses.replace(scene, scans=(*scene.scans, *backs)), defects_step.Params())
     assert found(result) == [("missing-part", "component-1")]
     assert result.pictures[0].deviation.size == 0
-    drawn = figures.of_result(result)
+    drawn = figures.draw(result)
     assert set(drawn) == {"defects-maps.png"}
     assert figures.files(result)["defects.pdf"].startswith(b"%PDF")
 

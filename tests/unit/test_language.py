@@ -16,7 +16,7 @@ from processor.model import Status, reason
 from processor.preassembly.ends.faces import PlateFace
 from processor.preassembly.result import Gauge
 from processor.preassembly.verdicts import joint_measures, trim_and_shim
-from processor.report import all_figures, page, view
+from processor.report import all_figures, page, page_script
 from processor.space_frame.design.matching import FrameRelation
 from tests.support.ball_results import of_frame, whole, with_truth
 from tests.support.bridge_results import LIMITS, SECTION, of_bridge, with_band
@@ -28,7 +28,7 @@ CODES = [code for code in messages_.CODES if code != "en"]
 
 @pytest.mark.parametrize("code", CODES)
 def test_all_that_the_scripts_say_is_known(code):
-    script, _ = view.script()
+    script, _ = page_script.script()
     said = set(re.findall(r'say\("([^"]+)"\)', script))
     assert len(said) > 20
     assert said - set(messages(code).of_scripts(script)) == set()
@@ -52,7 +52,7 @@ def test_live_figures_are_translated_but_for_names():
 
 
 def chinese_page(execution, report):
-    return page.html(execution, report, all_figures.of_run(execution, report), "zh")
+    return page.html(execution, report, all_figures.draw_figures(execution, report), "zh")
 
 
 def a_bridge():

@@ -101,7 +101,7 @@ def given():
 @pytest.mark.parametrize("made", [stitched, controlled, given, searched])
 def test_nothing_but_names_and_units_is_left_in_english(made):
     execution, report = made()
-    text = page.html(execution, report, all_figures.of_run(execution, report), "zh")
+    text = page.html(execution, report, all_figures.draw_figures(execution, report), "zh")
     assert left_in_english(text) == []
 
 

@@ -58,7 +58,7 @@ def of_frame():
 
 
 def render(execution, report):
-    return page.html(execution, report, all_figures.of_run(execution, report))
+    return page.html(execution, report, all_figures.draw_figures(execution, report))
 
 
 # --- results.json --------------------------------------------------------------------------------------------------
@@ -117,7 +117,7 @@ def test_results_json_of_balls():
 
 
 def by_file(execution, report, file):
-    (table,) = [one for one in all_tables.all_of(execution, report) if one.file == file]
+    (table,) = [one for one in all_tables.tables_of_run(execution, report) if one.file == file]
     return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
 
 
@@ -136,7 +136,7 @@ def test_csv_of_gaps_and_stations():
     }
     assert gaps[10]["dx_mm"] == ""
     linear = by_file(of_bridge(), ErrorReport(), "linear")
-    assert (linear[61]["edge"], linear[61]["station_mm"], linear[61]["deviation_mm"]) == ("right", "200.0", "1.2")
+    assert (linear[61]["edge"], linear[61]["chainage_mm"], linear[61]["deviation_mm"]) == ("right", "200.0", "1.2")
 
 
 def test_csv_of_balls_holds_the_error_against_the_true_radius():
@@ -201,7 +201,7 @@ def test_a_joint_without_an_answer_is_not_a_perfect_one():
 
 
 def figures_of_both():
-    drawn = all_figures.of_run(of_bridge(), ErrorReport()) | all_figures.of_run(*of_frame())
+    drawn = all_figures.draw_figures(of_bridge(), ErrorReport()) | all_figures.draw_figures(*of_frame())
     return drawn["preassemble"] | drawn["spheres"]
 
 
@@ -271,7 +271,7 @@ def test_the_page_says_first_what_came_out():
     text = render(execution, report)
     assert text.index("1 of 3 balls without a flag") < text.index("<h2>")
     assert text.index("1 wrong-size, 1 not-found") < text.index("<h2>")
-    assert text.index("1 of 1 limits missed") < text.index("<h2>")
+    assert text.index("1 of 1 accuracy limits missed") < text.index("<h2>")
     assert "No truth" in render(of_bridge(), ErrorReport())
 
 

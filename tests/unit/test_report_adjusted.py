@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import io
 import json
+from types import SimpleNamespace
 
 import matplotlib.image
 import numpy as np
@@ -11,11 +12,11 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import StepRun
+from processor.model import Status, StepRun, Verdict
 from processor.pipeline import Execution
 from processor.preassembly.result import Deviations
 from processor.preassembly.verdicts import joint_measures
-from processor.report import all_figures, all_tables, results_json
+from processor.report import all_figures, all_tables, page, results_json
 from processor.report import table as report_table
 from processor.report.preassembly import joint_figures, residual_map
 from processor.report.style import rounded
@@ -38,7 +39,7 @@ NAN = float("nan")
 
 
 def of_file(execution, file):
-    (table,) = [one for one in all_tables.all_of(execution, ErrorReport()) if one.file == file]
+    (table,) = [one for one in all_tables.tables_of_run(execution, ErrorReport()) if one.file == file]
     return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
 
 
@@ -109,7 +110,9 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
     # What was stated and is held against nothing is said.
     assert step["limits_not_held"] == ["bow_mm"]
     assert of_file(execution, "limits-not-held") == [{"key": "bow_mm", "limit": "bow of a unit preassembled"}]
-    on_terminal = [str(table.title) for table in all_tables.all_of(execution, ErrorReport()) if table.on_terminal]
+    on_terminal = [
+        str(table.title) for table in all_tables.tables_of_run(execution, ErrorReport()) if table.on_terminal
+    ]
     assert {"Limits of the whole chain, method adjustment (mm)", "Limits that nothing is compared with"} <= set(
         on_terminal
     )
@@ -133,7 +136,7 @@ def test_gaps_have_intervals_in_the_joints_axes_too():
     assert len(of_file(execution, "gaps-line")[0]) == 8
 
 
-def test_both_poses_of_an_ambiguous_part_and_what_would_tell():
+def test_both_poses_of_an_ambiguous_part_and_what_would_decide():
     rows = of_file(of_bridge(), "candidates")
     assert [row["candidate"] for row in rows] == ["as assembled", "the other pose"]
     assert [float(row["turned_deg"]) for row in rows] == [0.0, 180.0]
@@ -143,10 +146,10 @@ def test_both_poses_of_an_ambiguous_part_and_what_would_tell():
 
 def test_what_limits_the_accuracy_has_a_file_and_stands_on_the_terminal():
     rows = of_file(of_bridge(), "accuracy")
-    assert rows[0]["answer"].startswith("J1 P1: ± 0.087 mm (95 %), 69% of the variance from the end face")
-    assert rows[1]["answer"].startswith("a scan of rib1 that shows more of the end face")
+    assert rows[0]["statement"].startswith("J1 P1: ± 0.087 mm (95 %), 69% of the variance from the end face")
+    assert rows[1]["statement"].startswith("a scan of rib1 that shows more of the end face")
     assert any(
-        table.file == "accuracy" and table.on_terminal for table in all_tables.all_of(of_bridge(), ErrorReport())
+        table.file == "accuracy" and table.on_terminal for table in all_tables.tables_of_run(of_bridge(), ErrorReport())
     )
 
 
@@ -154,7 +157,7 @@ def test_why_a_method_failed_is_said_and_it_is_not_drawn():
     execution = of_bridge()
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
-    answered = all_figures.of_run(execution, ErrorReport())["preassemble"]["linear-error.png"]
+    answered = all_figures.draw_figures(execution, ErrorReport())["preassemble"]["linear-error.png"]
     assert "without a band, for they state no uncertainty: line" in str(answered[0])
     line = execution.runs[1]
     linear = line.result.linear
@@ -168,15 +171,15 @@ def test_why_a_method_failed_is_said_and_it_is_not_drawn():
         ),
     )
     alone = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=own)))
-    caption, picture = all_figures.of_run(alone, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = all_figures.draw_figures(alone, ErrorReport())["preassemble"]["linear-error.png"]
     assert "the error of these methods for parts exactly as designed, scanned alike: line" in str(caption)
     assert picture != answered[1]
-    (summary,) = (table for table in all_tables.all_of(alone, ErrorReport()) if table.file == "summary")
+    (summary,) = (table for table in all_tables.tables_of_run(alone, ErrorReport()) if table.file == "summary")
     assert "Of a bridge exactly as designed, scanned alike, line states up to 9.000" in str(summary.note)
     nothing = Deviations(deviation=np.full(120, NAN))
     result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
-    caption, picture = all_figures.of_run(silent, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = all_figures.draw_figures(silent, ErrorReport())["preassemble"]["linear-error.png"]
     assert "without a result, so not drawn: line" in str(caption)
     assert picture != answered[1]
     data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
@@ -201,17 +204,23 @@ def test_span_closure_budget_and_trade_off_as_tables():
 def test_methods_without_intervals_have_none_of_these():
     runs = (StepRun("preassemble", "line", "{}", assembled("line")),)
     execution = Execution(arch_scene(), runs, PROVENANCE)
-    files = {table.file for table in all_tables.all_of(execution, ErrorReport())}
+    files = {table.file for table in all_tables.tables_of_run(execution, ErrorReport())}
     assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
-    assert not set(all_figures.of_run(execution, ErrorReport())["preassemble"]) & OWN
+    assert not set(all_figures.draw_figures(execution, ErrorReport())["preassemble"]) & OWN
     assert "What limits the accuracy" not in rendered(execution)
+
+
+@pytest.mark.parametrize(("verified", "tone"), [(True, "good"), (False, "")])
+def test_a_pass_is_marked_as_good_only_by_limits_that_are_verified(verified, tone):
+    result = SimpleNamespace(status=Status.OK, overall=Verdict.PASS, verified=verified)
+    assert page._tone(SimpleNamespace(result=result)) == tone
 
 
 def test_the_verdict_stands_before_all_else_and_what_to_do_before_the_pictures():
     text = rendered(of_bridge())
     places = [
         text.index(one)
-        for one in ("joints 2 fail", "NOT VERIFIED", "-1.250 ± 0.500", "J1 P1: ±", "A scan of rib1", "<h2>")
+        for one in ("joints 2 fail", "verdicts are provisional", "-1.250 ± 0.500", "J1 P1: ±", "A scan of rib1", "<h2>")
     ]
     assert places == sorted(places)
     assert text.index("Joints: what to do") < text.index("data:image/png")
@@ -248,7 +257,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
     execution = of_bridge()
     result = unknown(execution.runs[0].result, list(joints), parts)
     execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
-    found = all_figures.of_run(execution, ErrorReport())["preassemble"]
+    found = all_figures.draw_figures(execution, ErrorReport())["preassemble"]
     assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == drawn
     parsed = Page(rendered(execution))
     last = parsed.tables["Joints: what to do, method adjustment"][-1]
@@ -264,7 +273,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
 
 
 def test_every_picture_shows_something():
-    found = all_figures.of_run(of_bridge(), ErrorReport())["preassemble"]
+    found = all_figures.draw_figures(of_bridge(), ErrorReport())["preassemble"]
     assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
     for name, (caption, png) in found.items():
         pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
@@ -276,13 +285,13 @@ def test_every_picture_shows_something():
 
 def test_pictures_follow_what_they_show():
     """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
-    before = all_figures.of_run(of_bridge(), ErrorReport())["preassemble"]
+    before = all_figures.draw_figures(of_bridge(), ErrorReport())["preassemble"]
     execution = of_bridge()
     run = execution.runs[0]
     before_of = run.result.adjustment
     residuals = dataclasses.replace(before_of.residuals, distance=-3.0 * np.abs(before_of.residuals.distance))
     other = dataclasses.replace(run.result, adjustment=dataclasses.replace(before_of, residuals=residuals, weight=1.0))
-    after = all_figures.of_run(
+    after = all_figures.draw_figures(
         dataclasses.replace(execution, runs=(dataclasses.replace(run, result=other),)), ErrorReport()
     )["preassemble"]
     assert {name for name in OWN if before[name] != after[name]} == {"residuals.png", "trade-off.png"}
@@ -331,5 +340,5 @@ def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps
         assert box.x1 <= frame.x1, one.get_text()
         assert frame.y0 <= box.y0, one.get_text()
         assert box.y1 <= frame.y1, one.get_text()
-    assert [one.get_text() for one in silent.texts] == ["no answer: the gaps are not known"]
+    assert [one.get_text() for one in silent.texts] == ["no gaps computed"]
     assert silent.get_title() == "J2: indeterminate"

@@ -50,7 +50,7 @@ from tests.support.report_pages import TablesOfPage
 
 
 def by_file(file, *args):
-    (table,) = [one for one in all_tables.all_of(*of_frame(*args)) if one.file == file]
+    (table,) = [one for one in all_tables.tables_of_run(*of_frame(*args)) if one.file == file]
     return list(csv.DictReader(io.StringIO(report_table.csv_text(table))))
 
 
@@ -211,15 +211,15 @@ def moved_to(result, centres, T):
 
 
 def test_without_a_limit_the_table_says_so():
-    (table,) = [one for one in all_tables.all_of(*of_frame(whole(limit=NAN))) if one.file == "nodes"]
+    (table,) = [one for one in all_tables.tables_of_run(*of_frame(whole(limit=NAN))) if one.file == "nodes"]
     assert "node_place_mm" in str(table.note)
-    (table,) = [one for one in all_tables.all_of(*of_frame(whole(matching="ambiguous"))) if one.file == "nodes"]
+    (table,) = [one for one in all_tables.tables_of_run(*of_frame(whole(matching="ambiguous"))) if one.file == "nodes"]
     assert "10 mm by project.toml" in str(table.note)
     assert "not certain" in str(table.note)
 
 
 def test_the_terminal_has_a_summary_what_to_look_at_and_the_stations():
-    shown = [one for one in all_tables.all_of(*of_frame()) if one.on_terminal]
+    shown = [one for one in all_tables.tables_of_run(*of_frame()) if one.on_terminal]
     assert [str(one.title).split(",")[0] for one in shown] == [
         "Balls in short", "Balls to look at", "Stations against each other (mm"
     ]  # fmt: skip
@@ -309,7 +309,7 @@ def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
 
 def test_figures_of_a_frame_and_those_of_balls_to_look_at():
     report, result = with_truth()
-    found = all_figures.of_run(*of_frame(result, report))["spheres"]
+    found = all_figures.draw_figures(*of_frame(result, report))["spheres"]
     assert set(found) == {
         "plan.png", "radius-errors.png", "ball-errors.png", "ball-to-see-11.png", "ball-to-see-12.png",
         "ball-to-see-13.png",
@@ -319,19 +319,19 @@ def test_figures_of_a_frame_and_those_of_balls_to_look_at():
     assert "sd" not in str(found["ball-errors.png"][0])
     assert str(found["ball-to-see-11.png"][0]).startswith("Ball 11, wrong-size")
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
-        assert all_figures.of_run(*of_frame(result, report))["spheres"] == found
-    untold = all_figures.of_run(*of_frame())["spheres"]
+        assert all_figures.draw_figures(*of_frame(result, report))["spheres"] == found
+    untold = all_figures.draw_figures(*of_frame())["spheres"]
     assert "Standard deviations" in str(untold["ball-errors.png"][0])
 
 
 def test_points_that_are_not_at_hand_leave_the_pictures_of_balls_out():
-    found = all_figures.of_run(*of_frame(points=np.empty((0, 3))))["spheres"]
+    found = all_figures.draw_figures(*of_frame(points=np.empty((0, 3))))["spheres"]
     assert set(found) == {"plan.png", "ball-errors.png"}
 
 
 def test_at_most_twelve_balls_have_a_picture_worst_first():
     made = repeated(whole(), 8)
-    drawn = close_ups.of_result(scene(made), made)
+    drawn = close_ups.draw(scene(made), made)
     captions = [str(caption) for caption, _ in drawn.values()]
     assert len(drawn) == 12
     assert [caption.split(",")[1].split(":")[0].strip() for caption in captions][:8] == ["wrong-size"] * 8
@@ -393,11 +393,11 @@ def test_balls_of_a_file_are_drawn_as_those_in_memory(tmp_path):
     )
     one = dataclasses.replace(scene(made), scans=scans, stations=Stations(("S1",), np.zeros((1, 3))))
     store.write_scene(tmp_path / "s.h5", one, None, {})
-    in_memory = close_ups.of_result(store.read_scene(tmp_path / "s.h5"), made)
+    in_memory = close_ups.draw(store.read_scene(tmp_path / "s.h5"), made)
     alone = store.read_scene(tmp_path / "s.h5", points=False)
     assert len(in_memory) > 1
-    assert close_ups.of_result(alone, made) == {}
-    assert close_ups.of_result(alone, made, tmp_path / "s.h5") == in_memory
+    assert close_ups.draw(alone, made) == {}
+    assert close_ups.draw(alone, made, tmp_path / "s.h5") == in_memory
 
 
 def test_control_points_have_a_table_and_their_place_in_results_json():
@@ -410,7 +410,7 @@ def test_control_points_have_a_table_and_their_place_in_results_json():
             scans=("S1", "S2"),
         ),
     )
-    (table,) = (one for one in space_frame_tables.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+    (table,) = (one for one in space_frame_tables.step_tables([StepRun("spheres", "ray", "{}", made)], ErrorReport())
                 if one.file == "control")  # fmt: skip
     assert table.columns[0] == "control_point"
     name, *off, used, scan = table.rows[0]
@@ -430,7 +430,7 @@ def test_targets_without_members_have_lowest_points_and_bounds():
     columns = {"sizes": np.full(5, NAN), "axes": np.zeros(5, int), "nominal_radii": np.full(5, NAN)}
     made = without_design(whole(changed=columns, tubes=Tubes(), stations=StationCorrections()))
     found = {
-        one.file: one for one in space_frame_tables.of_runs([StepRun("spheres", "ray", "{}", made)], ErrorReport())
+        one.file: one for one in space_frame_tables.step_tables([StepRun("spheres", "ray", "{}", made)], ErrorReport())
     }
     assert {"balls", "lowest"} <= set(found)
     assert {"bound_sd_lowest_z_mm", "efficiency_radius"} <= set(found["balls"].columns)
@@ -456,7 +456,7 @@ def test_where_the_design_has_a_ball():
 
 def test_the_page_of_a_frame():
     execution, report = of_frame()
-    drawn = all_figures.of_run(execution, report)
+    drawn = all_figures.draw_figures(execution, report)
     text = page.html(execution, report, drawn)
     found = TablesOfPage(text)
     assert {"Nodes against the design (mm)", "Balls to look at, method ray (mm)", "Balls, method ray (mm)"} <= set(

@@ -58,7 +58,7 @@ def test_a_point_of_the_bridge_can_be_read(tmp_path):
 def test_balls_in_space_react_and_their_table_holds_the_results(tmp_path):
     execution, report = of_frame()
     path = tmp_path / "r.html"
-    path.write_text(page.html(execution, report, all_figures.of_run(execution, report)), "utf-8")
+    path.write_text(page.html(execution, report, all_figures.draw_figures(execution, report)), "utf-8")
     step = results_json.results_json(execution, report)["steps"]["spheres"]
     with opened(path) as shown:
         first = picture(shown)

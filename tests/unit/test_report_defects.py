@@ -13,7 +13,7 @@ from processor.defects.result import Result
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.report import page, surface_view
-from processor.report.defects import figures, view
+from processor.report.defects import figures, live_data
 from processor.report.record_json import as_object
 from processor.report.results_json import plain
 from processor.store import store
@@ -22,7 +22,7 @@ from tests.support.report_pages import Page
 
 
 def drawn(result):
-    return view.of_runs(None, step_results.execution(("defects", "default", "{}", result)).runs)
+    return live_data.live_data(None, step_results.execution(("defects", "default", "{}", result)).runs)
 
 
 def test_the_view_holds_the_surface_and_an_outline_a_defect():

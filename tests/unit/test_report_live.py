@@ -9,8 +9,8 @@ import subprocess
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report import results_json, view
-from processor.report.preassembly import view as preassembly_view
+from processor.report import page_script, results_json
+from processor.report.preassembly import live_data as preassembly_data
 from tests.support.bridge_results import of_bridge
 from tests.support.report_pages import BAD, Page, rendered
 
@@ -45,7 +45,7 @@ def test_no_name_ends_the_data_or_becomes_markup():
 
 def test_the_page_runs_its_own_script_alone_and_loads_nothing():
     text = rendered(of_bridge())
-    script, digest = view.script()
+    script, digest = page_script.script()
     assert "default-src 'none'" in text
     assert f"script-src {html.escape(digest)}" in text.replace("&#39;", "&#x27;")
     assert script in text
@@ -56,11 +56,11 @@ def test_many_points_keep_the_page_small():
     text = rendered(of_bridge(per_part=100_000))
     assert len(text.encode()) < 3_000_000
     data = json.loads(Page(text).scripts[0][1])["steps"]["preassemble"]
-    assert sum(len(part["residual"]) for part in data["parts"]) <= preassembly_view.MOST_POINTS
+    assert sum(len(part["residual"]) for part in data["parts"]) <= preassembly_data.MOST_POINTS
 
 
 @pytest.mark.skipif(shutil.which("node") is None, reason="no node")
 def test_the_script_is_valid(tmp_path):
-    (tmp_path / "live.js").write_text(view.script()[0])
+    (tmp_path / "live.js").write_text(page_script.script()[0])
     done = subprocess.run(["node", "--check", tmp_path / "live.js"], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr

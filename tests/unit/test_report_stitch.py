@@ -10,7 +10,7 @@ from processor.geometry import rigid
 from processor.model import Scan, StepRun
 from processor.report import all_figures, page
 from processor.report.record_json import as_object
-from processor.report.stitching import view
+from processor.report.stitching import live_data
 from processor.stitching.result import ControlPoints, ControlSightings
 from processor.store import store
 from tests.support import step_results
@@ -68,7 +68,7 @@ def test_a_result_as_json_has_names_truth_values_and_nulls():
 
 
 def test_each_point_says_how_far_the_other_scan_lies(made):
-    data = view.of_runs(made.scene, made.runs)
+    data = live_data.live_data(made.scene, made.runs)
     assert [part["name"] for part in data["parts"]] == list(NAMES[:3])
     off = [np.array(part["residual"], float) for part in data["parts"]]
     # What lies behind as its scanner sees it is negative, what lies before it positive; both to the rounding.
@@ -83,14 +83,14 @@ def test_each_point_says_how_far_the_other_scan_lies(made):
 
 def test_one_scan_alone_has_no_view(made):
     alone = dataclasses.replace(made.scene, scans=made.scene.scans[:1])
-    assert view.of_runs(alone, made.runs) is None
+    assert live_data.live_data(alone, made.runs) is None
 
 
 def test_many_scans_keep_the_page_small(made):
     rng = np.random.default_rng(1)
     scans = [dataclasses.replace(scan, points=rng.normal(0.0, 1e4, (100_000, 3))) for scan in made.scene.scans]
-    data = view.of_runs(dataclasses.replace(made.scene, scans=tuple(scans)), made.runs)
-    assert sum(len(part["residual"]) for part in data["parts"]) <= view.MOST_POINTS
+    data = live_data.live_data(dataclasses.replace(made.scene, scans=tuple(scans)), made.runs)
+    assert sum(len(part["residual"]) for part in data["parts"]) <= live_data.MOST_POINTS
 
 
 @pytest.mark.parametrize(
@@ -99,7 +99,7 @@ def test_many_scans_keep_the_page_small(made):
 )
 def test_scans_in_space_react(made, tmp_path, lang, unit):
     report = ErrorReport()
-    (tmp_path / "page.html").write_text(page.html(made, report, all_figures.of_run(made, report), lang), "utf-8")
+    (tmp_path / "page.html").write_text(page.html(made, report, all_figures.draw_figures(made, report), lang), "utf-8")
     with opened(tmp_path / "page.html") as shown:
         shown.locator("canvas.space").scroll_into_view_if_needed()
         first = picture(shown)

@@ -18,7 +18,7 @@ from processor.report.style import (
     DIVERGING,
     LEAST_SHOWN_MM,
     MARKERS,
-    Drawn,
+    CaptionedPngs,
     label,
     pdf,
     png,
@@ -34,9 +34,9 @@ LINE = 0.07  # of a panel's height
 REMARK_WIDTH, REMARK_LINES = 52, 4
 
 
-def of_result(result: Result) -> Drawn:
+def draw(result: Result) -> CaptionedPngs:
     """Draw the maps and deflection curves of defects; nothing without defects."""
-    drawn: Drawn = {}
+    drawn: CaptionedPngs = {}
     if result.pictures:
         drawn[MAPS] = _maps(result)
     if _bent(result):

@@ -7,8 +7,8 @@ import collections
 from processor.defects.result import DefectClass, Result
 from processor.language.messages import Message, text
 from processor.model import Status
-from processor.report.defects import figures, tables, view
-from processor.report.section import StepReport
+from processor.report.defects import figures, live_data, tables
+from processor.report.step_report import StepReport
 
 
 def _summary(result: Result) -> tuple[Message, Message]:
@@ -37,8 +37,8 @@ def _summary(result: Result) -> tuple[Message, Message]:
 REPORT = StepReport(
     title=text("Defects"),
     summary=_summary,
-    tables=tables.of_runs,
-    figures=lambda _, runs, __: figures.of_result(runs[0].result),
+    tables=tables.step_tables,
+    figures=lambda _, runs, __: figures.draw(runs[0].result),
     files=lambda _, run: figures.files(run.result),
-    live=view.of_runs,
+    interactive_data=live_data.live_data,
 )

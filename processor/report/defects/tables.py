@@ -16,10 +16,10 @@ from processor.report.table import Table
 
 LIST_NOTE = text(
     "Centres in the design's frame; a depth inward is positive. ci95 is the half-width of the 95 % interval. The depth "
-    "of a missing part is the design's thickness. Confidence 0.5 is as good as a coin; below 0.6 the class is unknown, "
-    "and the second class is the most probable. lod95 is the level of detection of the mean that the depth follows "
-    "from. A defect is doubtful if more than one false alarm as strong is expected on 10 000 m2, or if another "
-    "attitude of the structure fits as well."
+    "of a missing part is the design's thickness. Confidence 0.5: both classes are equally likely; "
+    "below 0.6 the class is unknown, and the second class is the most probable. lod95 is the level of detection of the "
+    "mean that the depth follows from. A defect is doubtful if more than one false alarm as strong is expected on "
+    "10 000 m2, or if another attitude of the structure fits as well."
 )
 LEAST_NOTE = text(
     "The mean deviation from which a place of this size is found, at the given rate of false alarms; median over the "
@@ -27,7 +27,7 @@ LEAST_NOTE = text(
 )
 
 
-def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
+def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     """Tables of the first run in short and in full, and the defects of the methods that it is compared with."""
     result: Result = runs[0].result
     tables = [_summary(result, runs[0].method), *(_list(run, run is runs[0]) for run in runs)]

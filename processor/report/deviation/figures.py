@@ -26,8 +26,8 @@ BOTH_SIDES = 0.1  # share of core points that look away from which they get a pa
 def deviation_map(core: Floats, normals: Floats, distances: Distances, unit: str) -> tuple[Message, bytes]:
     """Draw core points (k, 3) with normals (k, 3) by distance, seen along the axis on which they spread least.
 
-    What is beyond its level of detection is a large dot, what is within a small one, so that grey print tells too. A
-    structure that looks both ways is drawn from either side: what is seen from there.
+    Large dots exceed their level of detection, small ones do not, so the map is readable in grey. A structure with
+    faces to both sides gets one panel for each side.
     """
     drawn = np.unique(np.linspace(0, len(core) - 1, min(len(core), MOST_DRAWN)).astype(np.int64))
     spread = np.ptp(core, axis=0) if len(core) else np.zeros(3)

@@ -14,9 +14,9 @@ from processor.language.messages import Message, text
 from processor.model import Floats, Ints, Scene, Status, StepRun
 from processor.pipeline import Execution
 from processor.report import surface_view
-from processor.report.deviation import csv, figures
-from processor.report.section import StepReport
-from processor.report.style import Drawn
+from processor.report.deviation import core_points_csv, figures
+from processor.report.step_report import StepReport
+from processor.report.style import CaptionedPngs
 from processor.report.table import Table, figures_of
 
 MAP, HISTOGRAM = "deviation-map.png", "deviation-histogram.png"
@@ -60,7 +60,7 @@ def _tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     return [figures_of("Deviation of the surface from the design", runs, "deviation-figures")]
 
 
-def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
+def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> CaptionedPngs:
     core = runs[0].result.core
     if not np.isfinite(core.lod95).any():
         return {}
@@ -73,7 +73,7 @@ def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Drawn:
 
 def _files(_: Execution, run: StepRun) -> dict[str, bytes]:
     core = run.result.core
-    table = csv.csv_text(run.result.origin, core.points, core.distances, core.normals)
+    table = core_points_csv.csv_text(run.result.origin, core.points, core.distances, core.normals)
     return {"deviation.csv": table.encode("ascii")}
 
 
@@ -81,7 +81,7 @@ def _live(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     core = runs[0].result.core
     points = core.points + runs[0].result.origin
     everything: Ints = np.arange(len(points), dtype=np.int64)
-    return surface_view.of_points(
+    return surface_view.surface_view_data(
         text("Deviation in space"), runs[0].method, points, core.distance, [("surface", everything)], named=False
     )
 
@@ -92,5 +92,5 @@ REPORT = StepReport(
     tables=_tables,
     figures=_figures,
     files=_files,
-    live=_live,
+    interactive_data=_live,
 )

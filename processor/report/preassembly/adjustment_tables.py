@@ -1,4 +1,4 @@
-"""Tables of what only the adjustment states: what to do at the joints, limits, measures, span, closure, budget."""
+"""Tables of what only the adjustment gives: what to do at the joints, limits, measures, span, closure, budget."""
 
 from __future__ import annotations
 
@@ -36,8 +36,9 @@ _GROUPS: tuple[str | Message, ...] = (
     *[text("probability that all limits hold")] * 2,
 )  # fmt: skip
 _NOTE = text(
-    "± is the 95 % half-width. Groove gap: right part minus left along the bridge, positive is open. Pass and fail "
-    "hold with 95 % confidence, indeterminate is neither. Probabilities: as it is, and after the proposed work."
+    "± is the 95 % half-width. Groove gap: right part minus left along the bridge, positive is open. Pass: the whole "
+    "interval keeps the limit; fail: the whole interval exceeds it; indeterminate: the limit lies within it. "
+    "Probabilities: as it is, and after the proposed work."
 )
 LIMITS_NOTE = text(
     "Least and greatest allowed; a dash is no bound. Limits that are not verified were not compared with the "
@@ -90,7 +91,7 @@ def adjusted(result: Result, method: str) -> list[Table]:
         ),
         Table(
             text("What limits the accuracy, and which scan would help"),
-            ("question", "answer"),
+            ("subject", "statement"),
             (
                 (text("what limits the accuracy"), text("{reasons:;}", reasons=adjustment.limiting)),
                 (text("which scan would help"), text("{reasons:;}", reasons=adjustment.advice)),
@@ -203,14 +204,14 @@ def _candidates(result: Result, adjustment: Adjustment) -> Iterator[Table]:
     title = text("Parts that fit in two poses")
     yield Table(
         title,
-        ("component", "candidate", "turned_deg", "what_would_tell"),
+        ("component", "candidate", "turned_deg", "what_would_decide"),
         tuple(rows),
         note=text("Both fit the design alike. The matrices of both, scan to bridge, are in candidates.csv, mm."),
     )
     places = tuple(f"{row}{column}" + ("_mm" if column == "t" else "") for row in "xyz" for column in "xyzt")
     yield Table(
         title,
-        ("component", "candidate", "turned_deg", *places, "what_would_tell"),
+        ("component", "candidate", "turned_deg", *places, "what_would_decide"),
         tuple(matrices),
         file="candidates",
         on_page=False,

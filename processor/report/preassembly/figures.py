@@ -22,7 +22,7 @@ from processor.report.style import (
     DECADES_APART,
     LEAST_SHOWN_MM,
     MARKERS,
-    Drawn,
+    CaptionedPngs,
     label,
     png,
     rounded,
@@ -33,10 +33,10 @@ GAP_SHARE = 0.04  # of the bridge's length: how long the largest gap is drawn
 TRADED = (("splicing error, mean |d|", 0, 2, "mean"), ("splicing error, largest |d|", 1, 3, "largest"))
 
 
-def of_runs(scene: Scene, runs: Sequence[StepRun]) -> Drawn:
+def draw(scene: Scene, runs: Sequence[StepRun]) -> CaptionedPngs:
     """Draw the first run's bridge and the linear error of all; what a result does not have is left out."""
     result: Result = runs[0].result
-    figures: Drawn = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
+    figures: CaptionedPngs = {"bridge.png": _bridge(scene, runs[0]), "linear-error.png": _linear_error(scene, runs)}
     adjustment = result.adjustment
     if adjustment is not None and np.isfinite(adjustment.linear_offset_ci95).any():
         figures["linear-offset.png"] = _linear_offset(scene, runs[0])
@@ -79,7 +79,7 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
         x, _, z = scene.arch.joint_points[j].mean(axis=0) / 1e3
         size = np.abs(joints.gaps[j])
         finite = bool(np.isfinite(size).any())
-        _write(side, f"{name}\n{np.nanmax(size):.2f} mm" if finite else f"{name}\nno answer", (x, z), 30)
+        _write(side, f"{name}\n{np.nanmax(size):.2f} mm" if finite else f"{name}\nno gap computed", (x, z), 30)
     drawn = f"gaps drawn {times:,.0f} times their size" if times else "no gap is known"
     side.set(ylabel="height, m", title=f"side view, with the largest |d| of each joint; {drawn}")
     plan.set(ylabel="across, left up, m", title=f"plan; {drawn}")
@@ -98,7 +98,10 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
 
 
 def _times(scene: Scene, joints: Joints) -> float:
-    """By how much gaps are enlarged, 1, 2 or 5 times a power of ten; intervals count, lest noise look like a gap."""
+    """Return the enlargement of gaps: 1, 2 or 5 times a power of ten.
+
+    The intervals count as well, so that noise is not drawn as a gap.
+    """
     assert scene.arch is not None
     sizes = np.concatenate([np.abs(joints.gaps).ravel(), joints.gap_ci95.ravel()])
     largest = float(sizes[np.isfinite(sizes)].max(initial=0.0))
@@ -194,7 +197,7 @@ def _linear_error(scene: Scene, runs: Sequence[StepRun]) -> tuple[Message, bytes
         panels[0].set_ylim(bottom=0.0)
     for axes in panels:
         _mark_joints(axes, scene, runs[0].result.joints.name)
-    panels[1].set_xlabel("station along the bottom edge, m")
+    panels[1].set_xlabel("chainage along the bottom edge, m")
     if styled:
         panels[1].legend(fontsize=8, ncols=max(len(styled), 2), loc="upper center", bbox_to_anchor=(0.5, -0.2))
     return _linear_caption(runs, [run for _, run in styled]), png(figure)
@@ -206,9 +209,9 @@ def _draw_deviations(axes: Axes, run: StepRun, deviations: Deviations, k: int) -
     colour = COLOURS[k % 4]
     for edge, width in ((EdgeSide.LEFT, 1.6), (EdgeSide.RIGHT, 0.8)):
         on = np.array(linear.edge, dtype=object) == edge
-        station, deviation = linear.chainage[on] / 1000.0, deviations.deviation[on]
+        chainage_m, deviation = linear.chainage[on] / 1000.0, deviations.deviation[on]
         axes.plot(
-            station,
+            chainage_m,
             np.maximum(deviation, LEAST_SHOWN_MM),
             DASHES[k % 4],
             color=colour,
@@ -219,10 +222,10 @@ def _draw_deviations(axes: Axes, run: StepRun, deviations: Deviations, k: int) -
             continue
         band = deviations.ci95[on]
         if run.result.bands_as_designed:
-            axes.plot(station, band, color=colour, linewidth=width, alpha=AS_DESIGNED_ALPHA)
+            axes.plot(chainage_m, band, color=colour, linewidth=width, alpha=AS_DESIGNED_ALPHA)
         else:
             low, high = (np.maximum(deviation + sign * band, LEAST_SHOWN_MM) for sign in (-1.0, 1.0))
-            axes.fill_between(station, low, high, color=colour, alpha=0.2, linewidth=0.0)
+            axes.fill_between(chainage_m, low, high, color=colour, alpha=0.2, linewidth=0.0)
 
 
 def _linear_caption(runs: Sequence[StepRun], drawn: Sequence[StepRun]) -> Message:
@@ -261,15 +264,15 @@ def _linear_offset(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     for axis, (axes, title) in enumerate(zip(panels, ("to the left", "up"), strict=True)):
         for k, edge in enumerate(EdgeSide):
             on = np.array(linear.edge, dtype=object) == edge
-            station = linear.chainage[on] / 1e3
+            chainage_m = linear.chainage[on] / 1e3
             offset, width = adjustment.linear_offset[on, axis], adjustment.linear_offset_ci95[on, axis]
-            axes.fill_between(station, offset - width, offset + width, color=COLOURS[k], alpha=0.22, linewidth=0.0)
-            axes.plot(station, offset, DASHES[k], color=COLOURS[k], linewidth=1.4, label=f"{edge} edge, 95 % band")
+            axes.fill_between(chainage_m, offset - width, offset + width, color=COLOURS[k], alpha=0.22, linewidth=0.0)
+            axes.plot(chainage_m, offset, DASHES[k], color=COLOURS[k], linewidth=1.4, label=f"{edge} edge, 95 % band")
         axes.axhline(0.0, color="0.3", linewidth=0.8)
         axes.set(ylabel="offset, mm", title=f"{title}, as assembled")
         axes.grid(alpha=0.3)
         _mark_joints(axes, scene, run.result.joints.name)
-    panels[1].set_xlabel("station along the bottom edge, m")
+    panels[1].set_xlabel("chainage along the bottom edge, m")
     panels[1].legend(fontsize=8, ncols=2, loc="upper center", bbox_to_anchor=(0.5, -0.22))
     caption = text(
         "Offset of the bottom edges from the design's, method {method}; dotted lines are joints", method=run.method
@@ -279,13 +282,13 @@ def _linear_offset(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
 
 def _mark_joints(axes: Axes, scene: Scene, joints: Sequence[str]) -> None:
     assert scene.arch is not None
-    station = 0.0
+    chainage_m = 0.0
     for j, part in enumerate(scene.arch.parts[: len(joints)]):
-        station += float(np.linalg.norm(np.diff(part.bottom_edge_left, axis=0), axis=1).sum()) / 1000.0
-        axes.axvline(station, color="0.4", linewidth=0.9, linestyle=(0, (1, 2)))
+        chainage_m += float(np.linalg.norm(np.diff(part.bottom_edge_left, axis=0), axis=1).sum()) / 1000.0
+        axes.axvline(chainage_m, color="0.4", linewidth=0.9, linestyle=(0, (1, 2)))
         axes.annotate(
             label(joints[j], j),
-            (station, 1.0),
+            (chainage_m, 1.0),
             xycoords=("data", "axes fraction"),
             xytext=(3, -11),
             textcoords="offset points",
@@ -312,7 +315,7 @@ def _trade_off(result: Result, chosen: float) -> tuple[Message, bytes]:
         figures = np.maximum(result.trade_off.figures, LEAST_SHOWN_MM)
         axes.plot(figures[:, x], figures[:, y], "o-", color=COLOURS[0], markersize=5, linewidth=1.4)
         at_chosen = np.maximum(figures_of_weight(result, chosen), LEAST_SHOWN_MM)
-        marked = f"as answered, lambda {chosen:g}"
+        marked = f"used in the result, lambda {chosen:g}"
         axes.plot(
             at_chosen[x], at_chosen[y], "s", color=COLOURS[1], markersize=12, fillstyle="none", mew=2.0, label=marked
         )

@@ -25,7 +25,7 @@ ALIGNED = {-1: ("right", "top"), 0: ("center", "center"), 1: ("left", "bottom")}
 
 
 def gap_vectors(result: Result) -> tuple[Message, bytes]:
-    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; one without a result says so."""
+    """Draw every joint, up to MOST_JOINTS of them, all arrows to one scale; a joint without gaps gets a note."""
     measures = () if result.adjustment is None else result.adjustment.joints.measures
     shown = range(len(measures))[:MOST_JOINTS]
     complete = [j for j in shown if np.isfinite(measures[j].gaps).all()]
@@ -39,7 +39,7 @@ def gap_vectors(result: Result) -> tuple[Message, bytes]:
             _section(axes, measures[j], times)
         else:
             axes.set(xticks=[], yticks=[])
-            axes.text(0.5, 0.5, "no answer: the gaps are not known", ha="center", transform=axes.transAxes, fontsize=9)
+            axes.text(0.5, 0.5, "no gaps computed", ha="center", transform=axes.transAxes, fontsize=9)
         axes.set_title(f"{label(result.joints.name[j], j)}: {result.joints.verdict[j]}", fontsize=11)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
@@ -89,7 +89,7 @@ def by_axis(runs: Sequence[StepRun]) -> tuple[Message, bytes]:
 
 
 def _times(measures: Sequence[Measures]) -> float:
-    """By how much arrows are enlarged; intervals count, lest noise look like a gap."""
+    """By how much arrows are enlarged; the intervals count as well, so that noise is not drawn as a gap."""
     longest, size = LEAST_SHOWN_MM, 0.0
     for measure in measures:
         reach = RAYLEIGH_95 * np.sqrt(np.maximum(np.diag(measure.covariance), 0.0)).reshape(8, 3)[:, 1:].max()

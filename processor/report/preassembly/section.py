@@ -9,8 +9,8 @@ import numpy as np
 from processor.language.messages import Message, Text, text
 from processor.model import Floats, Status, Verdict
 from processor.preassembly.result import MeanMax, Result
-from processor.report.preassembly import figures, tables, view
-from processor.report.section import StepReport
+from processor.report.preassembly import figures, live_data, tables
+from processor.report.step_report import StepReport
 
 VERDICTS = {
     Verdict.PASS: text("{count} pass"),
@@ -43,9 +43,8 @@ def _summary(result: Result) -> tuple[Message, Message]:
         )
         chain = [limits for limits in result.adjustment.chain if len(limits.limits)]
         body += [text("Whole chain: {verdict}.", verdict=limits.verdict) for limits in chain]
-        compared = (*result.adjustment.joints.conformity, *chain)
-        if not all(limits.limits.verified.all() for limits in compared):
-            body.append(text("The limits are NOT VERIFIED against the standard's text."))
+        if not result.verified:
+            body.insert(0, text("Limits not checked against the standard: verdicts are provisional."))
     return head, text("{sentences:.}", sentences=body)
 
 
@@ -96,8 +95,8 @@ def _with_ci95(value: float, ci95: float) -> Text:
 REPORT = StepReport(
     title=text("Preassembly"),
     summary=_summary,
-    tables=tables.of_runs,
-    figures=lambda execution, runs, _: figures.of_runs(execution.scene, runs),
-    further=_further,
-    live=view.of_runs,
+    tables=tables.step_tables,
+    figures=lambda execution, runs, _: figures.draw(execution.scene, runs),
+    further_verdicts=_further,
+    interactive_data=live_data.live_data,
 )

@@ -29,7 +29,7 @@ POINTS = text(
 )
 
 
-def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
+def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     """Tables of an assembled bridge, what to do first; ``runs`` are the result and the methods compared with it."""
     first, method = runs[0].result, runs[0].method
     tables = [*adjusted(first, method), _summary(runs), _components(first), *_others(runs[1:]), _joints(first, method)]
@@ -175,7 +175,7 @@ def _linear(result: Result, method: str) -> Table:
     )
     return Table(
         text("Linear error by chainage, method {method}", method=method),
-        ("edge", "station_mm", "deviation_mm", "ci95_mm", "foot1_best_fit_deviation_mm", "foot1_best_fit_ci95_mm"),
+        ("edge", "chainage_mm", "deviation_mm", "ci95_mm", "foot1_best_fit_deviation_mm", "foot1_best_fit_ci95_mm"),
         rows,
         file="linear",
         on_page=False,

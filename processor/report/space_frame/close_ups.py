@@ -17,7 +17,7 @@ from processor.geometry import rigid
 from processor.language.messages import messages, text
 from processor.model import NORMAL_95, Floats, Scene
 from processor.report.space_frame.dxf import nominal_places
-from processor.report.style import COLOURS, Drawn, pdf, png, write_beside
+from processor.report.style import COLOURS, CaptionedPngs, pdf, png, write_beside
 from processor.space_frame.points.scene_source import SceneSource, of_scene
 from processor.space_frame.result import Balls, Flag, Result
 from processor.store.streaming import StoredPoints, points_of
@@ -36,7 +36,7 @@ LEAST_RADIUS_MM = 30.0
 VIEWS = (("from the side", (0, 2)), ("from above", (0, 1)))  # and the axes of each
 
 
-def of_result(scene: Scene, result: Result, stored: Path | None = None) -> Drawn:
+def draw(scene: Scene, result: Result, stored: Path | None = None) -> CaptionedPngs:
     """Draw the balls that are not ok, MOST_BALLS of them at most; none where the scene's points are not at hand.
 
     ``stored`` is the scene's file, where its points were left there.

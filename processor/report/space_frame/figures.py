@@ -20,7 +20,17 @@ from processor.model import Floats, Scene, StepRun
 from processor.report.space_frame import close_ups
 from processor.report.space_frame.dxf import nominal_places
 from processor.report.space_frame.tables import has_bounds
-from processor.report.style import COLOURS, DASHES, DIVERGING, HATCHES, LEAST_SHOWN_MM, MARKERS, Drawn, png, rounded
+from processor.report.style import (
+    COLOURS,
+    DASHES,
+    DIVERGING,
+    HATCHES,
+    LEAST_SHOWN_MM,
+    MARKERS,
+    CaptionedPngs,
+    png,
+    rounded,
+)
 from processor.space_frame.result import Flag, Result
 
 FLAGS = (Flag.OK, Flag.LOW_CONFIDENCE, Flag.WRONG_SIZE)
@@ -29,10 +39,10 @@ ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest a
 PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
 
 
-def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> Drawn:
-    """Draw balls; ``runs`` are the answer and those compared with it, ``stored`` the file that still has the points."""
+def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Path | None = None) -> CaptionedPngs:
+    """Draw balls; ``runs`` are the result and those compared with it, ``stored`` the file that still has the points."""
     first: Result = runs[0].result
-    figures: Drawn = {}
+    figures: CaptionedPngs = {}
     if len(first.balls) > 1:
         figures[PLAN] = _plan(scene, runs[0])
         if report.true_radii:
@@ -40,7 +50,7 @@ def of_runs(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: 
         if has_bounds(first):
             figures[BALL_ERRORS] = _ball_errors(runs[0], report)
     if has_bounds(first):
-        figures |= close_ups.of_result(scene, first, stored)
+        figures |= close_ups.draw(scene, first, stored)
     return figures
 
 

@@ -7,8 +7,8 @@ import collections
 from processor.language.messages import Message, text
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report.section import StepReport
-from processor.report.space_frame import close_ups, dxf, figures, tables, view
+from processor.report.space_frame import close_ups, dxf, figures, live_data, tables
+from processor.report.step_report import StepReport
 from processor.space_frame.result import Flag, Result
 
 
@@ -37,8 +37,8 @@ def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
 REPORT = StepReport(
     title=text("Bolt balls"),
     summary=_summary,
-    tables=tables.of_runs,
-    figures=lambda execution, runs, report: figures.of_runs(execution.scene, runs, report, execution.stored),
+    tables=tables.step_tables,
+    figures=lambda execution, runs, report: figures.draw(execution.scene, runs, report, execution.stored),
     files=_files,
-    live=view.of_runs,
+    interactive_data=live_data.live_data,
 )

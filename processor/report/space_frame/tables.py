@@ -20,7 +20,7 @@ XYZ = ("x", "y", "z")
 COORDINATES = tuple(f"{axis}_mm" for axis in XYZ)
 
 
-def of_runs(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
+def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tabulate balls, those to look at first; ``runs`` are the result and those of methods compared with it."""
     first = runs[0].result
     whole = has_bounds(first)

@@ -12,7 +12,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import Scene, Status, StepRun
 from processor.pipeline import Execution
-from processor.report.style import COLOURS, Drawn, label, png
+from processor.report.style import COLOURS, CaptionedPngs, label, png
 from processor.stitching.result import Result, Scans
 
 PLAN, OVERLAP = "stitch-plan.png", "stitch-overlap.png"
@@ -20,10 +20,10 @@ PLAN_POINTS = 4000  # of each scan
 MOST_NAMED = 40
 
 
-def of_runs(execution: Execution, runs: Sequence[StepRun], _: ErrorReport) -> Drawn:
+def draw(execution: Execution, runs: Sequence[StepRun], _: ErrorReport) -> CaptionedPngs:
     """Draw the result of stitching."""
     result: Result = runs[0].result
-    drawn: Drawn = {}
+    drawn: CaptionedPngs = {}
     if len(result.scans) > 1 and np.isfinite(result.scans.position).any():
         drawn[PLAN] = _plan(execution.scene, result)
         if len(result.pairs) and np.isfinite(result.pairs.overlap).any():

@@ -7,8 +7,8 @@ from collections import Counter
 from processor.language.messages import Message, text
 from processor.model import Status, StepRun
 from processor.pipeline import Execution
-from processor.report.section import StepReport
-from processor.report.stitching import figures, tables, view
+from processor.report.step_report import StepReport
+from processor.report.stitching import figures, live_data, tables
 from processor.stitching.result import Result
 
 
@@ -36,8 +36,8 @@ def _files(_: Execution, run: StepRun) -> dict[str, bytes]:
 REPORT = StepReport(
     title=text("Stitching"),
     summary=_summary,
-    tables=tables.of_runs,
-    figures=figures.of_runs,
+    tables=tables.step_tables,
+    figures=figures.draw,
     files=_files,
-    live=view.of_runs,
+    interactive_data=live_data.live_data,
 )

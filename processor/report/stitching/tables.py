@@ -11,7 +11,7 @@ import numpy as np
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, StepRun
-from processor.report.table import FORMULA, Table
+from processor.report.table import Table, csv_cell
 from processor.stitching.result import ProjectFrame, Result
 
 OF_SCAN = "stitch.of-scan"  # code of reasons that the table of scans has too
@@ -32,7 +32,7 @@ TO_GLCS_BY_CONTROL = text(
 )
 
 
-def of_runs(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
+def step_tables(runs: Sequence[StepRun], _: ErrorReport) -> list[Table]:
     """Tabulate stitched scans; ``runs`` are the result and those of the methods compared with it."""
     tables: list[Table] = []
     for number, run in enumerate(runs):
@@ -175,8 +175,6 @@ def poses_csv(result: Result) -> bytes:
     writer.writerow(["scan", "status", *(f"m{i}{j}" for i in range(4) for j in range(4)), "from", "to"])
     scans = result.scans
     for i, name in enumerate(scans.name):
-        # A spreadsheet would take such a name for a formula.
-        safe = f"'{name}" if name.startswith(FORMULA[:4]) else name
         matrix = [repr(float(x)) if np.isfinite(x) else "" for x in scans.T_project_scan[i].ravel()]
-        writer.writerow([safe, scans.status[i], *matrix, scans.from_frame[i], scans.to_frame[i]])
+        writer.writerow([csv_cell(name), scans.status[i], *matrix, scans.from_frame[i], scans.to_frame[i]])
     return out.getvalue().encode("utf-8")

@@ -1,0 +1,1 @@
+"""Coarse registration: candidate poses of pairs (rotations, translations), their scores, the placing of all scans."""

@@ -1,4 +1,4 @@
-"""The report of a step: ``REPORT`` of the module ``section`` in the folder of the step's name."""
+"""The report of a step: ``REPORT`` of ``section.py`` in the folder of the step's package (``pipeline.package_of``)."""
 
 from __future__ import annotations
 
@@ -12,25 +12,28 @@ from processor.language.messages import Message
 from processor.model import Scene, StepRun
 from processor.pipeline import Execution, package_of
 from processor.report.record_json import as_object
-from processor.report.style import Drawn
+from processor.report.style import CaptionedPngs
 from processor.report.table import Table
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What a step reports; ``runs`` are its result, then those of other methods on the same scene for comparison."""
+    """Functions that make the report of a step.
+
+    ``runs`` are its result, then those of other methods on the same scene for comparison.
+    """
 
     title: str | Message
-    summary: Callable[[Any], tuple[Any, Any]]  # of a result: the verdict's head, and what is said below it
+    summary: Callable[[Any], tuple[Any, Any]]  # of a result: the verdict's heading, and the sentences below it
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
-    figures: Callable[[Execution, Sequence[StepRun], ErrorReport], Drawn]  # file names are the step's own
+    figures: Callable[[Execution, Sequence[StepRun], ErrorReport], CaptionedPngs]  # file names are the step's own
     written: Callable[[Any], dict[str, Any]] = as_object  # of a result: its object in results.json
-    further: Callable[[Any], list[tuple[Any, Any]]] = lambda _: []  # heads and texts beside the verdict
+    further_verdicts: Callable[[Any], list[tuple[Any, Any]]] = lambda _: []  # headings and texts beside the verdict
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
-    live: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None  # what the page's script draws
+    interactive_data: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None
 
 
-def of(step: str) -> StepReport:
-    """Return how a step reports."""
+def step_report(step: str) -> StepReport:
+    """Return the functions that make the report of a step."""
     report: StepReport = importlib.import_module(f"processor.report.{package_of(step)}.section").REPORT
     return report

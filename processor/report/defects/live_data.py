@@ -14,11 +14,11 @@ from processor.report import surface_view
 from processor.report.surface_view import Region
 
 
-def of_runs(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+def live_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return the data of the view of the first run, mm, design frame; None without points on the surface."""
     result: Result = runs[0].result
     everything: Ints = np.arange(len(result.surface), dtype=np.int64)
-    return surface_view.of_points(
+    return surface_view.surface_view_data(
         text("Defects in space"),
         runs[0].method,
         result.surface.points,

@@ -8,7 +8,7 @@ import importlib.resources
 import json
 from typing import Any
 
-SCRIPTS = ("view.js", "chart.js", "start.js")
+SCRIPTS = ("space_view.js", "line_chart.js", "preassembly_charts.js", "start.js")
 
 
 def embedded(data: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""Core points and what M3C2 says at them as CSV, every number in full: coordinates may be far from zero."""
+"""Core points and their M3C2 distances as CSV, in full precision because coordinates may be large."""
 
 from __future__ import annotations
 

@@ -17,10 +17,10 @@ from processor.report.table import shown
 
 MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page
 MOST_ON_AN_EDGE = 80
-MOST_STATIONS = 3_000
+MOST_CHAINAGES = 3_000
 
 
-def of_runs(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
+def live_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     """Return what the page draws of an assembled bridge, mm; None where there is no design to draw."""
     if scene.arch is None or not scene.arch.parts:
         return None
@@ -95,11 +95,11 @@ def _thinned(edge: Floats) -> Floats:
 
 def _linear(run: StepRun) -> dict[str, Any]:
     linear = run.result.linear
-    step = max(1, -(-len(linear.chainage) // MOST_STATIONS))
+    step = max(1, -(-len(linear.chainage) // MOST_CHAINAGES))
     return {
         "method": run.method,
         "edge": list(linear.edge[::step]),
-        "station": np.round(linear.chainage[::step], 1),
+        "chainage": np.round(linear.chainage[::step], 1),
         "deviation": np.round(linear.assembled.deviation[::step], 6),
         "band": np.round(linear.assembled.ci95[::step], 6),
         "best_fit": np.round(linear.best_fit.deviation[::step], 6),

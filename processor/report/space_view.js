@@ -15,6 +15,8 @@ function make(tag, attributes, ...children) {
 let words = {}; // texts in the page's language; others stay as they are
 function say(text) { return words[text] || text; }
 
+function millimetres(value) { return value === null ? "–" : value.toFixed(3); }
+
 function colourTable(stops, size) {
   const rgb = stops.map((stop) => [1, 3, 5].map((at) => parseInt(stop.slice(at, at + 2), 16)));
   return Array.from({ length: size }, (_, i) => {
@@ -235,10 +237,9 @@ function spaceView(host, data) {
     if (!waiting) { waiting = true; requestAnimationFrame(paint); }
   }
 
-  const two = (value) => (value === null ? "–" : value.toFixed(3));
   const vector = (by, ci95) => `${["dx", "dy", "dz"].map((name, axis) => {
     const half = ci95 ? ci95[axis] : null;
-    return `${name} ${two(by[axis])}${half === null ? "" : ` ± ${two(half)}`}`;
+    return `${name} ${millimetres(by[axis])}${half === null ? "" : ` ± ${millimetres(half)}`}`;
   }).join(", ")} mm`;
   function read(event) {
     const box = canvas.getBoundingClientRect();
@@ -255,7 +256,7 @@ function spaceView(host, data) {
       if (index >= 0 && index < part.residual.length) {
         const where = Array.from(part.points.subarray(3 * index, 3 * index + 3), (value, k) => (value + origin[k]).toFixed(0)).join(", ");
         const region = part.region && part.region[index] >= 0 ? `; ${regions[part.region[index]]}` : "";
-        said.textContent = `${part.text || part.name}: ${two(part.residual[index])} mm ${say(data.from || "from the design at")} ${where} mm${region}`;
+        said.textContent = `${part.text || part.name}: ${millimetres(part.residual[index])} mm ${say(data.from || "from the design at")} ${where} mm${region}`;
         return;
       }
       index -= part.residual.length;
