@@ -21,7 +21,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from processor.geometry import mesh_distance, neighbors, rigid
-from processor.geometry.mesh_distance import FacetGrid, MeshSurface
+from processor.geometry.mesh_distance import Bools, FacetGrid, MeshSurface
 from processor.model import Floats, Ints
 
 ERROR_RATE = 0.05  # probability that one group of points deviates so that it fits the wrong pose
@@ -60,11 +60,11 @@ def choose(points: Floats, surface: MeshSurface, poses: list[Floats], scanner: F
     typical = max(typical, 0.5 * LEAST_OFF_MM / OFF)
     least_off = max(OFF * typical, ON * typical + LEAST_OFF_MM)
 
+    on, off = distances <= ON * typical, distances >= least_off
+
     def odds(i: int, j: int) -> float:
         """Logarithm of the odds of pose i against pose j."""
-        for_i = (distances[i] <= ON * typical) & (distances[j] >= least_off)
-        for_j = (distances[j] <= ON * typical) & (distances[i] >= least_off)
-        return _weight(voxel[for_i]) - _weight(voxel[for_j])
+        return _weight(voxel[off[j]], on[i][off[j]]) - _weight(voxel[off[i]], on[j][off[i]])
 
     best = 0
     for other in range(1, len(poses)):
@@ -112,11 +112,16 @@ def _means(values: Floats, group: Ints) -> Floats:
     return total
 
 
-def _weight(voxel: Ints) -> float:
-    """Return minus the log-probability that groups in voxels (k, 3) deviate by an error of the structure."""
+def _weight(voxel: Ints, explained: Bools) -> float:
+    """Return minus the log-probability that groups off a pose deviate by an error of the structure.
+
+    The groups in voxels (k, 3) are ``explained`` (k,) if they lie on the design in the other pose. A piece of which
+    most groups are not explained deviates in both poses, and parts of it lie on the design by chance.
+    """
     if not len(voxel):
         return 0.0
     pairs = cKDTree(voxel).query_pairs(1.0, p=np.inf, output_type="ndarray")
     links = coo_array((np.ones(len(pairs), np.int8), (pairs[:, 0], pairs[:, 1])), (len(voxel),) * 2)
-    size = np.bincount(connected_components(links, directed=False)[1])
-    return float(np.log(size / ERROR_RATE).sum())
+    piece = connected_components(links, directed=False)[1]
+    size, agreeing = np.bincount(piece), np.bincount(piece, explained)
+    return float(np.log(agreeing[agreeing > 0.5 * size] / ERROR_RATE).sum())

@@ -179,6 +179,7 @@ EVEN_CELLS = 200.0  # voxels along the scan's extent, for points of even density
 NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000
+LEAST_SHIFT_MM = 2.0  # thinner plates are not told apart by the side of their surface
 PROMISING = 3.0  # ratio of two poses' errors after the coarse registration, below which the fine one decides
 NAN = float("nan")
 
@@ -239,6 +240,9 @@ def place(points: Floats, surface: MeshSurface, given: Floats, how: str, scanner
     else:
         start, registration = given, Registration.FINE if how == "fine" else Registration.AS_GIVEN
         fitted = fine(few, surface, axes.axes, given)
+        if how == "auto" and (turned := _surely_turned(points, surface, axes, fitted, scanner)):
+            fitted, rivals = turned[0], [fit.T_design_scan for fit in turned[1:]]
+            start, registration = fitted.T_design_scan, Registration.COARSE
     determined = np.isfinite(fitted.covariance).all()
     best = fitted.T_design_scan if determined else np.full((4, 4), NAN)
     T = start if registration is Registration.AS_GIVEN or not determined else best
@@ -288,28 +292,88 @@ def _refined(points: Floats, design: Samples, size: float) -> Callable[[Floats],
     return refined
 
 
+def _surely_turned(
+    points: Floats, surface: MeshSurface, axes: PrincipalAxes, given: SurfaceFit, scanner: Floats | None
+) -> list[SurfaceFit]:
+    """Return the fit in another attitude, then its rivals, if surface rules out the ``given`` attitude; else none.
+
+    A scan in the design's frame may lie in it the wrong way round. Points of a plate slip along it, and each fit may
+    have slipped differently: the given attitude is ruled out only if it is so with the slip of the other fits, too.
+    """
+    if not np.isfinite(given.T_design_scan).all():
+        return []
+    design = _samples(surface)
+    refined = _refined(even(points), design, float(np.linalg.norm(np.ptp(design.points, axis=0))))
+    turns = _turns(axes)
+    (error, _), *others = [refined(turn @ given.T_design_scan) for turn in turns]
+    few = thinned(points, FINE_POINTS)
+    fits, turned_back = [], []
+    for turn, (rms, T) in zip(turns[1:], others, strict=True):
+        if rms <= PROMISING * error:
+            fits.append(fine(few, surface, axes.axes, T))
+            turned_back.append(rigid.invert(turn) @ fits[-1].T_design_scan)
+    poses = [*(fit.T_design_scan for fit in fits), given.T_design_scan, *turned_back]
+    choice = attitude.choose(points, surface, poses, scanner)
+    if choice.best >= len(fits) or any(rival >= len(fits) for rival in choice.rivals):
+        return []
+    return [fits[choice.best], *(fits[rival] for rival in choice.rivals)]
+
+
+def _samples(surface: MeshSurface) -> Samples:
+    spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
+    return mesh_distance.sampled(surface.vertices, surface.faces, spacing)
+
+
+def _turns(axes: PrincipalAxes) -> list[Floats]:
+    """Return the motions (4, 4) of a design onto itself that its principal axes allow, the identity first."""
+    turns = [axes.axes @ turn @ axes.axes.T for turn in principal.possible_turns(axes.variances, axes.variances)]
+    turns.sort(key=rigid.rotation_angle)
+    return [rigid.transform(R, axes.centre - R @ axes.centre) for R in turns]
+
+
 def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> list[tuple[float, Floats]]:
     """Return the rms in mm and coarse pose (4, 4) of points (n, 3) in every attitude, the least rms first.
 
     Attitudes are that of the best pose by principal axes, its rival, and the best turned as the design's principal axes
     allow: the axes of a scan from one side are off, and may not lead to every attitude.
     """
-    spacing = np.sqrt(mesh_distance.area(surface.vertices, surface.faces) / COARSE_SAMPLES)
-    design = mesh_distance.sampled(surface.vertices, surface.faces, spacing)
+    design = _samples(surface)
     size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
     first = coarse(points, design, axes)
     refined = _refined(points, design, size)
-    turns = [axes.axes @ turn @ axes.axes.T for turn in principal.possible_turns(axes.variances, axes.variances)]
-    found = [refined(rigid.transform(R, axes.centre - R @ axes.centre) @ first.T_target_source) for R in turns]
+    found = [refined(turn @ first.T_target_source) for turn in _turns(axes)]
     found.append((first.rms_mm, first.T_target_source))
     if np.isfinite(first.T_rival).all():
         found.append((first.ambiguity * first.rms_mm, first.T_rival))
+    distinct = _distinct(found, points.mean(axis=0), size)
+    promising = [T for error, T in distinct if error <= PROMISING * distinct[0][0]]
+    shifted = [refined(start) for T in promising for start in _other_sides(points, design.points, axes.axes, T)]
+    return _distinct([*distinct, *shifted], points.mean(axis=0), size)
+
+
+def _distinct(found: list[tuple[float, Floats]], centre: Floats, size: float) -> list[tuple[float, Floats]]:
+    """Return the errors and poses of a body about ``centre`` that are not of one pose, the least error first."""
     distinct: list[tuple[float, Floats]] = []
     for k in sorted(range(len(found)), key=lambda k: (found[k][0], k)):
         T = found[k][1]
-        if all(principal.differ(T, other, points.mean(axis=0), size) for _, other in distinct):
+        if all(principal.differ(T, other, centre, size) for _, other in distinct):
             distinct.append(found[k])
     return distinct
+
+
+def _other_sides(points: Floats, design: Floats, axes: Floats, T: Floats) -> list[Floats]:
+    """Return poses (4, 4) shifted so that either side of the points (n, 3) lies at that side of the design (m, 3).
+
+    The side of a plate that was scanned alone may have come to lie on the plate's other side.
+    """
+    placed, designed = rigid.apply(T, points) @ axes, design @ axes
+    starts = []
+    for k in range(3):
+        for side in (np.min, np.max):
+            shift = float(side(designed[:, k]) - side(placed[:, k]))
+            if LEAST_SHIFT_MM < abs(shift) < NEAR_MM:
+                starts.append(rigid.transform(np.eye(3), shift * axes[:, k]) @ T)
+    return starts
 
 
 def even(points: Floats) -> Floats:

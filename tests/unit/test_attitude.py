@@ -48,6 +48,36 @@ def test_a_displaced_and_a_missing_bracket_turn_nothing_over():
         assert not ambiguous
 
 
+@pytest.mark.parametrize("thickness", [6.0, 20.0, 40.0])
+def test_the_side_of_a_plate_that_was_scanned_lies_on_its_own_side(thickness):
+    box = trimesh.creation.box(
+        (240.0, 170.0, 160.0), rigid.transform(np.eye(3), [-170.0, -115.0, 80.0 + thickness / 2])
+    )
+    design = trimesh.util.concatenate([trimesh.creation.box((760.0, 640.0, thickness)), box])
+    points, face = trimesh.sample.sample_surface(design, 40_000, seed=3)
+    points = points[design.face_normals[face, 2] > -0.5]  # nothing from below
+    points += np.random.default_rng(3).normal(0.0, 0.6, points.shape)
+    T = rigid.transform(rigid.rotation_from_vector([0.0, 0.0, 2.7]), [3e4, -8e3, 1e4])
+    surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
+    found = surface_registration.place(rigid.apply(rigid.invert(T), points), surface, np.eye(4), "auto")
+    off = found.T @ rigid.invert(T)
+    assert rigid.rotation_angle(off[:3, :3]) < 5e-4
+    assert np.abs(off[:3, 3]).max() < 0.2
+    assert not found.ambiguous
+
+
+def test_a_scan_the_wrong_way_round_in_the_design_s_frame_is_turned():
+    design = structure(*(bracket(x, y) for x in (-2400.0, -1200.0, 300.0) for y in (1.0, -1.0)))
+    points = np.asarray(trimesh.sample.sample_surface(design, 60_000, seed=2)[0])
+    points += np.random.default_rng(2).normal(0.0, 1.0, points.shape)
+    surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
+    turned = rigid.apply(rigid.transform(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)), points)
+    right, wrong = (surface_registration.place(scan, surface, np.eye(4), "auto") for scan in (points, turned))
+    assert right.registration is surface_registration.Registration.AS_GIVEN
+    assert wrong.registration is surface_registration.Registration.COARSE
+    np.testing.assert_allclose(wrong.T[:3, :3], np.diag([-1.0, -1.0, 1.0]), atol=1e-3)
+
+
 def test_what_nothing_distinguishes_is_ambiguous():
     design = structure(bracket(1500.0, 1.0))
     assert placed(structure(), structure(), 0)[1]

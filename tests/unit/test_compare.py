@@ -16,7 +16,7 @@ from processor.compare.compare import Request
 from processor.geometry.m3c2 import Distances
 from processor.model import InputError, Scan, Scene, UsageError
 from processor.report import comparison
-from processor.report.deviation import csv as deviation_csv
+from processor.report.deviation import core_points_csv
 from processor.report.deviation.core_points_csv import COLUMNS
 from processor.store import store
 from tests.support.m3c2_clouds import brute, wavy
@@ -264,7 +264,7 @@ def test_what_has_no_answer_is_nan(tmp_path):
     origin = np.zeros(3)
     nan = np.array([np.nan])
     found = Distances(nan, nan, np.array([0]), np.array([2]), nan, np.array([0.5]))
-    text = deviation_csv.csv_text(origin, np.zeros((1, 3)), found, np.full((1, 3), np.nan))
+    text = core_points_csv.csv_text(origin, np.zeros((1, 3)), found, np.full((1, 3), np.nan))
     assert text.splitlines()[1] == "0.0,0.0,0.0,nan,nan,0,0,2,nan,0.5,nan,nan,nan"
 
 
