@@ -60,6 +60,8 @@ LEAST_VISIBLE = 0.08  # share of the sphere
 LARGEST_SD = 0.05  # of the radius or, where it is fixed, of the centre, in radii
 LARGEST_HALF_SD = 0.15  # the same by half of the points
 RADIUS_BAND = 0.15  # proposals within this share of a fixed radius
+LEAST_FLAT, MOST_FLAT = 8, 2000  # patches that the noise of a cloud rests on
+LEAST_SPREAD = 0.15  # of such a patch across its longest side, in its width: not one line of a scanner
 EVIDENCE_CELLS = 12.0  # of a thinned cloud, in a ball's radius
 
 
@@ -472,3 +474,27 @@ def _misfit(points: Floats, residual: Floats, ball: Sphere, scale: float) -> flo
     count = np.bincount(cell)
     mean = np.bincount(cell, residual) / count
     return float(np.median(np.sqrt(np.maximum(mean**2 - scale**2 / count, 0.0))[cell]))
+
+
+# --- noise of the cloud ----------------------------------------------------------------------------------------------
+
+
+def flat_noise(points: Floats, width: float) -> float:
+    """Median thickness (sd, mm) of flat patches of points (n, 3), ``width`` mm across; NaN with few patches.
+
+    It is the scanner's noise where patches are flat, and more where they are not. The order of the points does not
+    matter.
+    """
+    cloud = points[canonical_order(points)]
+    cloud = cloud - cloud.mean(axis=0)
+    seeds = cloud[thinned(cloud, width)]
+    seeds = seeds[:: len(seeds) // MOST_FLAT + 1]
+    found = []
+    for rows in cKDTree(cloud).query_ball_point(seeds, 0.5 * width, return_sorted=True):
+        if len(rows) < LEAST_CELLS:
+            continue
+        away = cloud[rows] - cloud[rows].mean(axis=0)
+        least, middle, _ = np.linalg.eigvalsh(away.T @ away / (len(rows) - 3))
+        if middle > (LEAST_SPREAD * width) ** 2:
+            found.append(np.sqrt(max(least, 0.0)))
+    return float(np.median(found)) if len(found) >= LEAST_FLAT else float("nan")

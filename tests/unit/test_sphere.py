@@ -15,6 +15,8 @@ from processor.geometry.sphere import (
     visible_fraction,
 )
 from processor.geometry.sphere_search import LEAST_POINTS, find_balls
+from processor.model import Scan, Scene
+from processor.space_frame import step as space_frame_step
 from tests.support import street_clouds
 
 NOWHERE = np.zeros((4, 4))
@@ -368,3 +370,19 @@ def test_crops_agree_with_every_distance():
         np.testing.assert_array_equal(rows, expected)
     assert sum(map(len, crops)) > 100
     assert [len(rows) for rows in nearest_crops(np.empty((0, 3)), centres, reaches)] == [0] * 12
+
+
+def test_a_trees_crown_is_rougher_than_the_street_and_is_not_sure():
+    rng = np.random.default_rng(3)
+    rays = street_clouds.lines(np.linspace(-25.0, 20.0, 40), 0.3)
+    street, _ = street_clouds.street(rng, None, 300.0, sigma=3.0, rays=rays)
+    out = rng.normal(size=(400, 3))
+    out /= np.linalg.norm(out, axis=1)[:, None]
+    out = out[out @ np.array([0.7, 0.7, 0.0]) < 0.2]
+    crown = np.array([4000.0, 4000.0, 900.0]) + (600.0 + rng.normal(0.0, 25.0, (len(out), 1))) * out
+    ball = np.array([2500.0, 600.0, -200.0]) + (300.0 + rng.normal(0.0, 5.0, (len(out), 1))) * out
+    for body, radius, flag in ((crown, 600.0, "low-confidence"), (ball, 300.0, "ok")):
+        scene = Scene("street", "structure", (Scan("S1", np.vstack([street, body])),))
+        result = space_frame_step.run(scene, space_frame_step.Params())
+        near = [f for f, r in zip(result.balls.flag, result.balls.radii, strict=True) if abs(r - radius) < 0.1 * radius]
+        assert near == [flag]

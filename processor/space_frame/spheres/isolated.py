@@ -20,7 +20,7 @@ from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Status
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Balls, Evidence, Flag, Result
-from processor.space_frame.spheres.quality import beyond, blank_tolerance
+from processor.space_frame.spheres.quality import LARGEST_SCALE, beyond, blank_tolerance
 
 LEAST_VISIBLE = 0.05  # share of the sphere
 LEAST_INLIERS = 0.3  # share of the crop
@@ -190,6 +190,9 @@ def _searched(id_: int, candidate: sphere_search.Ball, cloud: MergedCloud, param
     if sphere is None:
         return _missing(id_, NAN, len(on), reason("spheres.no-sphere"))
     row = _assessed(id_, NAN, sphere, on, candidate.inlier_share, params, Tolerance())
+    times = candidate.fit.scale / sphere_search.flat_noise(cloud.points, sphere.radius)
+    if times > LARGEST_SCALE:
+        row = replace(row, flag=Flag.LOW_CONFIDENCE, reasons=(*row.reasons, reason("spheres.rough", times=times)))
     if params.method == "least-squares":
         return row
     seen_from = None if cloud.scanner is None else cloud.scanner[candidate.fit.inliers]
