@@ -51,3 +51,12 @@ def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
     terms = np.stack([np.ones(1_000), *(at / 500.0).T], axis=1)
     assert viewpoints.thickness(terms, at, np.zeros(1_000), np.zeros(1_000, bool)) is None
     assert viewpoints.variances([]) == viewpoints.NONE
+
+
+def test_what_no_plates_show_is_of_the_scanners_class_and_what_they_show_is_kept():
+    term = viewpoints.SCANNER_CLASS_MM**2
+    assert viewpoints.variances([]).or_of_class() == viewpoints.NONE._replace(level=term, ring=term)
+    one = viewpoints.variances([plate(np.random.default_rng(1), 0.3)])
+    assert (one.level, one.or_of_class().level, one.or_of_class().ring) == (0.0, term, term)
+    shown = viewpoints.variances([plate(np.random.default_rng(k), 0.0) for k in range(4)])
+    assert shown.or_of_class() == shown

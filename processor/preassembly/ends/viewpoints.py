@@ -25,6 +25,9 @@ ALIKE_MM = 2.0  # plates that differ by less are of one nominal thickness: rolli
 PATCH_MM, FEWEST_OF_PATCH = 50.0, 4  # size of a patch, and points on either side of it
 FLOOR_MM = 0.004
 RISK = 1e-3  # that noise alone is taken for a difference between viewpoints
+# Of a view's level where no plates show it. Data sheets of phase-shift and pulsed scanners for up to 130 m give a range
+# error of 1 mm; it is taken as the limit of 95 %.
+SCANNER_CLASS_MM = 0.5
 OF_PAIR = 2  # opposite plates of an end are seen from the same two sides: their differences are the same
 
 
@@ -49,6 +52,10 @@ class Variances(NamedTuple):
     ring: float = 0.0
     evident: bool = False
     known: bool = False
+
+    def or_of_class(self) -> Variances:
+        """Return the variances with the levels of the scanner's class where the plates do not show them."""
+        return self if self.known else self._replace(level=SCANNER_CLASS_MM**2, ring=SCANNER_CLASS_MM**2)
 
 
 NONE = Variances()

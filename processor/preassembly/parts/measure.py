@@ -166,6 +166,8 @@ def fit(
 def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[MeasuredPart]:
     """Estimate the ends of all parts together, and add ``systematic`` errors to their covariance."""
     between = _between_viewpoints(parts)
+    if not systematic.known:
+        between = between.or_of_class()
     seen = [_as_seen(part, between.level) for part in parts]
     fitted = [(end, part.views.left) for part in seen for end in part.ends if isinstance(end, FittedEnd)]
     of_ends = [between._replace(level=left * between.level) for _, left in fitted]
@@ -187,6 +189,8 @@ def _viewpoint_remarks(part: FittedPart, between: viewpoints.Variances) -> Itera
     if any(isinstance(end, FittedEnd) and end.plates for end in part.ends):
         if between.evident:
             yield reason("preassemble.viewpoints-differ", sd=float(np.sqrt(between.level)))
+        elif not between.known and between.level > 0.0:
+            yield reason("preassemble.viewpoints-by-class", sd=float(np.sqrt(between.level)))
         elif not between.known:
             yield reason("preassemble.viewpoints-not-compared")
 
