@@ -6,7 +6,6 @@ import dataclasses
 import importlib
 import importlib.util
 import json
-import math
 import pkgutil
 import sys
 import time
@@ -22,6 +21,7 @@ from typing import Any
 
 from processor.model import InputError, Scene, Status, StepRun, UsageError, reason
 from processor.progress import stage
+from processor.store.json_values import json_ready
 from processor.version import __version__
 
 if sys.version_info >= (3, 11):
@@ -50,6 +50,16 @@ class Execution:
     runs: tuple[StepRun, ...]  # the result of each step first, then other methods for comparison
     provenance: dict[str, Any]
     stored: Path | None = None  # the scene's file, where its points are still in it
+
+    def by_step(self) -> list[tuple[StepRun, list[StepRun]]]:
+        """Pair the first run of each step, its result, with the runs of other methods for comparison."""
+        by_step: dict[str, tuple[StepRun, list[StepRun]]] = {}
+        for run in self.runs:
+            if run.step in by_step:
+                by_step[run.step][1].append(run)
+            else:
+                by_step[run.step] = (run, [])
+        return list(by_step.values())
 
 
 @cache
@@ -288,7 +298,7 @@ def _stopped(job: Job, step: str, log: Callable[[str], None]) -> StepRun:
         status=Status.FAILED, method=job.params.method, reasons=(reason("pipeline.scans-not-placed", step=step),)
     )
     log(f"{job.step} ({job.params.method}): not run, {step} failed or is ambiguous")
-    return StepRun(job.step, job.params.method, as_json(dataclasses.asdict(job.params)), result)
+    return StepRun(job.step, job.params.method, _json_text(job.params), result)
 
 
 def _run(path: Path, scene: Scene, job: Job, given: Mapping[str, Any], log: Callable[[str], None]) -> StepRun:
@@ -304,7 +314,11 @@ def _run(path: Path, scene: Scene, job: Job, given: Mapping[str, Any], log: Call
             f"{path.name}: internal error in step {job.step} ({job.params.method}): {error!r}; --debug shows where"
         ) from error
     log(f"{job.step} ({job.params.method}): {result.status}, {time.monotonic() - started:.1f} s")
-    return StepRun(job.step, job.params.method, as_json(dataclasses.asdict(job.params)), result)
+    return StepRun(job.step, job.params.method, _json_text(job.params), result)
+
+
+def _json_text(params: Any) -> str:
+    return json.dumps(json_ready(dataclasses.asdict(params)), allow_nan=False, ensure_ascii=False)
 
 
 def _parameters(runs: Sequence[StepRun]) -> list[dict[str, Any]]:
@@ -352,18 +366,3 @@ def software() -> dict[str, str]:
     python = ".".join(str(part) for part in sys.version_info[:3])
     found = {"processor": __version__, "python": python, **{name: version(name) for name in SOFTWARE}}
     return dict(sorted(found.items()))
-
-
-def as_json(value: Any) -> str:
-    """Write JSON text; numbers that are not finite become null."""
-    return json.dumps(_finite(value), allow_nan=False, ensure_ascii=False)
-
-
-def _finite(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

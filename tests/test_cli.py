@@ -14,7 +14,7 @@ import pytest
 from processor import __main__, pipeline
 from processor.evaluation.evaluate import evaluate
 from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError
-from processor.report import results_folder
+from processor.report import write_results
 from processor.store import store
 from tests.support import arch_clouds
 
@@ -179,7 +179,7 @@ def run_in_process(path, out, methods=(), params=None):
     scene = pipeline.read(path, None)
     execution = pipeline.execute(path, scene, pipeline.plan(pipeline.steps_for(scene), methods, params or {}, 0))
     report = evaluate(path, execution)
-    results_folder.write(out, execution, report)
+    write_results.write_results(out, execution, report)
     return json.loads((out / "results.json").read_text("utf-8")), report
 
 

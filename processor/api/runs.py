@@ -13,7 +13,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, Metric, Scene, Truth, Verdict, worst
 from processor.pipeline import Execution
 from processor.progress import stage
-from processor.report import results_folder
+from processor.report import write_results
 from processor.scan_folder import fingerprint
 
 Names = str | Sequence[str] | None
@@ -130,7 +130,7 @@ def run(
     if not path.exists():
         raise InputError(f"{path}: there is no such file or folder")
     if out is not None:
-        results_folder.check_output(out, path)
+        write_results.check_output(out, path)
     if wanted:
         pipeline.plan(wanted, methods, parameters, seed)  # wrong names are reported before a long reading
     place = None if out is None else out.resolve()
@@ -148,7 +148,7 @@ def _run_scene(
     scene: Scene, out: Path | None, jobs: Sequence[pipeline.Job], lang: str, log: Callable[[str], None]
 ) -> Results:
     if out is not None:
-        results_folder.check_output(out, None)
+        write_results.check_output(out, None)
     return write(Results(pipeline.execute(Path(scene.name), scene, jobs, log)), out, lang)
 
 
@@ -156,7 +156,7 @@ def write(results: Results, out: Path | None, lang: str = "en") -> Results:
     """Write the folder of results, in place of an earlier one; returns the results."""
     if out is not None:
         with stage("drawing and writing the report"):
-            results_folder.write(out, results.execution, results.report, lang)
+            write_results.write_results(out, results.execution, results.report, lang)
     return results
 
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from processor.batch import job as batch_job
-from processor.batch import record, summary
-from processor.batch.finding import STATE, Input, Inputs, find
+from processor.batch import summary
+from processor.batch.find_inputs import STATE, Input, Inputs, find
 from processor.batch.job import Job, OutputGoneError
 from processor.batch.record import JobStatus, Record
 from processor.jobs import process, runner
@@ -26,6 +26,8 @@ from processor.jobs.child import Loss, Lost
 from processor.jobs.runner import StoppedError
 from processor.language.messages import messages
 from processor.model import InputError, UsageError, reason
+from processor.results.names import JOB_RECORD
+from processor.store.atomic_file import replace_text
 
 LOGS = "logs"
 LONGEST_NAME = 240  # bytes of a file's name, with room for prefix and suffix
@@ -34,15 +36,15 @@ MEMORY_SHARE, LEAST_MEMORY_MB = 0.8, 1024  # of the machine, for all jobs togeth
 
 @dataclass(frozen=True)
 class Settings:
-    """Settings of a batch; ``arguments`` are passed to every ``processor run``, ``units`` to those of scans."""
+    """Settings of a batch; ``run_options`` are passed to every ``processor run``, ``units`` to those of scans."""
 
     root: Path
     out: Path
-    arguments: tuple[str, ...] = ()
-    params: bytes = b""  # the parameter file, as it was when the batch began
-    parameters: dict[str, Any] = field(default_factory=dict)  # all that results depend on
+    run_options: tuple[str, ...] = ()
+    params_toml: bytes = b""  # the parameter file, as it was when the batch began
+    identity_parameters: dict[str, Any] = field(default_factory=dict)  # all settings that results depend on
     units: str | None = None
-    jobs: int = 1
+    at_a_time: int = 1
     cluster: str | None = None
     timeout_s: float = 3600.0
     memory_mb: int | None = None
@@ -53,7 +55,7 @@ class Settings:
     @property
     def at_once(self) -> int:
         """Number of jobs at a time on one machine."""
-        return 1 if self.cluster else self.jobs
+        return 1 if self.cluster else self.at_a_time
 
 
 def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record], None]) -> summary.Summary:
@@ -76,7 +78,7 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
     if not inputs.inputs:
         raise InputError(f"{settings.root}: expected scan folders, scenes or scans in it, found none")
     with (
-        runner.executor(settings.cluster, settings.jobs, say) as executor,
+        runner.executor(settings.cluster, settings.at_a_time, say) as executor,
         runner.stoppable() as check_stop,
         _alone_in(out) as state,
     ):
@@ -85,7 +87,7 @@ def run(settings: Settings, say: Callable[[str], None], ended: Callable[[Record]
         except OSError as error:
             raise InputError(f"{out}: cannot be written ({error.strerror or error})") from error
         try:
-            with closing(executor.run(batch_job.do, jobs, check_stop)) as results:
+            with closing(executor.run(batch_job.run_job, jobs, check_stop)) as results:
                 records = _records(results, len(jobs), say, ended)
         finally:
             with suppress(OSError):
@@ -121,7 +123,7 @@ def _checked(job: Job, result: Record | Lost) -> Record:
     if isinstance(result, Lost):
         died = result.loss is Loss.DIED
         why = reason("batch.workers-died") if died else reason("batch.worker-failed", error=str(result.error))
-    elif result.status == JobStatus.FAILED or (job.place / record.RECORD).is_file():
+    elif result.status == JobStatus.FAILED or (job.results_folder / JOB_RECORD).is_file():
         return result
     else:
         why = reason("batch.not-shared")
@@ -138,12 +140,12 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
     for folder in ("failed", "work"):
         (state / folder).mkdir(exist_ok=True)
     token = secrets.token_hex(8)
-    record.write_text(_token_file(state), token)
+    replace_text(_token_file(state), token)
     summary.remove(out)  # there is none until all jobs are done: an older one would be of other results
-    arguments = settings.arguments
-    if settings.params:
-        record.write_text(state / "params.toml", settings.params.decode("utf-8"))
-        arguments = (*arguments, "--params", str(state / "params.toml"))
+    run_options = settings.run_options
+    if settings.params_toml:
+        replace_text(state / "params.toml", settings.params_toml.decode("utf-8"))
+        run_options = (*run_options, "--params", str(state / "params.toml"))
     keys = {each.name: hashlib.sha256(os.fsencode(each.name)).hexdigest()[:32] for each in inputs.inputs}
     for path in (state / "failed").iterdir():
         if path.stem not in keys.values():
@@ -159,14 +161,14 @@ def _jobs(settings: Settings, inputs: Inputs, root: Path, out: Path, state: Path
                 source=each.path,
                 root=root,
                 out=out,
-                place=out / (root.name if each.name == "." else each.name),
+                results_folder=out / (root.name if each.name == "." else each.name),
                 log=_log(out, each, key),
-                failed=state / "failed" / f"{key}.json",
-                work=state / "work" / key,
+                failure_record=state / "failed" / f"{key}.json",
+                work_folder=state / "work" / key,
                 token_file=_token_file(state),
-                token=token,
-                arguments=(*arguments, *units),
-                parameters={**settings.parameters, "units": settings.units if units else None},
+                batch_token=token,
+                run_options=(*run_options, *units),
+                identity_parameters={**settings.identity_parameters, "units": settings.units if units else None},
                 software=batch_job.software(),
                 timeout_s=settings.timeout_s,
                 memory_mb=settings.memory_mb or _memory_mb(settings.at_once),

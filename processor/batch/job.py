@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import errno
-import hashlib
 import json
 import os
 import secrets
@@ -19,13 +18,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from processor.batch import figures, record
+from processor.batch import record
 from processor.batch.record import JobStatus, Record
-from processor.jobs import process
+from processor.batch.summary_values import step_status, summary_values
+from processor.jobs import exit_codes, process
 from processor.jobs.process import Cause
-from processor.jobs.software import OtherSoftwareError, check_same, versions
-from processor.language.messages import messages
+from processor.jobs.software import OtherSoftwareError, check_same, source_digest, versions
+from processor.language.messages import messages, printable
 from processor.model import InputError, Reason, reason
+from processor.results.names import FORMAT, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
 from processor.scan_folder import fingerprint
 from processor.store.atomic_file import sync
 from processor.version import __version__
@@ -44,7 +45,11 @@ PACKAGES = (
     "trimesh",
 )
 # By the exit code of `processor run`.
-STATUS = {0: JobStatus.DONE, 1: JobStatus.IN_PART, 4: JobStatus.LIMIT_MISSED}
+STATUS = {
+    exit_codes.DONE: JobStatus.DONE,
+    exit_codes.IN_PART: JobStatus.IN_PART,
+    exit_codes.LIMIT_MISSED: JobStatus.LIMIT_MISSED,
+}
 WITH_RESULTS = tuple(STATUS.values())
 # Errors of the output folder, not of an input.
 OUTPUT_GONE = tuple(os.strerror(code) for code in (errno.ENOSPC, errno.EDQUOT, errno.EROFS))
@@ -63,14 +68,14 @@ class Job:
     source: Path
     root: Path
     out: Path  # of the batch
-    place: Path  # of the results
+    results_folder: Path
     log: Path
-    failed: Path  # of the record of a failure
-    work: Path
+    failure_record: Path
+    work_folder: Path
     token_file: Path
-    token: str  # of this run of the batch, which is over when the file holds another one
-    arguments: tuple[str, ...]
-    parameters: dict[str, Any]
+    batch_token: str  # of this run of the batch, which is over when the file holds another one
+    run_options: tuple[str, ...]
+    identity_parameters: dict[str, Any]
     software: dict[str, str]
     timeout_s: float
     memory_mb: int
@@ -82,45 +87,41 @@ class Job:
 @cache
 def software() -> dict[str, str]:
     """Return the versions of what results depend on; that of the processor with a hash of its files."""
-    digest = hashlib.sha256()
-    package = Path(__file__).parents[1]
-    for path in sorted(path for path in package.rglob("*") if path.suffix in (".py", ".toml", ".html", ".js", ".css")):
-        digest.update(f"{path.relative_to(package)}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
-    sources = f"{__version__} {digest.hexdigest()[:16]}"
+    sources = f"{__version__} {source_digest(('processor',), ('.py', '.toml', '.html', '.js', '.css'))[:16]}"
     return {"processor": sources, "python": ".".join(map(str, sys.version_info[:3])), **versions(PACKAGES)}
 
 
-def do(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
+def run_job(job: Job, stopped: Callable[[], bool] = process.never) -> Record:
     """Do a job, or return the record of an earlier run of the batch if input, parameters and software are the same.
 
     Failures are returned as records. Raises OutputGoneError if results cannot be written.
     """
 
-    def over() -> bool:
-        return stopped() or _token(job) != job.token
+    def batch_ended() -> bool:
+        return stopped() or _token(job) != job.batch_token
 
     try:
         check_same(software(), job.software)
         input_sha256 = fingerprint.content_hash(job.source, job.out)
-        identity = record.identity(input_sha256, job.parameters, job.software)
-        earlier = _earlier(job, identity)
+        identity = record.identity(input_sha256, job.identity_parameters, job.software)
+        earlier = _still_valid_record(job, identity)
         if earlier is not None:
             return dataclasses.replace(earlier, kept=True)
-        if over():
-            return _passing(job, STOPPED)
-        return _processed(job, input_sha256, identity, over)
+        if batch_ended():
+            return _failure_to_retry(job, STOPPED)
+        return _processed(job, input_sha256, identity, batch_ended)
     except OutputGoneError:
         raise
     except OtherSoftwareError as error:
-        return _passing(job, reason("batch.other-software", difference=error.args[0]))
+        return _failure_to_retry(job, reason("batch.other-software", difference=error.args[0]))
     except (InputError, OSError) as error:
         text = str(error)
         if any(sign in text for sign in OUTPUT_GONE):
             raise OutputGoneError(text) from error
-        return _passing(job, reason("batch.error", message=_plain(job, text)))
+        return _failure_to_retry(job, reason("batch.error", message=_one_line(job, text)))
 
 
-def _passing(job: Job, why: Reason) -> Record:
+def _failure_to_retry(job: Job, why: Reason) -> Record:
     """Record a failure that is tried again in the next run."""
     return Record(input=job.name, identity="", status=JobStatus.FAILED, reason=why, lasting=False)
 
@@ -132,14 +133,14 @@ def _token(job: Job) -> str:
         return ""
 
 
-def _earlier(job: Job, identity: str) -> Record | None:
+def _still_valid_record(job: Job, identity: str) -> Record | None:
     """Return the record of an earlier run, if it still holds."""
-    done = record.read(job.place / record.RECORD)
+    done = record.read(job.results_folder / JOB_RECORD)
     if done is not None and done.identity == identity and done.status in WITH_RESULTS:
-        whole = (job.place / "report.html").is_file() and (job.place / "results.h5").is_file()
-        if whole and record.sha256_of(job.place / record.RESULTS) == done.results_sha256:
+        whole = (job.results_folder / REPORT_PAGE).is_file() and (job.results_folder / RESULTS_H5).is_file()
+        if whole and record.sha256_of(job.results_folder / RESULTS_JSON) == done.results_sha256:
             return done
-    failed = record.read(job.failed)
+    failed = record.read(job.failure_record)
     if failed is None or failed.identity != identity or failed.status != JobStatus.FAILED or job.retry:
         return None
     now = {"timeout_s": job.timeout_s, "memory_mb": float(job.memory_mb)}
@@ -147,23 +148,23 @@ def _earlier(job: Job, identity: str) -> Record | None:
     return None if more else failed
 
 
-def _processed(job: Job, input_sha256: str, identity: str, over: Callable[[], bool]) -> Record:
+def _processed(job: Job, input_sha256: str, identity: str, batch_ended: Callable[[], bool]) -> Record:
     """Run the processor and move its results, or the record of its failure, to their final name."""
-    job.work.mkdir(parents=True, exist_ok=True)
+    job.work_folder.mkdir(parents=True, exist_ok=True)
     job.log.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(dir=job.work))
+    temporary_folder = Path(tempfile.mkdtemp(dir=job.work_folder))
     try:
-        made = making / "results"
-        ended = _run(job, identity, made, over)
+        new_results = temporary_folder / "results"
+        ended = _run(job, identity, new_results, batch_ended)
         if ended.cause is Cause.STOPPED:
-            return _passing(job, STOPPED)
-        status, why, limits, results = _assessed(job, ended, made)
+            return _failure_to_retry(job, STOPPED)
+        status, why, limits, results = _assessed(job, ended, new_results)
         if why is not None and any(sign in ended.last_line for sign in OUTPUT_GONE):
             raise OutputGoneError(messages("en").text(why))
         if fingerprint.content_hash(job.source, job.out) != input_sha256:
-            return _passing(job, reason("batch.input-changed"))
-        if over():
-            return _passing(job, STOPPED)
+            return _failure_to_retry(job, reason("batch.input-changed"))
+        if batch_ended():
+            return _failure_to_retry(job, STOPPED)
         ending = Record(
             input=job.name,
             identity=identity,
@@ -176,41 +177,50 @@ def _processed(job: Job, input_sha256: str, identity: str, over: Callable[[], bo
         )
         if results is None:
             _remove_results(job)  # of an earlier state of the input
-            record.write(job.failed, ending)
+            record.write(job.failure_record, ending)
             return ending
-        digest = record.sha256_of(made / record.RESULTS)
+        digest = record.sha256_of(new_results / RESULTS_JSON)
         ending = dataclasses.replace(
-            ending, results_sha256=digest, figures=figures.of_results(results), steps=figures.step_status(results)
+            ending, results_sha256=digest, figures=summary_values(results), steps=step_status(results)
         )
-        record.write(made / record.RECORD, ending)
-        _publish(job, made)
-        job.failed.unlink(missing_ok=True)
+        record.write(new_results / JOB_RECORD, ending)
+        _publish(job, new_results)
+        job.failure_record.unlink(missing_ok=True)
         return ending
     finally:
-        shutil.rmtree(making, ignore_errors=True)
+        shutil.rmtree(temporary_folder, ignore_errors=True)
 
 
-def _run(job: Job, identity: str, made: Path, over: Callable[[], bool]) -> process.Ended:
+def _run(job: Job, identity: str, new_results: Path, batch_ended: Callable[[], bool]) -> process.Ended:
     with job.log.open("a", encoding="utf-8") as log:
-        log.write(f"--- {job.token} {identity}\n")
+        log.write(f"--- {job.batch_token} {identity}\n")
     return process.run(
-        (*job.program, str(job.memory_mb), "processor", "run", str(job.source), "-o", str(made), *job.arguments),
+        (
+            *job.program,
+            str(job.memory_mb),
+            "processor",
+            "run",
+            str(job.source),
+            "-o",
+            str(new_results),
+            *job.run_options,
+        ),
         log=job.log,
         env=process.environment(job.threads, PYTHONFAULTHANDLER="1"),
         timeout_s=job.timeout_s,
         memory_mb=job.memory_mb,
-        stopped=over,
+        stopped=batch_ended,
     )
 
 
 _Assessed = tuple[JobStatus, Reason | None, dict[str, float], dict[str, Any] | None]
 
 
-def _assessed(job: Job, ended: process.Ended, made: Path) -> _Assessed:
+def _assessed(job: Job, ended: process.Ended, new_results: Path) -> _Assessed:
     """Return the status of a process that ended, the reason, the limits that ended it, and its results."""
     if ended.cause is Cause.TIME:
         return _failure(reason("batch.timeout", limit=job.timeout_s), timeout_s=job.timeout_s)
-    last = _plain(job, ended.last_line.replace(str(made), record.RESULTS), 500)
+    last = _one_line(job, ended.last_line.replace(str(new_results), RESULTS_JSON), 500)
     if ended.cause is Cause.MEMORY or "MemoryError" in last or "Unable to allocate" in last:
         return _failure(reason("batch.memory", limit=job.memory_mb), memory_mb=float(job.memory_mb))
     if ended.cause is Cause.SIGNAL:
@@ -220,8 +230,8 @@ def _assessed(job: Job, ended: process.Ended, made: Path) -> _Assessed:
         return _failure(reason("batch.crashed-unnamed", number=ended.code))
     if ended.code in STATUS:
         try:
-            results = json.loads((made / record.RESULTS).read_text("utf-8"))
-            if results["format"] != "processor-results" or not (made / "report.html").is_file():
+            results = json.loads((new_results / RESULTS_JSON).read_text("utf-8"))
+            if results["format"] != FORMAT or not (new_results / REPORT_PAGE).is_file():
                 raise ValueError(results["format"])
             return STATUS[ended.code], None, {}, results
         except (OSError, ValueError, TypeError, KeyError):
@@ -237,38 +247,38 @@ def _failure(why: Reason, **limits: float) -> _Assessed:
     return JobStatus.FAILED, why, limits, None
 
 
-def _plain(job: Job, text: str, most: int = 2000) -> str:
+def _one_line(job: Job, text: str, most: int = 2000) -> str:
     """Return a text on one line with relative paths: the summary does not depend on where the folders are."""
     for folder in (job.root, job.out):
         text = text.replace(f"{folder}/", "") if str(folder) != "/" else text
     text = " ".join(text.replace(str(job.source), job.source.name).split())
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)[:most]
+    return printable(text)[:most]
 
 
-def _publish(job: Job, made: Path) -> None:
+def _publish(job: Job, new_results: Path) -> None:
     """Move results to their final name by one renaming, in place of earlier ones."""
     try:
-        for path in made.rglob("*"):
+        for path in new_results.rglob("*"):
             if path.is_dir():
                 sync(path)
-        sync(made)
-        job.place.parent.mkdir(parents=True, exist_ok=True)
+        sync(new_results)
+        job.results_folder.parent.mkdir(parents=True, exist_ok=True)
         _remove_results(job)
-        os.replace(made, job.place)
-        sync(job.place.parent)
+        os.replace(new_results, job.results_folder)
+        sync(job.results_folder.parent)
     except OSError as error:
-        raise InputError(f"{job.place}: cannot be written ({error.strerror or error})") from error
+        raise InputError(f"{job.results_folder}: cannot be written ({error.strerror or error})") from error
 
 
 def _remove_results(job: Job) -> None:
     """Remove earlier results. Raises InputError if something else has their name."""
-    if not os.path.lexists(job.place):
+    if not os.path.lexists(job.results_folder):
         return
     with suppress(OSError):
-        job.place.rmdir()  # empty
+        job.results_folder.rmdir()  # empty
         return
-    if job.place.is_symlink() or not (job.place / record.RESULTS).is_file():
-        raise InputError(f"{job.place}: is there and holds no results; take it away or name another folder")
-    old = job.work / f"old-{secrets.token_hex(8)}"
-    os.replace(job.place, old)
+    if job.results_folder.is_symlink() or not (job.results_folder / RESULTS_JSON).is_file():
+        raise InputError(f"{job.results_folder}: is there and holds no results; take it away or name another folder")
+    old = job.work_folder / f"old-{secrets.token_hex(8)}"
+    os.replace(job.results_folder, old)
     shutil.rmtree(old, ignore_errors=True)

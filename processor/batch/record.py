@@ -15,10 +15,9 @@ from typing import Any
 
 from processor.language.messages import messages
 from processor.model import Reason, Word
-from processor.store.atomic_file import replacing
+from processor.store.atomic_file import replace_text
 
 FORMAT, FORMAT_VERSION = "processor-batch-job", "1.0"
-RECORD, RESULTS = "job.json", "results.json"
 
 
 class JobStatus(Word):
@@ -87,13 +86,7 @@ def write(path: Path, record: Record) -> None:
     """Write a record. Raises InputError if it cannot be written."""
     content = {"format": FORMAT, "format_version": FORMAT_VERSION, **as_object(record)}
     text = json.dumps(content, indent=1, allow_nan=False)
-    write_text(path, text + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole, or leave it as it was. Raises InputError if it cannot be written."""
-    with replacing(path) as temporary:
-        temporary.write_text(text, "utf-8", newline="")
+    replace_text(path, text + "\n")
 
 
 def sha256_of(path: Path) -> str:

@@ -5,31 +5,29 @@ Times and memory, which differ from run to run, are in timings.csv.
 
 from __future__ import annotations
 
-import csv
-import io
 import json
-import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from processor.batch import record
-from processor.batch.figures import COLUMNS
 from processor.batch.job import Job
 from processor.batch.record import JobStatus, Record
-from processor.language.messages import Text, label, messages, text
+from processor.batch.summary_values import COLUMNS
+from processor.language.messages import Text, label, messages, printable, text
 from processor.model import InputError, Reason, Status, Verdict
 from processor.report import templates
+from processor.report.table import csv_of_rows
+from processor.results.names import REPORT_PAGE
+from processor.store.atomic_file import replace_text
 
 CSV, JSON, PAGE, TIMINGS = "summary.csv", "summary.json", "index.html", "timings.csv"
 FILES = (CSV, JSON, PAGE, TIMINGS)
 FORMAT, FORMAT_VERSION = "processor-batch", "1.0"
 ENDS = ("report", "log", "input_sha256")  # of a row, after the reason
-FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters of cells that a spreadsheet would execute
 TONES = {
     JobStatus.DONE: "good",
     JobStatus.IN_PART: "between",
@@ -72,13 +70,13 @@ def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, 
     columns = ["input", "status", "verdict", *(name for name in COLUMNS if name != "verdict"), "reason", *ENDS]
     head = {"format": FORMAT, "format_version": FORMAT_VERSION, "units": "mm", "counts": counts}
     content = head | {"inputs": rows, "left_out": left}
-    record.write_text(out / CSV, _csv(columns, ([row.get(name) for name in columns] for row in rows)))
-    record.write_text(out / JSON, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    replace_text(out / CSV, csv_of_rows(columns, ([row.get(name) for name in columns] for row in rows)))
+    replace_text(out / JSON, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     times = ([readable(r.input), r.status, r.seconds, r.peak_mb, "yes" if r.kept else ""] for _, r in done)
-    record.write_text(out / TIMINGS, _csv(["input", "status", "seconds", "peak_mb", "kept"], times))
+    replace_text(out / TIMINGS, csv_of_rows(["input", "status", "seconds", "peak_mb", "kept"], times))
     try:
         page = _html(rows, [ending for _, ending in done], statuses, left_out, lang)
-        record.write_text(out / PAGE, page)  # last: it is there only if all are
+        replace_text(out / PAGE, page)  # last: it is there only if all are
     except InputError:
         remove(out)
         raise
@@ -92,37 +90,20 @@ def _written(why: Reason | None, lang: str) -> str:
 
 def readable(text: str) -> str:
     """Return a name on one line, with bytes that are not UTF-8 escaped."""
-    plain = os.fsencode(text).decode("utf-8", "backslashreplace")
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in plain)
+    return printable(os.fsencode(text).decode("utf-8", "backslashreplace"))
 
 
 def _row(out: Path, job: Job, ending: Record) -> dict[str, Any]:
     why = ending.reason
     row: dict[str, Any] = {"input": readable(ending.input), "status": ending.status, "verdict": None}
     row |= {"reason": _written(why, "en"), "reason_code": "" if why is None else why.code, **ending.figures}
-    row["report"] = "" if ending.status == JobStatus.FAILED else _link(out, job.place / "report.html")
+    row["report"] = "" if ending.status == JobStatus.FAILED else _link(out, job.results_folder / REPORT_PAGE)
     row["log"] = _link(out, job.log) if job.log.is_file() else ""
     return row | {"input_sha256": ending.input_sha256}
 
 
 def _link(out: Path, path: Path) -> str:
     return quote(os.fsencode(path.relative_to(out)), safe="/")
-
-
-def _csv(columns: Sequence[str], rows: Iterable[Iterable[Any]]) -> str:
-    text = io.StringIO(newline="")
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(columns)
-    table.writerows([_cell(cell) for cell in row] for row in rows)
-    return text.getvalue()
-
-
-def _cell(cell: Any) -> Any:
-    if isinstance(cell, str):
-        return f"'{cell}" if cell.startswith(FORMULA) else cell
-    if isinstance(cell, float):
-        return repr(round(cell, 6)) if math.isfinite(cell) else ""
-    return "" if cell is None else cell
 
 
 def _html(

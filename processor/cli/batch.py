@@ -10,16 +10,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from processor.cli.common import (
-    DONE,
-    IN_PART,
     LANGUAGES,
-    LIMIT_MISSED,
     UNITS,
     check_jobs,
     debug_option,
     print_error_line,
     split_names,
 )
+from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED
 
 if TYPE_CHECKING:
     from processor.batch.batch import Settings
@@ -104,9 +102,9 @@ def _settings(root: Path, options: BatchOptions) -> Settings:
     return batch_run.Settings(
         root=root,
         out=options.output,
-        arguments=tuple(text for name, value in arguments.items() if value for text in (name, value)),
-        params=options.params.read_bytes() if options.params else b"",
-        parameters={
+        run_options=tuple(text for name, value in arguments.items() if value for text in (name, value)),
+        params_toml=options.params.read_bytes() if options.params else b"",
+        identity_parameters={
             "steps": options.steps,
             "methods": options.methods,
             "seed": options.seed,
@@ -114,7 +112,7 @@ def _settings(root: Path, options: BatchOptions) -> Settings:
             "params": json.loads(json.dumps(parameters, default=str)),
         },
         units=options.units,
-        jobs=options.jobs or 1,
+        at_a_time=options.jobs or 1,
         cluster=options.cluster,
         timeout_s=options.timeout_s,
         memory_mb=options.memory_mb,

@@ -8,8 +8,10 @@ from typing import Any
 
 import click
 
-from processor.cli.common import DONE, LIMIT_MISSED, debug_option
+from processor.cli.common import debug_option
+from processor.jobs.exit_codes import DONE, LIMIT_MISSED
 from processor.model import InputError, Metric, Statistic
+from processor.results.names import FORMAT, RESULTS_JSON
 
 
 @click.command()
@@ -51,11 +53,11 @@ def _number(value: float | None) -> float:
 
 
 def _read_results(output: Path) -> dict[str, Any]:
-    path = output / "results.json"
+    path = output / RESULTS_JSON
     try:
         results: dict[str, Any] = json.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, ValueError) as error:
         raise InputError(f"{path}: no readable results ({error}); run processor run again") from error
-    if results.get("format") != "processor-results" or not isinstance(results.get("checks"), list):
+    if results.get("format") != FORMAT or not isinstance(results.get("checks"), list):
         raise InputError(f"{path}: expected results of processor, found something else")
     return results

@@ -1,4 +1,4 @@
-"""What the commands of ``processor`` share: exit codes, units, shared options, and output on the terminal."""
+"""What the commands of ``processor`` share: units, shared options, and output on the terminal."""
 
 from __future__ import annotations
 
@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING
 
 import click
 
+from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED
+from processor.language.messages import printable
 from processor.model import Status, UsageError
 
 if TYPE_CHECKING:
     from processor.api.runs import Results
 
-DONE, IN_PART, LIMIT_MISSED = 0, 1, 4
 LANGUAGES = ("en", "zh")
 UNITS = ("m", "mm", "cm", "inch", "ft")
 
@@ -22,7 +23,7 @@ debug_option = click.option("--debug", is_flag=True, expose_value=False, help="s
 
 def print_error_line(line: str) -> None:
     """Write one line on standard error; control characters, as of a file's name, are replaced."""
-    click.echo("".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in line), err=True)
+    click.echo(printable(line), err=True)
 
 
 def check_jobs(jobs: int | None, cluster: str | None) -> None:
@@ -38,15 +39,16 @@ def split_names(_: click.Context, __: click.Parameter, value: str | None) -> tup
 
 def show_results(context: click.Context, output: Path, results: Results, as_json: bool) -> None:
     """Print what was found and set the exit code."""
-    from processor.report import all_tables, results_folder
+    from processor.report import all_tables
     from processor.report import table as report_table
+    from processor.results.names import REPORT_PAGE, RESULTS_JSON
 
     if as_json:
-        click.echo((output / results_folder.RESULTS).read_text("utf-8"), nl=False)
+        click.echo((output / RESULTS_JSON).read_text("utf-8"), nl=False)
     else:
         for table in all_tables.tables_of_run(results.execution, results.report):
             if table.on_terminal:
                 click.echo(report_table.plain_text(table) + "\n")
-        click.echo(f"report: {output / 'report.html'}")
+        click.echo(f"report: {output / REPORT_PAGE}")
     complete = all(result.status == Status.OK for result in results.steps.values())
     context.exit(LIMIT_MISSED if not results.report.passed else DONE if complete else IN_PART)

@@ -27,10 +27,11 @@ def report(
     from processor import pipeline
     from processor.api import runs
     from processor.evaluation.evaluate import evaluate
-    from processor.report import results_folder
+    from processor.report import write_results
+    from processor.results.names import RESULTS_H5
 
-    results_folder.check_output(output, input_)
-    input_ = input_ or pipeline.find_input(output / results_folder.RUNS)
-    execution = pipeline.read_execution(output / results_folder.RUNS, input_, units)
+    write_results.check_output(output, input_)
+    input_ = input_ or pipeline.find_input(output / RESULTS_H5)
+    execution = pipeline.read_execution(output / RESULTS_H5, input_, units)
     results = runs.write(runs.Results(execution, evaluate(input_, execution)), output, lang)
     show_results(context, output, results, as_json)

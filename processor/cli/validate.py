@@ -9,7 +9,8 @@ from typing import Any
 
 import click
 
-from processor.cli.common import DONE, IN_PART, LANGUAGES, LIMIT_MISSED, check_jobs, debug_option
+from processor.cli.common import LANGUAGES, check_jobs, debug_option
+from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED
 
 
 @dataclass(frozen=True)

@@ -1,10 +1,13 @@
-"""Versions of installed software, which results depend on."""
+"""Software that results depend on: versions of libraries, and digests of sources."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import hashlib
+import importlib.util
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
 from processor.model import InputError
 
@@ -16,6 +19,20 @@ def versions(packages: Iterable[str]) -> dict[str, str]:
         with suppress(PackageNotFoundError):
             installed[name] = version(name)
     return installed
+
+
+def source_digest(packages: Iterable[str], suffixes: Collection[str], left_out: Collection[str] = ()) -> str:
+    """Return the SHA-256 (hex) of the files of packages with the suffixes; ``left_out`` are folders of packages."""
+    digest = hashlib.sha256()
+    for package in packages:
+        spec = importlib.util.find_spec(package)
+        for place in (spec.submodule_search_locations or []) if spec else []:
+            root = Path(place)
+            for path in sorted(path for path in root.rglob("*") if path.suffix in suffixes):
+                relative = path.relative_to(root)
+                if relative.parts[0] not in left_out:
+                    digest.update(f"{package}/{relative}\0".encode() + hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 class OtherSoftwareError(InputError):

@@ -56,6 +56,11 @@ def text(template: str, /, **values: Any) -> Text:
     return Text(template, values)
 
 
+def printable(characters: str) -> str:
+    """Replace control characters, as of a file's name, which a terminal or a spreadsheet may obey."""
+    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in characters)
+
+
 def label(english: str) -> Text:
     """Return a text without fields, which may be a name: translated where a catalogue has exactly this text."""
     return Text(english, None)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError
-from processor.readers import e57, las, pcd, ply, proprietary, ptx, sandbox, text
+from processor.readers import closed_formats, e57, las, pcd, ply, ptx, sandbox, text
 from processor.readers.common import RawScan
 
 __all__ = ["ARCHIVES", "SUFFIXES", "RawScan", "read"]
@@ -15,7 +15,7 @@ __all__ = ["ARCHIVES", "SUFFIXES", "RawScan", "read"]
 _FORMATS = {suffix: module for module in (e57, las, pcd, ply, ptx, text) for suffix in module.SUFFIXES}
 
 SUFFIXES = tuple(sorted(_FORMATS))
-ARCHIVES = proprietary.ARCHIVES
+ARCHIVES = closed_formats.ARCHIVES
 
 
 def read(path: Path) -> list[RawScan]:
@@ -25,7 +25,7 @@ def read(path: Path) -> list[RawScan]:
     """
     suffix = path.suffix.lower()
     if is_closed(path):
-        raise InputError(f"{path}: {proprietary.advice(suffix)}")
+        raise InputError(f"{path}: {closed_formats.advice(suffix)}")
     if suffix not in _FORMATS:
         raise InputError(f"{path}: expected a scan file ({', '.join(SUFFIXES)}), found {suffix or 'no suffix'}")
     if not path.is_file():
@@ -48,4 +48,4 @@ def read(path: Path) -> list[RawScan]:
 
 def is_closed(path: Path) -> bool:
     """Whether a path has the suffix of a closed format, which only its maker's software reads."""
-    return path.suffix.lower() in proprietary.FORMATS
+    return path.suffix.lower() in closed_formats.FORMATS

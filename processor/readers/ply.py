@@ -48,7 +48,7 @@ class _Element:
     name: str
     count: int
     types: dict[str, str] = field(default_factory=dict)
-    lists: list[str] = field(default_factory=list)
+    list_counts: dict[str, str] = field(default_factory=dict)  # type of the number of values, by list property
 
 
 @dataclass(frozen=True)
@@ -62,13 +62,13 @@ class Header:
 
 def read(path: Path) -> list[RawScan]:
     """Read the vertices of a PLY file as one scan, with their intensity if it has one."""
-    header = check_header(path)
+    header = read_header(path)
     vertex = next((element for element in header.elements if element.name == "vertex"), _Element("vertex", 0))
     before = header.elements[: header.elements.index(vertex)] if vertex in header.elements else []
     missing = [name for name in "xyz" if name not in vertex.types]
     if missing:
         raise InputError(f"{path}: expected vertices with x, y, z, found {', '.join(vertex.types) or 'none'}")
-    if vertex.lists or (header.order and any(element.lists for element in before)):
+    if vertex.list_counts or (header.order and any(element.list_counts for element in before)):
         raise InputError(f"{path}: expected vertices only, found lists before or within them; export points only")
     intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
     wanted = [*"xyz", *(name for name in (intensity, station) if name)]
@@ -99,8 +99,8 @@ def read(path: Path) -> list[RawScan]:
     ]
 
 
-def check_header(path: Path) -> Header:
-    """Check the numbers that a header declares against the size of the file, before memory is allocated.
+def read_header(path: Path) -> Header:
+    """Read a header, and check the numbers that it declares against the size of the file, before memory is allocated.
 
     Raises InputError for a file with too few or too many bytes, and for one without a header.
     """
@@ -121,16 +121,16 @@ def check_header(path: Path) -> Header:
                 elements.append(_Element(words[1], int(words[2])))
                 check_room(path, "PLY", elements[-1].count, 1, room)
             elif words[0] == "property" and words[1] == "list":
-                elements[-1].lists.append(TYPES[words[2]])
+                elements[-1].list_counts[words[4]] = TYPES[words[2]]
                 elements[-1].types[words[4]] = TYPES[words[3]]
             elif words[0] == "property":
                 if words[2] in elements[-1].types:
                     raise ValueError(f"two properties {words[2]}")
                 elements[-1].types[words[2]] = TYPES[words[1]]
-    exact = not any(element.lists for element in elements)
+    exact = not any(element.list_counts for element in elements)
     least = 0
     for element in elements:
-        codes = [*list(element.types.values())[: len(element.types) - len(element.lists)], *element.lists]
+        codes = [element.list_counts.get(name, code) for name, code in element.types.items()]
         least += element.count * (2 * len(codes) if not order else sum(int(code[1]) for code in codes))
     # The last number of an ASCII file needs no separator after it.
     if least > room + (not order):

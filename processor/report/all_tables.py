@@ -12,8 +12,6 @@ from processor.pipeline import Execution
 from processor.report.step_report import step_report
 from processor.report.table import Table
 
-__all__ = ["Table", "checks_table", "grouped", "tables_of_run", "tables_of_step"]
-
 
 def tables_of_step(run: StepRun, others: Sequence[StepRun], report: ErrorReport) -> list[Table]:
     """Tables of a step's result, with those of other methods on the same scene."""
@@ -50,16 +48,6 @@ def _outcome(limit: float, passed: bool) -> Text:
 def tables_of_run(execution: Execution, report: ErrorReport) -> list[Table]:
     """All tables of a run, the checks last where there are any."""
     tables: list[Table] = []
-    for run, others in grouped(execution.runs):
+    for run, others in execution.by_step():
         tables += tables_of_step(run, others, report)
     return [*tables, checks_table(report)] if report.metrics else tables
-
-
-def grouped(runs: Sequence[StepRun]) -> list[tuple[StepRun, list[StepRun]]]:
-    """Pair the first run of each step, its result, with the runs of other methods for comparison."""
-    by_step: dict[str, tuple[StepRun, list[StepRun]]] = {}
-    for run in runs:
-        by_step.setdefault(run.step, (run, []))
-        if by_step[run.step][0] is not run:
-            by_step[run.step][1].append(run)
-    return list(by_step.values())

@@ -9,17 +9,18 @@ import math
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-
 from processor import pipeline
 from processor.compare.compare import Comparison
 from processor.geometry.m3c2 import FEWEST_FOR_LOD
 from processor.geometry.normal_orientation import CONVENTION, Turned
 from processor.language.messages import NO_NUMBER, Message, messages, text
-from processor.report import results_folder, templates
+from processor.report import templates, write_results
 from processor.report.deviation import core_points_csv
 from processor.report.deviation import figures as deviation_figures
-from processor.report.record_json import reason_json
+from processor.report.style import default_settings
+from processor.results.fields_to_json import reason_json
+from processor.store.json_values import json_ready
+from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
 OWN_NAMES = (TABLE, *FIGURES, RECORD, PAGE)
@@ -34,7 +35,7 @@ def check_output(out: Path, inputs: tuple[Path | None, ...]) -> None:
     """Raise UsageError for a folder that holds an input, or anything but an earlier comparison."""
     for path in inputs:
         if path is not None:
-            results_folder.check_output(out, path, RECORD, OWN_NAMES)
+            write_results.check_output(out, path, RECORD, OWN_NAMES)
 
 
 def as_json(result: Comparison) -> dict[str, Any]:
@@ -43,38 +44,36 @@ def as_json(result: Comparison) -> dict[str, Any]:
     names = ("reference", "compared", "core", "normals")
     files = {name: path for name in names if (path := getattr(request, name)) is not None}
     english = messages("en")
-    written: dict[str, Any] = json.loads(
-        pipeline.as_json(
-            {
-                "format": "processor-comparison",
-                "format_version": "1.0",
-                "inputs": {
-                    name: {"file": path.name, "sha256": result.hashes[name], "points": result.points.get(name)}
-                    for name, path in files.items()
-                },
-                "unit": result.unit or "that of the files, which do not give it",
-                "unit_note": result.unit_note and english.text(result.unit_note),
-                "definition": DEFINITION,
-                "normals": english.text(result.normals_from),
-                "normals_note": english.sentences(notes) if notes else None,
-                "notes": [reason_json(note) for note in result.notes],
-                "normals_turned": None if result.turned is None else _turned(result.turned),
-                "parameters": {
-                    "normal_diameter": None if request.normals else scales.normal_diameter_mm,
-                    "projection_diameter": scales.projection_diameter_mm,
-                    "max_depth": scales.max_depth_mm,
-                    "registration_error": request.registration_error,
-                    "given": [
-                        name
-                        for name in ("normal_diameter", "projection_diameter", "max_depth", "registration_error")
-                        if getattr(request, name) and not (name == "normal_diameter" and request.normals)
-                    ],
-                },
-                "spacing": {"reference": scales.reference_spacing_mm, "compared": scales.compared_spacing_mm},
-                "summary": _summary(result),
-                "software": pipeline.software(),
-            }
-        )
+    written: dict[str, Any] = json_ready(
+        {
+            "format": "processor-comparison",
+            "format_version": "1.0",
+            "inputs": {
+                name: {"file": path.name, "sha256": result.hashes[name], "points": result.points.get(name)}
+                for name, path in files.items()
+            },
+            "unit": result.unit or "that of the files, which do not give it",
+            "unit_note": result.unit_note and english.text(result.unit_note),
+            "definition": DEFINITION,
+            "normals": english.text(result.normals_from),
+            "normals_note": english.sentences(notes) if notes else None,
+            "notes": [reason_json(note) for note in result.notes],
+            "normals_turned": None if result.turned is None else _turned(result.turned),
+            "parameters": {
+                "normal_diameter": None if request.normals else scales.normal_diameter_mm,
+                "projection_diameter": scales.projection_diameter_mm,
+                "max_depth": scales.max_depth_mm,
+                "registration_error": request.registration_error,
+                "given": [
+                    name
+                    for name in ("normal_diameter", "projection_diameter", "max_depth", "registration_error")
+                    if getattr(request, name) and not (name == "normal_diameter" and request.normals)
+                ],
+            },
+            "spacing": {"reference": scales.reference_spacing_mm, "compared": scales.compared_spacing_mm},
+            "summary": _summary(result),
+            "software": pipeline.software(),
+        }
     )
     return written
 
@@ -106,21 +105,19 @@ def _turned(turned: Turned) -> dict[str, Any]:
 def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
     """Write the folder in place of an earlier one, its page in ``lang``; returns the object of compare.json."""
     record = as_json(result)
-    with mpl.rc_context():
-        mpl.rcdefaults()
-        mpl.rcParams["text.parse_math"] = False
+    with default_settings():
         drawn = [
             deviation_figures.deviation_map(result.core + result.origin, result.normals, result.distances, result.unit),
             deviation_figures.histogram(result.distances, result.unit),
         ]
-    with results_folder.replacing_folder(out) as making:
+    with replacing_folder(out) as making:
         table = core_points_csv.csv_text(result.origin, result.core, result.distances, result.normals)
-        results_folder.write_text(making / TABLE, table)
+        write_text(making / TABLE, table)
         record_text = json.dumps(record, indent=1, allow_nan=False, ensure_ascii=False)
-        results_folder.write_text(making / RECORD, record_text + "\n")
+        write_text(making / RECORD, record_text + "\n")
         for name, (_, data) in zip(FIGURES, drawn, strict=True):
-            results_folder.write_bytes(making / name, data)
-        results_folder.write_text(making / PAGE, _page(result, record, drawn, lang))
+            write_bytes(making / name, data)
+        write_text(making / PAGE, _page(result, record, drawn, lang))
     return record
 
 

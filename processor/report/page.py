@@ -17,7 +17,7 @@ from processor.pipeline import Execution
 from processor.report import all_tables, page_script, templates
 from processor.report.step_report import step_report
 from processor.report.style import CaptionedPngs
-from processor.report.table import headings, numeric, shown
+from processor.report.table import Table, headings, numeric, shown
 
 GOOD = "ok"
 LONG_CELL = 24  # characters
@@ -48,7 +48,7 @@ def html(execution: Execution, report: ErrorReport, figures: Mapping[str, Captio
     scene = execution.scene
     live = {
         run.step: data
-        for run, others in all_tables.grouped(execution.runs)
+        for run, others in execution.by_step()
         if (data := step_report(run.step).interactive_data(scene, [run, *others])) is not None
     }
     script, digest = page_script.script()
@@ -91,7 +91,7 @@ def _about(scene: Scene) -> Text:
 
 def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]:
     verdicts: list[dict[str, Any]] = []
-    for run, _ in all_tables.grouped(execution.runs):
+    for run, _ in execution.by_step():
         report_of = step_report(run.step)
         head, body = report_of.summary(run.result)
         title = text("{step}: {head}", step=report_of.title, head=head)
@@ -141,7 +141,7 @@ def _sections(
     execution: Execution, report: ErrorReport, figures: Mapping[str, CaptionedPngs], live: Container[str], lang: str
 ) -> list[dict[str, Any]]:
     sections = []
-    for run, others in all_tables.grouped(execution.runs):
+    for run, others in execution.by_step():
         tables = [table for table in all_tables.tables_of_step(run, others, report) if table.on_page]
         sections.append(
             {
@@ -190,7 +190,7 @@ def heading(name: str, lang: str) -> str:
     return catalogue.texts.get(f"heading|{name}", catalogue.text(label(name)))
 
 
-def _table(table: all_tables.Table, lang: str) -> dict[str, Any]:
+def _table(table: Table, lang: str) -> dict[str, Any]:
     note: Any = table.note
     if len(table.rows) > MOST_ROWS:
         note = text(

@@ -11,7 +11,6 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message
 from processor.model import Scene, StepRun
 from processor.pipeline import Execution, package_of
-from processor.report.record_json import as_object
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table
 
@@ -27,7 +26,6 @@ class StepReport:
     summary: Callable[[Any], tuple[Any, Any]]  # of a result: the verdict's heading, and the sentences below it
     tables: Callable[[Sequence[StepRun], ErrorReport], list[Table]]
     figures: Callable[[Execution, Sequence[StepRun], ErrorReport], CaptionedPngs]  # file names are the step's own
-    written: Callable[[Any], dict[str, Any]] = as_object  # of a result: its object in results.json
     further_verdicts: Callable[[Any], list[tuple[Any, Any]]] = lambda _: []  # headings and texts beside the verdict
     files: Callable[[Execution, StepRun], dict[str, bytes]] = lambda *_: {}  # further files in OUT by name
     interactive_data: Callable[[Scene, Sequence[StepRun]], dict[str, Any] | None] = lambda *_: None

@@ -7,10 +7,11 @@ readers). The same run gives the same bytes: no dates, and no settings of the us
 from __future__ import annotations
 
 import io
-import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import cache
 
+import matplotlib as mpl
 import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
@@ -37,6 +38,15 @@ LONGEST_LABEL = 24
 CaptionedPngs = dict[str, tuple[str | Message, bytes]]  # file name -> (caption, PNG)
 
 
+@contextmanager
+def default_settings() -> Iterator[None]:
+    """Draw with Matplotlib's own settings, not with those of the user; names may contain dollar signs."""
+    with mpl.rc_context():
+        mpl.rcdefaults()
+        mpl.rcParams["text.parse_math"] = False
+        yield
+
+
 def png(figure: Figure) -> bytes:
     """Write a figure as PNG, without a date."""
     out = io.BytesIO()
@@ -58,19 +68,28 @@ def _font() -> FT2Font:
     return font_manager.get_font(font_manager.findfont("DejaVu Sans"))
 
 
-def write_beside(axes: Axes, rows: Sequence[tuple[str, str]], line: float, size: float) -> None:
-    """Write rows of a name and a value at spacing ``line``, a share of the panel's height; "–" for no number."""
+def write_beside(axes: Axes, rows: Sequence[tuple[str, str | None]], line: float, size: float) -> None:
+    """Write rows of a name and a value at spacing ``line``, a share of the panel's height; "–" for None."""
     axes.axis("off")
     for row, (what, value) in enumerate(rows):
-        text_value = value if not re.search(r"\bnan\b", value) else "–"
-        for x, text, side in ((0.0, what, "left"), (1.0, text_value, "right")):
+        for x, text, side in ((0.0, what, "left"), (1.0, "–" if value is None else value, "right")):
             axes.text(x, 1.0 - line * row, text, fontsize=size, ha=side, va="top", transform=axes.transAxes)
 
 
-def label(name: str, place: int) -> str:
-    """Return a name as a figure can show it, or its place in the tables where the font lacks its characters."""
+def number(value: float, form: str, unit: str = "") -> str | None:
+    """Write a number by a format; None for what is not finite."""
+    return f"{value:{form}}{unit}" if np.isfinite(value) else None
+
+
+def with_interval(value: float, half: float, digits: int, unit: str = "") -> str | None:
+    """Write a value with the half-width of its interval; None where either is no number."""
+    return f"{value:.{digits}f} ± {half:.2f}{unit}" if np.isfinite([value, half]).all() else None
+
+
+def printable_name(name: str, row: int) -> str:
+    """Return a name as Matplotlib can draw it; ``#row+1``, its place in the tables, if the font lacks a character."""
     if not all(character.isprintable() and _font().get_char_index(ord(character)) for character in name):
-        return f"#{place + 1}"
+        return f"#{row + 1}"
     return name if len(name) <= LONGEST_LABEL else name[: LONGEST_LABEL - 1] + "…"
 
 

@@ -11,8 +11,8 @@ from scipy.spatial import cKDTree
 
 from processor.language.messages import Message, text
 from processor.model import Floats, Ints
-from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS, colour_limit
+from processor.store.json_values import json_ready
 
 MOST_POINTS = 60_000  # about 1.4 MB of the page
 LEAST_POINTS, SAMPLE = 20, 2_000  # that the spacing is estimated from
@@ -92,7 +92,7 @@ def surface_view_data(
         "regions": [_heading(region) for region in regions] if region_of is not None else [],
         "places": places,
     }
-    made: dict[str, Any] = plain(data)
+    made: dict[str, Any] = json_ready(data)
     return made
 
 

@@ -8,13 +8,13 @@ import io
 import itertools
 import math
 import unicodedata
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from processor.language.messages import Message, Text, label, messages, text
+from processor.language.messages import Message, Text, label, messages, printable, text
 from processor.model import Checked, Reason, StepRun
 
 NAN = float("nan")
@@ -67,10 +67,15 @@ FORMULA = ("=", "+", "-", "@", "＝", "＋", "－", "＠")  # first characters o
 
 def csv_text(table: Table) -> str:
     """Write a table as CSV; a leading apostrophe protects text that a spreadsheet would execute as a formula."""
+    return csv_of_rows(table.columns, table.rows)
+
+
+def csv_of_rows(columns: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
+    """Write columns and rows as CSV; see :func:`csv_text`."""
     out = io.StringIO()
     writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(table.columns)
-    writer.writerows([csv_cell(cell) for cell in row] for row in table.rows)
+    writer.writerow(columns)
+    writer.writerows([csv_cell(cell) for cell in row] for row in rows)
     return out.getvalue()
 
 
@@ -90,7 +95,7 @@ def shown(cell: Any) -> str:
         cell = messages("en").text(cell)
     if isinstance(cell, float | np.floating):
         return "–" if not math.isfinite(cell) else f"{cell:.3f}"
-    return "".join(character if character.isprintable() else "\N{REPLACEMENT CHARACTER}" for character in str(cell))
+    return printable(str(cell))
 
 
 def plain_text(table: Table, most: int = 40) -> str:

@@ -38,7 +38,7 @@ def read_mesh(path: Path) -> tuple[Floats, Ints]:
 def _read_ply_mesh(path: Path) -> tuple[Floats, Ints]:
     from plyfile import PlyData
 
-    ply.check_header(path)
+    ply.read_header(path)
     with parsing(path, "PLY mesh"):
         data = PlyData.read(str(path), known_list_len={})
         vertex = data["vertex"].data

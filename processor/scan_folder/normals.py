@@ -56,7 +56,7 @@ def read(path: Path, core: Floats, origin: Floats, tolerance: float) -> Floats:
 def _from_ply(path: Path) -> tuple[Floats | None, Floats]:
     from plyfile import PlyData
 
-    ply.check_header(path)
+    ply.read_header(path)
     with parsing(path, "PLY"):
         data: Any = PlyData.read(str(path))["vertex"].data
     return _by_name(path, data.dtype.names, lambda name: np.asarray(data[name], np.float64))

@@ -36,6 +36,12 @@ def replacing(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
+def replace_text(path: Path, text: str) -> None:
+    """Write a text file whole, or leave it as it was. Raises InputError if it cannot be written."""
+    with replacing(path) as temporary:
+        temporary.write_text(text, "utf-8", newline="")
+
+
 def sync(path: Path) -> None:
     """Wait until a file or folder is written to the disk."""
     handle = os.open(path, os.O_RDONLY)

@@ -3,9 +3,10 @@
 It has the form of ISO 15530-3, where a calibrated workpiece is measured repeatedly under the conditions of use. Here
 the scene made by the generator is the workpiece and its truth the calibration, so u_cal = 0 except for rounding. For
 each quantity u_p is the standard deviation of all errors, b their mean, and u_b the standard uncertainty of b from the
-scatter between scenes. As results are not corrected by b, U = k sqrt(u_cal^2 + u_p^2 + u_b^2) + |b| with k = 2. The
-standard's u_w, for differences of workpieces in material and make, is not included: recipes "as built" vary the make,
-and are separate rows.
+scatter between scenes. As results are not corrected by b, U = k sqrt(u_cal^2 + u_p^2 + u_b^2) + |b| with k = 2. With
+fewer than three scenes u_b is not known, and U uses u_p / sqrt(n) in its place, n the number of errors. The standard's
+u_w, for differences of workpieces in material and make, is not included: recipes "as built" vary the make, and are
+separate rows.
 """
 
 from __future__ import annotations
@@ -40,7 +41,8 @@ METHOD = text(
     "After ISO 15530-3 (uncertainty from repeated measurement of a calibrated workpiece): the simulated structure is "
     "the workpiece, its truth the calibration (u_cal = 0). u_p: standard deviation of all errors. b: their mean, u_b "
     "its standard uncertainty from the scatter between scenes. Results are not corrected by b, so U = k sqrt(u_cal^2 "
-    "+ u_p^2 + u_b^2) + |b| with k = 2. u_w (material and make of workpieces) is not included. Coverage: share of "
+    "+ u_p^2 + u_b^2) + |b| with k = 2. With fewer than three scenes u_b is not known; U then uses u_p / sqrt(n), n "
+    "the number of errors, in its place. u_w (material and make of workpieces) is not included. Coverage: share of "
     "errors within the 95 % intervals of the results. Efficiency: 1 / rms(error / least possible standard deviation); "
     "no unbiased estimator exceeds 1 (Cramer-Rao). Errors are those of balls without a flag, and of all key points of "
     "bridges."

@@ -35,7 +35,7 @@ from scipy import special, stats
 
 from processor.language.messages import Text, text
 from processor.model import Better, Word
-from processor.validation.aims import Badness, badness
+from processor.validation.badness import Badness, badness
 from processor.validation.history import Name, Row
 
 ALARM_RATE = 0.005  # of a night, for worse and for better each
@@ -265,7 +265,7 @@ def _paired(name: Name, pairs: Sequence[_Pair], figure: _Series, measure: Badnes
     count = len(means)
     if count < LEAST_PAIRS:
         return _Test(name, "paired", size, math.nan, cases=count)
-    margin = measure.margin + measure.share * float(np.sqrt(np.mean([before**2 for *_, before in pairs])))
+    margin = measure.margin + measure.margin_share * float(np.sqrt(np.mean([before**2 for *_, before in pairs])))
     spread = max(float(np.std(means, ddof=1)), LEAST_SPREAD)
     scales = [(spread, count - 1)]
     seeds, freedom = _between_seeds(figure, measure)

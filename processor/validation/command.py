@@ -6,10 +6,10 @@ import datetime
 import sys
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 from tqdm import tqdm
 
+from processor.language.messages import printable
 from processor.model import InputError, UsageError
 from processor.validation import matrix as matrices
 from processor.validation import night as nights
@@ -44,7 +44,7 @@ def run(
             bar.refresh()
             if cell is not None and outcome is not None and outcome.failed:
                 with bar.external_write_mode(sys.stderr):
-                    print(f"{cell.title}: failed: {_printable(outcome.failed)}", file=sys.stderr)
+                    print(f"{cell.title}: failed: {printable(outcome.failed)}", file=sys.stderr)
 
         return nights.run(wanted, out, night, runner, history, again, progress=progress, lang=lang)
 
@@ -68,7 +68,3 @@ def _night(night: str | None) -> str:
     night = night or datetime.datetime.now(datetime.timezone.utc).date().isoformat()
     nights.number_of(night)
     return night
-
-
-def _printable(text: Any) -> str:
-    return "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in text)

@@ -21,6 +21,7 @@ from typing import Any
 from processor import pipeline
 from processor.jobs.runner import locked
 from processor.model import UsageError
+from processor.results.names import RESULTS_JSON
 from processor.store.atomic_file import replacing
 from processor.validation import certificate, changes, coverage, junit, software, summary
 from processor.validation.cells import Cell, Outcome
@@ -155,7 +156,7 @@ def _keep(out: Path, night: str, cell: Cell, outcome: Outcome, code: str) -> Non
     folder = out / CELLS / night / cell.key
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "cell.json").unlink(missing_ok=True)
-    _write(folder / "results.json", (json.dumps(outcome.results, ensure_ascii=False) + "\n").encode())
+    _write(folder / RESULTS_JSON, (json.dumps(outcome.results, ensure_ascii=False) + "\n").encode())
     content = {"title": cell.title, "code": code, "seconds": outcome.seconds, "peak_mb": outcome.peak_mb}
     _write(folder / "cell.json", _json(content | cell.spec()).encode())  # last: it is there only with whole results
 
@@ -167,7 +168,7 @@ def _earlier(out: Path, night: str, cell: Cell, code: str) -> Outcome | None:
         content = json.loads((folder / "cell.json").read_text("utf-8"))
         if content["code"] != code:
             return None
-        results = json.loads((folder / "results.json").read_text("utf-8"))
+        results = json.loads((folder / RESULTS_JSON).read_text("utf-8"))
         return Outcome("", results, float(content["seconds"]), float(content["peak_mb"]))
     except (OSError, ValueError, LookupError, TypeError):
         return None

@@ -14,14 +14,15 @@ from typing import Any
 
 from processor.jobs import process, runner
 from processor.jobs.child import Lost
+from processor.jobs.exit_codes import WITH_RESULTS
 from processor.jobs.process import Cause, Ended
+from processor.results.names import RESULTS_JSON
 from processor.validation.cells import Cell, Origin, Outcome
 
 # Runs cells and yields each with its outcome as it comes; closing the generator stops those under way.
 Runner = Callable[[Sequence[Cell]], Generator[tuple[Cell, Outcome], None, None]]
 
 TIMEOUT_S = 3600.0
-WITH_RESULTS = (0, 1, 4)  # exit codes of processor run: done, done in part, an accuracy limit missed
 TAIL = 500  # characters of an error message
 
 
@@ -75,7 +76,7 @@ def _results(spec: dict[str, Any], folder: Path, command: Callable[..., Ended]) 
     if ran.cause is not Cause.EXIT or ran.code not in WITH_RESULTS:
         raise _FailedError(_reason("processor run", ran))
     try:
-        content: dict[str, Any] = json.loads((results / "results.json").read_text("utf-8"))
+        content: dict[str, Any] = json.loads((results / RESULTS_JSON).read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise _FailedError(f"processor run: ended with code {ran.code} and without results ({error})") from error
     return content

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import os
 import platform
 import subprocess
@@ -11,12 +10,12 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from processor.jobs.software import versions
+from processor.jobs.software import source_digest, versions
 
 PACKAGES = ("processor", "designgen")
 LIBRARIES = ("numpy", "scipy", "numba", "h5py", "cadquery", "cadquery-ocp")
 SOURCES = (".py", ".toml")
-UNIMPORTANT = ("report", "validation")  # of processor: no figure depends on them
+NOT_DIGESTED = ("report",)  # of processor: tables, figures and pages, which no figure of a night is read from
 GIT_S = 10
 
 
@@ -37,24 +36,9 @@ def present() -> Software:
     """Return the software installed here."""
     machine = {"python": platform.python_version(), "machine": platform.machine()}
     installed = machine | versions(("steel-scan-check", *LIBRARIES))
-    digest = hashlib.sha256(repr(sorted(installed.items())).encode())
-    for package in PACKAGES:
-        for path in _sources(package):
-            digest.update(path.name.encode())
-            digest.update(path.read_bytes())
+    sources = source_digest(PACKAGES, SOURCES, NOT_DIGESTED)
+    digest = hashlib.sha256(repr([*sorted(installed.items()), sources]).encode())
     return Software(digest.hexdigest()[:16], _commit(), installed)
-
-
-def _sources(package: str) -> list[Path]:
-    spec = importlib.util.find_spec(package)
-    if spec is None or not spec.submodule_search_locations:
-        return []
-    root = Path(spec.submodule_search_locations[0])
-    return sorted(
-        path
-        for path in root.rglob("*")
-        if path.suffix in SOURCES and path.relative_to(root).parts[0] not in UNIMPORTANT
-    )
 
 
 def _commit() -> str:

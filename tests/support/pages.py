@@ -3,8 +3,7 @@
 import re
 from html.parser import HTMLParser
 
-from processor.batch import figures as batch_figures
-from processor.batch import summary
+from processor.batch import summary, summary_values
 from processor.batch.job import Job
 from processor.batch.record import JobStatus, Record
 from processor.defects.result import DefectClass
@@ -150,7 +149,7 @@ def job(out, name):
 
 
 def indexed(out, lang, reasons=REASONS):
-    everything = dict.fromkeys(batch_figures.COLUMNS, 3)
+    everything = dict.fromkeys(summary_values.COLUMNS, 3)
     steps = dict(zip(("preassemble", "spheres", "stitch", "deviation", "defects"), map(str, Status), strict=True))
     done = [
         Record(f"扫描 {i}", "", JobStatus(status), figures={**everything, "verdict": verdict}, steps=steps)

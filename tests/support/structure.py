@@ -147,6 +147,7 @@ LAYERS = (
     STEPS,
     ("pipeline",),
     ("compare", "evaluation"),
+    ("results",),
     ("report",),
     ("api",),
     ("batch", "validation"),

@@ -23,8 +23,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from processor.batch import batch, finding, job, summary
-from processor.batch.figures import of_results
+from processor.batch import batch, find_inputs, job, summary
+from processor.batch.summary_values import summary_values
 from processor.cli import main as cli_main
 from processor.jobs import runner
 from processor.model import InputError, UsageError
@@ -92,7 +92,7 @@ def processes_of(mark):
 
 
 def found_in(root, out="out"):
-    found = finding.find(root, root / out)
+    found = find_inputs.find(root, root / out)
     return [one.name for one in found.inputs], found.left_out
 
 
@@ -118,6 +118,13 @@ def test_scans_beside_other_inputs_are_inputs_of_their_own(tmp_path):
     (tmp_path / "site/target.xyz").write_text("1 2 3\n")
     assert found_in(tmp_path)[0] == ["site/bridge", "site/target.xyz"]
     assert found_in(tmp_path / "site/bridge")[0] == ["scan.xyz"]
+
+
+def test_tables_beside_scans_are_no_inputs(tmp_path):
+    (tmp_path / "scan.xyz").write_text("1 2 3\n")
+    for name in ("control.csv", "picks.csv", "deviation.csv", "index.csv"):
+        (tmp_path / name).write_text("1,1000,2000,3000\n2,1000,2500,3000\n")
+    assert found_in(tmp_path) == (["scan.xyz"], {})
 
 
 def test_a_root_that_is_a_scan_folder_is_one_input(tmp_path):
@@ -607,7 +614,7 @@ def test_figures_of_all_steps():
         },
         "checks": [{"passed": True}, {"passed": False}],
     }
-    assert of_results(results) == {
+    assert summary_values(results) == {
         "steps": "preassemble, spheres (weak), stitch, deviation, defects",
         "verdict": "indeterminate",
         "joints_pass": 2,
@@ -628,9 +635,9 @@ def test_figures_of_all_steps():
         "checks_missed": 1,
     }
     moved = [{"flag": "ok", "movement": {"verdict": v}} for v in ("pass", "fail", "no limit")]
-    assert of_results({"steps": {"spheres": {"balls": moved}}, "checks": []})["verdict"] == "fail"
+    assert summary_values({"steps": {"spheres": {"balls": moved}}, "checks": []})["verdict"] == "fail"
     chain = {"joints": [{"verdict": "pass"}], "chain_limits": [{"verdict": "fail"}]}
-    assert of_results({"steps": {"preassemble": chain}, "checks": []})["verdict"] == "fail"
+    assert summary_values({"steps": {"preassemble": chain}, "checks": []})["verdict"] == "fail"
 
 
 def test_names_that_are_no_text_are_shown_escaped():

@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from processor.batch import figures as batch_figures
+from processor.batch import summary_values
 from processor.report import all_figures, page
 from tests.support import pages
 from tests.support.batches import folder, run
@@ -24,7 +24,7 @@ def test_the_index_of_a_batch(tmp_path, lang, width):
     pages.indexed(tmp_path, lang)
     with opened(tmp_path / "index.html", width) as shown:
         assert shown.locator("html").get_attribute("lang") == lang
-        assert shown.locator("thead").first.locator("th").count() == 4 + len(batch_figures.COLUMNS) - 1
+        assert shown.locator("thead").first.locator("th").count() == 4 + len(summary_values.COLUMNS) - 1
         assert fits(shown)
 
 

@@ -1,7 +1,6 @@
 """Defects found on clouds made here: plates seen from stations, their damage and their truth in closed form."""
 
 import dataclasses
-import json
 
 import numpy as np
 import pytest
@@ -22,9 +21,9 @@ from processor.defects import step as defects_step
 from processor.defects.measures import thickness_at
 from processor.geometry import mesh_distance, rigid
 from processor.model import InputError, Scan, Scene, StructureDesign, UsageError
-from processor.pipeline import as_json
 from processor.report.defects import figures, section
-from processor.report.results_json import plain
+from processor.results.fields_to_json import as_object
+from processor.store.json_values import json_ready
 
 SIDE, THICK, GAP = 600.0, 12.0, 300.0
 BOX_FACES = np.array(
@@ -295,7 +294,7 @@ def test_the_papers_chain_finds_a_dent_and_is_seeded():
 
 def test_what_is_written():
     result = defects_step.run(scene_of(3, bump(3.0, 90.0, (250.0, 300.0))), defects_step.Params())
-    written = json.loads(as_json(plain(section.REPORT.written(result))))
+    written = json_ready(as_object(result))
     (one,) = written["defects"]
     keys = {"id", "class", "confidence", "component", "centre", "area_mm2", "depth_max", "depth_ci95", "volume_mm3"}
     assert keys <= set(one)

@@ -31,8 +31,9 @@ from processor.model import (
     UsageError,
 )
 from processor.pipeline import Execution
-from processor.report import record_json, results_folder, results_json
+from processor.report import write_results
 from processor.report.deviation import figures, section
+from processor.results import fields_to_json, to_json
 from tests.support.meshes import bracket
 
 FAR = np.array([5.0e8, 3.2e9, 1.0e5])  # mm
@@ -233,7 +234,7 @@ def test_after_a_stitch_that_failed_later_steps_do_not_run(tmp_path, monkeypatch
             assert run.result.status == "failed"
             assert codes(run.result) == ["pipeline.scans-not-placed"]
             assert run.result.reasons[0].values["step"] == "stitch"
-    results_folder.write(tmp_path / "out", found, ErrorReport())
+    write_results.write_results(tmp_path / "out", found, ErrorReport())
     written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]
     assert written["deviation"]["status"] == written["defects"]["status"] == "failed"
 
@@ -346,7 +347,7 @@ def test_a_pose_that_is_another_of_those_that_fit_is_not_held_against_the_truth(
 def test_the_least_and_the_greatest_have_their_intervals(tmp_path):
     scene, _ = scene_of(14, count=20_000)
     result = deviation_step.run(scene, deviation_step.Params())
-    written = record_json.as_object(result)
+    written = fields_to_json.as_object(result)
     known = np.isfinite(result.core.lod95)
     for end, row in (("min", np.argmin(result.core.distance[known])), ("max", np.argmax(result.core.distance[known]))):
         value, lod95 = result.core.distance[known][row], result.core.lod95[known][row]
@@ -378,7 +379,7 @@ def test_it_is_written_as_the_interface_says(tmp_path):
     found = pipeline.execute(tmp_path / "scene.h5", scene, jobs)
     report = ErrorReport(tuple(deviation_evaluation.check(scene, found.runs[0].result, truth)))
     assert isinstance(found, Execution)
-    results_folder.write(tmp_path / "out", found, report)
+    write_results.write_results(tmp_path / "out", found, report)
     written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["deviation"]
     for key in ("T_design_scan", "registration_error", "core_points", "significant_share", "min", "max"):
         assert written[key] is not None
@@ -393,7 +394,7 @@ def test_it_is_written_as_the_interface_says(tmp_path):
     np.testing.assert_allclose(data[known, 4], 1.96 * (spread + written["registration_error"]), rtol=1e-9)
     np.testing.assert_array_equal(data[:, 5], np.abs(data[:, 3]) > data[:, 4])
     assert (tmp_path / "out" / "figures" / "deviation-map.png").exists()
-    assert results_json.step_json(found.runs[0])["status"] == "ok"
+    assert to_json.step_json(found.runs[0])["status"] == "ok"
 
 
 @pytest.mark.slow

@@ -45,6 +45,12 @@ def test_ply_ascii_with_faces(tmp_path):
     assert scan.intensity.tolist() == [9, 8, 7]
 
 
+def test_ply_with_a_property_after_a_list_in_later_elements(tmp_path):
+    more = "element face 2\nproperty list uchar double w\nproperty uchar flag\n"
+    content = ply_header("binary_little_endian", "double", more) + POINTS.astype("<f8").tobytes() + bytes(4)
+    assert np.array_equal(one(put(tmp_path / "a.ply", content)).points, POINTS)
+
+
 def test_far_points_keep_their_precision(tmp_path):
     far = np.array([[500_123.4567, 4_400_321.7654, 12.25], [500_999.0, 4_399_000.5, 14.5]])
     content = ply_header("binary_little_endian", "double", count=2) + far.astype("<f8").tobytes()

@@ -24,8 +24,9 @@ from processor.model import (
 )
 from processor.pipeline import Execution
 from processor.preassembly.result import Deviations, Result
-from processor.report import all_figures, all_tables, page, results_folder, results_json
+from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
+from processor.results import to_json
 from processor.space_frame import step as space_frame_step
 from processor.store import store
 from tests.support.ball_results import balls
@@ -72,7 +73,7 @@ def strict(text):
 
 
 def test_results_json_has_the_names_that_scripts_rely_on():
-    made = results_json.results_json(of_bridge(), ErrorReport())
+    made = to_json.results_json(of_bridge(), ErrorReport())
     found = strict(json.dumps(made, allow_nan=False))
     assert (found["format"], found["format_version"], found["checks"]) == ("processor-results", "1.0", [])
     step = found["steps"]["preassemble"]
@@ -97,7 +98,7 @@ def test_results_json_has_the_names_that_scripts_rely_on():
 
 def test_results_json_of_balls():
     execution, report = of_frame()
-    found = strict(json.dumps(results_json.results_json(execution, report), allow_nan=False))
+    found = strict(json.dumps(to_json.results_json(execution, report), allow_nan=False))
     ok, _, missing = found["steps"]["spheres"]["balls"]
     assert {"id", "centre", "radius", "lowest", "covariance", "points", "visible_fraction", "evidence", "flag"} <= set(
         ok
@@ -293,9 +294,9 @@ def contents(folder):
 
 def test_earlier_results_are_replaced_as_a_whole(tmp_path):
     out = tmp_path / "deep" / "out"
-    results_folder.write(out, *of_frame())
+    write_results.write_results(out, *of_frame())
     assert "balls.csv" in contents(out)
-    results_folder.write(out, of_bridge(), ErrorReport())
+    write_results.write_results(out, of_bridge(), ErrorReport())
     found = contents(out)
     assert "balls.csv" not in found
     assert {"results.h5", "results.json", "report.html", "gaps.csv", "figures/bridge.png"} <= set(found)
@@ -305,7 +306,7 @@ def test_earlier_results_are_replaced_as_a_whole(tmp_path):
 @pytest.mark.parametrize("where", ["page", "move"])
 def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
     out = tmp_path / "out"
-    results_folder.write(out, *of_frame())
+    write_results.write_results(out, *of_frame())
     before = contents(tmp_path)
     if where == "page":
         monkeypatch.setattr(page, "html", lambda *_: (_ for _ in ()).throw(OSError(28, "No space left on device")))
@@ -319,7 +320,7 @@ def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
 
         monkeypatch.setattr(os, "replace", failing)
     with pytest.raises(InputError, match=r"cannot be written \(No space left"):
-        results_folder.write(out, of_bridge(), ErrorReport())
+        write_results.write_results(out, of_bridge(), ErrorReport())
     monkeypatch.undo()
     assert contents(tmp_path) == before
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
@@ -328,22 +329,22 @@ def test_a_failure_leaves_the_earlier_results(tmp_path, monkeypatch, where):
 def test_a_folder_with_anything_else_in_it_is_refused(tmp_path):
     source, out = tmp_path / "b.h5", tmp_path / "out"
     source.touch()
-    results_folder.check_output(out, source)
+    write_results.check_output(out, source)
     out.mkdir()
-    results_folder.check_output(out, source)
-    results_folder.write(out, *of_frame())
-    results_folder.check_output(out, source)
+    write_results.check_output(out, source)
+    write_results.write_results(out, *of_frame())
+    write_results.check_output(out, source)
     (out / "my-notes.txt").touch()
     with pytest.raises(UsageError, match=r"my-notes\.txt"):
-        results_folder.check_output(out, source)
+        write_results.check_output(out, source)
     (out / "my-notes.txt").unlink()
     with pytest.raises(UsageError, match="holds the input"):
-        results_folder.check_output(out, out / "results.h5")
+        write_results.check_output(out, out / "results.h5")
     with pytest.raises(UsageError, match="is a file"):
-        results_folder.check_output(source, source)
+        write_results.check_output(source, source)
     (out / "results.json").unlink()
     with pytest.raises(UsageError, match="no earlier results"):
-        results_folder.check_output(out, source)
+        write_results.check_output(out, source)
 
 
 @pytest.mark.parametrize("made", [assembled(), balls()], ids=["preassemble", "spheres"])

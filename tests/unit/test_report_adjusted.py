@@ -16,10 +16,11 @@ from processor.model import Status, StepRun, Verdict
 from processor.pipeline import Execution
 from processor.preassembly.result import Deviations
 from processor.preassembly.verdicts import joint_measures
-from processor.report import all_figures, all_tables, page, results_json
+from processor.report import all_figures, all_tables, page
 from processor.report import table as report_table
 from processor.report.preassembly import joint_figures, residual_map
 from processor.report.style import rounded
+from processor.results import to_json
 from tests.support.bridge_results import (
     OWN,
     PROVENANCE,
@@ -52,7 +53,7 @@ def number(text):
 
 def test_what_to_do_holds_the_numbers_of_results_json():
     execution = of_bridge()
-    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     on_page = Page(rendered(execution)).tables["Joints: what to do, method adjustment"][2:]
     rows = of_file(execution, "what-to-do")
     assert [row["joint"] for row in rows] == ["J1", "J2"]
@@ -79,7 +80,7 @@ def test_what_to_do_holds_the_numbers_of_results_json():
 
 def test_limits_say_clause_and_whether_they_were_verified():
     execution = of_bridge()
-    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     rows = of_file(execution, "limits")
     wanted = [limit for joint in step["joint_measures"] for limit in joint["limits"]]
     assert len(rows) == len(wanted) == 4
@@ -94,7 +95,7 @@ def test_limits_say_clause_and_whether_they_were_verified():
 
 def test_limits_of_the_chain_stand_beside_those_of_joints():
     execution = of_bridge()
-    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     (chain,) = step["chain_limits"]
     (limit,) = chain["limits"]
     (row,) = of_file(execution, "limits-chain")
@@ -120,7 +121,7 @@ def test_limits_of_the_chain_stand_beside_those_of_joints():
 
 def test_gaps_have_intervals_in_the_joints_axes_too():
     execution = of_bridge()
-    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     rows = of_file(execution, "gaps")
     assert list(rows[0])[:8] == ["joint", "point", "dx_mm", "dy_mm", "dz_mm", "ci95_dx_mm", "ci95_dy_mm", "ci95_dz_mm"]
     for j, joint in enumerate(step["joint_measures"]):

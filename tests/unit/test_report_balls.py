@@ -19,11 +19,12 @@ import pytest
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import Scan, Scene, Stations, StepRun, Verdict, reason
 from processor.pipeline import Execution
-from processor.report import all_figures, all_tables, page, results_folder, results_json
+from processor.report import all_figures, all_tables, page, write_results
 from processor.report import table as report_table
 from processor.report.space_frame import close_ups, dxf
 from processor.report.space_frame import figures as space_frame_figures
 from processor.report.space_frame import tables as space_frame_tables
+from processor.results import to_json
 from processor.space_frame.result import (
     ControlDeviations,
     Result,
@@ -98,7 +99,7 @@ def test_a_node_that_did_not_move_has_no_direction_but_a_verdict():
 
 
 def written(result):
-    made = results_json.results_json(*of_frame(result))
+    made = to_json.results_json(*of_frame(result))
     return json.loads(json.dumps(made, allow_nan=False))["steps"]["spheres"]
 
 
@@ -141,7 +142,7 @@ def test_results_json_of_a_whole_frame():
 def test_results_json_holds_only_what_there_is():
     paper = balls()
     execution = Execution(scene(whole()), (StepRun("spheres", "ransac", "{}", paper),), PROVENANCE)
-    step = results_json.results_json(execution, ErrorReport())["steps"]["spheres"]
+    step = to_json.results_json(execution, ErrorReport())["steps"]["spheres"]
     assert set(step) == {"status", "method", "reasons", "balls"}
     assert "size" not in step["balls"][0]
     blind = written(without_design(whole()))
@@ -280,13 +281,13 @@ def test_a_drawing_is_the_same_bytes_in_another_process_and_holds_no_names():
 
 
 def test_starting_the_program_loads_no_drawing_library():
-    code = "import sys, processor.cli.main, processor.report.results_folder; assert 'ezdxf' not in sys.modules"
+    code = "import sys, processor.cli.main, processor.report.write_results; assert 'ezdxf' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
     execution, report = of_frame()
-    results_folder.write(tmp_path / "out", execution, report)
+    write_results.write_results(tmp_path / "out", execution, report)
     found = {path.name for path in (tmp_path / "out").iterdir()}
     assert {
         "nodes.dxf",
@@ -297,8 +298,8 @@ def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
         "tubes.csv",
         "stations.csv",
     } <= found
-    results_folder.check_output(tmp_path / "out", tmp_path / "b.h5")
-    results_folder.write(
+    write_results.check_output(tmp_path / "out", tmp_path / "b.h5")
+    write_results.write_results(
         tmp_path / "out", Execution(execution.scene, (StepRun("spheres", "ransac", "{}", balls()),), PROVENANCE), report
     )
     assert not {"nodes.dxf", "lowest.csv", "nodes.csv"} & {path.name for path in (tmp_path / "out").iterdir()}

@@ -6,7 +6,8 @@ import io
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report import all_figures, page, results_json
+from processor.report import all_figures, page
+from processor.results import to_json
 from tests.support.ball_results import of_frame
 from tests.support.bridge_results import of_bridge
 from tests.support.browser import opened, picture, read_over
@@ -59,7 +60,7 @@ def test_balls_in_space_react_and_their_table_holds_the_results(tmp_path):
     execution, report = of_frame()
     path = tmp_path / "r.html"
     path.write_text(page.html(execution, report, all_figures.draw_figures(execution, report)), "utf-8")
-    step = results_json.results_json(execution, report)["steps"]["spheres"]
+    step = to_json.results_json(execution, report)["steps"]["spheres"]
     with opened(path) as shown:
         first = picture(shown)
         shown.locator("canvas.space").focus()
@@ -78,7 +79,7 @@ def test_tables_hold_the_results_and_can_be_copied(tmp_path):
     execution = of_bridge()
     path = tmp_path / "r.html"
     path.write_text(rendered(execution), "utf-8")
-    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     with opened(path) as shown:
         shown.context.grant_permissions(["clipboard-read"])
         rows = {row[0]: row[1:] for row in cells_below(shown, "Splicing error, method adjustment (mm)")}

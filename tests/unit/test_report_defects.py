@@ -14,9 +14,9 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.report import page, surface_view
 from processor.report.defects import figures, live_data
-from processor.report.record_json import as_object
-from processor.report.results_json import plain
+from processor.results.fields_to_json import as_object
 from processor.store import store
+from processor.store.json_values import json_ready
 from tests.support import step_results
 from tests.support.report_pages import Page
 
@@ -117,7 +117,7 @@ def test_results_are_stored_and_read_again(tmp_path):
     )
     store.write_results(tmp_path / "r.h5", [StepRun("defects", "default", "{}", result)], {})
     (back,) = store.read_results(tmp_path / "r.h5", {"defects": Result})
-    assert plain(as_object(back.result)) == plain(as_object(result))
+    assert json_ready(as_object(back.result)) == json_ready(as_object(result))
     for name in ("pictures", "surface"):
         np.testing.assert_equal(dataclasses.asdict(back.result)[name], dataclasses.asdict(result)[name])
     first, second, *_ = as_object(result)["defects"]

@@ -9,8 +9,9 @@ import subprocess
 import pytest
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.report import page_script, results_json
+from processor.report import page_script
 from processor.report.preassembly import live_data as preassembly_data
+from processor.results import to_json
 from tests.support.bridge_results import of_bridge
 from tests.support.report_pages import BAD, Page, rendered
 
@@ -20,7 +21,7 @@ def test_the_page_carries_what_its_script_draws():
     kinds = Page(rendered(execution)).scripts
     assert [kind for kind, _ in kinds] == ["application/json", ""]
     data = json.loads(kinds[0][1])["steps"]["preassemble"]
-    step = results_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
+    step = to_json.results_json(execution, ErrorReport())["steps"]["preassemble"]
     for drawn, joint in zip(data["joints"], step["joints"], strict=True):
         assert drawn["gap"] == [pytest.approx(joint["points"][key]["gap"]) for key in data["keys"]]
         assert drawn["ci95"] == [pytest.approx(joint["points"][key]["ci95"]) for key in data["keys"]]

@@ -9,8 +9,8 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.geometry import rigid
 from processor.model import Scan, StepRun
 from processor.report import all_figures, page
-from processor.report.record_json import as_object
 from processor.report.stitching import live_data
+from processor.results.fields_to_json import as_object
 from processor.stitching.result import ControlPoints, ControlSightings
 from processor.store import store
 from tests.support import step_results

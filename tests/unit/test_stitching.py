@@ -12,7 +12,7 @@ from processor import pipeline
 from processor.evaluation import stitching as stitching_evaluation
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, Scan, Scene, StationTruth, Truth, UsageError
-from processor.report import results_folder
+from processor.report import write_results
 from processor.scan_folder import folder
 from processor.stitching import step as stitching_step
 from processor.stitching.result import ControlPoints, Scans
@@ -229,7 +229,7 @@ def test_a_run_writes_all_reports(room, tmp_path):
     store.write_scene(path, Scene("room", "structure", scans, units="mm", units_reason="made so"), None, {})
     scene = pipeline.read(path, None)
     execution = pipeline.execute(path, scene, pipeline.plan(("stitch",), (), {}, None))
-    results_folder.write(tmp_path / "out", execution, ErrorReport())
+    write_results.write_results(tmp_path / "out", execution, ErrorReport())
     written = json.loads((tmp_path / "out" / "results.json").read_text())["steps"]["stitch"]
     assert written["reference"] == "S1"
     assert [row["status"] for row in written["scans"]] == ["ok"] * 4

@@ -14,7 +14,7 @@ from scipy.stats import chi2
 from processor.cli import main
 from processor.geometry import rigid
 from processor.model import Control, InputError, reason
-from processor.report.record_json import as_object
+from processor.results.fields_to_json import as_object
 from processor.stitching import step as stitching_step
 from processor.stitching.fine import control_points
 from tests.support.picked_networks import network

@@ -52,6 +52,24 @@ def test_a_pose_by_a_single_overlap_is_refuted_by_free_space():
     np.testing.assert_allclose(network.refuted(alone, 3, 0), [0.0, 2.02 / 50.0, 3.1 / 50.0])
 
 
+def test_a_motion_that_was_applied_is_no_rival_of_the_pose_it_gave(monkeypatch):
+    """Every motion seems better than the pose at hand: the rivals in the result are those of the last poses."""
+    poses = []
+
+    def moves(placed, coarse, reference):
+        poses.append(placed.T.copy())
+        return [network.Move(scans=[1], M=rigid.transform(np.eye(3), np.array([100.0, 0.0, 0.0])), ratio=2.0)]
+
+    scored = pairwise.ScoredPose(np.eye(4), 600.0, 0.0, 0.4)
+    monkeypatch.setattr(network.Network, "score_beside", lambda self, i, j, pose: scored)
+    monkeypatch.setattr(pairwise, "same", lambda T, S, side, b: np.array_equal(T, S))
+    monkeypatch.setattr(network, "_moves", moves)
+    scans = [SimpleNamespace(side_mm=700.0)] * 2
+    placed = network.place(scans, {(0, 1): [pairwise.ScoredPose(np.eye(4), 1.0, 0.0, 0.4)]}, 0)
+    np.testing.assert_array_equal(poses[-1], placed.T)
+    np.testing.assert_allclose((placed.T_rival[1] @ rigid.invert(placed.T[1]))[:3, 3], [100.0, 0.0, 0.0])
+
+
 @pytest.mark.parametrize(("against", "ambiguous"), [(0.05, True), (3.0, False)])
 def test_scans_beyond_a_rival_pose_are_ambiguous_together(monkeypatch, against, ambiguous):
     """Free space decides between two bays, if it contradicts one of them; else all that lies beyond is ambiguous."""

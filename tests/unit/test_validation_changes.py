@@ -15,7 +15,7 @@ from processor.model import Better, FrameDesign, FrameTruth, Scan, Scene, Truth
 from processor.space_frame import step as space_frame_step
 from processor.space_frame.spheres import isolated
 from processor.validation import changes
-from processor.validation.aims import badness
+from processor.validation.badness import badness
 from processor.validation.history import Row
 from tests.support import validation_nights
 from tests.support.metrics import described

@@ -19,9 +19,11 @@ from processor.report.style import (
     LEAST_SHOWN_MM,
     MARKERS,
     CaptionedPngs,
-    label,
+    number,
     pdf,
     png,
+    printable_name,
+    with_interval,
     write_beside,
 )
 
@@ -91,8 +93,8 @@ def _maps(result: Result) -> tuple[Message, bytes]:
 
 def _map(axes: Axes, figure: Figure, result: Result, k: int) -> None:
     defects, picture = result.defects, result.pictures[k]
-    depth = f"{defects.depth_max[k]:.2f} ± {defects.depth_ci95[k]:.2f} mm"
-    name = label(defects.component[k], k)
+    depth = with_interval(defects.depth_max[k], defects.depth_ci95[k], 2, " mm")
+    name = printable_name(defects.component[k], k)
     axes.set_title(f"{defects.id[k]}: {defects.defect_class[k]}, {depth}\n{name}", fontsize=9)
     if not picture.deviation.size:
         axes.axis("off")
@@ -118,23 +120,23 @@ def _map(axes: Axes, figure: Figure, result: Result, k: int) -> None:
     bar.set_label("mm", fontsize=8)
 
 
-def _measures(result: Result, k: int) -> list[tuple[str, str]]:
+def _measures(result: Result, k: int) -> list[tuple[str, str | None]]:
     """Return the measures of a defect as names and values."""
     defects = result.defects
     length, width = defects.extent[k].tolist()
-    rows = [
+    rows: list[tuple[str, str | None]] = [
         ("class", f"{defects.defect_class[k]}, {defects.confidence[k]:.2f}"),
         ("otherwise", str(defects.otherwise[k])),
-        ("component", label(defects.component[k], k)),
-        ("area", f"{defects.area_mm2[k]:.0f} mm2"),
+        ("component", printable_name(defects.component[k], k)),
+        ("area", number(defects.area_mm2[k], ".0f", " mm2")),
         ("length, width", f"{length:.0f}, {width:.0f} mm"),
-        ("depth, greatest", f"{defects.depth_max[k]:.2f} ± {defects.depth_ci95[k]:.2f} mm"),
-        ("depth, mean", f"{defects.depth_mean[k]:.2f} mm"),
+        ("depth, greatest", with_interval(defects.depth_max[k], defects.depth_ci95[k], 2, " mm")),
+        ("depth, mean", number(defects.depth_mean[k], ".2f", " mm")),
         ("volume", f"{defects.volume_mm3[k]:.0f} ± {defects.volume_ci95[k]:.0f} mm3"),
-        ("from the face's border", f"{defects.edge_distance[k]:.0f} mm"),
-        ("curvature", f"{defects.curvature_per_m[k]:.2f} 1/m"),
+        ("from the face's border", number(defects.edge_distance[k], ".0f", " mm")),
+        ("curvature", number(defects.curvature_per_m[k], ".2f", " 1/m")),
         ("by chance on 100 m2", f"{defects.chance[k]:.1g}" + (", doubtful" if defects.doubtful[k] else "")),
-        ("LOD95 of its depth", f"{defects.lod95[k]:.2f} mm"),
+        ("LOD95 of its depth", number(defects.lod95[k], ".2f", " mm")),
         *((f"centre {axis}", f"{at:.1f} mm") for axis, at in zip("xyz", defects.centre[k].tolist(), strict=True)),
     ]
     remark = messages("en").text(defects.reasons[k])
@@ -161,7 +163,7 @@ def _draw_curves(axes: Axes, result: Result, bent: Sequence[int]) -> None:
             linestyle=DASHES[style],
             marker=MARKERS[style],
             markersize=3,
-            label=f"{result.defects.id[k]}: {label(result.defects.component[k], k)}",
+            label=f"{result.defects.id[k]}: {printable_name(result.defects.component[k], k)}",
         )
         if np.isfinite(curve.ci95).all():
             low, high = curve.displacement - curve.ci95, curve.displacement + curve.ci95

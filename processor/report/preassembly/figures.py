@@ -23,8 +23,8 @@ from processor.report.style import (
     LEAST_SHOWN_MM,
     MARKERS,
     CaptionedPngs,
-    label,
     png,
+    printable_name,
     rounded,
 )
 
@@ -73,8 +73,8 @@ def _bridge(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     for i, part in enumerate(scene.arch.parts):
         x, _, z = part.bottom_edge_left.T / 1e3
         middle = (x[len(x) // 2], z[len(z) // 2]) if len(x) else (0.0, 0.0)
-        _write(side, label(part.name, i), middle, -20)
-    labels = [label(name, j) for j, name in enumerate(joints.name)]
+        _write(side, printable_name(part.name, i), middle, -20)
+    labels = [printable_name(name, j) for j, name in enumerate(joints.name)]
     for j, name in enumerate(labels):
         x, _, z = scene.arch.joint_points[j].mean(axis=0) / 1e3
         size = np.abs(joints.gaps[j])
@@ -287,7 +287,7 @@ def _mark_joints(axes: Axes, scene: Scene, joints: Sequence[str]) -> None:
         chainage_m += float(np.linalg.norm(np.diff(part.bottom_edge_left, axis=0), axis=1).sum()) / 1000.0
         axes.axvline(chainage_m, color="0.4", linewidth=0.9, linestyle=(0, (1, 2)))
         axes.annotate(
-            label(joints[j], j),
+            printable_name(joints[j], j),
             (chainage_m, 1.0),
             xycoords=("data", "axes fraction"),
             xytext=(3, -11),

@@ -15,7 +15,7 @@ from processor.language.messages import Message, text
 from processor.model import KEY_POINTS, NORMAL_95, Floats, StepRun
 from processor.preassembly.result import Result
 from processor.preassembly.verdicts.joint_measures import RAYLEIGH_95, Measures
-from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, label, png, rounded
+from processor.report.style import BEHIND_TEXT, COLOURS, LEAST_SHOWN_MM, MARKERS, png, printable_name, rounded
 
 MOST_JOINTS = 24
 ARROW_SHARE = 0.3  # of the section: how long the longest arrow is drawn
@@ -40,7 +40,7 @@ def gap_vectors(result: Result) -> tuple[Message, bytes]:
         else:
             axes.set(xticks=[], yticks=[])
             axes.text(0.5, 0.5, "no gaps computed", ha="center", transform=axes.transAxes, fontsize=9)
-        axes.set_title(f"{label(result.joints.name[j], j)}: {result.joints.verdict[j]}", fontsize=11)
+        axes.set_title(f"{printable_name(result.joints.name[j], j)}: {result.joints.verdict[j]}", fontsize=11)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     handles = [
@@ -82,7 +82,7 @@ def by_axis(runs: Sequence[StepRun]) -> tuple[Message, bytes]:
         for line in range(1, len(joints)):
             axes.axvline(line - 0.5, color="0.8", linewidth=0.8)
         axes.set(ylabel=f"{name}, mm")
-    panels[2].set_xticks(np.arange(len(joints)), [label(joint, j) for j, joint in enumerate(joints)])
+    panels[2].set_xticks(np.arange(len(joints)), [printable_name(joint, j) for j, joint in enumerate(joints)])
     panels[2].set(xlabel="joint, P1 to P8 from left to right")
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=9)
     return text("Gaps by every method along each axis, right part minus left"), png(figure)

@@ -11,9 +11,9 @@ import numpy.typing as npt
 from processor.language.messages import text
 from processor.model import KEY_POINTS, Floats, Scene, StepRun
 from processor.preassembly.result import Residuals, Result
-from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS, colour_limit
 from processor.report.table import shown
+from processor.store.json_values import json_ready
 
 MOST_POINTS = 24_000  # of all parts: about 0.6 MB of the page
 MOST_ON_AN_EDGE = 80
@@ -60,7 +60,7 @@ def live_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
             "linear_max": np.round(trade.linear_max, 6),
         },
     }
-    made: dict[str, Any] = plain(view)
+    made: dict[str, Any] = json_ready(view)
     return made
 
 

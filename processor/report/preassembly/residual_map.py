@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from processor.language.messages import Message, text
 from processor.model import DesignPart, Floats, Scene
 from processor.preassembly.result import Residuals, Result
-from processor.report.style import DIVERGING, LEAST_SHOWN_MM, label, png
+from processor.report.style import DIVERGING, LEAST_SHOWN_MM, png, printable_name
 
 FACES = ("bottom", "right", "top", "left")
 MOST_PARTS = 24
@@ -125,7 +125,7 @@ def draw(scene: Scene, result: Result) -> tuple[Message, bytes] | None:
     for axes, (i, flat, values, x, y) in zip(panels, drawn, strict=False):
         _panel(axes, flat)
         mesh = axes.pcolormesh(x, y, np.ma.masked_invalid(values), cmap=DIVERGING, vmin=-limit, vmax=limit)
-        axes.set_title(label(names[i], i), fontsize=11)
+        axes.set_title(printable_name(names[i], i), fontsize=11)
     for axes in panels[len(shown) :]:
         axes.set_visible(False)
     bar = figure.colorbar(mesh, ax=panels.tolist(), location="bottom", shrink=0.6, aspect=40, extend="both", pad=0.02)

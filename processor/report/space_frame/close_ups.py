@@ -17,7 +17,7 @@ from processor.geometry import rigid
 from processor.language.messages import messages, text
 from processor.model import NORMAL_95, Floats, Scene
 from processor.report.space_frame.dxf import nominal_places
-from processor.report.style import COLOURS, CaptionedPngs, pdf, png, write_beside
+from processor.report.style import COLOURS, CaptionedPngs, number, pdf, png, with_interval, write_beside
 from processor.space_frame.points.scene_source import SceneSource, of_scene
 from processor.space_frame.result import Balls, Flag, Result
 from processor.store.streaming import StoredPoints, points_of
@@ -178,37 +178,34 @@ def _ball(result: Result, i: int, middle: Floats, nominal: Floats, points: Float
     return figure
 
 
-def _numbers(balls: Balls, i: int, nominal: Floats) -> list[tuple[str, str]]:
+def _numbers(balls: Balls, i: int, nominal: Floats) -> list[tuple[str, str | None]]:
     """Return names and values of a ball's figures; ``nominal`` (3,) is the design's place less the ball's."""
     sd = np.sqrt(np.where((variance := np.diag(balls.covariance[i])) >= 0.0, variance, np.nan))
     bound = balls.bound_sd[i]
-    rows = [("mm", "± 95 %")]
+    rows: list[tuple[str, str | None]] = [("mm", "± 95 %")]
     for k, axis in enumerate("xyz"):
-        rows.append((f"centre {axis}", _with(balls.centres[i, k], NORMAL_95 * sd[k], 1)))
+        rows.append((f"centre {axis}", with_interval(balls.centres[i, k], NORMAL_95 * sd[k], 1)))
     rows += [
-        ("radius", _with(balls.radii[i], NORMAL_95 * sd[3], 2)),
-        ("size in the catalogue", f"{balls.sizes[i]:g}"),
-        ("radius designed", f"{balls.nominal_radii[i]:g}"),
-        ("lowest point z", _with(balls.lowest[i, 2], NORMAL_95 * balls.lowest_sd[i], 2)),
+        ("radius", with_interval(balls.radii[i], NORMAL_95 * sd[3], 2)),
+        ("size in the catalogue", number(balls.sizes[i], "g")),
+        ("radius designed", number(balls.nominal_radii[i], "g")),
+        ("lowest point z", with_interval(balls.lowest[i, 2], NORMAL_95 * balls.lowest_sd[i], 2)),
     ]
     off = zip("xyz", (-nominal).tolist(), strict=True)
-    rows += [(f"off the design's place, {axis}", f"{value:.2f}") for axis, value in off]
+    rows += [(f"off the design's place, {axis}", number(value, ".2f")) for axis, value in off]
     rows += [
-        (f"least possible ±, {quantity}", f"{NORMAL_95 * bound[k]:.2f}") for k, quantity in ((2, "z"), (3, "radius"))
+        (f"least possible ±, {quantity}", number(NORMAL_95 * bound[k], ".2f"))
+        for k, quantity in ((2, "z"), (3, "radius"))
     ]
     rows += [
-        ("residuals, rms", f"{balls.rms[i]:.2f}"),
+        ("residuals, rms", number(balls.rms[i], ".2f")),
         ("points", f"{int(balls.points[i])}"),
-        ("visible, %", f"{100.0 * balls.visible_fraction[i]:.0f}"),
+        ("visible, %", number(100.0 * balls.visible_fraction[i], ".0f")),
         ("stations", f"{int(balls.stations[i])}"),
         ("axes of members", f"{int(balls.axes[i])}"),
         ("evidence", balls.evidence[i]),
     ]
     return rows
-
-
-def _with(value: float, half: float, digits: int) -> str:
-    return f"{value:.{digits}f} ± {half:.2f}"
 
 
 def _points(axes: Axes, points: Floats, across: tuple[int, int]) -> None:

@@ -9,9 +9,9 @@ import numpy as np
 
 from processor.language.messages import text
 from processor.model import NORMAL_95, Floats, Scene, StepRun
-from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS
 from processor.space_frame.result import Flag, Result
+from processor.store.json_values import json_ready
 
 FLAGS = (Flag.OK, Flag.LOW_CONFIDENCE, Flag.WRONG_SIZE)
 TONES = ("#0072B2", "#D55E00", "#000000")  # of FLAGS
@@ -36,7 +36,7 @@ def live_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     empty = {"name": "", "edges": [], "points": [], "residual": []}
     parts: list[dict[str, Any]] = [{**empty, "text": text("balls: {flag}", flag=flag)} for flag in used]
     parts.append({**empty, "text": text("tubes"), "edges": [np.round(tube - origin, 1) for tube in tubes]})
-    data: dict[str, Any] = plain(
+    data: dict[str, Any] = json_ready(
         {
             "title": text("Balls in space"),
             "arrows": text("movements as arrows"),

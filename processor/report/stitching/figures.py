@@ -12,7 +12,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import Scene, Status, StepRun
 from processor.pipeline import Execution
-from processor.report.style import COLOURS, CaptionedPngs, label, png
+from processor.report.style import COLOURS, CaptionedPngs, png, printable_name
 from processor.stitching.result import Result, Scans
 
 PLAN, OVERLAP = "stitch-plan.png", "stitch-overlap.png"
@@ -74,7 +74,7 @@ def _draw_positions(axes: Axes, scans: Scans) -> None:
         if not np.isfinite(scans.position[i]).all():
             continue
         x, y = scans.position[i, :2].tolist()
-        names.setdefault((round(x, -2), round(y, -2)), []).append(label(name, i))
+        names.setdefault((round(x, -2), round(y, -2)), []).append(printable_name(name, i))
         ok = scans.status[i] == Status.OK
         axes.plot(1e-3 * x, 1e-3 * y, "o" if ok else "X", color=COLOURS[2] if ok else COLOURS[1], zorder=2)
     for (x, y), here in list(names.items())[:MOST_NAMED]:
@@ -92,7 +92,7 @@ def _overlap(result: Result) -> tuple[Message, bytes]:
     axes = figure.subplots()
     image = axes.imshow(share, vmin=0.0, vmax=100.0, cmap="Blues")
     figure.colorbar(image, ax=axes, label="overlap (%)")
-    ticks = [label(name, i) for i, name in enumerate(scans.name)]
+    ticks = [printable_name(name, i) for i, name in enumerate(scans.name)]
     if k <= MOST_NAMED:
         axes.set_xticks(range(k), ticks, rotation=90)
         axes.set_yticks(range(k), ticks)

@@ -12,10 +12,10 @@ from scipy.spatial import cKDTree
 from processor.geometry import parallel, rigid
 from processor.language.messages import text
 from processor.model import NORMAL_95, Floats, Scan, Scene, Status, StepRun
-from processor.report.results_json import plain
 from processor.report.style import DIVERGING_STOPS, colour_limit
 from processor.report.surface_view import spacing
 from processor.stitching.result import Result, Scans
+from processor.store.json_values import json_ready
 
 MOST_POINTS = 60_000  # of all scans: about 1.4 MB of the page
 MOST_SEARCHED = 400_000  # of each scan
@@ -53,7 +53,7 @@ def live_data(scene: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
         parts.append({"name": scan.name, "edges": [], "points": places, "residual": distances[k].round(3)})
         if np.isfinite(scans.position[i]).all():
             marks.append(_station(scans, i, k, origin))
-    data: dict[str, Any] = plain(
+    data: dict[str, Any] = json_ready(
         {
             "title": text("Scans in space"),
             "arrows": "",

@@ -75,14 +75,15 @@ def place(scans: list[ScanPatches], candidates: Pairs, reference: int) -> Coarse
         T[j] = pose
         network.placed.append(j)
     coarse = _rated(network, reference)
+    moves = _moves(network, coarse, reference)
     for _ in range(k):
-        moves = _moves(network, coarse, reference)
         better = max(moves, key=lambda move: move.ratio, default=None)
         if better is None or better.ratio <= 1.0:
-            return _with_moves(coarse, moves)
+            break
         for j in better.scans:
             T[j] = better.M @ T[j]
         coarse = _rated(network, reference)
+        moves = _moves(network, coarse, reference)
     return _with_moves(coarse, moves)
 
 

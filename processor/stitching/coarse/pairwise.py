@@ -9,9 +9,9 @@ import numpy as np
 
 from processor.geometry import rigid
 from processor.model import Floats
-from processor.stitching.coarse import face_index, rotations, translations
+from processor.stitching.coarse import candidate_rotations, candidate_translations, face_index
+from processor.stitching.coarse.candidate_translations import WeightedPatches
 from processor.stitching.coarse.face_index import FaceIndex
-from processor.stitching.coarse.translations import WeightedPatches
 from processor.stitching.planes.samples import sample
 from processor.stitching.planes.scan_planes import Cloud
 
@@ -105,16 +105,16 @@ def cube_side(clouds: list[Cloud]) -> float:
 
 def prepare(cloud: Cloud, side_mm: float) -> ScanPatches:
     """Sample and index the patches of a cloud."""
-    patches = translations.weighted(sample(cloud, side_mm))
+    patches = candidate_translations.weighted(sample(cloud, side_mm))
     fine = sample(cloud, FINE * side_mm)
     return ScanPatches(
         cloud=cloud,
         side_mm=side_mm,
         patches=patches,
-        voters=translations.thinned(patches),
+        voters=candidate_translations.thinned(patches),
         small=face_index.build(fine, SMALL * side_mm),
         large=face_index.build(fine, LARGE * side_mm),
-        modes=rotations.normal_modes(patches.patches.normals),
+        modes=candidate_rotations.normal_modes(patches.patches.normals),
     )
 
 
@@ -132,8 +132,8 @@ def candidate_poses(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, most: 
 def _search(a: ScanPatches, b: ScanPatches, most_tilt_rad: float, effort: Effort) -> list[ScoredPose]:
     """Vote, score roughly, refine, slide; returns the distinct poses, the best first."""
     voted: list[tuple[float, Floats]] = []
-    for R in rotations.candidate_rotations(a.modes, b.modes, most_tilt_rad):
-        shifts, votes = translations.candidate_translations(
+    for R in candidate_rotations.candidate_rotations(a.modes, b.modes, most_tilt_rad):
+        shifts, votes = candidate_translations.candidate_translations(
             a.voters, b.voters, R, a.side_mm, effort.peaks, effort.least_of_best
         )
         voted += [(float(v), rigid.transform(R, t)) for t, v in zip(shifts, votes, strict=True)]

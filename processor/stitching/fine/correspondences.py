@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
-from processor.stitching.coarse import rotations
+from processor.stitching.coarse import candidate_rotations
 from processor.stitching.planes import extraction, hashing
 from processor.stitching.planes.samples import facing
 from processor.stitching.planes.scan_planes import LIMIT_SIGMAS, Cloud
@@ -178,11 +178,11 @@ def _excess(weighted: Floats, count: Floats, piece: Ints, pieces: int) -> Floats
 
 def direction_class(normals: Floats) -> Ints:
     """Classify normals (n, 3) by direction: the structure's modes first, so that no class border runs through one."""
-    axes, _ = rotations.normal_modes(thinned(normals, MOST_NORMALS))
-    group = rotations.MOST_MODES + facing(normals)
+    axes, _ = candidate_rotations.normal_modes(thinned(normals, MOST_NORMALS))
+    group = candidate_rotations.MOST_MODES + facing(normals)
     if len(axes):
         cosine = normals @ axes.T
         nearest = np.argmax(cosine, axis=1)
-        near = np.take_along_axis(cosine, nearest[:, None], axis=1)[:, 0] > rotations.SEPARATION_COS
+        near = np.take_along_axis(cosine, nearest[:, None], axis=1)[:, 0] > candidate_rotations.SEPARATION_COS
         group[near] = nearest[near]
     return group

@@ -1,4 +1,4 @@
-"""The figures of one job's results in the summary."""
+"""The values of one job's results in the summary."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 from processor.model import Status
 
-Figures = dict[str, Any]
+SummaryValues = dict[str, Any]
 VERDICTS = ("fail", "indeterminate", "pass")  # the worst first
 COLUMNS = {
     "steps": "steps, with the status of those that did not end well",
@@ -33,29 +33,29 @@ COLUMNS = {
 }
 
 
-def of_results(results: Mapping[str, Any]) -> Figures:
-    """Return the figures of a results.json by the names of COLUMNS; absent are those of steps not run and of nulls."""
+def summary_values(results: Mapping[str, Any]) -> SummaryValues:
+    """Return the values of a results.json by the names of COLUMNS; absent are those of steps not run and of nulls."""
     steps: Mapping[str, Mapping[str, Any]] = results["steps"]
-    figures: Figures = {"steps": ", ".join(_with_status(*each) for each in step_status(results).items())}
+    values: SummaryValues = {"steps": ", ".join(_with_status(*each) for each in step_status(results).items())}
     verdicts: Counter[str] = Counter()
     if "preassemble" in steps:
-        verdicts += _add_preassembly(steps["preassemble"], figures)
+        verdicts += _add_preassembly(steps["preassemble"], values)
     if "spheres" in steps:
-        verdicts += _add_spheres(steps["spheres"], figures)
+        verdicts += _add_spheres(steps["spheres"], values)
     if "stitch" in steps:
         states = [scan.get("status") for scan in steps["stitch"].get("scans", [])]
-        figures |= {"scans_stitched": states.count("ok"), "scans_not_stitched": len(states) - states.count("ok")}
+        values |= {"scans_stitched": states.count("ok"), "scans_not_stitched": len(states) - states.count("ok")}
     if "deviation" in steps:
         keys = ("min", "max", "significant_share")
         names = ("deviation_min_mm", "deviation_max_mm", "deviation_significant_share")
-        figures |= {name: steps["deviation"].get(key) for name, key in zip(names, keys, strict=True)}
+        values |= {name: steps["deviation"].get(key) for name, key in zip(names, keys, strict=True)}
     if "defects" in steps:
-        figures["defects"] = len(steps["defects"].get("defects", []))
-    figures["verdict"] = next((verdict for verdict in VERDICTS if verdicts[verdict]), None)
+        values["defects"] = len(steps["defects"].get("defects", []))
+    values["verdict"] = next((verdict for verdict in VERDICTS if verdicts[verdict]), None)
     if results["checks"]:
         passed = sum(bool(check["passed"]) for check in results["checks"])
-        figures |= {"checks_passed": passed, "checks_missed": len(results["checks"]) - passed}
-    return {name: figures[name] for name in COLUMNS if figures.get(name) is not None}
+        values |= {"checks_passed": passed, "checks_missed": len(results["checks"]) - passed}
+    return {name: values[name] for name in COLUMNS if values.get(name) is not None}
 
 
 def step_status(results: Mapping[str, Any]) -> dict[str, str]:
@@ -67,19 +67,19 @@ def _with_status(name: str, status: str) -> str:
     return name if status == Status.OK else f"{name} ({status})"
 
 
-def _add_preassembly(step: Mapping[str, Any], figures: Figures) -> Counter[str]:
+def _add_preassembly(step: Mapping[str, Any], values: SummaryValues) -> Counter[str]:
     verdicts = Counter(str(joint.get("verdict")) for joint in step.get("joints", []) if joint.get("verdict"))
-    figures.update({f"joints_{name}": verdicts[name] for name in VERDICTS} if verdicts else {})
+    values.update({f"joints_{name}": verdicts[name] for name in VERDICTS} if verdicts else {})
     for error in ("splicing", "linear"):
         for statistic in ("mean", "max"):
-            figures[f"{error}_{statistic}_mm"] = step.get(f"{error}_error", {}).get(statistic)
+            values[f"{error}_{statistic}_mm"] = step.get(f"{error}_error", {}).get(statistic)
     return verdicts + _count(chain.get("verdict") for chain in step.get("chain_limits", []))
 
 
-def _add_spheres(step: Mapping[str, Any], figures: Figures) -> Counter[str]:
+def _add_spheres(step: Mapping[str, Any], values: SummaryValues) -> Counter[str]:
     flags = [ball.get("flag") for ball in step.get("balls", [])]
     present = len(flags) - flags.count("not-found")
-    figures |= {"balls_found": present, "balls_flagged": len(flags) - flags.count("ok")}
+    values |= {"balls_found": present, "balls_flagged": len(flags) - flags.count("ok")}
     return _count((ball.get("movement") or {}).get("verdict") for ball in step.get("balls", []))
 
 

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from typing import Any
-
-import numpy as np
 
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import StepRun
 from processor.pipeline import Execution
-from processor.report.step_report import step_report
-
-FORMAT, FORMAT_VERSION = "processor-results", "1.0"
+from processor.results.fields_to_json import as_object
+from processor.results.names import FORMAT, FORMAT_VERSION
+from processor.store.json_values import json_ready
 
 
 def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
     """Build the object of results.json; further methods of a step are under ``comparison``."""
-    answers: dict[str, Any] = {}
-    comparison: dict[str, list[Any]] = {}
-    for run in execution.runs:
-        if run.step in answers:
-            comparison.setdefault(run.step, []).append(step_json(run))
-        else:
-            answers[run.step] = step_json(run)
+    by_step = execution.by_step()
     made = execution.provenance
     content: dict[str, Any] = {
         "format": FORMAT,
@@ -34,8 +25,8 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
         "seed": made["seed"],
         "software": made["software"],
         "parameters": made["parameters"],
-        "steps": answers,
-        "comparison": comparison,
+        "steps": {run.step: step_json(run) for run, _ in by_step},
+        "comparison": {run.step: [step_json(other) for other in others] for run, others in by_step if others},
         "checks": [
             {
                 "step": metric.step,
@@ -52,25 +43,10 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
             for metric in report.metrics
         ],
     }
-    written: dict[str, Any] = plain(content)
+    written: dict[str, Any] = json_ready(content)
     return written
 
 
 def step_json(run: StepRun) -> dict[str, Any]:
-    """Write one step's result."""
-    return step_report(run.step).written(run.result)
-
-
-def plain(value: Any) -> Any:
-    """Turn arrays and numpy numbers into lists and numbers, and what is not finite into None."""
-    if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, np.generic):
-        return plain(value.item())
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
+    """Write the result of one step."""
+    return as_object(run.result)

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from processor import readers
 from processor.model import Reason, reason
+from processor.results.names import RESULTS_H5, RESULTS_JSON
+from processor.scan_folder.files import DESIGNS, NOT_SCANS, PROJECT, SCANS, TRUTH
 
-PROJECT, SCANS = "project.toml", "scans"
-MARKS = (PROJECT, "design.json", "design.csv")
-RESULTS = ("results.json", "results.h5")
-NOT_INPUTS = ("truth.h5", "results.h5", "design.csv", "picks.csv", "deviation.csv", "stations.json")
+MARKS = (PROJECT, *DESIGNS)
+NOT_INPUTS = (*NOT_SCANS, TRUTH, RESULTS_H5)
 STATE = ".batch"  # folder of a batch's state, in that of its results
 PROSE = (".txt", ".csv", ".asc")  # may hold anything
 PEEK = 1 << 16
@@ -58,7 +58,7 @@ def _search(folder: Path, name: str, out: Path, left_out: dict[str, Reason]) -> 
         left_out[name or "."] = reason("batch.unreadable", error=error.strerror or str(error))
         return []
     names = {entry.name for entry in entries}
-    if STATE in names or names.issuperset(RESULTS):
+    if STATE in names or names.issuperset((RESULTS_JSON, RESULTS_H5)):
         left_out[name or "."] = reason("batch.holds-results")
         return []
     if names.intersection(MARKS):

@@ -17,14 +17,15 @@ BIAS_MARGIN = 0.1  # of the size that the figure has
 
 @dataclass(frozen=True)
 class Badness:
-    """``of`` a value is larger the worse it is; differences below ``margin`` + ``share`` of its size are passed over.
+    r"""Maps a value to a number ``of`` it that grows as the value gets worse.
 
-    ``is_ratio``: a difference is the logarithm of a ratio.
+    Differences up to ``margin`` + ``margin_share`` times the value are not reported. ``is_ratio``: a difference is the
+    logarithm of a ratio.
     """
 
     of: Callable[[float], float]
     margin: float
-    share: float
+    margin_share: float
     is_ratio: bool
 
 

@@ -1,0 +1,64 @@
+"""Write the folder of results, and check where it may be written."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection
+from pathlib import Path
+
+from processor.evaluation.evaluate import ErrorReport
+from processor.model import UsageError
+from processor.pipeline import Execution
+from processor.report import all_figures, all_tables, page
+from processor.report import table as report_table
+from processor.report.step_report import step_report
+from processor.results.names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
+from processor.results.to_json import results_json
+from processor.store import store
+from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
+
+# The record of a batch's job is replaced with its results: without it, the batch does the job again.
+OWN_NAMES = (RESULTS_JSON, RESULTS_H5, REPORT_PAGE, FIGURES, JOB_RECORD)
+OWN_ENDINGS = (".csv", ".dxf", ".pdf")
+
+
+def check_output(out: Path, source: Path | None, mark: str = RESULTS_JSON, names: Collection[str] = OWN_NAMES) -> None:
+    """Raise UsageError for a folder with anything but earlier results, as it will be replaced as a whole.
+
+    Earlier results are recognised by the file ``mark`` among files of the ``names`` of results.
+    """
+    if out.exists() and not out.is_dir():
+        raise UsageError(f"{out}: is a file; name a folder for the results")
+    if source is not None and source.resolve().is_relative_to(out.resolve()):
+        raise UsageError(f"{out}: holds the input {source}, which the results would replace; name another folder")
+    inside = sorted(path.name for path in out.iterdir()) if out.is_dir() else []
+    if inside and mark not in inside:
+        raise UsageError(f"{out}: is not empty and holds no earlier results; name another folder")
+    others = [name for name in inside if name not in names and not name.endswith(OWN_ENDINGS)]
+    if others:
+        raise UsageError(f"{out}: holds more than earlier results ({others[0]}); take it out or name another folder")
+
+
+def write_results(out: Path, execution: Execution, report: ErrorReport, lang: str = "en") -> None:
+    """Write results.h5, results.json, CSV tables, figures, drawings and report.html into ``out``, in place of others.
+
+    Only the page is in the language ``lang``. Raises InputError where they cannot be written, and leaves ``out`` as it
+    was.
+    """
+    with replacing_folder(out) as making:
+        store.write_results(making / RESULTS_H5, execution.runs, execution.provenance)
+        content = results_json(execution, report)
+        write_text(making / RESULTS_JSON, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
+        for table in all_tables.tables_of_run(execution, report):
+            if table.file:
+                write_text(making / f"{table.file}.csv", report_table.csv_text(table))
+        for run, _ in execution.by_step():
+            for name, data in step_report(run.step).files(execution, run).items():
+                write_bytes(making / name, data)
+        drawn = all_figures.draw_figures(execution, report)
+        if any(drawn.values()):
+            (making / FIGURES).mkdir()
+        for of_step in drawn.values():
+            for name, (_, png) in of_step.items():
+                write_bytes(making / FIGURES / name, png)
+        write_text(making / REPORT_PAGE, page.html(execution, report, drawn, lang))
