@@ -19,7 +19,7 @@ from processor.geometry.point_grid import PointGrid
 from processor.language.messages import messages
 from processor.model import Floats, InputError, Reason, UsageError, reason
 from processor.readers import RawScan
-from processor.readers.common import FAR, ORIGIN_STEP
+from processor.readers.raw_scan import FAR, ORIGIN_STEP
 from processor.scan_folder import normals as scan_folder_normals
 
 CLOUDS = ("reference", "compared", "core")

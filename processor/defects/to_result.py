@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from processor.adjustment.finite_median import finite_median
 from processor.defects import classes, measures, pictures
 from processor.defects.alignment import Alignment
 from processor.defects.classes import Classification
@@ -77,7 +78,7 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
     registration = np.hypot(
         search.alignment.sd(surface.centres[seen], surface.outward[seen]), np.sqrt(field.stations[seen])
     )
-    noise = _median(field.noise[seen])
+    noise = finite_median(field.noise[seen])
     formal = np.sqrt(field.variance[seen]) * search.levels.inflation[0]
     examined = float(surface.share[seen].sum()) * cell**2
     reasons = [reason("defects.examined", examined=examined / 1e6, surface=surface.area_mm2 / 1e6)]
@@ -88,21 +89,17 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
         status=Status.OK if seen.any() else Status.FAILED,
         method=params.method,
         reasons=tuple(reasons),
-        registration_error=_median(registration),
+        registration_error=finite_median(registration),
         cell=cell,
         noise=noise,
-        lod95=NORMAL_95 * _median(np.hypot(formal, registration)),
+        lod95=NORMAL_95 * finite_median(np.hypot(formal, registration)),
         examined_mm2=examined,
         expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
-        least_depth=_least_depth(search.levels, cell, noise, _median(field.count[seen])),
+        least_depth=_least_depth(search.levels, cell, noise, finite_median(field.count[seen])),
         defects=table([defect.values for defect in defects], origin, doubt),
         pictures=pictures.of_defects(drawn, surface),
         surface=pictures.of_surface([defect.cells for defect in defects], field, surface, origin),
     )
-
-
-def _median(values: Floats | Ints) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
 
 
 def _least_depth(levels: Levels, cell: float, noise: float, points: float) -> Windows:

@@ -8,9 +8,9 @@ import numpy as np
 
 from processor.model import InputError
 from processor.readers import closed_formats, e57, las, pcd, ply, ptx, sandbox, text
-from processor.readers.common import RawScan
+from processor.readers.raw_scan import RawScan
 
-__all__ = ["ARCHIVES", "SUFFIXES", "RawScan", "read"]
+__all__ = ["ARCHIVES", "SUFFIXES", "RawScan", "is_closed", "read"]
 
 _FORMATS = {suffix: module for module in (e57, las, pcd, ply, ptx, text) for suffix in module.SUFFIXES}
 

@@ -25,6 +25,8 @@ ENDED, FULL, ODD, SHORT_ROW = range(4)  # reasons why parsing stopped
 LONGEST_LINE = 1 << 20
 NUMBERS = frozenset(b"+-0123456789.eE")
 WORDS = ("nan", "inf", "infinity")
+EXACT = 1 << 53  # whole numbers below are exact as float64
+SPLITTER = 2.0**27 + 1.0  # halves of a float64 (Dekker 1971)
 
 
 class _Buffer:
@@ -220,7 +222,7 @@ def count_ends(text: npt.NDArray[np.uint8], start: int, stop: int) -> int:
 @njit(cache=True, nogil=True)
 def _times_power(digits: np.uint64, power: int) -> float:
     """Return digits * 10**power, rounded once: by exact operations, or else in double-double arithmetic (Dekker)."""
-    if digits < 9007199254740992 and -22 <= power <= 22:  # both exact, so one rounding
+    if digits < EXACT and -22 <= power <= 22:  # both exact, so one rounding
         near = float(digits)
         return float(near / HIGH[REACH - power] if power < 0 else near * HIGH[REACH + power])
     a = float(digits >> np.uint64(32)) * 4294967296.0
@@ -229,10 +231,10 @@ def _times_power(digits: np.uint64, power: int) -> float:
     rest = b - (top - a)
     p, q = HIGH[REACH + power], LOW[REACH + power]
     product = top * p
-    split = 134217729.0 * top
+    split = SPLITTER * top
     t1 = split - (split - top)
     t2 = top - t1
-    split = 134217729.0 * p
+    split = SPLITTER * p
     p1 = split - (split - p)
     p2 = p - p1
     error = ((t1 * p1 - product) + t1 * p2 + t2 * p1) + t2 * p2

@@ -13,9 +13,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from processor.model import Floats, InputError, Labels
-from processor.readers.common import RawScan, make, parsing, room_for, stem
+from processor.readers.allocation import allocate
+from processor.readers.file_checks import errors_name_the_file
+from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".e57",)
 UNIT = "m"
@@ -40,7 +43,7 @@ def read(path: Path) -> list[RawScan]:
     import pye57
 
     _check_structure(path)
-    with parsing(path, "E57"), path.open("rb") as opened:
+    with errors_name_the_file(path, "E57"), path.open("rb") as opened:
         # By its descriptor: the library accepts names in UTF-8 only.
         by_descriptor = Path(f"/proc/self/fd/{opened.fileno()}")
         file = pye57.E57(str(by_descriptor if by_descriptor.exists() else path))
@@ -48,7 +51,7 @@ def read(path: Path) -> list[RawScan]:
             count = file.scan_count
             if not count:
                 raise InputError(f"{path}: expected scans, found none")
-            scan_names = names(stem(path), [_stored_name(file.get_header(i)) for i in range(count)])
+            scan_names = names(scan_name(path), [_stored_name(file.get_header(i)) for i in range(count)])
             return [_read_scan(path, file, i, scan_names) for i in range(count)]
         finally:
             file.close()
@@ -132,7 +135,7 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
     pose = _pose(path, name, header) if header.has_pose() else np.empty(0)
     # Writers give single and merged clouds an identity pose too, so it is no evidence of a scanner's position.
     posed = pose.size > 0 and (len(scan_names) > 1 or bool((pose != np.eye(4)).any()))
-    return make(
+    return build_scan(
         path,
         name,
         points,
@@ -151,11 +154,11 @@ def _read_points(
     """Return points (n, 3), intensities and, if the scan has a grid, rows and columns (n,) of the valid points."""
     declared, fields = int(header.point_count), set(header.point_fields)
     state = "cartesianInvalidState" if axes is CARTESIAN else "sphericalInvalidState"
-    points = room_for(declared, 3)
-    intensity = room_for(declared if "intensity" in fields else 0)
+    points = allocate(declared, 3)
+    intensity = allocate(declared if "intensity" in fields else 0)
     data, buffers = file.make_buffers([*axes, *({state, "intensity"} & fields)], min(declared, PIECE) or 1)
     grid = _grid_buffers(file, header, data, buffers, min(declared, PIECE) or 1)
-    cells = [room_for(declared, dtype=np.int32) for _ in grid]
+    cells = [allocate(declared, dtype=np.int32) for _ in grid]
     reader = header.points.reader(buffers)
     read = count = 0
     while declared and (rows := reader.read()):
@@ -229,12 +232,7 @@ def _pose(path: Path, name: str, header: Any) -> Floats:
             raise InputError(
                 f"{path}: the pose of scan {name!r} has a quaternion of length {length:g}, expected 1; export it again"
             )
-        w, x, y, z = w / length, x / length, y / length, z / length
-        pose[:3, :3] = [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
+        pose[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
     if node.isDefined("translation"):
         pose[:3, 3] = [float(node["translation"][key].value()) for key in "xyz"]
     if not np.isfinite(pose).all():

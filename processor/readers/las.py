@@ -10,10 +10,16 @@ from typing import Any
 import numpy as np
 
 from processor.model import InputError
-from processor.readers.common import RawScan, check_room, make, parsing, room_for, stem
+from processor.readers.allocation import allocate
+from processor.readers.file_checks import check_declared_points, errors_name_the_file
+from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".las", ".laz")
 UNIT = "m"
+# Bytes of the header and of records (LAS 1.4 R15, tables 3, 7 and 8).
+LEAST_HEADER, HEADER_1_4 = 227, 375
+VERSION_MINOR_AT, COUNTS_AT, POINT_FORMAT_AT, EXTENDED_AT = 25, 96, 104, 235
+VLR_HEADER, EVLR_HEADER = 54, 60
 PIECE = 1_000_000
 PACKED = 0xC0  # bits of the point format
 LAZ_LIMIT = 2_000  # compression ratio that no real file exceeds
@@ -25,8 +31,8 @@ EPSG_UNITS = {9001: "m", 9002: "ft", 9003: "us-ft"}
 def needs_sandbox(path: Path) -> bool:
     """Whether the file is read in a separate process: if it is compressed, as native code decompresses it."""
     with path.open("rb") as file:
-        head = file.read(105)
-    return len(head) == 105 and bool(head[104] & PACKED)
+        head = file.read(POINT_FORMAT_AT + 1)
+    return len(head) > POINT_FORMAT_AT and bool(head[POINT_FORMAT_AT] & PACKED)
 
 
 def read(path: Path) -> list[RawScan]:
@@ -35,7 +41,7 @@ def read(path: Path) -> list[RawScan]:
 
     _check_header(path)
     count = 0
-    with parsing(path, "LAS"), laspy.open(str(path)) as file:
+    with errors_name_the_file(path, "LAS"), laspy.open(str(path)) as file:
         header = file.header
         fits_degrees = bool((np.abs([header.mins, header.maxs])[:, :2] <= [180.0, 90.0]).all())
         unit = _unit(path, [*header.vlrs, *(header.evlrs or [])], fits_degrees)
@@ -45,7 +51,7 @@ def read(path: Path) -> list[RawScan]:
                 f"{path}: expected finite scales and offsets, and scales other than 0, found {header.scales} and "
                 f"{header.offsets}; export it again"
             )
-        points, intensity = room_for(declared, 3), room_for(declared)
+        points, intensity = allocate(declared, 3), allocate(declared)
         station = np.empty(declared, np.uint16)
         for piece in file.chunk_iterator(PIECE):
             rows = slice(count, count + len(piece))
@@ -59,26 +65,36 @@ def read(path: Path) -> list[RawScan]:
     if count != declared:
         raise InputError(f"{path}: expected {declared} points as declared, found {count}; copy it again")
     # 0 in all points: the stations are unknown.
-    return [make(path, stem(path), points, unit=unit, intensity=intensity, station=station if station.any() else ())]
+    return [
+        build_scan(
+            path, scan_name(path), points, unit=unit, intensity=intensity, station=station if station.any() else ()
+        )
+    ]
 
 
 def _check_header(path: Path) -> None:
     """Check the counts of the header (LAS 1.4 R15, table 3) against the size of the file: laspy allocates by them."""
     size = path.stat().st_size
     with path.open("rb") as file:
-        head = file.read(375)
-    if not head.startswith(b"LASF") or len(head) < 227:
+        head = file.read(HEADER_1_4)
+    if not head.startswith(b"LASF") or len(head) < LEAST_HEADER:
         raise InputError(f"{path}: not a readable LAS file: it has no LAS header; copy or export it again")
-    start, vlrs, form, length, count = struct.unpack_from("<IIBHI", head, 96)
+    start, vlrs, form, length, count = struct.unpack_from("<IIBHI", head, COUNTS_AT)
     extended_start, extended = 0, 0
-    if head[25] >= 4 and len(head) >= 375:
-        extended_start, extended, count = struct.unpack_from("<QIQ", head, 235)
-    if not length or start > size or vlrs * 54 > start or extended * 60 > size or extended_start > size:
+    if head[VERSION_MINOR_AT] >= 4 and len(head) >= HEADER_1_4:
+        extended_start, extended, count = struct.unpack_from("<QIQ", head, EXTENDED_AT)
+    if (
+        not length
+        or start > size
+        or vlrs * VLR_HEADER > start
+        or extended * EVLR_HEADER > size
+        or extended_start > size
+    ):
         raise InputError(f"{path}: the header's counts do not fit the file of {size} bytes; copy or export it again")
     packed = bool(form & PACKED)
-    check_room(path, "LAS", count, length / (LAZ_LIMIT if packed else 1), size - start)
+    check_declared_points(path, "LAS", count, length / (LAZ_LIMIT if packed else 1), size - start)
     # From version 1.3 on, other data may follow the points.
-    if not packed and head[25] < 3 and size - start - count * length >= length:
+    if not packed and head[VERSION_MINOR_AT] < 3 and size - start - count * length >= length:
         raise InputError(
             f"{path}: the header declares {count} points, but there is room for {(size - start) // length}; "
             "the file was not finished or its header is damaged: export it again"
@@ -124,10 +140,12 @@ def _in_degrees(path: Path) -> InputError:
 def _last_unit(wkt: str) -> str:
     """Return the last unit of length of a coordinate system in WKT, "" if it is unknown."""
     units = re.findall(r'(?<!ANGLE)UNIT\["([^"]*)",\s*([0-9.eE+-]+)', wkt)
-    lengths = [(name, float(size)) for name, size in units if not 0.017 < float(size) < 0.018]
+    lengths = [
+        (name, float(size)) for name, size in units if not 0.017 < float(size) < 0.018
+    ]  # a degree is 0.01745 rad
     if not lengths:
         return ""
     name, size = lengths[-1]
-    if 0.3 < size < 0.31:
+    if 0.3 < size < 0.31:  # a foot is 0.3048 m
         return "us-ft" if "US" in name.upper() else "ft"
     return "m" if size == 1.0 else ""

@@ -17,20 +17,11 @@ from typing import Any, BinaryIO
 import numpy as np
 
 from processor.model import Floats, InputError
+from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
-from processor.readers.common import (
-    INTENSITY_NAMES,
-    STATION_NAMES,
-    RawScan,
-    check_room,
-    fill,
-    first_named,
-    make,
-    of_records,
-    parsing,
-    room_for,
-    stem,
-)
+from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, columns_of_records, fill_columns, first_named
+from processor.readers.file_checks import check_declared_points, errors_name_the_file
+from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".pcd",)
 UNIT = ""
@@ -64,22 +55,22 @@ def read(path: Path) -> list[RawScan]:
         raise InputError(f"{path}: expected FIELDS with x, y, z, found {' '.join(names)}")
     intensity, station = first_named(names, INTENSITY_NAMES), first_named(names, STATION_NAMES)
     fields = [names.index(name) for name in (*"xyz", intensity, station) if name]
-    columns = [room_for(count, 3), *(room_for(count) for _ in fields[3:])]
-    with parsing(path, "PCD"), path.open("rb") as file:
+    columns = [allocate(count, 3), *(allocate(count) for _ in fields[3:])]
+    with errors_name_the_file(path, "PCD"), path.open("rb") as file:
         file.seek(header.start)
         if header.data == "ascii":
             first = np.cumsum([0, *header.counts])
-            fill(columns, Rows(file).pieces([int(first[field]) for field in fields], count))
+            fill_columns(columns, Rows(file).pieces([int(first[field]) for field in fields], count))
         elif header.data == "binary":
-            pieces = of_records(file, header.dtype(), [str(field) for field in fields], count)
-            fill(columns, ([column[:, 0] for column in piece] for piece in pieces))
+            pieces = columns_of_records(file, header.dtype(), [str(field) for field in fields], count)
+            fill_columns(columns, ([column[:, 0] for column in piece] for piece in pieces))
         else:
-            fill(columns, _unpacked(file, header, fields))
+            fill_columns(columns, _unpacked(file, header, fields))
     returns = _without_nan(columns)
     return [
-        make(
+        build_scan(
             path,
-            stem(path),
+            scan_name(path),
             columns[0][:returns],
             unit=UNIT,
             intensity=columns[1][:returns] if intensity else (),
@@ -106,7 +97,7 @@ def read_header(path: Path) -> Header:
     if missing:
         raise InputError(f"{path}: not a readable PCD file: its header has no {missing[0]} line; export it again")
     names = lines["FIELDS"]
-    with parsing(path, "PCD"):
+    with errors_name_the_file(path, "PCD"):
         sizes, kinds = lines["SIZE"], lines["TYPE"]
         counts = [int(word) for word in lines.get("COUNT", ["1"] * len(names))]
         if not len(names) == len(sizes) == len(kinds) == len(counts):
@@ -125,7 +116,7 @@ def read_header(path: Path) -> Header:
     room = path.stat().st_size - stop - 1
     row = sum(int(size) * n for size, n in zip(sizes, counts, strict=True))
     least = {"ascii": 2 * sum(counts), "binary": row}.get(form, row / LZF_LIMIT)
-    check_room(path, "PCD", points, least, room + (form == "ascii"))
+    check_declared_points(path, "PCD", points, least, room + (form == "ascii"))
     return Header(names, types, counts, points=points, data=form, start=stop + 1)
 
 

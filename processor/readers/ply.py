@@ -12,20 +12,11 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError
+from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
-from processor.readers.common import (
-    INTENSITY_NAMES,
-    STATION_NAMES,
-    RawScan,
-    check_room,
-    fill,
-    first_named,
-    make,
-    of_records,
-    parsing,
-    room_for,
-    stem,
-)
+from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, columns_of_records, fill_columns, first_named
+from processor.readers.file_checks import check_declared_points, errors_name_the_file
+from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".ply",)
 UNIT = ""
@@ -72,24 +63,24 @@ def read(path: Path) -> list[RawScan]:
         raise InputError(f"{path}: expected vertices only, found lists before or within them; export points only")
     intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
     wanted = [*"xyz", *(name for name in (intensity, station) if name)]
-    columns = [room_for(vertex.count, 3), *(room_for(vertex.count) for _ in wanted[3:])]
-    with parsing(path, "PLY"), path.open("rb") as file:
+    columns = [allocate(vertex.count, 3), *(allocate(vertex.count) for _ in wanted[3:])]
+    with errors_name_the_file(path, "PLY"), path.open("rb") as file:
         file.seek(header.start)
         if header.order:
             dtype = np.dtype([(name, header.order + code) for name, code in vertex.types.items()])
             skipped = sum(e.count * sum(int(code[1]) for code in e.types.values()) for e in before)
             file.seek(header.start + skipped)
-            fill(columns, of_records(file, dtype, wanted, vertex.count))
+            fill_columns(columns, columns_of_records(file, dtype, wanted, vertex.count))
         else:
             rows = Rows(file)
             for _ in range(sum(element.count for element in before)):
                 rows.skip_line()
             names = list(vertex.types)
-            fill(columns, rows.pieces([names.index(name) for name in wanted], vertex.count))
+            fill_columns(columns, rows.pieces([names.index(name) for name in wanted], vertex.count))
     return [
-        make(
+        build_scan(
             path,
-            stem(path),
+            scan_name(path),
             columns[0],
             unit=UNIT,
             intensity=columns[1] if intensity else (),
@@ -112,14 +103,14 @@ def read_header(path: Path) -> Header:
         raise InputError(f"{path}: not a readable PLY file: it has no PLY header; copy or export it again")
     room = path.stat().st_size - stop - 1
     order, elements = "", list[_Element]()
-    with parsing(path, "PLY"):
+    with errors_name_the_file(path, "PLY"):
         for line in head[:end].decode("latin-1").splitlines():
             words = line.split() or [""]
             if words[0] == "format":
                 order = ORDERS[words[1]]
             elif words[0] == "element":
                 elements.append(_Element(words[1], int(words[2])))
-                check_room(path, "PLY", elements[-1].count, 1, room)
+                check_declared_points(path, "PLY", elements[-1].count, 1, room)
             elif words[0] == "property" and words[1] == "list":
                 elements[-1].list_counts[words[4]] = TYPES[words[2]]
                 elements[-1].types[words[4]] = TYPES[words[3]]

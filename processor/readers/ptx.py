@@ -14,8 +14,10 @@ import numpy as np
 from numba import njit
 
 from processor.model import Floats, InputError, Labels
+from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
-from processor.readers.common import RawScan, check_room, make, parsing, room_for, stem
+from processor.readers.file_checks import check_declared_points, errors_name_the_file
+from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".ptx",)
 UNIT = "m"
@@ -30,22 +32,22 @@ def read(path: Path) -> list[RawScan]:
     size = path.stat().st_size
     with path.open("rb") as file:
         rows = Rows(file)
-        with parsing(path, "PTX"):
+        with errors_name_the_file(path, "PTX"):
             first = rows.line()
         while first is not None:
             scans.append(_read_grid(path, rows, first, len(scans) + 1, size))
-            with parsing(path, "PTX"):
+            with errors_name_the_file(path, "PTX"):
                 first = rows.line()
     if not scans:
         raise InputError(f"{path}: expected scans, found none")
     if len(scans) == 1:
         return scans
-    return [dataclasses.replace(scan, name=f"{stem(path)}-{i}") for i, scan in enumerate(scans, 1)]
+    return [dataclasses.replace(scan, name=f"{scan_name(path)}-{i}") for i, scan in enumerate(scans, 1)]
 
 
 def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> RawScan:
     widths = (1, 1, 3, 3, 3, 3, 4, 4, 4, 4)
-    with parsing(path, "PTX"):
+    with errors_name_the_file(path, "PTX"):
         head = [first, *(rows.line() or "" for _ in range(9))]
     try:
         numbers = [[float(word) for word in line.split()] for line in head]
@@ -60,14 +62,14 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     cells = columns * lines
     if columns < 1 or lines < 1:
         raise InputError(f"{path}: expected a grid of 1 x 1 cells or more, found {columns} x {lines} in scan {number}")
-    check_room(path, "PTX", cells, SHORTEST_ROW, size)
+    check_declared_points(path, "PTX", cells, SHORTEST_ROW, size)
     T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
-    with parsing(path, "PTX"):
+    with errors_name_the_file(path, "PTX"):
         wide = rows.width() in (4, 7)
-        points, intensity = room_for(cells, 3), room_for(cells if wide else 0)
+        points, intensity = allocate(cells, 3), allocate(cells if wide else 0)
         # A cloud without a grid is often written as one row or column.
         gridded = cells if min(columns, lines) > 1 and max(columns, lines) <= MOST_LINES else 0
-        row, column = (room_for(gridded, dtype=np.int32) for _ in range(2))
+        row, column = (allocate(gridded, dtype=np.int32) for _ in range(2))
         read = count = 0
         for piece in rows.pieces((0, 1, 2, 3) if wide else (0, 1, 2), cells):
             count = copy_returns(piece, read, lines, count, points, intensity, row, column)
@@ -77,9 +79,9 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     if not count:
         raise InputError(f"{path}: scan {number} holds no returns, only cells of 0 0 0")
     position = T_project_scan[:3, :3].T @ (np.array(numbers[2]) - T_project_scan[:3, 3])
-    return make(
+    return build_scan(
         path,
-        stem(path),
+        scan_name(path),
         points[:count],
         unit=UNIT,
         intensity=intensity[: count if wide else 0],

@@ -32,7 +32,8 @@ import numpy.typing as npt
 from processor.jobs.child import end_with_parent
 from processor.jobs.process import end, isolated, start
 from processor.model import InputError
-from processor.readers.common import RawScan, give_room_by
+from processor.readers.allocation import allocate_with
+from processor.readers.raw_scan import RawScan
 
 SLACK_BYTES = 1 << 30
 LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # the libraries are much faster than this
@@ -282,7 +283,7 @@ def serve() -> None:
         except (EOFError, OSError):
             return
         shared = _Shared()
-        give_room_by(shared.new)
+        allocate_with(shared.new)
         _limit_memory(SLACK_BYTES)
         signal.setitimer(signal.ITIMER_PROF, request["limit_s"])
         signal.setitimer(signal.ITIMER_REAL, PATIENCE * request["limit_s"])
@@ -292,7 +293,7 @@ def serve() -> None:
         _send(channel, answer, shared.descriptor)
         os.close(shared.descriptor)
         del shared
-        give_room_by(np.empty)
+        allocate_with(np.empty)
 
 
 def _answer(path: Path, module: str, shared: _Shared) -> dict[str, Any]:

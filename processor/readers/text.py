@@ -17,19 +17,12 @@ from typing import BinaryIO
 import numpy as np
 
 from processor.model import Floats, InputError
+from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
-from processor.readers.common import (
-    INTENSITY_NAMES,
-    STATION_NAMES,
-    RawScan,
-    check_room,
-    decoded,
-    first_named,
-    make,
-    parsing,
-    room_for,
-    stem,
-)
+from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, first_named
+from processor.readers.encoding import decoded
+from processor.readers.file_checks import check_declared_points, errors_name_the_file
+from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
 SUFFIXES = (".asc", ".csv", ".pts", ".txt", ".xyz")
 UNIT = ""
@@ -68,10 +61,10 @@ def read(path: Path) -> list[RawScan]:
     wanted = [*columns.axes, *(index for index in (columns.intensity, columns.station) if index is not None)]
     size = path.stat().st_size
     tables, declared = [], layout.declared
-    with parsing(path, "text"), _opened(path, layout) as file:
+    with errors_name_the_file(path, "text"), _opened(path, layout) as file:
         rows = _rows(file, layout)
         while True:
-            check_room(path, "text", max(declared, 0), SHORTEST_ROW, size)
+            check_declared_points(path, "text", max(declared, 0), SHORTEST_ROW, size)
             tables.append(_filled(rows, wanted, declared))
             following = rows.line()
             if following is None or declared < 0:
@@ -79,9 +72,9 @@ def read(path: Path) -> list[RawScan]:
             if not re.fullmatch(r"\d+", following):
                 raise InputError(f"{path}: expected {declared} points as declared, found more; export it again")
             declared = int(following)
-    names = [stem(path)] if len(tables) == 1 else [f"{stem(path)}-{i}" for i in range(1, len(tables) + 1)]
+    names = [scan_name(path)] if len(tables) == 1 else [f"{scan_name(path)}-{i}" for i in range(1, len(tables) + 1)]
     return [
-        make(
+        build_scan(
             path,
             name,
             points,
@@ -96,7 +89,7 @@ def read(path: Path) -> list[RawScan]:
 def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, Floats]:
     """Return coordinates (n, 3) and the other wanted columns (n, k) of the declared rows, for -1 of all rows."""
     room, count = declared if declared >= 0 else rows.likely_left(), 0
-    points, others = room_for(room, 3), room_for(room, len(wanted) - 3)
+    points, others = allocate(room, 3), allocate(room, len(wanted) - 3)
     for piece in rows.pieces(wanted, declared if declared >= 0 else 2**62):
         if count + len(piece) > room:
             room = room + room // 4 + len(piece)
@@ -110,14 +103,14 @@ def _filled(rows: Rows, wanted: Sequence[int], declared: int) -> tuple[Floats, F
 
 
 def _grown(column: Floats, room: int) -> Floats:
-    larger = room_for(room, column.shape[1])
+    larger = allocate(room, column.shape[1])
     larger[: len(column)] = column
     return larger
 
 
 def numbers(path: Path, layout: Layout) -> Floats:
     """Return all columns (n, k) of a table. Raises InputError for a cell that is not a number."""
-    with parsing(path, "text"), _opened(path, layout) as file:
+    with errors_name_the_file(path, "text"), _opened(path, layout) as file:
         rows = _rows(file, layout)
         pieces = [piece.copy() for piece in rows.pieces(range(layout.columns))]
     return np.concatenate(pieces) if pieces else np.empty((0, layout.columns))

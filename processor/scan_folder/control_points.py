@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import Control, Floats, InputError, Scan, Stations
-from processor.readers.common import decoded, parsing
+from processor.readers.encoding import decoded
+from processor.readers.file_checks import errors_name_the_file
 from processor.scan_folder.checked_toml import Table, inside
 from processor.scan_folder.files import CONTROL
 from processor.scan_folder.units import MM_PER_UNIT
@@ -74,7 +75,7 @@ def _from_csv(path: Path) -> list[Measured]:
         text = decoded(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    with parsing(path, "CSV"):
+    with errors_name_the_file(path, "CSV"):
         rows = [(line, row) for line, row in enumerate(csv.reader(text.splitlines()), 1) if any(map(str.strip, row))]
     header = tuple(name.strip().lower() for name in rows[0][1]) if rows else ()
     if sorted(header) != sorted(COLUMNS):

@@ -13,7 +13,8 @@ import numpy as np
 
 from processor.geometry import box_girder
 from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints, UsageError
-from processor.readers.common import decoded, parsing
+from processor.readers.encoding import decoded
+from processor.readers.file_checks import errors_name_the_file
 from processor.scan_folder import cad
 from processor.scan_folder.checked_toml import Table, inside
 from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
@@ -176,7 +177,7 @@ def _read_nodes(path: Path, table_unit: str) -> FrameDesign:
     text = _text(path)
     first = text.split("\n", 1)[0]
     separator = next((mark for mark in (";", "\t", ",") if mark in first), ",")
-    with parsing(path, "CSV"):
+    with errors_name_the_file(path, "CSV"):
         rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(map(str.strip, row))]
     header = [name.strip().lower() for name in rows[0]] if rows else []
     columns, units = {}, set()

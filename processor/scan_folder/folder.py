@@ -26,7 +26,8 @@ from processor.model import (
 )
 from processor.progress import tracked
 from processor.readers import RawScan
-from processor.readers.common import decoded, stem, text_of, used_up
+from processor.readers.encoding import decoded, file_name_as_text
+from processor.readers.raw_scan import scaled_in_place, scan_name
 from processor.scan_folder import scanner_grid, units
 from processor.scan_folder.checked_toml import Table, inside
 from processor.scan_folder.control_points import Measured, control_points, read_control
@@ -100,7 +101,7 @@ def read_input(path: Path, units: str | None = None) -> Scene:
         return _read_folder(path, option)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return _scene(_Project(stem(path), (_Entry(path),)), None, option)
+    return _scene(_Project(scan_name(path), (_Entry(path),)), None, option)
 
 
 def _read_folder(folder: Path, option: str) -> Scene:
@@ -109,7 +110,7 @@ def _read_folder(folder: Path, option: str) -> Scene:
     if project.design is not None:
         unit = project.design_units or project.units or option or "m"
         if is_surface(project.design) and project.kind in ("", "structure"):
-            design = StructureDesign(stem(project.design), *read_surface(project.design, unit))
+            design = StructureDesign(scan_name(project.design), *read_surface(project.design, unit))
         else:
             design = read_design(folder, project.design, project.design_units or option or project.units or "m")
     scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"))
@@ -162,7 +163,7 @@ def _read_project(folder: Path) -> _Project:
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
     control, control_file = read_control(folder, table)
     return _Project(
-        name=table.text("name", text_of(folder.resolve().name)),
+        name=table.text("name", file_name_as_text(folder.resolve().name)),
         kind=kind,
         units=table.unit("units", ""),
         design=design,
@@ -293,7 +294,7 @@ def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
     for number in range(1, len(raws) + 1):
         raw = raws.pop(0)
         if several and any(raw.name == other.name for other in scans):  # scanners name the first of each file S1
-            raw = dataclasses.replace(raw, name=f"{stem(entry.path)}-{number}")
+            raw = dataclasses.replace(raw, name=f"{scan_name(entry.path)}-{number}")
         yield raw
 
 
@@ -333,7 +334,7 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
     row, column = scanner_grid.of_scanner(raw.points, raw.grid_row, raw.grid_column, scanner - raw.origin)
     return Scan(
         raw.name,
-        used_up(raw, scale),
+        scaled_in_place(raw, scale),
         origin,
         intensity=raw.intensity,
         point_station=station.astype(np.int32),

@@ -9,7 +9,7 @@ import numpy as np
 
 from processor.model import Floats, InputError, Ints
 from processor.readers import ply
-from processor.readers.common import parsing
+from processor.readers.file_checks import errors_name_the_file
 
 MESH_SUFFIXES = (".ply", ".stl", ".obj")
 CAD_SUFFIXES = (".step", ".stp", ".ifc")  # converted to meshes first, see :mod:`processor.scan_folder.cad`
@@ -39,7 +39,7 @@ def _read_ply_mesh(path: Path) -> tuple[Floats, Ints]:
     from plyfile import PlyData
 
     ply.read_header(path)
-    with parsing(path, "PLY mesh"):
+    with errors_name_the_file(path, "PLY mesh"):
         data = PlyData.read(str(path), known_list_len={})
         vertex = data["vertex"].data
         vertices = np.stack([np.asarray(vertex[name], np.float64) for name in "xyz"], axis=1)
@@ -54,7 +54,7 @@ def _read_other_mesh(path: Path, suffix: str) -> tuple[Floats, Ints]:
     import trimesh
 
     # From an open file and without materials the library cannot open other files.
-    with parsing(path, suffix[1:].upper()), path.open("rb") as file:
+    with errors_name_the_file(path, suffix[1:].upper()), path.open("rb") as file:
         options: dict[str, Any] = {"skip_materials": True} if suffix == ".obj" else {}
         mesh: Any = trimesh.load(file, file_type=suffix[1:], process=False, force="mesh", **options)
         return np.array(mesh.vertices, np.float64), np.array(mesh.faces, np.int64)

@@ -9,7 +9,8 @@ import numpy as np
 
 from processor.model import Floats, InputError
 from processor.readers import ply, text
-from processor.readers.common import first_named, parsing
+from processor.readers.columns import first_named
+from processor.readers.file_checks import errors_name_the_file
 
 NAMES = tuple(rf"(n|normal_?){axis}" for axis in "xyz")
 UNIT_LENGTH = 0.1  # difference of a normal's length from 1 allowed in columns without names
@@ -57,7 +58,7 @@ def _from_ply(path: Path) -> tuple[Floats | None, Floats]:
     from plyfile import PlyData
 
     ply.read_header(path)
-    with parsing(path, "PLY"):
+    with errors_name_the_file(path, "PLY"):
         data: Any = PlyData.read(str(path))["vertex"].data
     return _by_name(path, data.dtype.names, lambda name: np.asarray(data[name], np.float64))
 

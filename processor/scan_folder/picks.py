@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import InputError, Picks, Scan
-from processor.readers.common import decoded, parsing
+from processor.readers.encoding import decoded
+from processor.readers.file_checks import errors_name_the_file
 from processor.scan_folder.units import MM_PER_UNIT
 
 COLUMNS = ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
@@ -24,7 +25,7 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
         text = decoded(path.read_bytes())
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    with parsing(path, "CSV"):
+    with errors_name_the_file(path, "CSV"):
         rows = list(csv.reader(text.splitlines()))
     header = tuple(cell.strip().lower() for cell in rows[0]) if rows else ()
     if header != COLUMNS:

@@ -39,6 +39,9 @@ class Flag(Word):
     NOT_FOUND = "not-found"
 
 
+LOCATED_FLAGS = (Flag.OK, Flag.LOW_CONFIDENCE, Flag.WRONG_SIZE)  # of spheres that have a place
+
+
 class Evidence(Word):
     """What a sphere's centre is estimated from."""
 
@@ -179,6 +182,11 @@ class Result(Checked):
     stations: StationCorrections = dataclasses.field(default_factory=StationCorrections, metadata={"optional": True})
     datum: tuple[Reason, ...] = described((), reasons="", optional=True)  # what fixes all stations together
     control: ControlDeviations = dataclasses.field(default_factory=ControlDeviations, metadata={"optional": True})
+
+    @property
+    def has_bounds(self) -> bool:
+        """Whether balls were found by method ``ray``, with the bounds of their estimates."""
+        return len(self.balls.sizes) > 0
 
     @property
     def overall(self) -> Verdict:

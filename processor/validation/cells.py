@@ -81,8 +81,11 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Figure:
-    """One check of a cell. ``limit`` is NaN if there is none; a value of NaN passes no limit."""
+class CheckValue:
+    """One check of a cell, as read from results.json or the history.
+
+    ``limit`` is NaN if there is none; a value of NaN passes no limit.
+    """
 
     step: str
     method: str
@@ -118,11 +121,11 @@ def fresh_seed(case: Case, number: int, i: int) -> int:
     return int(_digest([case.key, number, i])[:SEED_DIGITS], 16)
 
 
-def figures_of(results: Mapping[str, Any]) -> list[Figure]:
+def check_values(results: Mapping[str, Any]) -> list[CheckValue]:
     """Read the checks of a results.json, each with the method it is of; names are without the method."""
     main = {step: str(result.get("method", "")) for step, result in results["steps"].items()}
     return [
-        Figure(
+        CheckValue(
             step=check["step"],
             method=check["method"] or main.get(check["step"], ""),
             name=Metric(check["step"], check["quantity"], 0.0, Statistic(check["statistic"])).name,

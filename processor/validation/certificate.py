@@ -13,13 +13,13 @@ from __future__ import annotations
 
 import json
 import math
-import statistics
 import sys
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from processor.adjustment.finite_median import finite_median
 from processor.language.messages import NO_NUMBER, text
 from processor.model import Statistic
 from processor.report import templates
@@ -212,7 +212,7 @@ def _line(case: Case, step: str, method: str, quantity: str, scenes: Sequence[_R
         u_b=u_b,
         u_p=u_p,
         U95=COVERAGE_FACTOR * math.hypot(u_p, known_u_b) + abs(bias),
-        error_95=_median(of(Statistic.ERROR_95)),
+        error_95=finite_median(of(Statistic.ERROR_95)),
         coverage=_weighted(of(Statistic.COVERAGE), numbers),
         efficiency=_weighted(of(Statistic.EFFICIENCY), numbers),
     )
@@ -239,11 +239,6 @@ def conditions(case: Case) -> tuple[str, str, str]:
         noise = ", ".join(f"{key} {value}" for key, value in scanner.items() if "noise" in key)
         return str(scan.get("scanner", "default")), noise or "the preset's", f"{scan.get('step_mrad', '?')} mrad"
     return "none (sampled)", f"{scan.get('sigma_mm', '?')} mm", f"{scan.get('spacing_mm', '?')} mm"
-
-
-def _median(values: Sequence[float]) -> float:
-    finite = [value for value in values if math.isfinite(value)]
-    return statistics.median(finite) if finite else math.nan
 
 
 def _weighted(values: Sequence[float], weights: Sequence[float]) -> float:

@@ -21,7 +21,7 @@ from typing import Any
 from processor.language.messages import Text
 from processor.model import InputError
 from processor.store.codec import value_from_json, value_to_json
-from processor.validation.cells import Cell, Figure, Origin, Outcome, figures_of
+from processor.validation.cells import Cell, CheckValue, Origin, Outcome, check_values
 from processor.validation.software import Software
 
 VERSION = 3
@@ -173,7 +173,7 @@ class History:
     def add(self, night: str, cell: Cell, outcome: Outcome) -> None:
         """Write a cell with its figures, in place of an earlier attempt that failed."""
         case = cell.case
-        figures: list[Figure] = [] if outcome.failed else figures_of(outcome.results)
+        figures: list[CheckValue] = [] if outcome.failed else check_values(outcome.results)
         with self._transaction():
             self.db.execute("DELETE FROM cells WHERE night = ? AND cell = ? AND failed != ''", [night, cell.key])
             added = self.db.execute(
@@ -268,15 +268,17 @@ class History:
             )
         ]
 
-    def missed(self, night: str) -> dict[str, list[Figure]]:
+    def missed(self, night: str) -> dict[str, list[CheckValue]]:
         """Return the figures of a night that are beyond their limits, by cell."""
-        beyond: dict[str, list[Figure]] = {}
+        beyond: dict[str, list[CheckValue]] = {}
         for cell, step, method, name, value, limit, unit in self.db.execute(
             "SELECT cell, step, method, name, value, limit_, unit FROM figures"
             " WHERE night = ? AND limit_ IS NOT NULL AND (value IS NULL OR value > limit_)",
             [night],
         ):
-            figure = Figure(step=step, method=method, name=name, value=_number(value), limit=_number(limit), unit=unit)
+            figure = CheckValue(
+                step=step, method=method, name=name, value=_number(value), limit=_number(limit), unit=unit
+            )
             beyond.setdefault(cell, []).append(figure)
         return beyond
 

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree as ET
 
-from processor.validation.cells import Figure
+from processor.validation.cells import CheckValue
 from processor.validation.changes import ALARMS, Detected
 from processor.validation.coverage import Coverage
 from processor.validation.coverage import missed as beyond_limits
@@ -15,7 +15,7 @@ from processor.validation.coverage import missed as beyond_limits
 def xml(
     night: str,
     cells: Sequence[Mapping[str, Any]],
-    missed: Mapping[str, Sequence[Figure]],
+    missed: Mapping[str, Sequence[CheckValue]],
     detected: Detected,
     intervals: Sequence[Coverage] = (),
 ) -> bytes:

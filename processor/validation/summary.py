@@ -8,15 +8,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-import numpy as np
-
+from processor.adjustment.finite_median import finite_median
 from processor.language.messages import NO_NUMBER, Text, label, text
 from processor.model import Statistic
 from processor.report import templates
 from processor.report.all_tables import figure_name
 from processor.validation import changes
 from processor.validation import coverage as intervals
-from processor.validation.cells import Figure, Origin
+from processor.validation.cells import CheckValue, Origin
 from processor.validation.changes import ALARMS, Change, ChangeKind, Detected, Direction
 from processor.validation.coverage import Coverage
 from processor.validation.history import Name, Night, Row
@@ -44,7 +43,7 @@ class Summary:
     night: str
     software: Software
     cells: tuple[Mapping[str, Any], ...]
-    missed: Mapping[str, Sequence[Figure]]
+    missed: Mapping[str, Sequence[CheckValue]]
     detected: Detected
     coverage: tuple[Coverage, ...] = ()
 
@@ -196,7 +195,7 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], 
     for key in sorted(course):
         if summary.night not in course[key]:
             continue
-        levels = [_middle(course[key].get(night, [])) for night in shown]
+        levels = [finite_median(course[key].get(night, [])) for night in shown]
         name = key[1]
         change, row = change_of.get(name), last[key]
         figures.append(
@@ -226,11 +225,6 @@ def nights_html(summary: Summary, nights: Sequence[Night], rows: Sequence[Row], 
         )
     )
     return page + "\n"
-
-
-def _middle(values: Sequence[float]) -> float:
-    finite = [value for value in values if math.isfinite(value)]
-    return float(np.median(finite)) if finite else math.nan
 
 
 def _spark(levels: Sequence[float]) -> list[str]:

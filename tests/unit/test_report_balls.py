@@ -222,7 +222,7 @@ def test_without_a_limit_the_table_says_so():
 def test_the_terminal_has_a_summary_what_to_look_at_and_the_stations():
     shown = [one for one in all_tables.tables_of_run(*of_frame()) if one.on_terminal]
     assert [str(one.title).split(",")[0] for one in shown] == [
-        "Balls in short", "Balls to look at", "Stations against each other (mm"
+        "Balls in short", "Flagged balls", "Stations against each other (mm"
     ]  # fmt: skip
     values = {str(row[0]): row[1] for row in shown[0].rows}
     assert (values["balls"], values["flag ok"], values["flag not-found"]) == (5, 2, 1)
@@ -291,7 +291,7 @@ def test_the_folder_holds_the_drawing_and_can_be_replaced(tmp_path):
     found = {path.name for path in (tmp_path / "out").iterdir()}
     assert {
         "nodes.dxf",
-        "balls-to-look-at.pdf",
+        "flagged-balls.pdf",
         "balls.csv",
         "lowest.csv",
         "nodes.csv",
@@ -312,13 +312,13 @@ def test_figures_of_a_frame_and_those_of_balls_to_look_at():
     report, result = with_truth()
     found = all_figures.draw_figures(*of_frame(result, report))["spheres"]
     assert set(found) == {
-        "plan.png", "radius-errors.png", "ball-errors.png", "ball-to-see-11.png", "ball-to-see-12.png",
-        "ball-to-see-13.png",
+        "plan.png", "radius-errors.png", "ball-errors.png", "flagged-ball-11.png", "flagged-ball-12.png",
+        "flagged-ball-13.png",
     }  # fmt: skip
     assert "times their size" in str(found["plan.png"][0])
     assert "minus truth" in str(found["ball-errors.png"][0])
     assert "sd" not in str(found["ball-errors.png"][0])
-    assert str(found["ball-to-see-11.png"][0]).startswith("Ball 11, wrong-size")
+    assert str(found["flagged-ball-11.png"][0]).startswith("Ball 11, wrong-size")
     with mpl.rc_context({"lines.linewidth": 9.0, "font.size": 20.0}):
         assert all_figures.draw_figures(*of_frame(result, report))["spheres"] == found
     untold = all_figures.draw_figures(*of_frame())["spheres"]
@@ -337,7 +337,7 @@ def test_at_most_twelve_balls_have_a_picture_worst_first():
     assert len(drawn) == 12
     assert [caption.split(",")[1].split(":")[0].strip() for caption in captions][:8] == ["wrong-size"] * 8
     assert "the first 12 of" in captions[0]
-    every = close_ups.doubtful(scene(made), made)
+    every = close_ups.flagged_rows(scene(made), made)
     assert pages_of(close_ups.document(scene(made), made)) == len(every) > 12
 
 
@@ -460,7 +460,7 @@ def test_the_page_of_a_frame():
     drawn = all_figures.draw_figures(execution, report)
     text = page.html(execution, report, drawn)
     found = TablesOfPage(text)
-    assert {"Nodes against the design (mm)", "Balls to look at, method ray (mm)", "Balls, method ray (mm)"} <= set(
+    assert {"Nodes against the design (mm)", "Flagged balls, method ray (mm)", "Balls, method ray (mm)"} <= set(
         found.tables
     )
     assert found.tables["Nodes against the design (mm)"][1][-3] == "pass"

@@ -121,7 +121,7 @@ def test_foreign_cells_name_settings_that_their_generators_have():
 def test_figures_are_told_apart_by_method():
     found = validation_nights.results({"radii, bias": 0.5, "ransac | radii, bias": None, "other: x": (2.0, 1.0, "%")})
     found["comparison"] = {"spheres": [{"method": "ransac"}]}
-    figures = cells.figures_of(found)
+    figures = cells.check_values(found)
     assert [(f.method, f.name) for f in figures] == [
         ("ray", "radii, bias"),
         ("ransac", "radii, bias"),
@@ -543,7 +543,7 @@ def test_a_generator_beside_the_matrix(tmp_path):
     assert (cell.case.origin, cell.case.recipe) == (cells.Origin.FOREIGN, "mine")
     found = running.do(cell, scratch=str(tmp_path))
     assert not found.failed
-    assert [figure.name for figure in cells.figures_of(found.results)][:1] == ["scans not placed"]
+    assert [figure.name for figure in cells.check_values(found.results)][:1] == ["scans not placed"]
     (tmp_path / "mine.py").write_text("import sys; sys.exit('no idea')", "utf-8")
     (cell,) = matrix.read(tmp_path / "m.toml", False).cells(1)
     assert running.do(cell, scratch=str(tmp_path)).failed == "mine: exit code 1: no idea"

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from scipy.stats import binned_statistic_2d
 
 from processor.language.messages import Message, text
 from processor.model import DesignPart, Floats, Scene
@@ -85,15 +86,8 @@ def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
             [np.linspace(a, b, max(rows // 4, 1) + 1) for a, b in zip(flat.edges, flat.edges[1:], strict=False)]
         )
     )
-    i = np.clip(np.searchsorted(x, flat.along, side="right") - 1, 0, columns - 1)
-    k = np.clip(np.searchsorted(y, flat.around, side="right") - 1, 0, len(y) - 2)
-    means = np.full((len(y) - 1, columns), np.nan)
-    place = k * columns + i
-    order = np.argsort(place, kind="stable")
-    starts = np.flatnonzero(np.diff(place[order], prepend=-1))
-    for group in np.split(order, starts[1:]):
-        means.flat[place[group[0]]] = np.median(values[group])
-    return means, x, y
+    medians = binned_statistic_2d(flat.around, flat.along, values, "median", bins=(y, x)).statistic
+    return medians, x, y
 
 
 def _can_show(part: DesignPart, residuals: Residuals, i: int) -> bool:

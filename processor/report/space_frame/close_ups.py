@@ -1,4 +1,4 @@
-"""A figure of each ball to look at: the points about it in elevation and plan, the fitted and the nominal sphere."""
+"""A figure of each flagged ball: the points about it in elevation and plan, the fitted and the nominal sphere."""
 
 from __future__ import annotations
 
@@ -13,19 +13,18 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from processor.geometry import rigid
 from processor.language.messages import messages, text
 from processor.model import NORMAL_95, Floats, Scene
-from processor.report.space_frame.dxf import nominal_places
+from processor.report.space_frame.node_places import designed_places
 from processor.report.style import COLOURS, CaptionedPngs, number, pdf, png, with_interval, write_beside
 from processor.space_frame.points.scene_source import SceneSource, of_scene
 from processor.space_frame.result import Balls, Flag, Result
 from processor.store.streaming import StoredPoints, points_of
 
-PREFIX = "ball-to-see-"
+PREFIX = "flagged-ball-"
 MOST_BALLS = 12  # on the page
 MOST_PAGES = 500
-DOCUMENT = "balls-to-look-at.pdf"
+DOCUMENT = "flagged-balls.pdf"
 LINE = 0.052  # of the panel's height
 ORDER = (Flag.WRONG_SIZE, Flag.NOT_FOUND, Flag.LOW_CONFIDENCE)  # of what is drawn first
 ROUND_MM = 60.0  # shown about the ball
@@ -41,8 +40,10 @@ def draw(scene: Scene, result: Result, stored: Path | None = None) -> CaptionedP
 
     ``stored`` is the scene's file, where its points were left there.
     """
-    balls, every = result.balls, len(doubtful(scene, result))
-    more = text(" (the first {most} of {all} to look at, all in {file})", most=MOST_BALLS, all=every, file=DOCUMENT)
+    balls, every = result.balls, len(flagged_rows(scene, result))
+    more = text(
+        " (the first {most} of {all} that are flagged, all in {file})", most=MOST_BALLS, all=every, file=DOCUMENT
+    )
     return {
         f"{PREFIX}{int(balls.ids[i])}.png": (
             text(
@@ -66,7 +67,7 @@ def document(scene: Scene, result: Result, stored: Path | None = None) -> bytes:
     return pdf(figure for _, figure in (first, *drawn)) if first is not None else b""
 
 
-def doubtful(scene: Scene, result: Result) -> list[int]:
+def flagged_rows(scene: Scene, result: Result) -> list[int]:
     """Rows of the flagged balls with a known place, in the order in which they are drawn."""
     there = np.isfinite(_places(result, designed_places(scene, result))).all(axis=1)
     return [i for flag in ORDER for i in np.flatnonzero(there).tolist() if result.balls.flag[i] is flag]
@@ -81,7 +82,7 @@ def _places(result: Result, nominal: Floats) -> Floats:
 def _drawn(scene: Scene, result: Result, stored: Path | None, most: int) -> Iterator[tuple[int, Figure]]:
     nominal = designed_places(scene, result)
     centres = _places(result, nominal)
-    shown = doubtful(scene, result)[:most]
+    shown = flagged_rows(scene, result)[:most]
     if not shown or (stored is None and not all(len(scan.points) for scan in scene.scans)):
         return
     reach = [_radius(result, i) + ROUND_MM for i in shown]
@@ -89,23 +90,6 @@ def _drawn(scene: Scene, result: Result, stored: Path | None, most: int) -> Iter
         crops = crops_about(scene, centres[shown], np.array(reach), points)
     for k, i in enumerate(shown):
         yield i, _ball(result, i, centres[i], nominal[i] - centres[i], crops[k], reach[k])
-
-
-def designed_places(scene: Scene, result: Result) -> Floats:
-    """Return where the design has each ball (k, 3), in the input's own frame; NaN where it has none.
-
-    Where the node was found that is its place less its movement, else the design's place by the estimated pose.
-    """
-    places = nominal_places(result)
-    if scene.frame is None:
-        return places
-    nodes = scene.frame.centres
-    if result.matching is not None:
-        nodes = rigid.apply(rigid.invert(result.matching.T_design_scan), nodes)
-    place_of_id = dict(zip(scene.frame.ids.tolist(), nodes, strict=True))
-    for i in np.flatnonzero(~np.isfinite(places).all(axis=1)).tolist():
-        places[i] = place_of_id.get(int(result.balls.ids[i]), places[i])
-    return places
 
 
 def crops_about(scene: Scene, centres: Floats, reach: Floats, stored: StoredPoints | None = None) -> list[Floats]:

@@ -12,22 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from processor.model import Floats
+from processor.report.space_frame.node_places import nominal_places
 from processor.space_frame.result import Result
 
 MILLIMETRES = 4  # of $INSUNITS
 METRIC = 1  # of $MEASUREMENT
 LAYERS = {"NODES": 5, "AXES": 8, "MOVEMENTS": 30, "IDS": 7}  # with the colours of AutoCAD's index
 TEXT_HEIGHT_MM = 50.0
-
-
-def nominal_places(result: Result) -> Floats:
-    """Return where the design has each node (k, 3), in the input's own frame; NaN where no movement is known."""
-    balls = result.balls
-    if result.movement_reference is None or result.matching is None:
-        return np.full_like(balls.centres, np.nan)
-    places: Floats = balls.centres - balls.movement @ result.matching.T_design_scan[:3, :3]
-    return places
 
 
 def drawing(result: Result) -> bytes:

@@ -1,4 +1,4 @@
-"""Figures of balls: plan with movements, errors beside the bound, and each ball to look at."""
+"""Figures of balls: plan with movements, errors beside the bound, and each flagged ball."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 from scipy.spatial import cKDTree
 
+from processor.adjustment.finite_median import finite_median
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import Floats, Scene, StepRun
 from processor.report.space_frame import close_ups
-from processor.report.space_frame.dxf import nominal_places
-from processor.report.space_frame.tables import has_bounds
+from processor.report.space_frame.node_places import designed_places, nominal_places
 from processor.report.style import (
     COLOURS,
     DASHES,
@@ -31,9 +31,8 @@ from processor.report.style import (
     png,
     rounded,
 )
-from processor.space_frame.result import Flag, Result
+from processor.space_frame.result import LOCATED_FLAGS, Flag, Result
 
-FLAGS = (Flag.OK, Flag.LOW_CONFIDENCE, Flag.WRONG_SIZE)
 MOST_LABELS = 30
 ARROW_SHARE = 0.6  # of the way to the next ball: how long all but the longest arrows are drawn
 PLAN, RADIUS_ERRORS, BALL_ERRORS = "plan.png", "radius-errors.png", "ball-errors.png"
@@ -47,9 +46,9 @@ def draw(scene: Scene, runs: Sequence[StepRun], report: ErrorReport, stored: Pat
         figures[PLAN] = _plan(scene, runs[0])
         if report.true_radii:
             figures[RADIUS_ERRORS] = _radius_errors(runs, report)
-        if has_bounds(first):
+        if first.has_bounds:
             figures[BALL_ERRORS] = _ball_errors(runs[0], report)
-    if has_bounds(first):
+    if first.has_bounds:
         figures |= close_ups.draw(scene, first, stored)
     return figures
 
@@ -64,7 +63,7 @@ def _plan(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
     result: Result = run.result
     balls = result.balls
     arrows = _movements(figure, axes, result)
-    for k, flag in enumerate(FLAGS):
+    for k, flag in enumerate(LOCATED_FLAGS):
         on = balls.flagged(flag) & balls.placed
         if on.any():
             axes.scatter(
@@ -78,21 +77,21 @@ def _plan(scene: Scene, run: StepRun) -> tuple[Message, bytes]:
             )
     where = balls.centres.copy()
     missing = ~balls.placed | balls.flagged(Flag.NOT_FOUND)
-    where[missing] = close_ups.designed_places(scene, result)[missing]
+    where[missing] = designed_places(scene, result)[missing]
     drawn = missing & np.isfinite(where).all(axis=1)
     if drawn.any():
         label = f"not found, place of the design ({drawn.sum()})"
         x, y = (where[drawn, :2] / 1000.0).T
         axes.scatter(x, y, s=36.0, marker="x", color="black", label=label)
-    to_see = np.flatnonzero(~balls.flagged(Flag.OK) & np.isfinite(where).all(axis=1))[:MOST_LABELS]
-    for i in to_see.tolist():
+    flagged = np.flatnonzero(~balls.flagged(Flag.OK) & np.isfinite(where).all(axis=1))[:MOST_LABELS]
+    for i in flagged.tolist():
         axes.annotate(str(balls.ids[i]), where[i, :2] / 1000.0, xytext=(5, 4), textcoords="offset points", fontsize=8)
     axes.set(xlabel="x, m", ylabel="y, m")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(fontsize=8, loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3)
-    caption: Message = text("Plan of the balls, method {method}; those to look at have their ids", method=run.method)
+    caption: Message = text("Plan of the balls, method {method}; flagged ones have their ids", method=run.method)
     return caption if arrows is None else text("{plan}; {arrows}", plan=caption, arrows=arrows), png(figure)
 
 
@@ -203,7 +202,7 @@ def _errors(axes: Axes, off: Floats, sd: Floats, bound: Floats, xlabel: str, yla
     finite = np.isfinite(off)
     errors = off[finite]
     reach = float(np.quantile(np.abs(errors), 0.99)) if len(errors) else 1.0
-    reach = 1.15 * max(reach, 2.5 * _middle(bound[finite]), LEAST_SHOWN_MM)
+    reach = 1.15 * max(reach, 2.5 * finite_median(bound[finite]), LEAST_SHOWN_MM)
     bins = np.linspace(-reach, reach, 31)
     _bars(axes, np.clip(errors, -reach, reach), bins, f"errors (n = {len(errors)})")
     x = np.linspace(-reach, reach, 301)
@@ -242,8 +241,3 @@ def _bars(axes: Axes, values: npt.NDArray[np.float64], bins: Floats, label: str,
         values, bins=bins.tolist(), histtype="stepfilled", facecolor=(*mpl.colors.to_rgb(COLOURS[k]), 0.35),
         edgecolor=COLOURS[k], hatch=HATCHES[k], label=label,
     )  # fmt: skip
-
-
-def _middle(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else 0.0

@@ -10,11 +10,10 @@ import numpy as np
 from processor.language.messages import text
 from processor.model import NORMAL_95, Floats, Scene, StepRun
 from processor.report.style import DIVERGING_STOPS
-from processor.space_frame.result import Flag, Result
+from processor.space_frame.result import LOCATED_FLAGS, Flag, Result
 from processor.store.json_values import json_ready
 
-FLAGS = (Flag.OK, Flag.LOW_CONFIDENCE, Flag.WRONG_SIZE)
-TONES = ("#0072B2", "#D55E00", "#000000")  # of FLAGS
+TONES = ("#0072B2", "#D55E00", "#000000")  # of LOCATED_FLAGS
 MOST_BALLS = 5_000  # about 1 MB of the page; flagged balls are always included
 MOST_TUBES = 15_000
 
@@ -31,7 +30,7 @@ def live_data(_: Scene, runs: Sequence[StepRun]) -> dict[str, Any] | None:
     step = max(1, -(-len(rest) // max(1, MOST_BALLS - int(flagged.sum()))))
     drawn = np.sort(np.concatenate([placed[flagged], rest[::step]]))
     origin = np.round(balls.centres[placed].mean(axis=0))
-    used = [flag for flag in FLAGS if flag in {balls.flag[i] for i in drawn}]
+    used = [flag for flag in LOCATED_FLAGS if flag in {balls.flag[i] for i in drawn}]
     tubes = np.stack([result.tubes.start, result.tubes.end], axis=1)[:MOST_TUBES]
     empty = {"name": "", "edges": [], "points": [], "residual": []}
     parts: list[dict[str, Any]] = [{**empty, "text": text("balls: {flag}", flag=flag)} for flag in used]
@@ -57,7 +56,7 @@ def _mark(result: Result, i: int, origin: Floats, used: Sequence[Flag]) -> dict[
     balls, flag = result.balls, result.balls.flag[i]
     mark = {
         "part": used.index(flag),
-        "tone": FLAGS.index(flag),
+        "tone": LOCATED_FLAGS.index(flag),
         "name": f"{balls.ids[i]}",
         "at": np.round(balls.centres[i] - origin, 2),
         "radius": round(float(balls.radii[i]), 2),

@@ -28,7 +28,7 @@ def _summary(result: Result) -> tuple[Message, Message | str]:
 
 def _files(execution: Execution, run: StepRun) -> dict[str, bytes]:
     files = {"nodes.dxf": dxf.drawing(run.result)} if len(run.result.tubes) else {}
-    if tables.has_bounds(run.result):
+    if run.result.has_bounds:
         pages = close_ups.document(execution.scene, run.result, execution.stored)
         files |= {close_ups.DOCUMENT: pages} if pages else {}
     return files

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from processor.adjustment.finite_median import finite_median
 from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Message, text
 from processor.model import NORMAL_95, Floats, Status, StepRun, Verdict
@@ -21,29 +22,21 @@ COORDINATES = tuple(f"{axis}_mm" for axis in XYZ)
 
 
 def step_tables(runs: Sequence[StepRun], report: ErrorReport) -> list[Table]:
-    """Tabulate balls, those to look at first; ``runs`` are the result and those of methods compared with it."""
+    """Tabulate balls, the flagged ones first; ``runs`` are the result and those of methods compared with it."""
     first = runs[0].result
-    whole = has_bounds(first)
+    whole = first.has_bounds
     tables = [_radius_errors(runs, report)] if report.true_radii else []
     if whole:
         tables.append(_summary(first, runs[0].method))
-    tables += _to_look_at(first, runs[0].method)
+    tables += _flagged(first, runs[0].method)
     for run in runs:
         true = report.true_radii.get(run.method, np.full(len(run.result.balls), NAN))
         file = "balls" if run is runs[0] else f"balls-{run.method}"
-        tables.append(_with_bounds(run, true, file) if has_bounds(run.result) else _formal(run, true, file, runs[0]))
+        tables.append(_with_bounds(run, true, file) if run.result.has_bounds else _formal(run, true, file, runs[0]))
     if whole:
         tables += [_brief(first, runs[0].method), _lowest(first.balls), *_nodes(first), *_tubes(first)]
         tables += [*_stations(first), *_control(first)]
     return tables
-
-
-def has_bounds(result: Result) -> bool:
-    """Whether balls were found by method ``ray``, with the bounds of their estimates."""
-    return len(result.balls.sizes) > 0
-
-
-# --- balls ---------------------------------------------------------------------------------------------------------
 
 
 def _formal(run: StepRun, true: Floats, file: str, first: StepRun) -> Table:
@@ -145,7 +138,7 @@ def _brief(result: Result, method: str) -> Table:
     return Table(_title(method), columns, rows, note=note, on_terminal=not len(result.tubes))
 
 
-def _to_look_at(result: Result, method: str) -> list[Table]:
+def _flagged(result: Result, method: str) -> list[Table]:
     balls = result.balls
     rows = tuple(
         (ball, balls.flag[i], balls.reasons[i], *balls.centres[i].tolist(), float(balls.radii[i]))
@@ -153,7 +146,7 @@ def _to_look_at(result: Result, method: str) -> list[Table]:
         if balls.flag[i] is not Flag.OK
     )
     columns = ("id", "flag", "remark", *COORDINATES, "radius_mm")
-    return [Table(text("Balls to look at, method {method} (mm)", method=method), columns, rows)] if rows else []
+    return [Table(text("Flagged balls, method {method} (mm)", method=method), columns, rows)] if rows else []
 
 
 def _radius_errors(runs: Sequence[StepRun], report: ErrorReport) -> Table:
@@ -210,10 +203,10 @@ def _summary(result: Result, method: str) -> Table:
         (text("height of the lowest point"), balls.lowest_sd),
     ):
         name = text("95 % half-width of the {quantity}, median", quantity=quantity)
-        rows.append((name, _median(NORMAL_95 * sd), "mm"))
+        rows.append((name, finite_median(NORMAL_95 * sd), "mm"))
     for k, quantity in enumerate((text("centre"), text("radius"), text("lowest point"))):
         name = text("bound over sd of the {quantity}, median", quantity=quantity)
-        rows.append((name, _median(balls.efficiency[:, k]), ""))
+        rows.append((name, finite_median(balls.efficiency[:, k]), ""))
     if result.matching is not None:
         rows.append((text("matching with the design"), result.matching.status, ""))
     if result.movement_reference is not None:
@@ -224,17 +217,12 @@ def _summary(result: Result, method: str) -> Table:
 def _movements(balls: Balls) -> Iterator[tuple[Any, ...]]:
     has_movement = np.isfinite(balls.movement_size)
     known = balls.movement_size[has_movement]
-    yield text("movement of a node, median"), _median(known), "mm"
+    yield text("movement of a node, median"), finite_median(known), "mm"
     yield text("movement of a node, largest"), float(known.max()) if len(known) else NAN, "mm"
     counts = collections.Counter(verdict for verdict, known in zip(balls.verdict, has_movement, strict=True) if known)
     for verdict in Verdict:
         if counts[verdict]:
             yield text("nodes, verdict {verdict}", verdict=verdict), counts[verdict], ""
-
-
-def _median(values: Floats) -> float:
-    finite = values[np.isfinite(values)]
-    return float(np.median(finite)) if len(finite) else NAN
 
 
 def _nodes(result: Result) -> list[Table]:

@@ -1,0 +1,62 @@
+"""Columns of tables and records: found by name, and filled piece by piece."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from processor.model import Floats
+
+INTENSITY_NAMES = r"(scalar_)?(intensity|reflectance|reflectivity|amplitude)|i"
+STATION_NAMES = r"(scalar_)?station"
+PIECE_BYTES = 1 << 19  # fits in the cache of a processor core between the passes over it
+
+
+def first_named(columns: Any, pattern: str) -> str | None:
+    """Return the first column name that matches a whole pattern, ignoring case; None without one."""
+    return next((name for name in columns if re.fullmatch(pattern, name, re.IGNORECASE)), None)
+
+
+def columns_of_records(file: BinaryIO, dtype: Any, wanted: Sequence[str], count: int) -> Iterator[Sequence[Any]]:
+    """Yield the wanted fields, as columns, of the next ``count`` records of a file, piece by piece.
+
+    A piece is valid until the next one is requested.
+    """
+    size = dtype.itemsize
+    text = bytearray(max(1, min(count, PIECE_BYTES // size)) * size)
+    view = memoryview(text)
+    while count > 0:
+        filled = 0
+        while filled < len(view) and (read := file.readinto(view[filled:])):  # type: ignore[attr-defined]
+            filled += read
+        records = np.frombuffer(text, dtype, min(filled // size, count))
+        if not len(records):
+            return
+        count -= len(records)
+        yield [records[name] for name in wanted]
+
+
+def fill_columns(columns: Sequence[Floats], pieces: Iterable[Any]) -> None:
+    """Fill columns, the first of them (n, 3), the others (n,), from pieces: lists of columns, or arrays (m, k).
+
+    Raises ValueError if the pieces have fewer than n rows.
+    """
+    filled, count = 0, len(columns[0])
+    for piece in pieces:
+        if isinstance(piece, np.ndarray):
+            rows = slice(filled, filled + len(piece))
+            columns[0][rows] = piece[:, :3]
+            parts = list(piece.T)
+        else:
+            parts = piece
+            rows = slice(filled, filled + len(parts[0]))
+            for axis in range(3):
+                columns[0][rows, axis] = parts[axis]
+        for values, part in zip(columns[1:], parts[3:], strict=True):
+            values[rows] = part
+        filled += len(parts[0])
+    if filled != count:
+        raise ValueError(f"expected {count} points as declared, found {filled}")

@@ -1,0 +1,100 @@
+"""The record that all readers return, and how it is built."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from processor.model import Checked, Floats, InputError, Ints, Labels, column, optional
+from processor.readers.encoding import file_name_as_text
+
+FAR = 10_000.0  # units; an origin is subtracted from coordinates beyond this
+ORIGIN_STEP = 1_000.0
+
+
+@dataclass(frozen=True)
+class RawScan(Checked):
+    """One scan as stored in its file. Coordinates in the scan's frame are ``origin + points``, in ``unit``."""
+
+    name: str
+    points: Floats = column("n", 3)
+    origin: Floats = dataclasses.field(
+        default_factory=lambda: np.zeros(3), metadata={"shape": (3,), "dtype": np.float64}
+    )
+    intensity: Floats = column("n")
+    position: Floats = optional(3)  # of the scanner, in the scan's frame
+    T_project_scan: Floats = optional(4, 4)
+    unit: str = ""  # "" = not given by the format
+    station: Ints = column("n", dtype=np.int64)  # station that saw the point, from 1; 0 = unknown
+    grid_row: Labels = column("n", dtype=np.int32)  # as stored; see scan_folder.scanner_grid
+    grid_column: Labels = column("n", dtype=np.int32)
+    step: float = 0.0  # resolution of the coordinates in the file's number type; 0 = unlimited
+
+
+def scan_name(path: Path) -> str:
+    """Return the name of a file's scan: the name of the file without suffix, as text."""
+    return file_name_as_text(path.stem) or "scan"
+
+
+def build_scan(
+    path: Path,
+    name: str,
+    points: Floats,
+    *,
+    unit: str,
+    intensity: npt.ArrayLike = (),
+    position: npt.ArrayLike = (),
+    T_project_scan: npt.ArrayLike = (),
+    station: npt.ArrayLike = (),
+    grid: tuple[Labels, Labels] | None = None,
+    single: bool = False,
+) -> RawScan:
+    """Build the record from coordinates (n, 3); an origin of whole thousands is subtracted in place where they are far.
+
+    ``grid``: rows and columns (n,) of the scanner's grid. ``single``: coordinates are 32-bit floats in the file. Raises
+    InputError without points, and for coordinates that are not finite.
+    """
+    if not len(points):
+        raise InputError(f"{path}: scan {name!r} holds no points; export it again")
+    low, high = float(points.min()), float(points.max())  # NaN where there is one
+    if not (np.isfinite(low) and np.isfinite(high)):
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        raise InputError(
+            f"{path}: {len(bad)} of {len(points)} points of {name!r} have coordinates that are not finite, "
+            f"the first in row {bad[0] + 1}; remove them or export the scan again"
+        )
+    farthest = max(-low, high)
+    origin = np.zeros(3)
+    if farthest > FAR:
+        # The median of a sample: a single point may be an outlier.
+        sample = points[:: max(1, len(points) // 1000)]
+        origin = np.floor(np.sort(sample, axis=0)[len(sample) // 2] / ORIGIN_STEP) * ORIGIN_STEP
+        points -= origin
+    with np.errstate(over="ignore"):
+        step = float(np.spacing(np.float32(farthest))) if single else 0.0
+    return RawScan(
+        name,
+        points,
+        origin,
+        intensity=np.asarray(intensity, np.float64),
+        position=np.asarray(position, np.float64),
+        T_project_scan=np.asarray(T_project_scan, np.float64),
+        unit=unit,
+        station=np.asarray(station, np.int64),
+        grid_row=grid[0] if grid else np.empty(0, np.int32),
+        grid_column=grid[1] if grid else np.empty(0, np.int32),
+        step=step,
+    )
+
+
+def scaled_in_place(raw: RawScan, factor: float) -> Floats:
+    """Return the points times a factor, in the record's memory; the record must not be used afterwards."""
+    points: Floats = raw.points
+    points.flags.writeable = True
+    if factor != 1.0:
+        points *= factor
+    return points
