@@ -34,8 +34,8 @@ def run(
     night = _night(night)
     wanted = matrices.read(matrix or matrices.DEFAULT, full)
     with (
-        nights.opened(out) as scratch,
-        running.opened(cluster, jobs, scratch, lambda line: print(line, file=sys.stderr)) as runner,
+        nights.locked_output(out) as scratch,
+        running.cell_runner(cluster, jobs, scratch, lambda line: print(line, file=sys.stderr)) as runner,
         tqdm(total=0, unit="cell", disable=not sys.stderr.isatty()) as bar,
     ):
 

@@ -46,7 +46,7 @@ def number_of(night: str) -> int:
 
 
 @contextmanager
-def opened(out: Path) -> Iterator[Path]:
+def locked_output(out: Path) -> Iterator[Path]:
     """Lock the folder of results and give the folder for scenes in it. Raises UsageError if it is not free."""
     if out.exists() and not out.is_dir():
         raise UsageError(f"{out}: is a file; name a folder for the results")
@@ -73,7 +73,9 @@ def run(
     progress: Callable[[int, int, Cell | None, Outcome | None], None] = lambda *_: None,
     lang: str = "en",
 ) -> Summary:
-    """Run the cells of a night that are not done, and report it in the language ``lang``; ``out`` must be ``opened``.
+    """Run the cells of a night that are not done, and report it in the language ``lang``.
+
+    ``out`` must be locked by :func:`locked_output`.
 
     ``again`` deletes cells of this night that other software has done; without it, they raise UsageError. ``progress``
     is called with the numbers of cells done and of all, and the last cell with its outcome.

@@ -120,7 +120,7 @@ def _key(name: str) -> str:
 
 
 @contextmanager
-def opened(cluster: str | None, jobs: int, scratch: Path, say: Callable[[str], None]) -> Iterator[Runner]:
+def cell_runner(cluster: str | None, jobs: int, scratch: Path, say: Callable[[str], None]) -> Iterator[Runner]:
     """Give what runs cells: ``jobs`` at a time in folders below ``scratch``, or on a cluster, which shares no folder.
 
     Raises UsageError if there is no cluster at the address ``cluster``; InputError if it is lost on the way.

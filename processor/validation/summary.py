@@ -25,11 +25,12 @@ FORMAT, FORMAT_VERSION = "processor-validation", "1.0"
 MOST_NAMED = 2  # changes that the line names
 SPARK_NIGHTS, SPARK_WIDTH, SPARK_HEIGHT = 60, 120, 22
 TEST = text(
-    "Fixed seeds: the same scenes every night; their figures change only with the software. Changed figures: paired "
-    "one-sided t tests over the scenes against a margin of 2 % (1 point for shares), with the scatter of the "
-    "differences and with that from seed to seed, the smaller p doubled. Seeds of the night: an exact stratified rank "
-    "test (normal scores) against {least} to {most} earlier nights. Holm's correction over all tests of a night: if "
-    "nothing got worse, the chance of any alarm is at most {rate:g} %; the same for improvements.",
+    "Fixed seeds give the same scenes every night, so their figures change only with the software. Changed figures "
+    "are tested by paired one-sided t tests over the scenes, with a margin of 2 % (1 point for shares). The scatter"
+    " is that of the differences or that from seed to seed: the smaller p counts, doubled. Figures of the seeds of "
+    "the night are compared with {least} to {most} earlier nights by an exact stratified rank test (normal scores)."
+    " Holm's correction covers all tests of a night: if nothing got worse, the chance of any alarm is at most "
+    "{rate:g} %. The same holds for improvements.",
     least=changes.LEAST_NIGHTS,
     most=changes.MOST_NIGHTS,
     rate=100.0 * changes.ALARM_RATE,

@@ -140,7 +140,7 @@ def of_cell(cell):
 
 def run(out, asked, figures_of=of_cell, day=NIGHT, done=None, **more):
     more.setdefault("made_by", validation_nights.SOFTWARE)
-    with night.opened(out):
+    with night.locked_output(out):
         return night.run(asked, out, day, validation_nights.runner(figures_of, done), **more)
 
 
@@ -244,9 +244,13 @@ def test_folders_and_files_that_are_something_else(tmp_path):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "thesis.txt").write_text("", "utf-8")
     for path, said in ((tmp_path / "full", "holds no earlier nights"), (tmp_path / "full" / "thesis.txt", "is a file")):
-        with pytest.raises(UsageError, match=said), night.opened(path):
+        with pytest.raises(UsageError, match=said), night.locked_output(path):
             pass
-    with night.opened(tmp_path / "out"), pytest.raises(UsageError, match="at work"), night.opened(tmp_path / "out"):
+    with (
+        night.locked_output(tmp_path / "out"),
+        pytest.raises(UsageError, match="at work"),
+        night.locked_output(tmp_path / "out"),
+    ):
         pass
     with pytest.raises(InputError, match="expected a history"):
         History(tmp_path / "full" / "thesis.txt" / "x")
@@ -289,7 +293,7 @@ def slow(cell):
     return t.of_cell(cell)
 
 out = Path(sys.argv[1])
-with night.opened(out):
+with night.locked_output(out):
     print("begun", flush=True)
     night.run(t.killed_matrix(), out, t.NIGHT, validation_nights.runner(slow), made_by=validation_nights.SOFTWARE)
 print("ended", flush=True)

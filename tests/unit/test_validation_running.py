@@ -67,7 +67,7 @@ def test_parameters_are_written_as_toml():
 def test_stopping_ends_what_is_under_way(tmp_path):
     cell = Cell(validation_nights.case(), 1, True)
     started = time.monotonic()
-    with running.opened(None, 1, tmp_path, print) as run:
+    with running.cell_runner(None, 1, tmp_path, print) as run:
         coming = run([cell, cell])
         next(coming)  # fails soon: its recipe is no recipe
         coming.close()
@@ -88,7 +88,7 @@ def test_cells_on_a_cluster(tmp_path, monkeypatch):
     cells = [Cell(validation_nights.case(), seed, True) for seed in (1, 2, 3)]
     with (
         distributed.LocalCluster(1, processes=False, threads_per_worker=2, dashboard_address=None) as cluster,
-        running.opened(cluster.scheduler_address, 1, tmp_path, print) as run,
+        running.cell_runner(cluster.scheduler_address, 1, tmp_path, print) as run,
     ):
         found = {cell.seed: outcome for cell, outcome in run(cells)}
     assert {seed: outcome.results.get("seed") for seed, outcome in found.items()} == {1: 1, 2: None, 3: 3}
@@ -99,6 +99,6 @@ def test_a_cluster_that_does_not_answer(tmp_path, monkeypatch):
     monkeypatch.setattr(runner, "CONNECT_S", 1)
     with (
         pytest.raises(UsageError, match="expected the address of a Dask scheduler that answers"),
-        running.opened("tcp://127.0.0.1:1", 1, tmp_path, print),
+        running.cell_runner("tcp://127.0.0.1:1", 1, tmp_path, print),
     ):
         pass
