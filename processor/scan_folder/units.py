@@ -41,6 +41,9 @@ PART_RATIOS: tuple[float, ...] = (
 FRAME_RATIOS: tuple[float, ...] = (1000.0, 304.8, 25.4, 1 / 304.8, 0.001)
 STRUCTURE_RATIOS: tuple[float, ...] = (1000.0, 304.8, 1 / 304.8, 0.001)
 RATIO_TOLERANCE = 0.25
+CERTAIN_RATIO = 100.0  # and its inverse: ratios that no surroundings of a part and no piece of one cause
+SHAPE_TOLERANCE = 2.0  # ratio of extents along the principal axes, of which a part seen from one side lacks some
+THIN = 0.05  # of the largest extent: such an extent is not compared
 SAMPLE = 100_000  # points
 
 
@@ -84,8 +87,9 @@ def check_ratio(
 ) -> None:
     """Raise InputError if the size of a scan's points (n, 3), mm, differs from its design's by a ratio of units.
 
-    ``nominal`` (m, 3) are the vertices of the design, or none; sizes are distances from the middle. ``what`` names file
-    and scan, ``reason`` the source of ``unit``.
+    A mistaken unit scales all extents alike, a floor around a small part does not. ``nominal`` (m, 3) are the
+    vertices of the design, or none; sizes are distances from the middle. ``what`` names file and scan, ``reason``
+    the source of ``unit``.
     """
     size = radius(nominal) if len(nominal) else 0.0
     if not size > 0.0:
@@ -94,10 +98,31 @@ def check_ratio(
     centre = np.quantile(sample, [0.01, 0.99], axis=0).mean(axis=0)
     ratio = float(np.quantile(np.linalg.norm(sample - centre, axis=1), 0.99)) / size
     factor = unit_ratio.nearest_factor(ratio, ratios, RATIO_TOLERANCE)
-    if factor is None:
+    if factor is None or not (_certain(factor) or _scaled_alike(sample, nominal, factor)):
         return
     likely = [name for name, mm in MM_PER_UNIT.items() if abs(MM_PER_UNIT[unit] / mm / factor - 1.0) < 0.01]
     raise InputError(
         f"{what} is {ratio:.4g} times as large as the design, close to {factor:.4g}: its unit was read as {unit} "
         f"({reason}), which seems wrong{f' (is it {likely[0]}?)' if likely else ''}; {advice}"
     )
+
+
+def _certain(factor: float) -> bool:
+    return not 1.0 / CERTAIN_RATIO < factor < CERTAIN_RATIO
+
+
+def _scaled_alike(points: Floats, nominal: Floats, factor: float) -> bool:
+    """Whether the extents of points (n, 3) are those of nominal (m, 3) times the factor along all principal axes."""
+    scanned, designed = _extents(points, 0.01), _extents(nominal, 0.0)
+    compared = designed > THIN * designed[0]
+    ratios = scanned[compared] / (factor * designed[compared])
+    return bool((ratios < SHAPE_TOLERANCE).all() and (ratios > 1.0 / SHAPE_TOLERANCE).all())
+
+
+def _extents(points: Floats, stray: float) -> Floats:
+    """Return the extents (3,) of points (n, 3) along their principal axes, the largest first."""
+    centred = points - points.mean(axis=0)
+    axes = np.linalg.eigh(centred.T @ centred)[1]
+    low, high = np.quantile(centred @ axes, [stray, 1.0 - stray], axis=0)
+    extents: Floats = np.sort(high - low)[::-1]
+    return extents

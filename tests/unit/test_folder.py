@@ -129,6 +129,15 @@ def test_a_wrong_unit_is_noticed(bridge, units, factor):
         folder.read_input(bridge)
 
 
+def test_a_part_on_a_wide_floor_is_no_wrong_unit(bridge):
+    part = surface()
+    size = np.linalg.norm(np.ptp(part, axis=0))
+    rng = np.random.default_rng(3)
+    wide = np.column_stack([rng.uniform(-1.0, 1.0, (4 * len(part), 2)) * 1.2 * size, np.zeros(4 * len(part))])
+    write_xyz(bridge / "scans/foot1.xyz", np.vstack([part, part.mean(axis=0) + wide]))
+    assert len(folder.read_input(bridge).scans) == 2
+
+
 def test_a_turned_part_is_no_wrong_unit(bridge):
     turn = np.linalg.qr(np.random.default_rng(5).normal(size=(3, 3)))[0]
     write_xyz(bridge / "scans/foot1.xyz", surface() @ turn.T + 50.0)
