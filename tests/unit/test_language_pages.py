@@ -193,7 +193,7 @@ CHANGES = (
 
 def a_night(failed=1, missed=2, found=CHANGES, **more):
     cells = tuple({"failed": "x" if i < failed else ""} for i in range(3))
-    figure = nights_summary.Figure("spheres", "ray", "radii, bias", 1.0, 0.5, "mm")
+    figure = nights_summary.CheckValue("spheres", "ray", "radii, bias", 1.0, 0.5, "mm")
     of = changes.Detected(found, 12, 3, 4, **more)
     return nights_summary.Summary(
         "2026-11-21", validation_nights.SOFTWARE, cells, {"a": [figure] * missed} if missed else {}, of
