@@ -35,6 +35,11 @@ class ScanCloud:
     unposed: int = 0  # scans without a pose
     unplaced: tuple[str, ...] = ()
 
+    @property
+    def unnamed_views(self) -> bool:
+        """Whether the scan may be merged from several views of which nothing is known."""
+        return self.scanner is None and len(self.sources) == 1
+
     def of(self, sources: Ints) -> ScanCloud:
         """Return the points of some sources alone."""
         used = np.isin(self.source, sources)

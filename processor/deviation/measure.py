@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
-from processor.deviation import stable_fit, surface_movement, to_result
+from processor.adjustment import scanner_class
+from processor.deviation import opposite_sides, stable_fit, surface_movement, to_result
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
@@ -36,13 +38,14 @@ HALF = 0.5  # of the steel: the least that a stable fit is to rest on
 class Measured:
     """Core points with their movements, at a diameter and a spacing of core points and a depth to either side, mm.
 
-    ``shared`` (k,) is the standard deviation of what the points of one station have in common. ``on_surface`` is the
-    share of the scan's points that are within the depth.
+    ``shared`` (k,) is the standard deviation of what the points of one station have in common; ``views`` is that of
+    views which are not named. ``on_surface`` is the share of the scan's points that are within the depth.
     """
 
     core: Samples
     moved: Movement
     shared: Floats
+    views: float
     diameter: float
     spacing: float
     depth: float
@@ -104,13 +107,18 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
     core = mesh_distance.sampled(surface.vertices, surface.faces, core_spacing)
     depth = params.max_depth_mm or _depth(cloud.points, surface)
     moved, share, shared = surface_movement.movement(cloud, core, curved, diameter, depth)
+    views = 0.0
+    if scan.unnamed_views:
+        views = opposite_sides.view_sd(core, moved, diameter, stable_fit.overlap(diameter, core_spacing))
     return Measured(
-        core=core, moved=moved, shared=shared, diameter=diameter, spacing=core_spacing, depth=depth, on_surface=share,
+        core=core, moved=moved, shared=np.hypot(shared, views), views=views, diameter=diameter, spacing=core_spacing,
+        depth=depth, on_surface=share,
     )  # fmt: skip
 
 
 def _fits(measured: Measured, params: Params) -> Fits:
-    return stable_fit.fits(measured.core, measured.moved, measured.diameter, measured.spacing, params.seed)
+    m = measured
+    return stable_fit.fits(m.core, m.moved, m.diameter, m.spacing, params.seed, m.views)
 
 
 def _fitted_pose(scan: ScanCloud, curved: CurvedFacets, placed: Placed, params: Params) -> Floats:
@@ -193,11 +201,14 @@ def _result(
         best = _shifted(scan, placed.T, rigid.invert(fits.best.motion) @ placed.T)
     stable = _shifted(scan, placed.T, rigid.invert(fits.stable.motion) @ placed.T)
     status, reasons = _status(placed, fits, total, params, (best, stable))
+    reasons += _of_views(scan, placed, measured)
     if scan.unposed > 1:
         reasons.append(reason("deviation.unposed-scans", scans=scan.unposed))
     known = distance.std2[np.isfinite(distance.lod95)]
     area = 1e-6 * measured.spacing**2 * float(np.isfinite(measured.moved.along).sum())
     covariance = fits.of(params.fit).covariance if fits.determined else placed.covariance
+    if scan.unnamed_views and placed.registration is not Registration.AS_GIVEN:
+        covariance = covariance + scanner_class.pose_covariance(core.points)
     return Result(
         status=status,
         method=params.method,
@@ -229,6 +240,14 @@ def _result(
         core=points,
         **to_result.statistics(points, total),
     )
+
+
+def _of_views(scan: ScanCloud, placed: Placed, measured: Measured) -> Iterator[Reason]:
+    """Yield what is taken of the errors of views that are not named."""
+    if scan.unnamed_views and placed.registration is not Registration.AS_GIVEN:
+        yield reason("deviation.views-by-class", shift=scanner_class.SHIFT_MM, offset=scanner_class.OFFSET_MM)
+    if measured.views > 0.0:
+        yield reason("deviation.views-differ", sd=measured.views)
 
 
 class _Shifted(NamedTuple):

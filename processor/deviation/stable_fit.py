@@ -94,41 +94,51 @@ class _Blocks:
     of_point: Ints
 
 
-def fits(core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, seed: int) -> Fits:
-    """Fit rigid motions to movements at core points, one per ``spacing_mm`` squared."""
+def overlap(diameter_mm: float, spacing_mm: float) -> float:
+    """At how many core points, one per ``spacing_mm`` squared, a scanned point counts: their circles overlap."""
+    return float(max(1.0, 0.25 * np.pi * (diameter_mm / spacing_mm) ** 2))
+
+
+def fits(
+    core: Samples, moved: Movement, diameter_mm: float, spacing_mm: float, seed: int, view_sd_mm: float = 0.0
+) -> Fits:
+    """Fit rigid motions to movements at core points, one per ``spacing_mm`` squared.
+
+    ``view_sd_mm`` is the standard deviation of what the points of a view have in common.
+    """
     known = np.flatnonzero(np.isfinite(moved.along) & np.isfinite(moved.sd))
     nothing = Fits(UNDETERMINED, UNDETERMINED, float("nan"))
     if len(known) < FEWEST_CLUSTERS:
         return nothing
     error = moved.sd[known] / np.sqrt(moved.count[known])
     places = core.points[known], core.normals[known]
-    # The circles about core points overlap: each scanned point counts in several.
-    overlap = max(1.0, 0.25 * np.pi * (diameter_mm / spacing_mm) ** 2)
-    blocks = _blocks(*places, moved.along[known], np.sqrt(overlap) * error, diameter_mm)
+    sd = np.sqrt(overlap(diameter_mm, spacing_mm)) * error
+    blocks = _blocks(*places, moved.along[known], sd, diameter_mm)
     if int(blocks.block.max()) + 1 < FEWEST_CLUSTERS:
         return nothing
-    wavy = _short_range(blocks)
-    variance = blocks.variance + wavy
+    wavy, common = _short_range(blocks), view_sd_mm**2
+    variance = blocks.variance + wavy + common
     best = _solved(blocks, 1.0 / variance)
     limit = np.maximum(AGREES * np.sqrt(variance), Z95 * float(np.median(error)))
     stable = _consensus(blocks, best, limit, seed)
     levels = [_Level(blocks, blocks.block, _scaled(blocks, stable, np.sqrt(variance), limit))]
     for level in range(1, LEVELS):
-        larger = _blocks(*places, moved.along[known], np.sqrt(overlap) * error, diameter_mm, 2.0**level)
+        larger = _blocks(*places, moved.along[known], sd, diameter_mm, 2.0**level)
         parent = larger.of_point[blocks.first_point][blocks.block]
         inside = np.bincount(parent, minlength=int(larger.block.max()) + 1)[larger.block]
-        sd = np.sqrt(larger.variance + wavy / inside)
-        levels.append(_Level(larger, parent, _scaled(larger, stable, sd, np.full(len(sd), np.median(limit)))))
+        scale = np.sqrt(larger.variance + wavy / inside + common)
+        scale = _scaled(larger, stable, scale, np.full(len(scale), np.median(limit)))
+        levels.append(_Level(larger, parent, scale))
     stable, small = _reweighted(levels, stable), _reweighted(levels[:1], stable)
     share = float(blocks.area[_worst(blocks, stable[None], limit)[0] <= 1.0].sum() / blocks.area.sum())
-    worst, sd = _largest(levels, stable), levels[0].sd
+    worst, scale = _largest(levels, stable), levels[0].sd
     weight = _tukey(worst)
-    z = np.abs(blocks.value - blocks.design @ stable) / sd
+    z = np.abs(blocks.value - blocks.design @ stable) / scale
     slope = np.where(z < worst, weight, _tukey_slope(z))
     return Fits(
         best=_fit(blocks, best, 1.0 / variance, 1.0 / variance, 1.0, places),
         # What the larger blocks changed shows what is left of movements too small for any block.
-        stable=_fit(blocks, stable, weight / sd**2, slope / sd**2, share, places, stable - small),
+        stable=_fit(blocks, stable, weight / scale**2, slope / scale**2, share, places, stable - small),
         limit_mm=float(np.median(limit)),
     )
 

@@ -37,7 +37,7 @@ def shared_sd(
         return shared
     at = known[cKDTree(core.points[known]).query(feet, workers=-1)[1]]
     rows = np.flatnonzero(np.einsum("ni,ni->n", facing, core.normals[at]) > SAME_FACE)
-    cell = _cells(core.points[known], core.normals[known], CELL_DIAMETERS * diameter_mm)
+    cell = pieces(core.points[known], core.normals[known], CELL_DIAMETERS * diameter_mm)
     of_core = np.full(len(core.points), -1, np.int64)
     of_core[known] = cell
     left = distance[rows] - moved.along[at[rows]]
@@ -55,7 +55,7 @@ def shared_sd(
     return shared
 
 
-def _cells(points: Floats, normals: Floats, side: float) -> Ints:
+def pieces(points: Floats, normals: Floats, side: float) -> Ints:
     """Return the piece (k,) of a face that each place (k, 3) is on, by its cell and the direction of its normal."""
     place = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
     cells: Ints = np.unique(np.hstack([place, np.rint(normals).astype(np.int64)]), axis=0, return_inverse=True)[1]

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 from processor.deviation.result import Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
 from processor.geometry import principal, rigid
+from processor.geometry.surface_registration import Registration
 from processor.model import Floats, Metric, Scene, Statistic, Status, StructureTruth, Truth
 
 NEIGHBOURS = 24
@@ -26,9 +27,10 @@ BEYOND_LIMIT = 5.0  # % of core points farther from the truth than their level o
 def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     """Hold deviations against the true movement, in the frame that the result is in.
 
-    The truth is in the design's frame. Where the scan was moved to fit, the truth is moved along: what is true of a
-    best fit is what is left after it. Nothing is checked where scans came without a pose, or where a structure that is
-    about symmetric was found in another attitude, and called ambiguous: its core points have other places' truth.
+    The truth is in the design's frame, and so is what was registered by steel that did not move. Elsewhere the truth is
+    moved along with the scan: what is true of a best fit is what is left after it. Nothing is checked where scans came
+    without a pose, or where a structure that is about symmetric was found in another attitude, and called ambiguous:
+    its core points have other places' truth.
     """
     if truth.structure is None or not len(truth.structure.points) or result.status == "failed":
         return []
@@ -142,6 +144,15 @@ def _otherwise(result: Result, true_pose: Floats) -> float | None:
     return float(np.degrees(rigid.rotation_angle(T[:3, :3])))
 
 
+def _held_by_steel_at_rest(result: Result, truth: StructureTruth) -> bool:
+    """Whether a scan was registered by its stable part, of a structure of which enough did not move."""
+    at_rest = float(np.mean(np.linalg.norm(truth.displacement, axis=1) < STABLE_MM))
+    if not result.T_stable_fit.size:
+        return False
+    by_stable_part = np.allclose(result.T_design_scan, result.T_stable_fit, rtol=0.0, atol=1e-6)
+    return at_rest > LEAST_SHARE and by_stable_part and result.registration is not Registration.AS_GIVEN
+
+
 def true_deviation(result: Result, truth: StructureTruth, true_pose: Floats) -> Floats:
     """Movement (k,) along the normal of each core point by the nearest points of the truth, NaN where none is near."""
     places = truth.points - result.origin
@@ -160,6 +171,9 @@ def true_deviation(result: Result, truth: StructureTruth, true_pose: Floats) -> 
     right = np.einsum("nk,nki,nkj->nij", weight, basis, truth.displacement[at])
     moved = np.linalg.solve(normal, right)[:, 0]
     moved[~near.any(axis=1)] = np.nan
+    if _held_by_steel_at_rest(result, truth):
+        along: Floats = np.einsum("ni,ni->n", moved, result.core.normals)
+        return along
     T = rigid.with_origin(result.T_design_scan @ rigid.invert(true_pose), -result.origin)
     T = rigid.transform(T[:3, :3], T[:3, 3] - result.origin)
     found: Floats = np.einsum(

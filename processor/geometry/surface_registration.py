@@ -180,6 +180,7 @@ NEAR_MM = 100.0  # of the design's surface
 NEAR_SHARE = 0.5  # share of points near the surface from which on a scan lies at its design
 FINE_POINTS = 30_000
 LEAST_SHIFT_MM = 2.0  # thinner plates are not told apart by the side of their surface
+FACE_COS, MOST_AREA, FACE_ROUNDS = 0.9, 0.5, 5  # faces about along an axis, their least share of the area
 PROMISING = 3.0  # ratio of two poses' errors after the coarse registration, below which the fine one decides
 NAN = float("nan")
 
@@ -304,7 +305,7 @@ def _surely_turned(
         return []
     design = _samples(surface)
     refined = _refined(even(points), design, float(np.linalg.norm(np.ptp(design.points, axis=0))))
-    turns = _turns(axes)
+    turns = _turns(axes, surface)
     (error, _), *others = [refined(turn @ given.T_design_scan) for turn in turns]
     few = thinned(points, FINE_POINTS)
     fits, turned_back = [], []
@@ -324,11 +325,35 @@ def _samples(surface: MeshSurface) -> Samples:
     return mesh_distance.sampled(surface.vertices, surface.faces, spacing)
 
 
-def _turns(axes: PrincipalAxes) -> list[Floats]:
-    """Return the motions (4, 4) of a design onto itself that its principal axes allow, the identity first."""
-    turns = [axes.axes @ turn @ axes.axes.T for turn in principal.possible_turns(axes.variances, axes.variances)]
+def _turns(axes: PrincipalAxes, surface: MeshSurface) -> list[Floats]:
+    """Return the motions (4, 4) of a design about onto itself that its principal axes allow, the identity first."""
+    square = _along_faces(axes.axes, surface)
+    turns = [square @ turn @ square.T for turn in principal.possible_turns(axes.variances, axes.variances)]
     turns.sort(key=rigid.rotation_angle)
     return [rigid.transform(R, axes.centre - R @ axes.centre) for R in turns]
+
+
+def _along_faces(axes: Floats, surface: MeshSurface) -> Floats:
+    """Turn principal ``axes`` (3, 3) to the normals of the faces that look about along them, if most of the area does.
+
+    A part on a plate turns the plate's principal axes by degrees: a half turn about these would tilt the plate.
+    """
+    corners = surface.vertices[surface.faces]
+    weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(weighted, axis=1)
+    found = axes
+    for _ in range(FACE_ROUNDS):
+        along = weighted @ found
+        axis = np.argmax(np.abs(along), axis=1)
+        best = along[np.arange(len(axis)), axis]
+        near = np.abs(best) > FACE_COS * size
+        if size[near].sum() < MOST_AREA * size.sum():
+            return axes
+        towards = np.sign(best[near])[:, None] * weighted[near]
+        sums = np.stack([towards[axis[near] == k].sum(axis=0) for k in range(3)], axis=1)
+        U, _, Vt = np.linalg.svd(sums)
+        found = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return found
 
 
 def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> list[tuple[float, Floats]]:
@@ -341,7 +366,7 @@ def _attitudes(points: Floats, surface: MeshSurface, axes: PrincipalAxes) -> lis
     size = float(np.linalg.norm(np.ptp(design.points, axis=0)))
     first = coarse(points, design, axes)
     refined = _refined(points, design, size)
-    found = [refined(turn @ first.T_target_source) for turn in _turns(axes)]
+    found = [refined(turn @ first.T_target_source) for turn in _turns(axes, surface)]
     found.append((first.rms_mm, first.T_target_source))
     if np.isfinite(first.T_rival).all():
         found.append((first.ambiguity * first.rms_mm, first.T_rival))

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.geometry import attitude, mesh_distance, rigid, surface_registration
+from processor.geometry import attitude, mesh_distance, principal, rigid, surface_registration
 
 GIRDER = (6000.0, 800.0, 1400.0)
 PLATE = (400.0, 140.0, 14.0)  # a bracket, its upper side in the girder's middle
@@ -94,3 +94,26 @@ def test_a_contradiction_as_large_as_the_evidence_is_no_choice():
     both = structure(bracket(-1500.0, 1.0), bracket(1500.0, -1.0))  # one where each of the attitudes has one
     points = np.asarray(trimesh.sample.sample_surface(both, 60_000, seed=1)[0])
     assert len(attitude.choose(points, surface, [np.eye(4), turned]).rivals) == 1
+
+
+def test_turns_of_a_plate_with_a_box_on_it_keep_the_plate_in_its_plane():
+    # The box tilts the principal axes by 3 degrees; a scan that is turned about them would lie across the plate.
+    box = trimesh.creation.box((240.0, 170.0, 160.0), rigid.transform(np.eye(3), [-170.0, -115.0, 90.0]))
+    design = trimesh.util.concatenate([trimesh.creation.box((760.0, 640.0, 20.0)), box])
+    surface = mesh_distance.of_design(np.asarray(design.vertices), np.asarray(design.faces).astype(np.int64))
+    axes = principal.of_mesh(surface.vertices, surface.faces)
+    assert np.abs(axes.axes[2]).max() < np.cos(np.radians(2.0))
+    turns = surface_registration._turns(axes, surface)
+    assert len(turns) == 4
+    for turn in turns:
+        np.testing.assert_allclose(np.abs(turn[:3, :3]), np.eye(3), atol=1e-9)
+
+
+def test_axes_of_a_body_without_flat_faces_along_them_stay():
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=100.0)
+    ball.apply_scale([3.0, 2.0, 1.0])
+    surface = mesh_distance.of_design(np.asarray(ball.vertices), np.asarray(ball.faces).astype(np.int64))
+    axes = rigid.rotation_from_vector(np.array([0.3, -0.2, 0.1]))
+    found = surface_registration._along_faces(axes, surface)
+    assert np.linalg.det(found) == pytest.approx(1.0)
+    np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-12)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from processor.adjustment import scanner_class
 from processor.preassembly.ends import viewpoints
 
 
@@ -54,7 +55,7 @@ def test_a_plate_of_which_one_side_was_seen_has_no_thickness():
 
 
 def test_what_no_plates_show_is_of_the_scanners_class_and_what_they_show_is_kept():
-    term = viewpoints.SCANNER_CLASS_MM**2
+    term = scanner_class.VIEW_MM**2
     assert viewpoints.variances([]).or_of_class() == viewpoints.NONE._replace(level=term, ring=term)
     one = viewpoints.variances([plate(np.random.default_rng(1), 0.3)])
     assert (one.level, one.or_of_class().level, one.or_of_class().ring) == (0.0, term, term)

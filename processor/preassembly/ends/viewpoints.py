@@ -17,6 +17,7 @@ import numpy as np
 from scipy.stats import chi2
 
 from processor.adjustment import clusters
+from processor.adjustment.scanner_class import VIEW_MM
 from processor.model import Floats
 from processor.preassembly.ends.plate_sides import Bools
 
@@ -25,9 +26,6 @@ ALIKE_MM = 2.0  # plates that differ by less are of one nominal thickness: rolli
 PATCH_MM, FEWEST_OF_PATCH = 50.0, 4  # size of a patch, and points on either side of it
 FLOOR_MM = 0.004
 RISK = 1e-3  # that noise alone is taken for a difference between viewpoints
-# Of a view's level where no plates show it. Data sheets of phase-shift and pulsed scanners for up to 130 m give a range
-# error of 1 mm; it is taken as the limit of 95 %.
-SCANNER_CLASS_MM = 0.5
 OF_PAIR = 2  # opposite plates of an end are seen from the same two sides: their differences are the same
 
 
@@ -55,7 +53,7 @@ class Variances(NamedTuple):
 
     def or_of_class(self) -> Variances:
         """Return the variances with the levels of the scanner's class where the plates do not show them."""
-        return self if self.known else self._replace(level=SCANNER_CLASS_MM**2, ring=SCANNER_CLASS_MM**2)
+        return self if self.known else self._replace(level=VIEW_MM**2, ring=VIEW_MM**2)
 
 
 NONE = Variances()

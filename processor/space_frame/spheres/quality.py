@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtrc
 
+from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
 from processor.limits import standards
 from processor.model import NORMAL_95, Floats, Reason, Tolerance, reason
 from processor.space_frame.catalogue import Catalogue
@@ -27,7 +28,6 @@ from processor.space_frame.spheres.records import (
     Spheres,
     ViewErrors,
 )
-from processor.space_frame.spheres.unnamed_views import OFFSET_MM, SHIFT_MM
 
 Bools = npt.NDArray[np.bool_]
 

@@ -7,8 +7,7 @@ from what the fits of all spheres leave (Henderson 1953): means of residuals ove
 scatter within them. The products of different spheres give the part that is common to all of them.
 
 A shift of all views together, and an offset of all their ranges, look like places and radii: they are not estimated but
-stated. ``SHIFT_MM``: targets are measured to about 1 mm, and a network rests on some 25 sightings of them.
-``OFFSET_MM``: the zero offset of a calibrated scanner, which all of its views have in common.
+stated, by the scanner's class.
 """
 
 from __future__ import annotations
@@ -17,11 +16,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
 from processor.geometry.sphere import sphere_cells
 from processor.model import Floats, Ints
 from processor.space_frame.spheres.records import AimedCrops, Fits, Priors, ViewErrors
 
-SHIFT_MM, OFFSET_MM = 0.2, 0.2  # sd, of terrestrial scanners; the shift is along each axis
 MEAN_COSINE = 2.0 / 3.0  # of incidence on a sphere: a range moves the surface by less along its normal
 BANDS, SECTORS = 10, 20  # of sphere_cells
 LEAST_POINTS = 30

@@ -1,0 +1,76 @@
+"""Errors of views that are not named, from the two sides of plates and bars.
+
+The views of a merged cloud have errors of registration and range of their own. Where a piece of steel was seen from two
+opposite sides, its movement cancels in the sum of the outward movements of both. What the sum is beyond its noise is
+what the views of the two sides differ by, or a thickness other than designed. Each side has half of its variance.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import brentq
+from scipy.spatial import cKDTree
+
+from processor.deviation.local_translation import Movement
+from processor.deviation.station_offsets import CELL_DIAMETERS, SURE, pieces
+from processor.geometry.mesh_distance import Samples
+from processor.model import Floats, Ints
+
+FEWEST_CORES = 3  # of a piece
+FEWEST_PAIRS = 8
+FLOOR_MM = 1e-3  # least noise, for scans without any
+BESIDE = 0.25  # of a piece's side, the most by which two sides lie beside each other
+OPPOSED = -0.9  # largest cosine between the normals of two sides
+CHI2_MEDIAN, MEDIAN_SD = 0.4549, 1.065  # of chi-squared with one degree of freedom; sd of n values' median, by sqrt(n)
+
+
+def view_sd(core: Samples, moved: Movement, diameter_mm: float, overlap: float) -> float:
+    """Return the standard deviation of what a view's points have in common, mm; 0 where nothing shows it.
+
+    The variance is that for which the median of the squared sums, over their variances, is as of normal errors: pieces
+    with dents do not count for more. It is 0 where few pieces were seen from both sides, and where the median may be
+    that of chance. Each scanned point counts at ``overlap`` core points.
+    """
+    known = np.flatnonzero(np.isfinite(moved.along) & np.isfinite(moved.sd))
+    if not len(known):
+        return 0.0
+    points, normals = core.points[known], core.normals[known]
+    piece = pieces(points, normals, CELL_DIAMETERS * diameter_mm)
+    count = np.bincount(piece)
+    mean = np.bincount(piece, moved.along[known]) / count
+    noise = overlap * np.bincount(piece, moved.sd[known] ** 2 / moved.count[known]) / count**2
+    pairs = _opposite(_means(points, piece), _means(normals, piece), CELL_DIAMETERS * diameter_mm)
+    pairs = pairs[(count[pairs] >= FEWEST_CORES).all(axis=1)]
+    independent = len(np.unique(pairs)) / 2
+    if independent < FEWEST_PAIRS:
+        return 0.0
+    square, variance = mean[pairs].sum(axis=1) ** 2, np.maximum(noise[pairs].sum(axis=1), FLOOR_MM**2)
+
+    def surplus(view_variance: float) -> float:
+        return float(np.median(square / (variance + 2.0 * view_variance))) - CHI2_MEDIAN
+
+    if surplus(0.0) <= SURE * MEDIAN_SD / np.sqrt(independent):
+        return 0.0
+    return float(np.sqrt(brentq(surplus, 0.0, float(square.max()) / CHI2_MEDIAN)))
+
+
+def _means(values: Floats, piece: Ints) -> Floats:
+    """Return the means (p, 3) of values (k, 3) on pieces."""
+    sums = [np.bincount(piece, values[:, i]) for i in range(3)]
+    means: Floats = np.stack(sums, axis=1) / np.bincount(piece)[:, None]
+    return means
+
+
+def _opposite(places: Floats, normals: Floats, reach_mm: float) -> Ints:
+    """Return pairs (m, 2) of pieces that are the two sides of one body: each lies behind the other.
+
+    Beside each other, they would differ by how the movement changes along the body.
+    """
+    pairs = cKDTree(places).query_pairs(reach_mm, output_type="ndarray").astype(np.int64)
+    first, second = pairs.T
+    between = places[second] - places[first]
+    across = np.einsum("mi,mi->m", between, normals[first])
+    beside = np.linalg.norm(between - across[:, None] * normals[first], axis=1)
+    opposed = np.einsum("mi,mi->m", normals[first], normals[second]) < OPPOSED
+    found: Ints = pairs[opposed & (across < 0.0) & (beside < BESIDE * reach_mm)]
+    return found
