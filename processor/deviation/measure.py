@@ -207,7 +207,7 @@ def _result(
     known = distance.std2[np.isfinite(distance.lod95)]
     area = 1e-6 * measured.spacing**2 * float(np.isfinite(measured.moved.along).sum())
     covariance = fits.of(params.fit).covariance if fits.determined else placed.covariance
-    if scan.unnamed_views and placed.registration is not Registration.AS_GIVEN:
+    if _views_by_class(scan, placed):
         covariance = covariance + scanner_class.pose_covariance(core.points)
     return Result(
         status=status,
@@ -242,9 +242,14 @@ def _result(
     )
 
 
+def _views_by_class(scan: ScanCloud, placed: Placed) -> bool:
+    """Whether the pose was found by views that are not named: what they have in common is stated."""
+    return scan.unnamed_views and placed.registration is not Registration.AS_GIVEN
+
+
 def _of_views(scan: ScanCloud, placed: Placed, measured: Measured) -> Iterator[Reason]:
     """Yield what is taken of the errors of views that are not named."""
-    if scan.unnamed_views and placed.registration is not Registration.AS_GIVEN:
+    if _views_by_class(scan, placed):
         yield reason("deviation.views-by-class", shift=scanner_class.SHIFT_MM, offset=scanner_class.OFFSET_MM)
     if measured.views > 0.0:
         yield reason("deviation.views-differ", sd=measured.views)

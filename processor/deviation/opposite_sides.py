@@ -11,7 +11,9 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
+from processor.deviation.cloud import group_means
 from processor.deviation.local_translation import Movement
+from processor.deviation.stable_fit import CHI2_MEDIAN
 from processor.deviation.station_offsets import CELL_DIAMETERS, SURE, pieces
 from processor.geometry.mesh_distance import Samples
 from processor.model import Floats, Ints
@@ -21,7 +23,7 @@ FEWEST_PAIRS = 8
 FLOOR_MM = 1e-3  # least noise, for scans without any
 BESIDE = 0.25  # of a piece's side, the most by which two sides lie beside each other
 OPPOSED = -0.9  # largest cosine between the normals of two sides
-CHI2_MEDIAN, MEDIAN_SD = 0.4549, 1.065  # of chi-squared with one degree of freedom; sd of n values' median, by sqrt(n)
+MEDIAN_SD = 1.065  # of the median of n values of chi-squared with one degree of freedom, times sqrt(n)
 
 
 def view_sd(core: Samples, moved: Movement, diameter_mm: float, overlap: float) -> float:
@@ -39,7 +41,7 @@ def view_sd(core: Samples, moved: Movement, diameter_mm: float, overlap: float) 
     count = np.bincount(piece)
     mean = np.bincount(piece, moved.along[known]) / count
     noise = overlap * np.bincount(piece, moved.sd[known] ** 2 / moved.count[known]) / count**2
-    pairs = _opposite(_means(points, piece), _means(normals, piece), CELL_DIAMETERS * diameter_mm)
+    pairs = _opposite(group_means(points, piece), group_means(normals, piece), CELL_DIAMETERS * diameter_mm)
     pairs = pairs[(count[pairs] >= FEWEST_CORES).all(axis=1)]
     independent = len(np.unique(pairs)) / 2
     if independent < FEWEST_PAIRS:
@@ -52,13 +54,6 @@ def view_sd(core: Samples, moved: Movement, diameter_mm: float, overlap: float) 
     if surplus(0.0) <= SURE * MEDIAN_SD / np.sqrt(independent):
         return 0.0
     return float(np.sqrt(brentq(surplus, 0.0, float(square.max()) / CHI2_MEDIAN)))
-
-
-def _means(values: Floats, piece: Ints) -> Floats:
-    """Return the means (p, 3) of values (k, 3) on pieces."""
-    sums = [np.bincount(piece, values[:, i]) for i in range(3)]
-    means: Floats = np.stack(sums, axis=1) / np.bincount(piece)[:, None]
-    return means
 
 
 def _opposite(places: Floats, normals: Floats, reach_mm: float) -> Ints:

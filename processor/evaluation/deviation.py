@@ -146,11 +146,10 @@ def _otherwise(result: Result, true_pose: Floats) -> float | None:
 
 def _held_by_steel_at_rest(result: Result, truth: StructureTruth) -> bool:
     """Whether a scan was registered by its stable part, of a structure of which enough did not move."""
-    at_rest = float(np.mean(np.linalg.norm(truth.displacement, axis=1) < STABLE_MM))
-    if not result.T_stable_fit.size:
+    if not result.T_stable_fit.size or result.registration is Registration.AS_GIVEN:
         return False
-    by_stable_part = np.allclose(result.T_design_scan, result.T_stable_fit, rtol=0.0, atol=1e-6)
-    return at_rest > LEAST_SHARE and by_stable_part and result.registration is not Registration.AS_GIVEN
+    at_rest = float(np.mean(np.linalg.norm(truth.displacement, axis=1) < STABLE_MM))
+    return at_rest > LEAST_SHARE and np.allclose(result.T_design_scan, result.T_stable_fit, rtol=0.0, atol=1e-6)
 
 
 def true_deviation(result: Result, truth: StructureTruth, true_pose: Floats) -> Floats:

@@ -50,7 +50,7 @@ class Samples:
 
 def area(vertices: Floats, faces: Ints) -> float:
     """Area of a mesh, mm^2."""
-    return 0.5 * float(_double_areas(vertices, faces)[1].sum())
+    return 0.5 * float(double_areas(vertices, faces)[1].sum())
 
 
 def sampled(vertices: Floats, faces: Ints, spacing_mm: float) -> Samples:
@@ -60,14 +60,14 @@ def sampled(vertices: Floats, faces: Ints, spacing_mm: float) -> Samples:
 
 def spread(vertices: Floats, faces: Ints, count_of: Callable[[float], int]) -> Samples:
     """Spread ``count_of(area in mm^2)`` points over a mesh in a fixed low-discrepancy pattern."""
-    cross, double = _double_areas(vertices, faces)
+    cross, double = double_areas(vertices, faces)
     cumulative = np.cumsum(double)
     count = count_of(0.5 * float(cumulative[-1]))
     facet = np.searchsorted(cumulative, (np.arange(count) + 0.5) / count * cumulative[-1]).astype(np.int64)
     return Samples(_placed(vertices, faces, facet), cross[facet] / double[facet, None], facet)
 
 
-def _double_areas(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
+def double_areas(vertices: Floats, faces: Ints) -> tuple[Floats, Floats]:
     """Return the normals (f, 3) of facets, each as long as twice the facet's area, and these lengths (f,)."""
     a, b, c = (vertices[faces[:, k]] for k in range(3))
     cross = np.cross(b - a, c - a)
@@ -146,7 +146,7 @@ class MeshSurface:
 
 def of_mesh(vertices: Floats, faces: Ints, spacing_mm: float = 12.0) -> MeshSurface:
     """Prepare a mesh; searches start from samples about ``spacing_mm`` apart, which is less than a plate is thick."""
-    cross, size = _double_areas(vertices, faces)
+    cross, size = double_areas(vertices, faces)
     used = size > 1e-9
     faces, cross, size = faces[used], cross[used], size[used]
     normals = cross / size[:, None]
@@ -337,7 +337,7 @@ def facet_grid(vertices: Floats, faces: Ints, normals: Floats, reach: float) -> 
 
 def touching(vertices: Floats, faces: Ints, within: float) -> tuple[Ints, Ints]:
     """Pairs of a vertex (k,) and a facet (k,) that come within a distance of each other."""
-    cross, double = _double_areas(vertices, faces)
+    cross, double = double_areas(vertices, faces)
     normals = cross / np.maximum(double, 1e-12)[:, None]
     span = float(np.median(np.ptp(vertices[faces], axis=1).max(axis=1)))
     grid = facet_grid(vertices, faces, normals, max(within, 0.25 * span))

@@ -84,6 +84,13 @@ def cross_matrix(v: Floats) -> Floats:
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
 
 
+def nearest_rotation(M: Floats) -> Floats:
+    """Rotation (3, 3), no reflection, nearest to a matrix (3, 3): it has the largest trace of R^T M (by the SVD)."""
+    U, _, Vt = np.linalg.svd(M)
+    R: Floats = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+    return R
+
+
 def fit(source: Floats, target: Floats) -> Floats:
     """Rigid T_target_source (4, 4), no reflection, of least squared distances of paired points (n, 3), n >= 3.
 

@@ -338,9 +338,7 @@ def _along_faces(axes: Floats, surface: MeshSurface) -> Floats:
 
     A part on a plate turns the plate's principal axes by degrees: a half turn about these would tilt the plate.
     """
-    corners = surface.vertices[surface.faces]
-    weighted = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    size = np.linalg.norm(weighted, axis=1)
+    weighted, size = mesh_distance.double_areas(surface.vertices, surface.faces)
     found = axes
     for _ in range(FACE_ROUNDS):
         along = weighted @ found
@@ -350,9 +348,7 @@ def _along_faces(axes: Floats, surface: MeshSurface) -> Floats:
         if size[near].sum() < MOST_AREA * size.sum():
             return axes
         towards = np.sign(best[near])[:, None] * weighted[near]
-        sums = np.stack([towards[axis[near] == k].sum(axis=0) for k in range(3)], axis=1)
-        U, _, Vt = np.linalg.svd(sums)
-        found = U @ np.diag([1.0, 1.0, np.sign(np.linalg.det(U @ Vt))]) @ Vt
+        found = rigid.nearest_rotation(np.stack([towards[axis[near] == k].sum(axis=0) for k in range(3)], axis=1))
     return found
 
 

@@ -111,9 +111,6 @@ def test_turns_of_a_plate_with_a_box_on_it_keep_the_plate_in_its_plane():
 
 def test_axes_of_a_body_without_flat_faces_along_them_stay():
     ball = trimesh.creation.icosphere(subdivisions=3, radius=100.0)
-    ball.apply_scale([3.0, 2.0, 1.0])
     surface = mesh_distance.of_design(np.asarray(ball.vertices), np.asarray(ball.faces).astype(np.int64))
     axes = rigid.rotation_from_vector(np.array([0.3, -0.2, 0.1]))
-    found = surface_registration._along_faces(axes, surface)
-    assert np.linalg.det(found) == pytest.approx(1.0)
-    np.testing.assert_allclose(found.T @ found, np.eye(3), atol=1e-12)
+    np.testing.assert_array_equal(surface_registration._along_faces(axes, surface), axes)

@@ -94,7 +94,11 @@ def test_a_movement_is_found_within_its_level_of_detection_and_not_taken_for_a_b
     ]
     assert fitted.status == "weak"
     best = deviation_step.run(scene, deviation_step.Params(register="fine", fit="all"))
-    assert codes(best)[1:3] == ["deviation.best-fit", "deviation.stable-fit-would-move"]
+    assert codes(best)[1:] == [
+        "deviation.best-fit",
+        "deviation.stable-fit-would-move",
+        "deviation.views-by-class",
+    ]
     assert np.linalg.norm(best.best_fit_shift) < 0.05
     assert metrics(scene, fitted, truth)["core points farther from the truth than their LOD95"].value < 5.0
 

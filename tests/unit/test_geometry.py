@@ -148,3 +148,10 @@ def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
     shuffled = points[rng.permutation(len(points))]
     sorted_points = points[neighbors.by_cell(points, 40.0)]
     np.testing.assert_array_equal(sorted_points, shuffled[neighbors.by_cell(shuffled, 40.0)])
+
+
+def test_the_nearest_rotation_is_the_polar_factor_and_never_a_reflection():
+    R = rigid.rotation_from_vector(np.array([0.4, -1.1, 0.7]))
+    stretch = np.array([[3.0, 0.5, 0.1], [0.5, 2.0, 0.3], [0.1, 0.3, 1.0]])
+    np.testing.assert_allclose(rigid.nearest_rotation(R @ stretch), R, atol=1e-14)
+    np.testing.assert_allclose(rigid.nearest_rotation(np.diag([3.0, 2.0, -1.0])), np.eye(3), atol=1e-14)

@@ -6,6 +6,7 @@ import itertools
 
 import numpy as np
 
+from processor.geometry import rigid
 from processor.model import Floats
 
 CONE_COS = float(np.cos(np.radians(6.0)))  # normals of one mode
@@ -108,6 +109,4 @@ def _frames(first: Floats, second: Floats) -> Floats:
 def _refined(R: Floats, axes_a: Floats, axes_b: Floats, weight: Floats) -> Floats:
     """Fit the rotation (3, 3) to all modes that match under ``R`` (Wahba's problem, by the SVD)."""
     matches = (axes_a @ R @ axes_b.T > MATCHED_COS) * weight
-    U, _, Vt = np.linalg.svd(np.einsum("ab,ai,bj->ij", matches, axes_a, axes_b))
-    refined: Floats = U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
-    return refined
+    return rigid.nearest_rotation(np.einsum("ab,ai,bj->ij", matches, axes_a, axes_b))
