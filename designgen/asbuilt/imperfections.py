@@ -332,7 +332,10 @@ def _hole(part: ArchPart, params: ArchParams, rng: np.random.Generator, ledger: 
 
 
 def frame(nominal: Frame, params: FrameParams, rng: np.random.Generator, ledger: Ledger) -> Frame:
-    """Draw a frame's errors, add them to the ledger, and return the frame as built, at its temperature.
+    """Draw a frame's errors and return the frame as built, at its temperature.
+
+    Wrong sizes, missing bolts, bows and eccentricities are added to the ledger; centres and radii are in the truth's
+    table of nodes.
 
     Raises UsageError for more wrong balls or missing bolts than there are, and for errors too large to build the frame.
     """

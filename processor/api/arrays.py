@@ -72,7 +72,8 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
 
     A robust search finds the sphere; Gauss-Newton with Tukey's biweight then fits it. The residual is the orthogonal
     distance, or with ``scanner`` the difference of ranges along the ray, which has no bias where a sphere is partly
-    seen. The covariance is that of an M-estimator (Huber and Ronchetti 2009, eq. 6.6).
+    seen. The covariance is that of an M-estimator (Huber and Ronchetti 2009, "Robust Statistics", 2nd ed.,
+    Wiley, eq. 6.6).
 
     Parameters
     ----------
@@ -203,7 +204,8 @@ def m3c2(
 ) -> CorePoints:
     """Measure distances between two clouds along local normals, each with its level of detection.
 
-    Lague, Brodu and Leroux (2013); LOD95 as in paper 002, eq. 10.
+    Lague, Brodu and Leroux (2013), "Accurate 3D comparison of complex topography with terrestrial laser scanner", ISPRS
+    Journal of Photogrammetry and Remote Sensing 82, 10-26; LOD95 as in paper 002, eq. 10.
 
     Parameters
     ----------
@@ -226,8 +228,9 @@ def m3c2(
     ValueError : wrong shapes, NaN, no points, diameters that are not positive or wider than the reference, which
         indicates another unit.
     """
-    first, second = _points(reference, "reference", 1), _points(compared, "compared", 1)
-    places = first if core is None else _points(core, "core", 1)
+    first = _points(reference, "reference", 1, in_mm=False)
+    second = _points(compared, "compared", 1, in_mm=False)
+    places = first if core is None else _points(core, "core", 1, in_mm=False)
     _check_lengths(first, normal_diameter, projection_diameter, max_depth)
     origin = first.mean(axis=0)
     local = places - origin
@@ -267,15 +270,16 @@ def _check_lengths(reference: Floats, normal_diameter: float, projection_diamete
         )
 
 
-def _points(values: npt.ArrayLike, name: str, least: int) -> Floats:
-    """Check an array of points."""
+def _points(values: npt.ArrayLike, name: str, least: int, in_mm: bool = True) -> Floats:
+    """Check an array of points, and with ``in_mm`` that they are not in metres."""
     points = _finite(values, name)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"{name}: expected an array (n, 3) of coordinates in mm, got shape {points.shape}")
+        unit = " in mm" if in_mm else ""
+        raise ValueError(f"{name}: expected an array (n, 3) of coordinates{unit}, got shape {points.shape}")
     if len(points) < least:
         raise ValueError(f"{name}: expected {least} points or more, got {len(points)}")
     extent = float(np.ptp(points, axis=0).max())
-    if len(points) > 1 and extent < LEAST_EXTENT_MM:
+    if in_mm and len(points) > 1 and extent < LEAST_EXTENT_MM:
         raise ValueError(
             f"{name}: span {extent:.4g}; expected coordinates in mm, these seem to be in metres: multiply them by 1000"
         )

@@ -66,8 +66,8 @@ def read(path: str | Path, units: str | None = None) -> Scene:
     Parameters
     ----------
     path : a scan folder, a scene file or a scan file (E57, LAS, LAZ, PLY, PCD, PTX, PTS, text).
-    units : of the coordinates, "m", "mm", "cm", "inch" or "ft", whatever the format states; None = as the project or
-        the format has it, else metres.
+    units : of the coordinates, "mm", "cm", "dm", "m", "km", "inch", "ft" or "us-ft", whatever the format states; None =
+        as the project or the format has it, else metres.
 
     Returns
     -------
@@ -76,7 +76,7 @@ def read(path: str | Path, units: str | None = None) -> Scene:
     Raises
     ------
     InputError : the input cannot be used.
-    UsageError : ``units`` is given for a scene file, which states its own.
+    UsageError : the unit is unknown, or ``units`` is given for a scene file, which states its own.
     """
     source = Path(path)
     if not source.exists():

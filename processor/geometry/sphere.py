@@ -103,7 +103,7 @@ def through_four(quads: Floats) -> tuple[Floats, Floats]:
     return first + offset, np.linalg.norm(offset, axis=1)
 
 
-BANDS, SECTORS = 10, 20
+BANDS, SECTORS = 10, 20  # cells of equal area that the visible share of a sphere is counted in
 
 
 def sphere_cells(points: Floats, centre: Floats) -> Ints:

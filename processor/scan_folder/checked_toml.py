@@ -14,8 +14,11 @@ from processor.model import Floats, InputError, UsageError
 from processor.scan_folder.units import known_unit
 
 
-def inside(folder: Path, text: str, where: str) -> Path:
-    """Return the path of a file below ``folder``. Raises InputError for a path that leads out of the folder."""
+def existing_file_in(folder: Path, text: str, where: str) -> Path:
+    """Return the path of an existing file below ``folder``.
+
+    Raises InputError if it does not exist, or leads out of the folder.
+    """
     path = folder / text
     parts = text.replace("\\", "/").split("/")
     if "\0" in text or (path.is_absolute() and text.startswith(("/", "\\"))) or ".." in parts or ":" in parts[0]:

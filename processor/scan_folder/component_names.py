@@ -21,12 +21,17 @@ NUMBERED = r"[\s_\-.#号段节第no]*"  # between a word and its number
 
 def plain(name: str) -> str:
     """Return a name in lower case, with Chinese numbers as digits and synonyms replaced by one term."""
-    text = unicodedata.normalize("NFKC", name).casefold()
-    text = re.sub(r"([一二三四五六七八九])?十([一二三四五六七八九])?", _tens, text)
-    text = "".join(DIGITS.get(c, c) for c in text)
+    text = _latin_digits(name)
     for word, chinese, english in WORDS:
         text = re.sub(rf"{chinese}|(?<![a-z])(?:{english})(?![a-z])", f" {word} ", text)
     return " ".join(text.split())
+
+
+def _latin_digits(name: str) -> str:
+    """Return a name in lower case, with Chinese numbers up to 99 as digits."""
+    text = unicodedata.normalize("NFKC", name).casefold()
+    text = re.sub(r"([一二三四五六七八九])?十([一二三四五六七八九])?", _tens, text)
+    return "".join(DIGITS.get(c, c) for c in text)
 
 
 def _tens(match: re.Match[str]) -> str:
@@ -71,8 +76,7 @@ def _has_number(text: str, word: str, number: str) -> bool:
 
 def station(stem: str) -> str:
     """Return the station named in the stem of a file, such as S3; "" for none."""
-    text = unicodedata.normalize("NFKC", stem).casefold()
-    text = "".join(DIGITS.get(c, c) for c in text)
+    text = _latin_digits(stem)
     match = re.search(r"(?:^|[\s_\-.])(?:s|st|station|setup|pos|position)[\s_\-.]*0*(\d+)(?!\d)", text)
     match = match or re.search(r"(?:测站|站点|站)[\s_\-.]*0*(\d+)|(?:第)?0*(\d+)[号\s]*(?:测站|站点|站)", text)
     return f"S{next(number for number in match.groups() if number)}" if match else ""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,10 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from processor.model import Control, Floats, InputError, Scan, Stations
-from processor.readers.encoding import decoded
-from processor.readers.file_checks import errors_name_the_file
-from processor.scan_folder.checked_toml import Table, inside
+from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.files import CONTROL
+from processor.scan_folder.text_files import csv_rows
 from processor.scan_folder.units import MM_PER_UNIT
 
 KEYS = ("name", "position", "sd_mm", "scan", "seen", "seen_sd_mm")
@@ -43,7 +41,7 @@ def read_control(folder: Path, project: Table) -> tuple[tuple[Measured, ...], Pa
         return tuple(measured for table in project.tables("control") for measured in _from_table(table)), None
     if given is None and not (folder / CONTROL).exists():
         return (), None
-    path = inside(folder, project.text("control", CONTROL), project.where)
+    path = existing_file_in(folder, project.text("control", CONTROL), project.where)
     return tuple(_from_csv(path)), path
 
 
@@ -69,14 +67,13 @@ def _not_negative(where: str, sd_mm: float) -> float:
 
 
 def _from_csv(path: Path) -> list[Measured]:
-    if not path.is_file() or path.stat().st_size > LARGEST_FILE:
-        raise InputError(f"{path}: expected a table of control points, found a folder or more than 16 MB")
-    try:
-        text = decoded(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    with errors_name_the_file(path, "CSV"):
-        rows = [(line, row) for line, row in enumerate(csv.reader(text.splitlines()), 1) if any(map(str.strip, row))]
+    if not path.is_file():
+        raise InputError(f"{path}: expected a file of control points, found a folder")
+    if path.stat().st_size > LARGEST_FILE:
+        raise InputError(
+            f"{path}: expected at most {LARGEST_FILE} bytes, found {path.stat().st_size}; is it the right file?"
+        )
+    rows = csv_rows(path)
     header = tuple(name.strip().lower() for name in rows[0][1]) if rows else ()
     if sorted(header) != sorted(COLUMNS):
         raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}")
@@ -118,7 +115,7 @@ def control_points(
             raise InputError(f"{target.where}: control point {target.name!r} has coordinates already; give them once")
     seen = [target for target in measured if target.scan]
     if not seen:
-        raise InputError(f"{known[0].where}: no control point is seen in a scan; give one's place there (scan, seen)")
+        raise InputError(f"{known[0].where}: no control point was measured in a scan; give 'scan' and 'seen' for one")
     views: list[tuple[int, int, int]] = []  # rows of the point, of the scan and of the station
     for target in seen:
         if target.name not in row:

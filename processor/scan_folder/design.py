@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import re
 from collections.abc import Sequence
@@ -13,11 +12,10 @@ import numpy as np
 
 from processor.geometry import box_girder
 from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints, UsageError
-from processor.readers.encoding import decoded
-from processor.readers.file_checks import errors_name_the_file
 from processor.scan_folder import cad
-from processor.scan_folder.checked_toml import Table, inside
+from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
+from processor.scan_folder.text_files import csv_rows, read_text
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
 
 TEXT_LIMIT = 256 * 2**20
@@ -61,10 +59,7 @@ def _text(path: Path) -> str:
         raise InputError(
             f"{path}: expected at most {TEXT_LIMIT} bytes, found {path.stat().st_size}; is it the right file?"
         )
-    try:
-        return decoded(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
+    return read_text(path)
 
 
 def _arch(folder: Path, design: Table) -> ArchDesign:
@@ -123,7 +118,7 @@ def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floa
             raise InputError(f"{part.where}: expected two points or more in bottom_edge_{side}, none repeated in a row")
     plate_mm = part.number("plate_mm", box_girder.PLATE_MM, positive=True)
     if "mesh" in part.values:
-        vertices, faces = read_surface(inside(folder, part.text("mesh"), part.where), unit)
+        vertices, faces = read_surface(existing_file_in(folder, part.text("mesh"), part.where), unit)
         return DesignPart(name, vertices, faces, edges[0], edges[1])
     try:
         vertices, faces = box_girder.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
@@ -174,12 +169,11 @@ def _check_ids(where: str, ids: list[int]) -> None:
 
 def _read_nodes(path: Path, table_unit: str) -> FrameDesign:
     """Read a table of nodes: columns id, x, y, z, radius in any order, named by a header (``x_mm`` gives a unit)."""
-    text = _text(path)
-    first = text.split("\n", 1)[0]
+    lines = [line for line in _text(path).splitlines() if line.strip()]
+    first = lines[0] if lines else ""
     separator = next((mark for mark in (";", "\t", ",") if mark in first), ",")
-    with errors_name_the_file(path, "CSV"):
-        rows = [row for row in csv.reader(text.splitlines(), delimiter=separator) if any(map(str.strip, row))]
-    header = [name.strip().lower() for name in rows[0]] if rows else []
+    rows = csv_rows(path, separator)
+    header = [name.strip().lower() for name in rows[0][1]] if rows else []
     columns, units = {}, set()
     for i, name in enumerate(header):
         match = re.fullmatch(r"(x|y|z|radius)[\s_\[(]*([a-z-]*)[\])]?|id", name)
@@ -194,7 +188,7 @@ def _read_nodes(path: Path, table_unit: str) -> FrameDesign:
     except UsageError as error:
         raise InputError(f"{path}: {error}") from None
     ids, numbers = [], []
-    for line, row in enumerate(rows[1:], 2):
+    for line, row in rows[1:]:
         try:
             cells = [row[columns[key]].strip() for key in ("x", "y", "z", "radius")]
             values = [float(cell.replace(",", ".") if separator != "," else cell) for cell in cells]

@@ -26,15 +26,16 @@ from processor.model import (
 )
 from processor.progress import tracked
 from processor.readers import RawScan
-from processor.readers.encoding import decoded, file_name_as_text
+from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name
 from processor.scan_folder import scanner_grid, units
-from processor.scan_folder.checked_toml import Table, inside
+from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
 from processor.scan_folder.files import DESIGNS, PICKS, PROJECT, SCANS, STATIONS, TRUTH, scan_files
 from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
+from processor.scan_folder.text_files import read_text
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
 
 if sys.version_info >= (3, 11):
@@ -112,7 +113,7 @@ def _read_folder(folder: Path, option: str) -> Scene:
         if is_surface(project.design) and project.kind in ("", "structure"):
             design = StructureDesign(scan_name(project.design), *read_surface(project.design, unit))
         else:
-            design = read_design(folder, project.design, project.design_units or option or project.units or "m")
+            design = read_design(folder, project.design, unit)
     scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"))
     if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
         named = project.design_units or project.units
@@ -125,7 +126,7 @@ def _read_folder(folder: Path, option: str) -> Scene:
     unit = scene.units if scene.units in MM_PER_UNIT else ""
     if not unit:
         raise InputError(f"{folder / PICKS}: expected scans in one unit, found {scene.units}; give one by --units")
-    inside(folder, PICKS, str(folder))
+    existing_file_in(folder, PICKS, str(folder))
     return dataclasses.replace(scene, picks=read_picks(folder / PICKS, scene.scans, unit))
 
 
@@ -134,7 +135,7 @@ def _read_stations(folder: Path, unit: str) -> Stations | None:
     path = folder / STATIONS
     if not path.exists():
         return None
-    inside(folder, STATIONS, str(folder))
+    existing_file_in(folder, STATIONS, str(folder))
     table = read_json(path)
     stations = {name: table.table(name) for name in table.values}
     for station in stations.values():
@@ -147,19 +148,17 @@ def _read_project(folder: Path) -> _Project:
     path = folder / PROJECT
     table = Table(str(path), {})
     if path.exists():
-        inside(folder, PROJECT, str(folder))
+        existing_file_in(folder, PROJECT, str(folder))
         try:
-            table = Table.of(str(path), tomllib.loads(decoded(path.read_bytes())))
+            table = Table.of(str(path), tomllib.loads(read_text(path)))
         except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise InputError(f"{path}: not readable TOML: {error}") from None
-        except OSError as error:
-            raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     table.only(KEYS)
     kind = table.text("kind", "")
     if kind and kind not in KINDS:
         raise InputError(f"{path}: unknown kind {kind!r}; expected one of {', '.join(KINDS)}")
     named = table.text("design", "") or next((name for name in DESIGNS if (folder / name).exists()), "")
-    design = inside(folder, named, str(path)) if named else None
+    design = existing_file_in(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
     control, control_file = read_control(folder, table)
     return _Project(
@@ -210,7 +209,7 @@ def _entry(folder: Path, scan: Table) -> _Entry:
             f"{scan.where}: 'pose' is not a rotation and a translation above a row of 0, 0, 0, 1; correct the matrix"
         )
     return _Entry(
-        inside(folder, scan.text("file"), scan.where),
+        existing_file_in(folder, scan.text("file"), scan.where),
         component=scan.text("component", ""),
         station=scan.text("station", ""),
         pose=pose,
@@ -223,7 +222,7 @@ def _open_scans(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
     """Return the scan files of a folder. Raises InputError for none, and for one in a closed format only."""
     files = scan_files(folder, excluded)
     for path in files:
-        inside(folder, str(path.relative_to(folder)), str(folder))
+        existing_file_in(folder, str(path.relative_to(folder)), str(folder))
     scans = [path for path in files if not readers.is_closed(path)]
     # A scanner's own files often lie beside the files exported from them.
     exported = {path.stem for path in scans}

@@ -16,7 +16,7 @@ from processor.geometry import mesh_distance, principal
 from processor.model import ArchDesign, Floats, FrameDesign, InputError, Ints
 from processor.readers import RawScan
 from processor.scan_folder import component_names
-from processor.scan_folder.checked_toml import inside
+from processor.scan_folder.checked_toml import existing_file_in
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
 from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files
 from processor.scan_folder.meshes import MESH_SUFFIXES
@@ -143,7 +143,7 @@ def _read_design(folder: Path, path: Path | None, project: Guess) -> ArchDesign 
     if path is None:
         return None
     try:
-        inside(folder, str(path.relative_to(folder)), str(folder))
+        existing_file_in(folder, str(path.relative_to(folder)), str(folder))
         if is_surface(path):
             project.kind, project.kind_reason = "structure", f"{project.design} is one surface of the whole"
             return read_surface(path, "mm")
@@ -171,7 +171,7 @@ def _sizes(design: ArchDesign | FrameDesign | Surface | None) -> list[float]:
 def _read_scan(folder: Path, path: Path, project: Guess) -> ScanGuess:
     scan = ScanGuess(str(path.relative_to(folder)), stem=path.stem)
     try:
-        inside(folder, scan.file, str(folder))
+        existing_file_in(folder, scan.file, str(folder))
         raws = readers.read(path)
     except InputError as error:
         scan.error = str(error).replace(f"{folder}/", "")

@@ -21,7 +21,8 @@ def read(path: Path, core: Floats, origin: Floats, tolerance: float) -> Floats:
 
     PLY, or text with columns nx, ny, nz by name, or three columns, or six with x, y, z first. Raises InputError if
     their number differs from the core points', if one has no length, or lies farther than ``tolerance`` from its core
-    point; without names also if they are not unit vectors, as they may be coordinates or colours.
+    point; without names also if they are not unit vectors, as they may be coordinates or colours. A normal of NaN stays
+    NaN: its core point has none.
     """
     if not path.is_file():
         raise InputError(f"{path}: no such file")

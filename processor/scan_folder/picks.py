@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from processor.model import InputError, Picks, Scan
-from processor.readers.encoding import decoded
-from processor.readers.file_checks import errors_name_the_file
+from processor.scan_folder.text_files import csv_rows
 from processor.scan_folder.units import MM_PER_UNIT
 
 COLUMNS = ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
@@ -21,20 +19,13 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
 
     Raises InputError, which names the line, for malformed rows and for scans that do not exist.
     """
-    try:
-        text = decoded(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
-    with errors_name_the_file(path, "CSV"):
-        rows = list(csv.reader(text.splitlines()))
-    header = tuple(cell.strip().lower() for cell in rows[0]) if rows else ()
+    rows = csv_rows(path)
+    header = tuple(cell.strip().lower() for cell in rows[0][1]) if rows else ()
     if header != COLUMNS:
         raise InputError(f"{path}: expected columns {','.join(COLUMNS)}, found {','.join(header)[:80]!r}")
     known = {scan.name for scan in scans}
-    names_a, names_b, points, numbers = [], [], [], []
-    for line, row in enumerate(rows[1:], 2):
-        if not any(map(str.strip, row)):
-            continue
+    names_a, names_b, point_names, numbers = [], [], [], []
+    for line, row in rows[1:]:
         where = f"{path}: line {line}"
         if len(row) != len(COLUMNS):
             raise InputError(f"{where}: expected {len(COLUMNS)} cells, found {len(row)}")
@@ -52,9 +43,9 @@ def read_picks(path: Path, scans: Sequence[Scan], unit: str) -> Picks:
             raise InputError(f"{where}: expected finite numbers, found {row[3:]}")
         names_a.append(a)
         names_b.append(b)
-        points.append(row[2].strip())
+        point_names.append(row[2].strip())
         numbers.append(values)
     if not numbers:
         raise InputError(f"{path}: holds no points; expected three or more for each pair of scans")
     table = np.array(numbers) * MM_PER_UNIT[unit]
-    return Picks(tuple(names_a), tuple(names_b), tuple(points), table[:, :3], table[:, 3:])
+    return Picks(tuple(names_a), tuple(names_b), tuple(point_names), table[:, :3], table[:, 3:])

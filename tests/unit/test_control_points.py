@@ -190,7 +190,11 @@ def test_a_csv_is_no_scan_and_may_name_stations_of_a_merged_cloud(tmp_path):
         (TABLES.replace("position = [0.0, 0.0, 100.0]", "where = 1"), None, "unknown key 'where'"),
         (TABLES.replace("[2000.0, 4000.0, 300.0]", "[2000.0, nan, 300.0]"), None, "numbers of shape 3"),
         ('[[control]]\nname = "T1"\n', None, "found neither"),
-        ('[[control]]\nname = "T1"\nposition = [0, 0, 0]\nsd_mm = 1.0\n', None, "no control point is seen"),
+        (
+            '[[control]]\nname = "T1"\nposition = [0, 0, 0]\nsd_mm = 1.0\n',
+            None,
+            "no control point was measured in a scan",
+        ),
         ('[[control]]\nname = "T1"\nscan = "a"\nseen = [0, 0, 0]\n', None, "no known coordinates"),
         (TABLES + TABLES, None, "has coordinates already"),
         ("", CSV + "T1,b,0,0,0,\n", "seen in 'b' twice"),
@@ -208,7 +212,8 @@ def test_nonsense_is_named(tmp_path, toml, csv, said):
 
 
 @pytest.mark.parametrize(
-    ("value", "said"), [("3", "expected a text"), ('"../x.csv"', "leads out"), ('"no"', "no file")]
+    ("value", "said"),
+    [("3", "expected a text"), ('"."', "found a folder"), ('"../x.csv"', "leads out"), ('"no"', "no file")],
 )
 def test_a_table_that_is_not_there(tmp_path, value, said):
     with pytest.raises(InputError, match=said):

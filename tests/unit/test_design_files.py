@@ -57,6 +57,15 @@ def test_a_table_of_balls(tmp_path, table):
     assert frame.radii.tolist() == [75, 75, 75]
 
 
+def test_the_projects_unit_precedes_that_of_the_command_for_a_table(tmp_path):
+    write_xyz(tmp_path / "hall.xyz", surface())
+    (tmp_path / "design.csv").write_text(
+        "id,x,y,z,radius\n4,4000,8000,500,75\n2,2000,4000,500,75\n7,14000,7000,500,75\n"
+    )
+    (tmp_path / "project.toml").write_text('units = "mm"\n')
+    assert folder.read_input(tmp_path, "m").frame.radii.tolist() == [75, 75, 75]
+
+
 @pytest.mark.parametrize("suffix", [".stl", ".obj"])
 def test_other_meshes(bridge, suffix):
     mesh = bridge / f"design/foot1{suffix}"
@@ -164,6 +173,7 @@ def test_mistakes_in_a_frame(tmp_path, case):
         ("id,x_mm,y_m,z_m,radius_m\n1,2,3,4,5\n", "of one unit"),
         ("id,x,y,z,radius\n1,2,3,4\n", "line 2: expected id,x,y,z,radius"),
         ("id,x,y,z,radius\n1,2,3,4,nan\n", "line 2: expected finite numbers"),
+        ("\nid;x;y;z;radius\n\n1;2;3;4;5\n2;3;4;5;nan\n", "line 5: expected finite numbers"),
         ("id,x,y,z,radius\n", "expected nodes, found none"),
         ("", "expected columns"),
     ],

@@ -53,7 +53,17 @@ def test_names_of_a_chinese_design():
 
 @pytest.mark.parametrize(
     ("stem", "expected"),
-    [("S03", "S3"), ("bridge_station 2", "S2"), ("测站5", "S5"), ("第三站", "S3"), ("roof", ""), ("is2", "")],
+    [
+        ("S03", "S3"),
+        ("bridge_station 2", "S2"),
+        ("测站5", "S5"),
+        ("第三站", "S3"),
+        ("第十二站", "S12"),
+        ("二十一号测站", "S21"),
+        ("站十二", "S12"),
+        ("roof", ""),
+        ("is2", ""),
+    ],
 )
 def test_names_of_stations(stem, expected):
     assert component_names.station(stem) == expected

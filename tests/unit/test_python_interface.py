@@ -90,6 +90,11 @@ def test_a_shift_of_a_plane_by_m3c2():
     assert table.core.shape == table.normals.shape == (300, 3)
     given = processor.m3c2(first, second, core=first[:10], normals=np.tile([0.0, 0.0, -1.0], (10, 1)), **scales)
     np.testing.assert_allclose(given.distance, -5.0, atol=0.5)
+    metres = {name: length / 1e6 for name, length in scales.items()}
+    small = processor.m3c2(first / 1e6, second / 1e6, core=first[:300] / 1e6, **metres)
+    np.testing.assert_allclose(1e6 * small.distance, table.distance, atol=1e-3)
+    with pytest.raises(ValueError, match=r"array \(n, 3\) of coordinates, got"):
+        processor.m3c2(first[:, :2], second, **scales)
     with pytest.raises(ValueError, match="one unit"):
         processor.m3c2(first / 100.0, second / 100.0, **scales)
     with pytest.raises(ValueError, match="positive"):

@@ -5,6 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from processor.geometry import parallel
 from processor.limits import standards
 from processor.model import UsageError, reason
 from processor.space_frame import catalogue
@@ -59,11 +60,12 @@ def test_every_ball_has_its_size_and_its_place(roof, found):
     assert found.noise[0] + found.noise[2] == pytest.approx(4.0, rel=0.2)
 
 
-def test_order_chunks_and_threads_change_nothing(roof, found):
+def test_order_chunks_and_threads_change_nothing(roof, found, monkeypatch):
     _, _, _, source, nodes, tubes = roof
     order = np.random.default_rng(1).permutation(source.count)
     mixed = InMemory(source.points[order], source.station[order], source.scanners, chunk_size=3001)
     assert same_bytes(found, fit_spheres(mixed, nodes, tubes, catalogue.load()))
+    monkeypatch.delattr(parallel, "_pool")  # one thread starts no others
     alone = fit_spheres(source, nodes, tubes, catalogue.load(), params=Params(threads=1))
     assert same_bytes(found, alone)
 

@@ -11,6 +11,7 @@ from numba import njit
 
 from processor.geometry.linalg_small import inverse_of
 from processor.geometry.parallel import over_ranges
+from processor.geometry.sphere import BANDS, SECTORS
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import (
     NormalEquations,
@@ -50,7 +51,6 @@ from processor.space_frame.spheres.size_selection import (
 TOLERANCE_MM = 1e-6
 TURNS = 4  # alternations of the scale and the fit by it
 LARGEST_BIAS = 0.3  # sd
-BANDS, SECTORS = 10, 20  # cells of equal area that the visible share is counted in
 
 
 def finish(
@@ -223,7 +223,7 @@ def leftover(observations, chosen, noise, unknowns, covariance, residuals):  # t
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _cell_of(point, state, shift):  # type: ignore[no-untyped-def]
-    """Return the cell of the sphere's surface, of BANDS x SECTORS, that a point lies over."""
+    """Return the cell that a point lies over; the cells of :func:`~processor.geometry.sphere.sphere_cells`."""
     x, y, z = point[0] - state[0] - shift[0], point[1] - state[1] - shift[1], point[2] - state[2] - shift[2]
     d = np.sqrt(x**2 + y**2 + z**2)
     band = min(max(int(np.floor((z / d + 1.0) * (BANDS / 2.0))), 0), BANDS - 1)

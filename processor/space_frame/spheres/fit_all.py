@@ -19,7 +19,7 @@ from processor.space_frame.points.sphere_crops import Crops, gather
 from processor.space_frame.spheres import noise_model, occlusion, quality
 from processor.space_frame.spheres.aiming import aimed
 from processor.space_frame.spheres.final_fit import finish
-from processor.space_frame.spheres.gauss_newton import LEAST_COSINE
+from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
 from processor.space_frame.spheres.occlusion import AXIS_MM, FLAT_MM, Ends
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
@@ -250,7 +250,9 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
             new[~undecided] = old[~undecided]
     keep_nominal(chosen, problem.expected)
     priors = Priors(problem.centre_weight, chosen.sizes, np.full(len(chosen.sizes), size_weight))
-    done = finish(problem.crops, masks, model, setting.model_points, priors, chosen.states, 4.5 * sigma)
+    done = finish(
+        problem.crops, masks, model, setting.model_points, priors, chosen.states, CUT_SD * sigma, params.threads
+    )
     fits = Fits(
         states=done.states,
         covariance=done.covariances,

@@ -89,7 +89,7 @@ def residual(px, py, pz, ux, uy, uz, cx, cy, cz, r):  # type: ignore[no-untyped-
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def weight(t):  # type: ignore[no-untyped-def]
-    """Weight of a residual of t sd: redescending, with almost full efficiency for normal noise."""
+    """Weight of a residual of t sd: 1 up to FULL_SD, then a biweight that is 0 from CUT_SD."""
     t = abs(t)
     if t <= FULL_SD:
         return 1.0

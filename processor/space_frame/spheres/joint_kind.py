@@ -89,7 +89,8 @@ def for_a_ball(sphere: Floats, neck: Floats) -> Floats:
 def most_likely(odds: Floats, pairs: Ints) -> Bools:
     """Most likely assignment (k,) by log odds (k,) of each node, where pairs (p, 2) are mostly of one kind.
 
-    The minimum cut of a binary Markov field (Greig, Porteous and Seheult 1989).
+    The minimum cut of a binary Markov field (Greig, Porteous and Seheult 1989, "Exact maximum a posteriori
+    estimation for binary images", Journal of the Royal Statistical Society B 51, 271-279).
     """
     k = len(odds)
     if not k:

@@ -20,7 +20,7 @@ SLEEVE_MM = 25.0  # where the tube's radius is not known either
 FLAT_MM = 1.0  # by which a milled flat is wider than its sleeve
 AXIS_MM = 1.5  # allowance for the error of the axis at the node
 LEAST_POINTS = 8
-CLASS_MM = 4.0  # tubes within this are of one class, and have equal sleeves
+RADIUS_BIN_MM = 4.0  # tubes whose radii round to the same multiple are taken to have equal sleeves
 
 
 class Ends(NamedTuple):
@@ -68,7 +68,7 @@ def measured(member_ends: Ends, start: Ints, points: Floats, states: Floats, thr
     over_ranges(kernel, len(states), threads)
     single = np.where(counts >= LEAST_POINTS, medians / MEDIAN_OF_CORNER, np.nan)
     corner = first_guess(member_ends)
-    classes = np.where(np.isfinite(radii), np.rint(radii / CLASS_MM), -1.0)
+    classes = np.where(np.isfinite(radii), np.rint(radii / RADIUS_BIN_MM), -1.0)
     for number in np.unique(classes):
         rows = classes == number
         seen = single[rows & np.isfinite(single)]

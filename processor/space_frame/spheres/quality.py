@@ -9,12 +9,12 @@ import numpy.typing as npt
 from scipy.special import chdtrc
 
 from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
+from processor.geometry.sphere import BANDS, SECTORS
 from processor.limits import standards
 from processor.model import NORMAL_95, Floats, Reason, Tolerance, reason
 from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.members.records import Nodes
 from processor.space_frame.result import Evidence, Flag
-from processor.space_frame.spheres.final_fit import BANDS, SECTORS
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
     CELLS,

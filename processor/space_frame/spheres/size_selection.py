@@ -15,6 +15,7 @@ from numba import njit
 
 from processor.geometry.parallel import over_ranges
 from processor.space_frame.spheres.gauss_newton import (
+    CUT_SD,
     Mask,
     Observations,
     Prior,
@@ -163,7 +164,7 @@ def fit_one(observations, mask, model, prior, catch, tolerance, state, shifts, c
     for i in range(len(ranges)):
         far += ranges[i] / len(ranges)
     typical = np.sqrt(noise[0] + noise[1] * far * far)
-    first = max(1.0, catch / (4.5 * typical))
+    first = max(1.0, catch / (CUT_SD * typical))
     used = -1
     turns = 3 if tolerance > FINE_MM else 4
     for turn in range(turns):

@@ -3,8 +3,9 @@
 A view sees normals within a right angle of its direction. Its range offset and the errors of its registration displace
 all of them alike, so that the displacement of a merged surface along its normal is a smooth field over the normals. The
 field is modelled as a Gaussian process with a correlation of exp(cos angle - 1). Its variance is estimated by moments
-from what the fits of all spheres leave (Henderson 1953): means of residuals over cells of the normals against the
-scatter within them. The products of different spheres give the part that is common to all of them.
+from what the fits of all spheres leave (Henderson 1953, "Estimation of variance and covariance components", Biometrics
+9, 226-252): means of residuals over cells of the normals against the scatter within them. The products of different
+spheres give the part that is common to all of them.
 
 A shift of all views together, and an offset of all their ranges, look like places and radii: they are not estimated but
 stated, by the scanner's class.
@@ -17,12 +18,11 @@ from typing import NamedTuple
 import numpy as np
 
 from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
-from processor.geometry.sphere import sphere_cells
+from processor.geometry.sphere import BANDS, SECTORS, sphere_cells
 from processor.model import Floats, Ints
 from processor.space_frame.spheres.records import AimedCrops, Fits, Priors, ViewErrors
 
 MEAN_COSINE = 2.0 / 3.0  # of incidence on a sphere: a range moves the surface by less along its normal
-BANDS, SECTORS = 10, 20  # of sphere_cells
 LEAST_POINTS = 30
 LEAST_CELLS = 8
 ACROSS = 0.3  # largest cosine between an axis and the normals of its tube: cells are as wide
