@@ -14,7 +14,7 @@ import numpy.typing as npt
 
 from processor.model import Floats, Ints
 
-Mask = npt.NDArray[np.bool_]
+Bools = npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -133,7 +133,7 @@ class Consensus:
     """The sphere, its inliers (n,), and the numbers of minimal sets tried and needed."""
 
     sphere: Sphere
-    inliers: Mask
+    inliers: Bools
     trials: int
     needed: float
 
@@ -208,7 +208,7 @@ class RobustFit:
     """The sphere, the points (n,) of weight > 0, the scale (sd) of their residuals and whether the fit converged."""
 
     sphere: Sphere
-    inliers: Mask
+    inliers: Bools
     scale: float
     converged: bool
 

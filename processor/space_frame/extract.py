@@ -22,7 +22,7 @@ from processor.space_frame.members.members import Measured
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.result import Flag
-from processor.space_frame.spheres import fit_all, joint_kind, quality, visibility
+from processor.space_frame.spheres import ball_or_none, fit_all, hidden_or_missing, quality
 from processor.space_frame.spheres.quality import Bools
 from processor.space_frame.spheres.records import Spheres
 from processor.space_frame.stations import registration
@@ -174,7 +174,7 @@ def blind(source: Source, params: members.Params) -> Start | None:
         return None
     rows = np.full(len(graph.nodes), -1, np.int64)
     start = _measured(source, graph.nodes, graph.pairs, rows, params)
-    start = replace(start, balls=joint_kind.balls(source, start.measured, start.positions, params.threads))
+    start = replace(start, balls=ball_or_none.nodes_with_ball(source, start.measured, start.positions, params.threads))
     others = int((~start.balls & members.meeting(start.measured, params.largest_scatter_mm)).sum())
     return replace(start, reasons=(reason("spheres.other-joints", joints=others),)) if others else start
 
@@ -276,7 +276,7 @@ def _fit_spheres(
     spheres = fit_all.fit_spheres(source, nodes, measured.members, catalogue, expected, between, limits=options.limits)
     smallest = float(catalogue.radii.min()) if len(catalogue.radii) else np.nan
     spheres = quality.with_ambiguous_design(spheres, disputed)
-    return nodes, visibility.classified(spheres, source, smallest)
+    return nodes, hidden_or_missing.with_cause_of_absence(spheres, source, smallest)
 
 
 def _expected(start: Start, design: FrameDesign, origin: Floats, expansion: float) -> tuple[Floats, Bools]:

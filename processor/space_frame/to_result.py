@@ -52,7 +52,7 @@ def of_same_points(scene: Scene, params: Params) -> Result | None:
     if extracted is None:
         return None
     ids, limits = _ids(extracted.design_row, scene.frame), standards.default_for(scene.tolerance)
-    return baselines.compared(
+    return baselines.fit_same_points(
         extracted.source, extracted.nodes, extracted.members, extracted.spheres, ids, params, limits
     )
 
@@ -127,7 +127,7 @@ def _balls(extracted: Extracted, origin: Floats, scene: Scene) -> Balls:
         points=spheres.points,
         visible_fraction=spheres.visible_fraction,
         rms=spheres.rms,
-        nominal_radii=spheres.expected,
+        nominal_radii=spheres.nominal,
         evidence=spheres.evidence,
         flag=spheres.flag,
         reasons=tuple(reasons),

@@ -10,11 +10,11 @@ from processor.limits import standards
 from processor.model import UsageError, reason
 from processor.space_frame import catalogue
 from processor.space_frame.members.records import Members, Nodes
-from processor.space_frame.params import Params as PaperParams
+from processor.space_frame.params import Params
 from processor.space_frame.points import sphere_crops
 from processor.space_frame.spheres import baselines, fit_all
-from processor.space_frame.spheres.fit_all import Params, fit_spheres
-from processor.space_frame.spheres.records import Chosen
+from processor.space_frame.spheres.fit_all import RayFitParams, fit_spheres
+from processor.space_frame.spheres.records import SizeChoice
 from tests.support.ball_clouds import frame, grid_of_balls
 from tests.support.memory_source import InMemory
 
@@ -66,7 +66,7 @@ def test_order_chunks_and_threads_change_nothing(roof, found, monkeypatch):
     mixed = InMemory(source.points[order], source.station[order], source.scanners, chunk_size=3001)
     assert same_bytes(found, fit_spheres(mixed, nodes, tubes, catalogue.load()))
     monkeypatch.delattr(parallel, "_pool")  # one thread starts no others
-    alone = fit_spheres(source, nodes, tubes, catalogue.load(), params=Params(threads=1))
+    alone = fit_spheres(source, nodes, tubes, catalogue.load(), params=RayFitParams(threads=1))
     assert same_bytes(found, alone)
 
 
@@ -90,7 +90,7 @@ def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
     _centres, _, sizes, source, nodes, tubes = roof
     nominal = sizes.copy()
     nominal[[2, 7]] += 10.0
-    found = fit_spheres(source, nodes, tubes, catalogue.load(), expected_mm=nominal)
+    found = fit_spheres(source, nodes, tubes, catalogue.load(), nominal_mm=nominal)
     assert np.flatnonzero(np.array(found.flag) == "wrong-size").tolist() == [2, 7]
     assert found.reasons[2] == (reason("spheres.other-size", size=60.0, nominal=70.0),)
     assert np.array(found.flag)[np.delete(np.arange(12), [2, 7])].tolist() == ["ok"] * 10
@@ -98,17 +98,17 @@ def test_wrong_sizes_are_named_and_the_right_ones_are_not(roof):
 
 def test_a_doubtful_size_is_no_evidence_against_the_nominal_one():
     nan = np.nan
-    chosen = Chosen(
+    choice = SizeChoice(
         states=np.tile([0.0, 0.0, 0.0, 50.0], (4, 1)),
         sizes=np.full(4, 50.0),
         energy=np.array([10.0, 10.0, 10.0, np.inf]),
         second=np.array([55.0, 55.0, 60.0, nan]),
         second_energy=np.array([20.0, 40.0, 20.0, np.inf]),
     )
-    fit_all.keep_nominal(chosen, np.array([55.0, 55.0, 55.0, nan]))
-    assert chosen.sizes.tolist() == [55.0, 50.0, 50.0, 50.0]
-    assert chosen.states[:, 3].tolist() == [55.0, 50.0, 50.0, 50.0]
-    assert chosen.second[:3].tolist() == [50.0, 55.0, 60.0]
+    fit_all.keep_nominal(choice, np.array([55.0, 55.0, 55.0, nan]))
+    assert choice.sizes.tolist() == [55.0, 50.0, 50.0, 50.0]
+    assert choice.states[:, 3].tolist() == [55.0, 50.0, 50.0, 50.0]
+    assert choice.second[:3].tolist() == [50.0, 55.0, 60.0]
 
 
 def test_without_scanners_the_bias_is_said_to_stand(roof):
@@ -134,7 +134,7 @@ def test_a_node_without_points_is_known_from_its_axes_alone(roof):
     assert (found.evidence[-1], found.flag[-1]) == ("axes", "low-confidence")
     assert np.isnan(found.radii[-1])
     assert found.reasons[-1][0].code == "spheres.axes-alone"
-    known = fit_spheres(source, away, tubes, catalogue.load(), expected_mm=np.append(np.full(12, np.nan), 60.0))
+    known = fit_spheres(source, away, tubes, catalogue.load(), nominal_mm=np.append(np.full(12, np.nan), 60.0))
     assert known.radii[-1] == 60.0
     assert known.lowest[-1, 2] == pytest.approx(6000.0 - 60.0)
     assert known.lowest_sd[-1] > 0.5
@@ -216,7 +216,7 @@ def test_the_papers_estimators_run_on_the_same_points(roof, found):
     _, radii, _, source, nodes, tubes = roof
     limits = standards.default_for(None)
     plain, drawn = (
-        baselines.compared(source, nodes, tubes, found, np.arange(12), PaperParams(method, seed=1), limits)
+        baselines.fit_same_points(source, nodes, tubes, found, np.arange(12), Params(method, seed=1), limits)
         for method in ("least-squares", "ransac")
     )
     assert (drawn.balls.points <= plain.balls.points).all()  # those that consent
@@ -226,7 +226,7 @@ def test_the_papers_estimators_run_on_the_same_points(roof, found):
         assert np.isfinite(other.balls.radii).all()
         assert ours < np.median(np.abs(other.balls.radii - radii))
     with pytest.raises(UsageError, match="ransac"):
-        PaperParams("magic").check(True)
+        Params("magic").check(True)
 
 
 def test_catalogues_are_data_and_say_whether_they_were_checked():

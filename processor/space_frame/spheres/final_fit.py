@@ -1,10 +1,11 @@
-"""Compiled final fit of every sphere whose size is chosen: state, covariance, bound and what it rests on."""
+"""Compiled final fit of every sphere whose size is surface: state, covariance, bound and what it rests on."""
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
 from __future__ import annotations
 
 import math
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -14,6 +15,7 @@ from processor.geometry.parallel import over_ranges
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import (
+    VISIBLE,
     NormalEquations,
     Prior,
     Unknowns,
@@ -32,7 +34,7 @@ from processor.space_frame.spheres.records import (
     RMS,
     SCALE,
     STATIONS,
-    AimedCrops,
+    CropsWithRays,
     Finished,
     Masks,
     Priors,
@@ -49,25 +51,36 @@ from processor.space_frame.spheres.size_selection import (
 )
 
 TOLERANCE_MM = 1e-6
-TURNS = 4  # alternations of the scale and the fit by it
+ITERATIONS = 4  # alternations of the scale and the fit by it
 LARGEST_BIAS = 0.3  # sd
 
 
-def finish(
-    crops: AimedCrops,
+class ResidualSums(NamedTuple):
+    """Sums over the points of one sphere, by their robust weights w."""
+
+    weight: float  # of w
+    scaled_squares: float  # of w (e / sd)^2
+    leverage: float  # of w h
+    squares: float  # of w e^2, mm^2
+    cells: int  # of the sphere's surface that hold points
+    stations: int
+
+
+def fit_final(
+    crops: CropsWithRays,
     masks: Masks,
     model: StochasticModel,
     model_points: float,
     priors: Priors,
     states: Floats,
-    catch: float,
+    first_reach_mm: float,
     threads: int = 0,
 ) -> Finished:
     """Fit every node whose state (k, 4) is finite, with the priors of its centre and size.
 
     The scale about the noise model is estimated for each sphere, with as many degrees of freedom as points and
     ``model_points`` more, which the noise model is worth. Bounds are those of the noise and the priors with every point
-    at its full weight and stations fixed. ``catch`` is the reach of the first steps, mm.
+    at its full weight and stations fixed. ``first_reach_mm`` is the reach of the first steps, mm.
     """
     nodes, count = len(states), len(crops.points)
     residuals = Residuals(np.zeros(count), np.zeros(count), np.zeros(count))
@@ -78,21 +91,21 @@ def finish(
         numbers=np.zeros((nodes, 8)),
         residuals=residuals,
     )
-    kernel = partial(_finish_range, crops, masks, model, model_points, priors, states, catch, finished)
-    over_ranges(kernel, nodes, threads)
+    fit_range = partial(_fit_range, crops, masks, model, model_points, priors, states, first_reach_mm, finished)
+    over_ranges(fit_range, nodes, threads)
     return finished
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _finish_range(crops, masks, model, model_points, priors, states, catch, finished, first, last):  # type: ignore[no-untyped-def]
+def _fit_range(crops, masks, model, model_points, priors, states, first_reach_mm, finished, first, last):  # type: ignore[no-untyped-def]
     for k in range(first, last):
         if not np.isnan(states[k, 0]) and crops.start[k + 1] > crops.start[k]:
-            _finish_at(k, crops, masks, model, model_points, priors, states[k].copy(), catch, finished)
+            _fit_at(k, crops, masks, model, model_points, priors, states[k].copy(), first_reach_mm, finished)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _finish_at(k, crops, masks, model, model_points, priors, state, catch, finished):  # type: ignore[no-untyped-def]
-    """Fit node ``k`` from ``state``; see :func:`finish`."""
+def _fit_at(k, crops, masks, model, model_points, priors, state, first_reach_mm, finished):  # type: ignore[no-untyped-def]
+    """Fit node ``k`` from ``state``; see :func:`fit_final`."""
     rows, observations = within(crops, k, state[3] - AROUND_MM, state[3] + AROUND_MM)
     n = len(rows)
     if n == 0:
@@ -100,35 +113,35 @@ def _finish_at(k, crops, masks, model, model_points, priors, state, catch, finis
     shifts = np.zeros((segments(observations.station), 3))
     unknowns = Unknowns(state, shifts, np.zeros((len(shifts), 3, 8)))
     prior = Prior(priors.centre_weight[k], priors.sizes[k], priors.size_weights[k])
-    chosen, covariance = np.zeros(n, np.uint8), np.zeros((4, 4))
+    surface, covariance = np.zeros(n, np.uint8), np.zeros((4, 4))
     used = fit_one(
-        observations, mask_of(masks, k), model, prior, catch, TOLERANCE_MM, state, shifts, chosen, covariance
+        observations, mask_of(masks, k), model, prior, first_reach_mm, TOLERANCE_MM, state, shifts, surface, covariance
     )
     if used < 1:
         return
     local = StochasticModel(model.noise.copy(), model.shift_covariance)
     residuals = Residuals(np.zeros(n), np.zeros(n), np.zeros(n))
     used, scale, degrees = _scaled(
-        observations, chosen, model.noise, local, model_points, prior, unknowns, covariance, residuals
+        observations, surface, model.noise, local, model_points, prior, unknowns, covariance, residuals
     )
     if used < 1:
         return
     # variables for False and True: numba compiles a kernel anew for every literal
     robust, whole = n < 0, n > 0
     normal = NormalEquations(np.empty((4, 4)), np.empty(4))
-    normal_equations(observations, chosen, local, 1.0, robust, prior, unknowns, normal)
+    normal_equations(observations, surface, local, 1.0, robust, prior, unknowns, normal)
     if not inverse_of(normal.H, covariance):
         return
-    weights, _, _, plain, seen, stations = leftover(observations, chosen, local.noise, unknowns, covariance, residuals)
+    sums = fill_residuals(observations, surface, local.noise, unknowns, covariance, residuals)
     fixed = StochasticModel(local.noise, local.shift_covariance[:0])
-    used = normal_equations(observations, chosen, fixed, 1.0, whole, prior, unknowns, normal)
+    used = normal_equations(observations, surface, fixed, 1.0, whole, prior, unknowns, normal)
     if not inverse_of(normal.H, finished.bounds[k]):
         return
     chi2 = 0.0
     for i in range(3):
         for j in range(3):
             chi2 += state[i] * prior.centre_weight[i, j] * state[j]
-    _without_bias(observations, chosen, local.noise, state, covariance)
+    _without_bias(observations, surface, local.noise, state, covariance)
     finished.states[k] = state
     finished.covariances[k] = covariance
     for i in range(n):
@@ -136,42 +149,39 @@ def _finish_at(k, crops, masks, model, model_points, priors, state, catch, finis
         finished.residuals.cosines[rows[i]] = residuals.cosines[i]
         finished.residuals.weights[rows[i]] = residuals.weights[i]
     numbers = finished.numbers[k]
-    numbers[POINTS], numbers[CELLS], numbers[STATIONS] = used, seen, stations
-    numbers[RMS] = np.sqrt(plain / max(weights, 1e-9))
+    numbers[POINTS], numbers[CELLS], numbers[STATIONS] = used, sums.cells, sums.stations
+    numbers[RMS] = np.sqrt(sums.squares / max(sums.weight, 1e-9))
     numbers[SCALE], numbers[DEGREES] = scale, degrees
     numbers[CENTRE_CHI2], numbers[FITTED] = chi2, 1.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _scaled(observations, chosen, noise, local, model_points, prior, unknowns, covariance, residuals):  # type: ignore[no-untyped-def]
+def _scaled(observations, surface, noise, local, model_points, prior, unknowns, covariance, residuals):  # type: ignore[no-untyped-def]
     """Alternate the scale about the noise model and the fit; ``local.noise`` becomes the noise times its square.
 
     Returns points used (below 1: failed), the scale and its degrees of freedom.
     """
     scale, used, degrees = 1.0, 0, 0.0
-    steps = 10 if len(chosen) > 0 else 6  # a variable: see the literals above
-    for turn in range(TURNS):
-        weights, squares, leverages, _, _, _ = leftover(
-            observations, chosen, local.noise, unknowns, covariance, residuals
-        )
-        free = max(weights - leverages, 0.0)
+    steps = 10 if len(surface) > 0 else 6  # a variable: see the literals above
+    for iteration in range(ITERATIONS):
+        sums = fill_residuals(observations, surface, local.noise, unknowns, covariance, residuals)
+        free = max(sums.weight - sums.leverage, 0.0)
         degrees = model_points + free
-        scale2 = (model_points + squares * scale * scale) / degrees if degrees > 0.0 else 1.0
+        scale2 = (model_points + sums.scaled_squares * scale * scale) / degrees if degrees > 0.0 else 1.0
         scale = np.sqrt(scale2)
         for i in range(3):
             local.noise[i] = noise[i] * scale2
-        tolerance = TOLERANCE_MM if turn + 1 == TURNS else COARSE_MM
-        used = solve(observations, chosen, local, 1.0, prior, unknowns, tolerance, steps, covariance)
+        tolerance = TOLERANCE_MM if iteration + 1 == ITERATIONS else COARSE_MM
+        used = solve(observations, surface, local, 1.0, prior, unknowns, tolerance, steps, covariance)
         if used < 1:
             break
     return used, scale, degrees
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def leftover(observations, chosen, noise, unknowns, covariance, residuals):  # type: ignore[no-untyped-def]
-    """Fill each chosen point's residual, cosine and weight.
+def fill_residuals(observations, surface, noise, unknowns, covariance, residuals):  # type: ignore[no-untyped-def]
+    """Fill the residual, cosine and weight of each point on visible surface, and return their sums.
 
-    Returns the sums of w, of w u^2, of w leverage and of w e^2, and the numbers of visible cells and of stations.
     Residuals are divided by sqrt(1 - leverage): their spread is that of the noise, also for few points.
     """
     points, rays, ranges, station = observations
@@ -182,7 +192,7 @@ def leftover(observations, chosen, noise, unknowns, covariance, residuals):  # t
     segment, inside, stations, seen = 0, False, 0, 0
     for i in range(len(points)):
         on[i] = 0.0
-        if chosen[i] == 1:
+        if surface[i] == VISIBLE:
             e, cosine, J[0], J[1], J[2], J[3] = residual(
                 points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2],
                 state[0] + shifts[segment, 0], state[1] + shifts[segment, 1], state[2] + shifts[segment, 2], state[3],
@@ -218,7 +228,7 @@ def leftover(observations, chosen, noise, unknowns, covariance, residuals):  # t
             if inside:
                 stations += 1
             inside = False
-    return weights, squares, leverages, plain, seen, stations
+    return ResidualSums(weights, squares, leverages, plain, seen, stations)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -227,8 +237,8 @@ def _cell_of(point, state, shift):  # type: ignore[no-untyped-def]
     x, y, z = point[0] - state[0] - shift[0], point[1] - state[1] - shift[1], point[2] - state[2] - shift[2]
     d = np.sqrt(x**2 + y**2 + z**2)
     band = min(max(int(np.floor((z / d + 1.0) * (BANDS / 2.0))), 0), BANDS - 1)
-    turn = math.atan2(y, x) / (2.0 * np.pi) + 0.5
-    sector = min(max(int(np.floor(turn * SECTORS)), 0), SECTORS - 1)
+    angle = math.atan2(y, x) / (2.0 * np.pi) + 0.5
+    sector = min(max(int(np.floor(angle * SECTORS)), 0), SECTORS - 1)
     return band * SECTORS + sector
 
 
@@ -236,10 +246,10 @@ def _cell_of(point, state, shift):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _without_bias(observations, chosen, noise, state, covariance):  # type: ignore[no-untyped-def]
+def _without_bias(observations, surface, noise, state, covariance):  # type: ignore[no-untyped-def]
     """Take the bias by curvature off the state, and half of that by unknown rays, whose spread the covariance gets."""
     off = np.zeros(4)
-    bias(observations, chosen, noise, state, covariance, off)
+    curvature_bias(observations, surface, noise, state, covariance, off)
     largest = 0.0
     for i in range(4):
         largest = max(largest, abs(off[i]) / np.sqrt(covariance[i, i]))
@@ -247,7 +257,7 @@ def _without_bias(observations, chosen, noise, state, covariance):  # type: igno
         for i in range(4):
             state[i] -= off[i]
     # Where rays are unknown the bias lies between none and all of ``off``: uniform, its variance is off^2 / 12.
-    lean(observations.points, observations.rays, chosen, noise, state, covariance, off)
+    unknown_ray_bias(observations.points, observations.rays, surface, noise, state, covariance, off)
     for i in range(4):
         state[i] -= 0.5 * off[i]
         for j in range(4):
@@ -255,7 +265,7 @@ def _without_bias(observations, chosen, noise, state, covariance):  # type: igno
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def bias(observations, chosen, noise, state, covariance, off):  # type: ignore[no-untyped-def]
+def curvature_bias(observations, surface, noise, state, covariance, off):  # type: ignore[no-untyped-def]
     """Fill the bias (4,) of least squares by the residuals' curvature, -1/2 C sum J w trace(C H).
 
     Source: M. J. Box, Bias in nonlinear estimation, J. Roy. Statist. Soc. B 33 (1971), 171-201.
@@ -264,7 +274,7 @@ def bias(observations, chosen, noise, state, covariance, off):  # type: ignore[n
     cx, cy, cz, r = state[0], state[1], state[2], state[3]
     total, J, v, u = np.zeros(4), np.empty(4), np.empty(3), np.empty(3)
     for i in range(len(points)):
-        if chosen[i] != 1:
+        if surface[i] != VISIBLE:
             continue
         e, cosine, J[0], J[1], J[2], J[3] = residual(
             points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], cx, cy, cz, r
@@ -299,7 +309,7 @@ def bias(observations, chosen, noise, state, covariance, off):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def lean(points, rays, chosen, noise, state, covariance, off):  # type: ignore[no-untyped-def]
+def unknown_ray_bias(points, rays, surface, noise, state, covariance, off):  # type: ignore[no-untyped-def]
     """Fill the bias of the state (4,) where rays are unknown, for noise that is the same in all directions.
 
     Noise across the normal of a sphere moves points outward by variance / distance on the mean. Of noise along a ray
@@ -307,7 +317,7 @@ def lean(points, rays, chosen, noise, state, covariance, off):  # type: ignore[n
     """
     J, total = np.empty(4), np.zeros(4)
     for i in range(len(points)):
-        if chosen[i] != 1 or rays[i, 0] != 0.0 or rays[i, 1] != 0.0 or rays[i, 2] != 0.0:
+        if surface[i] != VISIBLE or rays[i, 0] != 0.0 or rays[i, 1] != 0.0 or rays[i, 2] != 0.0:
             continue
         e, cosine, J[0], J[1], J[2], J[3] = residual(
             points[i, 0], points[i, 1], points[i, 2], 0.0, 0.0, 0.0, state[0], state[1], state[2], state[3]

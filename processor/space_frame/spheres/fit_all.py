@@ -16,24 +16,24 @@ from processor.space_frame.catalogue import Catalogue
 from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.source import Source
 from processor.space_frame.points.sphere_crops import Crops, gather
-from processor.space_frame.spheres import noise_model, occlusion, quality
-from processor.space_frame.spheres.aiming import aimed
-from processor.space_frame.spheres.final_fit import finish
+from processor.space_frame.spheres import noise_model, quality, sleeves
+from processor.space_frame.spheres.final_fit import fit_final
 from processor.space_frame.spheres.gauss_newton import CUT_SD, LEAST_COSINE
-from processor.space_frame.spheres.occlusion import AXIS_MM, FLAT_MM, Ends
+from processor.space_frame.spheres.rays import with_rays
 from processor.space_frame.spheres.records import (
     AMBIGUOUS,
-    AimedCrops,
-    Chosen,
+    CropsWithRays,
     Fits,
     Masks,
     Priors,
     Residuals,
+    SizeChoice,
     Sizes,
     Spheres,
     StochasticModel,
 )
 from processor.space_frame.spheres.size_selection import choose
+from processor.space_frame.spheres.sleeves import AXIS_MM, FLAT_MM, MemberEnds
 from processor.space_frame.spheres.station_scatter import shift_sd
 from processor.space_frame.spheres.unnamed_views import view_errors
 
@@ -47,14 +47,14 @@ VAGUE_MM = 50.0  # a node with a larger sd than this has no prior
 
 
 @dataclass(frozen=True)
-class Params:
+class RayFitParams:
     """Parameters of the fit, mm. ``sigma_mm`` starts the estimate of the noise."""
 
     sigma_mm: float = 2.0
     process_hole_mm: float = 15.0  # radius of the cap about the lowest point that the process hole may take
     least_cosine: float = LEAST_COSINE
-    surprise: float = 9.0  # by which the energy of a size other than the expected one is raised
-    catch_mm: float = 12.0  # reach of the first steps
+    other_size_penalty: float = 9.0  # by which the energy of a size other than the nominal one is raised
+    first_reach_mm: float = 12.0  # reach of the first steps
     threads: int = 0  # 0 = as many as there are
 
 
@@ -62,12 +62,12 @@ class Params:
 class _Problem:
     """Input of all rounds."""
 
-    crops: AimedCrops
-    ends: Ends
+    crops: CropsWithRays
+    ends: MemberEnds
     centre_weight: Floats  # (k, 3, 3)
-    expected: Floats  # (k,)
+    nominal: Floats  # (k,)
     catalogue: Catalogue
-    params: Params
+    params: RayFitParams
 
     @property
     def free(self) -> bool:
@@ -81,7 +81,7 @@ class _Setting:
 
     noise: Floats  # (3,)
     model_points: float  # that the noise model is worth
-    corner: Floats  # (m,) radii of sleeves
+    sleeve_radii: Floats  # (m,) radii of sleeves
     radius_sd: float
     least_cosine: float
     station_sd: float
@@ -97,25 +97,25 @@ def fit_spheres(
     nodes: Nodes,
     members: Members,
     catalogue: Catalogue,
-    expected_mm: Floats | None = None,
+    nominal_mm: Floats | None = None,
     station_covariance: Floats | None = None,
-    params: Params | None = None,
+    params: RayFitParams | None = None,
     limits: Tolerance | None = None,
 ) -> Spheres:
     """Fit a sphere at every node; one pass over the source.
 
     Parameters
     ----------
-    expected_mm : (k,) nominal radii, NaN = none: a prior on the size alone
+    nominal_mm : (k,) nominal radii, NaN = none: a prior on the size alone
     station_covariance : (s, 3, 3) of each scanner's place as registered, mm^2; by default it is estimated from spheres
         that several stations saw
     limits : has the tolerance of a sphere's blank; by default that of the default standard
     """
     largest = float(catalogue.radii.max()) if len(catalogue.radii) else LARGEST_FREE_MM
-    if expected_mm is not None and np.isfinite(expected_mm).any():
-        largest = max(largest, float(np.nanmax(expected_mm)))
+    if nominal_mm is not None and np.isfinite(nominal_mm).any():
+        largest = max(largest, float(np.nanmax(nominal_mm)))
     crops = gather(source, nodes.positions, largest + MARGIN_MM, params.threads if params else 0)
-    return fit_crops(crops, source.scanners, nodes, members, catalogue, expected_mm, station_covariance, params, limits)
+    return fit_crops(crops, source.scanners, nodes, members, catalogue, nominal_mm, station_covariance, params, limits)
 
 
 def fit_crops(
@@ -124,23 +124,23 @@ def fit_crops(
     nodes: Nodes,
     members: Members,
     catalogue: Catalogue,
-    expected_mm: Floats | None = None,
+    nominal_mm: Floats | None = None,
     station_covariance: Floats | None = None,
-    params: Params | None = None,
+    params: RayFitParams | None = None,
     limits: Tolerance | None = None,
 ) -> Spheres:
     """Fit a sphere to each node's gathered points; see :func:`fit_spheres`."""
-    params = params or Params()
+    params = params or RayFitParams()
     problem = _Problem(
-        crops=aimed(crops, np.array(nodes.positions), np.array(scanners, np.float64), params.threads),
-        ends=occlusion.ends(nodes, members),
+        crops=with_rays(crops, np.array(nodes.positions), np.array(scanners, np.float64), params.threads),
+        ends=sleeves.member_ends(nodes, members),
         centre_weight=centre_weights(nodes.covariance),
-        expected=np.full(nodes.count, NAN) if expected_mm is None else np.asarray(expected_mm, np.float64),
+        nominal=np.full(nodes.count, NAN) if nominal_mm is None else np.asarray(nominal_mm, np.float64),
         catalogue=catalogue,
         params=params,
     )
     fits, setting, residuals = _rounds(problem, len(scanners), station_covariance)
-    rays = bool(np.any(problem.crops.ranges > 0.0))
+    scanners_known = bool(np.any(problem.crops.ranges > 0.0))
     priors = Priors(problem.centre_weight, fits.sizes, np.full(len(fits.sizes), setting.size_weight(problem.free)))
     offset = (0.0, np.inf)
     if len(catalogue.radii):
@@ -148,17 +148,17 @@ def fit_crops(
         offset = noise_model.radius_offset(
             fits.states[sure, 3], fits.covariance[sure, 3, 3], fits.sizes[sure], setting.radius_sd, catalogue.sd_mm
         )
-    conditions = quality.Conditions(
+    context = quality.FitContext(
         catalogue=catalogue,
-        rays=rays,
-        views=None if rays else view_errors(problem.crops, residuals.weights, fits, priors),
+        scanners_known=scanners_known,
+        views=None if scanners_known else view_errors(problem.crops, residuals.weights, fits, priors),
         noise=setting.noise,
         radius_sd=setting.radius_sd,
         station_sd=setting.station_sd if station_covariance is None else NAN,
         radius_offset=offset,
         limits=standards.default_for(limits),
     )
-    return quality.assess(fits, nodes, problem.expected, conditions)
+    return quality.assess(fits, nodes, problem.nominal, context)
 
 
 def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None) -> tuple[Fits, _Setting, Residuals]:
@@ -167,23 +167,23 @@ def _rounds(problem: _Problem, scanners: int, station_covariance: Floats | None)
     setting = _Setting(
         noise=np.array([problem.params.sigma_mm**2, 0.0, 0.0]),
         model_points=10.0,
-        corner=occlusion.first_guess(problem.ends),
+        sleeve_radii=sleeves.sleeve_radii_from_tubes(problem.ends),
         radius_sd=catalogue.sd_mm,
         least_cosine=problem.params.least_cosine,
         station_sd=0.0,
         shift=np.array(station_covariance, np.float64) if known else np.zeros((scanners, 3, 3)),
     )
     fits: Fits | None = None
-    for turn in range(ROUNDS):
+    for iteration in range(ROUNDS):
         fits, residuals = _fit(problem, setting, fits)
-        if turn == ROUNDS - 1 or (turn == 1 and setting.station_sd == 0.0):
+        if iteration == ROUNDS - 1 or (iteration == 1 and setting.station_sd == 0.0):
             return fits, setting, residuals
         estimate = _estimated(problem, setting, fits, residuals)
         if known:
             estimate = replace(estimate, station_sd=0.0, shift=setting.shift)
         noisier = typical_variance(estimate.noise, ranges) > 2.0 * typical_variance(setting.noise, ranges)
         # sleeves larger than guessed, or shifted stations, may have led to a wrong size
-        spoilt = bool((estimate.corner > setting.corner + AXIS_MM).any())
+        spoilt = bool((estimate.sleeve_radii > setting.sleeve_radii + AXIS_MM).any())
         if noisier or spoilt or estimate.station_sd > 1.2 * setting.station_sd:
             fits = None
         setting = estimate
@@ -194,7 +194,7 @@ def _estimated(problem: _Problem, setting: _Setting, fits: Fits, residuals: Resi
     """Estimate the next round's setting from all spheres of one round."""
     crops, catalogue, threads = problem.crops, problem.catalogue, problem.params.threads
     errors, cosines, weights = residuals
-    corner = occlusion.measured(problem.ends, crops.start, crops.points, fits.states, threads)
+    sleeve_radii = sleeves.sleeve_radii(problem.ends, crops.start, crops.points, fits.states, threads)
     noise, count = noise_model.noise_model(errors, cosines, crops.ranges, weights, setting.noise)
     limb = noise_model.limb_cosine(errors, cosines, crops.ranges, weights, noise, setting.least_cosine)
     sure, radius_sd, size_weight = fits.clear, setting.radius_sd, setting.size_weight(problem.free)
@@ -210,7 +210,7 @@ def _estimated(problem: _Problem, setting: _Setting, fits: Fits, residuals: Resi
     return _Setting(
         noise=noise,
         model_points=min(count, MOST_MODEL_POINTS),
-        corner=corner,
+        sleeve_radii=sleeve_radii,
         radius_sd=radius_sd,
         least_cosine=limb,
         station_sd=station_sd,
@@ -222,12 +222,12 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
     """One round: choose sizes, except where ``before`` has final ones, and fit."""
     params, ends = problem.params, problem.ends
     sigma = float(np.sqrt(typical_variance(setting.noise, problem.crops.ranges)))
-    tube = np.where(np.isfinite(ends.tube_radii), ends.tube_radii, 1.5 * setting.corner)
+    tube = np.where(np.isfinite(ends.tube_radii), ends.tube_radii, 1.5 * setting.sleeve_radii)
     masks = Masks(
         start=ends.start,
         axis_points=ends.points,
         axes=ends.directions,
-        keep_off=setting.corner + FLAT_MM + AXIS_MM + 0.5 * sigma,
+        keep_off=setting.sleeve_radii + FLAT_MM + AXIS_MM + 0.5 * sigma,
         tube_off=tube + 2.0 + 2.0 * sigma,
         hole=params.process_hole_mm,
         least_cosine=setting.least_cosine,
@@ -237,40 +237,42 @@ def _fit(problem: _Problem, setting: _Setting, before: Fits | None) -> tuple[Fit
     sizes = Sizes(
         sizes=FREE_SIZES if problem.free else np.array(problem.catalogue.radii),
         weight=size_weight,
-        expected=problem.expected,
-        surprise=params.surprise,
+        nominal=problem.nominal,
+        other_size_penalty=params.other_size_penalty,
         free=problem.free,
         centre_weight=problem.centre_weight,
     )
-    undecided = np.ones(len(problem.expected), bool) if before is None else ~before.final_size
-    chosen = choose(problem.crops, masks, model, sizes, 2.5 * sigma + 1.0, params.catch_mm, undecided, params.threads)
+    undecided = np.ones(len(problem.nominal), bool) if before is None else ~before.final_size
+    choice = choose(
+        problem.crops, masks, model, sizes, 2.5 * sigma + 1.0, params.first_reach_mm, undecided, params.threads
+    )
     if before is not None:
-        earlier = Chosen(before.states, before.sizes, before.energy, before.second, before.second_energy)
-        for new, old in zip(chosen, earlier, strict=True):
+        earlier = SizeChoice(before.states, before.sizes, before.energy, before.second, before.second_energy)
+        for new, old in zip(choice, earlier, strict=True):
             new[~undecided] = old[~undecided]
-    keep_nominal(chosen, problem.expected)
-    priors = Priors(problem.centre_weight, chosen.sizes, np.full(len(chosen.sizes), size_weight))
-    done = finish(
-        problem.crops, masks, model, setting.model_points, priors, chosen.states, CUT_SD * sigma, params.threads
+    keep_nominal(choice, problem.nominal)
+    priors = Priors(problem.centre_weight, choice.sizes, np.full(len(choice.sizes), size_weight))
+    final = fit_final(
+        problem.crops, masks, model, setting.model_points, priors, choice.states, CUT_SD * sigma, params.threads
     )
     fits = Fits(
-        states=done.states,
-        covariance=done.covariances,
-        bound=done.bounds,
-        sizes=chosen.sizes,
-        energy=chosen.energy,
-        second=chosen.second,
-        second_energy=chosen.second_energy,
-        numbers=done.numbers,
+        states=final.states,
+        covariance=final.covariances,
+        bound=final.bounds,
+        sizes=choice.sizes,
+        energy=choice.energy,
+        second=choice.second,
+        second_energy=choice.second_energy,
+        numbers=final.numbers,
     )
-    return fits, done.residuals
+    return fits, final.residuals
 
 
-def keep_nominal(chosen: Chosen, expected: Floats) -> None:
-    """Take the expected size (k,) where it is the runner-up and is not ruled out, in place."""
-    rows = (chosen.second == expected) & (chosen.second_energy < chosen.energy + AMBIGUOUS)
-    chosen.second[rows] = chosen.sizes[rows]
-    chosen.sizes[rows] = chosen.states[rows, 3] = expected[rows]
+def keep_nominal(choice: SizeChoice, nominal: Floats) -> None:
+    """Take the nominal size (k,) where it is the runner-up and is not ruled out, in place."""
+    rows = (choice.second == nominal) & (choice.second_energy < choice.energy + AMBIGUOUS)
+    choice.second[rows] = choice.sizes[rows]
+    choice.sizes[rows] = choice.states[rows, 3] = nominal[rows]
 
 
 def typical_variance(noise: Floats, ranges: Floats) -> float:

@@ -1,7 +1,7 @@
 """Compiled Gauss-Newton fit of one sphere: centre and radius by robust residuals along the ray, with priors.
 
 Each station may be shifted as a whole by an unknown vector of known covariance (from its registration). The shift is
-estimated with the sphere and so enters the sphere's covariance. Coordinates are less the node's position, so that the
+estimated with the sphere and so enters the sphere's covariance. Coordinates are relative to the node, so that the
 prior of the centre has mean 0.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
@@ -18,11 +18,12 @@ from processor.geometry.linalg_small import inverse_of
 from processor.model import Floats, Labels
 
 LEAST_COSINE = 0.15
+MISSED, VISIBLE, MASKED = 0, 1, 2  # what a ray meets
 FULL_SD, CUT_SD = 3.0, 4.5  # residuals up to the first have weight 1, beyond the second weight 0
 
 
 class Observations(NamedTuple):
-    """Points of one sphere, sorted by station; see :class:`~processor.space_frame.spheres.records.AimedCrops`."""
+    """Points of one sphere, sorted by station; see :class:`~processor.space_frame.spheres.records.CropsWithRays`."""
 
     points: Floats
     rays: Floats
@@ -30,7 +31,7 @@ class Observations(NamedTuple):
     station: Labels
 
 
-class Mask(NamedTuple):
+class SphereMask(NamedTuple):
     """Mask of one sphere; see :class:`~processor.space_frame.spheres.records.Masks`."""
 
     axis_points: Floats
@@ -71,7 +72,12 @@ Flags = npt.NDArray[np.uint8]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def residual(px, py, pz, ux, uy, uz, cx, cy, cz, r):  # type: ignore[no-untyped-def]
-    """Residual, cosine of incidence on the model (0 = missed), and the residual's derivatives by centre and radius."""
+    """Residual of a point p to a sphere (c, r), the cosine of its incidence, and the residual's derivatives by c and r.
+
+    Along the unit ray u from the scanner, positive where the point lies behind the surface that the ray meets first.
+    All numbers are 0 where the ray misses the sphere. With u = 0 the ray is unknown: the distance from the centre less
+    the radius, positive outside the sphere, with cosine 1.
+    """
     wx, wy, wz = cx - px, cy - py, cz - pz
     if ux == 0.0 and uy == 0.0 and uz == 0.0:
         d = np.sqrt(wx * wx + wy * wy + wz * wz)
@@ -107,18 +113,18 @@ def variance(noise, distance, cosine):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def select(points, rays, mask, state, gate, chosen):  # type: ignore[no-untyped-def]
-    """Mark points in ``chosen`` (n,) by where their rays meet the model, and count those on visible surface.
+def select(points, rays, mask, state, gate, surface):  # type: ignore[no-untyped-def]
+    """Mark points in ``surface`` (n,) by where their rays meet the model, and count those on visible surface.
 
-    1: the ray meets the sphere's own visible surface. 2: it meets masked surface, that is flats and sleeves
-    (``keep_off`` from each member's axis) or the process hole about the lowest point. 0: it misses the model or its
-    incidence is below ``least_cosine``. The choice does not use the noisy point itself. ``gate`` (mm) only saves work:
+    VISIBLE: the ray meets the sphere's own visible surface. MASKED: it meets masked surface, that is flats and
+    sleeves (``keep_off`` from each member's axis) or the process hole about the lowest point. MISSED: it misses the
+    model or its incidence is below ``least_cosine``. The noisy point itself is not used. ``gate`` (mm) only saves work:
     it is far beyond the noise.
     """
     cx, cy, cz, r = state[0], state[1], state[2], state[3]
     total = 0
     for i in range(len(points)):
-        chosen[i] = 0
+        surface[i] = MISSED
         e, cosine, jx, jy, jz, _ = residual(
             points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2], cx, cy, cz, r
         )
@@ -141,7 +147,7 @@ def select(points, rays, mask, state, gate, chosen):  # type: ignore[no-untyped-
             along = sx * dx + sy * dy + sz * dz
             across2 = sx * sx + sy * sy + sz * sz - along * along
             masked = along > 0.0 and across2 < mask.keep_off[m] * mask.keep_off[m]
-        chosen[i] = 2 if masked else 1
+        surface[i] = MASKED if masked else VISIBLE
         total += not masked
     return total
 
@@ -204,7 +210,7 @@ def _start_from(prior, state, normal):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def normal_equations(observations, chosen, model, stretch, whole, prior, unknowns, normal):  # type: ignore[no-untyped-def]
+def normal_equations(observations, surface, model, stretch, whole, prior, unknowns, normal):  # type: ignore[no-untyped-def]
     """Fill the normal equations at the unknowns; returns the number of points of weight above 0.
 
     ``stretch`` widens the robust cut; ``whole`` gives all these points their full weight.
@@ -217,7 +223,7 @@ def normal_equations(observations, chosen, model, stretch, whole, prior, unknown
     n = len(points)
     used, segment, inside = 0, 0, 0
     for i in range(n):
-        if chosen[i] == 1:
+        if surface[i] == VISIBLE:
             cx = state[0] + shifts[segment, 0]
             cy = state[1] + shifts[segment, 1]
             cz = state[2] + shifts[segment, 2]
@@ -261,7 +267,7 @@ def normal_equations(observations, chosen, model, stretch, whole, prior, unknown
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def solve(observations, chosen, model, stretch, prior, unknowns, tolerance, steps, covariance):  # type: ignore[no-untyped-def]
+def solve(observations, surface, model, stretch, prior, unknowns, tolerance, steps, covariance):  # type: ignore[no-untyped-def]
     """Move state and shifts by at most ``steps`` Gauss-Newton steps; returns the number of points used, or -1.
 
     Iteration stops after a step below ``tolerance`` mm. ``covariance`` (4, 4) is the inverse of the information at the
@@ -272,7 +278,7 @@ def solve(observations, chosen, model, stretch, prior, unknowns, tolerance, step
     used = 0
     for _ in range(steps):
         # a variable for False: numba compiles a kernel anew for every literal
-        used = normal_equations(observations, chosen, model, stretch, steps < 0, prior, unknowns, normal)
+        used = normal_equations(observations, surface, model, stretch, steps < 0, prior, unknowns, normal)
         if not inverse_of(normal.H, covariance):
             return -1
         step = np.zeros(4)

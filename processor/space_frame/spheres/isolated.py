@@ -15,7 +15,7 @@ import numpy as np
 from processor.geometry import sphere_search
 from processor.geometry.merging import MergedCloud
 from processor.geometry.neighbors import nearest_crops
-from processor.geometry.sphere import Mask, Sphere, algebraic, bound, ransac, visible_fraction
+from processor.geometry.sphere import Bools, Sphere, algebraic, bound, ransac, visible_fraction
 from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Status, Tolerance, Verdict, reason
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import NAN, Params
@@ -84,7 +84,7 @@ def fit_points(
 def _fit_node(id_: int, node: Floats, nominal: float, crop: Floats, params: Params, limits: Tolerance) -> _Row:
     if len(crop) < 4:
         return _missing(id_, nominal, len(crop), reason("spheres.few-crop-points", points=len(crop)))
-    on: Mask = np.ones(len(crop), bool)
+    on: Bools = np.ones(len(crop), bool)
     sphere: Sphere | None
     if params.method == "least-squares":
         sphere = algebraic(crop - node)

@@ -46,7 +46,7 @@ DOWN = np.array([0.0, 0.0, 1.0, -1.0])  # height of the lowest point by (x, y, z
 
 
 @dataclass(frozen=True)
-class Conditions:
+class FitContext:
     """Facts about a whole fit that each sphere is assessed by.
 
     ``radius_offset`` is the mean deviation of radii from their sizes and its standard deviation, mm. It may come from
@@ -57,7 +57,7 @@ class Conditions:
     """
 
     catalogue: Catalogue
-    rays: bool  # scanners are known
+    scanners_known: bool
     noise: Floats
     radius_sd: float
     station_sd: float
@@ -66,27 +66,27 @@ class Conditions:
     limits: Tolerance
 
 
-def assess(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -> Spheres:
-    """Return the spheres with evidence, flag and reasons; ``expected`` (k,) are nominal radii, NaN = none."""
-    state, covariance = _states(fits, nodes, expected, conditions)
-    evidence, flags, reasons = _assessments(fits, nodes, expected, conditions, state, covariance)
+def assess(fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext) -> Spheres:
+    """Return the spheres with evidence, flag and reasons; ``nominal`` (k,) are nominal radii, NaN = none."""
+    state, covariance = _states(fits, nodes, nominal, context)
+    evidence, flags, reasons = _assessments(fits, nodes, nominal, context, state, covariance)
     centres = nodes.positions + state[:, :3]
     bound = fits.bound
     lowest_sd = np.sqrt(np.einsum("i,kij,j->k", DOWN, covariance, DOWN))
     bound_lowest = np.sqrt(np.einsum("i,kij,j->k", DOWN, bound, DOWN))
     with np.errstate(invalid="ignore"):
-        trace = np.sqrt(np.einsum("kii->k", bound[:, :3, :3]) / np.einsum("kii->k", covariance[:, :3, :3]))
+        by_centre = np.sqrt(np.einsum("kii->k", bound[:, :3, :3]) / np.einsum("kii->k", covariance[:, :3, :3]))
         by_radius = np.sqrt(bound[:, 3, 3] / covariance[:, 3, 3])
     return Spheres(
         centres=centres,
         radii=state[:, 3],
         lowest=centres - state[:, 3:] * np.array([0.0, 0.0, 1.0]),
         covariance=covariance,
-        common=np.zeros_like(covariance) if conditions.views is None else conditions.views.common,
+        common=np.zeros_like(covariance) if context.views is None else context.views.common,
         lowest_sd=lowest_sd,
         bound=bound,
         bound_lowest_sd=bound_lowest,
-        efficiency_centre=trace,
+        efficiency_centre=by_centre,
         efficiency_radius=by_radius,
         efficiency_lowest=bound_lowest / lowest_sd,
         points=fits.numbers[:, POINTS].astype(np.int64),
@@ -98,46 +98,46 @@ def assess(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -
         sizes=fits.sizes,
         second_sizes=fits.second,
         margin=fits.margin,
-        expected=expected,
+        nominal=nominal,
         evidence=tuple(evidence),
         flag=tuple(flags),
         reasons=tuple(reasons),
-        noise=conditions.noise,
-        radius_sd=conditions.radius_sd,
-        station_sd=conditions.station_sd,
-        messages=_messages(conditions),
-        views=conditions.views,
+        noise=context.noise,
+        radius_sd=context.radius_sd,
+        station_sd=context.station_sd,
+        messages=_messages(context),
+        views=context.views,
     )
 
 
-def _states(fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions) -> tuple[Floats, Floats]:
+def _states(fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext) -> tuple[Floats, Floats]:
     """States (k, 4) and their covariances: those of the fits, or of the axes and the design where there is no fit."""
     state = fits.states.copy()
     degrees = fits.numbers[:, DEGREES]
     # The scale is estimated: the variance of Student's t is wider than the normal one.
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
-    common = np.array([0.0, 0.0, 1.0, 1.0]) * conditions.radius_offset[0]
+    common = np.array([0.0, 0.0, 1.0, 1.0]) * context.radius_offset[0]
     covariance = fits.covariance * wider[:, None, None] + np.outer(common, common)
-    if conditions.views is not None:
-        covariance = covariance + conditions.views.covariance
+    if context.views is not None:
+        covariance = covariance + context.views.covariance
     for i in np.flatnonzero(~fits.fitted).tolist():
         state[i, :3] = 0.0
-        state[i, 3] = expected[i]
+        state[i, 3] = nominal[i]
         covariance[i] = np.nan
         covariance[i, :3, :3] = nodes.covariance[i]
-        if np.isfinite(expected[i]):
+        if np.isfinite(nominal[i]):
             covariance[i, 3, :], covariance[i, :, 3] = 0.0, 0.0
-            covariance[i, 3, 3] = conditions.radius_sd**2
+            covariance[i, 3, 3] = context.radius_sd**2
     return state, covariance
 
 
 def _assessments(
-    fits: Fits, nodes: Nodes, expected: Floats, conditions: Conditions, state: Floats, covariance: Floats
+    fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext, state: Floats, covariance: Floats
 ) -> tuple[list[Evidence], list[Flag], list[tuple[Reason, ...]]]:
     """Evidence, flag and reasons of each node."""
-    sized = len(conditions.catalogue.radii) > 0
+    sized = len(context.catalogue.radii) > 0
     axes_known = np.asarray(np.isfinite(nodes.covariance).all(axis=(1, 2)))
-    agreement = agreements(fits, nodes, conditions.radius_sd if sized else np.inf)
+    agreement = agreements(fits, nodes, context.radius_sd if sized else np.inf)
     margin = fits.margin
     evidence: list[Evidence] = []
     flags: list[Flag] = []
@@ -145,15 +145,15 @@ def _assessments(
     for i, fitted in enumerate(fits.fitted.tolist()):
         if not fitted:
             axes = int(nodes.axis_count[i])
-            flag, causes = _without_points(axes, bool(axes_known[i]), bool(np.isfinite(expected[i])))
+            flag, causes = _without_points(axes, bool(axes_known[i]), bool(np.isfinite(nominal[i])))
             evidence.append(Evidence.AXES)
         else:
             fused = axes_known[i] and fits.numbers[i, CENTRE_CHI2] > 0.0
             evidence.append(Evidence.FUSED if fused else Evidence.BALL)
             doubts = _doubts(fits, i, margin[i], state[i], covariance[i])
             flag, causes = _assessment(
-                doubts, state[i], float(np.sqrt(covariance[i, 3, 3])), fits.sizes[i], expected[i],
-                bool(agreement[i] < UNLIKELY), conditions,
+                doubts, state[i], float(np.sqrt(covariance[i, 3, 3])), fits.sizes[i], nominal[i],
+                bool(agreement[i] < UNLIKELY), context,
             )  # fmt: skip
         flags.append(flag)
         reasons.append(causes)
@@ -191,15 +191,15 @@ def _assessment(
     state: Floats,
     radius_sd: float,
     size: float,
-    expected: float,
+    nominal: float,
     disagrees: bool,
-    conditions: Conditions,
+    context: FitContext,
 ) -> tuple[Flag, tuple[Reason, ...]]:
     """Flag and reasons of a fitted sphere, by its doubts, its priors (``disagrees``) and its nominal radius."""
-    catalogue = conditions.catalogue
+    catalogue = context.catalogue
     away, off = float(np.linalg.norm(state[:3])), float(state[3] - size)
-    if not doubts and _unlisted(disagrees, off, conditions.radius_sd, catalogue):
-        wrong = beyond(state[3], expected, NORMAL_95 * radius_sd, conditions.limits)
+    if not doubts and _unlisted(disagrees, off, context.radius_sd, catalogue):
+        wrong = beyond(state[3], nominal, NORMAL_95 * radius_sd, context.limits)
         if wrong is not None:
             return Flag.WRONG_SIZE, (wrong,)
     if disagrees and len(catalogue.radii):
@@ -208,8 +208,8 @@ def _assessment(
         doubts = [*doubts, reason("spheres.axes-disagree", distance=away)]
     if doubts:
         return Flag.LOW_CONFIDENCE, tuple(doubts)
-    if np.isfinite(expected) and len(catalogue.radii) and size != expected:
-        return Flag.WRONG_SIZE, (reason("spheres.other-size", size=size, nominal=expected),)
+    if np.isfinite(nominal) and len(catalogue.radii) and size != nominal:
+        return Flag.WRONG_SIZE, (reason("spheres.other-size", size=size, nominal=nominal),)
     return Flag.OK, ()
 
 
@@ -224,19 +224,19 @@ def _unlisted(disagrees: bool, off: float, radius_sd: float, catalogue: Catalogu
     return disagrees and abs(off) > UNLISTED * radius_sd
 
 
-def _messages(conditions: Conditions) -> tuple[Reason, ...]:
+def _messages(context: FitContext) -> tuple[Reason, ...]:
     """Return the reasons that are about all spheres of a fit."""
-    offset, offset_sd = conditions.radius_offset
-    catalogue = conditions.catalogue
-    messages = [reason("spheres.ranges") if conditions.rays else reason("spheres.orthogonal-distances")]
-    if conditions.station_sd > 0.0:
-        messages.append(reason("spheres.stations-disagree", sd=conditions.station_sd))
-    if conditions.views is not None:
+    offset, offset_sd = context.radius_offset
+    catalogue = context.catalogue
+    messages = [reason("spheres.ranges") if context.scanners_known else reason("spheres.orthogonal-distances")]
+    if context.station_sd > 0.0:
+        messages.append(reason("spheres.stations-disagree", sd=context.station_sd))
+    if context.views is not None:
         messages.append(
             reason(
                 "spheres.unnamed-views",
-                sd=conditions.views.sd,
-                common=conditions.views.common_sd,
+                sd=context.views.sd,
+                common=context.views.common_sd,
                 shift=SHIFT_MM,
                 offset=OFFSET_MM,
             )

@@ -15,11 +15,11 @@ AMBIGUOUS = 14.0  # in chi-square: below it the runner-up's size is more than a 
 POINTS, CELLS, STATIONS, RMS, SCALE, DEGREES, CENTRE_CHI2, FITTED = range(8)  # columns of ``Fits.numbers``
 
 
-class AimedCrops(NamedTuple):
+class CropsWithRays(NamedTuple):
     """Points about k nodes with their rays: those of node i are rows ``start[i]`` to ``start[i + 1]``, by station."""
 
     start: Ints  # (k + 1,)
-    points: Floats  # (n, 3) less their node, mm
+    points: Floats  # (n, 3) relative to their node, mm
     rays: Floats  # (n, 3) unit vectors from the scanner; 0 where it is unknown
     ranges: Floats  # (n,) mm
     station: Labels  # (n,) rows of the scanners; -1 = unknown
@@ -29,7 +29,7 @@ class Masks(NamedTuple):
     """Where spheres' own surfaces cannot be seen: member ends of node i are rows ``start[i]`` to ``start[i + 1]``."""
 
     start: Ints  # (k + 1,)
-    axis_points: Floats  # (m, 3) on the axis, less the node, mm
+    axis_points: Floats  # (m, 3) on the axis, relative to the node, mm
     axes: Floats  # (m, 3) unit vectors away from the node
     keep_off: Floats  # (m,) distance from the axis within which sleeves and flats hide the sphere, mm
     tube_off: Floats  # (m,) the same of the member's tube
@@ -49,13 +49,13 @@ class Sizes(NamedTuple):
 
     sizes: Floats  # (m,) radii, mm
     weight: float  # 1 / variance of a radius about its size; 0 where radii are free
-    expected: Floats  # (k,) nominal radii, NaN = none
-    surprise: float  # by which the energy of a size other than the expected one is raised
+    nominal: Floats  # (k,) nominal radii, NaN = none
+    other_size_penalty: float  # by which the energy of a size other than the nominal one is raised
     free: bool  # radii are free: sizes are starts only
     centre_weight: Floats  # (k, 3, 3) inverse covariances of the nodes
 
 
-class Chosen(NamedTuple):
+class SizeChoice(NamedTuple):
     """Of k nodes the best state (x, y, z, r), its size and energy, and size and energy of the runner-up."""
 
     states: Floats
@@ -93,7 +93,7 @@ class Finished(NamedTuple):
 
 @dataclass(frozen=True)
 class Fits:
-    """Results of the compiled fits of k nodes: states (x, y, z, r) less the node's position, mm."""
+    """Results of the compiled fits of k nodes: states (x, y, z, r) relative to the node's position, mm."""
 
     states: Floats
     covariance: Floats
@@ -145,7 +145,7 @@ class ViewErrors:
 
 @dataclass(frozen=True)
 class Spheres(Checked):
-    """Spheres at k nodes, mm: centres less the source's origin.
+    """Spheres at k nodes, mm: centres relative to the source's origin.
 
     ``covariance`` is of x, y, z and radius. ``bound`` is the least covariance of any unbiased estimate from these
     points and priors (Cramér and Rao), the stations being fixed; ``efficiency_*`` is the bound's standard deviation
@@ -172,7 +172,7 @@ class Spheres(Checked):
     sizes: Floats = column("k")  # of the catalogue; NaN = none
     second_sizes: Floats = column("k")
     margin: Floats = column("k")  # energy by which the second size loses
-    expected: Floats = column("k")  # nominal radii given, NaN = none
+    nominal: Floats = column("k")  # nominal radii given, NaN = none
     evidence: tuple[Evidence, ...] = words("k", Evidence)
     flag: tuple[Flag, ...] = words("k", Flag)
     reasons: tuple[tuple[Reason, ...], ...] = reasons("k")

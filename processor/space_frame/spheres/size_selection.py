@@ -16,16 +16,18 @@ from numba import njit
 from processor.geometry.parallel import over_ranges
 from processor.space_frame.spheres.gauss_newton import (
     CUT_SD,
-    Mask,
+    MASKED,
+    VISIBLE,
     Observations,
     Prior,
+    SphereMask,
     Unknowns,
     residual,
     select,
     solve,
     variance,
 )
-from processor.space_frame.spheres.records import AimedCrops, Chosen, Masks, Sizes, StochasticModel
+from processor.space_frame.spheres.records import CropsWithRays, Masks, SizeChoice, Sizes, StochasticModel
 
 Bools = npt.NDArray[np.bool_]
 
@@ -42,54 +44,58 @@ COARSE_MM, FINE_MM = 1e-3, 1e-4
 
 
 def choose(
-    crops: AimedCrops,
+    crops: CropsWithRays,
     masks: Masks,
     model: StochasticModel,
     sizes: Sizes,
-    kernel: float,
-    catch: float,
+    vote_half_width: float,
+    first_reach_mm: float,
     wanted: Bools,
     threads: int = 0,
-) -> Chosen:
+) -> SizeChoice:
     """Choose the size of each node's sphere, and fit it.
 
-    ``kernel`` is the half-width of a vote, ``catch`` the reach of the first steps, mm. States are NaN and energies
+    ``vote_half_width`` and ``first_reach_mm``, the reach of the first steps, are in mm. States are NaN and energies
     infinite where nothing fits, and where a node is not ``wanted`` (k,).
 
     Sleeves hide more of a small sphere than of a large one. Sizes near the best are therefore compared by the points
     that are masked for none of them; otherwise the size with the most points would win.
     """
-    nodes = len(sizes.expected)
-    chosen = Chosen(
+    nodes = len(sizes.nominal)
+    choice = SizeChoice(
         states=np.full((nodes, 4), np.nan),
         sizes=np.full(nodes, np.nan),
         energy=np.full(nodes, np.inf),
         second=np.full(nodes, np.nan),
         second_energy=np.full(nodes, np.inf),
     )
-    over_ranges(partial(_choose_range, crops, masks, model, sizes, kernel, catch, wanted, chosen), nodes, threads)
-    return chosen
+    over_ranges(
+        partial(_choose_range, crops, masks, model, sizes, vote_half_width, first_reach_mm, wanted, choice),
+        nodes,
+        threads,
+    )
+    return choice
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _choose_range(crops, masks, model, sizes, kernel, catch, wanted, chosen, first, last):  # type: ignore[no-untyped-def]
+def _choose_range(crops, masks, model, sizes, vote_half_width, first_reach_mm, wanted, choice, first, last):  # type: ignore[no-untyped-def]
     for k in range(first, last):
         if wanted[k]:
-            _choose_at(k, crops, masks, model, sizes, kernel, catch, chosen)
+            _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, choice)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _choose_at(k, crops, masks, model, sizes, kernel, catch, chosen):  # type: ignore[no-untyped-def]
+def _choose_at(k, crops, masks, model, sizes, vote_half_width, first_reach_mm, choice):  # type: ignore[no-untyped-def]
     """Choose the size of node ``k``; see :func:`choose`."""
-    mask, expected = mask_of(masks, k), sizes.expected[k]
-    known = not np.isnan(expected)
-    tried = with_expected(sizes.sizes, expected)
+    mask, nominal = mask_of(masks, k), sizes.nominal[k]
+    known = not np.isnan(nominal)
+    tried = with_nominal(sizes.sizes, nominal)
     vote = np.empty(len(tried))
     ends = slice(masks.start[k], masks.start[k + 1])
     rows = slice(crops.start[k], crops.start[k + 1])
-    votes(crops.points[rows], crops.rays[rows], mask, masks.tube_off[ends], tried, kernel, vote)
+    votes(crops.points[rows], crops.rays[rows], mask, masks.tube_off[ends], tried, vote_half_width, vote)
     order = by_votes(vote)
-    worth, widest = _worth(tried, vote, order, expected)
+    worth, widest = _worth(tried, vote, order, nominal)
     _, observations = within(crops, k, 0.0, widest + AROUND_MM)
     points, rays = observations.points, observations.rays
     n = len(points)
@@ -98,64 +104,64 @@ def _choose_at(k, crops, masks, model, sizes, kernel, catch, chosen):  # type: i
     all_shifts = np.zeros((TRIED + 1, segments(observations.station), 3))
     all_states, energies, radii = np.zeros((TRIED + 1, 4)), np.empty(TRIED + 1), np.empty(TRIED + 1)
     codes, covariance = np.zeros((TRIED + 1, n), np.uint8), np.zeros((4, 4))
-    done = 0
+    count = 0
     w = 0.0 if sizes.free else sizes.weight
     for j in order:
-        nominal = known and tried[j] == expected
-        if not worth[j] or done >= (TRIED + 1 if nominal else TRIED):
+        is_nominal = known and tried[j] == nominal
+        if not worth[j] or count >= (TRIED + 1 if is_nominal else TRIED):
             continue
-        state, shifts, code = all_states[done], all_shifts[done], codes[done]
+        state, shifts, code = all_states[count], all_shifts[count], codes[count]
         restart(state, shifts, tried[j])
         prior = Prior(sizes.centre_weight[k], tried[j], w)
-        used = fit_one(observations, mask, model, prior, catch, COARSE_MM, state, shifts, code, covariance)
+        used = fit_one(observations, mask, model, prior, first_reach_mm, COARSE_MM, state, shifts, code, covariance)
         if used < 1:
             if sizes.free:
                 continue
             # the sphere may be hidden altogether: the size stays until visible points contradict it
             restart(state, shifts, tried[j])
-        again = False
-        for i in range(done):
-            again = again or (sizes.free and abs(all_states[i, 3] - state[3]) < 0.5)
-        if again:
+        repeated = False
+        for i in range(count):
+            repeated = repeated or (sizes.free and abs(all_states[i, 3] - state[3]) < 0.5)
+        if repeated:
             continue
         select(points, rays, mask, state, np.inf, code)
-        radii[done] = tried[j]
-        energies[done] = energy(observations, code, model.noise, prior, state, shifts)
-        if known and not nominal:
-            energies[done] += sizes.surprise
-        done += 1
-    if done == 0:
+        radii[count] = tried[j]
+        energies[count] = energy(observations, code, model.noise, prior, state, shifts)
+        if known and not is_nominal:
+            energies[count] += sizes.other_size_penalty
+        count += 1
+    if count == 0:
         return
-    best = least_of(energies, done)
-    fair = np.ones(n, np.uint8)
-    for j in range(done):
+    best = least_of(energies, count)
+    comparable = np.ones(n, np.uint8)
+    for j in range(count):
         if abs(radii[j] - radii[best]) <= NEIGHBOURS_MM:
             for i in range(n):
-                if codes[j, i] == 2:
-                    fair[i] = 0
-    for j in range(done):
+                if codes[j, i] == MASKED:
+                    comparable[i] = 0
+    for j in range(count):
         for i in range(n):
-            codes[j, i] *= fair[i]
+            codes[j, i] *= comparable[i]
         prior = Prior(sizes.centre_weight[k], radii[j], w)
         energies[j] = energy(observations, codes[j], model.noise, prior, all_states[j], all_shifts[j])
-        if known and radii[j] != expected:
-            energies[j] += sizes.surprise
-    best = least_of(energies, done)
-    chosen.energy[k], chosen.sizes[k] = energies[best], all_states[best, 3] if sizes.free else radii[best]
+        if known and radii[j] != nominal:
+            energies[j] += sizes.other_size_penalty
+    best = least_of(energies, count)
+    choice.energy[k], choice.sizes[k] = energies[best], all_states[best, 3] if sizes.free else radii[best]
     for i in range(4):
-        chosen.states[k, i] = all_states[best, i]
+        choice.states[k, i] = all_states[best, i]
     energies[best] = np.inf
-    if done > 1:
-        then = least_of(energies, done)
-        chosen.second[k] = all_states[then, 3] if sizes.free else radii[then]
-        chosen.second_energy[k] = energies[then]
+    if count > 1:
+        runner_up = least_of(energies, count)
+        choice.second[k] = all_states[runner_up, 3] if sizes.free else radii[runner_up]
+        choice.second_energy[k] = energies[runner_up]
 
 
 # --- one fit and its energy ------------------------------------------------------------------------------------------
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def fit_one(observations, mask, model, prior, catch, tolerance, state, shifts, chosen, covariance):  # type: ignore[no-untyped-def]
+def fit_one(observations, mask, model, prior, first_reach_mm, tolerance, state, shifts, surface, covariance):  # type: ignore[no-untyped-def]
     """Fit from ``state``: select points, solve, and select again as the cut narrows; returns points used or -1."""
     points, rays, ranges, _ = observations
     noise = model.noise
@@ -164,17 +170,17 @@ def fit_one(observations, mask, model, prior, catch, tolerance, state, shifts, c
     for i in range(len(ranges)):
         far += ranges[i] / len(ranges)
     typical = np.sqrt(noise[0] + noise[1] * far * far)
-    first = max(1.0, catch / (CUT_SD * typical))
+    first = max(1.0, first_reach_mm / (CUT_SD * typical))
     used = -1
-    turns = 3 if tolerance > FINE_MM else 4
-    for turn in range(turns):
-        last = turn + 1 == turns
-        stretch = first if turn == 0 else np.sqrt(first) if turn == 1 else 1.0
-        gate = GATE_MM if turn == 0 else max(GATE_MM * 0.5, 30.0 * typical)
-        if select(points, rays, mask, state, gate, chosen) == 0:
+    iterations = 3 if tolerance > FINE_MM else 4
+    for iteration in range(iterations):
+        last = iteration + 1 == iterations
+        stretch = first if iteration == 0 else np.sqrt(first) if iteration == 1 else 1.0
+        gate = GATE_MM if iteration == 0 else max(GATE_MM * 0.5, 30.0 * typical)
+        if select(points, rays, mask, state, gate, surface) == 0:
             return -1
         used = solve(
-            observations, chosen, model, stretch, prior, unknowns, tolerance if last else max(tolerance, COARSE_MM),
+            observations, surface, model, stretch, prior, unknowns, tolerance if last else max(tolerance, COARSE_MM),
             12 if last else 6, covariance,
         )  # fmt: skip
         if used < 0:
@@ -183,7 +189,7 @@ def fit_one(observations, mask, model, prior, catch, tolerance, state, shifts, c
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def energy(observations, chosen, noise, prior, state, shifts):  # type: ignore[no-untyped-def]
+def energy(observations, surface, noise, prior, state, shifts):  # type: ignore[no-untyped-def]
     """Chi-square of the points, each at most its reward, less the rewards, with the priors' chi-square.
 
     A ray that passes through the sphere adds a cost; a point in front of it does not.
@@ -195,7 +201,7 @@ def energy(observations, chosen, noise, prior, state, shifts):  # type: ignore[n
             total += state[i] * prior.centre_weight[i, j] * state[j]
     segment = 0
     for i in range(len(points)):
-        if chosen[i] == 1:
+        if surface[i] == VISIBLE:
             e, cosine, _, _, _, _ = residual(
                 points[i, 0], points[i, 1], points[i, 2], rays[i, 0], rays[i, 1], rays[i, 2],
                 state[0] + shifts[segment, 0], state[1] + shifts[segment, 1], state[2] + shifts[segment, 2], state[3],
@@ -215,19 +221,19 @@ def energy(observations, chosen, noise, prior, state, shifts):  # type: ignore[n
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def votes(points, rays, mask, tube_off, radii, kernel, count):  # type: ignore[no-untyped-def]
-    """Fill votes (m,) for radii: points in the shell less those deeper than two kernels inside it.
+def votes(points, rays, mask, tube_off, radii, vote_half_width, count):  # type: ignore[no-untyped-def]
+    """Fill votes (m,) for radii: points in the shell less those deeper than two half-widths of a vote inside it.
 
     Points within ``keep_off`` of an axis are sleeves. Cones are wider than sleeves and stand where a large sphere would
     be: radii from twice ``tube_off`` on do not count the points within that of an axis either.
     """
     n = len(points)
-    depth, slim = np.empty(n), np.empty(n, np.uint8)
+    distance, near_tube = np.empty(n), np.empty(n, np.uint8)
     widest, farthest = 0.0, 0.0
     for m in range(len(mask.axes)):
         widest = max(widest, tube_off[m])
     for k in range(len(radii)):
-        farthest = max(farthest, radii[k] + kernel)
+        farthest = max(farthest, radii[k] + vote_half_width)
     number = 0
     for i in range(n):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
@@ -251,43 +257,43 @@ def votes(points, rays, mask, tube_off, radii, kernel, count):  # type: ignore[n
                 break
             tube = tube or across < tube_off[m] * tube_off[m]
         if not masked:
-            depth[number] = d
-            slim[number] = tube
+            distance[number] = d
+            near_tube[number] = tube
             number += 1
     for k in range(len(radii)):
         count[k] = 0.0
         for i in range(number):
-            off = depth[i] - radii[k]
-            if abs(off) < kernel:
-                if not slim[i] or radii[k] < 2.0 * widest:
+            off = distance[i] - radii[k]
+            if abs(off) < vote_half_width:
+                if not near_tube[i] or radii[k] < 2.0 * widest:
                     count[k] += 1.0
-            elif off < -2.0 * kernel:
+            elif off < -2.0 * vote_half_width:
                 count[k] -= 1.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _worth(tried, vote, order, expected):  # type: ignore[no-untyped-def]
-    """Which radii (m,) have enough votes to be fitted, and the largest of them; the expected one always is."""
+def _worth(tried, vote, order, nominal):  # type: ignore[no-untyped-def]
+    """Which radii (m,) have enough votes to be fitted, and the largest of them; the nominal one always is."""
     most = vote[order[0]]
     worth, widest = np.zeros(len(tried), np.uint8), 0.0
     for j in order:
         near = abs(tried[j] - tried[order[0]]) <= NEIGHBOURS_MM and (most < MANY or vote[j] >= NEAR_SHARE * most)
-        worth[j] = near or (vote[j] >= SHARE * most and vote[j] >= 3.0) or tried[j] == expected
+        worth[j] = near or (vote[j] >= SHARE * most and vote[j] >= 3.0) or tried[j] == nominal
         if worth[j]:
             widest = max(widest, tried[j])
     return worth, widest
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def with_expected(sizes, expected):  # type: ignore[no-untyped-def]
-    """Return the sizes, with the expected one appended if it is none of them."""
+def with_nominal(sizes, nominal):  # type: ignore[no-untyped-def]
+    """Return the sizes, with the nominal one appended if it is none of them."""
     count = len(sizes)
     tried = np.empty(count + 1)
-    fresh = not np.isnan(expected)
+    fresh = not np.isnan(nominal)
     for j in range(count):
         tried[j] = sizes[j]
-        fresh = fresh and sizes[j] != expected
-    tried[count] = expected
+        fresh = fresh and sizes[j] != nominal
+    tried[count] = nominal
     return tried[: count + 1] if fresh else tried[:count]
 
 
@@ -310,7 +316,7 @@ def by_votes(vote):  # type: ignore[no-untyped-def]
 def mask_of(masks, k):  # type: ignore[no-untyped-def]
     """Return the mask of node ``k``."""
     ends = slice(masks.start[k], masks.start[k + 1])
-    return Mask(masks.axis_points[ends], masks.axes[ends], masks.keep_off[ends], masks.hole, masks.least_cosine)
+    return SphereMask(masks.axis_points[ends], masks.axes[ends], masks.keep_off[ends], masks.hole, masks.least_cosine)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")

@@ -17,7 +17,7 @@ from processor.geometry.linalg_small import inverse_of, log_det
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats
 from processor.space_frame.spheres.gauss_newton import residual, variance
-from processor.space_frame.spheres.records import AimedCrops, Priors
+from processor.space_frame.spheres.records import CropsWithRays, Priors
 
 # In mm. The others must beat the first by EVIDENCE in chi-square.
 GRID = np.array([0.0, 0.05, 0.07, 0.1, 0.14, 0.2, 0.28, 0.4, 0.56, 0.8, 1.1, 1.6, 2.2, 3.2, 4.5, 6.4])
@@ -26,7 +26,7 @@ LEAST_SPHERES = 5
 
 
 def shift_sd(
-    crops: AimedCrops,
+    crops: CropsWithRays,
     weights: Floats,
     states: Floats,
     usable: npt.NDArray[np.bool_],
@@ -40,8 +40,8 @@ def shift_sd(
     """
     nodes = len(states)
     costs, several = np.zeros((nodes, len(GRID))), np.zeros(nodes, np.uint8)
-    kernel = partial(_cost_range, crops, weights, states, usable, noise, priors, costs, several)
-    over_ranges(kernel, nodes, threads)
+    cost_range = partial(_cost_range, crops, weights, states, usable, noise, priors, costs, several)
+    over_ranges(cost_range, nodes, threads)
     if int(several.sum()) < LEAST_SPHERES:
         return 0.0
     total = costs.sum(axis=0)

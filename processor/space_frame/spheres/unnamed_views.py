@@ -20,7 +20,7 @@ import numpy as np
 from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
 from processor.geometry.sphere import BANDS, SECTORS, sphere_cells
 from processor.model import Floats, Ints
-from processor.space_frame.spheres.records import AimedCrops, Fits, Priors, ViewErrors
+from processor.space_frame.spheres.records import CropsWithRays, Fits, Priors, ViewErrors
 
 MEAN_COSINE = 2.0 / 3.0  # of incidence on a sphere: a range moves the surface by less along its normal
 LEAST_POINTS = 30
@@ -41,10 +41,10 @@ class _Fit(NamedTuple):
     gain: Floats  # (4, c) change of the state by a displacement of each cell's surface
 
 
-def view_errors(crops: AimedCrops, weights: Floats, fits: Fits, priors: Priors) -> ViewErrors:
+def view_errors(crops: CropsWithRays, weights: Floats, fits: Fits, priors: Priors) -> ViewErrors:
     """Estimate the errors of unnamed views from the fits of k spheres; ``weights`` (n,) > 0 mark the points used."""
     directions = _directions()
-    kernel = np.exp(directions @ directions.T - 1.0)
+    correlation = np.exp(directions @ directions.T - 1.0)
     found, seen = {}, np.zeros(len(directions))
     for k in np.flatnonzero(fits.fitted).tolist():
         fit = _fit_of(k, crops, weights, fits, priors)
@@ -52,13 +52,13 @@ def view_errors(crops: AimedCrops, weights: Floats, fits: Fits, priors: Priors) 
             found[k] = fit
             seen[fit.cells] += fit.counts
     rows = [k for k, fit in found.items() if len(fit.cells) >= LEAST_CELLS and fit.counts.sum() >= LEAST_POINTS]
-    chosen = (
+    sampled = (
         [found[rows[i]] for i in np.unique(np.linspace(0, len(rows) - 1, MOST_SPHERES).astype(int))] if rows else []
     )
-    variance, shared = _variances(chosen, kernel)
+    variance, shared = _variances(sampled, correlation)
     whole, common = np.zeros((len(fits.states), 4, 4)), np.zeros((len(fits.states), 4, 4))
     for k, fit in found.items():
-        by_field = fit.gain @ kernel[np.ix_(fit.cells, fit.cells)] @ fit.gain.T
+        by_field = fit.gain @ correlation[np.ix_(fit.cells, fit.cells)] @ fit.gain.T
         by_offset = MEAN_COSINE * OFFSET_MM * fit.gain.sum(axis=1)
         by_class = np.diag([SHIFT_MM**2] * 3 + [0.0]) + np.outer(by_offset, by_offset)
         whole[k] = variance * by_field + by_class
@@ -95,7 +95,7 @@ def _directions() -> Floats:
     return np.column_stack([level * np.cos(turn), level * np.sin(turn), z])
 
 
-def _fit_of(k: int, crops: AimedCrops, weights: Floats, fits: Fits, priors: Priors) -> _Fit | None:
+def _fit_of(k: int, crops: CropsWithRays, weights: Floats, fits: Fits, priors: Priors) -> _Fit | None:
     rows = slice(crops.start[k], crops.start[k + 1])
     on = weights[rows] > 0.0
     if not on.any():
@@ -132,16 +132,16 @@ def _fit_of(k: int, crops: AimedCrops, weights: Floats, fits: Fits, priors: Prio
     return _Fit(cells, counts, means, scatter, J, covariance, gain)
 
 
-def _variances(fits: list[_Fit], kernel: Floats) -> tuple[float, float]:
+def _variances(fits: list[_Fit], correlation: Floats) -> tuple[float, float]:
     """Variance of the field and its part common to all spheres, mm^2, by moments."""
-    count = len(kernel)
+    count = len(correlation)
     squares, expected = 0.0, 0.0
     total, own = np.zeros(count), 0.0
     spread, own_spread = np.zeros((count, count)), 0.0
     for fit in fits:
         weight = fit.counts  # not over the sphere's own noise: a ratio of estimates is biased
         left = np.eye(len(fit.cells)) - fit.J @ fit.gain
-        K = kernel[np.ix_(fit.cells, fit.cells)]
+        K = correlation[np.ix_(fit.cells, fit.cells)]
         absorbed = float(np.einsum("c,ci,ij,cj->", weight, fit.J, fit.covariance, fit.J))
         noise = float(np.sum(fit.scatter)) - absorbed
         squares += float(weight @ fit.means**2) - noise
@@ -151,9 +151,9 @@ def _variances(fits: list[_Fit], kernel: Floats) -> tuple[float, float]:
         score = np.zeros(count)
         score[fit.cells] = weight * fit.means
         total, own = total + score, own + float(score @ score)
-        spread, own_spread = spread + S, own_spread + float(np.sum((S @ kernel) * S))
+        spread, own_spread = spread + S, own_spread + float(np.sum((S @ correlation) * S))
     if not expected > 0.0:
         return 0.0, 0.0
-    between = float(np.sum((spread @ kernel) * spread)) - own_spread
+    between = float(np.sum((spread @ correlation) * spread)) - own_spread
     shared = (float(total @ total) - own) / between if len(fits) > 1 and between > 0.0 else 0.0
     return max(squares / expected, shared, 0.0), max(shared, 0.0)

@@ -23,16 +23,16 @@ LEAST_POINTS = 8
 RADIUS_BIN_MM = 4.0  # tubes whose radii round to the same multiple are taken to have equal sleeves
 
 
-class Ends(NamedTuple):
+class MemberEnds(NamedTuple):
     """Member ends at nodes: those of node i in rows ``start[i]`` to ``start[i + 1]``."""
 
     start: Ints  # (k + 1,)
-    points: Floats  # (m, 3) on the axis, less the node's position
+    points: Floats  # (m, 3) on the axis, relative to the node
     directions: Floats  # (m, 3) away from the node
     tube_radii: Floats  # (m,)
 
 
-def ends(nodes: Nodes, members: Members) -> Ends:
+def member_ends(nodes: Nodes, members: Members) -> MemberEnds:
     """List the members' ends by node. The foot of the node on each axis stands for the axis."""
     node = np.concatenate([members.node_a, members.node_b])
     row = np.concatenate([np.arange(len(members.node_a))] * 2)
@@ -44,30 +44,30 @@ def ends(nodes: Nodes, members: Members) -> Ends:
     direction = members.directions[row]
     to_axis = members.points[row] - nodes.positions[node]
     foot = to_axis - np.einsum("mi,mi->m", to_axis, direction)[:, None] * direction
-    return Ends(start, foot, direction * sign[:, None], members.radii[row])
+    return MemberEnds(start, foot, direction * sign[:, None], members.radii[row])
 
 
-def first_guess(member_ends: Ends) -> Floats:
+def sleeve_radii_from_tubes(ends: MemberEnds) -> Floats:
     """Corner radii (m,) of sleeves from the radii of the tubes alone, mm."""
-    radii = member_ends.tube_radii
+    radii = ends.tube_radii
     guess: Floats = np.where(np.isfinite(radii), SLEEVE_OF_TUBE * radii, SLEEVE_MM)
     return guess
 
 
-def measured(member_ends: Ends, start: Ints, points: Floats, states: Floats, threads: int = 0) -> Floats:
+def sleeve_radii(ends: MemberEnds, start: Ints, points: Floats, states: Floats, threads: int = 0) -> Floats:
     """Corner radii (m,) of sleeves from the points (n, 3) just beyond the spheres (k, 4), mm.
 
     The larger of an end's own radius and the median over ends of the same class is taken: masking too much loses a few
     points, masking too little biases the fit. The guess from the tube remains where there are no points.
     """
-    radii = member_ends.tube_radii
+    radii = ends.tube_radii
     # without a tube's radius, as far as the widest plausible sleeve
     widest = np.where(np.isfinite(radii), radii + 6.0, 50.0)
     medians, counts = np.full(len(radii), np.nan), np.zeros(len(radii), np.int64)
-    kernel = partial(_medians, start, points, member_ends, widest, states, medians, counts)
-    over_ranges(kernel, len(states), threads)
+    median_range = partial(_medians, start, points, ends, widest, states, medians, counts)
+    over_ranges(median_range, len(states), threads)
     single = np.where(counts >= LEAST_POINTS, medians / MEDIAN_OF_CORNER, np.nan)
-    corner = first_guess(member_ends)
+    corner = sleeve_radii_from_tubes(ends)
     classes = np.where(np.isfinite(radii), np.rint(radii / RADIUS_BIN_MM), -1.0)
     for number in np.unique(classes):
         rows = classes == number
@@ -80,17 +80,17 @@ def measured(member_ends: Ends, start: Ints, points: Floats, states: Floats, thr
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _medians(start, points, member_ends, widest, states, medians, counts, first, last):  # type: ignore[no-untyped-def]
+def _medians(start, points, ends, widest, states, medians, counts, first, last):  # type: ignore[no-untyped-def]
     """Fill median distance from the axis and number of the points 4 to 25 mm beyond each end's sphere."""
     for k in range(first, last):
         radius = states[k, 3]
         if np.isnan(radius):
             continue
         off = np.empty(start[k + 1] - start[k])
-        for m in range(member_ends.start[k], member_ends.start[k + 1]):
+        for m in range(ends.start[k], ends.start[k + 1]):
             near, far = radius + 4.0, radius + 25.0
-            dx, dy, dz = member_ends.directions[m, 0], member_ends.directions[m, 1], member_ends.directions[m, 2]
-            foot = member_ends.points[m]
+            dx, dy, dz = ends.directions[m, 0], ends.directions[m, 1], ends.directions[m, 2]
+            foot = ends.points[m]
             number = 0
             for i in range(start[k], start[k + 1]):
                 x, y, z = points[i, 0], points[i, 1], points[i, 2]

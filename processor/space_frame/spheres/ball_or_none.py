@@ -1,10 +1,10 @@
-"""Which of the places where members meet have balls: joints of scaffolds, pipes and purlins have none.
+"""Which of the places where members meet have balls: nodes of scaffolds, pipes and purlins have none.
 
-Two things in the points about a joint tell. A ball's surface lies at one distance from the node, where clamps and
+Two things in the points about a node tell. A ball's surface lies at one distance from the node, where clamps and
 crossing tubes differ from a sphere by a share of their size. And members of bolted balls narrow to sleeves before the
 ball, so that points lie inside the tube's surface, where a tube that goes on would hide them. Not all frames have
-sleeves: how often joints of either kind have them is estimated from all joints. What a joint's own points leave open is
-decided by the joints that its members lead to.
+sleeves: how often nodes of either kind have them is estimated from all nodes. What a node's own points leave open is
+decided by the nodes that its members lead to.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -24,14 +24,14 @@ from processor.model import Floats, Ints
 from processor.space_frame.members.members import Measured
 from processor.space_frame.points import sphere_crops
 from processor.space_frame.points.source import Source
-from processor.space_frame.spheres import occlusion
-from processor.space_frame.spheres.aiming import aimed
+from processor.space_frame.spheres import sleeves
 from processor.space_frame.spheres.gauss_newton import residual
+from processor.space_frame.spheres.rays import with_rays
 
 Bools = npt.NDArray[np.bool_]
 
 REACH_MM = 240.0  # about a node: sleeve and cone of an ordinary ball
-POINTS = 512  # of a joint, at most
+POINTS = 512  # of a node, at most
 RADII = np.arange(25.0, 160.0, 2.5)
 LEAST_RATIO = 1.25  # of a ball's radius to that of its thinnest tube
 LUMP = 0.12  # rms departure of a cylinder or box from the nearest sphere, in radii
@@ -42,13 +42,12 @@ SLEEVE_SHARE = 0.45  # of it
 SLEEVE_SPREAD = 0.1  # sd of a sleeve's radius about the usual one, in tube radii
 CLAMP = 1.6  # tube radii from the node: no sleeve begins nearer
 CLEAR_MM = 5.0  # of either
-AXIS_MM = 1.5  # error of an axis at the node
 MISTAKEN = 0.01  # probability that evidence of one kind is wrong as a whole, however many points it has
 UNLIKE = 0.2  # probability that a member joins a ball and something else
-TURNS = 50
+ITERATIONS = 50
 
 
-def balls(source: Source, measured: Measured, starts: Floats, threads: int = 0) -> Bools:
+def nodes_with_ball(source: Source, measured: Measured, starts: Floats, threads: int = 0) -> Bools:
     """Return which nodes (k,) have a ball, the most likely assignment of all together; one pass over the source.
 
     ``starts`` (k, 3) are the places of nodes that no axes fix.
@@ -57,27 +56,27 @@ def balls(source: Source, measured: Measured, starts: Floats, threads: int = 0) 
     lost = ~np.isfinite(measured.nodes.positions).all(axis=1, keepdims=True)
     nodes = replace(measured.nodes, positions=np.where(lost, starts, measured.nodes.positions))
     noise = float(np.median(members.rms)) if len(members.rms) else 1.0
-    sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + AXIS_MM**2))
+    sd = float(np.sqrt(noise**2 + measured.station_sd_mm**2 + sleeves.AXIS_MM**2))
     near = sphere_crops.gather(source, nodes.positions, REACH_MM, threads, POINTS * nodes.count)
-    crops = aimed(near, nodes.positions, np.array(source.scanners, np.float64), threads)
+    crops = with_rays(near, nodes.positions, np.array(source.scanners, np.float64), threads)
     sphere, neck = np.zeros(nodes.count), np.zeros(nodes.count)
-    kernel = partial(_evidence, crops, occlusion.ends(nodes, members), sd, sphere, neck)
-    over_ranges(kernel, nodes.count, threads)
+    evidence_range = partial(_evidence, crops, sleeves.member_ends(nodes, members), sd, sphere, neck)
+    over_ranges(evidence_range, nodes.count, threads)
     joined = (members.node_a >= 0) & (members.node_b >= 0)
     pairs = np.unique(np.sort(np.stack([members.node_a, members.node_b], axis=1)[joined], axis=1), axis=0)
-    return most_likely(for_a_ball(sphere, neck), pairs.reshape(-1, 2))
+    return most_likely(log_odds_of_ball(sphere, neck), pairs.reshape(-1, 2))
 
 
-def for_a_ball(sphere: Floats, neck: Floats) -> Floats:
+def log_odds_of_ball(sphere: Floats, neck: Floats) -> Floats:
     """Log odds (k,) of a ball by the log likelihood ratios of both kinds of evidence.
 
-    Joints are of three kinds: balls with sleeves, balls without, and others. The shares of the kinds are estimated by
-    expectation and maximization, with one joint of each kind added.
+    Nodes are of three kinds: balls with sleeves, balls without, and others. The shares of the kinds are estimated by
+    expectation and maximization, with one node of each kind added.
     """
     sphere, neck = _bounded(sphere), _bounded(neck)
     likelihood = np.exp(np.stack([sphere + neck, sphere, np.zeros(len(sphere))], axis=1))
     share = np.full(3, 1.0 / 3.0)
-    for _ in range(TURNS):
+    for _ in range(ITERATIONS):
         belongs = likelihood * share
         belongs /= belongs.sum(axis=1, keepdims=True)
         share = (belongs.sum(axis=0) + 1.0) / (len(sphere) + 3.0)
@@ -153,7 +152,7 @@ def _beside_members(points, rays, feet, axes, tubes, sd):  # type: ignore[no-unt
         free = True
         for m in range(len(tubes)):
             along, off = _by_axis(x, feet[m], axes[m])
-            free = free and (along <= 0.0 or off > occlusion.SLEEVE_OF_TUBE * tubes[m] + occlusion.FLAT_MM + sd)
+            free = free and (along <= 0.0 or off > sleeves.SLEEVE_OF_TUBE * tubes[m] + sleeves.FLAT_MM + sd)
         if free:
             rows[n] = i
             n += 1
@@ -189,7 +188,7 @@ def _neck_ratio(points, foot, axis, tube, beyond, sd):  # type: ignore[no-untype
     totals = np.zeros(len(NECKS))
     wide = np.sqrt(sd * sd + (SLEEVE_SPREAD * tube) ** 2)
     stray = 1.0 / (tube + 3.0 * sd)
-    sleeve = occlusion.SLEEVE_OF_TUBE * occlusion.MEDIAN_OF_CORNER * tube
+    sleeve = sleeves.SLEEVE_OF_TUBE * sleeves.MEDIAN_OF_CORNER * tube
     for i in range(len(points)):
         along, off = _by_axis(points[i], foot, axis)
         if along < beyond or off > tube + 3.0 * sd:

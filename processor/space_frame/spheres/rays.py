@@ -11,15 +11,15 @@ from numba import njit
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats
 from processor.space_frame.points.sphere_crops import Crops
-from processor.space_frame.spheres.records import AimedCrops
+from processor.space_frame.spheres.records import CropsWithRays
 
 
-def aimed(crops: Crops, nodes: Floats, scanners: Floats, threads: int) -> AimedCrops:
+def with_rays(crops: Crops, nodes: Floats, scanners: Floats, threads: int) -> CropsWithRays:
     """Add the rays of gathered points from the scanners (s, 3) that saw them."""
     rays, ranges = np.zeros((len(crops.points), 3)), np.zeros(len(crops.points))
-    aimed = AimedCrops(crops.start, crops.points, rays, ranges, crops.station)
-    over_ranges(partial(_aim, aimed, nodes, scanners), len(nodes), threads)
-    return aimed
+    found = CropsWithRays(crops.start, crops.points, rays, ranges, crops.station)
+    over_ranges(partial(_aim, found, nodes, scanners), len(nodes), threads)
+    return found
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
