@@ -21,9 +21,9 @@ from processor.space_frame.spheres import isolated
 
 LEAST_EXTENT_MM = 2.0  # nothing that is scanned is smaller: the coordinates are in metres
 LEAST_POINTS = 10
-LEAST_SCAN = 100
+LEAST_SCAN_POINTS = 100
 MOST_RATIO = 30.0  # of the extents of a scan and its design; beyond it the units differ
-CLEARLY = 0.1  # difference of shares of points that face the scanner between two poses
+FACING_MARGIN = 0.1  # difference of shares of points that face the scanner between two poses
 
 
 @dataclass(frozen=True)
@@ -90,12 +90,12 @@ def fit_sphere(points: npt.ArrayLike, radius: float | None = None, scanner: npt.
     ValueError : wrong shape, NaN, too few points, or coordinates that seem to be in metres.
     """
     cloud = _points(points, "points", LEAST_POINTS)
-    if radius is not None and not 0.0 < radius < np.inf:
-        raise ValueError(f"radius: expected a positive length in mm, got {radius}")
+    if radius is not None and (isinstance(radius, str) or not 0.0 < radius < np.inf):
+        raise ValueError(f"radius: expected a positive length in mm, got {radius!r}")
     origin = cloud.mean(axis=0)
     seen_from = None
     if scanner is not None:
-        seen_from = np.broadcast_to(_finite(scanner, "scanner"), cloud.shape) - origin
+        seen_from = _positions(scanner, "scanner", cloud.shape) - origin
     params = Params(radius_mm=float("nan") if radius is None else float(radius), max_balls=1)
     measured = isolated.search(MergedCloud(cloud - origin, origin, seen_from), params)
     balls = measured.balls
@@ -143,7 +143,7 @@ def register(
     ------
     ValueError : wrong shapes, NaN, too few points, faces that name no vertex, points and mesh in different units.
     """
-    cloud, corners = _points(points, "points", LEAST_SCAN), _points(vertices, "vertices", 3)
+    cloud, corners = _points(points, "points", LEAST_SCAN_POINTS), _points(vertices, "vertices", 3)
     triangles = np.asarray(faces)
     if triangles.ndim != 2 or triangles.shape[1] != 3 or triangles.dtype.kind not in "iu":
         raise ValueError(f"faces: expected an array (f, 3) of whole numbers, got {triangles.dtype} {triangles.shape}")
@@ -159,11 +159,11 @@ def register(
     placed = surface_registration.place(local, surface, given, "auto")
     rival = placed.T_rival if placed.ambiguous else None
     if rival is not None and scanners is not None:
-        seen_from = np.broadcast_to(_finite(scanners, "scanners"), cloud.shape) - scan_origin
+        seen_from = _positions(scanners, "scanners", cloud.shape) - scan_origin
         shares = [_facing_share(local, seen_from, surface, T) for T in (placed.T, rival)]
-        if shares[1] > shares[0] + CLEARLY:
+        if shares[1] > shares[0] + FACING_MARGIN:
             placed = surface_registration.place(local, surface, rival, "fine")
-        rival = None if abs(shares[1] - shares[0]) > CLEARLY else rival
+        rival = None if abs(shares[1] - shares[0]) > FACING_MARGIN else rival
     determined = bool(np.isfinite(placed.T_best_fit).all())
     T = placed.T_best_fit if determined else placed.T
     near, _ = surface.tree.query(rigid.apply(T, local), distance_upper_bound=surface_registration.NEAR_MM, workers=-1)
@@ -204,8 +204,7 @@ def m3c2(
 ) -> CorePoints:
     """Measure distances between two clouds along local normals, each with its level of detection.
 
-    Lague, Brodu and Leroux (2013), "Accurate 3D comparison of complex topography with terrestrial laser scanner", ISPRS
-    Journal of Photogrammetry and Remote Sensing 82, 10-26; LOD95 as in paper 002, eq. 10.
+    Lague, Brodu and Leroux (2013), cited in full in :mod:`processor.geometry.m3c2`; LOD95 as in paper 002, eq. 10.
 
     Parameters
     ----------
@@ -225,13 +224,11 @@ def m3c2(
 
     Raises
     ------
-    ValueError : wrong shapes, NaN, no points, diameters that are not positive or wider than the reference, which
-        indicates another unit.
+    ValueError : wrong shapes, NaN, no points, lengths that are not positive or wider than the reference.
     """
-    first = _points(reference, "reference", 1, in_mm=False)
-    second = _points(compared, "compared", 1, in_mm=False)
+    first, second = (_points(reference, "reference", 1, in_mm=False), _points(compared, "compared", 1, in_mm=False))
     places = first if core is None else _points(core, "core", 1, in_mm=False)
-    _check_lengths(first, normal_diameter, projection_diameter, max_depth)
+    _check_lengths(first, normal_diameter, projection_diameter, max_depth, registration_error)
     origin = first.mean(axis=0)
     local = places - origin
     grid = m3c2_distances.grid(first - origin, projection_diameter)
@@ -241,7 +238,9 @@ def m3c2(
     else:
         directions = _finite(normals, "normals")
         if directions.shape != places.shape:
-            raise ValueError(f"normals: expected shape {places.shape}, one normal a core point; got {directions.shape}")
+            raise ValueError(
+                f"normals: expected shape {places.shape}, one normal per core point; got {directions.shape}"
+            )
     measured = m3c2_distances.distances(
         grid,
         m3c2_distances.grid(second - origin, projection_diameter),
@@ -254,7 +253,15 @@ def m3c2(
     return CorePoints(**vars(measured), core=places, normals=directions)
 
 
-def _check_lengths(reference: Floats, normal_diameter: float, projection_diameter: float, max_depth: float) -> None:
+def _check_lengths(
+    reference: Floats,
+    normal_diameter: float,
+    projection_diameter: float,
+    max_depth: float,
+    registration_error: float,
+) -> None:
+    if not 0.0 <= registration_error < np.inf:
+        raise ValueError(f"registration_error: expected 0 or a positive length, got {registration_error}")
     for name, value in (
         ("normal_diameter", normal_diameter),
         ("projection_diameter", projection_diameter),
@@ -284,6 +291,14 @@ def _points(values: npt.ArrayLike, name: str, least: int, in_mm: bool = True) ->
             f"{name}: span {extent:.4g}; expected coordinates in mm, these seem to be in metres: multiply them by 1000"
         )
     return points
+
+
+def _positions(values: npt.ArrayLike, name: str, shape: tuple[int, ...]) -> Floats:
+    """Return the scanner's position for each point: (3,) for all, or one of ``shape`` (n, 3)."""
+    positions = _finite(values, name)
+    if positions.shape not in ((3,), shape):
+        raise ValueError(f"{name}: expected shape (3,) or {shape}, got {positions.shape}")
+    return np.broadcast_to(positions, shape)
 
 
 def _finite(values: Any, name: str) -> Floats:

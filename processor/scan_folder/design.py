@@ -101,9 +101,14 @@ def _joints(design: Table, order: Sequence[str], scale: float) -> dict[tuple[str
         if sides in joints:
             raise InputError(f"{joint.where}: expected one joint of {sides[0]} and {sides[1]}, found a second")
         joints[sides] = (joint.text("name"), corners)
-    if different := sorted(set(pairwise(order)) ^ set(joints)):
+    neighbours = set(pairwise(order))
+    for left, right in sorted(set(joints) - neighbours):
         raise InputError(
-            f"{design.where}: expected one joint for each two neighbours in 'order' (left, right); see {different[0]}"
+            f"{design.where}: joint of {left!r} and {right!r}, which are not neighbours in 'order'; correct one of them"
+        )
+    for left, right in sorted(neighbours - set(joints)):
+        raise InputError(
+            f"{design.where}: no joint of the neighbours {left!r} (left) and {right!r} (right); add it to 'joints'"
         )
     return joints
 

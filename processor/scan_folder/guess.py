@@ -111,7 +111,8 @@ def _find_design(folder: Path, project: Guess) -> Path | None:
     if len(candidates) > 1:
         named = ", ".join(str(path.relative_to(folder)) for path in candidates[:5])
         project.unsure.append(
-            f"design: {len(candidates)} candidates ({named}): name one, of kind structure, or make a design.json"
+            f"design: several files may be it ({named}); name one as 'design', with kind = \"structure\", or write a "
+            "design.json"
         )
         return None
     if candidates:

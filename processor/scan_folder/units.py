@@ -17,7 +17,7 @@ MM_PER_UNIT = {
     "ft": 304.8,
     "us-ft": 1_200_000.0 / 3937.0,
 }
-LARGEST_KM = 10.0  # of anything measured to a millimetre; at a thousand times its size a step runs out of memory
+LARGEST_KM = 10.0  # no structure is larger; a scan in mm read as metres is, and would exhaust the memory
 STRAY = 0.01  # share of a scan's points at either end of an axis that may be outliers
 SYNONYMS = {
     "in": "inch",
@@ -95,7 +95,7 @@ def check_ratio(
     if not size > 0.0:
         return
     sample = points[:: max(1, len(points) // SAMPLE)]
-    centre = np.quantile(sample, [0.01, 0.99], axis=0).mean(axis=0)
+    centre = np.quantile(sample, [STRAY, 1.0 - STRAY], axis=0).mean(axis=0)
     ratio = float(np.quantile(np.linalg.norm(sample - centre, axis=1), 0.99)) / size
     factor = unit_ratio.nearest_factor(ratio, ratios, RATIO_TOLERANCE)
     if factor is None or not (_certain(factor) or _scaled_alike(sample, nominal, factor)):
@@ -113,7 +113,7 @@ def _certain(factor: float) -> bool:
 
 def _scaled_alike(points: Floats, nominal: Floats, factor: float) -> bool:
     """Whether the extents of points (n, 3) are those of nominal (m, 3) times the factor along all principal axes."""
-    scanned, designed = _extents(points, 0.01), _extents(nominal, 0.0)
+    scanned, designed = _extents(points, STRAY), _extents(nominal, 0.0)
     compared = designed > THIN * designed[0]
     ratios = scanned[compared] / (factor * designed[compared])
     return bool((ratios < SHAPE_TOLERANCE).all() and (ratios > 1.0 / SHAPE_TOLERANCE).all())

@@ -126,8 +126,11 @@ DESIGNS = {
     "edge of a point": (change(["components", "rib1", "bottom_edge_left"], [[1, 2, 3]]), "two points or more"),
     "edge of one place": (change(["components", "rib1", "bottom_edge_left"], [[1, 2, 3]] * 2), "none repeated"),
     "edge of NaN": (change(["components", "rib1", "bottom_edge_left"], [[1, 2, float("nan")]] * 2), "shape n x 3"),
-    "joint missing": (change(["joints"], []), r"one joint for each two neighbours .*'foot1', 'rib1'"),
-    "joint of others": (change(["joints", 0, "right"], "foot1"), "one joint for each two neighbours"),
+    "joint missing": (change(["joints"], []), r"no joint of the neighbours 'foot1' \(left\) and 'rib1'"),
+    "joint of others": (
+        change(["joints", 0, "right"], "foot1"),
+        "joint of 'foot1' and 'foot1', which are not neighbours",
+    ),
     "point missing": (change(["joints", 0, "points", "P5"], None), "expected numbers of shape 3 as 'P5', found noth"),
     "point more": (change(["joints", 0, "points", "P9"], [1, 2, 3]), "unknown key 'P9'"),
     "huge number": (change(["joints", 0, "points", "P5"], [10**400, 0, 0]), "numbers of shape 3 as 'P5'"),

@@ -55,6 +55,15 @@ def test_a_sphere_of_a_target():
     assert held.covariance[3, 3] == 0.0
 
 
+def test_a_radius_and_a_scanner_that_cannot_be_used():
+    points = np.random.default_rng(0).uniform(-100.0, 100.0, (20, 3))
+    with pytest.raises(ValueError, match="radius: expected a positive length in mm, got 'a'"):
+        processor.fit_sphere(points, radius="a")
+    for scanner in (np.zeros(2), np.zeros((5, 3)), 0.0):
+        with pytest.raises(ValueError, match=r"scanner: expected shape \(3,\) or \(20, 3\), got"):
+            processor.fit_sphere(points, scanner=scanner)
+
+
 def test_points_of_no_sphere_fail_and_are_no_error():
     fit = processor.fit_sphere(np.random.default_rng(0).uniform(-500.0, 500.0, (300, 3)))
     assert fit.status in (Status.FAILED, Status.WEAK)
@@ -99,6 +108,8 @@ def test_a_shift_of_a_plane_by_m3c2():
         processor.m3c2(first / 100.0, second / 100.0, **scales)
     with pytest.raises(ValueError, match="positive"):
         processor.m3c2(first, second, **{**scales, "max_depth": 0.0})
+    with pytest.raises(ValueError, match="registration_error: expected 0 or"):
+        processor.m3c2(first, second, **scales, registration_error=-1.0)
 
 
 def test_a_folder_is_read_and_run(tmp_path):

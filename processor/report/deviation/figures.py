@@ -48,7 +48,7 @@ def deviation_map(core: Floats, normals: Floats, distances: Distances, unit: str
         _panel(axes, core[rows][:, [across, up]], rows, distances, norm)
         axes.set(xlabel=f"{AXES[across]}{_in(unit)}", ylabel=f"{AXES[up]}{_in(unit)}")
         if side:
-            axes.set_title(f"what looks towards {side}{AXES[along]}", fontsize=10)
+            axes.set_title(f"surface facing {side}{AXES[along]}", fontsize=10)
     bar = ScalarMappable(norm, DIVERGING)
     label = f"compared minus reference along the normal{_in(unit)}"
     figure.colorbar(bar, ax=panels.tolist(), label=label, shrink=0.7)
