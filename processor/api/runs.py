@@ -38,20 +38,21 @@ class Results:
     @property
     def steps(self) -> dict[str, Any]:
         """Result records by step."""
+        # reversed: the first method of a step is kept, as it comes last
         return {run.step: run.result for run in reversed(self.execution.runs)}
 
     @property
     def comparison(self) -> dict[str, dict[str, Any]]:
         """Result records of further methods, by step and method."""
-        metrics: dict[str, dict[str, Any]] = {}
+        others: dict[str, dict[str, Any]] = {}
         for run in self.execution.runs:
             if self.steps[run.step] is not run.result:
-                metrics.setdefault(run.step, {})[run.method] = run.result
-        return metrics
+                others.setdefault(run.step, {})[run.method] = run.result
+        return others
 
     @property
     def checks(self) -> tuple[Metric, ...]:
-        """Figures compared with the truth."""
+        """Numbers of the results compared with the truth."""
         return self.report.metrics
 
     @property
@@ -104,10 +105,10 @@ def run(
     output : folder for results.h5, results.json, report.html and tables; None = nothing is written.
     steps : names of the steps, in a list or one text with commas; None = those of the input's kind.
     method : one method or several; the first of a step gives its result, further ones are run for comparison.
-    params : a TOML file, or a table a step as the file has it.
+    params : a TOML file, or a mapping of one table per step.
     units : of the scans' coordinates, see :func:`read`.
     seed : of all randomness; None = that of the parameters.
-    lang : of the page, "en" or "zh".
+    lang : language of report.html, "en" or "zh".
     log : receives a line of progress at a time.
 
     Returns
@@ -165,7 +166,7 @@ def check(results: Results, truth: Truth) -> tuple[Metric, ...]:
 
     Returns
     -------
-    The figures: step, quantity, statistic, value, unit, limit and whether the limit is kept.
+    The checks: step, quantity, statistic, value, unit, limit and whether the limit is kept.
 
     Raises
     ------

@@ -23,6 +23,7 @@ from processor.store.json_values import json_ready
 from processor.store.replaced_folder import replacing_folder, write_bytes, write_text
 
 TABLE, FIGURES, RECORD, PAGE = "compare.csv", ("map.png", "histogram.png"), "compare.json", "report.html"
+LABEL = "compared minus reference along the normal"
 OWN_NAMES = (TABLE, *FIGURES, RECORD, PAGE)
 DEFINITION = (
     "distance = compared minus reference, means along the normal; lod95 = 1.96 (sqrt(std1^2/n1 + std2^2/n2) + "
@@ -107,8 +108,10 @@ def write(out: Path, result: Comparison, lang: str = "en") -> dict[str, Any]:
     record = as_json(result)
     with default_settings():
         drawn = [
-            deviation_figures.deviation_map(result.core + result.origin, result.normals, result.distances, result.unit),
-            deviation_figures.histogram(result.distances, result.unit),
+            deviation_figures.deviation_map(
+                result.core + result.origin, result.normals, result.distances, LABEL, result.unit
+            ),
+            deviation_figures.histogram(result.distances, LABEL, result.unit),
         ]
     with replacing_folder(out) as making:
         table = core_points_csv.csv_text(result.origin, result.core, result.distances, result.normals)

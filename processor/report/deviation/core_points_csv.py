@@ -14,7 +14,10 @@ ROWS_AT_ONCE = 50_000
 
 
 def csv_text(origin: Floats, core: Floats, distances: Distances, normals: Floats) -> str:
-    """Write core points (k, 3), less an ``origin`` (3,), with distances and normals (k, 3); nan where there is none."""
+    """Return as CSV the core points (k, 3), given relative to ``origin`` (3,), with distances and normals (k, 3).
+
+    nan stands where there is none. n1 and std1 are of the reference, n2 and std2 of the compared cloud.
+    """
     return "".join(_lines(origin, core, distances, normals))
 
 

@@ -23,11 +23,11 @@ LEGEND_COLOUR = "#404040"
 BOTH_SIDES = 0.1  # share of core points that look away from which they get a panel of their own
 
 
-def deviation_map(core: Floats, normals: Floats, distances: Distances, unit: str) -> tuple[Message, bytes]:
+def deviation_map(core: Floats, normals: Floats, distances: Distances, label: str, unit: str) -> tuple[Message, bytes]:
     """Draw core points (k, 3) with normals (k, 3) by distance, seen along the axis on which they spread least.
 
     Large dots exceed their level of detection, small ones do not, so the map is readable in grey. A structure with
-    faces to both sides gets one panel for each side.
+    faces to both sides gets one panel for each side. ``label`` says what a distance is.
     """
     drawn = np.unique(np.linspace(0, len(core) - 1, min(len(core), MOST_DRAWN)).astype(np.int64))
     spread = np.ptp(core, axis=0) if len(core) else np.zeros(3)
@@ -50,8 +50,7 @@ def deviation_map(core: Floats, normals: Floats, distances: Distances, unit: str
         if side:
             axes.set_title(f"surface facing {side}{AXES[along]}", fontsize=10)
     bar = ScalarMappable(norm, DIVERGING)
-    label = f"compared minus reference along the normal{_in(unit)}"
-    figure.colorbar(bar, ax=panels.tolist(), label=label, shrink=0.7)
+    figure.colorbar(bar, ax=panels.tolist(), label=f"{label}{_in(unit)}", shrink=0.7)
     part = "" if len(drawn) == len(core) else "; {drawn:,} of {all:,} core points drawn"
     template = "Deviations seen along {axis}; large dots are beyond their level of detection" + part
     return text(template, axis=AXES[along], drawn=len(drawn), all=len(core)), png(figure)
@@ -87,7 +86,7 @@ def _legend(unknown: int, within: int, beyond: int) -> list[Line2D]:
     ]
 
 
-def histogram(distances: Distances, unit: str) -> tuple[Message, bytes]:
+def histogram(distances: Distances, label: str, unit: str) -> tuple[Message, bytes]:
     """Draw how distances are spread, those beyond their level of detection hatched, and the median level."""
     figure = Figure(figsize=(8.0, 3.9), layout="constrained")
     axes = figure.subplots()
@@ -108,7 +107,7 @@ def histogram(distances: Distances, unit: str) -> tuple[Message, bytes]:
     )
     for side in (-middle, middle):
         axes.axvline(side, color="black", linestyle="--", label="median level of detection, 95 %" if side > 0 else None)
-    axes.set(xlabel=f"compared minus reference{_in(unit)}", ylabel="core points")
+    axes.set(xlabel=f"{label}{_in(unit)}", ylabel="core points")
     axes.grid(alpha=0.3)
     axes.legend(fontsize=8)
     return text("Deviations; the outermost bars hold all beyond"), png(figure)

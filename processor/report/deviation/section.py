@@ -20,6 +20,7 @@ from processor.report.style import CaptionedPngs
 from processor.report.table import Table, figures_of
 
 MAP, HISTOGRAM = "deviation-map.png", "deviation-histogram.png"
+LABEL = "scan minus design along the normal"
 
 
 def _summary(result: Result) -> tuple[Message, Message]:
@@ -32,8 +33,9 @@ def _summary(result: Result) -> tuple[Message, Message]:
         share=100.0 * result.significant_share,
     )
     body = text(
-        "95 %: {low:.1f} to {high:.1f} %. From {least} ± {least_half} to {greatest} ± {greatest_half} mm (95 %), "
-        "{near:.1f} % within 10 mm; median LOD95 {lod95} mm, {registration} mm of it registration. "
+        "95 % interval of this share: {low:.1f} to {high:.1f} %. "
+        "Deviations from {least} ± {least_half} to {greatest} ± {greatest_half} mm (95 %), "
+        "{near:.1f} % of them within 10 mm; median LOD95 {lod95} mm, {registration} mm of it registration. "
         "{measured} of {core} core points were measured.",
         low=100.0 * low,
         high=100.0 * high,
@@ -66,8 +68,8 @@ def _figures(_: Execution, runs: Sequence[StepRun], __: ErrorReport) -> Captione
         return {}
     points = core.points + runs[0].result.origin
     return {
-        MAP: figures.deviation_map(points, core.normals, core.distances, "mm"),
-        HISTOGRAM: figures.histogram(core.distances, "mm"),
+        MAP: figures.deviation_map(points, core.normals, core.distances, LABEL, "mm"),
+        HISTOGRAM: figures.histogram(core.distances, LABEL, "mm"),
     }
 
 
