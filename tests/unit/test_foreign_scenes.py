@@ -12,6 +12,7 @@ import pytest
 
 from processor.evaluation import truth_json
 from processor.model import InputError
+from processor.preassembly.parts import assignment, attitude
 from processor.scan_folder import folder
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -144,3 +145,12 @@ def test_faults_of_a_truth_are_named(tmp_path):
         (tmp_path / "truth.json").write_text(json.dumps({"format": "processor-truth"} | table))
         with pytest.raises(InputError, match=fault):
             truth_json.read(tmp_path)
+
+
+@pytest.mark.slow
+def test_a_segment_that_lies_on_longer_parts_is_none_of_them(tmp_path):
+    """To 30 mm SEG-1 lies on either springing and on SEG-3: as much of it as of a piece of them with clutter."""
+    scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", seed=1))
+    shapes = attitude.Shapes(scene.arch)
+    scan = next(scan for scan in scene.scans if scan.component == "SEG-1")
+    assert [assignment.rather(scan.points, k, shapes) for k in range(5)] == [1, None, 1, 1, 1]

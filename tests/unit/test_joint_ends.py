@@ -103,6 +103,26 @@ def test_corners_centimetres_off_are_found_within_their_intervals(seed):
     assert (np.abs(off) < 4.0 * np.hypot(sd, 0.05)).all()
 
 
+@pytest.mark.parametrize("through", ["webs", "flanges", "mitred"])
+def test_the_thickness_of_plates_by_the_facets_of_the_end_face(through):
+    """Webs of 12 mm, flanges of 18 mm, joined in either way; a plate is two facets."""
+    web, flange = 12.0, 18.0
+    outer = np.array([[0.0, B, 0], [0, -B, 0], [0, -B, H], [0, B, H]])
+    inner = outer - np.array([0.0, web, flange]) * np.sign(outer - [0.0, 0.0, 0.5 * H])
+    corners = []
+    for a, b in ((0, 1), (1, 2), (2, 3), (3, 0)):
+        runs_through = through == ("webs" if a % 2 else "flanges")
+        axis = 2 if a % 2 else 1  # along the plate
+        plate = np.array([outer[a], outer[b], inner[b], inner[a]])
+        if through != "mitred":
+            plate[:, axis] = (outer if runs_through else inner)[[a, b, b, a], axis]
+        corners.append(plate)
+    facets = np.array([4 * k + np.array(three) for k in range(4) for three in ((0, 1, 2), (0, 2, 3))])
+    surface = mesh_distance.of_mesh(np.vstack(corners), facets)
+    place = end_place(design()[1], 1.0)
+    np.testing.assert_allclose(joint_end._design_thickness(surface, place), [web, flange], atol=1e-9)
+
+
 @pytest.mark.parametrize("side", range(4))
 def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     """The outer side then lies where the design has the inner one, and has a fifth of the points."""

@@ -47,7 +47,6 @@ from processor.preassembly.ends.viewpoints import Thickness, Variances
 BENDS_MM = (0.0, 0.02, *SIZES_MM[1:])
 BEND_WEIGHTS = (0.5, 0.5, *(0.1,) * (len(SIZES_MM) - 1))
 RING = 8  # coefficients of the ring
-MITRE_MM = 0.01
 PLATE_SD_MM = 0.5  # of a plate's thickness: as delivered within -0.6 and +1.0 mm at 15 to 25 mm (EN 10029, class A)
 ITERATIONS = 4  # of a corner's place on its faces
 # Share of a departure, one standard deviation. Terms are taken where the design has the surface, not where the surface
@@ -270,9 +269,9 @@ def _design_thickness(surface: MeshSurface, place: EndPlace) -> Floats:
     corners = rigid.apply(T_joint_bridge, surface.vertices[surface.faces[across]])
     corners = corners[(np.abs(corners[:, :, 0]) < 0.5).all(axis=1)]
     depth = place.half[1:] - np.abs(corners[:, :, 1:])
-    lean = depth[:, :, 0].mean(axis=1) - depth[:, :, 1].mean(axis=1)
-    upright = np.ptp(corners[:, :, 2], axis=1) > np.ptp(corners[:, :, 1], axis=1)
-    on_web = np.where(np.abs(lean) < MITRE_MM, upright, lean < 0.0)  # a mitred facet is as deep on both
+    # By its middle: the ends of a flange that runs from side to side are on the webs' outer faces.
+    middle = place.half[1:] - np.abs(corners[:, :, 1:].mean(axis=1))
+    on_web = middle[:, 0] < middle[:, 1]
     return np.array([depth[on_web, :, 0].max(initial=0.0), depth[~on_web, :, 1].max(initial=0.0)])
 
 

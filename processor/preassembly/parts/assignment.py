@@ -1,7 +1,8 @@
 """Whether a scan is of the part it is assigned to, before the costly registration; and the assignment of all scans.
 
 A scan whose size is that of its part goes on without delay. Otherwise rough poses on the part and on the others are
-compared by surface that only one of two designs has there: the scan shows that of the right one.
+compared by surface that only one of two designs has there: the scan shows that of the right one. A part of an arch may
+lie on a longer one to some millimetres, so that points near a design do not show that the scan is a piece of it.
 """
 
 from __future__ import annotations
@@ -18,7 +19,9 @@ from processor.model import ArchDesign, Floats, Reason, reason
 from processor.preassembly.parts import attitude
 from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Shapes, Surface
 
-POINTS, SAMPLES = 100_000, 3_000  # of a scan, and of the surfaces that its rough poses are compared by
+POINTS, NEAR_POINTS = 100_000, 3_000  # of a scan, by which rough poses are compared, and their share near a design
+SAMPLES = 50_000  # of each surface: tens on a mark, also on a part of 100 m2
+EVERY = 1_000  # more than there are hypotheses
 NEAR_MM = surface_registration.GATES_MM[1]
 
 
@@ -63,13 +66,11 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     few = thinned(points, POINTS)
     pieces = not alike
 
-    def rough(k: int) -> Floats:
-        return attitude.rough(few, shapes.design.parts[k], shapes[k], pieces=pieces)
+    def rough(k: int, kept: int = attitude.ROUGH_KEPT) -> Floats:
+        return attitude.rough(few, shapes.design.parts[k], shapes[k], pieces=pieces, kept=kept)
 
     best, T_best = index, rough(index)
     share = _near_share(few, T_best, shapes[index])
-    if pieces and share >= 1.0 - surface_registration.CLUTTER_SHARE:
-        return None  # a piece of the part
     for other in others:
         T = rough(other)
         share = max(share, _near_share(few, T, shapes[other]))
@@ -79,7 +80,11 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     whole = all(part.source != box_girder.SOURCE for part in shapes.design.parts)
     if whole and share <= surface_registration.LEAST_SHARE:
         return -1
-    return None if best == index else best
+    if best == index:
+        return None
+    # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising.
+    own = shapes[index], rough(index, EVERY)
+    return best if _shows_other(few, own, (shapes[best], T_best)) else None
 
 
 def _other_shapes(index: int, numbers: Sequence[int] | range, design: ArchDesign) -> list[int]:
@@ -93,7 +98,7 @@ def _other_shapes(index: int, numbers: Sequence[int] | range, design: ArchDesign
 
 def _near_share(points: Floats, T: Floats, surface: Surface) -> float:
     """Share of points (n, 3), placed by T (4, 4), near a part's surface."""
-    placed = rigid.apply(T, thinned(points, SAMPLES))
+    placed = rigid.apply(T, thinned(points, NEAR_POINTS))
     _, distance, beyond = surface.mesh.distances(placed, 2.0 * NEAR_MM)
     return float(((np.abs(distance) < NEAR_MM) & (beyond < TELLING_MM)).mean())
 
