@@ -7,6 +7,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -30,6 +31,21 @@ def processor(*arguments, cwd=None):
         env={"PATH": "/usr/bin:/bin", "PYTHONPATH": str(ROOT), "LANG": "C.UTF-8", "MPLBACKEND": "Agg"},
         check=False,
     )
+
+
+@pytest.fixture
+def called(monkeypatch, capsys):
+    """``called(*arguments, cwd=ROOT)``: like :func:`processor`, in this process."""
+
+    def call(*arguments, cwd=ROOT):
+        monkeypatch.chdir(cwd)
+        monkeypatch.setattr(sys, "argv", ["processor", *map(str, arguments)])
+        with pytest.raises(SystemExit) as end:
+            __main__.main()
+        out, err = capsys.readouterr()
+        return SimpleNamespace(returncode=end.value.code or 0, stdout=out, stderr=err)
+
+    return call
 
 
 def ball_cloud(seed=0, radius=60.0, count=1500):
@@ -86,15 +102,15 @@ def test_the_same_bytes_in_give_the_same_bytes_out(sphere_run, tmp_path):
     assert str(tmp_path) not in (tmp_path / "again" / "results.json").read_text("utf-8")
 
 
-def test_results_are_replaced_but_nothing_else(sphere_run, tmp_path):
+def test_results_are_replaced_but_nothing_else(called, sphere_run, tmp_path):
     folder, _ = sphere_run
     arguments = ["run", folder / "target.xyz", "-o", tmp_path / "out", "--steps", "spheres"]
-    assert processor(*arguments).returncode == 0
+    assert called(*arguments).returncode == 0
     first = (tmp_path / "out" / "results.json").read_bytes()
-    assert processor(*arguments).returncode == 0
+    assert called(*arguments).returncode == 0
     assert (tmp_path / "out" / "results.json").read_bytes() == first
     (tmp_path / "out" / "notes.txt").write_text("keep")
-    done = processor(*arguments)
+    done = called(*arguments)
     assert (done.returncode, "notes.txt" in done.stderr) == (2, True)
     assert (tmp_path / "out" / "notes.txt").read_text() == "keep"
     assert [p.name for p in tmp_path.iterdir()] == ["out"]
@@ -153,24 +169,24 @@ def test_output_that_nobody_reads_ends_quietly(sphere_run):
     assert done.stderr == ""
 
 
-def test_a_report_is_made_again_without_running_the_steps(frame, tmp_path):
+def test_a_report_is_made_again_without_running_the_steps(called, frame, tmp_path):
     scene, truth = frame
     store.write_scene(tmp_path / "s.h5", scene, truth, {})
     run_in_process(tmp_path / "s.h5", tmp_path / "out", ("ransac", "least-squares"))
     before = {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()}
     (tmp_path / "out" / "report.html").unlink()
-    done = processor("report", tmp_path / "out", tmp_path / "s.h5")
+    done = called("report", tmp_path / "out", tmp_path / "s.h5")
     assert done.returncode == 0, done.stderr
     assert {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()} == before
     (tmp_path / "out" / "report.html").unlink()
-    assert processor("report", tmp_path / "out").returncode == 0  # the input lies beside
+    assert called("report", tmp_path / "out").returncode == 0  # the input lies beside
     assert {p.name: p.read_bytes() for p in (tmp_path / "out").iterdir() if p.is_file()} == before
     (tmp_path / "s.h5").rename(tmp_path / "moved.h5")
-    done = processor("report", tmp_path / "out")
+    done = called("report", tmp_path / "out")
     assert done.returncode == 2
     assert "expected its input 's.h5'" in done.stderr
     store.write_scene(tmp_path / "s.h5", dataclasses.replace(scene, name="another"), truth, {})
-    done = processor("report", tmp_path / "out", tmp_path / "s.h5")
+    done = called("report", tmp_path / "out", tmp_path / "s.h5")
     assert done.returncode == 3
     assert "was made from 's.h5' as it was then" in done.stderr
 
@@ -212,16 +228,16 @@ def test_tables_hold_what_results_json_holds(frame, tmp_path):
     assert "http" not in page.replace("http-equiv", "")
 
 
-def test_a_missed_limit_exits_with_4(frame, tmp_path):
+def test_a_missed_limit_exits_with_4(called, frame, tmp_path):
     scene, truth = frame
     wrong = dataclasses.replace(truth.frame, radii=truth.frame.radii + 10.0)
     store.write_scene(tmp_path / "s.h5", scene, dataclasses.replace(truth, frame=wrong), {})
-    done = processor("run", tmp_path / "s.h5", "-o", tmp_path / "out", "--method", "ransac")
+    done = called("run", tmp_path / "s.h5", "-o", tmp_path / "out", "--method", "ransac")
     assert done.returncode == 4
-    again = processor("check", tmp_path / "out", "--json")
+    again = called("check", tmp_path / "out", "--json")
     assert again.returncode == 4
     assert json.loads(again.stdout)["passed"] is False
-    assert "MISSED" in processor("check", tmp_path / "out").stdout
+    assert "MISSED" in called("check", tmp_path / "out").stdout
 
 
 def test_names_from_outside_are_shown_as_text(frame, tmp_path):
@@ -276,7 +292,7 @@ def test_a_bridge_through_the_pipeline(tmp_path):
         (["run", "good.xyz", "-o", ".", "--steps", "spheres"], 2, "holds the input"),
     ],
 )
-def test_what_cannot_be_done_is_said_in_one_line(tmp_path, arguments, code, said):
+def test_what_cannot_be_done_is_said_in_one_line(called, tmp_path, arguments, code, said):
     (tmp_path / "empty.xyz").touch()
     (tmp_path / "nan.xyz").write_text("0 0 0\n1 nan 0\n0 1 0\n0 0 1\n1 1 1\n")
     (tmp_path / "few.xyz").write_text("0 0 0\n1 0 0\n")
@@ -287,7 +303,7 @@ def test_what_cannot_be_done_is_said_in_one_line(tmp_path, arguments, code, said
     (tmp_path / "taken" / "mine.txt").write_text("keep")
     np.savetxt(tmp_path / "good.xyz", ball_cloud(count=200) / 1000.0)
     before = sorted(p.name for p in tmp_path.iterdir())
-    done = processor(*arguments, cwd=tmp_path)
+    done = called(*arguments, cwd=tmp_path)
     assert done.returncode == code, done.stderr
     assert said in done.stderr
     assert "Traceback" not in done.stderr

@@ -65,7 +65,7 @@ def trial(rng, draws, radius, count, visible, sigma, several, prior=None, likeli
     covariance = np.full((draws, 3, 3), np.nan) if prior is None else np.tile(prior**2 * np.eye(3), (draws, 1, 1))
     moved = Crops(crops.start, points - np.repeat(start, count, axis=0), station)
     nodes = Nodes(start, covariance, np.zeros(draws, np.int64), np.full(draws, np.nan))
-    params = fit_all.Params(sigma_mm=2.0, process_hole_mm=0.0)
+    params = fit_all.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
     got = fit_all.fit_crops(
         moved, stations, nodes, Members(), catalogue.of_radii([]), None, np.zeros((len(stations), 3, 3)), params
     )

@@ -31,8 +31,8 @@ from scipy.spatial.transform import Rotation
 
 from designgen import recipe_files
 from designgen.scenes.make import make
-from processor.evaluation import stitching
 from processor.evaluation import stitching as stitching_evaluation
+from processor.model import NORMAL_95
 from processor.stitching import step as stitching_step
 from tests.bench import stitching_picks
 
@@ -66,7 +66,7 @@ def measured(scene, truth, params):
         "stated_position_mm": float(np.nanmax(scans.position_sd)),
         "stated_rotation_mrad": float(1e3 * np.nanmax(scans.rotation_sd)),
         "components": len(pulls),
-        "within_95": float((np.abs(pulls) < stitching.NORMAL_95).mean()) if len(pulls) else float("nan"),
+        "within_95": float((np.abs(pulls) < NORMAL_95).mean()) if len(pulls) else float("nan"),
         "pull_rms": float(np.sqrt(np.mean(pulls**2))) if len(pulls) else float("nan"),
         "flags": [s for s in scans.status if s != "ok"],
         "pairs_used": f"{int(result.pairs.used.sum())}/{len(result.pairs)}",

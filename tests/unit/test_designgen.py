@@ -97,7 +97,7 @@ def test_solids_keep_to_the_closed_form(parts):
                 if face.name == "outer-top" and np.linalg.norm(point - arch_part.pad_frame(part)[0]) < 150.0:
                     continue  # under the pad
                 assert shell.distance(cq.Vertex.makeVertex(*point)) < 0.02, (part.name, face.name)
-        middles = design.triangles_center[rng.permutation(len(design.faces))[:60]]
+        middles = design.triangles_center[rng.permutation(len(design.faces))[:20]]
         assert max(shell.distance(cq.Vertex.makeVertex(*point)) for point in middles) < 0.02
 
 
@@ -232,7 +232,8 @@ def test_impossible_frames_are_refused_by_key(setting, said):
 
 
 def test_an_exported_folder_holds_design_and_truth(tmp_path):
-    recipe = recipe_files.overridden(recipe_files.load("frame-small")[1], ["scan.spacing_mm=40"])
+    small = ["scan.spacing_mm=40", "frame.nodes_x=3", "frame.nodes_y=3"]
+    recipe = recipe_files.overridden(recipe_files.load("frame-small")[1], small)
     scene, truth = make("roof", recipe)
     store.write_scene(tmp_path / "s.h5", scene, truth, {"parameters": recipe})
     export_folder.export(tmp_path / "s.h5", tmp_path / "out", "ply", with_truth=True, step=True)

@@ -9,9 +9,9 @@ from processor.space_frame.members.records import Members, Nodes
 from processor.space_frame.points.sphere_crops import Crops
 from processor.space_frame.spheres import fit_all
 from processor.space_frame.spheres.gauss_newton import (
-    Mask,
     Observations,
     Prior,
+    SphereMask,
     Unknowns,
     residual,
     select,
@@ -61,7 +61,7 @@ def test_selection_looks_at_the_ray_and_not_at_the_noisy_point():
         member = np.array([0.0, np.sin(0.65), -np.cos(0.65)])[None]  # its axis leaves the ball near (0, 30)
         chosen = np.zeros(len(at), np.uint8)
         state = np.array([0.0, 0.0, 0.0, 50.0])
-        mask = Mask(np.zeros((1, 3)), member, np.array([15.0]), 15.0, 0.15)
+        mask = SphereMask(np.zeros((1, 3)), member, np.array([15.0]), 15.0, 0.15)
         count = select(points, np.tile(up, (len(at), 1)), mask, state, 40.0, chosen)
         assert chosen.tolist() == [2, 2, 1, 0, 0, 2]
         assert count == 1
@@ -159,7 +159,7 @@ def test_without_rays_half_of_what_noise_may_bring_is_taken_off_and_the_rest_is_
         crops = Crops(np.arange(draws + 1) * count, points, np.full(len(points), -1, np.int32))
         unfixed = np.full((draws, 3, 3), np.nan)
         nodes = Nodes(np.zeros((draws, 3)), unfixed, np.zeros(draws, np.int64), np.full(draws, np.nan))
-        params = fit_all.Params(sigma_mm=2.0, process_hole_mm=0.0)
+        params = fit_all.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
         found = fit_all.fit_crops(crops, np.empty((0, 3)), nodes, Members(), catalogue.of_radii([]), params=params)
         return found.radii - radius, (found.covariance - found.common)[:, 3, 3]
 

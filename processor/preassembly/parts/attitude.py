@@ -23,6 +23,7 @@ SAMPLE_SPACING_MM = 30.0  # of the design's surface: ten samples on a mark of 0.
 COARSE_GATES_MM = (400.0, 150.0)  # for every hypothesis
 FINE_GATES_MM = (50.0, 25.0, 12.0)  # for the promising ones
 COARSE_POINTS, FINE_POINTS = 600, 20_000
+WIDE_POINTS = 4_000  # at all gates but the last
 # Least misfit by noise and form of parts: where no hypothesis of a whole part is better, the scan may be of a piece.
 PIECE_MM = 5.0
 PIECE_POINTS, PIECE_ITERATIONS, PIECES_KEPT = 200, 6, 24
@@ -309,10 +310,12 @@ def _rival_reason(best: Floats, rival: Floats, surface: Surface) -> Reason:
 
 
 def _align(points: Floats, surface: Surface, gates_mm: tuple[float, ...], candidate: _Candidate) -> _Candidate:
-    """Align from the pose of a candidate."""
-    T = icp.point_to_plane(
-        points, surface.points, surface.normals, candidate.T, gates_mm=gates_mm, tree=surface.tree, axes=surface.axes
-    ).T_target_source
+    """Align from the pose of a candidate, by a share of the points until the last gate."""
+    T = candidate.T
+    for seeds, gates in ((thinned(points, WIDE_POINTS), gates_mm[:-1]), (points, gates_mm[-1:])):
+        T = icp.point_to_plane(
+            seeds, surface.points, surface.normals, T, gates_mm=gates, tree=surface.tree, axes=surface.axes
+        ).T_target_source
     return _Candidate(T, candidate.start, _misfit(points, surface, T))
 
 
