@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from processor.adjustment import opposite_sides
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
 from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
@@ -15,6 +16,7 @@ from processor.model import Floats, Ints
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
 FEWEST_FREE = 20.0  # degrees of freedom below which the noise of all points is used
+PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that of the other side
 WHOLE_SHARE = 0.99  # of a cell that its face covers, from which the cell is whole
 
 
@@ -24,7 +26,8 @@ class Field:
 
     ``stray`` counts points that do not agree with the others of the cell. ``inner`` are cells away from their face's
     border, ``seen`` those of them with enough points. ``stations`` is the variance by errors of the stations'
-    movements, which neighbouring cells have in common; 0 in cells without points.
+    movements, which neighbouring cells have in common; 0 in cells without points. ``views`` is the standard deviation
+    of what the points of one view have in common, where views are not named, mm.
     """
 
     deviation: Floats
@@ -35,11 +38,12 @@ class Field:
     inner: Floats  # 0 or 1
     seen: Floats  # 0 or 1
     stations: Floats
+    views: float = 0.0
 
     def stations_sd(self, cells: Ints) -> float:
-        """Return the standard deviation that cells have in common by errors of the stations' movements, mm."""
+        """Return the standard deviation that cells have in common by errors of stations' movements or of views, mm."""
         variance = self.stations[cells][self.count[cells] > 0]
-        return float(np.sqrt(variance.mean())) if len(variance) else 0.0
+        return float(np.sqrt(variance.mean() + self.views**2)) if len(variance) else self.views
 
     def less(self, shape: Floats) -> Field:
         """Return the field less a shape (cells,)."""
@@ -75,15 +79,21 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         inner[rows] = _inner(charts.image(surface.share, chart), charts, chart, edge_mm).ravel()
     noise = np.sqrt(np.maximum(noise, 1e-6))
     stray = np.bincount(pairs.cell, pairs.stray, cells)
+    variance, seen = noise**2 / divisor, inner * (count + stray >= FEWEST_POINTS)
+    views = 0.0
+    if stations.unnamed:
+        used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
+        views = opposite_sides.view_sd(surface.centres[used], surface.outward[used], mean[used], variance[used], side)
     return Field(
         deviation=mean,
-        variance=noise**2 / divisor,
+        variance=variance,
         count=count.astype(np.int64),
         stray=stray.astype(np.int64),
         noise=noise,
         inner=inner,
-        seen=inner * (count + stray >= FEWEST_POINTS),
+        seen=seen,
         stations=station_variance(pairs, surface, stations, alignment),
+        views=views,
     )
 
 
