@@ -9,15 +9,16 @@ import numpy as np
 from scipy import ndimage
 
 from processor.adjustment import opposite_sides
+from processor.defects import surface_charts
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
-from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
+from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
+from processor.geometry.mesh_distance import Bools
 from processor.model import Floats, Ints
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
 FEWEST_FREE = 20.0  # degrees of freedom below which the noise of all points is used
 PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that of the other side
-WHOLE_SHARE = 0.99  # of a cell that its face covers, from which the cell is whole
 
 
 @dataclass(frozen=True)
@@ -70,13 +71,13 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     charts = surface.charts
     noise = np.zeros(cells)
     overall = float(square.sum() / max(freedom.sum(), 1.0))
-    inner = np.zeros(cells)
+    inner, exposed = np.zeros(cells), surface.covered & ~surface_charts.hidden(surface)
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
         pooled_square, pooled_freedom = (_pooled(charts.image(x, chart), charts, chart) for x in (square, freedom))
         known = pooled_freedom * POOLED_CELLS**2 > FEWEST_FREE
         noise[rows] = np.where(known, pooled_square / np.maximum(pooled_freedom, 1e-9), overall).ravel()
-        inner[rows] = _inner(charts.image(surface.share, chart), charts, chart, edge_mm).ravel()
+        inner[rows] = _inner(exposed[rows], charts, chart, edge_mm)
     noise = np.sqrt(np.maximum(noise, 1e-6))
     stray = np.bincount(pairs.cell, pairs.stray, cells)
     variance, seen = noise**2 / divisor, inner * (count + stray >= FEWEST_POINTS)
@@ -110,15 +111,22 @@ def _pooled(image: Floats, charts: Charts, chart: int) -> Floats:
     return np.maximum(mean, 0.0)
 
 
-def _inner(share: Floats, charts: Charts, chart: int, edge_mm: float) -> Floats:
-    """Mark cells that lie wholly on their face and ``edge_mm`` or more from its border."""
-    whole = np.pad(share > WHOLE_SHARE, 1)
+def _inner(exposed: Bools, charts: Charts, chart: int, edge_mm: float) -> Floats:
+    """Mark cells (n,) of a chart of which all that can be seen lies ``edge_mm`` or more from where their face ends.
+
+    ``exposed`` (n, samples) are the samples on the face that no other body touches: beams at a contact hit both bodies.
+    """
+    rows, columns = charts.shape[chart]
+    sample = charts.cell_mm / PER_SIDE
+    whole = exposed.reshape(rows, columns, PER_SIDE, PER_SIDE).transpose(0, 2, 1, 3)
+    whole = np.pad(whole.reshape(rows * PER_SIDE, columns * PER_SIDE), 1)
     if charts.kind[chart] == CYLINDER:  # no border at the seam
         whole[:, 0], whole[:, -1] = whole[:, -2], whole[:, 1]
         whole = np.concatenate([whole, whole, whole], axis=1)
-    distance = ndimage.distance_transform_edt(whole, sampling=charts.cell_mm) - 0.5 * charts.cell_mm
+    distance = ndimage.distance_transform_edt(whole, sampling=sample) - 0.5 * sample
     if charts.kind[chart] == CYLINDER:
-        wide = share.shape[1] + 2
+        wide = columns * PER_SIDE + 2
         distance = distance[:, wide : 2 * wide]
-    inner: Floats = (distance[1:-1, 1:-1] >= edge_mm).astype(float)
+    clear = (distance[1:-1, 1:-1] >= edge_mm).reshape(rows, PER_SIDE, columns, PER_SIDE)
+    inner: Floats = clear.all(axis=(1, 3)).ravel().astype(float)
     return inner

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from processor.deviation import assignment, enclosure
+from processor.deviation import assignment
 from processor.deviation import step as deviation_step
-from processor.geometry import mesh_distance
+from processor.geometry import enclosure, mesh_distance
 from processor.model import Scan, Scene, StructureDesign
 from tests.support.plate_clouds import SIGMA, STATIONS, plate
 
