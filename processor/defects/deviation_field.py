@@ -17,6 +17,7 @@ from processor.geometry.mesh_distance import Bools
 from processor.model import Floats, Ints
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
+ABOUT_CELLS, SEEN_SHARE = 3, 0.5  # side of the square about a cell, and the least share of it that was seen
 FEWEST_FREE = 20.0  # degrees of freedom below which the noise of all points is used
 PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that of the other side
 
@@ -26,9 +27,9 @@ class Field:
     """Deviation (mm, outward positive) of each cell (cells,), its variance from noise, and numbers of points.
 
     ``stray`` counts points that do not agree with the others of the cell. ``inner`` are cells away from their face's
-    border, ``seen`` those of them with enough points. ``stations`` is the variance by errors of the stations'
-    movements, which neighbouring cells have in common; 0 in cells without points. ``views`` is the standard deviation
-    of what the points of one view have in common, where views are not named, mm.
+    border, ``seen`` those of them with enough points, and about them as well. ``stations`` is the variance by errors of
+    the stations' movements, which neighbouring cells have in common; 0 in cells without points. ``views`` is the
+    standard deviation of what the points of one view have in common, where views are not named, mm.
     """
 
     deviation: Floats
@@ -81,6 +82,9 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     noise = np.sqrt(np.maximum(noise, 1e-6))
     stray = np.bincount(pairs.cell, pairs.stray, cells)
     variance, seen = noise**2 / divisor, inner * (count + stray >= FEWEST_POINTS)
+    for chart in range(len(charts.kind)):
+        rows = charts.cells(chart)
+        seen[rows] *= _amid(charts.image(seen, chart), charts.image(inner, chart), charts, chart).ravel()
     views = 0.0
     if stations.unnamed:
         used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
@@ -104,11 +108,18 @@ def component_of_cells(surface: DesignSurface) -> Ints:
     return component
 
 
-def _pooled(image: Floats, charts: Charts, chart: int) -> Floats:
-    """Return the means of an image over squares of POOLED_CELLS."""
+def _pooled(image: Floats, charts: Charts, chart: int, side: int = POOLED_CELLS) -> Floats:
+    """Return the means of an image over squares of ``side`` cells."""
     mode = ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
-    mean: Floats = ndimage.uniform_filter(image, POOLED_CELLS, mode=mode)
+    mean: Floats = ndimage.uniform_filter(image, side, mode=mode)
     return np.maximum(mean, 0.0)
+
+
+def _amid(seen: Floats, inner: Floats, charts: Charts, chart: int) -> Bools:
+    """Mark cells with half of the cells about them ``seen``: what lies alone on a face are beams past its edges."""
+    about, possible = (_pooled(image, charts, chart, ABOUT_CELLS) for image in (seen, inner))
+    amid: Bools = about > SEEN_SHARE * possible - 1e-9
+    return amid
 
 
 def _inner(exposed: Bools, charts: Charts, chart: int, edge_mm: float) -> Floats:
