@@ -150,9 +150,10 @@ def _fitted_shapes(
 ) -> tuple[Alignment, Field, list[ComponentShape]]:
     """Fit shapes of components; align the whole again without the components that have one, if that is more precise."""
     surface, pairs, stations = registered.surface, registered.pairs, registered.observed.stations
+    inner = deviation_field.inner_cells(surface, params.edge_mm)
 
     def fitted(aligned: Alignment) -> tuple[Alignment, Field, list[ComponentShape]]:
-        field = deviation_field.of_pairs(pairs, surface, stations, aligned, params.edge_mm)
+        field = deviation_field.of_pairs(pairs, surface, stations, aligned, inner)
         return aligned, field, component_shapes.fit_all(field, surface)
 
     first = fitted(registered.alignment)

@@ -58,8 +58,8 @@ class Field:
         return dataclasses.replace(self, seen=seen)
 
 
-def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, edge_mm: float) -> Field:
-    """Combine the observations of all stations by cell, corrected by the alignment."""
+def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, inner: Floats) -> Field:
+    """Combine the observations of all stations by cell, corrected by the alignment. ``inner`` (cells,): see Field."""
     cells = len(surface.share)
     points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
     rays = rays_to(points, stations.positions[pairs.station])
@@ -72,13 +72,11 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     charts = surface.charts
     noise = np.zeros(cells)
     overall = float(square.sum() / max(freedom.sum(), 1.0))
-    inner, exposed = np.zeros(cells), surface.covered & ~surface_charts.hidden(surface)
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
         pooled_square, pooled_freedom = (_pooled(charts.image(x, chart), charts, chart) for x in (square, freedom))
         known = pooled_freedom * POOLED_CELLS**2 > FEWEST_FREE
         noise[rows] = np.where(known, pooled_square / np.maximum(pooled_freedom, 1e-9), overall).ravel()
-        inner[rows] = _inner(exposed[rows], charts, chart, edge_mm)
     noise = np.sqrt(np.maximum(noise, 1e-6))
     stray = np.bincount(pairs.cell, pairs.stray, cells)
     variance, seen = noise**2 / divisor, inner * (count + stray >= FEWEST_POINTS)
@@ -120,6 +118,15 @@ def _amid(seen: Floats, inner: Floats, charts: Charts, chart: int) -> Bools:
     about, possible = (_pooled(image, charts, chart, ABOUT_CELLS) for image in (seen, inner))
     amid: Bools = about > SEEN_SHARE * possible - 1e-9
     return amid
+
+
+def inner_cells(surface: DesignSurface, edge_mm: float) -> Floats:
+    """Return 1 for cells (cells,) away from where their face can no longer be seen, and 0 for others."""
+    inner, exposed = np.zeros(len(surface.share)), surface.covered & ~surface_charts.hidden(surface)
+    for chart in range(len(surface.charts.kind)):
+        rows = surface.charts.cells(chart)
+        inner[rows] = _inner(exposed[rows], surface.charts, chart, edge_mm)
+    return inner
 
 
 def _inner(exposed: Bools, charts: Charts, chart: int, edge_mm: float) -> Floats:

@@ -125,20 +125,33 @@ def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
 
 def hidden(surface: DesignSurface) -> Bools:
     """Mark the samples (cells, samples) of cells that another body of the design touches or holds: none can be seen."""
-    charts = surface.charts
-    marked = np.zeros_like(surface.covered)
+    charts, marked = surface.charts, np.zeros_like(surface.covered)
+    along = np.repeat(charts.axes[:, 0], charts.shape.prod(axis=1), axis=0)
+    across = np.cross(surface.outward, along)
+    body = enclosure.closed_bodies(surface.faces)
+    near = np.flatnonzero(_near_bodies(surface, body, 0.5 * charts.cell_mm * (np.abs(along) + np.abs(across))))
+    centres, outward, along, across = (x[near] for x in (surface.centres, surface.outward, along, across))
     reach = max(float(np.linalg.norm(np.ptp(surface.vertices, axis=0))) * GRID_SHARE, charts.cell_mm)
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach)
-    middle = (np.arange(PER_SIDE) + 0.5) / PER_SIDE - 0.5
-    a, b = (charts.cell_mm * part.ravel() for part in np.meshgrid(middle, middle, indexing="ij"))
-    for chart in range(len(charts.kind)):
-        rows = charts.cells(chart)
-        cell, sample = np.nonzero(surface.covered[rows])
-        centres, outward = surface.centres[rows][cell], surface.outward[rows][cell]
-        along = charts.axes[chart, 0]
-        places = centres + a[sample, None] * along + b[sample, None] * np.cross(outward, along)
-        marked[rows][cell, sample] = enclosure.enclosed(places, outward, grid, surface.faces)
+    for sample in range(PER_SIDE**2):
+        a, b = (charts.cell_mm * ((k + 0.5) / PER_SIDE - 0.5) for k in divmod(sample, PER_SIDE))
+        on = surface.covered[near, sample]
+        marked[near[on], sample] = enclosure.enclosed((centres + a * along + b * across)[on], outward[on], grid, body)
     return marked
+
+
+def _near_bodies(surface: DesignSurface, body: Ints, halves: Floats) -> Bools:
+    """Mark cells, with half sides (cells, 3), that reach into the box about a closed body: no other can be hidden."""
+    low, high = enclosure.boxes(surface.vertices, surface.faces, body)
+    middles = surface.centres + enclosure.OUTSIDE_MM * surface.outward
+    first, last = middles - halves - WELD_MM, middles + halves + WELD_MM
+    near = np.zeros(len(middles), np.bool_)
+    for chart in range(len(surface.charts.kind)):
+        rows = surface.charts.cells(chart)
+        meet = (low <= last[rows].max(axis=0)) & (high >= first[rows].min(axis=0))
+        for k in np.flatnonzero(meet.all(axis=1)):
+            near[rows] |= ((low[k] <= last[rows]) & (high[k] >= first[rows])).all(axis=1)
+    return near
 
 
 def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:

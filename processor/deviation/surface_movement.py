@@ -59,7 +59,7 @@ def movement(
     """
     surface = curved.surface
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
-    within = enclosure.enclosed(core.points, core.normals, grid, surface.faces)
+    within = enclosure.enclosed(core.points, core.normals, grid, enclosure.closed_bodies(surface.faces))
     core = replace(core, normals=np.where(within[:, None], np.nan, core.normals))
     seen = assignment.assigned(cloud.points, cloud.scanner, curved, grid)
     near = np.abs(seen.distance) <= depth_mm

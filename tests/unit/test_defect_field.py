@@ -29,7 +29,7 @@ def pairs_of(surface, seed, mean=None):
 
 def field_of(surface, pairs, stations=NAMED):
     still = alignment.none(surface, 1, 0.0)
-    return deviation_field.of_pairs(pairs, surface, stations, still, EDGE)
+    return deviation_field.of_pairs(pairs, surface, stations, still, deviation_field.inner_cells(surface, EDGE))
 
 
 @pytest.mark.parametrize("cell", [5.0, 20.0, 25.0])
