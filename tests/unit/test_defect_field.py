@@ -53,6 +53,22 @@ def test_the_foot_of_a_rib_is_a_border_of_the_web():
     assert inner[away & inside].all()
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.7])
+def test_what_a_body_hides_is_the_area_of_the_contact(turn):
+    R = trimesh.transformations.rotation_matrix(turn, [1, 2, 3])
+    web, rib = ([[0, 0, 0], [2000, 20, 1000]], [[989, -130, 200], [1021, 0, 800]])
+    bodies = [trimesh.creation.box(bounds=np.array(bounds, float)) for bounds in (web, rib)]
+    mesh = trimesh.util.concatenate(bodies).apply_transform(R)
+    surface = surface_charts.of_mesh(np.array(mesh.vertices), np.array(mesh.faces, np.int64), 20.0)
+    hidden = surface_charts.hidden(surface) & surface.covered
+    up = surface.outward @ R[:3, :3] @ [0.0, -1.0, 0.0] > 0.5
+    foot = surface.outward @ R[:3, :3] @ [0.0, 1.0, 0.0] > 0.5
+    sample_mm2 = (20.0 / surface_charts.PER_SIDE) ** 2
+    for side in (up, foot):  # the web beneath the rib, and the rib's end
+        assert hidden[side].sum() * sample_mm2 == pytest.approx(32.0 * 600.0, rel=0.1)
+    assert not hidden[~(up | foot)].any()
+
+
 def test_points_alone_on_a_face_are_not_examined():
     surface = surface_of([[[0, 0, 0], [1000, 600, 400]]], 20.0)
     pairs = pairs_of(surface, 1)
