@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numba import njit
 
+from processor.adjustment import scanner_class
 from processor.defects.observations import Pairs, Stations
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import rigid
@@ -103,7 +104,8 @@ def align(
 ) -> Alignment:
     """Fit stations to each other, and the whole to the design if there are enough components.
 
-    ``excluded`` are components that moved or are deformed: the whole is fitted by the others.
+    ``excluded`` are components that moved or are deformed: the whole is fitted by the others. What views that are not
+    named have in common is added to the covariance by the class of scanners.
     """
     start = none(surface, len(stations.names), error_mm)
     blocks = _blocks(pairs, surface)
@@ -119,6 +121,8 @@ def align(
     if len(np.unique(component[used])) < FEWEST_COMPONENTS:
         return start
     whole, covariance, gain = _whole(residual[used], J[used, :6], component[used])
+    if stations.unnamed:
+        covariance = covariance + scanner_class.pose_covariance(points[used] - start.centre)
     response = np.zeros((6, station_covariance.shape[0]))
     for k in range(len(stations.names)):
         rows = np.flatnonzero(blocks.station[used] == k)

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from processor.adjustment import scanner_class
 from processor.defects import (
     alignment,
     component_shapes,
@@ -29,7 +31,7 @@ from processor.defects.params import Params
 from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import merging, mesh_distance, rigid
-from processor.model import Floats, InputError, Ints, Scene, Status, reason
+from processor.model import Floats, InputError, Ints, Reason, Scene, Status, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
 CELL_BOUNDS_MM = (5.0, 60.0)
@@ -73,11 +75,19 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         result,
         covariance=rigid.about_origin(search.alignment.pose_covariance(), search.alignment.centre + origin),
         status=pose.status if result.status is Status.OK else result.status,
-        reasons=(*pose.reasons, *result.reasons),
+        reasons=(*pose.reasons, *_of_views(search), *result.reasons),
         T_design_project=rigid.transform(np.eye(3), origin) @ T,
         points=registered.observed.points,
         points_used=len(registered.observed.chart),
     )
+
+
+def _of_views(search: to_result.Search) -> Iterator[Reason]:
+    """Yield what is taken of the errors of views that are not named."""
+    if search.points.observed.stations.unnamed and search.alignment.fitted:
+        yield reason("defects.views-by-class", shift=scanner_class.SHIFT_MM, offset=scanner_class.OFFSET_MM)
+    if search.field.views > 0.0:
+        yield reason("defects.views-differ", sd=search.field.views)
 
 
 def _registered(
@@ -140,9 +150,10 @@ def _fitted_shapes(
 ) -> tuple[Alignment, Field, list[ComponentShape]]:
     """Fit shapes of components; align the whole again without the components that have one, if that is more precise."""
     surface, pairs, stations = registered.surface, registered.pairs, registered.observed.stations
+    inner = deviation_field.inner_cells(surface, params.edge_mm)
 
     def fitted(aligned: Alignment) -> tuple[Alignment, Field, list[ComponentShape]]:
-        field = deviation_field.of_pairs(pairs, surface, stations, aligned, params.edge_mm)
+        field = deviation_field.of_pairs(pairs, surface, stations, aligned, inner)
         return aligned, field, component_shapes.fit_all(field, surface)
 
     first = fitted(registered.alignment)

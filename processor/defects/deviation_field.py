@@ -8,14 +8,18 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import ndimage
 
+from processor.adjustment import opposite_sides
+from processor.defects import surface_charts
 from processor.defects.alignment import Alignment, chart_of_cells, rays_to, station_variance
 from processor.defects.observations import FEWEST_POINTS, Pairs, Stations
-from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
+from processor.defects.surface_charts import CYLINDER, PER_SIDE, Charts, DesignSurface
+from processor.geometry.mesh_distance import Bools
 from processor.model import Floats, Ints
 
 POOLED_CELLS = 9  # side of the square over which noise is pooled
+ABOUT_CELLS, SEEN_SHARE = 3, 0.5  # side of the square about a cell, and the least share of it that was seen
 FEWEST_FREE = 20.0  # degrees of freedom below which the noise of all points is used
-WHOLE_SHARE = 0.99  # of a cell that its face covers, from which the cell is whole
+PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that of the other side
 
 
 @dataclass(frozen=True)
@@ -23,8 +27,9 @@ class Field:
     """Deviation (mm, outward positive) of each cell (cells,), its variance from noise, and numbers of points.
 
     ``stray`` counts points that do not agree with the others of the cell. ``inner`` are cells away from their face's
-    border, ``seen`` those of them with enough points. ``stations`` is the variance by errors of the stations'
-    movements, which neighbouring cells have in common; 0 in cells without points.
+    border, ``seen`` those of them with enough points, and about them as well. ``stations`` is the variance by errors of
+    the stations' movements, which neighbouring cells have in common; 0 in cells without points. ``views`` is the
+    standard deviation of what the points of one view have in common, where views are not named, mm.
     """
 
     deviation: Floats
@@ -35,11 +40,12 @@ class Field:
     inner: Floats  # 0 or 1
     seen: Floats  # 0 or 1
     stations: Floats
+    views: float = 0.0
 
     def stations_sd(self, cells: Ints) -> float:
-        """Return the standard deviation that cells have in common by errors of the stations' movements, mm."""
+        """Return the standard deviation that cells have in common by errors of stations' movements or of views, mm."""
         variance = self.stations[cells][self.count[cells] > 0]
-        return float(np.sqrt(variance.mean())) if len(variance) else 0.0
+        return float(np.sqrt(variance.mean() + self.views**2)) if len(variance) else self.views
 
     def less(self, shape: Floats) -> Field:
         """Return the field less a shape (cells,)."""
@@ -52,8 +58,8 @@ class Field:
         return dataclasses.replace(self, seen=seen)
 
 
-def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, edge_mm: float) -> Field:
-    """Combine the observations of all stations by cell, corrected by the alignment."""
+def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment: Alignment, inner: Floats) -> Field:
+    """Combine the observations of all stations by cell, corrected by the alignment. ``inner`` (cells,): see Field."""
     cells = len(surface.share)
     points, outward = surface.centres[pairs.cell], surface.outward[pairs.cell]
     rays = rays_to(points, stations.positions[pairs.station])
@@ -66,24 +72,31 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
     charts = surface.charts
     noise = np.zeros(cells)
     overall = float(square.sum() / max(freedom.sum(), 1.0))
-    inner = np.zeros(cells)
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
         pooled_square, pooled_freedom = (_pooled(charts.image(x, chart), charts, chart) for x in (square, freedom))
         known = pooled_freedom * POOLED_CELLS**2 > FEWEST_FREE
         noise[rows] = np.where(known, pooled_square / np.maximum(pooled_freedom, 1e-9), overall).ravel()
-        inner[rows] = _inner(charts.image(surface.share, chart), charts, chart, edge_mm).ravel()
     noise = np.sqrt(np.maximum(noise, 1e-6))
     stray = np.bincount(pairs.cell, pairs.stray, cells)
+    variance, seen = noise**2 / divisor, inner * (count + stray >= FEWEST_POINTS)
+    for chart in range(len(charts.kind)):
+        rows = charts.cells(chart)
+        seen[rows] *= _amid(charts.image(seen, chart), charts.image(inner, chart), charts, chart).ravel()
+    views = 0.0
+    if stations.unnamed:
+        used, side = np.flatnonzero(seen * count), PIECE_CELLS * charts.cell_mm
+        views = opposite_sides.view_sd(surface.centres[used], surface.outward[used], mean[used], variance[used], side)
     return Field(
         deviation=mean,
-        variance=noise**2 / divisor,
+        variance=variance,
         count=count.astype(np.int64),
         stray=stray.astype(np.int64),
         noise=noise,
         inner=inner,
-        seen=inner * (count + stray >= FEWEST_POINTS),
+        seen=seen,
         stations=station_variance(pairs, surface, stations, alignment),
+        views=views,
     )
 
 
@@ -93,22 +106,45 @@ def component_of_cells(surface: DesignSurface) -> Ints:
     return component
 
 
-def _pooled(image: Floats, charts: Charts, chart: int) -> Floats:
-    """Return the means of an image over squares of POOLED_CELLS."""
+def _pooled(image: Floats, charts: Charts, chart: int, side: int = POOLED_CELLS) -> Floats:
+    """Return the means of an image over squares of ``side`` cells."""
     mode = ("constant", "wrap" if charts.kind[chart] == CYLINDER else "constant")
-    mean: Floats = ndimage.uniform_filter(image, POOLED_CELLS, mode=mode)
+    mean: Floats = ndimage.uniform_filter(image, side, mode=mode)
     return np.maximum(mean, 0.0)
 
 
-def _inner(share: Floats, charts: Charts, chart: int, edge_mm: float) -> Floats:
-    """Mark cells that lie wholly on their face and ``edge_mm`` or more from its border."""
-    whole = np.pad(share > WHOLE_SHARE, 1)
+def _amid(seen: Floats, inner: Floats, charts: Charts, chart: int) -> Bools:
+    """Mark cells with half of the cells about them ``seen``: what lies alone on a face are beams past its edges."""
+    about, possible = (_pooled(image, charts, chart, ABOUT_CELLS) for image in (seen, inner))
+    amid: Bools = about > SEEN_SHARE * possible - 1e-9
+    return amid
+
+
+def inner_cells(surface: DesignSurface, edge_mm: float) -> Floats:
+    """Return 1 for cells (cells,) away from where their face can no longer be seen, and 0 for others."""
+    inner, exposed = np.zeros(len(surface.share)), surface.covered & ~surface_charts.hidden(surface)
+    for chart in range(len(surface.charts.kind)):
+        rows = surface.charts.cells(chart)
+        inner[rows] = _inner(exposed[rows], surface.charts, chart, edge_mm)
+    return inner
+
+
+def _inner(exposed: Bools, charts: Charts, chart: int, edge_mm: float) -> Floats:
+    """Mark cells (n,) of a chart of which all that can be seen lies ``edge_mm`` or more from where their face ends.
+
+    ``exposed`` (n, samples) are the samples on the face that no other body touches: beams at a contact hit both bodies.
+    """
+    rows, columns = charts.shape[chart]
+    sample = charts.cell_mm / PER_SIDE
+    whole = exposed.reshape(rows, columns, PER_SIDE, PER_SIDE).transpose(0, 2, 1, 3)
+    whole = np.pad(whole.reshape(rows * PER_SIDE, columns * PER_SIDE), 1)
     if charts.kind[chart] == CYLINDER:  # no border at the seam
         whole[:, 0], whole[:, -1] = whole[:, -2], whole[:, 1]
         whole = np.concatenate([whole, whole, whole], axis=1)
-    distance = ndimage.distance_transform_edt(whole, sampling=charts.cell_mm) - 0.5 * charts.cell_mm
+    distance = ndimage.distance_transform_edt(whole, sampling=sample) - 0.5 * sample
     if charts.kind[chart] == CYLINDER:
-        wide = share.shape[1] + 2
+        wide = columns * PER_SIDE + 2
         distance = distance[:, wide : 2 * wide]
-    inner: Floats = (distance[1:-1, 1:-1] >= edge_mm).astype(float)
+    clear = (distance[1:-1, 1:-1] >= edge_mm).reshape(rows, PER_SIDE, columns, PER_SIDE)
+    inner: Floats = clear.all(axis=(1, 3)).ravel().astype(float)
     return inner

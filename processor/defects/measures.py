@@ -122,9 +122,9 @@ def measure(
     along = surface.charts.axes[region.chart, 0]
     across = np.cross(outward, along)
     longest = turn[0, 1] * along + turn[1, 1] * across
-    registration = float(np.hypot(alignment.sd(place[None], outward[None])[0], field.stations_sd(rows)))
+    registration = registration_sd(alignment, field, place, outward, rows)
     edge, borders = _borders(region, surface, middle)
-    volume, volume_sd = _volume(region, field, surface)
+    volume, volume_sd, summed = _volume(region, field, surface)
     if region.sign == 0:
         # Missing: the uncertainty of the volume is that of the border's cells, which are missing in part.
         mean_sd = inflation / np.sqrt(np.sum(1.0 / np.maximum(variance, 1e-12)))
@@ -135,7 +135,7 @@ def measure(
         depth = _deepest(region, field, surface, inflation)
         depth_ci95 = NORMAL_95 * float(np.hypot(depth.sd, registration))
         mean = -float((deviation * area).sum() / total)
-        volume_ci95 = NORMAL_95 * float(np.hypot(volume_sd * inflation, registration * total))
+        volume_ci95 = NORMAL_95 * float(np.hypot(volume_sd * inflation, registration * summed))
     return Measures(
         centre=place + (middle - uv[closest]) @ np.stack([along, across]),
         axes=np.stack([longest, np.cross(outward, longest), outward]),
@@ -152,6 +152,11 @@ def measure(
         diameter=float(2.0 * np.sqrt(total / np.pi)),
         borders=borders,
     )
+
+
+def registration_sd(alignment: Alignment, field: Field, place: Floats, outward: Floats, cells: Ints) -> float:
+    """Return the standard deviation that all ``cells`` about a place (3,) have in common, mm: of poses and of views."""
+    return float(np.hypot(alignment.sd(place[None], outward[None])[0], field.stations_sd(cells)))
 
 
 def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: Bools) -> PlaceCells | None:
@@ -184,8 +189,8 @@ def cells_about(region: Region, field: Field, surface: DesignSurface, claimed: B
     )
 
 
-def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float]:
-    """Return the volume inward and its standard deviation from noise, with a border about the region.
+def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float, float, float]:
+    """Return the volume inward, its standard deviation from noise, and the area, with a border about the region.
 
     Cells of the border are too shallow to be significant one by one, but add up.
     """
@@ -197,7 +202,8 @@ def _volume(region: Region, field: Field, surface: DesignSurface) -> tuple[float
     rows = charts.first[chart] + np.flatnonzero(grown.ravel())
     rows = rows[(field.seen[rows] > 0) | mask[rows - charts.first[chart]]]
     area = surface.share[rows] * charts.cell_mm**2
-    return -float(field.deviation[rows] @ area), float(np.sqrt((field.variance[rows] * area**2).sum()))
+    sd = float(np.sqrt((field.variance[rows] * area**2).sum()))
+    return -float(field.deviation[rows] @ area), sd, float(area.sum())
 
 
 def _deepest(region: Region, field: Field, surface: DesignSurface, inflation: float) -> Depth:
@@ -304,7 +310,9 @@ def thickness_at(
     return float(t[hit].min()) if hit.any() else float("nan")
 
 
-def refined(measured: Measures, region: Region, points: CellPoints, field: Field, shape_values: Floats) -> Measures:
+def refined(
+    measured: Measures, region: Region, points: CellPoints, field: Field, shape_values: Floats, inflation: float
+) -> Measures:
     """Return measures with the depth of a bump d exp(-(r / R)^q) fitted to the points; unchanged without a fit.
 
     For small dents and pits: cells average their depth. The exponent q covers round and flat bottoms.
@@ -338,4 +346,6 @@ def refined(measured: Measures, region: Region, points: CellPoints, field: Field
     if not (fit.success and plausible and sd < 0.5 * abs(depth)):
         return measured
     curvature = 2.0 * abs(depth) / (fit.x[2] * radius) ** 2 * 1000.0
-    return dataclasses.replace(measured, depth=depth, depth_ci95=NORMAL_95 * sd, curvature=curvature)
+    registration = registration_sd(points.alignment, field, measured.centre, measured.axes[2], region.cells)
+    ci95 = NORMAL_95 * float(np.hypot(sd * inflation, registration))
+    return dataclasses.replace(measured, depth=depth, depth_ci95=ci95, curvature=curvature)

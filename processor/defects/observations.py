@@ -25,6 +25,11 @@ class Stations:
     names: tuple[str, ...]
     positions: Floats
 
+    @property
+    def unnamed(self) -> bool:
+        """Whether the scan may be merged from several views of which nothing is known."""
+        return len(self.names) == 1 and not np.isfinite(self.positions).all()
+
 
 @dataclass(frozen=True)
 class Observed:

@@ -75,9 +75,9 @@ def levels_of(field: Field, surface: DesignSurface, alarms_per_mm2: float, syste
         if len(z) < FEWEST_WINDOWS:
             scatter.append(scatter[-1] if scatter else 1.0)
             continue
-        observed = _robust_sd(z)
-        scatter.append(max(1.0, observed))
-        common = float(np.sqrt(max(observed**2 - 1.0, 0.0)) * np.median(sd))
+        surplus = _surplus(z, sd, field.views)
+        scatter.append(float(np.sqrt(1.0 + surplus)))
+        common = float(np.sqrt(surplus) * np.median(sd))
     cell = charts.cell_mm
     kinds = len(sides) + len(LINE_CELLS)
     windows = kinds / np.array([max(1, side // 4) * cell for side in sides]) ** 2
@@ -124,8 +124,10 @@ def _windows(field: Field, charts: Charts, used: list[int], side: int) -> tuple[
     return np.concatenate(z), np.concatenate(sd)
 
 
-def _robust_sd(values: Floats) -> float:
-    return 1.4826 * float(np.median(np.abs(values - np.median(values))))
+def _surplus(z: Floats, sd: Floats, views_mm: float) -> float:
+    """Return the variance of means by their formal standard deviations (n,), less 1 and that of unnamed views."""
+    scatter = 1.4826 * float(np.median(np.abs(z - np.median(z))))
+    return max(scatter**2 - 1.0 - (views_mm / float(np.median(sd))) ** 2, 0.0)
 
 
 def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> Finding:
@@ -133,6 +135,7 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
     shape = tuple(charts.shape[chart])
     finding = Finding(np.zeros(shape, np.int8), np.zeros(shape), np.full(shape, np.inf))
     sign = finding.sign
+    systematic = float(np.hypot(levels.systematic_mm, field.views))
     for side, inflation, threshold, per_mm2 in zip(
         levels.sides, levels.inflation, levels.threshold, levels.per_mm2, strict=True
     ):
@@ -140,20 +143,24 @@ def _search_chart(field: Field, charts: Charts, chart: int, levels: Levels) -> F
             break
         top, weight = _window_sums(field, charts, chart, side, sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            z = np.where(weight > 0.0, top / weight / np.hypot(inflation / np.sqrt(weight), levels.systematic_mm), 0.0)
+            z = np.where(weight > 0.0, top / weight / np.hypot(inflation / np.sqrt(weight), systematic), 0.0)
         if side == LINES_AFTER:
             _search_lines(field, charts, chart, levels, finding)
         if not (np.abs(z) > threshold).any():
             continue
         small_top, small_weight = _smoothed(field, charts, chart, max(1, side // 2), sign != 0)
         with np.errstate(invalid="ignore", divide="ignore"):
-            local_z = np.where(small_weight > 0.0, small_top / np.sqrt(small_weight), 0.0) / inflation
+            small_sd = np.hypot(inflation / np.sqrt(small_weight), field.views)
+            local_z = np.where(small_weight > 0.0, small_top / small_weight / small_sd, 0.0)
         for direction in (-1, 1):
             hits = direction * z > threshold
             if not hits.any():
                 continue
-            covered, best = _spread(np.where(hits, direction * z, 0.0), side, shape)
-            grown = _whole_pieces(covered & (direction * local_z > GROWTH) & (sign == 0), covered)
+            # What views differ by raises the threshold alike for the middle of a region and for what is around it.
+            least = GROWTH if field.views else threshold
+            covered, best = _spread(np.where(direction * z > least, direction * z, 0.0), side, shape)
+            grown = covered & (direction * local_z > GROWTH) & (sign == 0)
+            grown = _whole_pieces(_pieces_with(grown, best > threshold), covered)
             sign[grown] = direction
             finding.z[grown] = best[grown]
             finding.chance[grown] = 2.0 * ndtr(-best[grown]) * per_mm2
@@ -164,6 +171,7 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
     """Search lines of cells in LINE_TURNS directions, for what is narrower than a window and long; add to a finding."""
     top, weight = _images(field, charts, chart, finding.sign != 0)
     seen = (weight > 0.0).astype(float)
+    systematic = float(np.hypot(levels.systematic_mm, field.views))
     for length in LINE_CELLS:
         if length > max(top.shape):
             continue
@@ -171,7 +179,7 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
             offsets = _line(length, np.pi * turn / LINE_TURNS)
             sum_top, sum_weight, number = (sum(_shifted(x, i, j) for i, j in offsets) for x in (top, weight, seen))
             with np.errstate(invalid="ignore", divide="ignore"):
-                sd = np.hypot(levels.line_inflation / np.sqrt(sum_weight), levels.systematic_mm)
+                sd = np.hypot(levels.line_inflation / np.sqrt(sum_weight), systematic)
                 z = np.where(number >= COVERED * length, sum_top / sum_weight / sd, 0.0)
             for direction in (-1, 1):
                 for i, j in np.argwhere(direction * z > levels.line_threshold):
@@ -188,7 +196,7 @@ def _search_lines(field: Field, charts: Charts, chart: int, levels: Levels, find
 
 def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:
     """Return by how much the means of lines along the grid scatter more than by independent noise."""
-    scores = [np.empty(0)]
+    scores, sds = [np.empty(0)], [np.empty(0)]
     for chart in used:
         top, weight = _images(field, charts, chart, None)
         for axis in (0, 1):
@@ -198,9 +206,10 @@ def _line_inflation(field: Field, charts: Charts, used: list[int]) -> float:
                 for x in (top, weight, (weight > 0.0).astype(float))
             )
             enough = number >= COVERED * length
-            scores.append(sum_top[enough] / np.sqrt(sum_weight[enough]))
+            sds.append(1.0 / np.sqrt(sum_weight[enough]))
+            scores.append(sum_top[enough] * sds[-1])
     z = np.concatenate(scores)
-    return max(1.0, _robust_sd(z)) if len(z) >= FEWEST_WINDOWS else 1.0
+    return float(np.sqrt(1.0 + _surplus(z, np.concatenate(sds), field.views))) if len(z) >= FEWEST_WINDOWS else 1.0
 
 
 def _line(length: int, angle: float) -> list[tuple[int, int]]:
@@ -235,6 +244,16 @@ def _whole_pieces(cells: Bools, windows: Bools) -> Bools:
     np.maximum.at(largest, cluster_of[1:], sizes[1:])
     large = np.concatenate([[False], sizes[1:] >= PIECE_SHARE * largest[cluster_of[1:]]])
     pieces: Bools = large[label]
+    return pieces
+
+
+def _pieces_with(cells: Bools, some: Bools) -> Bools:
+    """Return the connected pieces of cells that have some of the given ones."""
+    label, count = ndimage.label(cells, EIGHT_NEIGHBOURS)
+    held = np.zeros(count + 1, np.bool_)
+    held[label[some]] = True
+    held[0] = False
+    pieces: Bools = held[label]
     return pieces
 
 

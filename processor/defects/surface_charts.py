@@ -14,7 +14,8 @@ from numba import njit
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from processor.geometry import mesh_distance
+from processor.geometry import enclosure, mesh_distance
+from processor.geometry.mesh_distance import Bools
 from processor.model import Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
@@ -25,6 +26,7 @@ TOUCH_MM = 0.5
 MOST_BODIES = 12  # of a component
 MOST_SIDES = 60  # edges tried for the direction of a face
 PLANE, CYLINDER = 0, 1
+GRID_SHARE = 0.01  # voxel by the design's size, to find bodies
 PER_SIDE = 4  # samples of a cell along each axis, for the share that its face covers
 
 
@@ -59,7 +61,10 @@ class Charts:
 
 @dataclass(frozen=True)
 class DesignSurface:
-    """A design's facets with their charts, and their cells; ``share`` is the part of a cell that its face covers."""
+    """A design's facets with their charts, and their cells; ``share`` is the part of a cell that its face covers.
+
+    ``covered`` marks the samples of a cell that are on its face, row by row of PER_SIDE x PER_SIDE.
+    """
 
     vertices: Floats
     faces: Ints
@@ -67,6 +72,7 @@ class DesignSurface:
     chart_of: Ints  # (f,)
     component_of: Ints  # (f,)
     charts: Charts
+    covered: Bools  # (cells, samples)
     share: Floats  # (cells,)
     centres: Floats  # (cells, 3)
     outward: Floats  # (cells, 3)
@@ -91,6 +97,7 @@ def of_mesh(vertices: Floats, faces: Ints, cell_mm: float) -> DesignSurface:
         chart_of=chart_of,
         component_of=component,
         charts=_charts(vertices, faces, normals, chart_of, component),
+        covered=np.empty((0, PER_SIDE**2), np.bool_),
         share=np.empty(0),
         centres=np.empty((0, 3)),
         outward=np.empty((0, 3)),
@@ -103,15 +110,48 @@ def gridded(surface: DesignSurface, cell_mm: float) -> DesignSurface:
     """Return the surface with cells of another size."""
     vertices, faces, chart_of = surface.vertices, surface.faces, surface.chart_of
     charts = _with_cells(surface, cell_mm)
-    share = np.zeros(int(charts.shape.prod(axis=1).sum()))
+    covered = np.zeros((int(charts.shape.prod(axis=1).sum()), PER_SIDE**2), np.bool_)
     a, b, c = (layout(charts, chart_of, vertices[faces[:, k]]) for k in range(3))
     turn = 2.0 * np.pi * charts.radius[chart_of]
     closed = charts.kind[chart_of] == CYLINDER
     for corner in (b, c):  # of a facet that lies across the seam
         corner[:, 1] += np.where(closed, np.round((a[:, 1] - corner[:, 1]) / turn), 0.0) * np.where(closed, turn, 0.0)
-    rasterise(a, b, c, chart_of, charts.low, charts.shape, charts.first, cell_mm, share)
+    rasterise(a, b, c, chart_of, charts.low, charts.shape, charts.first, cell_mm, covered)
     centres, outward = _cell_places(charts)
-    return dataclasses.replace(surface, charts=charts, share=np.minimum(share, 1.0), centres=centres, outward=outward)
+    return dataclasses.replace(
+        surface, charts=charts, covered=covered, share=covered.mean(axis=1), centres=centres, outward=outward
+    )
+
+
+def hidden(surface: DesignSurface) -> Bools:
+    """Mark the samples (cells, samples) of cells that another body of the design touches or holds: none can be seen."""
+    charts, marked = surface.charts, np.zeros_like(surface.covered)
+    along = np.repeat(charts.axes[:, 0], charts.shape.prod(axis=1), axis=0)
+    across = np.cross(surface.outward, along)
+    body = enclosure.closed_bodies(surface.faces)
+    near = np.flatnonzero(_near_bodies(surface, body, 0.5 * charts.cell_mm * (np.abs(along) + np.abs(across))))
+    centres, outward, along, across = (x[near] for x in (surface.centres, surface.outward, along, across))
+    reach = max(float(np.linalg.norm(np.ptp(surface.vertices, axis=0))) * GRID_SHARE, charts.cell_mm)
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach)
+    for sample in range(PER_SIDE**2):
+        a, b = (charts.cell_mm * ((k + 0.5) / PER_SIDE - 0.5) for k in divmod(sample, PER_SIDE))
+        on = surface.covered[near, sample]
+        marked[near[on], sample] = enclosure.enclosed((centres + a * along + b * across)[on], outward[on], grid, body)
+    return marked
+
+
+def _near_bodies(surface: DesignSurface, body: Ints, halves: Floats) -> Bools:
+    """Mark cells, with half sides (cells, 3), that reach into the box about a closed body: no other can be hidden."""
+    low, high = enclosure.boxes(surface.vertices, surface.faces, body)
+    middles = surface.centres + enclosure.OUTSIDE_MM * surface.outward
+    first, last = middles - halves - WELD_MM, middles + halves + WELD_MM
+    near = np.zeros(len(middles), np.bool_)
+    for chart in range(len(surface.charts.kind)):
+        rows = surface.charts.cells(chart)
+        meet = (low <= last[rows].max(axis=0)) & (high >= first[rows].min(axis=0))
+        for k in np.flatnonzero(meet.all(axis=1)):
+            near[rows] |= ((low[k] <= last[rows]) & (high[k] >= first[rows])).all(axis=1)
+    return near
 
 
 def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
@@ -289,9 +329,9 @@ def rasterise(
     shape: Ints,
     first: Ints,
     cell_mm: float,
-    share: Floats,
+    covered: Bools,
 ) -> None:
-    """Add to ``share`` (cells,) the part of the cells that triangles with corners a, b, c (f, 2) cover."""
+    """Mark in ``covered`` (cells, samples) the samples of cells that triangles with corners a, b, c (f, 2) cover."""
     step = cell_mm / PER_SIDE
     for f in range(len(a)):
         k = chart_of[f]
@@ -312,4 +352,5 @@ def rasterise(
                 q = ((cu - u) * (av - v) - (cv - v) * (au - u)) / turn
                 if p >= -1e-9 and q >= -1e-9 and p + q <= 1.0 + 1e-9:
                     row, column = i // PER_SIDE, (j % nv) // PER_SIDE
-                    share[first[k] + row * shape[k, 1] + column] += 1.0 / (PER_SIDE * PER_SIDE)
+                    sample = (i % PER_SIDE) * PER_SIDE + (j % nv) % PER_SIDE
+                    covered[first[k] + row * shape[k, 1] + column, sample] = True

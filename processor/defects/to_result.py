@@ -75,9 +75,8 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
     surface, field = search.surface, search.field
     seen = field.seen > 0
     cell = surface.charts.cell_mm
-    registration = np.hypot(
-        search.alignment.sd(surface.centres[seen], surface.outward[seen]), np.sqrt(field.stations[seen])
-    )
+    of_pose = search.alignment.sd(surface.centres[seen], surface.outward[seen])
+    registration = np.sqrt(of_pose**2 + field.stations[seen] + field.views**2)
     noise = finite_median(field.noise[seen])
     formal = np.sqrt(field.variance[seen]) * search.levels.inflation[0]
     examined = float(surface.share[seen].sum()) * cell**2
@@ -95,18 +94,18 @@ def result_of(search: Search, params: Params, origin: Floats, doubt: Reason | No
         lod95=NORMAL_95 * finite_median(np.hypot(formal, registration)),
         examined_mm2=examined,
         expected_mm2=float(surface.share[search.expected > 0.0].sum()) * cell**2,
-        least_depth=_least_depth(search.levels, cell, noise, finite_median(field.count[seen])),
+        least_depth=_least_depth(search.levels, cell, noise, finite_median(field.count[seen]), field.views),
         defects=table([defect.values for defect in defects], origin, doubt),
         pictures=pictures.of_defects(drawn, surface),
         surface=pictures.of_surface([defect.cells for defect in defects], field, surface, origin),
     )
 
 
-def _least_depth(levels: Levels, cell: float, noise: float, points: float) -> Windows:
+def _least_depth(levels: Levels, cell: float, noise: float, points: float, views: float) -> Windows:
     """Return the least mean depth that is found, by size of window, for cells of median noise and points."""
     sides = np.array(levels.sides)
     sd = levels.inflation * noise / np.sqrt(points) / sides
-    depth = levels.threshold * np.hypot(sd, levels.systematic_mm)
+    depth = levels.threshold * np.sqrt(sd**2 + levels.systematic_mm**2 + views**2)
     return Windows(side=sides * cell, depth=depth, noise_inflation=levels.inflation)
 
 
@@ -320,7 +319,7 @@ def _place_values(
         classification = classes.of_deviation(region.sign, measured.diameter, length, width, assumed, region.z)
         crack = classification.defect_class is DefectClass.CRACK
         if measured.diameter < SMALL_CELLS * cell and not crack:
-            measured = measures.refined(measured, region, search.points, search.field, search.shape_values)
+            measured = measures.refined(measured, region, search.points, search.field, search.shape_values, inflation)
         if not abs(measured.depth) > measured.lod95:
             return None  # significant only together with the defect beside it
         if crack:
@@ -371,9 +370,8 @@ def _by_profile(
     fitted = None if cells is None else profiles.fit(cells, region.sign)
     if fitted is None or fitted.profile is Profile.BUMP:
         return classification, measured, ()
-    registration = float(np.hypot(
-        search.alignment.sd(measured.centre[None], measured.axes[2:])[0], search.residuals.stations_sd(region.cells)
-    ))  # fmt: skip
+    place, outward = measured.centre, measured.axes[2]
+    registration = measures.registration_sd(search.alignment, search.residuals, place, outward, region.cells)
     measured = dataclasses.replace(
         measured, depth=-fitted.depth, depth_ci95=NORMAL_95 * float(np.hypot(fitted.sd * inflation, registration))
     )

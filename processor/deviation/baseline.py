@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from processor.adjustment.groups import group_means
 from processor.deviation import cloud, to_result
 from processor.deviation import measure as deviation_measure
 from processor.deviation.cloud import ScanCloud
@@ -32,8 +33,8 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
     preset = params.paper
     design = mesh_distance.sampled(vertices, scene.structure.faces, scan.spacing_mm)
     group = cloud.adaptive_voxels(design.points, preset.voxel_mm, preset.voxel_points)
-    core = cloud.group_means(design.points, group)
-    towards = cloud.group_means(design.normals, group)
+    core = group_means(design.points, group)
+    towards = group_means(design.normals, group)
     T, error, ambiguity = _registered(scan, core, origin, params)
     grid = m3c2.grid(design.points, preset.projection_diameter_mm)
     normals = m3c2.oriented(m3c2.normals(grid, core, preset.normal_diameter_mm).normals, towards)
@@ -85,7 +86,7 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
 def _registered(scan: ScanCloud, core: Floats, origin: Floats, params: Params) -> tuple[Floats, float, float]:
     """Pose T (4, 4) of the scan in the design's local frame, registration error in mm, and ambiguity."""
     preset = params.paper
-    reduced = cloud.group_means(scan.points, cloud.adaptive_voxels(scan.points, preset.voxel_mm, preset.voxel_points))
+    reduced = group_means(scan.points, cloud.adaptive_voxels(scan.points, preset.voxel_mm, preset.voxel_points))
     target, source = thinned(core, MOST_ICP_POINTS), thinned(reduced, MOST_ICP_POINTS)
     if params.register in ("none", "fine"):
         T, ambiguity = rigid.transform(np.eye(3), scan.origin - origin), NAN

@@ -129,13 +129,6 @@ def adaptive_voxels(points: Floats, size_mm: float, least: int) -> Ints:
     return group
 
 
-def group_means(values: Floats, group: Ints) -> Floats:
-    """Means (g, 3) of values (n, 3) in groups (n,)."""
-    count = np.bincount(group)
-    total: Floats = np.stack([np.bincount(group, values[:, k]) for k in range(values.shape[1])], axis=1)
-    return total / count[:, None]
-
-
 def _voxels(points: Floats, size: float) -> tuple[Ints, Ints]:
     """Return the number (n,) of each point's voxel, and points (v,) in each."""
     cell = np.floor(points / size).astype(np.int64)

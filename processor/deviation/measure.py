@@ -8,14 +8,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from processor.adjustment import scanner_class
-from processor.deviation import opposite_sides, stable_fit, surface_movement, to_result
+from processor.adjustment import opposite_sides, scanner_class
+from processor.deviation import stable_fit, surface_movement, to_result
 from processor.deviation.cloud import ScanCloud
 from processor.deviation.local_translation import Movement
 from processor.deviation.params import Params
 from processor.deviation.placement import Placement, place
 from processor.deviation.result import ErrorSource, Result
 from processor.deviation.stable_fit import Fits
+from processor.deviation.station_offsets import CELL_DIAMETERS
 from processor.deviation.surface_movement import Cloud
 from processor.geometry import m3c2, mesh_distance, rigid, surface_registration
 from processor.geometry.m3c2 import Distances
@@ -109,7 +110,10 @@ def _measured(scan: ScanCloud, curved: CurvedFacets, T: Floats, params: Params, 
     moved, share, shared = surface_movement.movement(cloud, core, curved, diameter, depth)
     views = 0.0
     if scan.unnamed_views:
-        views = opposite_sides.view_sd(core, moved, diameter, stable_fit.overlap(diameter, core_spacing))
+        # Each scanned point counts at ``overlap`` core points.
+        variance = stable_fit.overlap(diameter, core_spacing) * moved.sd**2 / np.maximum(moved.count, 1)
+        side = CELL_DIAMETERS * diameter
+        views = opposite_sides.view_sd(core.points, core.normals, moved.along, variance, side)
     return Measured(
         core=core, moved=moved, shared=np.hypot(shared, views), views=views, diameter=diameter, spacing=core_spacing,
         depth=depth, on_surface=share,

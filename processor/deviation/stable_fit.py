@@ -16,6 +16,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
+from processor.adjustment.opposite_sides import CHI2_MEDIAN
 from processor.deviation.local_translation import Movement
 from processor.geometry import rigid
 from processor.geometry.m3c2 import Z95
@@ -34,7 +35,6 @@ TUKEY = 4.685  # standard deviations at which the weight is 0: 95 % efficient fo
 AGREES = 2.5  # standard deviations within which a block agrees with a motion
 MOST_CONDITION = 1e10
 FEWEST_CLUSTERS = 12  # for a sandwich with six unknowns
-CHI2_MEDIAN = 0.4549  # of chi-squared with one degree of freedom
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,8 @@ import numpy.typing as npt
 from scipy.spatial import cKDTree
 from scipy.special import stdtrit
 
+from processor.adjustment.groups import pieces
+from processor.adjustment.opposite_sides import SURE
 from processor.deviation.local_translation import Movement
 from processor.geometry.m3c2 import Z95
 from processor.geometry.mesh_distance import Samples
@@ -20,7 +22,6 @@ from processor.model import Floats, Ints
 CELL_DIAMETERS = 3.0  # side of a piece of a face
 LEAST_POINTS = 10  # of a station on a piece
 SAME_FACE = 0.9  # least cosine between the normals of a point and of its core point
-SURE = 2.0  # standard errors from which on a variance is not that of chance
 
 
 def shared_sd(
@@ -53,13 +54,6 @@ def shared_sd(
     widening = float(stdtrit(len(np.unique(station)) - 1, 0.975)) / Z95
     shared[known] = widening * np.sqrt(variance * share[cell])
     return shared
-
-
-def pieces(points: Floats, normals: Floats, side: float) -> Ints:
-    """Return the piece (k,) of a face that each place (k, 3) is on, by its cell and the direction of its normal."""
-    place = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
-    cells: Ints = np.unique(np.hstack([place, np.rint(normals).astype(np.int64)]), axis=0, return_inverse=True)[1]
-    return cells.reshape(-1)
 
 
 def _between(cell: Ints, mean: Floats, noise: Floats, enough: npt.NDArray[np.bool_]) -> float:

@@ -12,10 +12,10 @@ import numpy as np
 import numpy.typing as npt
 from scipy.spatial import cKDTree
 
-from processor.deviation import assignment, enclosure, local_translation, station_offsets
+from processor.deviation import assignment, local_translation, station_offsets
 from processor.deviation.assignment import OnSurface
 from processor.deviation.local_translation import Movement
-from processor.geometry import m3c2, mesh_distance
+from processor.geometry import enclosure, m3c2, mesh_distance
 from processor.geometry.mesh_distance import CurvedFacets, MeshSurface, Samples
 from processor.model import Floats, Ints
 
@@ -59,7 +59,7 @@ def movement(
     """
     surface = curved.surface
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, depth_mm)
-    within = enclosure.enclosed(core.points, core.normals, grid, surface.faces)
+    within = enclosure.enclosed(core.points, core.normals, grid, enclosure.closed_bodies(surface.faces))
     core = replace(core, normals=np.where(within[:, None], np.nan, core.normals))
     seen = assignment.assigned(cloud.points, cloud.scanner, curved, grid)
     near = np.abs(seen.distance) <= depth_mm

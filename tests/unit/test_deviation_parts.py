@@ -5,6 +5,7 @@ import pytest
 import trimesh
 from scipy.spatial import cKDTree
 
+from processor.adjustment.groups import group_means
 from processor.deviation import cloud as deviation_cloud
 from processor.deviation import local_translation as moving
 from processor.geometry import m3c2, mesh_distance, neighbors, principal, rigid, surface_registration
@@ -167,7 +168,7 @@ def test_adaptive_voxels_hold_their_points():
     assert count.sum() == len(points)
     widths = [np.ptp(points[group == g], axis=0).max() for g in range(len(count) - 1)]
     assert max(widths[:50]) <= 2.0 < np.max(widths)
-    means = deviation_cloud.group_means(points, group)
+    means = group_means(points, group)
     np.testing.assert_allclose(means[3], points[group == 3].mean(axis=0))
 
 

@@ -3,18 +3,16 @@
 import numpy as np
 import pytest
 
-from processor.deviation import opposite_sides
+from processor.adjustment import opposite_sides
 from processor.deviation import step as deviation_step
-from processor.deviation.local_translation import Movement
-from processor.geometry.mesh_distance import Samples
 from processor.model import Scan, Scene
 from tests.support.plate_clouds import STATIONS, plate
 
-SPACING, SD, POINTS, THICKNESS = 10.0, 0.5, 40, 12.0
+SPACING, NOISE, SIDE, THICKNESS = 10.0, 0.08, 60.0, 12.0
 
 
 def plates(seed, between=0.0):
-    """Movements at core points of twelve plates; the two sides of each are displaced by errors of their views."""
+    """Places on twelve plates, normals, movements, variances; each side is displaced by an error of its view."""
     rng = np.random.default_rng(seed)
     x, y = np.meshgrid(np.arange(0.0, 300.0, SPACING), np.arange(0.0, 300.0, SPACING))
     flat = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
@@ -23,41 +21,37 @@ def plates(seed, between=0.0):
         for sign in (1.0, -1.0):
             points.append(flat + np.array([0.0, 500.0 * k, 0.5 * sign * THICKNESS]))
             normals.append(np.tile([0.0, 0.0, sign], (len(flat), 1)))
-            along.append(between * rng.normal() + rng.normal(0.0, SD / np.sqrt(POINTS), len(flat)))
+            along.append(between * rng.normal() + rng.normal(0.0, NOISE, len(flat)))
     points, normals, along = (np.concatenate(v) for v in (points, normals, along))
-    n = len(points)
-    moved = Movement(along, np.full(n, POINTS), np.full(n, SD), np.zeros((n, 3)), np.ones(n, np.int64))
-    return Samples(points, normals, np.zeros(n, np.int64)), moved
+    return points, normals, along, np.full(len(points), NOISE**2)
 
 
 @pytest.mark.parametrize("between", [0.3, 1.0])
 def test_the_standard_deviation_between_views_is_that_of_the_sides(between):
-    found = [opposite_sides.view_sd(*plates(seed, between), 2.0 * SPACING, 1.0) for seed in range(30)]
+    found = [opposite_sides.view_sd(*plates(seed, between), SIDE) for seed in range(30)]
     # Twelve independent sums a seed: the median of their squares is known to half of itself.
     assert np.median(found) == pytest.approx(between, rel=0.25)
 
 
 def test_noise_alone_is_no_difference_between_views():
-    found = [opposite_sides.view_sd(*plates(seed), 2.0 * SPACING, 1.0) for seed in range(30)]
-    assert max(found) < SD / np.sqrt(POINTS)
+    found = [opposite_sides.view_sd(*plates(seed), SIDE) for seed in range(30)]
+    assert max(found) < NOISE
 
 
 def test_a_movement_of_whole_plates_is_no_difference_between_views():
-    core, moved = plates(1)
-    moved.along[:] += 5.0 * core.normals[:, 2]
-    assert opposite_sides.view_sd(core, moved, 2.0 * SPACING, 1.0) < SD / np.sqrt(POINTS)
+    points, normals, along, variance = plates(1)
+    assert opposite_sides.view_sd(points, normals, along + 5.0 * normals[:, 2], variance, SIDE) < NOISE
 
 
 def test_steel_seen_from_one_side_does_not_show_it():
-    core, moved = plates(1, 1.0)
-    moved.along[core.normals[:, 2] < 0.0] = np.nan
-    assert opposite_sides.view_sd(core, moved, 2.0 * SPACING, 1.0) == 0.0
+    points, normals, along, variance = plates(1, 1.0)
+    along[normals[:, 2] < 0.0] = np.nan
+    assert opposite_sides.view_sd(points, normals, along, variance, SIDE) == 0.0
 
 
 def test_facing_sides_of_two_bodies_are_not_compared():
-    core, moved = plates(1, 1.0)
-    inside_out = Samples(core.points, -core.normals, core.facet)
-    assert opposite_sides.view_sd(inside_out, moved, 2.0 * SPACING, 1.0) == 0.0
+    points, normals, along, variance = plates(1, 1.0)
+    assert opposite_sides.view_sd(points, -normals, along, variance, SIDE) == 0.0
 
 
 def merged(scene, shifts):

@@ -14,9 +14,9 @@ from processor.geometry.sphere import (
     trials_needed,
     visible_fraction,
 )
-from processor.geometry.sphere_search import LEAST_POINTS, find_balls
 from processor.model import Scan, Scene
 from processor.space_frame import step as space_frame_step
+from processor.space_frame.spheres.sphere_search import LEAST_POINTS, find_balls
 from tests.support import street_clouds
 
 NOWHERE = np.zeros((4, 4))

@@ -12,7 +12,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from processor.geometry import sphere_search
 from processor.geometry.merging import MergedCloud
 from processor.geometry.neighbors import nearest_crops
 from processor.geometry.sphere import Bools, Sphere, algebraic, bound, ransac, visible_fraction
@@ -20,6 +19,7 @@ from processor.model import NORMAL_95, Floats, FrameDesign, Ints, Reason, Status
 from processor.space_frame.design import unit_mistakes
 from processor.space_frame.params import NAN, Params
 from processor.space_frame.result import Balls, Evidence, Flag, Result
+from processor.space_frame.spheres import sphere_search
 from processor.space_frame.spheres.quality import LARGEST_SCALE, beyond, blank_tolerance
 
 LEAST_VISIBLE = 0.05  # share of the sphere

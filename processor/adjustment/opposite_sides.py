@@ -11,45 +11,46 @@ import numpy as np
 from scipy.optimize import brentq
 from scipy.spatial import cKDTree
 
-from processor.deviation.cloud import group_means
-from processor.deviation.local_translation import Movement
-from processor.deviation.stable_fit import CHI2_MEDIAN
-from processor.deviation.station_offsets import CELL_DIAMETERS, SURE, pieces
-from processor.geometry.mesh_distance import Samples
+from processor.adjustment.groups import group_means, pieces
 from processor.model import Floats, Ints
 
-FEWEST_CORES = 3  # of a piece
+FEWEST_PLACES = 3  # of a piece
 FEWEST_PAIRS = 8
 FLOOR_MM = 1e-3  # least noise, for scans without any
 BESIDE = 0.25  # of a piece's side, the most by which two sides lie beside each other
 OPPOSED = -0.9  # largest cosine between the normals of two sides
+SURE = 2.0  # standard errors from which on a variance is not that of chance
+CHI2_MEDIAN = 0.4549  # of chi-squared with one degree of freedom
 MEDIAN_SD = 1.065  # of the median of n values of chi-squared with one degree of freedom, times sqrt(n)
 
 
-def view_sd(core: Samples, moved: Movement, diameter_mm: float, overlap: float) -> float:
+def view_sd(points: Floats, normals: Floats, along: Floats, variance: Floats, side_mm: float) -> float:
     """Return the standard deviation of what a view's points have in common, mm; 0 where nothing shows it.
+
+    ``along`` (n,) are outward movements at points (n, 3) with unit normals (n, 3), mm, NaN where there is none.
+    Their ``variance`` (n,) is from noise, as if they were independent. Pieces have a side of ``side_mm``.
 
     The variance is that for which the median of the squared sums, over their variances, is as of normal errors: pieces
     with dents do not count for more. It is 0 where few pieces were seen from both sides, and where the median may be
-    that of chance. Each scanned point counts at ``overlap`` core points.
+    that of chance.
     """
-    known = np.flatnonzero(np.isfinite(moved.along) & np.isfinite(moved.sd))
+    known = np.flatnonzero(np.isfinite(along) & np.isfinite(variance))
     if not len(known):
         return 0.0
-    points, normals = core.points[known], core.normals[known]
-    piece = pieces(points, normals, CELL_DIAMETERS * diameter_mm)
+    points, normals = points[known], normals[known]
+    piece = pieces(points, normals, side_mm)
     count = np.bincount(piece)
-    mean = np.bincount(piece, moved.along[known]) / count
-    noise = overlap * np.bincount(piece, moved.sd[known] ** 2 / moved.count[known]) / count**2
-    pairs = _opposite(group_means(points, piece), group_means(normals, piece), CELL_DIAMETERS * diameter_mm)
-    pairs = pairs[(count[pairs] >= FEWEST_CORES).all(axis=1)]
+    mean = np.bincount(piece, along[known]) / count
+    noise = np.bincount(piece, variance[known]) / count**2
+    pairs = _opposite(group_means(points, piece), group_means(normals, piece), side_mm)
+    pairs = pairs[(count[pairs] >= FEWEST_PLACES).all(axis=1)]
     independent = len(np.unique(pairs)) / 2
     if independent < FEWEST_PAIRS:
         return 0.0
-    square, variance = mean[pairs].sum(axis=1) ** 2, np.maximum(noise[pairs].sum(axis=1), FLOOR_MM**2)
+    square, noises = mean[pairs].sum(axis=1) ** 2, np.maximum(noise[pairs].sum(axis=1), FLOOR_MM**2)
 
     def surplus(view_variance: float) -> float:
-        return float(np.median(square / (variance + 2.0 * view_variance))) - CHI2_MEDIAN
+        return float(np.median(square / (noises + 2.0 * view_variance))) - CHI2_MEDIAN
 
     if surplus(0.0) <= SURE * MEDIAN_SD / np.sqrt(independent):
         return 0.0

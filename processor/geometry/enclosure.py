@@ -25,21 +25,31 @@ JITTER_MM = np.array([1.3e-4, 2.1e-4, 1.7e-4])  # so that no ray meets an edge b
 LEAST_RANGE = 2_000  # places per task of a thread
 
 
-def enclosed(points: Floats, normals: Floats, grid: FacetGrid, faces: Ints) -> Bools:
-    """Mark the places (n, 3) on a mesh with ``faces`` (f, 3), with unit normals (n, 3), that lie within another body.
+def enclosed(points: Floats, normals: Floats, grid: FacetGrid, body: Ints) -> Bools:
+    """Mark the places (n, 3) on a mesh, with unit normals (n, 3), that lie within another body.
 
-    ``grid`` is of the mesh.
+    ``grid`` is of the mesh, ``body`` (f,) are the closed bodies of its facets.
     """
-    closed = closed_bodies(faces)
     places = np.ascontiguousarray(points + OUTSIDE_MM * normals + JITTER_MM)
     inside = np.zeros(len(places), np.bool_)
     axis = int(np.argmin(grid.shape))
-    over_ranges(lambda a, b: _inside(grid, closed, places, axis, inside, a, b), len(places), least=LEAST_RANGE)
+    over_ranges(lambda a, b: _inside(grid, body, places, axis, inside, a, b), len(places), least=LEAST_RANGE)
     return inside
 
 
-def closed_bodies(faces: Ints) -> Bools:
-    """Mark the facets (f,) of bodies whose surface is closed: each edge is passed as often one way as the other."""
+def boxes(vertices: Floats, faces: Ints, body: Ints) -> tuple[Floats, Floats]:
+    """Return the corners low and high (b, 3) of boxes about the closed bodies; of other bodies they are empty."""
+    count = int(body.max(initial=-1)) + 1
+    low, high = np.full((count, 3), np.inf), np.full((count, 3), -np.inf)
+    closed = body >= 0
+    for corner in range(3):
+        np.minimum.at(low, body[closed], vertices[faces[closed, corner]])
+        np.maximum.at(high, body[closed], vertices[faces[closed, corner]])
+    return low, high
+
+
+def closed_bodies(faces: Ints) -> Ints:
+    """Return the body (f,) of each facet, -1 if not closed: each edge of a closed one is passed as often either way."""
     first, second = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     facet = np.repeat(np.arange(len(faces)), 3)
     count = int(faces.max()) + 1
@@ -50,12 +60,12 @@ def closed_bodies(faces: Ints) -> Bools:
     unpaired = np.bincount(number, np.where(first < second, 1.0, -1.0)) != 0.0
     open_ = np.zeros(int(body.max()) + 1, np.bool_)
     open_[body[facet[unpaired[number]]]] = True
-    closed: Bools = ~open_[body]
+    closed: Ints = np.where(open_[body], -1, body).astype(np.int64)
     return closed
 
 
 @njit(cache=True, nogil=True)
-def _inside(grid, closed, places, axis, inside, first, last):  # type: ignore[no-untyped-def]
+def _inside(grid, body, places, axis, inside, first, last):  # type: ignore[no-untyped-def]
     """Mark places first to last - 1 from which a ray along an axis leaves more bodies than it enters."""
     low, size, shape = grid.low, grid.size, grid.shape
     u, v = (axis + 1) % 3, (axis + 2) % 3
@@ -76,7 +86,7 @@ def _inside(grid, closed, places, axis, inside, first, last):  # type: ignore[no
             for k in range(grid.start[voxel], grid.start[voxel + 1]):
                 f = grid.facet[k]
                 n = grid.normals[f, axis]
-                if not closed[f] or abs(n) < 1e-12:
+                if body[f] < 0 or abs(n) < 1e-12:
                     continue
                 a, b, c = grid.corners[f, 0], grid.corners[f, 1], grid.corners[f, 2]
                 d = (b[u] - a[u]) * (p[v] - a[v]) - (b[v] - a[v]) * (p[u] - a[u])

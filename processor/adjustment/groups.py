@@ -1,0 +1,21 @@
+"""Pieces of faces, and means over groups."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from processor.model import Floats, Ints
+
+
+def pieces(points: Floats, normals: Floats, side: float) -> Ints:
+    """Return the piece (k,) of a face that each place (k, 3) is on, by its cell and the direction of its normal."""
+    place = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
+    cells: Ints = np.unique(np.hstack([place, np.rint(normals).astype(np.int64)]), axis=0, return_inverse=True)[1]
+    return cells.reshape(-1)
+
+
+def group_means(values: Floats, group: Ints) -> Floats:
+    """Means (g, 3) of values (n, 3) in groups (n,)."""
+    count = np.bincount(group)
+    total: Floats = np.stack([np.bincount(group, values[:, k]) for k in range(values.shape[1])], axis=1)
+    return total / count[:, None]
