@@ -58,7 +58,7 @@ def measured(scene, truth, params):
     true = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
     scans = result.scans
     rows = np.flatnonzero(scans.placed).tolist()
-    pulls = stitching.pulls_of(result, rows, np.stack([true[scans.name[i]] for i in rows]))
+    pulls = stitching_evaluation.pulls_of(result, rows, np.stack([true[scans.name[i]] for i in rows]))
     return {
         "points": int(sum(len(scan.points) for scan in scene.scans)),
         "position_mm": found.get("station positions after datum fit, max", float("inf")),
