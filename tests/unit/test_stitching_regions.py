@@ -3,9 +3,11 @@
 import dataclasses
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from processor.model import Scene
 from processor.stitching import step as stitching_step
+from processor.stitching.fine import correspondences
 from tests.support.stitch_clouds import four
 
 
@@ -27,6 +29,36 @@ def test_systematic_range_errors_raise_the_standard_deviations():
     assert off.max() > 0.5  # far more than the noise makes
     assert (bad.scans.position_sd[1:].max(axis=1) > 2.0 * good.scans.position_sd[1:].max(axis=1)).all()
     assert (off < 4.0 * np.linalg.norm(bad.scans.position_sd[1:], axis=1)).all()
+
+
+def test_offsets_of_the_ranges_are_told_from_the_poses():
+    """Opposite walls show them: without an unknown of its own an offset goes into the poses, by its size."""
+    T, scans = four(3, step_mrad=20.0)
+    offsets = (1.5, -1.0, 0.0, -1.5)
+    shifted = []
+    for scan, mm in zip(scans, offsets, strict=True):
+        R = np.linalg.norm(scan.points, axis=1)[:, None]
+        shifted.append(dataclasses.replace(scan, points=scan.points * (1.0 + mm / R)))
+    result = stitching_step.run(Scene("room", "structure", tuple(shifted)), stitching_step.Params())
+    pulls = []
+    for i in range(len(result.pairs)):
+        a, b = (int(name[1:]) - 1 for name in (result.pairs.a[i], result.pairs.b[i]))
+        off = result.pairs.T_a_b[i] @ np.linalg.inv(T[b]) @ T[a]
+        turn = Rotation.from_matrix(off[:3, :3]).as_rotvec()
+        pulls.append(np.append(turn, off[:3, 3]) / np.sqrt(np.diag(result.pairs.covariance[i])))
+    assert result.pairs.used.all()
+    assert np.abs(pulls).max() < 4.0
+    assert np.sqrt(np.mean(np.square(pulls))) < 1.5
+    off = result.scans.T_project_scan[:, :3, 3] - (np.linalg.inv(T[0]) @ T)[:, :3, 3]
+    assert np.abs(off).max() < 0.3
+
+
+def test_rays_along_a_cell_are_those_of_finite_differences():
+    points = np.array([[3000.0, -2000.0, 500.0], [-100.0, 4000.0, -1500.0]])
+    near = points + np.array([[4.0, -3.0, 5.0], [-2.0, 6.0, 1.0]])
+    rays = np.einsum("nij,nj->ni", correspondences.ray_maps(points), np.column_stack([near, np.ones(2)]))
+    np.testing.assert_allclose(rays, near / np.linalg.norm(near, axis=1)[:, None], atol=5e-6)
+    assert np.abs(rays - points / np.linalg.norm(points, axis=1)[:, None]).max() > 5e-4
 
 
 def test_a_board_that_moved_during_one_scan_does_not_bias_its_pose():
