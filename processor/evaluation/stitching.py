@@ -38,7 +38,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     if truth.stations is None:
         return []
     scans = result.scans
-    known = dict(zip(truth.stations.ids, truth.stations.T_project_station, strict=True))
+    known = dict(zip(truth.stations.ids, true_poses(truth.stations), strict=True))
     rows = [i for i, name in enumerate(scans.name) if name in known and scans.placed[i]]
     metrics = [Metric("stitch", "scans not placed", float((~scans.placed).sum()), Statistic.COUNT)]
     if len(rows) < 2:
@@ -70,6 +70,17 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *covered_pulls("stitch", "poses of pairs", _pulls_of_pairs(result, known)),
         *covered_pulls("stitch", "scales", _pulls_of_scales(result, truth.stations)),
     ]
+
+
+def true_poses(truth: StationTruth) -> Floats:
+    """Return the poses (k, 4, 4) that bring the stations' points to where they were: without the tilts of the scans.
+
+    A scan whose points are all turned by a tilt of its scanner has its frame turned back: no registration by points
+    can tell the two apart.
+    """
+    tilt = truth.tilt if len(truth.tilt) else np.zeros((len(truth.ids), 2))
+    back = [rigid.transform(rigid.rotation_from_vector(-np.append(row, 0.0)), np.zeros(3)) for row in tilt]
+    return truth.T_project_station @ np.reshape(back, (-1, 4, 4))
 
 
 def _pulls_of_scales(result: Result, truth: StationTruth) -> Floats:

@@ -121,19 +121,24 @@ def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) ->
     """Adjust all poses on shared pieces with narrowing gates: faces alone, then along loose motions, then with ends."""
     if not len(cells.sums):
         none = np.empty(0, np.int64)
-        blocks = Blocks(piece=none, scan=none, sums=np.empty((0, 10)), count=np.empty(0), kind=none, pieces=0)
+        blocks = Blocks(
+            piece=none, scan=none, sums=np.empty((0, 10)), count=np.empty(0), kind=none, pieces=0,
+            rays=np.empty((0, 3, 7)), face=none,
+        )  # fmt: skip
         return bundle_adjustment.solve(blocks, T, reference), blocks
+    ranges = np.zeros(len(T))
     for gate in GATES:
-        blocks = correspondences.segment(cells, T, gate * cells.size_mm).shared()
-        T = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm).T
-    pieces = correspondences.segment(cells, T, 0.0)
+        blocks = correspondences.segment(cells, T, gate * cells.size_mm, ranges).shared()
+        solution = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
+        T, ranges = solution.T, solution.ranges[: len(T)]
+    pieces = correspondences.segment(cells, T, 0.0, ranges)
     faces = bundle_adjustment.solve(pieces.shared(), T, reference)
     T = edge_constraints.resolve_loose_motions(clouds, pieces, faces, REACH * cells.size_mm)
     for gate in (*END_GATES, *[0.0] * MOST_FINAL):
-        pieces = correspondences.segment(cells, T, 0.0)
+        pieces = correspondences.segment(cells, T, 0.0, ranges)
         blocks = edge_constraints.with_ends(clouds, pieces, T, gate * cells.size_mm).shared()
         solution = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
-        before, T = T, solution.T
+        before, T, ranges = T, solution.T, solution.ranges[: len(T)]
         if gate == 0.0 and _largest_shift(T, before) < STILL_MM:
             break
     return solution, blocks

@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
+from processor.adjustment.scanner_class import VIEW_MM
 from processor.model import Floats, InputError, Reason, Scan, Scene, UsageError, reason
 from processor.stitching import automatic, three_point, to_result
 from processor.stitching.params import METHODS, Params
@@ -69,6 +70,9 @@ def _automatic(scans: Sequence[Scan], picked: Picked, reference: int, params: Pa
     solution, coarse = registered.solution, registered.coarse
     gross = [pair.is_gross for pair in registered.pairs]
     noise = float(np.median([cloud.sigma_mm for cloud in registered.clouds]))
+    # Where the prior tells more of a scan's range error than the faces do.
+    unseen = np.flatnonzero(solution.ranges_sd > np.sqrt(0.5) * VIEW_MM).tolist()
+    by_class = reason("stitch.ranges-by-class", scans=tuple(scans[s].name for s in unseen), sd_mm=VIEW_MM)
     return Network(
         T=solution.T,
         covariance=solution.covariance,
@@ -90,6 +94,7 @@ def _automatic(scans: Sequence[Scan], picked: Picked, reference: int, params: Pa
         groups=registered.groups,
         estimated=(noise, solution.tau[0], solution.tau[1]),
         point_mm=noise,
+        reasons=(by_class,) if unseen else (),
     )
 
 

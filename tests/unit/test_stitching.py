@@ -291,6 +291,18 @@ def test_poses_by_control_points_are_checked_in_the_control_frame():
     assert controlled["pose components within their 95 % intervals"] == pytest.approx(100.0 * 5 / 6)
 
 
+def test_a_tilted_scan_is_right_where_its_points_are():
+    """Points p of a scan with a tilt w are p + w x p: a pose turned back by w brings them to their places."""
+    T = np.stack([stitch_clouds.pose([3000.0, -2000.0, 1500.0], 40.0)] * 2)
+    tilt = np.array([[2e-5, -3e-5], [0.0, 0.0]])
+    point = np.array([5000.0, 1000.0, -800.0])
+    truth = StationTruth(("a", "b"), T, np.zeros(2), np.zeros(2), tilt)
+    poses = stitching_evaluation.true_poses(truth)
+    seen = point + np.cross([2e-5, -3e-5, 0.0], point)
+    np.testing.assert_allclose((poses[0] @ np.append(seen, 1.0))[:3], (T[0] @ np.append(point, 1.0))[:3], atol=1e-4)
+    np.testing.assert_array_equal(poses[1], T[1])
+
+
 ROOMS = Path(__file__).resolve().parents[2] / "../shared/data/pcd"
 
 

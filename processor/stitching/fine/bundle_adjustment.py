@@ -15,6 +15,7 @@ import numpy as np
 import numpy.typing as npt
 from numba import njit
 
+from processor.adjustment.scanner_class import VIEW_MM
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching.fine.correspondences import Blocks
@@ -28,6 +29,8 @@ ASIDE, ROUNDS = 1e-3, 8  # a weight below which a block counts as an outlier; ro
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # weak priors on the poses: undetermined components stay as they are
 MEDIAN = 0.6745  # of |z|, z normal
 KINDS = 2
+COLUMNS = 8  # unknowns of a block: the pose of its scan, and the range errors of its scan and of its face
+LEAST_FACE_MM, MOST_FACE_MM = 1e-3, 10.0  # standard deviation of the range errors of faces: where none show, at most
 EVEN, WIDE_SIGMAS = 3, 0.3  # first iterations with almost equal weights of all pieces: tau by the noise of a point
 LEAST_REAL = 0.01  # least share of the information in a direction that is taken as real
 LEAST_BLOCKS = 10  # to estimate tau from
@@ -39,7 +42,8 @@ class Solution:
     """Poses T_ref_scan (k, 4, 4) and their joint covariance (6k, 6k; rad, mm; rotations about each scan's own origin).
 
     ``offset`` (b,) is the mean distance of a block from its plane, mm; ``weight`` (b,) its robust weight. ``tau`` of
-    each kind: mm, for ends in standard deviations of a single one.
+    each kind: mm, for ends in standard deviations of a single one; the last is of the range errors of faces. ``ranges``
+    (k + f,) are the range errors of scans and of faces, mm, ``ranges_sd`` (k,) the standard deviations of the former.
     """
 
     T: Floats
@@ -47,6 +51,8 @@ class Solution:
     offset: Floats
     tau: tuple[float, ...]
     weight: Floats
+    ranges: Floats
+    ranges_sd: Floats
 
 
 def solve(
@@ -64,41 +70,54 @@ def solve(
     The covariance of scans without blocks is NaN. ``tau`` is estimated unless given. ``slack_mm`` is the error of the
     initial poses: no piece is rejected for a misfit of this size.
     """
-    common = np.zeros(KINDS) if tau is None else np.array(tau)
-    if not len(_unknowns(blocks, T, reference)):
-        covariance = _fixed_reference(np.full((6 * len(T), 6 * len(T)), np.nan), reference)
+    k = len(T)
+    common = np.zeros(KINDS + 1) if tau is None else np.array(tau)
+    ranges = np.zeros(k + int(blocks.face.max(initial=-1)) + 1)
+    unknowns = _unknowns(blocks, len(ranges), k, reference)
+    poses = unknowns[unknowns < 6 * k]
+    if not len(poses):
+        covariance = _fixed_reference(np.full((6 * k, 6 * k), np.nan), reference)
         none = np.empty(0)
-        return Solution(T=T, covariance=covariance, offset=none, tau=tuple(common.tolist()), weight=none)
+        return Solution(
+            T=T, covariance=covariance, offset=none, tau=tuple(common.tolist()), weight=none, ranges=ranges,
+            ranges_sd=np.full(k, VIEW_MM),
+        )  # fmt: skip
     weight = np.ones(len(blocks.piece))
-    initial = _initial_tau(blocks) if robust and tau is None else np.zeros(KINDS)
+    initial = _initial_tau(blocks) if robust and tau is None else np.zeros(KINDS + 1)
     for iteration in range(iterations):
-        least = initial if iteration < EVEN else np.zeros(KINDS)
-        equations = _linearize(blocks, T, np.maximum(common, least), weight)
+        least = initial if iteration < EVEN else np.zeros(KINDS + 1)
+        equations = _linearize(blocks, T, ranges, np.maximum(common, least), weight)
         if iteration and tau is None:
-            common = _estimate_tau(blocks, equations.offset, equations.variance, common)
+            common[:KINDS] = _estimate_tau(blocks, equations.offset, equations.variance, common)
+            common[KINDS] = _estimate_face_sd(equations, unknowns, k, ranges)
         if iteration == EVEN and initial.any():
             weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
             continue
-        step = _newton_step(equations, _unknowns(blocks, T, reference)).reshape(-1, 6)
+        change = _newton_step(equations, unknowns, ranges, common[KINDS])
+        step, ranges = change[: 6 * k].reshape(k, 6), ranges + change[6 * k :]
         T = _moved_by(T, step)
         if robust:
             weight = _robust_weights(blocks, _with_slack(equations, slack_mm))
         if iteration > EVEN and np.abs(step[:, 3:]).max(initial=0.0) < STILL_MM:
             break
-    equations = _linearize(blocks, T, common, weight)
-    unknowns = _unknowns(blocks, T, reference)
+    equations = _linearize(blocks, T, ranges, common, weight)
     at = np.ix_(unknowns, unknowns)
-    covariance = np.full(equations.N.shape, np.nan)
-    covariance[at] = _sandwich(equations.N[at], equations.spurious[at])
-    covariance = _fixed_reference(covariance, reference)
-    return Solution(T=T, covariance=covariance, offset=equations.offset, tau=tuple(common.tolist()), weight=weight)
+    C = _sandwich((equations.N + _prior(len(ranges), k, common[KINDS]))[at], equations.spurious[at])
+    covariance = np.full((6 * k, 6 * k), np.nan)
+    covariance[np.ix_(poses, poses)] = C[: len(poses), : len(poses)]
+    return Solution(
+        T=T, covariance=_fixed_reference(covariance, reference), offset=equations.offset, tau=tuple(common.tolist()),
+        weight=weight, ranges=ranges, ranges_sd=np.sqrt(np.diag(C)[len(poses) : len(poses) + k]),
+    )  # fmt: skip
 
 
-def weights_at(blocks: Blocks, T: Floats, tau: tuple[float, ...]) -> Floats:
-    """Return the robust weights (b,) of blocks at fixed poses T (k, 4, 4)."""
-    weight = np.ones(len(blocks.piece))
+def weights_at(blocks: Blocks, solution: Solution) -> Floats:
+    """Return the robust weights (b,) of blocks at the poses and the scans' range errors of a solution."""
+    weight, tau = np.ones(len(blocks.piece)), np.array(solution.tau)
+    ranges = np.zeros(len(solution.T) + int(blocks.face.max(initial=-1)) + 1)
+    ranges[: len(solution.T)] = solution.ranges[: len(solution.T)]
     for _ in range(ROUNDS):
-        weight = _robust_weights(blocks, _linearize(blocks, T, np.array(tau), weight).z)
+        weight = _robust_weights(blocks, _linearize(blocks, solution.T, ranges, tau, weight).z)
     return weight
 
 
@@ -107,8 +126,9 @@ def step_without(
 ) -> Floats:
     """Return the step (6k,) of the poses from a solution if blocks ``out`` (b,) had the weight ``almost_none``."""
     weight = np.where(out, almost_none, solution.weight)
-    equations = _linearize(blocks, solution.T, np.array(solution.tau), weight)
-    return _newton_step(equations, _unknowns(blocks, solution.T, reference))
+    ranges, k = solution.ranges, len(solution.T)
+    equations = _linearize(blocks, solution.T, ranges, np.array(solution.tau), weight)
+    return _newton_step(equations, _unknowns(blocks, len(ranges), k, reference), ranges, solution.tau[KINDS])[: 6 * k]
 
 
 # Normal equations.
@@ -133,13 +153,14 @@ class _Equations:
 class _Coupling(NamedTuple):
     """Rows (b,) of poses and planes to be eliminated, sorted by piece, and their blocks of the normal matrix.
 
-    ``Hsp`` (b, 6, 3) couples a scan's pose and the plane of its piece; ``inverse`` (p, 3, 3) is that of the planes'
+    ``columns`` (b, COLUMNS) are the unknowns of a row; the last, in blocks on no face, is one that is cut off.
+    ``Hsp`` (b, COLUMNS, 3) couples them and the plane of the piece; ``inverse`` (p, 3, 3) is that of the planes'
     block, ``gp`` (p, 3) their gradient. ``tilt`` (p, 3, 3) is the covariance of the ``normal`` (p, 3), ``along`` (b,)
     the information of a row on the shift of its scan along the normal.
     """
 
     piece: Ints
-    scan: Ints
+    columns: Ints
     Hsp: Floats
     inverse: Floats
     gp: Floats
@@ -148,15 +169,17 @@ class _Coupling(NamedTuple):
     along: Floats
 
 
-def _linearize(blocks: Blocks, T: Floats, tau: Floats, weight: Floats) -> _Equations:
-    """Build the normal equations at poses T (k, 4, 4), with planes and common offsets eliminated.
+def _linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: Floats) -> _Equations:
+    """Build the normal equations at poses T (k, 4, 4) and range errors, with planes and common offsets eliminated.
 
     The normal of a plane is not known exactly: if it is off, a piece seems to determine shifts along itself as well.
     The part of the normal matrix due to this follows from the uncertainty of the planes.
     """
     k, b = len(T), len(blocks.piece)
-    world = T[blocks.scan]
-    W = world @ extraction.square(blocks.sums) @ world.transpose(0, 2, 1)
+    size = 6 * k + len(ranges)
+    of_face = np.where(blocks.face < 0, size, 7 * k + blocks.face)
+    columns = np.column_stack([6 * blocks.scan[:, None] + np.arange(6), 6 * k + blocks.scan, of_face])
+    W = in_world(blocks, T, np.append(ranges, 0.0)[columns[:, 6:] - 6 * k].sum(axis=1))
     total = hashing.summed(extraction.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
     planes = extraction.planes_of(total)
     n, c = planes.normal[blocks.piece], planes.mean[blocks.piece]
@@ -167,7 +190,7 @@ def _linearize(blocks: Blocks, T: Floats, tau: Floats, weight: Floats) -> _Equat
     e = W[:, :, 3]
     W = (W - (t2 / (1.0 + t2 * mass))[:, None, None] * e[:, :, None] * e[:, None, :]) * weight[:, None, None]
     Ls, Lp = _design_matrices(blocks, T, planes)
-    rho = np.concatenate([n, np.zeros((b, 1))], axis=1)
+    rho = np.concatenate([n, np.zeros((b, 4))], axis=1)
     LsW, Wr = Ls @ W, np.einsum("bij,bj->bi", W, rho)
     Hss = LsW @ Ls.transpose(0, 2, 1)
     Hsp = LsW @ Lp.transpose(0, 2, 1)
@@ -176,60 +199,73 @@ def _linearize(blocks: Blocks, T: Floats, tau: Floats, weight: Floats) -> _Equat
     gp = hashing.summed(np.einsum("bij,bj->bi", Lp, Wr), blocks.piece, blocks.pieces)
     scale = np.einsum("nii->ni", Hpp)
     inverse = np.linalg.inv(Hpp + 1e-12 * np.maximum(scale, 1e-12)[:, :, None] * np.eye(3))
-    of_scans = np.zeros((k, k, 6, 6))
-    np.add.at(of_scans, (blocks.scan, blocks.scan), Hss)
-    N: Floats = np.ascontiguousarray(of_scans.transpose(0, 2, 1, 3)).reshape(6 * k, 6 * k)
-    gradient = np.zeros((k, 6))
-    np.add.at(gradient, blocks.scan, gs)
-    g, spurious = gradient.ravel(), np.zeros((6 * k, 6 * k))
-    along = np.einsum("bi,bij,bj->b", n, Hss[:, 3:, 3:], n)
+    N, g, spurious = np.zeros((size + 1, size + 1)), np.zeros(size + 1), np.zeros((size + 1, size + 1))
+    np.add.at(N, (columns[:, :, None], columns[:, None, :]), Hss)
+    np.add.at(g, columns, gs)
+    along = np.einsum("bi,bij,bj->b", n, Hss[:, 3:6, 3:6], n)
     tilt = planes.axes[:, :, 1:] @ inverse[:, :2, :2] @ planes.axes[:, :, 1:].transpose(0, 2, 1)
     coupling = _Coupling(
-        piece=blocks.piece, scan=blocks.scan, Hsp=Hsp, inverse=inverse, gp=gp, normal=planes.normal, tilt=tilt,
+        piece=blocks.piece, columns=columns, Hsp=Hsp, inverse=inverse, gp=gp, normal=planes.normal, tilt=tilt,
         along=along,
     )  # fmt: skip
     eliminate(coupling, N, g, spurious)
-    N += np.diag(np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k))
     # Misfit: the mean distance of a block from the plane; its variance is reduced by the block's leverage on the plane.
     mean = e[:, :3] / mass[:, None]
     offset = np.einsum("bi,bi->b", mean, n)
-    v = np.einsum("bij,bj->bi", Lp, np.concatenate([mean, np.ones((b, 1))], axis=1))
+    v = np.einsum("bij,bj->bi", Lp[:, :, :4], np.concatenate([mean, np.ones((b, 1))], axis=1))
     leverage = np.einsum("bi,bij,bj->b", v, inverse[blocks.piece], v) * weight / (1.0 / mass + t2)
     share = np.maximum(1.0 - leverage, 0.02)
     z = offset / np.sqrt((1.0 / mass + t2) * share)
-    return _Equations(N=N, spurious=spurious, g=g, z=z, offset=offset / np.sqrt(share), variance=1.0 / mass)
+    return _Equations(
+        N=N[:size, :size], spurious=spurious[:size, :size], g=g[:size], z=z, offset=offset / np.sqrt(share),
+        variance=1.0 / mass,
+    )  # fmt: skip
+
+
+def in_world(blocks: Blocks, T: Floats, error: Floats) -> Floats:
+    """Return the moments (b, 7, 7) of [p; 1; u], at poses T and with ranges shorter by ``error`` (b,)."""
+    W = np.empty((len(error), 7, 7))
+    W[:, :4, :4], W[:, 4:] = extraction.square(blocks.sums), blocks.rays
+    W[:, :4, 4:] = blocks.rays[:, :, :4].transpose(0, 2, 1)
+    world = np.zeros_like(W)
+    world[:, :4, :4], world[:, 4:, 4:] = T[blocks.scan], T[blocks.scan, :3, :3]
+    world[:, :3, 4:] = -error[:, None, None] * world[:, 4:, 4:]
+    moments: Floats = world @ W @ world.transpose(0, 2, 1)
+    return moments
 
 
 def _design_matrices(blocks: Blocks, T: Floats, planes: Planes) -> tuple[Floats, Floats]:
-    """Return the derivatives of a point's distance from its plane by the pose (b, 6, 4) and by the plane (b, 3, 4).
+    """Return the derivatives of a point's distance from its plane by its columns (b, 8, 7) and the plane (b, 3, 7).
 
-    They are linear in [p; 1], p relative to the mean of the plane.
+    They are linear in [p; 1; u], p relative to the mean of the plane, u the unit vector of the ray.
     """
     b = len(blocks.piece)
     n, c, axes = planes.normal[blocks.piece], planes.mean[blocks.piece], planes.axes[blocks.piece]
-    Lp = np.zeros((b, 3, 4))
+    Lp = np.zeros((b, 3, 7))
     Lp[:, 0, :3], Lp[:, 1, :3], Lp[:, 2, 3] = axes[:, :, 1], axes[:, :, 2], -1.0
     # Rotations w about the scan's own origin o: q = p - o, and n . (w x q) = w . (q x n).
     arm = c - T[blocks.scan, :3, 3]
-    Ls = np.zeros((b, 6, 4))
+    Ls = np.zeros((b, COLUMNS, 7))
     Ls[:, 0, 1], Ls[:, 0, 2] = n[:, 2], -n[:, 1]
     Ls[:, 1, 0], Ls[:, 1, 2] = -n[:, 2], n[:, 0]
     Ls[:, 2, 0], Ls[:, 2, 1] = n[:, 1], -n[:, 0]
     Ls[:, :3, 3] = np.cross(arm, n)
-    Ls[:, 3:, 3] = n
+    Ls[:, 3:6, 3] = n
+    Ls[:, 6, 4:] = -n
+    Ls[:, 7, 4:] = -n * (blocks.face >= 0)[:, None]
     return Ls, Lp
 
 
 @njit(cache=True, nogil=True)
 def eliminate(coupling, N, g, spurious):  # type: ignore[no-untyped-def]
-    """Subtract Hsp Hpp^-1 Hps from N (6k, 6k) and Hsp Hpp^-1 gp from g (6k,); add the spurious part of N.
+    """Subtract Hsp Hpp^-1 Hps from N (m, m) and Hsp Hpp^-1 gp from g (m,); add the spurious part of N.
 
     Sums run over the few scans of each piece; see :class:`_Coupling`.
     """
-    piece, scan, Hsp, inverse = coupling.piece, coupling.scan, coupling.Hsp, coupling.inverse
+    piece, columns, Hsp, inverse = coupling.piece, coupling.columns, coupling.Hsp, coupling.inverse
     normal, tilt = coupling.normal, coupling.tilt
     b = len(piece)
-    W, pull = np.empty((6, 3)), np.empty(3)
+    W, pull = np.empty((COLUMNS, 3)), np.empty(3)
     start = 0
     while start < b:
         p = piece[start]
@@ -237,56 +273,100 @@ def eliminate(coupling, N, g, spurious):  # type: ignore[no-untyped-def]
         while end < b and piece[end] == p:
             end += 1
         for x in range(start, end):
-            s = 6 * scan[x]
-            for i in range(6):
+            s = columns[x, 3]
+            for i in range(COLUMNS):
                 for j in range(3):
                     W[i, j] = 0.0
                     for m in range(3):
                         W[i, j] += Hsp[x, i, m] * inverse[p, m, j]
                 for j in range(3):
-                    g[s + i] -= W[i, j] * coupling.gp[p, j]
+                    g[columns[x, i]] -= W[i, j] * coupling.gp[p, j]
             for j in range(3):
                 pull[j] = normal[p, 0] * W[3, j] + normal[p, 1] * W[4, j] + normal[p, 2] * W[5, j]
             for i in range(3):
                 for j in range(3):
-                    spurious[s + 3 + i, s + 3 + j] += coupling.along[x] * tilt[p, i, j]
+                    spurious[s + i, s + j] += coupling.along[x] * tilt[p, i, j]
             for y in range(start, end):
-                t = 6 * scan[y]
+                t = columns[y, 3]
                 shared = 0.0
                 for m in range(3):
                     shared += pull[m] * (
                         normal[p, 0] * Hsp[y, 3, m] + normal[p, 1] * Hsp[y, 4, m] + normal[p, 2] * Hsp[y, 5, m]
                     )
-                for i in range(6):
-                    for j in range(6):
+                for i in range(COLUMNS):
+                    for j in range(COLUMNS):
                         total = 0.0
                         for m in range(3):
                             total += W[i, m] * Hsp[y, j, m]
-                        N[s + i, t + j] -= total
+                        N[columns[x, i], columns[y, j]] -= total
                 for i in range(3):
                     for j in range(3):
-                        spurious[s + 3 + i, t + 3 + j] -= shared * tilt[p, i, j]
+                        spurious[s + i, t + j] -= shared * tilt[p, i, j]
         start = end
 
 
 def _shifted(W: Floats, c: Floats) -> Floats:
-    """Move the origin of moments (b, 4, 4) to c (b, 3)."""
-    S = np.tile(np.eye(4), (len(c), 1, 1))
+    """Move the origin of moments (b, 7, 7) to c (b, 3)."""
+    S = np.tile(np.eye(7), (len(c), 1, 1))
     S[:, :3, 3] = -c
     shifted: Floats = S @ W @ S.transpose(0, 2, 1)
     return shifted
 
 
-def _newton_step(equations: _Equations, unknowns: Ints) -> Floats:
-    step = np.zeros(len(equations.g))
-    step[unknowns] = -np.linalg.solve(equations.N[np.ix_(unknowns, unknowns)], equations.g[unknowns])
+def _newton_step(equations: _Equations, unknowns: Ints, ranges: Floats, face_mm: float) -> Floats:
+    """Return the step of all unknowns; ``ranges`` (k + f,) are drawn to 0 by their priors."""
+    size = len(equations.g)
+    prior = _prior(len(ranges), (size - len(ranges)) // 6, face_mm)
+    g = equations.g.copy()
+    g[size - len(ranges) :] += np.diag(prior)[size - len(ranges) :] * ranges
+    step = np.zeros(size)
+    step[unknowns] = -np.linalg.solve((equations.N + prior)[np.ix_(unknowns, unknowns)], g[unknowns])
     return step
 
 
-def _unknowns(blocks: Blocks, T: Floats, reference: int) -> Ints:
-    """Return the rows (6m,) of the unknowns: six for every scan with blocks but the reference."""
-    scans = [s for s in range(len(T)) if s != reference and (blocks.scan == s).any()]
-    return (6 * np.array(scans, np.int64)[:, None] + np.arange(6)).ravel()
+def _prior(ranges: int, k: int, face_mm: float) -> Floats:
+    """Return the information of the priors: weak ones of k poses; range errors of scans by their class, of faces."""
+    of_poses = np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k)
+    return np.diag(
+        np.concatenate([of_poses, np.full(k, VIEW_MM**-2), np.full(ranges - k, max(face_mm, LEAST_FACE_MM) ** -2)])
+    )
+
+
+def _unknowns(blocks: Blocks, ranges: int, k: int, reference: int) -> Ints:
+    """Return the rows of the unknowns: six for every scan with blocks but the reference, and all range errors."""
+    scans = [s for s in range(k) if s != reference and (blocks.scan == s).any()]
+    poses = (6 * np.array(scans, np.int64)[:, None] + np.arange(6)).ravel()
+    return np.concatenate([poses, 6 * k + np.arange(ranges)])
+
+
+def _estimate_face_sd(equations: _Equations, unknowns: Ints, k: int, ranges: Floats) -> float:
+    """Estimate the standard deviation of the range errors of faces by restricted maximum likelihood.
+
+    With the other unknowns eliminated, the faces' information S and S times their estimate are turned to the axes of S,
+    where they are independent.
+    """
+    if len(ranges) == k:
+        return 0.0
+    rest, faces = unknowns[unknowns < 7 * k], np.arange(7 * k, len(equations.g))
+    N = equations.N + _prior(len(ranges), k, np.inf)
+    half = np.linalg.solve(N[np.ix_(rest, rest)], np.column_stack([N[np.ix_(rest, faces)], equations.g[rest]]))
+    S = N[np.ix_(faces, faces)] - N[np.ix_(faces, rest)] @ half[:, :-1]
+    pull = S @ ranges[k:] - equations.g[faces] + N[np.ix_(faces, rest)] @ half[:, -1]
+    information, axes = np.linalg.eigh(0.5 * (S + S.T))
+    information = np.maximum(information, 0.0)
+    square = (axes.T @ pull) ** 2
+
+    def slope(variance: float) -> float:
+        grown = 1.0 + information * variance
+        return float((square / grown**2 - information / grown).sum())
+
+    low, high = 0.0, MOST_FACE_MM**2
+    if slope(low) <= 0.0:
+        return 0.0
+    for _ in range(50):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if slope(middle) > 0.0 else (low, middle)
+    return float(np.sqrt(high))
 
 
 def _moved_by(T: Floats, step: Floats) -> Floats:
@@ -346,9 +426,9 @@ def _initial_tau(blocks: Blocks) -> Floats:
     """
     points = blocks.kind == 0
     if not points.any():
-        return np.zeros(KINDS)
+        return np.zeros(KINDS + 1)
     sigma = float(np.median(np.sqrt(blocks.count[points] / np.maximum(blocks.sums[points, 9], 1e-300))))
-    return np.array([WIDE_SIGMAS * sigma, 0.0])
+    return np.array([WIDE_SIGMAS * sigma, 0.0, 0.0])
 
 
 def _unit_variance(blocks: Blocks) -> Floats:
@@ -362,7 +442,7 @@ def _unit_variance(blocks: Blocks) -> Floats:
 
 def _estimate_tau(blocks: Blocks, offset: Floats, variance: Floats, before: Floats) -> Floats:
     """Estimate tau of each kind: the variance of offsets beyond that of the point noise, by the median of squares."""
-    tau: Floats = before.copy()
+    tau: Floats = before[:KINDS].copy()
     unit = _unit_variance(blocks)
     for kind in range(KINDS):
         rows = blocks.kind == kind

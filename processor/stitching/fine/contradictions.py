@@ -65,11 +65,12 @@ def of_scans(cells: CellTable, solution: Solution, gate_mm: float) -> list[Contr
 
 def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:
     """Compare each face with the plane of the other scans' points; only where both are planar within the noise."""
-    weight = bundle_adjustment.weights_at(blocks, solution.T, solution.tau)
+    weight = bundle_adjustment.weights_at(blocks, solution)
     # Where all faces of a piece but one are outliers, any may be wrong: each is compared with all others.
     left = np.bincount(blocks.piece, weight > bundle_adjustment.ASIDE, blocks.pieces)
     weight = np.where(left[blocks.piece] < 2, 1.0, weight)
-    world = extraction.transformed(blocks.sums, solution.T[blocks.scan])
+    moments = bundle_adjustment.in_world(blocks, solution.T, solution.ranges[blocks.scan])
+    world = extraction.triangle(moments)
     faces = extraction.planes_of(world)
     weighted = world * weight[:, None]
     rest = hashing.summed(weighted, blocks.piece, blocks.pieces)[blocks.piece] - weighted
@@ -83,6 +84,7 @@ def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:
     along = np.einsum("bi,bij->bj", shift, others.axes[:, :, 1:])
     lean = (along**2 / np.maximum(others.variance[:, 1:], 1e-12)).sum(axis=1)
     variance = 1.0 / faces.count + (1.0 + lean) / np.maximum(others.count, 1e-12) + 2.0 * solution.tau[0] ** 2
+    variance += solution.tau[bundle_adjustment.KINDS] ** 2
     arm = faces.mean - solution.T[blocks.scan, :3, 3]
     n = others.normal
     return _Misfits(

@@ -6,11 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
 from processor.stitching.coarse import candidate_rotations
 from processor.stitching.planes import extraction, hashing
+from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.samples import facing
 from processor.stitching.planes.scan_planes import LIMIT_SIGMAS, Cloud
 
@@ -39,22 +43,29 @@ class Blocks:
     count: Floats
     kind: Ints
     pieces: int
+    rays: Floats  # (b, 3, 7) moments of rays u and [p; 1; u], weighted alike; 0 if the scanner's position is unknown
+    face: Ints  # of the structure that the piece is on; -1: none of several pieces
 
     def take(self, rows: npt.NDArray[np.bool_]) -> Blocks:
         """Keep some rows; the pieces keep their numbers."""
         return replace(
             self, piece=self.piece[rows], scan=self.scan[rows], sums=self.sums[rows], count=self.count[rows],
-            kind=self.kind[rows],
+            kind=self.kind[rows], rays=self.rays[rows], face=self.face[rows],
         )  # fmt: skip
 
+    def weighted(self, weight: Floats) -> Blocks:
+        """Multiply the weights of the points by those of their rows (b,)."""
+        return replace(self, sums=self.sums * weight[:, None], rays=self.rays * weight[:, None, None])
+
     def shared(self) -> Blocks:
-        """Keep the pieces with two or more rows, and renumber them."""
+        """Keep the pieces with two or more rows, and renumber them and their faces."""
         _, inverse = np.unique(self.piece, return_inverse=True)
         inverse = inverse.ravel()
         keep = np.bincount(inverse)[inverse] >= 2 if len(inverse) else np.zeros(0, bool)
         _, piece = np.unique(inverse[keep], return_inverse=True)
         piece = piece.ravel()
-        return replace(self.take(keep), piece=piece, pieces=int(piece.max()) + 1 if len(piece) else 0)
+        face = np.unique(np.append(self.face[keep], -1), return_inverse=True)[1].ravel()[:-1] - 1
+        return replace(self.take(keep), piece=piece, pieces=int(piece.max()) + 1 if len(piece) else 0, face=face)
 
 
 @dataclass(frozen=True)
@@ -66,9 +77,25 @@ class CellTable:
     mean: Floats
     normal: Floats
     variance: Floats
+    known: npt.NDArray[np.bool_]  # of each cell: whether the scanner's position is known
     size_mm: float
     limit_mm: float
     slack_mm: float  # of planar pieces, beyond the noise
+
+    def corrected(self, ranges: Floats) -> CellTable:
+        """Return the cells if all ranges of each scan were too long by ``ranges`` (k,), mm."""
+        A = np.tile(np.eye(4), (len(self.scan), 1, 1))
+        A[:, :3] -= (ranges[self.scan] * self.known)[:, None, None] * ray_maps(self.mean)
+        sums = extraction.transformed(self.sums, A)
+        return replace(self, sums=sums, mean=extraction.scatter(sums)[0])
+
+
+def ray_maps(points: Floats) -> Floats:
+    """Return maps (n, 3, 4) from [p; 1] to the unit vector of the ray to p, to first order about each of ``points``."""
+    R = np.maximum(np.linalg.norm(points, axis=1), 1.0)[:, None]
+    u = points / R
+    across = (np.eye(3) - u[:, :, None] * u[:, None, :]) / R[:, :, None]
+    return np.concatenate([across, u[:, :, None]], axis=2)
 
 
 def gather(clouds: list[Cloud]) -> CellTable:
@@ -85,6 +112,7 @@ def gather(clouds: list[Cloud]) -> CellTable:
         mean=np.vstack([cloud.mean for cloud in clouds]),
         normal=np.vstack([cloud.normal for cloud in clouds]),
         variance=np.concatenate(variance),
+        known=np.repeat([cloud.has_position for cloud in clouds], [len(cloud.sums) for cloud in clouds]),
         size_mm=max(cloud.cell_mm for cloud in clouds),
         limit_mm=LIMIT_SIGMAS * sigma,
         slack_mm=SLACK_SIGMAS * sigma,
@@ -120,8 +148,12 @@ def incidence_cos(points: Floats, normals: Floats, known: bool) -> Floats:
     return cosine
 
 
-def segment(cells: CellTable, T: Floats, gate_mm: float) -> Blocks:
-    """Segment the scans merged by poses T (k, 4, 4) into planar pieces; faces up to about ``gate_mm`` apart are one."""
+def segment(cells: CellTable, T: Floats, gate_mm: float, ranges: Floats | None = None) -> Blocks:
+    """Segment the scans merged by poses T (k, 4, 4) into planar pieces; faces up to about ``gate_mm`` apart are one.
+
+    ``ranges`` (k,) are the range errors of scans that the segmentation is corrected by; those of the blocks stay.
+    """
+    raw, cells = cells, cells if ranges is None else cells.corrected(ranges)
     rows = np.flatnonzero(np.isfinite(T[cells.scan]).all(axis=(1, 2)))
     scan = cells.scan[rows]
     mean = np.einsum("nij,nj->ni", T[scan, :3, :3], cells.mean[rows]) + T[scan, :3, 3]
@@ -143,24 +175,55 @@ def segment(cells: CellTable, T: Floats, gate_mm: float) -> Blocks:
     same = (np.abs(np.einsum("ni,ni->n", n, normal[on])) > SAME_COS) & (
         np.abs(off) < 2.0 * np.hypot(cells.limit_mm, gate_mm)
     )
-    return _blocks(cells, rows[on[same]], piece[on[same]])
+    return _blocks(raw, T, rows[on[same]], piece[on[same]])
 
 
-def _blocks(cells: CellTable, rows: Ints, piece: Ints) -> Blocks:
+def _blocks(cells: CellTable, T: Floats, rows: Ints, piece: Ints) -> Blocks:
     """Sum cells ``rows`` (m,) by piece (m,) and scan; scans with too few points on a piece are left out."""
     scan = cells.scan[rows]
     _, first, inverse = np.unique(piece * MOST_SCANS + scan, return_index=True, return_inverse=True)
-    weighted = hashing.summed(cells.sums[rows] / cells.variance[rows][:, None], inverse.ravel(), len(first))
+    sums = cells.sums[rows] / cells.variance[rows][:, None]
+    to_ray = ray_maps(cells.mean[rows]) * cells.known[rows, None, None]
+    rays = to_ray @ extraction.square(sums)
+    rays = np.concatenate([rays, rays @ to_ray.transpose(0, 2, 1)], axis=2).reshape(len(rows), 21)
+    weighted = hashing.summed(np.hstack([sums, rays]), inverse.ravel(), len(first))
     count: Floats = np.bincount(inverse.ravel(), cells.sums[rows, 9], len(first)).astype(np.float64)
     enough = count >= LEAST_POINTS
     _, number = np.unique(piece[first][enough], return_inverse=True)
     number = number.ravel()
     pieces = int(number.max()) + 1 if len(number) else 0
-    excess = _excess(weighted[enough], count[enough], number, pieces)
+    excess = _excess(weighted[enough, :10], count[enough], number, pieces)
+    weighted = weighted[enough] / excess[number][:, None]
+    sums = weighted[:, :10]
+    of_scan = scan[first][enough]
+    world = hashing.summed(extraction.transformed(sums, T[of_scan]), number, pieces)
     return Blocks(
-        piece=number, scan=scan[first][enough], sums=weighted[enough] / excess[number][:, None], count=count[enough],
-        kind=np.zeros(len(number), np.int64), pieces=pieces,
+        piece=number, scan=of_scan, sums=sums, count=count[enough], kind=np.zeros(len(number), np.int64), pieces=pieces,
+        rays=weighted[:, 10:].reshape(-1, 3, 7), face=_faces(extraction.planes_of(world), cells)[number],
     )  # fmt: skip
+
+
+def _faces(planes: Planes, cells: CellTable) -> Ints:
+    """Return the number (p,) of the face that each piece is a part of: pieces of one plane that touch; -1 if alone."""
+    p, n = len(planes.mean), planes.normal
+    face = np.full(p, -1, np.int64)
+    if not p:
+        return face
+    reach = np.sqrt(3.0 * planes.variance[:, 1:].sum(axis=1)) + cells.size_mm
+    near = cKDTree(planes.mean).query_ball_point(planes.mean, 2.0 * reach)  # all that are no larger
+    a, b = np.repeat(np.arange(p), [len(row) for row in near]), np.concatenate(near).astype(np.int64)
+    way = planes.mean[b] - planes.mean[a]
+    one = (
+        (np.linalg.norm(way, axis=1) < reach[a] + reach[b])
+        & (np.abs(np.einsum("pi,pi->p", n[a], n[b])) > SAME_COS)
+        & (np.abs(np.einsum("pi,pi->p", n[a], way)) < cells.limit_mm)
+        & (np.abs(np.einsum("pi,pi->p", n[b], way)) < cells.limit_mm)
+    )
+    links = csr_matrix((np.ones(one.sum()), (a[one], b[one])), shape=(p, p))
+    joined = connected_components(links, directed=False)[1]
+    several = np.bincount(joined)[joined] > 1
+    face[several] = np.unique(joined[several], return_inverse=True)[1]
+    return face
 
 
 def _excess(weighted: Floats, count: Floats, piece: Ints, pieces: int) -> Floats:

@@ -66,6 +66,9 @@ def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) ->
     key, inverse = np.unique(ends.piece * len(T) + ends.scan, return_inverse=True)
     inverse = inverse.ravel()
     sums = hashing.summed(extraction.sums_of(ends.points) * weight[:, None], inverse, len(key))
+    u = ends.points / np.linalg.norm(ends.points, axis=1)[:, None]
+    y = np.hstack([ends.points, np.ones((len(u), 1)), u])
+    rays = hashing.summed((weight[:, None, None] * u[:, :, None] * y[:, None]).reshape(-1, 21), inverse, len(key))
     piece = np.concatenate([blocks.piece, key // len(T)])
     order = np.argsort(piece, kind="stable")
     return Blocks(
@@ -75,6 +78,8 @@ def with_ends(clouds: list[Cloud], blocks: Blocks, T: Floats, gate_mm: float) ->
         count=np.concatenate([blocks.count, np.bincount(inverse).astype(float)])[order],
         kind=np.concatenate([blocks.kind, np.ones(len(key), np.int64)])[order],
         pieces=blocks.pieces,
+        rays=np.concatenate([blocks.rays, rays.reshape(-1, 3, 7)])[order],
+        face=np.concatenate([blocks.face, np.full(len(key), -1)])[order],
     )
 
 

@@ -51,8 +51,7 @@ def measure(blocks: Blocks, network: Solution, a: int, b: int) -> Pair | None:
 
     Outliers keep their weights from the network, since two scans alone cannot decide which of them is wrong.
     """
-    weighted = replace(blocks, sums=blocks.sums * network.weight[:, None])
-    of_pair = weighted.take(np.isin(blocks.scan, (a, b))).shared()
+    of_pair = blocks.weighted(network.weight).take(np.isin(blocks.scan, (a, b))).shared()
     if of_pair.pieces < LEAST_PIECES:
         return None
     local = replace(of_pair, scan=(of_pair.scan == b).astype(np.int64))
