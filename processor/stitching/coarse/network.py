@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -100,17 +101,15 @@ def _moves(network: Network, coarse: CoarsePoses, reference: int) -> list[Move]:
     """Return the motions that rival poses of single pairs suggest, each of the scans that move along best.
 
     In a hall of nearly equal bays not one scan alone may stand a bay off, but all those beyond it too: beside these,
-    any other pose of a single one is contradicted. Scans that are ambiguous already are not tried again.
+    any other pose of a single one is contradicted. Of a pair either scan moves, unless both are ambiguous already.
     """
     moves = list[Move]()
     ambiguous = set(np.flatnonzero(coarse.rivalry > AMBIGUOUS).tolist())
-    for (i, j), poses in network.candidates.items():
-        if not {i, j} <= set(network.placed):
-            continue
+    for i, j in itertools.permutations(network.placed, 2):
         now = network.score_beside(i, j, network.T[j])
-        for pose in poses:
-            wanted = network.T[i] @ pose.T_a_b
-            if {i, j} & ambiguous or pose.score <= AMBIGUOUS * now.score or network.same(wanted, network.T[j], j):
+        for T_i_j, score in network.poses_beside(i, j):
+            wanted = network.T[i] @ T_i_j
+            if {i, j} <= ambiguous or score <= AMBIGUOUS * now.score or network.same(wanted, network.T[j], j):
                 continue
             move = _followers(network, i, j, wanted @ rigid.invert(network.T[j]))
             if reference in move.scans:
