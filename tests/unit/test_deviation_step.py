@@ -172,7 +172,10 @@ def test_scans_are_placed_as_they_were_stitched_and_left_out_where_they_were_not
     assert "deviation.unposed-scans" in codes(deviation_step.run(several, deviation_step.Params(register="none")))
 
 
-@pytest.mark.parametrize(("elsewhere", "wrong"), [(False, 1), (True, 2)])
+@pytest.mark.parametrize(
+    ("elsewhere", "wrong"),
+    [(False, 1), (True, 2), *(pytest.param(*case, marks=pytest.mark.slow) for case in ((False, 2), (True, 1)))],
+)
 def test_a_scan_in_another_frame_is_named_and_left_out(wrong, elsewhere):
     """Of three scans as they stand, of a third of the points each, one or two are in frames of their own."""
     scene, _ = scene_of(11, lambda p: 0.0 * p)

@@ -21,7 +21,6 @@ from processor.preassembly.parts.attitude import LEAST_EVIDENCE, TELLING_MM, Sha
 
 POINTS, NEAR_POINTS = 100_000, 3_000  # of a scan, by which rough poses are compared, and their share near a design
 SAMPLES = 50_000  # of each surface: tens on a mark, also on a part of 100 m2
-EVERY = 1_000  # more than there are hypotheses
 NEAR_MM = surface_registration.GATES_MM[1]
 
 
@@ -66,7 +65,7 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     few = thinned(points, POINTS)
     pieces = not alike
 
-    def rough(k: int, kept: int = attitude.ROUGH_KEPT) -> Floats:
+    def rough(k: int, kept: int | None = attitude.ROUGH_KEPT) -> Floats:
         return attitude.rough(few, shapes.design.parts[k], shapes[k], pieces=pieces, kept=kept)
 
     best, T_best = index, rough(index)
@@ -83,7 +82,7 @@ def rather(points: Floats, index: int, shapes: Shapes) -> int | None:
     if best == index:
         return None
     # The first rough pose may have missed the part itself: a scan is called wrong only after all that are promising.
-    own = shapes[index], rough(index, EVERY)
+    own = shapes[index], rough(index, None)
     return best if _shows_other(few, own, (shapes[best], T_best)) else None
 
 

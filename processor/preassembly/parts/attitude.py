@@ -200,10 +200,10 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     return _decide(points, box, seeds, surface, rivals)
 
 
-def rough(points: Floats, part: DesignPart, surface: Surface, *, pieces: bool, kept: int = ROUGH_KEPT) -> Floats:
+def rough(points: Floats, part: DesignPart, surface: Surface, *, pieces: bool, kept: int | None = ROUGH_KEPT) -> Floats:
     """T_bridge_scan (4, 4) of the hypothesis that a few hundred of points (n, 3) fit best; of a symmetric part any.
 
-    With ``pieces`` the scan may also be of a piece of the part. ``kept`` is the number of promising hypotheses tried.
+    With ``pieces`` the scan may also be of a piece of the part. ``kept`` promising hypotheses are tried, None: all.
     """
     even = _even(points, surface)
     coarse = _coarse(points, even, surface, part, pieces=pieces)[:kept]

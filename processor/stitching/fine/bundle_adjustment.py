@@ -14,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 from numba import njit
+from scipy.optimize import brentq
 
 from processor.adjustment.scanner_class import VIEW_MM
 from processor.geometry import rigid
@@ -72,7 +73,7 @@ def solve(
     """
     k = len(T)
     common = np.zeros(KINDS + 1) if tau is None else np.array(tau)
-    ranges = np.zeros(k + int(blocks.face.max(initial=-1)) + 1)
+    ranges = np.zeros(k + blocks.faces)
     unknowns = _unknowns(blocks, len(ranges), k, reference)
     poses = unknowns[unknowns < 6 * k]
     if not len(poses):
@@ -114,7 +115,7 @@ def solve(
 def weights_at(blocks: Blocks, solution: Solution) -> Floats:
     """Return the robust weights (b,) of blocks at the poses and the scans' range errors of a solution."""
     weight, tau = np.ones(len(blocks.piece)), np.array(solution.tau)
-    ranges = np.zeros(len(solution.T) + int(blocks.face.max(initial=-1)) + 1)
+    ranges = np.zeros(len(solution.T) + blocks.faces)
     ranges[: len(solution.T)] = solution.ranges[: len(solution.T)]
     for _ in range(ROUNDS):
         weight = _robust_weights(blocks, _linearize(blocks, solution.T, ranges, tau, weight).z)
@@ -360,13 +361,11 @@ def _estimate_face_sd(equations: _Equations, unknowns: Ints, k: int, ranges: Flo
         grown = 1.0 + information * variance
         return float((square / grown**2 - information / grown).sum())
 
-    low, high = 0.0, MOST_FACE_MM**2
-    if slope(low) <= 0.0:
+    if slope(0.0) <= 0.0:
         return 0.0
-    for _ in range(50):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if slope(middle) > 0.0 else (low, middle)
-    return float(np.sqrt(high))
+    if slope(MOST_FACE_MM**2) >= 0.0:
+        return MOST_FACE_MM
+    return float(np.sqrt(brentq(slope, 0.0, MOST_FACE_MM**2)))
 
 
 def _moved_by(T: Floats, step: Floats) -> Floats:

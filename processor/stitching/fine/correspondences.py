@@ -46,6 +46,11 @@ class Blocks:
     rays: Floats  # (b, 3, 7) moments of rays u and [p; 1; u], weighted alike; 0 if the scanner's position is unknown
     face: Ints  # of the structure that the piece is on; -1: none of several pieces
 
+    @property
+    def faces(self) -> int:
+        """Number of faces of several pieces."""
+        return int(self.face.max(initial=-1)) + 1
+
     def take(self, rows: npt.NDArray[np.bool_]) -> Blocks:
         """Keep some rows; the pieces keep their numbers."""
         return replace(
