@@ -171,8 +171,8 @@ def prepare(
 
 
 def _applies(module: ModuleType, scene: Scene) -> bool:
-    says: Callable[[Scene], bool] | None = getattr(module, "applies", None)
-    return scene.kind == module.KIND if says is None else says(scene)
+    applies: Callable[[Scene], bool] | None = getattr(module, "applies", None)
+    return scene.kind == module.KIND if applies is None else applies(scene)
 
 
 def plan(wanted: Sequence[str], methods: Sequence[str], params: Mapping[str, Any], seed: int | None) -> tuple[Job, ...]:

@@ -54,7 +54,7 @@ class BatchOptions:
 @click.option("--steps", callback=split_names, metavar="A,B", help="as of run; so are the options below")
 @click.option("--method", "methods", callback=split_names, metavar="NAME[,NAME]")
 @click.option("--params", type=click.Path(path_type=Path, dir_okay=False))
-@click.option("--units", type=click.Choice(UNITS), help="of scans; scene files know theirs")
+@click.option("--units", type=click.Choice(UNITS), help="of scans; scene files state theirs")
 @click.option("--seed", type=click.IntRange(min=0))
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of all pages")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")

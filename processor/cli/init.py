@@ -19,8 +19,8 @@ from processor.model import UsageError
 def init(folder: Path, force: bool, as_json: bool) -> None:
     """Write FOLDER/project.toml as its files suggest: kind, units, design, and which scan is which component.
 
-    Components are told by their names and by their shape against the design. What was unsure is said, and marked in
-    the file: look at it before the first run.
+    Components are recognised by their names and by their shapes against the design. What is uncertain is printed and
+    marked in the file: check it before the first run.
     """
     from processor.scan_folder import files, guess
     from processor.store.atomic_file import replacing
