@@ -14,7 +14,7 @@ NAN = float("nan")
 
 @dataclass(frozen=True)
 class Paper:
-    """The source paper's numbers (002): voxels of 2 mm with 5 points, scales in mm; the paper does not state its depth."""
+    """The source paper's numbers (002): voxels of 2 mm with 5 points, scales in mm; it states no depth."""
 
     voxel_mm: float = 2.0
     voxel_points: int = 5
