@@ -17,6 +17,7 @@ from scipy.spatial.distance import cdist
 from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
 from processor.geometry.sphere import sphere_cells
 from processor.model import NORMAL_95, Floats, Ints
+from processor.space_frame.members.records import Members
 from processor.space_frame.spheres.records import CropsWithRays, Fits, Priors, ViewErrors
 from processor.space_frame.spheres.view_field import (
     BallResiduals,
@@ -30,7 +31,6 @@ from processor.space_frame.spheres.view_field import (
 LEAST_POINTS = 30
 LEAST_CELLS = 8
 LEAST_COSINE = 0.1  # of incidence: no view shows a surface at less
-ACROSS = 0.3  # largest cosine between an axis and the normals of its tube: cells are as wide
 MOST_PAIRS = 20  # of neighbouring balls that the field is estimated from
 KNOTS = 12  # places whose fields stand for those of all balls
 BEAM = np.array([0.0, 0.0, 1.0, 1.0])  # what a wide beam does to the state of a ball that is seen from below
@@ -68,7 +68,7 @@ def view_errors(
     sampled = _neighbours(rows, places)
     field = field_of([_residuals(found[k], places[k]) for k in sampled])
     cosines = _mean_cosines(seen)
-    offset_sd, beam_sd = _offset_or_beam(list(found.values()), cosines, radius_offset)
+    offset_sd, beam_sd = _offset_or_beam(list(found.values()), cosines, radius_offset, field.variance)
     shared, own = _of_spheres(found, field, cosines, places, offset_sd, beam_sd)
     between = field.correlation(cdist(places[sampled], places[sampled])).mean() if sampled else 0.0
     return ViewErrors(
@@ -81,24 +81,21 @@ def view_errors(
     )
 
 
-def of_tubes(views: ViewErrors, axes: Floats, side: Floats) -> Floats:
-    """Covariances (m, 3, 3) of tubes by errors of views: of places along ``side`` and axis x side, and of radii; mm^2.
-
-    ``axes`` and ``side`` (m, 3) are unit vectors. Tubes are seen from where the spheres are: their points have the
-    normals of the spheres' points that are across the axis.
-    """
+def of_tubes(views: ViewErrors, members: Members) -> Floats:
+    """Covariances (m, 3, 3) of tubes by errors of views: of places along side and other, and of radii; mm^2."""
+    count, sectors = members.around.shape
+    turn = 2.0 * np.pi * (np.arange(sectors) + 0.5) / sectors
+    across = np.column_stack([np.cos(turn), np.sin(turn)])
+    J = np.column_stack([across, np.ones(sectors)])
+    factor = correlation(across @ across.T)
     normals, cosines = directions(), _mean_cosines(views.seen)
-    covariance = np.zeros((len(axes), 3, 3))
-    for m, (axis, first) in enumerate(zip(axes, side, strict=True)):
-        on = (np.abs(normals @ axis) < ACROSS) & (views.seen > 0.0)
-        normal = normals[on] - np.outer(normals[on] @ axis, axis)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        J = np.column_stack([normal @ first, normal @ np.cross(axis, first), np.ones(len(normal))])
-        weighted = (J * views.seen[on][:, None]).T
-        gain = np.linalg.pinv(weighted @ J, rcond=1e-6) @ weighted
-        by_offset = views.offset_sd * gain @ cosines[on]
-        covariance[m] = views.sd**2 * gain @ correlation(normal @ normal.T) @ gain.T
-        covariance[m] += np.diag([SHIFT_MM**2, SHIFT_MM**2, 0.0]) + np.outer(by_offset, by_offset)
+    covariance = np.tile(np.diag([SHIFT_MM**2, SHIFT_MM**2, 0.0]), (count, 1, 1))
+    for m, points in enumerate(members.around):
+        weighted = (J * points[:, None]).T
+        gain = np.linalg.pinv(weighted @ J, rcond=1e-6, hermitian=True) @ weighted
+        normal = across @ np.stack([members.side[m], members.other[m]])
+        by_offset = views.offset_sd * gain @ cosines[np.argmax(normal @ normals.T, axis=1)]
+        covariance[m] += views.sd**2 * gain @ factor @ gain.T + np.outer(by_offset, by_offset)
     return covariance
 
 
@@ -118,14 +115,14 @@ def _mean_cosines(seen: Floats) -> Floats:
     return mean
 
 
-def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float) -> tuple[float, float]:
+def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, variance: float) -> tuple[float, float]:
     """Standard deviations (mm) of an offset of ranges, and of a change of radii by a wide beam.
 
-    Of an offset of the radii one half of the variance is that of an offset of ranges, as far as a scanner of the class
-    may have it (95 %), and the rest that of a beam.
+    Of an offset of the radii one half of the variance is that of an offset of ranges, as far as the scanner's class and
+    the mean of the views, which has the field's variance, may have it (95 %). The rest is that of a beam.
     """
     change = float(np.mean([fit.gain[3] @ cosines[fit.cells] for fit in fits])) if fits else 0.0
-    limit = NORMAL_95 * OFFSET_MM
+    limit = NORMAL_95 * float(np.hypot(OFFSET_MM, np.sqrt(variance)))
     offset = radius_offset / change if abs(radius_offset) < limit * abs(change) else limit
     explained = 0.5 * (offset * change) ** 2
     return float(np.hypot(OFFSET_MM, np.sqrt(0.5) * offset)), float(np.sqrt(max(radius_offset**2 - explained, 0.0)))
