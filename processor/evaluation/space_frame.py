@@ -73,7 +73,7 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
         *signed("spheres", "centres", off[ok], bound[ok, :3]),
         *signed("spheres", "radii", radius[ok], bound[ok, 3]),
         *signed("spheres", "lowest points", lowest[ok], bound[ok, 4]),
-        *_movements(scene, result, true, rows[ok], matches[ok]),
+        *_movements(scene, result, true, rows, matches, ok),
         *_sizes(balls, true, rows, matches, result.method == "ray"),
         *_tubes(scene, result, truth, of_truth),
     ]
@@ -95,13 +95,20 @@ def _sizes(balls: Balls, true: FrameTruth, rows: Ints, matches: Ints, limited: b
     ]
 
 
-def _movements(scene: Scene, result: Result, true: FrameTruth, rows: Ints, matches: Ints) -> list[Metric]:
-    """Return movements of balls ``rows`` (m,) against the true ones, relative to the same datum.
+def _movements(
+    scene: Scene, result: Result, true: FrameTruth, rows: Ints, matches: Ints, ok: npt.NDArray[np.bool_]
+) -> list[Metric]:
+    """Return movements of balls ``rows`` (m,) against the true ones, of those that are ``ok`` (m,).
 
-    By a best fit, the truth is fitted as the balls are: by the robust fit of the same nodes.
+    By a best fit, the truth is fitted as the balls are: by the robust fit of the same nodes, also of those that are not
+    ok. A fit without some of the nodes is another datum.
     """
     balls, design = result.balls, scene.frame
-    if design is None or not len(balls.movement) or not np.isfinite(balls.movement[rows]).any():
+    if design is None or not len(balls.movement):
+        return []
+    moved = np.isfinite(balls.movement[rows]).all(axis=1)
+    rows, matches, ok = rows[moved], matches[moved], ok[moved]
+    if not ok.any():
         return []
     known = {int(id_): k for k, id_ in enumerate(design.ids)}
     nominal = np.array([design.centres[known[int(balls.ids[row])]] for row in rows]).reshape(-1, 3)
@@ -109,7 +116,7 @@ def _movements(scene: Scene, result: Result, true: FrameTruth, rows: Ints, match
     if result.movement_reference is not None and result.movement_reference.gauge is MovementGauge.BEST_FIT:
         middle = places.mean(axis=0)
         places = rigid.apply(robust_fit(places - middle, nominal)[0], places - middle)
-    vector = places - nominal
+    vector, rows = (places - nominal)[ok], rows[ok]
     size = np.linalg.norm(vector, axis=1)
     return [
         *covered("spheres", "movements", balls.movement[rows] - vector, balls.movement_ci95[rows]),

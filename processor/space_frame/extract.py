@@ -324,10 +324,9 @@ def _compare(
     matched = _matched(pattern, design, pose, options.expansion)
     at, stations = pattern.positions.mean(axis=0), registered.trusted
     common = np.diag([0.0, 0.0, 0.0, *3 * [options.datum_mm**2]]) if stations is None else stations.common(at)
-    views = spheres.common[rows, :3, :3]
-    common[3:, 3:] += views.mean(axis=0)
-    covariance = spheres.covariance[rows, :3, :3] - views + shared_offset[rows]
-    movements = movement(matched, pattern, covariance, design, common, at, expansion=options.expansion)
+    shared = spheres.shared[rows, :3]
+    covariance = spheres.covariance[rows, :3, :3] - shared @ np.swapaxes(shared, 1, 2) + shared_offset[rows]
+    movements = movement(matched, pattern, covariance, design, common, at, shared, expansion=options.expansion)
     assignment, weight = np.full(len(spheres.radii), -1, np.int64), np.zeros(len(spheres.radii))
     assignment[rows], weight[rows] = matched.assignment, matched.weight
     return replace(matched, assignment=assignment, weight=weight), replace(movements, found=rows[movements.found])

@@ -178,7 +178,7 @@ def _with_movements(balls: Balls, movements: Movement, limit: float, matched: bo
 def _tubes(members: Members, ids: Ints, origin: Floats, views: ViewErrors | None) -> Tubes:
     """Convert members; errors of unnamed ``views`` are part of the intervals."""
     half = 0.5 * members.lengths[:, None] * members.directions
-    common = np.zeros((len(half), 3, 3)) if views is None else of_tubes(views, members.directions, members.side)
+    common = np.zeros((len(half), 3, 3)) if views is None else of_tubes(views, members)
     return Tubes(
         a=np.where(members.node_a >= 0, ids[members.node_a], -1),
         b=np.where(members.node_b >= 0, ids[members.node_b], -1),

@@ -77,6 +77,7 @@ def frame(rng, centres, radii, stations, step_mrad=1.2, sigma=2.0, node_sd=0.5, 
         node_b=np.full(m, -1),
         count=np.full(m, 100),
         rms=np.full(m, 2.0),
+        around=np.zeros((m, 24)),
     )
     return source, nodes, found
 

@@ -40,6 +40,7 @@ def movement(
     design: FrameDesign,
     datum: Floats | None = None,
     datum_place: Floats | None = None,
+    shared: Floats | None = None,
     gauge: MovementGauge | None = None,
     expansion: float = 1.0,
 ) -> Movement:
@@ -50,6 +51,8 @@ def movement(
     covariance : (k, 3, 3) of the found nodes, without the motion common to all
     datum : (6, 6) covariance of the common motion: turn about ``datum_place`` (3,), which is less the nodes' origin,
         and translation; None = none. A best fit removes it.
+    shared : (k, 3, q) changes of the found nodes by standard normal variates that they have in common, without those of
+        ``covariance`` and ``datum``; a best fit removes what is a common motion of them
     gauge : by default the design's frame where the frames are the same, else the best fit
     expansion : factor of all lengths by temperature; nominal places are expanded about their mean
     """
@@ -65,11 +68,13 @@ def movement(
     # offset less offset first: adding either to the nodes would lose digits
     positions = nodes.positions[rows] @ R.T + (R @ nodes.origin + T[:3, 3] - middle)
     C = np.einsum("ij,njk,lk->nil", R, covariance[rows], R)
+    changes = np.zeros((len(rows), 3, 0)) if shared is None else R @ shared[rows]
     if in_frame and datum is not None:
         J = rigid.motion(nodes.positions[rows] - (np.zeros(3) if datum_place is None else datum_place))
         C = C + np.einsum("ij,njp,pq,nkq,lk->nil", R, J, datum, J, R, optimize=False)
     elif not in_frame and len(rows):
-        C = _relative(positions, C, matching.weight[rows])
+        C, changes = _relative(positions, C, changes, matching.weight[rows])
+    C = C + changes @ np.swapaxes(changes, 1, 2)
     return Movement(
         gauge=gauge,
         found=rows,
@@ -80,8 +85,8 @@ def movement(
     )
 
 
-def _relative(nodes: Floats, C: Floats, weight: Floats) -> Floats:
-    """Covariance (n, 3, 3) of nodes (n, 3) of covariance C relative to their own fit with weights (n,)."""
+def _relative(nodes: Floats, C: Floats, changes: Floats, weight: Floats) -> tuple[Floats, Floats]:
+    """Covariance (n, 3, 3) and changes (n, 3, q) of nodes (n, 3) relative to their own fit with weights (n,)."""
     J = rigid.motion(nodes - nodes.mean(axis=0))
     A = np.einsum("n,nip,niq->pq", weight, J, J)
     scale = np.sqrt(np.maximum(np.diag(A), 1e-300))
@@ -90,7 +95,7 @@ def _relative(nodes: Floats, C: Floats, weight: Floats) -> Floats:
     fit = np.einsum("npi,nij,nqj->pq", gain, C, gain)
     cross = np.einsum("nip,npj,njk->nik", J, gain, C)
     relative: Floats = C - cross - np.swapaxes(cross, 1, 2) + np.einsum("nip,pq,njq->nij", J, fit, J)
-    return relative
+    return relative, changes - np.einsum("nip,pq->niq", J, np.einsum("npi,niq->pq", gain, changes))
 
 
 # --- comparison with a limit -----------------------------------------------------------------------------------------

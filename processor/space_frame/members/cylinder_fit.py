@@ -39,6 +39,7 @@ TRIM_MM = 8.0  # off each end: the start of a cone is not sharp
 LEAST_SIGMA_MM = 0.05
 ROUGH_COS = 0.5  # of incidence, in rough fits
 COS_BINS = 8  # of 0.1 from GRAZING_COS to 1
+SECTORS = 24  # around a tube
 
 
 class Limits(NamedTuple):
@@ -249,6 +250,7 @@ def refine(gathered, scanners, spans, limits, errors, fits, first, last):  # typ
         good, count, assumed, sigma = _improve(p, half, observations, shifts, errors, sigma, 0.0, 4, solution)
         if not good or not limits.least_radius < p[4] < limits.most_radius:
             continue
+        _count_around(p, half, observations, CUT_SIGMAS * sigma, fits.around[m])
         _move(frame, p, half)
         fits.ok[m], fits.number[m], fits.sigma[m] = True, count, sigma
         _store(fits, m, frame, p, half, assumed, solution)
@@ -284,6 +286,20 @@ def _improve(p, h, observations, shifts, errors, sigma, slack, turns, solution):
             break
         before = change
     return good, count, assumed, sigma
+
+
+@njit(cache=True, nogil=True)
+def _count_around(p, h, observations, cut, around):  # type: ignore[no-untyped-def]
+    """Count the points of unknown scanners by sectors from ``side`` to ``other``: those on |z| <= h within the cut."""
+    P, U, known, _ = observations
+    J = np.zeros(NP)
+    for i in range(len(P)):
+        if known[i] or abs(P[i, 2]) > h:
+            continue
+        v, _ = residual(p, h, P[i, 0], P[i, 1], P[i, 2], U[i, 0], U[i, 1], U[i, 2], known[i], J)
+        if abs(v) <= cut:  # the derivatives by the offset are the negative normal
+            turn = np.arctan2(-J[1], -J[0]) / (2.0 * np.pi)
+            around[int(np.floor(turn * len(around))) % len(around)] += 1.0
 
 
 @njit(cache=True, nogil=True)

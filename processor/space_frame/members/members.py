@@ -185,4 +185,5 @@ def _members(fits: Fits, pairs: Ints) -> Members:
         node_b=pairs[rows, 1],
         count=fits.number[rows],
         rms=fits.sigma[rows],
+        around=fits.around[rows],
     )

@@ -52,6 +52,7 @@ class Members(Checked):
     node_b: Ints = column("m", dtype=np.int64)
     count: Ints = column("m", dtype=np.int64)  # points that the fit rests on
     rms: Floats = column("m")  # of their residuals, along the ray where scanners are known, mm
+    around: Floats = column("m", 24)  # points of unknown scanners by sectors, from ``side`` to ``other``
 
     @property
     def other(self) -> Floats:

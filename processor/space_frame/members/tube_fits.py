@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from processor.geometry.parallel import over_ranges
 from processor.model import Floats, Ints
-from processor.space_frame.members.cylinder_fit import COS_BINS, ROUGH_COS, Errors, Limits, fit_roughly, refine
+from processor.space_frame.members.cylinder_fit import COS_BINS, ROUGH_COS, SECTORS, Errors, Limits, fit_roughly, refine
 from processor.space_frame.members.cylinder_model import GRAZING_COS
 from processor.space_frame.points.line_crops import Gathered
 
@@ -38,7 +38,7 @@ class Fits(NamedTuple):
 
     ``ok`` marks the tubes that could be fitted; ``sigma`` is the standard deviation of a residual. ``response``
     (m, s, 4, 2) is the change of offsets and turns by a shift of each station across the tube by one standard
-    deviation; s = 0 where stations have none. The covariance includes it.
+    deviation; s = 0 where stations have none. The covariance includes it. ``around`` (m, 24) is as in :class:`Members`.
     """
 
     ok: npt.NDArray[np.bool_]
@@ -52,6 +52,7 @@ class Fits(NamedTuple):
     response: Floats
     number: Ints  # of points used
     sigma: Floats
+    around: Floats
 
 
 def rough(
@@ -110,6 +111,7 @@ def refined(
         response=np.zeros((m, len(scanners) if errors.a or errors.b else 0, 4, 2)),
         number=np.zeros(m, np.int64),
         sigma=start.sigma.copy(),
+        around=np.zeros((m, SECTORS)),
     )
     limits = Limits(*radii_mm, most)
     over_ranges(partial(refine, gathered, scanners, span_mm, limits, errors, fits), m, threads)

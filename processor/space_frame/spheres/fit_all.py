@@ -151,7 +151,9 @@ def fit_crops(
     context = quality.FitContext(
         catalogue=catalogue,
         scanners_known=scanners_known,
-        views=None if scanners_known else view_errors(problem.crops, residuals.weights, fits, priors),
+        views=None
+        if scanners_known
+        else view_errors(problem.crops, residuals.weights, fits, priors, nodes.positions, offset[0]),
         noise=setting.noise,
         radius_sd=setting.radius_sd,
         station_sd=setting.station_sd if station_covariance is None else NAN,

@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import chdtrc
 
-from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
+from processor.adjustment.scanner_class import SHIFT_MM
 from processor.geometry.sphere import BANDS, SECTORS
 from processor.limits import standards
 from processor.model import NORMAL_95, Floats, Reason, Tolerance, reason
@@ -82,7 +82,7 @@ def assess(fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext) -> Sp
         radii=state[:, 3],
         lowest=centres - state[:, 3:] * np.array([0.0, 0.0, 1.0]),
         covariance=covariance,
-        common=np.zeros_like(covariance) if context.views is None else context.views.common,
+        shared=np.zeros((len(covariance), 4, 0)) if context.views is None else context.views.shared,
         lowest_sd=lowest_sd,
         bound=bound,
         bound_lowest_sd=bound_lowest,
@@ -116,15 +116,19 @@ def _states(fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext) -> t
     degrees = fits.numbers[:, DEGREES]
     # The scale is estimated: the variance of Student's t is wider than the normal one.
     wider = np.where(degrees > 4.0, degrees / np.maximum(degrees - 2.0, 1.0), 2.0)
-    common = np.array([0.0, 0.0, 1.0, 1.0]) * context.radius_offset[0]
-    covariance = fits.covariance * wider[:, None, None] + np.outer(common, common)
-    if context.views is not None:
+    covariance = fits.covariance * wider[:, None, None]
+    if context.views is None:
+        common = np.array([0.0, 0.0, 1.0, 1.0]) * context.radius_offset[0]
+        covariance = covariance + np.outer(common, common)
+    else:  # they include the offset of radii
         covariance = covariance + context.views.covariance
     for i in np.flatnonzero(~fits.fitted).tolist():
         state[i, :3] = 0.0
         state[i, 3] = nominal[i]
         covariance[i] = np.nan
         covariance[i, :3, :3] = nodes.covariance[i]
+        if context.views is not None:
+            covariance[i, :3, :3] += context.views.covariance[i, :3, :3]
         if np.isfinite(nominal[i]):
             covariance[i, 3, :], covariance[i, :, 3] = 0.0, 0.0
             covariance[i, 3, 3] = context.radius_sd**2
@@ -238,7 +242,7 @@ def _messages(context: FitContext) -> tuple[Reason, ...]:
                 sd=context.views.sd,
                 common=context.views.common_sd,
                 shift=SHIFT_MM,
-                offset=OFFSET_MM,
+                offset=context.views.offset_sd,
             )
         )
     if abs(offset) > SURE * offset_sd:

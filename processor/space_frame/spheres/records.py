@@ -130,16 +130,19 @@ class Fits:
 
 @dataclass(frozen=True)
 class ViewErrors:
-    """Covariances (k, 4, 4) of spheres by errors of views: all, and the part common to all spheres; mm^2.
+    """Errors of k spheres by errors of views: covariances (k, 4, 4) of states, mm^2.
 
-    ``sd`` is that of a displacement along the normal, mm, and ``common_sd`` its part common to all spheres. ``seen``
-    are the points used of all spheres in each of the cells of normals.
+    ``shared`` (k, 4, q) are the changes of states by standard normal variates that spheres have in common: their
+    products are part of the covariances. ``sd`` is that of a displacement along the normal, mm, and ``common_sd`` its
+    part common to all spheres. ``offset_sd`` is that of an offset of all ranges, mm. ``seen`` are the points used of
+    all spheres in each of the cells of normals.
     """
 
     covariance: Floats
-    common: Floats
+    shared: Floats
     sd: float
     common_sd: float
+    offset_sd: float
     seen: Floats
 
 
@@ -156,7 +159,7 @@ class Spheres(Checked):
     radii: Floats = column("k")
     lowest: Floats = column("k", 3)
     covariance: Floats = column("k", 4, 4)
-    common: Floats = column("k", 4, 4)  # part of the covariance by errors of unnamed views common to all spheres
+    shared: Floats = column("k", 4, "q")  # changes by variates that spheres have in common: errors of unnamed views
     lowest_sd: Floats = column("k")
     bound: Floats = column("k", 4, 4)
     bound_lowest_sd: Floats = column("k")

@@ -1,14 +1,9 @@
 """Errors that the points of one view have in common, where a merged cloud does not name its views.
 
-A view sees normals within a right angle of its direction. Its range offset and the errors of its registration displace
-all of them alike, so that the displacement of a merged surface along its normal is a smooth field over the normals. The
-field is modelled as a Gaussian process with a correlation of exp(cos angle - 1). Its variance is estimated by moments
-from what the fits of all spheres leave (Henderson 1953, "Estimation of variance and covariance components", Biometrics
-9, 226-252): means of residuals over cells of the normals against the scatter within them. The products of different
-spheres give the part that is common to all of them.
-
-A shift of all views together, and an offset of all their ranges, look like places and radii: they are not estimated but
-stated, by the scanner's class.
+They displace surfaces by a smooth field (:mod:`processor.space_frame.spheres.view_field`), whose size the residuals of
+all balls show. A shift of all views together, and an offset of all their ranges, look like places and radii: they are
+stated by the scanner's class. If radii are off their sizes on the mean, this may be an offset of ranges, which moves
+surfaces that are seen from below, or a wide beam, which does not; both are taken to be equally likely.
 """
 
 from __future__ import annotations
@@ -16,17 +11,29 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.optimize import nnls
+from scipy.spatial.distance import cdist
 
 from processor.adjustment.scanner_class import OFFSET_MM, SHIFT_MM
-from processor.geometry.sphere import BANDS, SECTORS, sphere_cells
-from processor.model import Floats, Ints
+from processor.geometry.sphere import sphere_cells
+from processor.model import NORMAL_95, Floats, Ints
+from processor.space_frame.members.records import Members
 from processor.space_frame.spheres.records import CropsWithRays, Fits, Priors, ViewErrors
+from processor.space_frame.spheres.view_field import (
+    BallResiduals,
+    ViewField,
+    correlation,
+    directions,
+    field_of,
+    modes,
+)
 
-MEAN_COSINE = 2.0 / 3.0  # of incidence on a sphere: a range moves the surface by less along its normal
 LEAST_POINTS = 30
 LEAST_CELLS = 8
-ACROSS = 0.3  # largest cosine between an axis and the normals of its tube: cells are as wide
-MOST_SPHERES = 400  # that the variances are estimated from
+LEAST_COSINE = 0.1  # of incidence: no view shows a surface at less
+MOST_PAIRS = 20  # of neighbouring balls that the field is estimated from
+KNOTS = 12  # places whose fields stand for those of all balls
+BEAM = np.array([0.0, 0.0, 1.0, 1.0])  # what a wide beam does to the state of a ball that is seen from below
 
 
 class _Fit(NamedTuple):
@@ -35,67 +42,97 @@ class _Fit(NamedTuple):
     cells: Ints
     counts: Floats  # (c,) points
     means: Floats  # (c,) of residuals, mm
-    scatter: Floats  # (c,) variance of residuals within cells, mm^2
+    noise: float  # variance of residuals within cells, mm^2
     J: Floats  # (c, 4) derivatives by centre and radius
-    covariance: Floats  # (4, 4) by noise and priors
     gain: Floats  # (4, c) change of the state by a displacement of each cell's surface
 
 
-def view_errors(crops: CropsWithRays, weights: Floats, fits: Fits, priors: Priors) -> ViewErrors:
-    """Estimate the errors of unnamed views from the fits of k spheres; ``weights`` (n,) > 0 mark the points used."""
-    directions = _directions()
-    correlation = np.exp(directions @ directions.T - 1.0)
-    found, seen = {}, np.zeros(len(directions))
+def view_errors(
+    crops: CropsWithRays, weights: Floats, fits: Fits, priors: Priors, places: Floats, radius_offset: float = 0.0
+) -> ViewErrors:
+    """Estimate the errors of unnamed views from the fits of k spheres.
+
+    Parameters
+    ----------
+    weights : (n,) of points, > 0 where they are used
+    places : (k, 3) of the nodes, mm
+    radius_offset : mean deviation of the radii from their sizes, mm
+    """
+    found, seen = {}, np.zeros(len(directions()))
     for k in np.flatnonzero(fits.fitted).tolist():
         fit = _fit_of(k, crops, weights, fits, priors)
         if fit is not None:
             found[k] = fit
             seen[fit.cells] += fit.counts
     rows = [k for k, fit in found.items() if len(fit.cells) >= LEAST_CELLS and fit.counts.sum() >= LEAST_POINTS]
-    sampled = (
-        [found[rows[i]] for i in np.unique(np.linspace(0, len(rows) - 1, MOST_SPHERES).astype(int))] if rows else []
+    sampled = _neighbours(rows, places)
+    field = field_of([_residuals(found[k], places[k]) for k in sampled])
+    cosines = _mean_cosines(seen)
+    offset_sd, beam_sd = _offset_or_beam(list(found.values()), cosines, radius_offset, field.variance)
+    shared, own = _of_spheres(found, field, cosines, places, offset_sd, beam_sd)
+    between = field.correlation(cdist(places[sampled], places[sampled])).mean() if sampled else 0.0
+    return ViewErrors(
+        covariance=own + shared @ np.swapaxes(shared, 1, 2),
+        shared=shared,
+        sd=float(np.sqrt(field.variance)),
+        common_sd=float(np.sqrt(field.variance * between)),
+        offset_sd=offset_sd,
+        seen=seen,
     )
-    variance, shared = _variances(sampled, correlation)
-    whole, common = np.zeros((len(fits.states), 4, 4)), np.zeros((len(fits.states), 4, 4))
-    for k, fit in found.items():
-        by_field = fit.gain @ correlation[np.ix_(fit.cells, fit.cells)] @ fit.gain.T
-        by_offset = MEAN_COSINE * OFFSET_MM * fit.gain.sum(axis=1)
-        by_class = np.diag([SHIFT_MM**2] * 3 + [0.0]) + np.outer(by_offset, by_offset)
-        whole[k] = variance * by_field + by_class
-        common[k] = shared * by_field + by_class
-    return ViewErrors(whole, common, float(np.sqrt(variance)), float(np.sqrt(shared)), seen)
 
 
-def of_tubes(views: ViewErrors, axes: Floats, side: Floats) -> Floats:
-    """Covariances (m, 3, 3) of tubes by errors of views: of places along ``side`` and axis x side, and of radii; mm^2.
-
-    ``axes`` and ``side`` (m, 3) are unit vectors. Tubes are seen from where the spheres are: their points have the
-    normals of the spheres' points that are across the axis.
-    """
-    directions = _directions()
-    covariance = np.zeros((len(axes), 3, 3))
-    for m, (axis, first) in enumerate(zip(axes, side, strict=True)):
-        on = (np.abs(directions @ axis) < ACROSS) & (views.seen > 0.0)
-        normal = directions[on] - np.outer(directions[on] @ axis, axis)
-        normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        J = np.column_stack([normal @ first, normal @ np.cross(axis, first), np.ones(len(normal))])
-        weighted = (J * views.seen[on][:, None]).T
-        gain = np.linalg.pinv(weighted @ J, rcond=1e-6) @ weighted
-        by_offset = MEAN_COSINE * OFFSET_MM * gain.sum(axis=1)
-        covariance[m] = views.sd**2 * gain @ np.exp(normal @ normal.T - 1.0) @ gain.T
-        covariance[m] += np.diag([SHIFT_MM**2, SHIFT_MM**2, 0.0]) + np.outer(by_offset, by_offset)
+def of_tubes(views: ViewErrors, members: Members) -> Floats:
+    """Covariances (m, 3, 3) of tubes by errors of views: of places along side and other, and of radii; mm^2."""
+    count, sectors = members.around.shape
+    turn = 2.0 * np.pi * (np.arange(sectors) + 0.5) / sectors
+    across = np.column_stack([np.cos(turn), np.sin(turn)])
+    J = np.column_stack([across, np.ones(sectors)])
+    factor = correlation(across @ across.T)
+    normals, cosines = directions(), _mean_cosines(views.seen)
+    covariance = np.tile(np.diag([SHIFT_MM**2, SHIFT_MM**2, 0.0]), (count, 1, 1))
+    for m, points in enumerate(members.around):
+        weighted = (J * points[:, None]).T
+        gain = np.linalg.pinv(weighted @ J, rcond=1e-6, hermitian=True) @ weighted
+        normal = across @ np.stack([members.side[m], members.other[m]])
+        by_offset = views.offset_sd * gain @ cosines[np.argmax(normal @ normals.T, axis=1)]
+        covariance[m] += views.sd**2 * gain @ factor @ gain.T + np.outer(by_offset, by_offset)
     return covariance
 
 
-def _directions() -> Floats:
-    """Middles (200, 3) of the cells of :func:`~processor.geometry.sphere.sphere_cells`."""
-    z = np.repeat((np.arange(BANDS) + 0.5) * 2.0 / BANDS - 1.0, SECTORS)
-    turn = np.tile(((np.arange(SECTORS) + 0.5) / SECTORS - 0.5) * 2.0 * np.pi, BANDS)
-    level = np.sqrt(1.0 - z**2)
-    return np.column_stack([level * np.cos(turn), level * np.sin(turn), z])
+def _mean_cosines(seen: Floats) -> Floats:
+    """Mean cosines of incidence (200,) over the cells of normals, by the points ``seen`` (200,) in them.
+
+    The views are those directions whose densities, by the cosine of incidence, add up to the points best.
+    """
+    normals = directions()
+    cosine = normals @ normals.T
+    density = np.where(cosine > LEAST_COSINE, cosine, 0.0)
+    if not seen.any():
+        return np.full(len(seen), 2.0 / 3.0)  # of a sphere that is seen from all sides
+    views, _ = nnls(density, seen / seen.max())
+    points, total = density @ views, (density**2) @ views
+    mean: Floats = np.where(points > 0.0, total / np.where(points > 0.0, points, 1.0), LEAST_COSINE)
+    return mean
+
+
+def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, variance: float) -> tuple[float, float]:
+    """Standard deviations (mm) of an offset of ranges, and of a change of radii by a wide beam.
+
+    Of an offset of the radii one half of the variance is that of an offset of ranges, as far as the scanner's class and
+    the mean of the views, which has the field's variance, may have it (95 %). The rest is that of a beam.
+    """
+    change = float(np.mean([fit.gain[3] @ cosines[fit.cells] for fit in fits])) if fits else 0.0
+    limit = NORMAL_95 * float(np.hypot(OFFSET_MM, np.sqrt(variance)))
+    offset = radius_offset / change if abs(radius_offset) < limit * abs(change) else limit
+    explained = 0.5 * (offset * change) ** 2
+    return float(np.hypot(OFFSET_MM, np.sqrt(0.5) * offset)), float(np.sqrt(max(radius_offset**2 - explained, 0.0)))
+
+
+# --- spheres ---------------------------------------------------------------------------------------------------------
 
 
 def _fit_of(k: int, crops: CropsWithRays, weights: Floats, fits: Fits, priors: Priors) -> _Fit | None:
+    """Means of residuals over cells and the gain of the fit of sphere ``k``; None where it is not determined."""
     rows = slice(crops.start[k], crops.start[k + 1])
     on = weights[rows] > 0.0
     if not on.any():
@@ -108,13 +145,10 @@ def _fit_of(k: int, crops: CropsWithRays, weights: Floats, fits: Fits, priors: P
     residual = distance - state[3]
     means = np.bincount(cell, residual) / counts
     free = max(len(points) - len(cells), 1)
-    within = max(float(np.sum((residual - means[cell]) ** 2)) / free, 1e-6)
-    apart = np.bincount(cell, (residual - means[cell]) ** 2)
-    # Noise differs by incidence: each cell has its own, except where one point shows none.
-    scatter = np.where(counts > 1, apart / np.maximum(counts - 1.0, 1.0), within)
+    noise = max(float(np.sum((residual - means[cell]) ** 2)) / free, 1e-6)
     normal = np.stack([np.bincount(cell, away[:, i] / distance) / counts for i in range(3)], axis=1)
     J = np.column_stack([normal, np.ones(len(cells))])
-    by_points = (J * (counts / within)[:, None]).T
+    by_points = (J * (counts / noise)[:, None]).T
     prior = np.zeros((4, 4))
     prior[:3, :3] = priors.centre_weight[k]
     prior[3, 3] = priors.size_weights[k]
@@ -129,31 +163,68 @@ def _fit_of(k: int, crops: CropsWithRays, weights: Floats, fits: Fits, priors: P
     held = by_points[:3] @ J[:, :3]
     moved = np.linalg.pinv(held, rcond=1e-3) @ by_points[:3]
     gain = covariance @ (by_points + prior @ np.vstack([moved, np.zeros(len(cells))]))
-    return _Fit(cells, counts, means, scatter, J, covariance, gain)
+    return _Fit(cells.astype(np.int64), counts, means, noise, J, gain)
 
 
-def _variances(fits: list[_Fit], correlation: Floats) -> tuple[float, float]:
-    """Variance of the field and its part common to all spheres, mm^2, by moments."""
-    count = len(correlation)
-    squares, expected = 0.0, 0.0
-    total, own = np.zeros(count), 0.0
-    spread, own_spread = np.zeros((count, count)), 0.0
-    for fit in fits:
-        weight = fit.counts  # not over the sphere's own noise: a ratio of estimates is biased
-        left = np.eye(len(fit.cells)) - fit.J @ fit.gain
-        K = correlation[np.ix_(fit.cells, fit.cells)]
-        absorbed = float(np.einsum("c,ci,ij,cj->", weight, fit.J, fit.covariance, fit.J))
-        noise = float(np.sum(fit.scatter)) - absorbed
-        squares += float(weight @ fit.means**2) - noise
-        expected += float(np.einsum("c,ci,ij,cj->", weight, left, K, left, optimize=True))
-        S = np.zeros((count, count))
-        S[np.ix_(fit.cells, fit.cells)] = weight[:, None] * left
-        score = np.zeros(count)
-        score[fit.cells] = weight * fit.means
-        total, own = total + score, own + float(score @ score)
-        spread, own_spread = spread + S, own_spread + float(np.sum((S @ correlation) * S))
-    if not expected > 0.0:
-        return 0.0, 0.0
-    between = float(np.sum((spread @ correlation) * spread)) - own_spread
-    shared = (float(total @ total) - own) / between if len(fits) > 1 and between > 0.0 else 0.0
-    return max(squares / expected, shared, 0.0), max(shared, 0.0)
+def _residuals(fit: _Fit, place: Floats) -> BallResiduals:
+    left = np.eye(len(fit.cells)) - fit.J @ fit.gain
+    return BallResiduals(place, fit.cells, fit.means, fit.counts, left, fit.noise)
+
+
+def _neighbours(rows: list[int], places: Floats) -> list[int]:
+    """At most 40 of some rows of places (k, 3): evenly spaced ones, each with its nearest neighbour."""
+    if len(rows) <= 2 * MOST_PAIRS:
+        return rows
+    every = np.array(rows)
+    first = every[np.linspace(0, len(every) - 1, MOST_PAIRS).astype(int)]
+    others = np.setdiff1d(every, first)
+    distance = cdist(places[first], places[others])
+    return [int(row) for row in np.union1d(first, others[distance.argmin(axis=1)])]
+
+
+def _of_spheres(
+    found: dict[int, _Fit],
+    field: ViewField,
+    cosines: Floats,
+    places: Floats,
+    offset_sd: float,
+    beam_sd: float,
+) -> tuple[Floats, Floats]:
+    """Changes (k, 4, q) of states by variates common to all spheres, and the covariance (k, 4, 4) of each by itself."""
+    factor, at_knots = modes(), _knots(field, places)
+    count, knots = at_knots.shape
+    known = 5
+    shared, own = np.zeros((count, 4, known + factor.shape[1] * knots)), np.zeros((count, 4, 4))
+    shared[:, :3, :3] = SHIFT_MM * np.eye(3)
+    own_share = np.maximum(1.0 - np.sum(at_knots**2, axis=1), 0.0)
+    for k, fit in found.items():
+        change = np.sqrt(field.variance) * fit.gain @ factor[fit.cells]
+        shared[k, :, 3] = -offset_sd * fit.gain @ cosines[fit.cells]
+        shared[k, :, 4] = beam_sd * BEAM
+        shared[k, :, known:] = (change[:, :, None] * at_knots[k]).reshape(4, -1)
+        own[k] = own_share[k] * change @ change.T
+    # A node that is known from its axes alone was seen by the same views.
+    seen = sorted(found)
+    typical = own[seen] + shared[seen, :, 3:] @ np.swapaxes(shared[seen, :, 3:], 1, 2)
+    for k in np.setdiff1d(np.arange(count), seen).tolist():
+        own[k, :3, :3] = typical[:, :3, :3].mean(axis=0) if seen else field.variance * np.eye(3)
+    return shared, own
+
+
+def _knots(field: ViewField, places: Floats) -> Floats:
+    """Changes (k, u) of the fields at places (k, 3) by independent variates: those of some of the places, far apart.
+
+    What these do not explain of a field is independent of the others'.
+    """
+    rows = [0] if len(places) else []
+    away = np.linalg.norm(places - places[:1], axis=1)
+    while len(rows) < min(KNOTS, len(places)) and away.max() > 0.0:
+        rows.append(int(away.argmax()))
+        away = np.minimum(away, np.linalg.norm(places - places[rows[-1]], axis=1))
+    if not rows:
+        return np.zeros((len(places), 0))
+    values, vectors = np.linalg.eigh(field.correlation(cdist(places[rows], places[rows])))
+    good = values > 1e-9 * values[-1]
+    root = vectors[:, good] / np.sqrt(values[good])
+    changes: Floats = field.correlation(cdist(places, places[rows])) @ root
+    return changes
