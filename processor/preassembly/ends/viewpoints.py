@@ -16,9 +16,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from processor.adjustment import clusters
+from processor.adjustment import clusters, global_test
 from processor.adjustment.scanner_class import VIEW_MM
-from processor.model import Floats
+from processor.model import Floats, Ints
 from processor.preassembly.ends.plate_sides import Bools
 
 TERMS = 3  # of a plate's thickness: its mean, its changes along and across
@@ -98,10 +98,9 @@ def variances(plates: Sequence[Thickness]) -> Variances:
     if not plates:
         return NONE
     value, noise = np.array([one.value for one in plates]), np.array([one.noise for one in plates])
-    level = np.sort(value[:, 0])
-    group = np.cumsum(np.diff(level, prepend=level[0]) > ALIKE_MM)
+    group = _alike(value[:, 0])
     count = np.bincount(group)
-    level = level - (np.bincount(group, level) / count)[group]
+    level = value[:, 0] - (np.bincount(group, value[:, 0]) / count)[group]
     # The mean of a group takes its share of the noise out of the differences.
     by_noise = float(noise[:, 0].mean()) * (len(plates) - len(count))
     freedom = len(plates) - len(count)
@@ -115,6 +114,43 @@ def variances(plates: Sequence[Thickness]) -> Variances:
         known=freedom > 0,
         evident=squares > float(chi2.ppf(1.0 - RISK, max(freedom, 1))) * float(noise[:, 0].mean()),
     )
+
+
+def tails(ends: Sequence[Sequence[Thickness]]) -> Floats:
+    """Probabilities (e,) that the plates of each end differ as much from plates of other ends; NaN without such.
+
+    Other ends show the variance of a plate's thickness. Opposite plates of an end count as one observation.
+    """
+    value = np.array([plate.value[0] for end in ends for plate in end])
+    noise = np.array([max(plate.noise[0], FLOOR_MM**2) for end in ends for plate in end])
+    of_end = np.repeat(np.arange(len(ends)), [len(end) for end in ends])
+    group = _alike(value)
+    found = np.full(len(ends), np.nan)
+    for number in np.unique(of_end):
+        own, others = of_end == number, of_end != number
+        count = np.bincount(group[others], minlength=int(group.max()) + 1)
+        freedom = int((count - 1)[count > 0].sum())
+        own &= count[group] > 0
+        if not own.any() or freedom < 1:
+            continue
+        mean = np.bincount(group[others], value[others], len(count)) / np.maximum(count, 1)
+        by_noise = np.bincount(group[others], noise[others], len(count)) / np.maximum(count, 1)
+        squares = float(((value - mean[group])[others] ** 2).sum())
+        between = max(squares - float((by_noise * (count - 1))[count > 0].sum()), 0.0) / freedom
+        share = 1.0 / count[group[own]]
+        variance = noise[own] + by_noise[group[own]] * share + between * (1.0 + share)
+        independent = own.sum() / OF_PAIR
+        mean_square = float(np.mean((value[own] - mean[group[own]]) ** 2 / variance))
+        found[number] = global_test.tail(mean_square * independent, independent, freedom / OF_PAIR)
+    return found
+
+
+def _alike(level: Floats) -> Ints:
+    """Return the number (n,) of each plate's group, of one nominal thickness, by their thickness ``level`` (n,)."""
+    order = np.argsort(level, kind="stable")
+    group = np.zeros(len(level), np.int64)
+    group[order] = np.cumsum(np.diff(level[order], prepend=level[order[:1]]) > ALIKE_MM)
+    return group
 
 
 def _variance(squares: float, by_noise: float, freedom: int) -> float:
