@@ -210,7 +210,8 @@ def _viewpoint_remarks(part: FittedPart, between: viewpoints.Variances) -> Itera
 def _between_viewpoints(parts: Sequence[FittedPart]) -> viewpoints.Variances:
     """Variances between viewpoints by the plates of all parts."""
     ends = [end for part in parts for end in part.ends if isinstance(end, FittedEnd)]
-    return viewpoints.variances([plate for end in ends for plate in end.plates if plate is not None])
+    plates = [plate for end in ends for plate in end.plates if plate is not None]
+    return viewpoints.variances(plates, [end.ring_noise for end in ends if end.plates])
 
 
 def _as_seen(part: FittedPart, between: viewpoints.Variances) -> FittedPart:
