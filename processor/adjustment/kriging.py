@@ -17,6 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
+from processor.adjustment import global_test
 from processor.adjustment.model_averaging import weights_by_others
 from processor.model import Floats
 
@@ -29,12 +30,16 @@ LEAST_SHARE = 1e-4  # a hypothesis of less weight is left out of the average
 
 
 class Means(NamedTuple):
-    """Means (c,) of departures over patches at ``place`` (c, 2), mm, their variances by noise, and the trend (c, k)."""
+    """Means (c,) of departures over patches at ``place`` (c, 2), mm, their variances by noise, and the trend (c, k).
+
+    ``freedom`` is that of the noise's estimate.
+    """
 
     place: Floats
     value: Floats
     variance: Floats
     trend: Floats
+    freedom: float = np.inf
 
 
 class Kriged(NamedTuple):
@@ -45,11 +50,15 @@ class Kriged(NamedTuple):
 
 
 class Hypotheses(NamedTuple):
-    """The estimates by every hypothesis: means (h, k + m), covariances (h, k + m, k + m), log likelihoods (h,)."""
+    """The estimates by every hypothesis: means (h, k + m), covariances (h, k + m, k + m), log likelihoods (h,).
+
+    ``tails`` (h,) are the probabilities of residuals at least as large, see :mod:`.global_test`.
+    """
 
     means: Floats
     covariances: Floats
     logs: Floats
+    tails: Floats
 
 
 def by_hypotheses(means: Means, at: Floats) -> Hypotheses:
@@ -71,17 +80,27 @@ def learned_weights(every: Sequence[Hypotheses]) -> Floats:
 
 def average(found: Hypotheses, weights: Floats = PRIOR) -> Kriged:
     """Average over hypotheses with prior weights (h,)."""
-    share = weights * np.exp(found.logs - found.logs.max())
-    share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
-    share /= share.sum()
+    share = _shares(found, weights)
     mean = np.einsum("h,hk->k", share, found.means)
     off = found.means - mean
     within = np.einsum("h,hkl->kl", share, found.covariances)
     return Kriged(mean, within + np.einsum("h,hk,hl->kl", share, off, off))
 
 
-def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tuple[Floats, Floats, float]:
-    """Mean (k + m,) and covariance (k + m, k + m) by one hypothesis, and its restricted log likelihood.
+def tail(found: Hypotheses, weights: Floats) -> float:
+    """Posterior predictive probability of residuals at least as large, with prior weights (h,)."""
+    return float(_shares(found, weights) @ found.tails)
+
+
+def _shares(found: Hypotheses, weights: Floats) -> Floats:
+    share = weights * np.exp(found.logs - found.logs.max())
+    share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
+    shares: Floats = share / share.sum()
+    return shares
+
+
+def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tuple[Floats, Floats, float, float]:
+    """Mean (k + m,) and covariance (k + m, k + m) by one hypothesis, its restricted log likelihood and its tail.
 
     ``apart`` (c, c), ``to_wanted`` (m, c) and ``among`` (m, m) are covariances of the process between patches and
     wanted places.
@@ -99,7 +118,8 @@ def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tu
     both = -inverse @ by_trend.T
     covariance = np.block([[inverse, both], [both.T, of_process]])
     process = products[wanted, value] - by_trend @ coefficients
-    return np.concatenate([coefficients, process]), covariance, log
+    beyond = float(global_test.tail(float(rest), count - columns, means.freedom))
+    return np.concatenate([coefficients, process]), covariance, log, beyond
 
 
 @njit(cache=True)

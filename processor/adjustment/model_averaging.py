@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve, solve_triangular
+from scipy.special import chdtrc
 
 from processor.model import Floats, Ints
 
@@ -31,13 +32,15 @@ Bools = npt.NDArray[np.bool_]
 class Estimate:
     """Estimated departures (k,), their covariance (k, k), and the logarithm of the marginal likelihood.
 
-    ``gain`` (k, k) is the derivative of the departures by the values; columns of unknown values are zero.
+    ``gain`` (k, k) is the derivative of the departures by the values; columns of unknown values are zero. ``tail`` is
+    the posterior predictive probability of values at least as far off, see :mod:`.global_test`.
     """
 
     mean: Floats
     covariance: Floats
     gain: Floats
     log_evidence: float = 0.0
+    tail: float = float("nan")
 
     def not_followed(self, motion: Floats) -> Floats:
         """Part (k, m) of a common ``motion`` (k, m) of departures and values that the estimate does not follow."""
@@ -77,7 +80,7 @@ def average(
     log_evidence = float(logs.max() + np.log(share.sum()))
     share = np.where(share < LEAST_SHARE * share.sum(), 0.0, share)
     share /= share.sum()
-    mean, second, gain = np.zeros(len(at)), np.zeros((len(at),) * 2), np.zeros((len(at),) * 2)
+    mean, second, gain, tail = np.zeros(len(at)), np.zeros((len(at),) * 2), np.zeros((len(at),) * 2), 0.0
     for weight, prior in zip(share, priors, strict=True):
         if weight:
             factor = cho_factor(prior[np.ix_(at, at)] + noise, lower=True)
@@ -86,7 +89,8 @@ def average(
             mean += weight * prior_mean
             second += weight * (prior - prior_gain @ prior[at] + np.outer(prior_mean, prior_mean))
             gain[:, at] += weight * prior_gain
-    return Estimate(mean, second - np.outer(mean, mean), gain, log_evidence)
+            tail += weight * float(chdtrc(len(value), value @ cho_solve(factor, value)))
+    return Estimate(mean, second - np.outer(mean, mean), gain, log_evidence, tail)
 
 
 def mixture(a: Estimate, b: Estimate) -> Estimate:
@@ -98,7 +102,8 @@ def mixture(a: Estimate, b: Estimate) -> Estimate:
         share * of_a + (1.0 - share) * of_b
         for of_a, of_b in ((a.mean, b.mean), (a.covariance, b.covariance), (a.gain, b.gain))
     )
-    return Estimate(mean, covariance + share * (1.0 - share) * np.outer(difference, difference), gain, log_evidence)
+    covariance = covariance + share * (1.0 - share) * np.outer(difference, difference)
+    return Estimate(mean, covariance, gain, log_evidence, share * a.tail + (1.0 - share) * b.tail)
 
 
 def with_least_covariance(raw: Estimate, least: Floats) -> Estimate:

@@ -61,12 +61,6 @@ def group_covariance(basis: Floats, group: Ints, variance: float) -> Floats:
     return covariance
 
 
-def share_in_mean(group: Ints) -> float:
-    """Part of a variance between groups that is left in the mean of all points (n,)."""
-    number = np.bincount(group)
-    return float((number.astype(np.float64) ** 2).sum() / max(len(group), 1) ** 2)
-
-
 def lack_of_fit_variance(fits: Sequence[tuple[Floats, Ints]], coefficients: int) -> float:
     """Variance of the cells' means about fitted surfaces beyond noise, mm^2, one for all surfaces (method of moments).
 

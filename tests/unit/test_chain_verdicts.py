@@ -92,6 +92,9 @@ def test_quantities_of_the_edges_by_hand():
         departure=np.zeros((4, 2)),
         covariance=np.zeros((2, 4, 4)),
         by_pose=np.zeros((4, 2, 6)),
+        by_view=np.zeros((2, 4, 1)),
+        by_tilt=np.zeros((2, 4, 1)),
+        tails=np.ones((2, 2)),
     )
     member = Member((None, None), edges, np.zeros(3), np.zeros((6, 6)))
     adjusted = SimpleNamespace(

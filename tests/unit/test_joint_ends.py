@@ -214,6 +214,9 @@ def test_a_part_without_a_joint_stays_where_it_was_registered_along_its_chord():
         departure=noise,
         covariance=np.stack([0.02**2 * np.eye(120)] * 2),
         by_pose=np.zeros((120, 2, 6)),
+        by_view=np.zeros((2, 120, 1)),
+        by_tilt=np.zeros((2, 120, 1)),
+        tails=np.ones((2, 2)),
     )
     member = Member((None, None), edges, np.array([0.0, 0.0, 60_000.0]), np.zeros((6, 6)))
     adjusted = adjustment.adjust([member], np.empty((0, 8, 3)), np.empty((0, 4, 4)), 0.1)
@@ -247,6 +250,9 @@ def test_what_a_registration_is_wrong_by_is_the_same_at_both_ends_of_a_part():
             departure=np.zeros((24, 2)),
             covariance=np.stack([noise**2 * np.eye(24)] * 2),
             by_pose=moves,
+            by_view=np.zeros((2, 24, 1)),
+            by_tilt=np.zeros((2, 24, 1)),
+            tails=np.ones((2, 2)),
         )
         at_joint = rigid.motion(joints[0]).reshape(24, 6)
         covariance = at_joint @ pose @ at_joint.T + noise**2 * np.eye(24)

@@ -42,7 +42,6 @@ def test_covariance_of_a_line_by_stations_against_draws():
     np.testing.assert_allclose(
         variance_components.group_covariance(basis, station, 0.49), np.cov(moved.T), rtol=0.05, atol=5e-3
     )
-    assert variance_components.share_in_mean(np.array([0, 0, 1, 1])) == 0.5
 
 
 def test_lack_of_fit_variance():

@@ -3,11 +3,15 @@
 An edge is where the bottom and a web meet. In every interval of chainage the residuals of both faces against the design
 are fitted with a plane in the distances along and from the edge. Its value at the edge is the departure, of the web
 sideways and of the bottom up. The departures of an edge are then smoothed along it.
+
+Points of one view share errors. The webs are seen from different views, as are the halves of a part, so these errors
+are no motion of the part and stay after the adjustment. Where stations are named, the views are the stations, and each
+departure follows their errors as its plane does.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -34,7 +38,9 @@ class EdgeDepartures:
     """Departures of both bottom edges of a part from the design, a row per chainage and edge; mm, bridge frame.
 
     ``covariance`` leaves out the error of the part's registration; ``by_pose`` is the derivative of the departures'
-    errors by it.
+    errors by it. ``by_view`` is their derivative by errors that the points of a view share, along the axes, and
+    ``by_tilt`` by what tilts a face across. Views are the stations, where several are named; else the halves of the
+    left web and of the right web, for the departures sideways, and of the bottom, for those up.
     """
 
     side: tuple[str, ...]  # left | right
@@ -44,15 +50,27 @@ class EdgeDepartures:
     departure: Floats  # (k, 2) sideways and up; NaN = unknown
     covariance: Floats  # (2, k, k) sideways, and up
     by_pose: Floats  # (k, 2, 6)
+    by_view: Floats  # (2, k, v) sideways, and up
+    by_tilt: Floats  # (2, k, v)
+    tails: Floats  # (2, 2) probabilities of residuals at least as large: of left and right edge, sideways and up
 
 
 class _FacePoints(NamedTuple):
-    """Points of one face near an edge: interval (n,), distances (n,) along and from the edge, residual (n,)."""
+    """Points (n,) of one face near an edge: interval, distances along and from the edge, residual, station."""
 
     interval: Ints
     x: Floats
     w: Floats
     residual: Floats
+    station: Ints
+
+
+class _AtEdge(NamedTuple):
+    """Departures (k,) at the edge, their variances (k,) by noise, and their derivative (k, s) by errors of stations."""
+
+    value: Floats
+    variance: Floats
+    by_station: Floats
 
 
 def measure(part: RegisteredPart, left: Polyline, right: Polyline, sigma_mm: float) -> EdgeDepartures:
@@ -66,7 +84,19 @@ def measure(part: RegisteredPart, left: Polyline, right: Polyline, sigma_mm: flo
         departure=np.concatenate([edge.departure for edge in edges]),
         covariance=np.array([block_diag(*(edge.covariance[axis] for edge in edges)) for axis in range(2)]),
         by_pose=np.concatenate([edge.by_pose for edge in edges]),
+        by_view=np.concatenate([edge.by_view for edge in edges], axis=1),
+        by_tilt=np.concatenate([edge.by_tilt for edge in edges], axis=1),
+        tails=np.concatenate([edge.tails for edge in edges]),
     )
+
+
+def with_errors_of_views(edges: EdgeDepartures, level: float, across: float = 0.0) -> EdgeDepartures:
+    """Add errors that the points of a view share, of variances ``level`` and ``across`` in mm^2, to the covariance.
+
+    ``across`` is of the tilt across a face, at its sides.
+    """
+    added = [level * by @ by.T + across * tilt @ tilt.T for by, tilt in zip(edges.by_view, edges.by_tilt, strict=True)]
+    return replace(edges, covariance=edges.covariance + np.array(added))
 
 
 def unknown(left: Polyline, right: Polyline) -> EdgeDepartures:
@@ -87,14 +117,20 @@ def _measure_edge(side: str, part: RegisteredPart, line: Polyline, other: Polyli
     sense = 1.0 if side == "left" else -1.0
     count = max(1, int(line.length / INTERVAL_MM))
     chainage = INTERVAL_MM * (np.arange(count, dtype=np.float64) + 0.5)
-    at_edge = [_at_edge(face, count) for face in _faces(part, line, other, sense, sigma_mm, chainage)]
+    stations = int(part.station.max(initial=0)) + 1
+    at_edge = [_at_edge(face, count, stations) for face in _faces(part, line, other, sense, sigma_mm, chainage)]
     points = line.at(chainage)
     _, *axes = _frame(line, other, chainage, sense)
     motions = [np.einsum("ki,kij->kj", axis, rigid.motion(points)) for axis in axes]
     smoothed = [
-        smooth(chainage, value, variance, motion @ part.pose @ motion.T)
-        for (value, variance), motion in zip(at_edge, motions, strict=True)
+        smooth(chainage, at.value, at.variance, motion @ part.pose @ motion.T)
+        for at, motion in zip(at_edge, motions, strict=True)
     ]
+    by_station = np.stack([at.by_station for at in at_edge])
+    views = by_station, np.zeros_like(by_station)
+    if stations == 1:
+        views = _of_halves(chainage < 0.5 * line.length, sense)
+    by_view, by_tilt = (np.stack([e.gain for e in smoothed]) @ of_views for of_views in views)
     by_pose = [estimate.not_followed(motion) for estimate, motion in zip(smoothed, motions, strict=True)]
     return EdgeDepartures(
         side=(side,) * count,
@@ -104,7 +140,22 @@ def _measure_edge(side: str, part: RegisteredPart, line: Polyline, other: Polyli
         departure=np.stack([estimate.mean for estimate in smoothed], axis=1),
         covariance=np.array([e.covariance - F @ part.pose @ F.T for e, F in zip(smoothed, by_pose, strict=True)]),
         by_pose=np.stack(by_pose, axis=1),
+        by_view=by_view,
+        by_tilt=by_tilt,
+        tails=np.array([[estimate.tail for estimate in smoothed]]),
     )
+
+
+def _of_halves(first: Bools, sense: float) -> tuple[Floats, Floats]:
+    """Return derivatives (2, k, 4) of raw departures by the levels and tilts of views that are not named.
+
+    ``first`` (k,) marks the departures of the part's first half.
+    """
+    half = np.stack([first, ~first], axis=1).astype(np.float64)
+    none = np.zeros_like(half)
+    web = np.hstack([half, none] if sense > 0.0 else [none, half])
+    bottom = np.hstack([half, none])
+    return np.stack([web, bottom]), np.stack([web, sense * bottom])
 
 
 def _faces(
@@ -135,9 +186,11 @@ def _faces(
     for used, out in ((web, sense * np.sign(facing[0])), (bottom, -np.sign(facing[1]))):
         inner = np.abs(distance) < np.abs(residual) - plate_sides.LAYER_MM  # nearer to another face of the design
         used[used] = _outer(interval[used], (out * residual)[used], inner[used])
+    residuals = [np.sign(looking) * residual for looking in facing]
+    station = part.station[rows]
     return (
-        _FacePoints(interval[web], x[web], up[web], np.sign(facing[0][web]) * residual[web]),
-        _FacePoints(interval[bottom], x[bottom], inward[bottom], np.sign(facing[1][bottom]) * residual[bottom]),
+        _FacePoints(interval[web], x[web], up[web], residuals[0][web], station[web]),
+        _FacePoints(interval[bottom], x[bottom], inward[bottom], residuals[1][bottom], station[bottom]),
     )
 
 
@@ -164,11 +217,12 @@ def _outer(interval: Ints, out: Floats, inner: Bools) -> Bools:
     return outer
 
 
-def _at_edge(face: _FacePoints, count: int) -> tuple[Floats, Floats]:
-    """Value (count,) at the edge of planes in x and w, fitted to each interval's residuals, and its variance."""
+def _at_edge(face: _FacePoints, count: int, stations: int) -> _AtEdge:
+    """Values at the edge of planes in x and w, fitted to the residuals of each of ``count`` intervals."""
     basis = np.stack([np.ones_like(face.x), face.x / INTERVAL_MM, face.w / REACH_MM], axis=1)
     used = np.ones(len(face.x), bool)
     value, variance = np.full(count, np.nan), np.full(count, np.nan)
+    by_station = np.zeros((count, stations))
     for _ in range(3):
         interval, B, r = face.interval[used], basis[used], face.residual[used]
         number = np.bincount(interval, minlength=count)
@@ -186,8 +240,12 @@ def _at_edge(face: _FacePoints, count: int) -> tuple[Floats, Floats]:
         spread = 1.4826 * float(np.median(np.abs(rest[known & used]))) if (known & used).any() else 0.0
         value, variance = np.full(count, np.nan), np.full(count, np.nan)
         value[fitted], variance[fitted] = solution[fitted, 0], spread**2 * inverse[:, 0, 0] + FLOOR_MM**2
+        group = interval * stations + face.station[used]
+        of_station = np.stack([np.bincount(group, B[:, i], count * stations) for i in range(3)], axis=1)
+        of_station = of_station.reshape(count, stations, 3)[fitted]
+        by_station[:], by_station[fitted] = 0.0, np.einsum("ni,nsi->ns", inverse[:, 0], of_station)
         now = known & (np.abs(rest) < 4.5 * max(spread, FLOOR_MM))
         if (now == used).all():
             break
         used = now
-    return value, variance
+    return _AtEdge(value, variance, by_station)

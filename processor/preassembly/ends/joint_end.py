@@ -99,6 +99,8 @@ class FittedEnd:
     place: EndPlace
     plates: tuple[Thickness | None, ...]  # of the faces; none where the points' stations are known
     sides: PlateSides
+    thickness: Floats  # (2,) of webs and flanges as designed; 0 = unknown
+    ring_noise: float  # variance of the ring's points, mm^2
 
     @property
     def doubts(self) -> tuple[Reason, ...]:
@@ -159,6 +161,8 @@ def fit(part: RegisteredPart, place: EndPlace) -> FittedEnd | JointEnd:
         place=place,
         plates=tuple(face.plate for face in faces) if (part.station == part.station[0]).all() else (),
         sides=sides,
+        thickness=thickness,
+        ring_noise=float(np.median(np.abs(on_ring.residual)) * 1.4826) ** 2,
     )
 
 

@@ -2,9 +2,13 @@
 
 A cloud merged from several stations has errors of range, place and turn of each station in it, and each face is seen
 from some of them only. On one face they look like form. But the two sides of a plate are never seen from one place, and
-plates of one thickness are as thick at one end as at another: the variance of their thickness, as measured, is twice
-that between viewpoints. Waves and bends of a plate are the same on both of its sides and cancel. Rolling tolerances are
-in it as well: they cannot be told apart.
+plates of one thickness are as thick at one end as at another: the variance of their thickness, as measured, is that
+between viewpoints of its two sides together. Waves and bends of a plate are the same on both of its sides and cancel.
+Rolling tolerances are in it as well: they cannot be told apart.
+
+The sides do not share it equally. Errors of range act along the ray, on a face that is seen obliquely by the cosine, and
+the inner sides at an end are seen through its opening, obliquely, while the end's ring is seen from ahead. Noise of
+range acts along the ray as well. So a face has a share of the variance as of the noise.
 """
 
 from __future__ import annotations
@@ -16,9 +20,9 @@ from typing import NamedTuple
 import numpy as np
 from scipy.stats import chi2
 
-from processor.adjustment import clusters
+from processor.adjustment import clusters, global_test
 from processor.adjustment.scanner_class import VIEW_MM
-from processor.model import Floats
+from processor.model import Floats, Ints
 from processor.preassembly.ends.plate_sides import Bools
 
 TERMS = 3  # of a plate's thickness: its mean, its changes along and across
@@ -31,10 +35,14 @@ OF_PAIR = 2  # opposite plates of an end are seen from the same two sides: their
 
 @dataclass(frozen=True)
 class Thickness:
-    """Thickness (3,) of a plate at an end, mm: mean, changes along and across; variances (3,) by noise."""
+    """Thickness (3,) of a plate at an end, mm: mean, changes along and across; variances (3,) by noise.
+
+    ``sides`` are the variances of single points on its outer and on its inner side.
+    """
 
     value: Floats
     noise: Floats
+    sides: tuple[float, float]
 
 
 class Variances(NamedTuple):
@@ -69,6 +77,7 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
     count = int(patch.max(initial=-1)) + 1
     difference, variance = np.zeros(count), np.zeros(count)
     enough = np.ones(count, bool)
+    sides = []
     for side, sense in ((~inner, 1.0), (inner, -1.0)):
         number = np.bincount(patch[side], minlength=count)
         mean = np.bincount(patch[side], height[side], count) / np.maximum(number, 1)
@@ -77,6 +86,7 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
         difference += sense * mean
         variance += noise / np.maximum(number, 1)
         enough &= number >= FEWEST_OF_PATCH
+        sides.append(float((1.4826 * np.median(np.abs(rest))) ** 2) if len(rest) else 0.0)
     if enough.sum() < 2 * TERMS:
         return None
     total = np.bincount(patch, minlength=count)
@@ -86,11 +96,12 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
     if np.linalg.cond(terms * root) > 1e4:
         return None
     solve = np.linalg.pinv(terms * root) * root.T
-    return Thickness(solve @ difference[enough], np.diag(solve @ np.diag(variance[enough]) @ solve.T))
+    noise = np.diag(solve @ np.diag(variance[enough]) @ solve.T)
+    return Thickness(solve @ difference[enough], noise, (sides[0], sides[1]))
 
 
-def variances(plates: Sequence[Thickness]) -> Variances:
-    """Variances between viewpoints by the plates at all ends of a bridge.
+def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Variances:
+    """Variances between viewpoints by the plates at all ends of a bridge; ``rings`` are the variances of their points.
 
     They are widened for the number of differences they come from, so that 1.96 standard deviations cover what Student's
     t covers. 0 where no two plates are alike.
@@ -98,23 +109,61 @@ def variances(plates: Sequence[Thickness]) -> Variances:
     if not plates:
         return NONE
     value, noise = np.array([one.value for one in plates]), np.array([one.noise for one in plates])
-    level = np.sort(value[:, 0])
-    group = np.cumsum(np.diff(level, prepend=level[0]) > ALIKE_MM)
+    group = _alike(value[:, 0])
     count = np.bincount(group)
-    level = level - (np.bincount(group, level) / count)[group]
+    level = value[:, 0] - (np.bincount(group, value[:, 0]) / count)[group]
     # The mean of a group takes its share of the noise out of the differences.
     by_noise = float(noise[:, 0].mean()) * (len(plates) - len(count))
     freedom = len(plates) - len(count)
     squares = float((level**2).sum())
     between = _variance(squares, by_noise, freedom)
+    of_points = np.maximum(np.mean([one.sides for one in plates], axis=0), FLOOR_MM**2)
+    outer = of_points[0] / of_points.mean()
     return Variances(
-        level=between,
-        ring=between,
+        level=between * outer,
+        ring=between * (max(float(np.mean(rings)), FLOOR_MM**2) / of_points.mean() if len(rings) else outer),
         along=_variance(float((value[:, 1] ** 2).sum()), float(noise[:, 1].sum()), len(plates)),
         across=_variance(float((value[:, 2] ** 2).sum()), float(noise[:, 2].sum()), len(plates)),
         known=freedom > 0,
         evident=squares > float(chi2.ppf(1.0 - RISK, max(freedom, 1))) * float(noise[:, 0].mean()),
     )
+
+
+def tails(ends: Sequence[Sequence[Thickness]]) -> Floats:
+    """Probabilities (e,) that the plates of each end differ as much from plates of other ends; NaN without such.
+
+    Other ends show the variance of a plate's thickness. Opposite plates of an end count as one observation.
+    """
+    value = np.array([plate.value[0] for end in ends for plate in end])
+    noise = np.array([max(plate.noise[0], FLOOR_MM**2) for end in ends for plate in end])
+    of_end = np.repeat(np.arange(len(ends)), [len(end) for end in ends])
+    group = _alike(value)
+    found = np.full(len(ends), np.nan)
+    for number in np.unique(of_end):
+        own, others = of_end == number, of_end != number
+        count = np.bincount(group[others], minlength=int(group.max()) + 1)
+        freedom = int((count - 1)[count > 0].sum())
+        own &= count[group] > 0
+        if not own.any() or freedom < 1:
+            continue
+        mean = np.bincount(group[others], value[others], len(count)) / np.maximum(count, 1)
+        by_noise = np.bincount(group[others], noise[others], len(count)) / np.maximum(count, 1)
+        squares = float(((value - mean[group])[others] ** 2).sum())
+        between = max(squares - float((by_noise * (count - 1))[count > 0].sum()), 0.0) / freedom
+        share = 1.0 / count[group[own]]
+        variance = noise[own] + by_noise[group[own]] * share + between * (1.0 + share)
+        independent = own.sum() / OF_PAIR
+        mean_square = float(np.mean((value[own] - mean[group[own]]) ** 2 / variance))
+        found[number] = global_test.tail(mean_square * independent, independent, freedom / OF_PAIR)
+    return found
+
+
+def _alike(level: Floats) -> Ints:
+    """Return the number (n,) of each plate's group, of one nominal thickness, by their thickness ``level`` (n,)."""
+    order = np.argsort(level, kind="stable")
+    group = np.zeros(len(level), np.int64)
+    group[order] = np.cumsum(np.diff(level[order], prepend=level[order[:1]]) > ALIKE_MM)
+    return group
 
 
 def _variance(squares: float, by_noise: float, freedom: int) -> float:

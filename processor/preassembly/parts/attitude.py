@@ -37,6 +37,9 @@ NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose expl
 SAME_POSE_MM = 5.0  # poses are equal where no corner of the part differs by more
 TELLING_MM = 10.0  # distance between two poses' surfaces beyond which the scan can distinguish the poses
 CORNER_SAMPLES = 12  # nearest of the rival's design: some of them on each face that meets at a corner
+# An end plate's two sides are alike to few points: poses that differ by a plate's thickness, up to some 60 mm, along the
+# part are each stable, and are tried from starts nearer to each other than half of the plates that are usual.
+SLIDES_MM = (-60.0, -45.0, -30.0, -15.0, 15.0, 30.0, 45.0, 60.0)
 LEAST_EVIDENCE = 10  # samples of distinguishing surface that the scan shows
 SLIDE_RAD = np.radians(45.0)  # a rival turned by less has slid along the part: along an arch it turns a little
 RIVAL_RATIO = 1.5  # a pose whose misfit is within this factor of the best is a rival
@@ -192,6 +195,8 @@ def find(points: Floats, part: DesignPart, surface: Surface | None = None) -> At
     screened = each(partial(_align, even[1], surface, COARSE_GATES_MM[1:]), turned)
     turned = _promising([replace(c, misfit=s.misfit) for c, s in zip(turned, screened, strict=True)], box)
     candidates = _distinct(candidates + each(align, turned), box)
+    slid = _slid(thinned(seeds, WIDE_POINTS), surface, candidates[0], box)
+    candidates = _distinct(candidates + each(align, slid), box)
     best = candidates[0]
     if best.misfit > NO_FIT_MM:
         why = reason("preassemble.no-attitude", distance=best.misfit)
@@ -207,7 +212,19 @@ def rough(points: Floats, part: DesignPart, surface: Surface, *, pieces: bool, k
     """
     even = _even(points, surface)
     coarse = _coarse(points, even, surface, part, pieces=pieces)[:kept]
-    return min(each(partial(_align, even[1], surface, FINE_GATES_MM), coarse), key=lambda c: c.misfit).T
+    best = min(each(partial(_align, even[1], surface, FINE_GATES_MM), coarse), key=lambda c: c.misfit)
+    for other in _slid(even[1], surface, best, _corners(points)):
+        of_best, of_other = _evidence(points, surface, best.T, other.T)
+        best = other if of_other >= max(LEAST_EVIDENCE, 2 * of_best) else best
+    return best.T
+
+
+def _slid(points: Floats, surface: Surface, best: _Candidate, box: Floats) -> list[_Candidate]:
+    """Return other stable poses of points (n, 3) that differ from the best by a slide along the part."""
+    slides = [rigid.transform(np.eye(3), slide * surface.axes[:, 0]) for slide in SLIDES_MM]
+    starts = [_Candidate(slide @ best.T, best.start) for slide in slides]
+    found = each(partial(_align, points, surface, FINE_GATES_MM), starts)
+    return [c for c in _distinct([replace(best, misfit=-np.inf), *found], box) if c.misfit >= 0.0]
 
 
 def _even(points: Floats, surface: Surface) -> tuple[Floats, Floats]:

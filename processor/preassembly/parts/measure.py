@@ -20,7 +20,7 @@ from processor.preassembly.ends.faces import RegisteredPart
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
 from processor.preassembly.ends.joint_frame import end_place
 from processor.preassembly.params import SystematicParams
-from processor.preassembly.parts import assignment, attitude, identity, systematic_errors
+from processor.preassembly.parts import assignment, attitude, contradictions, identity, systematic_errors
 from processor.preassembly.parts.assignment import ScanParts
 from processor.preassembly.parts.member import Member
 
@@ -70,11 +70,12 @@ class _Views(NamedTuple):
 
 @dataclass(frozen=True)
 class FittedPart:
-    """A part whose ends are fitted but not estimated yet: ``measured`` has no ends."""
+    """A part whose ends are fitted but not estimated yet: ``measured`` has no ends. ``joints`` are the ends' names."""
 
     part: DesignPart
     measured: MeasuredPart
     ends: tuple[FittedEnd | JointEnd | None, ...]
+    joints: tuple[str, ...]
     views: _Views = field(default_factory=lambda: _Views(np.zeros((6, 6)), 0.0))
 
 
@@ -160,7 +161,9 @@ def fit(
         identities=_identities(placed, part),
     )
     several = len(np.unique(registered.station)) > 1
-    return FittedPart(part, measured, ends) if several else FittedPart(part, measured, ends, _views(registered, shape))
+    names = tuple("" if joint is None else design.joint_names[joint] for joint in joints)
+    fitted = FittedPart(part, measured, ends, names)
+    return fitted if several else replace(fitted, views=_views(registered, shape))
 
 
 def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[MeasuredPart]:
@@ -168,20 +171,29 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
     between = _between_viewpoints(parts)
     if not systematic.known:
         between = between.or_of_class()
-    seen = [_as_seen(part, between.level) for part in parts]
+    contradicted = contradictions.find([_examined(part) for part in parts])
+    seen = [_as_seen(part, between) for part in parts]
     fitted = [(end, part.views.left) for part in seen for end in part.ends if isinstance(end, FittedEnd)]
     of_ends = [between._replace(level=left * between.level) for _, left in fitted]
     estimated = iter(joint_end.estimate([end for end, _ in fitted], of_ends))
     measured = []
-    for part in seen:
+    for part, contradiction in zip(seen, contradicted, strict=True):
         ends = [next(estimated) if isinstance(end, FittedEnd) else end for end in part.ends]
         first, last = (
             None if end is None else systematic_errors.added_to_end(end, systematic, part.part) for end in ends
         )
         member = replace(part.measured.member, ends=(first, last))
-        reasons = (*part.measured.reasons, *_viewpoint_remarks(part, between))
-        measured.append(replace(part.measured, member=member, reasons=reasons))
+        reasons = (*contradiction, *part.measured.reasons, *_viewpoint_remarks(part, between))
+        status = Status.WEAK if contradiction and part.measured.status == Status.OK else part.measured.status
+        measured.append(replace(part.measured, member=member, status=status, reasons=reasons))
     return measured
+
+
+def _examined(part: FittedPart) -> contradictions.Examined:
+    ends = zip(part.joints, part.ends, strict=True)
+    return contradictions.Examined(
+        tuple((joint, end) for joint, end in ends if isinstance(end, FittedEnd)), part.measured.member.edges
+    )
 
 
 def _viewpoint_remarks(part: FittedPart, between: viewpoints.Variances) -> Iterator[Reason]:
@@ -198,13 +210,19 @@ def _viewpoint_remarks(part: FittedPart, between: viewpoints.Variances) -> Itera
 def _between_viewpoints(parts: Sequence[FittedPart]) -> viewpoints.Variances:
     """Variances between viewpoints by the plates of all parts."""
     ends = [end for part in parts for end in part.ends if isinstance(end, FittedEnd)]
-    return viewpoints.variances([plate for end in ends for plate in end.plates if plate is not None])
+    plates = [plate for end in ends for plate in end.plates if plate is not None]
+    return viewpoints.variances(plates, [end.ring_noise for end in ends if end.plates])
 
 
-def _as_seen(part: FittedPart, variance: float) -> FittedPart:
-    """Return a part with a ``variance`` between viewpoints in the covariances of its registration and its edges."""
-    pose = part.measured.member.pose + variance * part.views.pose
-    edges = systematic_errors.added_to_edges(part.measured.member.edges, SystematicParams(), variance * part.views.left)
+def _as_seen(part: FittedPart, between: viewpoints.Variances) -> FittedPart:
+    """Return a part with variances between viewpoints in the covariances of its registration and its edges.
+
+    What the registration follows of them cancels in the adjustment, where the edges have all of their views' errors.
+    """
+    if not part.views.left:
+        return part
+    pose = part.measured.member.pose + between.level * part.views.pose
+    edges = bottom_edges.with_errors_of_views(part.measured.member.edges, between.level, between.across)
     measured = replace(part.measured, member=replace(part.measured.member, edges=edges, pose=pose))
     ends = tuple(replace(end, pose=pose) if isinstance(end, FittedEnd) else end for end in part.ends)
     return replace(part, measured=measured, ends=ends)
@@ -258,8 +276,9 @@ def _edges(
     registered: RegisteredPart, part: DesignPart, sigma_mm: float, systematic: SystematicParams
 ) -> EdgeDepartures:
     edges = bottom_edges.measure(registered, *_design_edges(part), sigma_mm)
-    share = variance_components.share_in_mean(registered.station)
-    return systematic_errors.added_to_edges(edges, systematic, registered.between_stations * share)
+    return systematic_errors.added_to_edges(
+        bottom_edges.with_errors_of_views(edges, registered.between_stations), systematic
+    )
 
 
 def _design_edges(part: DesignPart) -> tuple[Polyline, Polyline]:
@@ -436,4 +455,5 @@ def _failed(part: DesignPart, joints: Sequence[int | None], placed: Sequence[_Pl
         residuals=np.empty(0),
         identities=_identities(placed, part),
     )
-    return FittedPart(part, measured, tuple(None if joint is None else joint_end.unknown(*why) for joint in joints))
+    ends = tuple(None if joint is None else joint_end.unknown(*why) for joint in joints)
+    return FittedPart(part, measured, ends, ("",) * len(ends))

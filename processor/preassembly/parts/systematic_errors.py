@@ -11,6 +11,7 @@ from dataclasses import replace
 import numpy as np
 
 from processor.model import DesignPart, Floats, Word
+from processor.preassembly.ends import bottom_edges
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.joint_end import JointEnd
 from processor.preassembly.params import SystematicParams
@@ -54,10 +55,12 @@ def end_variances(params: SystematicParams, part: DesignPart) -> Floats:
     return np.tile([any_axis + along, any_axis, any_axis], 8)
 
 
-def added_to_edges(edges: EdgeDepartures, params: SystematicParams, between_stations: float) -> EdgeDepartures:
-    """Return edges with their systematic errors and a variance between stations in the covariance.
+def added_to_edges(edges: EdgeDepartures, params: SystematicParams) -> EdgeDepartures:
+    """Return edges with their systematic errors in the covariance.
 
-    All points of an edge share these errors.
+    Registration moves each view by itself; the offset of the scanner moves all faces inward.
     """
-    variance = params.registration_mm**2 + params.offset_mm**2 + between_stations
-    return replace(edges, covariance=edges.covariance + variance)
+    inward = np.stack([np.where(np.array(edges.side) == "left", -1.0, 1.0), np.ones(len(edges.side))])
+    by_offset = params.offset_mm**2 * np.einsum("ak,al->akl", inward, inward)
+    registered = bottom_edges.with_errors_of_views(edges, params.registration_mm**2)
+    return replace(registered, covariance=registered.covariance + by_offset)
