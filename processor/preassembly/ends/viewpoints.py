@@ -4,11 +4,11 @@ A cloud merged from several stations has errors of range, place and turn of each
 from some of them only. On one face they look like form. But the two sides of a plate are never seen from one place, and
 plates of one thickness are as thick at one end as at another: the variance of their thickness, as measured, is that
 between viewpoints of its two sides together. Waves and bends of a plate are the same on both of its sides and cancel.
-Rolling tolerances are in it as well: they cannot be told apart.
+Rolling tolerances are in it as well: they cannot be separated.
 
-The sides do not share it equally. Errors of range act along the ray, on a face that is seen obliquely by the cosine, and
-the inner sides at an end are seen through its opening, obliquely, while the end's ring is seen from ahead. Noise of
-range acts along the ray as well. So a face has a share of the variance as of the noise.
+The sides do not share it equally. Errors of range act along the ray, on a face that is seen obliquely by the cosine,
+and the inner sides at an end are seen through its opening, obliquely, while the end's ring is seen from ahead. Noise
+of range acts along the ray as well. So a face has a share of the variance as of the noise.
 """
 
 from __future__ import annotations
@@ -96,8 +96,8 @@ def thickness(trend: Floats, at: Floats, height: Floats, inner: Bools) -> Thickn
     if np.linalg.cond(terms * root) > 1e4:
         return None
     solve = np.linalg.pinv(terms * root) * root.T
-    noise = np.diag(solve @ np.diag(variance[enough]) @ solve.T)
-    return Thickness(solve @ difference[enough], noise, (sides[0], sides[1]))
+    of_terms = np.diag(solve @ np.diag(variance[enough]) @ solve.T)
+    return Thickness(solve @ difference[enough], of_terms, (sides[0], sides[1]))
 
 
 def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Variances:

@@ -37,8 +37,8 @@ NO_FIT_MM = 25.0  # misfit, about a plate's thickness, beyond which no pose expl
 SAME_POSE_MM = 5.0  # poses are equal where no corner of the part differs by more
 TELLING_MM = 10.0  # distance between two poses' surfaces beyond which the scan can distinguish the poses
 CORNER_SAMPLES = 12  # nearest of the rival's design: some of them on each face that meets at a corner
-# An end plate's two sides are alike to few points: poses that differ by a plate's thickness, up to some 60 mm, along the
-# part are each stable, and are tried from starts nearer to each other than half of the plates that are usual.
+# An end plate's two sides are alike to few points: poses that differ by a plate's thickness, up to some 60 mm, along
+# the part are each stable, and are tried from starts nearer to each other than half of the plates that are usual.
 SLIDES_MM = (-60.0, -45.0, -30.0, -15.0, 15.0, 30.0, 45.0, 60.0)
 LEAST_EVIDENCE = 10  # samples of distinguishing surface that the scan shows
 SLIDE_RAD = np.radians(45.0)  # a rival turned by less has slid along the part: along an arch it turns a little

@@ -116,7 +116,7 @@ def _mean_cosines(seen: Floats) -> Floats:
 
 
 def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, variance: float) -> tuple[float, float]:
-    """Standard deviations (mm) of an offset of ranges, and of a change of radii by a wide beam.
+    """Return the standard deviations (mm) of an offset of ranges, and of a change of radii by a wide beam.
 
     Of an offset of the radii one half of the variance is that of an offset of ranges, as far as the scanner's class and
     the mean of the views, which has the field's variance, may have it (95 %). The rest is that of a beam.
@@ -190,7 +190,7 @@ def _of_spheres(
     offset_sd: float,
     beam_sd: float,
 ) -> tuple[Floats, Floats]:
-    """Changes (k, 4, q) of states by variates common to all spheres, and the covariance (k, 4, 4) of each by itself."""
+    """Return changes (k, 4, q) of states by variates common to all, and the covariance (k, 4, 4) of each by itself."""
     factor, at_knots = modes(), _knots(field, places)
     count, knots = at_knots.shape
     known = 5
@@ -212,7 +212,7 @@ def _of_spheres(
 
 
 def _knots(field: ViewField, places: Floats) -> Floats:
-    """Changes (k, u) of the fields at places (k, 3) by independent variates: those of some of the places, far apart.
+    """Return changes (k, u) of the fields at places (k, 3) by independent variates: those of places far apart.
 
     What these do not explain of a field is independent of the others'.
     """

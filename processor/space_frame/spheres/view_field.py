@@ -8,13 +8,13 @@ independent vectors, its displacement along the normal is a Gaussian field over 
     cos a (sin a + (pi - a) cos a) / pi
 
 at an angle a: the product of two normals for the vectors, times the arc-cosine kernel of first order for the densities
-(Cho and Saul 2009, "Kernel methods for deep learning"). From ball to ball views change their directions and weights: the
-correlation falls with the distance d as exp(-d / length).
+(Cho and Saul 2009, "Kernel methods for deep learning"). From ball to ball views change their directions and weights:
+the correlation falls with the distance d as exp(-d / length).
 
-Most of such a field is a shift and a change of radius, which no residual of one ball shows. The rest shows how large the
-field is. Its variance has the prior of the scanner's class, and the likelihood of the residuals with the states of all
-balls eliminated (restricted likelihood, Patterson and Thompson 1971). The mean of the variance over both includes its
-uncertainty, which few views leave large, as the variance of Student's t does.
+Most of such a field is a shift and a change of radius, which no residual of one ball shows. The rest shows how large
+the field is. Its variance has the prior of the scanner's class, and the likelihood of the residuals with the states of
+all balls eliminated (restricted likelihood, Patterson and Thompson 1971). The mean of the variance over both includes
+its uncertainty, which few views leave large, as the variance of Student's t does.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from processor.model import Floats, Ints
 # Spherical harmonics up to degree 3 hold all but a hundredth of the field's variance. A sphere's state takes up those
 # of degrees 0 and 1.
 MODES, TAKEN_UP = 16, 4
-# Combinations of modes that few points at the edge of the visible surface determine are left out, where mixed pixels are.
+# Combinations of modes that few points determine are left out: those at the edge of what is visible are mixed pixels.
 LEAST_INFORMATION = 0.02
 SD_MM = np.geomspace(0.01, 5.0, 40)  # a field below the first is nothing, one beyond the last no registered cloud
 LENGTHS_MM = np.array([1e3, 2e3, 4e3, 8e3, 16e3, 32e3, np.inf])  # stations are metres to tens of metres away
