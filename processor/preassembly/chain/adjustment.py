@@ -31,11 +31,26 @@ from processor.preassembly.parts.member import Member
 HOLD = 1e-3  # weight of a part's movement along its chord
 
 
+class Solution(NamedTuple):
+    """The motions (6 c,) of least squares and the edges' departures after them, by the n observations.
+
+    ``to_motion`` (6 c, n), ``to_departures`` (k, n) a part, with NaN where a departure is unknown; covariance (n, n) of
+    the observations, and ``with_pose`` (n, 6 c) that with the parts' registrations. Departures have rows sideways and
+    up in turn.
+    """
+
+    to_motion: Floats
+    to_departures: tuple[Floats, ...]
+    covariance: Floats
+    with_pose: Floats
+
+
 @dataclass(frozen=True)
 class Adjusted:
     """Motions T (c, 4, 4) of the registered parts, with covariance (6 c, 6 c) about the parts' centres, and the gaps.
 
-    ``motion_with_pose`` (6 c, 6 c) is the covariance of the motions with the parts' registrations.
+    ``motion_with_pose`` (6 c, 6 c) is the covariance of the motions with the parts' registrations. ``solution`` is
+    what other figures of the chain are propagated with.
     ``gaps`` (j, 8, 3) at these motions in bridge axes, with covariance (j, 24, 24). ``departures`` (k, 2) a part,
     sideways and up, are after the adjustment, with variances (k, 2). ``at_rest_variance`` (k, 2) are those with the
     whole bridge moved so that the first part lies where its registration has it.
@@ -49,6 +64,7 @@ class Adjusted:
     departures: tuple[Floats, ...]
     departure_variance: tuple[Floats, ...]
     at_rest_variance: tuple[Floats, ...]
+    solution: Solution
 
 
 class _Rows(NamedTuple):
@@ -98,7 +114,7 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
             gaps[j] = residual[row : row + 24].reshape(8, 3)
             # Of the gap at the poses found: the ends' errors that the motions follow are in it.
             gap_covariance[j] = observed.covariance[row : row + 24, row : row + 24]
-    departures, variances, at_rest = [], [], []
+    departures, variances, at_rest, to_departures = [], [], [], []
     for member, rows in zip(members, observed.edge_rows, strict=True):
         departure, variance, at_rest_variance = (np.full(member.edges.departure.shape, np.nan) for _ in range(3))
         known = np.isfinite(member.edges.departure)
@@ -106,6 +122,9 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
         # The first part at rest: the inverse of its motion moves every edge.
         by_first = after[rows] - _edge_motion(member.edges, members[0].centre)[known.ravel()] @ to_motion[:6]
         at_rest_variance[known] = np.einsum("ki,ij,kj->k", by_first, observed.covariance, by_first, optimize=True)
+        of_part = np.full((known.size, len(observed.value)), np.nan)
+        of_part[known.ravel()] = after[rows]
+        to_departures.append(of_part)
         departures.append(departure)
         variances.append(variance)
         at_rest.append(at_rest_variance)
@@ -119,6 +138,7 @@ def adjust(members: Sequence[Member], joint_points: Floats, joint_frames: Floats
         departures=tuple(departures),
         departure_variance=tuple(variances),
         at_rest_variance=tuple(at_rest),
+        solution=Solution(to_motion, tuple(to_departures), observed.covariance, observed.with_pose),
     )
 
 

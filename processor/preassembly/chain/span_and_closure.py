@@ -33,6 +33,18 @@ class PartEnd(Word):
     END = "end"
 
 
+class _OuterEnd(NamedTuple):
+    """What an outer end adds to a distance: a value with a variance, the derivative (n,) of it by the observations.
+
+    Beyond these, it moves with its part in the direction ``along`` (3,).
+    """
+
+    value: float
+    variance: float
+    by_value: Floats
+    along: Floats
+
+
 class Figures(NamedTuple):
     """Figures of the chain, named as in the result: see :func:`span`, :func:`closure` and :func:`limiting`."""
 
@@ -55,18 +67,48 @@ def span(parts: Sequence[MeasuredPart], adjusted: Adjusted, design: ArchDesign) 
     """Departure of the distance between the bridge's outer ends from the design's, mm, and its 95 % half-width.
 
     The adjustment does not constrain the span: parts that are too short bring the feet closer together. NaN where a
-    joint has no answer, since the distance of the parts beside it is not measured.
+    joint has no answer, since the distance of the parts beside it is not measured. An outer end is placed along its
+    part by its end face, and square to it by the bottom edges there; what was not seen of it is taken to be as
+    designed.
     """
     if not np.isfinite(adjusted.gaps).all():
         return float("nan"), float("nan")
     ends = _outer_ends(design)
     chord = (ends[1] - ends[0]) / np.linalg.norm(ends[1] - ends[0])
-    departure, by_motion, by_pose = 0.0, *np.zeros((2, 1, len(adjusted.motion_covariance)))
+    solution = adjusted.solution
+    departure, own, by_value, by_pose = 0.0, 0.0, np.zeros(len(solution.covariance)), np.zeros(len(solution.to_motion))
     for i, at, sign in ((0, ends[0], -1.0), (len(parts) - 1, ends[1], 1.0)):
-        departure += sign * float(chord @ (rigid.apply(adjusted.motions[i], at[None])[0] - at))
-        by_motion[0] += sign * chord @ _point_motion(parts, i, at)
-        by_pose[0, 6 * i : 6 * i + 6] += sign * chord @ rigid.motion(at[None])[0]
-    return departure, NORMAL_95 * float(np.sqrt(_covariance(parts, adjusted, by_motion, by_pose)[0, 0]))
+        outer = _outer_end(parts, adjusted, i, at, sign * chord)
+        departure += outer.value + float(outer.along @ (rigid.apply(adjusted.motions[i], at[None])[0] - at))
+        own += outer.variance
+        by_value += outer.by_value + outer.along @ _point_motion(parts, i, at) @ solution.to_motion
+        by_pose[6 * i : 6 * i + 6] += outer.along @ rigid.motion(at[None])[0]
+    both = by_value @ solution.with_pose @ by_pose
+    registered = by_pose @ block_diag(*(part.member.pose for part in parts)) @ by_pose
+    variance = by_value @ solution.covariance @ by_value + 2.0 * both + registered + own
+    return departure, NORMAL_95 * float(np.sqrt(max(variance, 0.0)))
+
+
+def _outer_end(parts: Sequence[MeasuredPart], adjusted: Adjusted, i: int, at: Floats, axis: Floats) -> _OuterEnd:
+    """Return what the outer end ``at`` (3,) of part i adds to a distance along an ``axis`` (3,)."""
+    edges, face = parts[i].member.edges, parts[i].outer
+    to_departures = adjusted.solution.to_departures[i]
+    value, variance, along = 0.0, 0.0, axis
+    by_value = np.zeros(to_departures.shape[1])
+    nearest = [np.argsort(np.linalg.norm(edges.points - at, axis=1) + np.where(of_side, 0.0, np.inf))[:2]
+               for of_side in (np.array(edges.side) == side for side in ("left", "right"))]  # fmt: skip
+    if np.isfinite(adjusted.departures[i][np.ravel(nearest), 1]).all():
+        up = edges.axes[nearest[0][0], 1]
+        along = axis - (axis @ up) * up
+        # Half an interval beyond the last departure.
+        for rows in nearest:
+            for row, weight in zip(rows, (0.75, -0.25), strict=True):
+                value += weight * float(axis @ up) * float(adjusted.departures[i][row, 1])
+                by_value += weight * float(axis @ up) * to_departures[2 * row + 1]
+    if face is not None:
+        value += float(along @ face.departure)
+        variance = face.variance * float(along @ face.direction) ** 2
+    return _OuterEnd(value, variance, by_value, along)
 
 
 def design_span(design: ArchDesign) -> float:

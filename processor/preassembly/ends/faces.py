@@ -143,7 +143,7 @@ def fit(part: RegisteredPart, local: Floats, place: EndPlace) -> list[FaceFit] |
         clear &= -place.outward * local[rows, 0] > margin
         rows = rows[clear]
         columns = basis(local[rows, 0], local[rows, across] / place.half[across])
-        coefficients, residual, inliers = _least_squares(columns, out[clear])
+        coefficients, residual, inliers = least_squares(columns, out[clear])
         if not len(coefficients):
             return reason("preassemble.few-points-on-face", face=name)
         used = UsedPoints(columns[inliers], residual, part.station[rows][inliers], cell[clear][inliers])
@@ -225,7 +225,7 @@ def _noise(residual: Floats) -> float:
     return float(1.4826 * np.median(np.abs(residual - middle))) if len(residual) else 0.0
 
 
-def _least_squares(basis: Floats, value: Floats) -> tuple[Floats, Floats, Bools]:
+def least_squares(basis: Floats, value: Floats) -> tuple[Floats, Floats, Bools]:
     """Coefficients (k,), residuals of the inliers, and a mark of these; empty for too few points."""
     used = np.ones(len(value), bool)
     coefficients: Floats = np.empty(0, np.float64)

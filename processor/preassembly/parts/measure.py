@@ -14,11 +14,12 @@ from processor.geometry.mesh_distance import MeshSurface, on_face
 from processor.geometry.neighbors import by_cell, thinned
 from processor.geometry.polyline import Polyline
 from processor.model import DesignPart, Floats, Ints, Reason, Scan, Status, reason
-from processor.preassembly.ends import bottom_edges, faces, joint_end, viewpoints
+from processor.preassembly.ends import bottom_edges, faces, joint_end, outer_end, viewpoints
 from processor.preassembly.ends.bottom_edges import EdgeDepartures
 from processor.preassembly.ends.faces import RegisteredPart
 from processor.preassembly.ends.joint_end import FittedEnd, JointEnd
 from processor.preassembly.ends.joint_frame import end_place
+from processor.preassembly.ends.outer_end import OuterEnd
 from processor.preassembly.params import SystematicParams
 from processor.preassembly.parts import assignment, attitude, contradictions, identity, systematic_errors
 from processor.preassembly.parts.assignment import ScanParts
@@ -50,6 +51,7 @@ class MeasuredPart:
     residual_points: Floats  # (r, 3) of the scan, thinned, on the design
     residuals: Floats  # (r,) from the design's surface, outward
     identities: tuple[ScanParts, ...] = ()  # of its scans
+    outer: OuterEnd | None = None  # of the first and the last part
 
     @property
     def of_others(self) -> tuple[Reason, ...]:
@@ -147,11 +149,13 @@ def fit(
     status = Status.AMBIGUOUS if first.attitude.status == Status.AMBIGUOUS else status
     resemblance = _resemblance(first.points, index, shapes) if status != Status.OK else ()
     residual_points, residuals = _residuals(registered.points, shape.mesh)
+    outer = _outer_end(registered, part, joints)
+    unseen = (reason("preassemble.outer-end-not-seen"),) if None in joints and outer is None else ()
     measured = MeasuredPart(
         name=part.name,
         scans=tuple(scan.scan for scan in used),
         status=status,
-        reasons=(*_reasons(placed, used, part, of_ends), *resemblance),
+        reasons=(*_reasons(placed, used, part, of_ends), *resemblance, *unseen),
         T_bridge_scan=first.registration.T_design_scan,
         member=Member((None, None), edges, part.vertices.mean(axis=0), registered.pose),
         shrink=shrink,
@@ -159,6 +163,7 @@ def fit(
         residual_points=residual_points,
         residuals=residuals,
         identities=_identities(placed, part),
+        outer=outer,
     )
     several = len(np.unique(registered.station)) > 1
     names = tuple("" if joint is None else design.joint_names[joint] for joint in joints)
@@ -183,9 +188,13 @@ def estimate(parts: Sequence[FittedPart], systematic: SystematicParams) -> list[
             None if end is None else systematic_errors.added_to_end(end, systematic, part.part) for end in ends
         )
         member = replace(part.measured.member, ends=(first, last))
+        outer = part.measured.outer
+        if outer is not None:
+            variance = outer.variance + systematic_errors.end_variances(systematic, part.part)[0]
+            outer = replace(outer, variance=variance + (between.ring if part.views.left else 0.0))
         reasons = (*contradiction, *part.measured.reasons, *_viewpoint_remarks(part, between))
         status = Status.WEAK if contradiction and part.measured.status == Status.OK else part.measured.status
-        measured.append(replace(part.measured, member=member, status=status, reasons=reasons))
+        measured.append(replace(part.measured, member=member, status=status, reasons=reasons, outer=outer))
     return measured
 
 
@@ -279,6 +288,15 @@ def _edges(
     return systematic_errors.added_to_edges(
         bottom_edges.with_errors_of_views(edges, registered.between_stations), systematic
     )
+
+
+def _outer_end(registered: RegisteredPart, part: DesignPart, joints: Sequence[int | None]) -> OuterEnd | None:
+    """Measure the end of a part that has no joint; None where both have one, or it was not seen."""
+    for joint, outermost, next_to_it in zip(joints, (0, -1), (1, -2), strict=True):
+        if joint is None:
+            at, before = (0.5 * (part.bottom_edge_left[k] + part.bottom_edge_right[k]) for k in (outermost, next_to_it))
+            return outer_end.measure(registered, at, (at - before) / np.linalg.norm(at - before))
+    return None
 
 
 def _design_edges(part: DesignPart) -> tuple[Polyline, Polyline]:
