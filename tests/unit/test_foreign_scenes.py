@@ -154,3 +154,11 @@ def test_a_segment_that_lies_on_longer_parts_is_none_of_them(tmp_path):
     shapes = attitude.Shapes(scene.arch)
     scan = next(scan for scan in scene.scans if scan.component == "SEG-1")
     assert [assignment.rather(scan.points, k, shapes) for k in range(5)] == [1, None, 1, 1, 1]
+
+
+@pytest.mark.slow
+def test_a_foot_is_not_placed_a_plates_thickness_off(tmp_path):
+    """Both sides of its end plate of 40 mm are stable places: the scan passed for that of the other foot."""
+    scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", seed=5))
+    scan = next(scan for scan in scene.scans if scan.component == "SP-E")
+    assert assignment.rather(scan.points, 4, attitude.Shapes(scene.arch)) is None
