@@ -162,3 +162,11 @@ def test_a_foot_is_not_placed_a_plates_thickness_off(tmp_path):
     scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", seed=5))
     scan = next(scan for scan in scene.scans if scan.component == "SP-E")
     assert assignment.rather(scan.points, 4, attitude.Shapes(scene.arch)) is None
+
+
+@pytest.mark.slow
+def test_a_rough_pose_turned_half_round_does_not_name_another_part(tmp_path):
+    """Of few points, the turned pose of SEG-1 has the least misfit: its scan passed for that of SEG-3."""
+    scene = folder.read_input(make("arch_bridge", tmp_path, "stations=4", "spacing=16", "raised=3700", seed=3))
+    scan = next(scan for scan in scene.scans if scan.component == "SEG-1")
+    assert assignment.rather(scan.points, 1, attitude.Shapes(scene.arch)) is None
