@@ -324,9 +324,10 @@ def _compare(
     matched = _matched(pattern, design, pose, options.expansion)
     at, stations = pattern.positions.mean(axis=0), registered.trusted
     common = np.diag([0.0, 0.0, 0.0, *3 * [options.datum_mm**2]]) if stations is None else stations.common(at)
-    # Absent where views are named: their errors are then in ``common`` and in the covariances.
-    shared = spheres.shared[rows, :3] if spheres.shared.size else np.zeros((len(rows), 3, 0))
-    covariance = spheres.covariance[rows, :3, :3] - shared @ np.swapaxes(shared, 1, 2) + shared_offset[rows]
+    covariance = spheres.covariance[rows, :3, :3] + shared_offset[rows]
+    shared = None if spheres.views is None else spheres.views.shared[rows, :3]
+    if shared is not None:
+        covariance = covariance - shared @ np.swapaxes(shared, 1, 2)
     movements = movement(matched, pattern, covariance, design, common, at, shared, expansion=options.expansion)
     assignment, weight = np.full(len(spheres.radii), -1, np.int64), np.zeros(len(spheres.radii))
     assignment[rows], weight[rows] = matched.assignment, matched.weight

@@ -161,7 +161,7 @@ def test_without_rays_half_of_what_noise_may_bring_is_taken_off_and_the_rest_is_
         nodes = Nodes(np.zeros((draws, 3)), unfixed, np.zeros(draws, np.int64), np.full(draws, np.nan))
         params = fit_all.RayFitParams(sigma_mm=2.0, process_hole_mm=0.0)
         found = fit_all.fit_crops(crops, np.empty((0, 3)), nodes, Members(), catalogue.of_radii([]), params=params)
-        return found.radii - radius, (found.covariance - found.common)[:, 3, 3]
+        return found.radii - radius, (found.covariance - found.views.covariance)[:, 3, 3]
 
     chance = 4.0 * sigma / np.sqrt(draws * count)
     off, variance = radii(rng.normal(0.0, sigma, (draws * count, 3)))

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from processor.space_frame.catalogue import of_radii
+from processor.space_frame.members.records import Members
 from processor.space_frame.spheres import fit_all
 from processor.space_frame.spheres.unnamed_views import of_tubes
 from tests.support import ball_clouds
@@ -44,18 +45,52 @@ def test_lowest_points_hold_whether_views_agree_or_not(shift_mm):
 
 def test_errors_of_views_common_to_all_spheres_are_part_of_the_whole():
     found = fitted(1, 0.6)
-    left = found.covariance - found.common
+    shared = found.views.shared @ np.swapaxes(found.views.shared, 1, 2)
+    left = found.covariance - shared
     assert (np.linalg.eigvalsh(left).min(axis=1) > 0.0).all()
-    assert (found.common[:, 2, 2] > 0.2**2 - 1e-9).all()
+    assert (shared[:, 2, 2] > 0.2**2 - 1e-9).all()
 
 
 def test_tubes_of_a_merged_cloud_hold_shifted_views():
-    """Circles seen from below by four views: what the fit takes up of their shifts is in the intervals."""
+    """A tube seen from below: what its fit takes up of the views' errors is in the intervals, more if seen less."""
     found = fitted(1, 0.6)
-    axis, side = np.array([[1.0, 0.0, 0.0]]), np.array([[0.0, 1.0, 0.0]])
-    (covariance,) = of_tubes(found.views, axis, side)
-    assert (np.linalg.eigvalsh(covariance) > 0.0).all()
-    exact = dataclasses.replace(found.views, sd=0.0)
-    (least,) = of_tubes(exact, axis, side)
-    assert np.sqrt(np.diag(least)) == pytest.approx([0.2, 0.2, 2.0 / 3.0 * 0.2], abs=1e-6)
-    assert (np.diag(covariance) > np.diag(least)).all()
+    below, narrow = np.zeros((2, 24))
+    below[12:], narrow[15:21] = 10.0, 10.0
+    tubes = Members(
+        points=np.zeros((2, 3)),
+        directions=np.tile([1.0, 0.0, 0.0], (2, 1)),
+        side=np.tile([0.0, 1.0, 0.0], (2, 1)),
+        lengths=np.full(2, 1000.0),
+        radii=np.full(2, 30.0),
+        bow=np.zeros((2, 2)),
+        covariance=np.zeros((2, 5, 5)),
+        node_a=np.full(2, -1),
+        node_b=np.full(2, -1),
+        count=np.full(2, 100),
+        rms=np.ones(2),
+        around=np.stack([below, narrow]),
+    )
+    whole = of_tubes(found.views, tubes)
+    assert (np.linalg.eigvalsh(whole) > 0.0).all()
+    assert whole[1, 2, 2] > whole[0, 2, 2]
+    least = of_tubes(dataclasses.replace(found.views, sd=0.0), tubes)
+    assert (np.einsum("mii->mi", least)[:, :2] > 0.2**2 - 1e-9).all()
+    assert (np.einsum("mii->mi", whole - least) > 0.0).all()
+
+
+def test_differences_between_balls_hold_views_that_differ_and_are_narrow_where_they_agree():
+    """Centres less their mean, which no common shift moves: neither too narrow nor, without errors, too wide."""
+    rms = {}
+    for shift_mm in (0.0, 0.6):
+        pulls = []
+        for seed in range(5):
+            found = fitted(seed, shift_mm)
+            off = found.centres - CENTRES
+            shared = found.views.shared[:, :3]
+            own = found.covariance[:, :3, :3] - shared @ np.swapaxes(shared, 1, 2)
+            apart = shared - shared.mean(axis=0)
+            variance = np.einsum("kii->ki", own + apart @ np.swapaxes(apart, 1, 2))
+            pulls.append((off - off.mean(axis=0)) / np.sqrt(variance))
+        rms[shift_mm] = float(np.sqrt(np.mean(np.square(pulls))))
+    assert 0.5 < rms[0.0] < 1.15
+    assert 0.5 < rms[0.6] < 1.15

@@ -82,7 +82,6 @@ def assess(fits: Fits, nodes: Nodes, nominal: Floats, context: FitContext) -> Sp
         radii=state[:, 3],
         lowest=centres - state[:, 3:] * np.array([0.0, 0.0, 1.0]),
         covariance=covariance,
-        shared=np.empty((0, 4, 0)) if context.views is None else context.views.shared,
         lowest_sd=lowest_sd,
         bound=bound,
         bound_lowest_sd=bound_lowest,

@@ -159,7 +159,6 @@ class Spheres(Checked):
     radii: Floats = column("k")
     lowest: Floats = column("k", 3)
     covariance: Floats = column("k", 4, 4)
-    shared: Floats = column("k", 4, "q")  # changes by variates that spheres have in common: errors of unnamed views
     lowest_sd: Floats = column("k")
     bound: Floats = column("k", 4, 4)
     bound_lowest_sd: Floats = column("k")

@@ -116,7 +116,7 @@ def _mean_cosines(seen: Floats) -> Floats:
 
 
 def _offset_or_beam(fits: list[_Fit], cosines: Floats, radius_offset: float, variance: float) -> tuple[float, float]:
-    """Return the standard deviations (mm) of an offset of ranges, and of a change of radii by a wide beam.
+    """Return standard deviations (mm) of an offset of ranges and of a change of radii by a wide beam.
 
     Of an offset of the radii one half of the variance is that of an offset of ranges, as far as the scanner's class and
     the mean of the views, which has the field's variance, may have it (95 %). The rest is that of a beam.

@@ -1,8 +1,8 @@
 """Displacement of merged surfaces by the errors of views that nobody names: its covariance and how large it is.
 
 A view displaces the part of a surface that it sees by one vector: its shift, its rotation times the lever arm, and its
-range offset along its rays. Its points on a ball have normals within a right angle of its direction and a density that
-goes with the cosine of incidence. The merged surface has the mean of its views. For many views from all sides with
+range offset along its rays. Its points on a ball have normals within a right angle of its direction and a density
+that goes with the cosine of incidence. The merged surface has the mean of its views. For many views from all sides with
 independent vectors, its displacement along the normal is a Gaussian field over the normals with the correlation
 
     cos a (sin a + (pi - a) cos a) / pi
@@ -30,7 +30,7 @@ from processor.model import Floats, Ints
 # Spherical harmonics up to degree 3 hold all but a hundredth of the field's variance. A sphere's state takes up those
 # of degrees 0 and 1.
 MODES, TAKEN_UP = 16, 4
-# Combinations of modes that few points determine are left out: those at the edge of what is visible are mixed pixels.
+# Combinations of modes that only few points at the edge of the visible surface determine are left out.
 LEAST_INFORMATION = 0.02
 SD_MM = np.geomspace(0.01, 5.0, 40)  # a field below the first is nothing, one beyond the last no registered cloud
 LENGTHS_MM = np.array([1e3, 2e3, 4e3, 8e3, 16e3, 32e3, np.inf])  # stations are metres to tens of metres away
@@ -85,7 +85,7 @@ def modes() -> Floats:
 
 
 def field_of(balls: list[BallResiduals]) -> ViewField:
-    """Variance and lengths of the field, by the residuals of balls and the scanner's class."""
+    """Estimate the field's variance and lengths, by the residuals of balls and the scanner's class."""
     # Equal probability for equal ratios, to the class's error of a view; beyond it less, as of a Cauchy distribution.
     prior = -np.log1p((SD_MM / VIEW_MM) ** 2)
     log_probability = np.tile(prior, (len(LENGTHS_MM), 1))
