@@ -117,6 +117,7 @@ def _on_patches(
     edges = np.flatnonzero(np.diff(patch[order])) + 1
     for rows in np.split(order, edges):
         at, triangle = surfaces.patches[patch[rows[0]]].at, shape[rows]
+        assert at is not None, "a face of triangles has no other surface"
         d = ray[rows] @ R  # in the scene's frame
         corners, pq = surfaces.numbers[triangle, :9].reshape(-1, 3, 3), surfaces.corner_pq[triangle]
         edge, pq_edges = corners[:, 1:] - corners[:, :1], pq[:, 1:] - pq[:, :1]

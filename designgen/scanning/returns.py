@@ -315,7 +315,7 @@ class _StationCaster:
         low = self.scanner.min_range_mm
         measured = echoes.range + sigma * rng.standard_normal(n)
         measured = np.where(stray, low + where * (echoes.range - low), measured)
-        surface = self.surfaces.surface_label[self.surfaces.surface[echoes.shape]]
+        surface = self.surfaces.label[echoes.shape]
         returns = Returns(
             points=self.grid.directions(echoes.row, echoes.column) * measured[:, None],
             intensity=echoes.signal.astype(np.float32),
