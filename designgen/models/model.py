@@ -16,12 +16,12 @@ from processor.model import Floats, Ints
 SMOOTH_COS = np.cos(1e-2)  # of the angle between two faces at a common edge, up to which they are one smooth surface
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ModelBody:
     """A body: vertices (v, 3), mm, triangles (f, 3) with outward normals, and the face (f,) that each belongs to.
 
-    ``pq`` (f, 3, 2) are the parameters of the corners on the surfaces of the faces, None for faces that are their
-    triangles. Faces of one number in ``smooth`` join without an edge.
+    ``pq`` (f, 3, 2) are the parameters of the corners on the surfaces of the faces, of which a mesh has none. A face
+    that is ``flat`` is its triangles. Faces of one number in ``smooth`` join without an edge.
     """
 
     name: str
@@ -31,6 +31,7 @@ class ModelBody:
     pq: Floats
     face_names: tuple[str, ...]
     surfaces: tuple[Surface | None, ...]
+    flat: tuple[bool, ...]
     smooth: tuple[int, ...]
 
     def patches(self) -> list[tuple[Trimmed, int]]:
@@ -38,8 +39,16 @@ class ModelBody:
         order = np.argsort(self.face, kind="stable")
         groups = np.split(order, np.searchsorted(self.face[order], np.arange(1, len(self.face_names))))
         return [
-            (Trimmed(name, self.vertices[self.triangles[rows]], self.pq[rows], surface), smooth)
-            for name, surface, smooth, rows in zip(self.face_names, self.surfaces, self.smooth, groups, strict=True)
+            (
+                Trimmed(
+                    self.face_names[k],
+                    self.vertices[self.triangles[rows]],
+                    self.pq[rows],
+                    None if self.flat[k] else self.surfaces[k],
+                ),
+                self.smooth[k],
+            )
+            for k, rows in enumerate(groups)
             if len(rows)
         ]
 
@@ -64,8 +73,8 @@ def of_cad(body: Body, name: str) -> ModelBody:
     if body.forms is None:
         return of_mesh(name, body.vertices, body.faces)
     forms = body.forms.forms
-    # The triangles of a plane are the plane.
-    surfaces = tuple(None if form.kind == PLANE else surface_of(form) for form in forms)
+    surfaces = tuple(surface_of(form) for form in forms)
+    flat = tuple(form.kind == PLANE or surface is None for form, surface in zip(forms, surfaces, strict=True))
     return ModelBody(
         name=name,
         vertices=body.vertices,
@@ -74,7 +83,8 @@ def of_cad(body: Body, name: str) -> ModelBody:
         pq=body.forms.corner_uv,
         face_names=tuple(unique([form.name for form in forms])),
         surfaces=surfaces,
-        smooth=_smooth(body, surfaces),
+        flat=flat,
+        smooth=_smooth(body, [None if plane else surface for plane, surface in zip(flat, surfaces, strict=True)]),
     )
 
 
@@ -106,6 +116,7 @@ def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0
         pq=np.zeros((len(triangles), 3, 2)),
         face_names=tuple(f"face {i + 1}" for i in range(count)),
         surfaces=(None,) * count,
+        flat=(True,) * count,
         smooth=tuple(range(count)),
     )
 

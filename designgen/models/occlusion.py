@@ -19,7 +19,7 @@ LEAF = 4  # most triangles of a leaf
 DEPTH = 64  # of the stack: halves of 2^60 triangles
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Tree:
     """Triangles in the order of the tree, and its nodes.
 

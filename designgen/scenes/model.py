@@ -6,20 +6,20 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from os import PathLike
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from designgen.asbuilt import bodies
 from designgen.models import loading, placement
-from designgen.models.model import Model
+from designgen.models.model import Model, ModelBody
 from designgen.reading import filled
 from designgen.recipe_files import Recipe, overridden
 from designgen.scanning import scanner as scanner_module
 from designgen.scanning import survey
 from designgen.scanning.scan_settings import ByRays, Scanning
-from designgen.scanning.surfaces import Builder
+from designgen.scanning.surfaces import Builder, Surfaces
 from designgen.scenes import MADE_IN_MM
 from processor.model import Floats, Scene, StructureDesign, Truth, UsageError
 
@@ -51,27 +51,6 @@ def recipe_of(
     return overridden(recipe, settings)
 
 
-def scan(
-    model: Any,
-    stations: int | str | PathLike[str],
-    scanner: str,
-    seed: int,
-    units: str,
-    settings: Mapping[str, Any],
-) -> tuple[Scene, Truth]:
-    """Scan a model, a path or an object; see :func:`designgen.scan`."""
-    from designgen.scenes import make as scenes
-
-    of_file = isinstance(model, str | PathLike)
-    name = Path(model).stem if of_file else "model"
-    recipe = recipe_of(str(model) if of_file else name, _text(stations), scanner, units, settings)
-    return scenes.make(name, recipe, seed, None if of_file else loading.load(model, units, name))
-
-
-def _text(stations: int | str | PathLike[str]) -> int | str:
-    return stations if isinstance(stations, int) else str(stations)
-
-
 def make(
     name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int, model: Model | None = None
 ) -> tuple[Scene, Truth]:
@@ -85,13 +64,10 @@ def make(
         model = loading.load(Path(section.file), section.units)
     loading.say(model)
     params, origin = scanning.params, np.array(scanning.params.origin_mm)
-    builder = Builder()
-    for part, body in enumerate(model.bodies):
-        for patch, smooth in body.patches():
-            builder.patch(part, patch, smooth)
     names = tuple(body.name for body in model.bodies)
+    built = bodies.build(model, bodies.params_of(recipe, names), seed)
     poses = _poses(model, recipe, scanning, seed)
-    surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
+    surveyed = survey.survey(_surfaces(built.bodies), names, poses, scanning.device, params, seed)
     scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
     if not params.registered:
         scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
@@ -105,7 +81,24 @@ def make(
         units_reason=MADE_IN_MM,
         structure=StructureDesign(model.name, vertices + origin, faces),
     )
-    return scene, Truth(labels, stations=station_truth, spacing_mm=scanning.spacing_mm, sigma_mm=scanning.sigma_mm)
+    return scene, Truth(
+        labels,
+        structure=dataclasses.replace(built.movement, points=built.movement.points + origin),
+        defects=dataclasses.replace(built.defects, centres=built.defects.centres + origin),
+        stations=station_truth,
+        as_built=built.ledger,
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
+    )
+
+
+def _surfaces(built: Sequence[ModelBody | None]) -> Surfaces:
+    """Return the surfaces of bodies as built; None for one that is left out."""
+    builder = Builder()
+    for part, body in enumerate(built):
+        for patch, smooth in body.patches() if body is not None else ():
+            builder.patch(part, patch, smooth)
+    return builder.to_surfaces()
 
 
 def _poses(model: Model, recipe: Mapping[str, Any], scanning: ByRays, seed: int) -> dict[str, Floats]:
