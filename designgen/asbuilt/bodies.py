@@ -16,13 +16,13 @@ import numpy as np
 
 from designgen.asbuilt.imperfections import Ledger
 from designgen.checks import expect_all
-from designgen.designs.patch import Displacement, Surface
-from designgen.models import occlusion
+from designgen.designs.patch import Bools, Displacement, Surface
 from designgen.models.model import Model, ModelBody
 from designgen.models.placement import spread
 from designgen.models.subdivision import Spacing, subdivided
 from designgen.randomness import generator
 from designgen.reading import filled
+from designgen.scanning import triangle_tree
 from processor.model import AsBuilt, DefectTruth, Floats, StructureTruth, UsageError
 
 TRUTH_POINTS, LEAST_TRUTH_POINTS = 20_000, 60  # of the whole model, by area; of a body, at least
@@ -83,6 +83,23 @@ class _Defect:
     volume: float
 
 
+@dataclass(frozen=True)
+class _View:
+    """The triangles of all bodies, and their tree."""
+
+    tree: triangle_tree.Tree
+    corners: Floats
+
+    @classmethod
+    def of(cls, model: Model) -> _View:
+        corners = np.concatenate([body.vertices[body.triangles] for body in model.bodies])
+        tree = triangle_tree.build(corners)
+        return cls(tree, corners[tree.order])
+
+    def free(self, start: Floats, end: Floats) -> Bools:
+        return triangle_tree.free(self.tree, self.corners, start, end, 1e-3)
+
+
 def params_of(recipe: Mapping[str, Any], names: Sequence[str]) -> dict[str, Params]:
     """Return the deviations of a recipe's bodies by name; UsageError for an unknown body or key."""
     section = recipe.get("asbuilt", {})
@@ -105,7 +122,7 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
     built: list[ModelBody | None] = []
     truths = []
     areas = np.array([_areas(body).sum() for body in model.bodies])
-    tree = occlusion.tree(np.concatenate([body.vertices[body.triangles] for body in model.bodies])) if params else None
+    view = _View.of(model) if params else None
     for body, share in zip(model.bodies, areas / areas.sum(), strict=True):
         count = max(LEAST_TRUTH_POINTS, int(TRUTH_POINTS * share))
         points, normals = spread(body.vertices[body.triangles], count)
@@ -119,8 +136,8 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
             ledger.note("left out", body.name, 1.0, "count")
             defects.append(_missing(body))
             continue
-        assert tree is not None
-        parts = _parts(body, deviations, tree, seed)
+        assert view is not None
+        parts = _parts(body, deviations, view, seed)
         built.append(_displaced(body, parts))
         near = _about(parts, body)
         points, normals = np.concatenate([points, near[0]]), np.concatenate([normals, near[1]])
@@ -166,10 +183,10 @@ class _Change:
     notes: tuple[tuple[str, float, str], ...]
 
 
-def _parts(body: ModelBody, params: Params, tree: occlusion.Tree, seed: int) -> _Parts:
+def _parts(body: ModelBody, params: Params, view: _View, seed: int) -> _Parts:
     """Return the deviation of a body by its parameters."""
     bend = [_bend(body, params)] if params.bend_mm else []
-    dent = [_dent(body, params, tree, seed)] if params.dent_mm else []
+    dent = [_dent(body, params, view, seed)] if params.dent_mm else []
     changes, moved = bend + dent, _movement(body, params)
 
     def displacement(points: Floats) -> Floats:
@@ -221,9 +238,9 @@ def _bend(body: ModelBody, params: Params) -> _Change:
     )
 
 
-def _dent(body: ModelBody, params: Params, tree: occlusion.Tree, seed: int) -> _Change:
+def _dent(body: ModelBody, params: Params, view: _View, seed: int) -> _Change:
     """Return a round dent; it fades out in depth, so that an opposite wall stays."""
-    centre, inward = _dent_place(body, params, tree, seed)
+    centre, inward = _dent_place(body, params, view, seed)
     radius, depth = params.dent_radius_mm, params.dent_mm
 
     def field(points: Floats) -> Floats:
@@ -276,7 +293,7 @@ def _movement(body: ModelBody, params: Params) -> Displacement | None:
     return moved
 
 
-def _dent_place(body: ModelBody, params: Params, tree: occlusion.Tree, seed: int) -> tuple[Floats, Floats]:
+def _dent_place(body: ModelBody, params: Params, view: _View, seed: int) -> tuple[Floats, Floats]:
     """Return the middle (3,) of a dent on the surface, and the unit normal (3,) into the body."""
     points, normals = spread(body.vertices[body.triangles], 2000)
     at = np.array(params.dent_at_mm)
@@ -289,7 +306,7 @@ def _dent_place(body: ModelBody, params: Params, tree: occlusion.Tree, seed: int
     on_face = np.abs(areas - areas.max()) < 0.01 * areas.max()
     rows = np.flatnonzero(on_face[body.face])
     points, normals = spread(body.vertices[body.triangles[rows]], 500)
-    free = tree.free(points + 1e-3 * normals, points + FREE_MM * normals, 1e-6)
+    free = view.free(points + 1e-3 * normals, points + FREE_MM * normals)
     points, normals = (points[free], normals[free]) if free.any() else (points, normals)
     others = body.vertices[body.triangles[np.setdiff1d(np.arange(len(body.face)), rows)]]
     if len(others):

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from designgen.designs.patch import Bools
-from designgen.models import occlusion
 from designgen.models.model import Model
 from designgen.randomness import generator
+from designgen.scanning import triangle_tree
 from designgen.scanning.returns import LOWEST_DEG
 from designgen.scanning.scanner import Scanner
 from designgen.scanning.survey import levelled_pose
+from designgen.scanning.triangle_tree import Tree
 from designgen.sequences import in_square
 from processor.model import Floats, InputError
 
@@ -78,11 +79,12 @@ def placed(model: Model, count: int, distance_mm: float | None, device: Scanner,
     size = float((high - low).max())
     if distance_mm is None:
         distance_mm = min(max(DISTANCE_SHARE * size, NEAREST_MM, 1.5 * device.min_range_mm), FARTHEST_MM)
-    tree = occlusion.tree(corners)
+    tree = triangle_tree.build(corners)
+    ordered = corners[tree.order]
     points, normals = spread(corners, SAMPLES)
     places = _candidates(low, high, distance_mm, _room(device), points)
     margin = 1e-6 * size
-    seen = np.stack([_seen(tree, place, points, normals, device, margin) for place in places])
+    seen = np.stack([_seen(tree, ordered, place, points, normals, device, margin) for place in places])
     worth, chosen = np.ones(len(points)), []
     for _ in range(count):
         gains = seen @ worth
@@ -135,7 +137,7 @@ def _to_box(unit: Floats, half: Floats) -> float:
 
 
 def _seen(
-    tree: occlusion.Tree, place: Floats, points: Floats, normals: Floats, device: Scanner, margin: float
+    tree: Tree, corners: Floats, place: Floats, points: Floats, normals: Floats, device: Scanner, margin: float
 ) -> Bools:
     """Return which points (n,) a scanner at a place sees at a fair incidence."""
     arm = points - place
@@ -145,5 +147,5 @@ def _seen(
     facing &= arm[:, 2] > range_ * np.sin(np.radians(LOWEST_DEG))
     rows = np.flatnonzero(facing)
     starts = np.broadcast_to(place, (len(rows), 3)).copy()
-    facing[rows] = tree.free(starts, points[rows], margin)
+    facing[rows] = triangle_tree.free(tree, corners, starts, points[rows], margin)
     return facing

@@ -8,17 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from designgen.designs.patch import Patch, Trimmed, within_triangle
+from designgen.scanning import triangle_tree
+from designgen.scanning.triangle_tree import Tree
 from designgen.sequences import in_square
 from processor.model import Floats, Ints, Labels
 
 SPHERE, CONE, DISC, TRIANGLE = range(4)
 NUMBERS = 14  # of a shape: see Builder
+MANY = 20_000  # triangles of a scene from which a tree is used; the results are the same
 FLAT_MM = 1e-7  # a face this close to a plane is plane, and its net is exact
 FLAT_SAMPLES = 1000  # least number of points of a face at which this is tested
 
@@ -45,6 +49,14 @@ class Surfaces:
     piece_radius: Floats  # (k,)
     patches: tuple[Patch | Trimmed, ...]
     surface_names: tuple[str, ...]
+
+    @cached_property
+    def tree(self) -> Tree | None:
+        """The tree of all triangles; None for few, of which the windows on the grid are faster."""
+        triangles = self.kind == TRIANGLE
+        if triangles.sum() < MANY:
+            return None
+        return triangle_tree.build(self.numbers[triangles, :9].reshape(-1, 3, 3))
 
 
 @dataclass
