@@ -23,6 +23,8 @@ def bodies_of(path: str, pieces: Sequence[Piece], stem: str) -> tuple[list[Model
     notes: list[str] = []
     for name, vertices, triangles in pieces:
         points, faces = _joined(vertices, triangles, JOIN_SHARE * size)
+        if not len(faces):
+            continue
         parts = _oriented(points, faces, name or stem, notes)
         if name:
             parts = [np.concatenate(parts)] if parts else []
