@@ -79,24 +79,24 @@ def _oriented(vertices: Floats, triangles: Ints, name: str, notes: list[str]) ->
         turned ^= (share > 0.5)[label]
     faces = np.where(turned[:, None], triangles[:, ::-1], triangles)
     order = np.argsort(label, kind="stable")
-    parts = np.split(faces[order], np.flatnonzero(np.diff(label[order])) + 1)
-    flipped = int(turned.sum())
+    rows = np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
+    parts = [faces[part] for part in rows]
     volumes = [volume(vertices, part) for part in parts]
-    around = [
-        _around(vertices, part, parts, volumes) if size < 0.0 else -1 for part, size in zip(parts, volumes, strict=True)
-    ]
-    result = {}
+    result, cavities = {}, []
     for i, part in enumerate(parts):
-        if volumes[i] < 0.0 and around[i] < 0 and not _open_edges(part):
-            result[i] = part[:, ::-1]
-            flipped += len(part)
-        elif around[i] < 0:
-            result[i] = part
-    for i, host in enumerate(around):
+        host = _around(vertices, part, parts, volumes) if volumes[i] < 0.0 else -1
         if host >= 0:
-            result[host] = np.concatenate([result[host], parts[i]])
-    if flipped:
-        notes.append(f"{name!r}: {flipped} of {len(triangles)} triangles were turned so that all normals point outward")
+            cavities.append((host, part))
+            continue
+        inward = volumes[i] < 0.0 and not _open_edges(part)
+        turned[rows[i]] ^= inward
+        result[i] = part[:, ::-1] if inward else part
+    for host, part in cavities:
+        result[host] = np.concatenate([result[host], part])
+    if turned.any():
+        notes.append(
+            f"{name!r}: {int(turned.sum())} of {len(triangles)} triangles were turned so that all normals point outward"
+        )
     return list(result.values())
 
 

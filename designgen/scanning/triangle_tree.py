@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import njit
 
 from designgen.designs.patch import Bools
@@ -21,16 +20,18 @@ BINS = 16
 MOST_DEPTH = 48  # of nodes divided by the surface area heuristic; deeper ones are halved
 STACK = 160
 SLACK = 1e-9  # of the largest coordinate: boxes are larger by it, as the test of a triangle has a slack, too
+MORE, LEAST_MORE = 1, 300_000  # pieces of long triangles in addition: by the number of triangles, and at least
+MOST_PIECES = 64  # of a triangle
 TOP = 512  # number of nodes whose windows are drawn onto the grid
 
 
 class Tree(NamedTuple):
-    """The nodes of a tree. Node k has the triangles ``order[first[k]:last[k]]``.
+    """The nodes of a tree. Node k has the triangles ``order[first[k]:last[k]]``; long ones are in several nodes.
 
     ``box`` (k, 6) are the lowest and highest coordinates; ``child[k]`` is the first of its two children, -1 for a leaf.
     """
 
-    order: Ints  # (f,) rows of the triangles
+    order: Ints  # (r,) rows of the triangles
     box: Floats  # (k, 6)
     child: Ints
     first: Ints
@@ -47,10 +48,48 @@ class Tree(NamedTuple):
 
 def build(corners: Floats) -> Tree:
     """Return the tree of triangles (f, 3, 3)."""
-    low, high = corners.min(axis=1), corners.max(axis=1)
+    rows, low, high = _cut(corners)
     order, child, first, last = _divided(low, high, 0.5 * (low + high))
     slack = SLACK * float(np.abs(corners).max(initial=1.0))
-    return Tree(order, _boxes(low, high, order, child, first, last, slack), child, first, last)
+    return Tree(rows[order], _boxes(low, high, order, child, first, last, slack), child, first, last)
+
+
+def _cut(corners: Floats) -> tuple[Ints, Floats, Floats]:
+    """Return rows (r,) of triangles and boxes, low and high (r, 3), of pieces across the longest edges of long ones.
+
+    The box of a long triangle that runs askew is mostly empty; those of its pieces are not.
+    """
+    lengths = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2)
+    turn = (np.argmax(lengths, axis=1)[:, None] + np.arange(3)) % 3
+    a, b, c = np.moveaxis(np.take_along_axis(corners, turn[:, :, None], axis=1), 1, 0)
+    box = np.ptp(corners, axis=1)
+    area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    empty = box[:, 0] * box[:, 1] + box[:, 1] * box[:, 2] + box[:, 2] * box[:, 0] - area
+    longest, budget = np.where(empty > area, lengths.max(axis=1), 0.0), MORE * len(corners) + LEAST_MORE
+    piece = float(longest.max(initial=0.0)) / MOST_PIECES + 1e-300
+    while (count := np.clip(np.ceil(longest / piece), 1, MOST_PIECES)).sum() - len(corners) > budget:
+        piece *= 1.3
+    number = count.astype(np.int64)
+    rows = np.repeat(np.arange(len(corners)), number)
+    start = (np.arange(len(rows)) - np.repeat(np.cumsum(number) - number, number)) / number[rows]
+    end = start + 1.0 / number[rows]
+    along = b - a
+    foot = np.einsum("ni,ni->n", c - a, along) / np.maximum(np.einsum("ni,ni->n", along, along), 1e-300)
+    foot = np.clip(foot, 0.0, 1.0)[rows]
+    a, c, along = a[rows], c[rows], along[rows]
+    low, high = np.full((len(rows), 3), np.inf), np.full((len(rows), 3), -np.inf)
+    for share in (start, end, np.clip(foot, start, end)):
+        on_edge = a + share[:, None] * along
+        # Of the line across the longest edge, at the other two edges.
+        before = share / np.maximum(foot, 1e-300)
+        after = (1.0 - share) / np.maximum(1.0 - foot, 1e-300)
+        weight = np.minimum(np.minimum(before, after), 1.0)[:, None]
+        across = on_edge + weight * (c - a - foot[:, None] * along)
+        for points in (on_edge, across):
+            low, high = np.minimum(low, points), np.maximum(high, points)
+    whole = (number == 1)[rows]
+    low[whole], high[whole] = corners[rows[whole]].min(axis=1), corners[rows[whole]].max(axis=1)
+    return rows, low, high
 
 
 def free(tree: Tree, corners: Floats, start: Floats, end: Floats, margin_mm: float) -> Bools:
@@ -59,16 +98,6 @@ def free(tree: Tree, corners: Floats, start: Floats, end: Floats, margin_mm: flo
     ``corners`` (f, 3, 3) are the triangles in the order of the tree.
     """
     result: Bools = _free(tree, corners.reshape(-1, 9), start, end, margin_mm)
-    return result
-
-
-def inside(tree: Tree, corners: Floats, points: Floats) -> npt.NDArray[np.int64]:
-    """Return the sum of signs (n,) with which rays from points (n, 3) leave (1) and enter (-1) closed meshes.
-
-    ``corners`` (f, 3, 3) are the triangles in the order of the tree, with outward normals.
-    """
-    direction = np.array([0.5393, 0.2747, 0.7960])  # along no axis and no edge of common designs
-    result: npt.NDArray[np.int64] = _winding(tree, corners.reshape(-1, 9), points, direction)
     return result
 
 
@@ -236,28 +265,3 @@ def _free(tree, corners, start, end, margin):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _inverse(x):  # type: ignore[no-untyped-def]
     return 1.0 / x if x != 0.0 else np.inf
-
-
-@njit(cache=True, nogil=True)
-def _winding(tree, corners, points, d):  # type: ignore[no-untyped-def]
-    _, box, child, first, last = tree
-    result = np.zeros(len(points), np.int64)
-    stack = np.empty(STACK, np.int64)
-    ix, iy, iz = _inverse(d[0]), _inverse(d[1]), _inverse(d[2])
-    for r in range(len(points)):
-        x, y, z = points[r, 0], points[r, 1], points[r, 2]
-        stack[0], top = 0, 1
-        while top:
-            top -= 1
-            node = stack[top]
-            if enters(box, node, x, y, z, ix, iy, iz, np.inf) == np.inf:
-                continue
-            if child[node] >= 0:
-                stack[top], stack[top + 1] = child[node], child[node] + 1
-                top += 2
-                continue
-            for i in range(first[node], last[node]):
-                t, det = _range(corners[i], x, y, z, d[0], d[1], d[2])
-                if 0.0 < t < np.inf:
-                    result[r] += 1 if det < 0.0 else -1
-    return result
