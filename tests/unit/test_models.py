@@ -184,6 +184,20 @@ def test_files_come_back(tmp_path, caplog):
     assert np.ptp(loading.load(stl, "inch").mesh()[0]) > 25.0 * 300.0 / 2.0
 
 
+def test_a_recipe_names_a_model_beside_it(tmp_path):
+    cq.exporters.export(SOLIDS["plane"], str(tmp_path / "part.step"))
+    (tmp_path / "part.toml").write_text(
+        'kind = "structure"\n[model]\nfile = "part.step"\n[scan]\nmode = "rays"\nstations = 1\nstep_mrad = 6.0\n'
+        '[asbuilt."part-1"]\nmissing = false\nmove_mm = [0, 0, 5]\n'
+    )
+    names = loading.load(tmp_path / "part.step").bodies
+    text = (tmp_path / "part.toml").read_text().replace("part-1", names[0].name)
+    (tmp_path / "part.toml").write_text(text)
+    scene, truth = designgen.make(tmp_path / "part.toml")
+    assert len(scene.scans[0].points) > 100
+    np.testing.assert_allclose(truth.structure.displacement, np.tile([0.0, 0.0, 5.0], (len(truth.structure.points), 1)))
+
+
 @pytest.mark.parametrize(
     ("name", "content", "said"),
     [
