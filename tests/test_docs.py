@@ -49,7 +49,6 @@ RUN = (
     "designgen export roof.h5 -o roof --format e57",
     "designgen import design.step -o meshes",
     "designgen scan design.step -o part.h5",
-    "processor run part.h5 -o part-results",
     "processor run my-roof -o results --steps deviation",
     "processor run my-plates -o results --steps deviation,defects",
 )
