@@ -96,6 +96,48 @@ def make(
 
 
 @commands.command()
+@click.argument("model", type=click.Path(path_type=Path, dir_okay=False))
+@click.option("-o", "--output", required=True, type=click.Path(path_type=Path, dir_okay=False), help="scene file")
+@click.option(
+    "--stations", default="6", metavar="N|FILE.json", help="number of stations, or their places  [default: 6]"
+)
+@click.option("--scanner", default="phase", help="class of scanner  [default: phase]")
+@click.option("--units", default="", help="unit of the model's numbers, instead of that in the file: mm, m, inch, ...")
+@click.option("--seed", type=click.IntRange(min=0), default=0, help="of all random numbers  [default: 0]")
+@click.option(
+    "--set", "settings", multiple=True, metavar="KEY=VALUE", help="change a setting, e.g. scan.step_mrad=1; repeatable"
+)
+@click.option("--json", "as_json", is_flag=True, help="print one JSON object")
+def scan(
+    model: Path,
+    output: Path,
+    stations: str,
+    scanner: str,
+    units: str,
+    seed: int,
+    settings: tuple[str, ...],
+    as_json: bool,
+) -> None:
+    """Scan MODEL (STEP, IFC, PLY, STL, OBJ, or a Python file) from stations around it: a scene with its truth.
+
+    A Python file is run as a program and leaves a CadQuery object in ``result``. Without a file of places, stations are
+    placed so that most of the surface is seen. Exit codes: 0 done, 2 wrong usage, 3 bad input.
+    """
+    from designgen import batch
+    from designgen.scenes import model as models
+
+    recipe = models.recipe_of(str(model), stations, scanner, units, settings)
+    with stage(f"scanning {model.name}"):
+        used, scans, points = batch.make_scene(output, model.stem, recipe, seed)
+    if as_json:
+        click.echo(
+            json.dumps({"scene": str(output), "model": str(model), "seed": used, "scans": scans, "points": points})
+        )
+    else:
+        click.echo(f"{output}: model {model.name}, seed {used}, {scans} scan(s), {points:,} points")
+
+
+@commands.command()
 @click.argument("scene", type=click.Path(path_type=Path, dir_okay=False))
 @click.option("-o", "--output", required=True, type=click.Path(path_type=Path, file_okay=False), help="new folder")
 @click.option("--format", "format_", required=True, type=click.Choice(FORMATS), help="format of the scans")

@@ -46,9 +46,14 @@ def load(name_or_path: str | PathLike[str]) -> tuple[str, Recipe]:
     if path.suffix != ".toml":
         raise UsageError(f"no recipe {name!r}; there are {', '.join(recipes)}, or give a .toml file")
     try:
-        return path.stem, tomllib.loads(path.read_text("utf-8"))
+        content = tomllib.loads(path.read_text("utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: not a readable recipe: {error}") from error
+    model = content.get("model")
+    for key in ("file", "stations"):  # a recipe names files beside it
+        if isinstance(model, dict) and isinstance(model.get(key), str) and model[key]:
+            model[key] = str(path.parent / model[key])
+    return path.stem, content
 
 
 def overridden(recipe: Mapping[str, Any], settings: Sequence[str] | Mapping[str, Any]) -> Recipe:

@@ -48,6 +48,7 @@ RUN = (
     "designgen export s1.h5 -o example --format ply",
     "designgen export roof.h5 -o roof --format e57",
     "designgen import design.step -o meshes",
+    "designgen scan design.step -o part.h5",
     "processor run my-roof -o results --steps deviation",
     "processor run my-plates -o results --steps deviation,defects",
 )
@@ -62,6 +63,9 @@ ELSEWHERE = {
     "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
     "processor validate -o nights --accept": "tests/unit/test_validation.py",
     "designgen make frame-1040 -o roof.h5 --seed 3": "make weekend",
+    "designgen scan hall.ifczip -o hall.h5 --stations places.json --scanner pulse --set scan.step_mrad=0.5": (
+        "tests/unit/test_models.py"
+    ),
     "designgen make arch-s1-rays -o set --count 100 --vary scanner.noise_mm=0.3,1,2 --jobs 4": (
         "tests/unit/test_designgen_batch.py"
     ),
@@ -256,7 +260,7 @@ def test_parameters_in_the_pages_exist():
 def test_the_functions_of_the_python_page_exist():
     code = "\n".join(blocks(ROOT / "docs/python.md", "python"))
     names = re.findall(r"\b(processor|designgen)\.(\w+)\(", code)
-    assert len(names) == 7
+    assert len(names) == 8
     missing = [f"{module}.{name}" for module, name in names if not hasattr(MODULES[module], name)]
     if missing:
         pytest.skip(f"not in this version yet: {', '.join(missing)}")

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from designgen.cad.forms import Forms
 from processor.model import Floats, InputError, Ints
 
 TESSELLATION_MM = 0.05  # deviation aimed at
+EDGE_SHARE = 0.1  # of it at edges, where the forms of faces are known: a scanned point departs by that at most
 ANGLE_RAD = 0.1  # largest angle between adjacent facets of a curved face
 COARSE_SHARE = 1e-3  # deviation of the first mesh as a fraction of the body's size
 COARSER = 10.0  # largest ratio of the deviations of a mesh and the next
@@ -27,7 +29,7 @@ class Body:
     """A solid of a CAD file, or a surface without a volume: vertices (v, 3) in mm and triangles (f, 3).
 
     ``closed``: the mesh has no open edge. ``deviation_mm`` is the kernel's figure of the largest distance between mesh
-    and body. ``volume_mm3`` is NaN for a surface.
+    and body. ``volume_mm3`` is NaN for a surface. ``forms`` are the surfaces of its faces, where they were asked for.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Body:
     volume_mm3: float
     area_mm2: float
     deviation_mm: float
+    forms: Forms | None = None
 
     @property
     def size_mm(self) -> Floats:

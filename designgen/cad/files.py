@@ -7,6 +7,8 @@ import json
 import re
 import tempfile
 import unicodedata
+import zipfile
+import zlib
 from collections.abc import Mapping
 from hashlib import sha256
 from pathlib import Path
@@ -19,7 +21,7 @@ from designgen.ply import write_mesh
 from processor.jobs.process import Cause, isolated, run
 from processor.model import InputError, UsageError
 
-STEP_SUFFIXES, IFC_SUFFIXES = (".step", ".stp"), (".ifc",)
+STEP_SUFFIXES, ZIPPED, IFC_SUFFIXES = (".step", ".stp"), ".ifczip", (".ifc", ".ifczip")
 MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"
 LIMIT_S = 600.0  # time for reading a file
 MEMORY_BYTES = 8 * 10**9  # memory for reading a file, where the platform can limit it
@@ -39,19 +41,21 @@ def read(
     units: str = "",
     *,
     content: bytes | None = None,
+    exact: bool = False,
     limit_s: float = LIMIT_S,
     memory_bytes: int = MEMORY_BYTES,
 ) -> CadFile:
     """Read a STEP or IFC file, or its ``content``; ``units``, if given, replace the unit of length in the file.
 
-    A child process reads it, within ``limit_s`` seconds and ``memory_bytes`` of memory. Raises InputError for a file
-    that cannot be read so, is of another kind, cut off, damaged, or without geometry; UsageError for unknown units and
-    where the library for IFC is missing.
+    With ``exact`` bodies have the forms of their faces. A child process reads the file, within ``limit_s`` seconds and
+    ``memory_bytes`` of memory. Raises InputError for a file that cannot be read so, is of another kind, cut off,
+    damaged, or without geometry; UsageError for unknown units and where the library for IFC is missing.
     """
     content = _content(path) if content is None else content
     if units:
         unit_mm(units)
-    job: dict[str, Any] = {"path": str(path), "suffix": path.suffix.lower(), "units": units.lower()}
+    suffix = ".ifc" if path.suffix.lower() in IFC_SUFFIXES else path.suffix.lower()
+    job: dict[str, Any] = {"path": str(path), "suffix": suffix, "units": units.lower(), "exact": exact}
     job |= {"limit_s": limit_s, "memory_bytes": memory_bytes}
     # A damaged file can end the child process, and the kernels print to its standard streams.
     with tempfile.TemporaryFile() as question, tempfile.TemporaryFile() as answer:
@@ -84,11 +88,11 @@ def _content(path: Path) -> bytes:
     """Return a file's bytes; InputError where they are not of the kind of its suffix, or are cut off."""
     suffix = path.suffix.lower()
     if suffix not in STEP_SUFFIXES + IFC_SUFFIXES:
-        raise InputError(f"{path}: expected a CAD file (.step, .stp, .ifc), found {suffix or 'no suffix'}")
+        raise InputError(f"{path}: expected a CAD file (.step, .stp, .ifc, .ifczip), found {suffix or 'no suffix'}")
     try:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: expected a CAD file, found a folder or device")
-        content = path.read_bytes()
+        content = _unzipped(path) if suffix == ZIPPED else path.read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     if not content[:4096].lstrip(b"\xef\xbb\xbf \r\n\t").startswith(MAGIC):
@@ -103,6 +107,20 @@ def _content(path: Path) -> bytes:
     if content.rfind(END) < 0:
         raise InputError(f"{path}: is cut off: its last line, {END.decode()}, is missing; copy or export it again")
     return content
+
+
+def _unzipped(path: Path) -> bytes:
+    """Return the one IFC file in a zip file; InputError where there is another number, or it cannot be unpacked."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            inside = [entry for entry in archive.infolist() if entry.filename.lower().endswith(".ifc")]
+            if len(inside) != 1:
+                raise InputError(f"{path}: expected one .ifc file in it, found {len(inside)}; unpack it and name one")
+            if inside[0].file_size > MEMORY_BYTES:
+                raise InputError(f"{path}: unpacked it has more than {MEMORY_BYTES / 1e9:g} GB; export it in parts")
+            return archive.read(inside[0])
+    except (zipfile.BadZipFile, zlib.error, RuntimeError, NotImplementedError, EOFError):
+        raise InputError(f"{path}: is no zip file, damaged or encrypted; copy or export it again") from None
 
 
 def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:

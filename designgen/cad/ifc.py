@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,8 +17,11 @@ NO_BODIES = ("IfcFeatureElementSubtraction", "IfcSpace", "IfcVirtualElement", "I
 FLAT = ("Axis", "FootPrint", "Annotation", "Box", "CoG", "Reference")  # representations without a surface
 
 
-def parse(path: str, content: bytes, units: str) -> CadFile:
-    """Read the text of an IFC file; its numbers are in ``units`` if given. Raises as :func:`process.parse`."""
+def parse(path: str, content: bytes, units: str, *, exact: bool = False) -> CadFile:
+    """Read the text of an IFC file; its numbers are in ``units`` if given. Raises as :func:`process.parse`.
+
+    ``exact``: bodies have the forms of their faces, where the library gives their exact geometry.
+    """
     try:
         import ifcopenshell
         import ifcopenshell.util.unit
@@ -38,13 +43,14 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     elif not units:
         raise InputError(f"{path}: {NO_UNIT}")
     taken = UNITS_MM[units] if units else size
-    bodies = []
+    bodies: list[Any] = []
     for product in model.by_type("IfcProduct"):
         if product.Representation is None or any(product.is_a(kind) for kind in NO_BODIES):
             continue
-        body = _body(path, product, 1000.0 * taken / size)
-        if body is not None:
-            bodies.append(body)
+        to_mm = 1000.0 * taken / size
+        found = (_exact(path, product, to_mm) if exact else []) or [_body(path, product, to_mm)]
+        if found[0] is not None:
+            bodies += found
         elif any(r.RepresentationIdentifier not in FLAT for r in product.Representation.Representations):
             problems.append(f"{_name(product)!r} ({product.is_a()}) cannot be meshed and is left out")
     return CadFile(units or name, taken, name, tuple(bodies), tuple(problems))
@@ -52,6 +58,40 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
 
 def _name(product: Any) -> str:
     return (product.Name or "").strip() or str(product.is_a())
+
+
+def _exact(path: str, product: Any, to_mm: float) -> list[Any]:
+    """Return a product's bodies with the forms of their faces; empty if the library does not give exact geometry."""
+    import ifcopenshell
+    import ifcopenshell.geom
+    from OCP.BRep import BRep_Builder
+    from OCP.BRepTools import BRepTools
+    from OCP.TopoDS import TopoDS_Shape
+
+    from designgen.cad.shapes import body_of, pieces
+
+    settings = ifcopenshell.geom.settings()
+    settings.set("use-world-coords", True)
+    settings.set("iterator-output", ifcopenshell.ifcopenshell_wrapper.SERIALIZED)
+    shape = TopoDS_Shape()
+    try:
+        text = ifcopenshell.geom.create_shape(settings, product).geometry.brep_data
+        with tempfile.TemporaryDirectory() as folder:  # the kernel reads it from a file alone
+            file = Path(folder, "product.brep")
+            file.write_text(text, "ascii")
+            if not BRepTools.Read_s(shape, str(file), BRep_Builder()):
+                return []
+    except (RuntimeError, AttributeError):
+        return []
+    found = list(pieces(shape))
+    if not found:
+        return []
+    named = (_name(product) if len(found) == 1 else f"{_name(product)}-{i + 1}" for i in range(len(found)))
+    bodies = [
+        body_of(path, name, piece, to_mm, solid=solid, face_name=lambda face: "")
+        for name, (piece, solid) in zip(named, found, strict=True)
+    ]
+    return bodies if all(isinstance(body, Body) for body in bodies) else []
 
 
 def _body(path: str, product: Any, to_mm: float) -> Body | None:

@@ -18,6 +18,7 @@ from typing import IO, Any
 import numpy as np
 
 from designgen.cad.bodies import Body, CadFile
+from designgen.cad.forms import Form, Forms, surface_of
 from processor.jobs.child import end_with_parent
 from processor.model import InputError, UsageError
 
@@ -25,7 +26,8 @@ from processor.model import InputError, UsageError
 def serve() -> None:
     """Read the file in the file descriptor of the command line; the answer goes to standard output.
 
-    The descriptor holds a line of JSON with ``path``, ``suffix``, ``units``, ``limit_s`` and ``memory_bytes``, and the
+    The descriptor holds a line of JSON with ``path``, ``suffix``, ``units``, ``exact``, ``limit_s``,
+    ``memory_bytes``, and the
     file's content.
     """
     end_with_parent()
@@ -38,7 +40,7 @@ def serve() -> None:
     _limit(job["limit_s"], job["memory_bytes"])
     path, cad = job["path"], None
     try:
-        cad = parse(path, job["suffix"], content, job["units"])
+        cad = parse(path, job["suffix"], content, job["units"], exact=job["exact"])
         header = _header(cad)
     except (InputError, UsageError) as error:
         header = {"error": type(error).__name__, "message": str(error)}
@@ -54,7 +56,11 @@ def serve() -> None:
         header = {"error": "InputError", "message": message}
     answers.write(json.dumps(header).encode("ascii") + b"\n")
     for body in cad.bodies if cad is not None and "bodies" in header else ():
-        for array in (body.vertices, body.faces):
+        arrays: list[Any] = [body.vertices, body.faces]
+        if body.forms is not None:
+            numbers = np.concatenate([np.empty(0), *(form.numbers for form in body.forms.forms)])
+            arrays += [body.forms.of_triangle, body.forms.corner_uv, numbers]
+        for array in arrays:
             np.lib.format.write_array(answers, np.ascontiguousarray(array), allow_pickle=False)
     answers.flush()
 
@@ -76,7 +82,11 @@ def _limit(limit_s: float, memory_bytes: int) -> None:
 def _header(cad: CadFile) -> dict[str, Any]:
     scalars = ("name", "solid", "closed", "volume_mm3", "area_mm2", "deviation_mm")
     header = {key: getattr(cad, key) for key in ("unit", "unit_mm", "unit_said", "problems")}
-    return {**header, "bodies": [{key: getattr(body, key) for key in scalars} for body in cad.bodies]}
+    bodies: list[dict[str, Any]] = [{key: getattr(body, key) for key in scalars} for body in cad.bodies]
+    for entry, body in zip(bodies, cad.bodies, strict=True):
+        if body.forms is not None:
+            entry["forms"] = [[form.name, form.kind, len(form.numbers)] for form in body.forms.forms]
+    return {**header, "bodies": bodies}
 
 
 def received(answer: IO[bytes]) -> CadFile:
@@ -96,6 +106,7 @@ def received(answer: IO[bytes]) -> CadFile:
         )
         if not fits or not len(faces) or faces.min() < 0 or faces.max() >= len(vertices):
             raise ValueError("no mesh")
+        forms = _received_forms(answer, entry["forms"], len(faces)) if "forms" in entry else None
         body = Body(
             name=str(entry["name"]),
             solid=bool(entry["solid"]),
@@ -105,6 +116,7 @@ def received(answer: IO[bytes]) -> CadFile:
             volume_mm3=float(entry["volume_mm3"]) if entry["solid"] else float("nan"),
             area_mm2=float(entry["area_mm2"]),
             deviation_mm=float(entry["deviation_mm"]),
+            forms=forms,
         )
         sizes = [body.area_mm2, body.deviation_mm, *([body.volume_mm3] if body.solid else [])]
         if not np.isfinite(vertices).all() or not np.isfinite(sizes).all():
@@ -114,9 +126,28 @@ def received(answer: IO[bytes]) -> CadFile:
     return CadFile(str(header["unit"]), float(header["unit_mm"]), str(header["unit_said"]), tuple(bodies), problems)
 
 
-def parse(path: str, suffix: str, content: bytes, units: str) -> CadFile:
+def _received_forms(answer: IO[bytes], entries: list[Any], triangles: int) -> Forms:
+    """Return the forms of a body in an answer; ValueError for invalid ones."""
+    of_triangle, corner_uv, numbers = (np.lib.format.read_array(answer, allow_pickle=False) for _ in range(3))
+    lengths = [int(length) for _, _, length in entries]
+    fits = of_triangle.dtype == np.int64 and corner_uv.dtype == numbers.dtype == np.float64
+    fits &= of_triangle.shape == (triangles,) and corner_uv.shape == (triangles, 3, 2) and numbers.ndim == 1
+    fits &= min(lengths, default=0) >= 0 and sum(lengths) == len(numbers)
+    if not fits or of_triangle.min() < 0 or of_triangle.max() >= len(entries):
+        raise ValueError("no forms")
+    if not np.isfinite(corner_uv).all() or not np.isfinite(numbers).all():
+        raise ValueError("no number")
+    parts = np.split(numbers, np.cumsum(lengths)[:-1])
+    forms = tuple(Form(str(name), str(kind), part) for (name, kind, _), part in zip(entries, parts, strict=True))
+    for form in forms:
+        surface_of(form)
+    return Forms(forms, of_triangle, corner_uv)
+
+
+def parse(path: str, suffix: str, content: bytes, units: str, *, exact: bool = False) -> CadFile:
     """Read the text of a STEP file (``suffix`` .step, .stp) or an IFC file; its numbers are in ``units`` if given.
 
+    ``exact``: bodies have the forms of their faces.
     Raises InputError for a text that cannot be read or has no unit, UsageError where the library for IFC is missing and
     where ``units`` are given but the file has several units.
     """
@@ -125,11 +156,11 @@ def parse(path: str, suffix: str, content: bytes, units: str) -> CadFile:
     if suffix == ".ifc":
         from designgen.cad import ifc
 
-        cad = ifc.parse(path, text, units)
+        cad = ifc.parse(path, text, units, exact=exact)
     else:
         from designgen.cad import step
 
-        cad = step.parse(path, text, units)
+        cad = step.parse(path, text, units, exact=exact)
     lost = missing_lines(text)
     if not lost:
         return cad

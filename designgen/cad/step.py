@@ -4,16 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator
 from io import BytesIO
 from typing import Any
 
-import numpy as np
-from OCP.Bnd import Bnd_Box
-from OCP.BRep import BRep_Builder
-from OCP.BRepBndLib import BRepBndLib
-from OCP.BRepGProp import BRepGProp
-from OCP.GProp import GProp_GProps
 from OCP.IFSelect import IFSelect_RetDone
 from OCP.StepBasic import StepBasic_SiUnitAndLengthUnit, StepBasic_SiUnitName
 from OCP.STEPConstruct import STEPConstruct_UnitContext
@@ -26,22 +19,20 @@ from OCP.StepRepr import (
 )
 from OCP.StepShape import StepShape_FaceSurface, StepShape_ManifoldSolidBrep, StepShape_ShapeDefinitionRepresentation
 from OCP.TColStd import TColStd_SequenceOfAsciiString
-from OCP.TopAbs import TopAbs_FACE, TopAbs_SHELL, TopAbs_SOLID
-from OCP.TopExp import TopExp_Explorer
+from OCP.TopAbs import TopAbs_FACE, TopAbs_SOLID
 from OCP.TopLoc import TopLoc_Location
-from OCP.TopoDS import TopoDS_Compound
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from designgen.cad import tessellation
-from designgen.cad.bodies import NO_UNIT, UNITS_MM, Body, CadFile, finest_mm, is_closed, unit_name
+from designgen.cad.bodies import NO_UNIT, UNITS_MM, Body, CadFile, unit_name
+from designgen.cad.shapes import body_of, parts, pieces
 from processor.model import InputError, UsageError
 
-MOST_TRIANGLES = 700_000  # of a body: about ten seconds
-LARGE_MM = 1000.0  # larger bodies are meshed by the algorithm for many triangles
 
+def parse(path: str, content: bytes, units: str, *, exact: bool = False) -> CadFile:
+    """Read the text of a STEP file; its numbers are in ``units`` if given. Raises as :func:`process.parse`.
 
-def parse(path: str, content: bytes, units: str) -> CadFile:
-    """Read the text of a STEP file; its numbers are in ``units`` if given. Raises as :func:`process.parse`."""
+    ``exact``: bodies have the forms of their faces and meshes that are finer at edges.
+    """
     reader = STEPControl_Reader()
     if reader.ReadStream("file.step", BytesIO(content)) != IFSelect_RetDone:
         raise InputError(f"{path}: not a readable STEP file: it is damaged; copy or export it again")
@@ -72,8 +63,10 @@ def parse(path: str, content: bytes, units: str) -> CadFile:
     bodies = []
     if reader.NbShapes():
         stem = re.sub(r"\.\w+$", "", os.path.basename(path))
-        for number, (shape, solid) in enumerate(_pieces(reader.OneShape())):
-            body = _body(path, names.of(shape) or f"{stem}-{number + 1}", shape, scale, solid=solid)
+        face_names = _FaceNames(reader, entities) if exact else None
+        for number, (shape, solid) in enumerate(pieces(reader.OneShape())):
+            name = names.of(shape) or f"{stem}-{number + 1}"
+            body = body_of(path, name, shape, scale, solid=solid, face_name=face_names.of if face_names else None)
             if isinstance(body, Body):
                 bodies.append(body)
             else:
@@ -119,8 +112,8 @@ def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
     made, faces = set[Any](), TopTools_IndexedMapOfShape()
     if reader.NbShapes():
         shape = reader.OneShape()
-        made = {names.item(solid) for solid in _parts(shape, TopAbs_SOLID)}
-        for face in _parts(shape, TopAbs_FACE):
+        made = {names.item(solid) for solid in parts(shape, TopAbs_SOLID)}
+        for face in parts(shape, TopAbs_FACE):
             faces.Add(face.Located(TopLoc_Location()))
     solids = [entity for entity in entities if isinstance(entity, StepShape_ManifoldSolidBrep)]
     problems = [f"solid {_text(s)!r} is damaged, so that it did not become one" for s in solids if s not in made]
@@ -128,63 +121,6 @@ def _lost(reader: Any, entities: list[Any], names: _Names) -> list[str]:
     if faces.Extent() < expected:
         problems.append(f"{expected - faces.Extent()} of {expected} faces are damaged and are left out")
     return problems
-
-
-def _pieces(shape: Any) -> Iterator[tuple[Any, bool]]:
-    """Yield every solid (True), then every shell and the loose faces outside of solids (False)."""
-    for solid in _parts(shape, TopAbs_SOLID):
-        yield solid, True
-    for shell in _parts(shape, TopAbs_SHELL, TopAbs_SOLID):
-        yield shell, False
-    if faces := list(_parts(shape, TopAbs_FACE, TopAbs_SHELL)):
-        builder, loose = BRep_Builder(), TopoDS_Compound()
-        builder.MakeCompound(loose)
-        for face in faces:
-            builder.Add(loose, face)
-        yield loose, False
-
-
-def _parts(shape: Any, *kinds: Any) -> Iterator[Any]:
-    """Yield the parts of a shape of the first kind, outside of those of the second."""
-    explorer = TopExp_Explorer(shape, *kinds)
-    while explorer.More():
-        yield explorer.Current()
-        explorer.Next()
-
-
-def _body(path: str, name: str, shape: Any, scale: float, *, solid: bool) -> Body | str:
-    """Return a shape, whose unit is ``scale`` mm, as a body, or the problem with it."""
-    box = Bnd_Box()
-    BRepBndLib.Add_s(shape, box, False)
-    if box.IsVoid():
-        return f"{name!r} is empty and left out"
-    if not np.isfinite(box.SquareExtent()):
-        return f"{name!r} has a face without bounds and is left out"
-    size = scale * float(np.sqrt(box.SquareExtent()))
-    deviation = finest_mm(
-        path, name, size, MOST_TRIANGLES, lambda mm: tessellation.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
-    )
-    volumes, areas = GProp_GProps(), GProp_GProps()
-    BRepGProp.VolumeProperties_s(shape, volumes)
-    BRepGProp.SurfaceProperties_s(shape, areas)
-    try:
-        vertices, faces, measured = tessellation.facets(shape)
-    except ValueError:
-        return f"{name!r} has faces that cannot be meshed and is left out"
-    vertices = scale * vertices
-    numbers = np.array([volumes.Mass(), areas.Mass(), measured]) * [scale**3, scale**2, scale]
-    if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(numbers).all():
-        return f"{name!r} has no extent and is left out"
-    return Body(
-        name=name,
-        solid=solid,
-        closed=is_closed(faces),
-        vertices=vertices,
-        faces=faces,
-        volume_mm3=float(numbers[0]) if solid else float("nan"),
-        area_mm2=float(numbers[1]),
-        deviation_mm=max(deviation, float(numbers[2])),
-    )
 
 
 class _Names:
@@ -247,3 +183,22 @@ def _text(entity: Any) -> str:
     except (AttributeError, UnicodeDecodeError):
         return ""
     return "" if name.upper() == "NONE" else name.encode("utf-8", "replace").decode()
+
+
+class _FaceNames:
+    """Names of faces; most files have none."""
+
+    def __init__(self, reader: Any, entities: list[Any]) -> None:
+        transfers = reader.WS().TransferReader()
+        self._shapes, self._names = TopTools_IndexedMapOfShape(), list[str]()
+        for entity in entities:
+            name = _text(entity) if isinstance(entity, StepShape_FaceSurface) else ""
+            shape = transfers.ShapeResult(entity) if name else None
+            if shape is not None and not shape.IsNull() and not self._shapes.Contains(shape):
+                self._shapes.Add(shape)
+                self._names.append(name)
+
+    def of(self, face: Any) -> str:
+        """Return the name of a face in the file, "" for none."""
+        row = self._shapes.FindIndex(face.Located(TopLoc_Location()))
+        return self._names[row - 1] if row else ""

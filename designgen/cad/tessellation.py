@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from OCP.BRep import BRep_Tool
+from OCP.BRep import BRep_Builder, BRep_Tool
 from OCP.BRepMesh import BRepMesh_IncrementalMesh
 from OCP.BRepTools import BRepTools
 from OCP.IMeshTools import IMeshTools_MeshAlgoType, IMeshTools_Parameters
@@ -13,10 +14,11 @@ from OCP.Message import Message_ProgressRange
 from OCP.TopAbs import TopAbs_FACE, TopAbs_REVERSED
 from OCP.TopExp import TopExp
 from OCP.TopLoc import TopLoc_Location
-from OCP.TopoDS import TopoDS
+from OCP.TopoDS import TopoDS, TopoDS_Compound
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
-from designgen.cad.bodies import ANGLE_RAD
+from designgen.cad.bodies import ANGLE_RAD, EDGE_SHARE
+from designgen.designs.patch import Bools
 from processor.model import Floats, Ints
 
 
@@ -26,6 +28,27 @@ def mesh_faces(shape: Any, tolerance_mm: float, *, large: bool = False) -> int:
     ``large`` selects the kernel's other algorithm, whose time does not grow with the square of a face's triangles.
     """
     BRepTools.Clean_s(shape)
+    _mesh(shape, tolerance_mm, large)
+    return _triangles(shape)
+
+
+def mesh_edges_finer(shape: Any, tolerance_mm: float, finer: Callable[[Any], bool], *, large: bool = False) -> int:
+    """Mesh a shape as :func:`mesh_faces`, but the faces for which ``finer`` is true EDGE_SHARE times as coarse.
+
+    The kernel keeps the edges of faces that have been meshed, so the other faces have finer edges, too.
+    """
+    BRepTools.Clean_s(shape)
+    first, builder = TopoDS_Compound(), BRep_Builder()
+    builder.MakeCompound(first)
+    for face, _, _ in meshes(shape):
+        if finer(face):
+            builder.Add(first, face)
+    _mesh(first, EDGE_SHARE * tolerance_mm, large)
+    _mesh(shape, tolerance_mm, large)
+    return _triangles(shape)
+
+
+def _mesh(shape: Any, tolerance_mm: float, large: bool) -> None:
     if large:
         parameters = IMeshTools_Parameters()
         parameters.Deflection, parameters.Angle = tolerance_mm, ANGLE_RAD
@@ -33,7 +56,10 @@ def mesh_faces(shape: Any, tolerance_mm: float, *, large: bool = False) -> int:
         BRepMesh_IncrementalMesh(shape, parameters, Message_ProgressRange())
     else:
         BRepMesh_IncrementalMesh(shape, tolerance_mm, False, ANGLE_RAD, False)
-    return sum(mesh.NbTriangles() for _, mesh, _ in _meshes(shape) if mesh is not None)
+
+
+def _triangles(shape: Any) -> int:
+    return sum(mesh.NbTriangles() for _, mesh, _ in meshes(shape) if mesh is not None)
 
 
 def facets(shape: Any) -> tuple[Floats, Ints, float]:
@@ -43,7 +69,7 @@ def facets(shape: Any) -> tuple[Floats, Ints, float]:
     ValueError for a face without a mesh.
     """
     points, triangles, deviation, count = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0.0, 0
-    for face, mesh, location in _meshes(shape):
+    for face, mesh, location in meshes(shape):
         if mesh is None:
             raise ValueError("a face cannot be meshed")
         of_face = np.array([mesh.Node(i).Coord() for i in range(1, mesh.NbNodes() + 1)], np.float64).reshape(-1, 3)
@@ -58,10 +84,11 @@ def facets(shape: Any) -> tuple[Floats, Ints, float]:
         triangles.append(corners - 1 + count)
         count += len(of_face)
         deviation = max(deviation, float(mesh.Deflection()))
-    return *_merged(np.vstack(points), np.vstack(triangles)), deviation
+    vertices, faces, _ = merged(np.vstack(points), np.vstack(triangles))
+    return vertices, faces, deviation
 
 
-def _meshes(shape: Any) -> list[tuple[Any, Any, Any]]:
+def meshes(shape: Any) -> list[tuple[Any, Any, Any]]:
     """Return every face of a shape with its mesh, None where it has none, and the mesh's location."""
     faces, result = TopTools_IndexedMapOfShape(), []
     TopExp.MapShapes_s(shape, TopAbs_FACE, faces)
@@ -71,9 +98,13 @@ def _meshes(shape: Any) -> list[tuple[Any, Any, Any]]:
     return result
 
 
-def _merged(points: Floats, triangles: Ints) -> tuple[Floats, Ints]:
+def merged(points: Floats, triangles: Ints) -> tuple[Floats, Ints, Bools]:
+    """Return the distinct points (v, 3), the triangles of these (f, 3), and which of the given triangles are kept.
+
+    Triangles of which two corners are one point are left out.
+    """
     # Faces have separate vertices along a common edge; 1e-5 mm is far below any edge and far above rounding.
     _, first, inverse = np.unique(np.round(points, 5), axis=0, return_index=True, return_inverse=True)
     faces = inverse.reshape(-1)[triangles]
     proper = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
-    return points[first], faces[proper].astype(np.int64)
+    return points[first], faces[proper].astype(np.int64), proper

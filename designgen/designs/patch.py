@@ -51,6 +51,19 @@ class Patch:
         return dataclasses.replace(self, at=displaced_at)
 
 
+@dataclass(frozen=True)
+class Trimmed:
+    """A face whose net is any set of triangles, with corners (f, 3, 3), mm, and their parameters pq (f, 3, 2).
+
+    ``at`` maps parameters p, q (n,) to points (n, 3); None: the triangles are the face itself.
+    """
+
+    name: str
+    corners: Floats
+    pq: Floats
+    at: Surface | None = None
+
+
 def outside(a: Floats, b: Floats, rectangles: Floats) -> Bools:
     """Mark the points (a, b), (n,) each, that lie in none of the rectangles (k, 4): a0, a1, b0, b1."""
     result = np.ones(len(a), bool)

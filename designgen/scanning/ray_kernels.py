@@ -222,12 +222,12 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
 
     ``grid`` is a :class:`designgen.scanning.raycast.Grid`. Beside the strip only the next ``beside`` (rows,) columns
     are cast. No hit: -1 and infinite. The third result is the range at which the beam may touch a shape so thin that
-    the grid's rays may all miss it; infinite where there is none.
+    the grid's rays may all miss it; infinite where there is none. Hits nearer than the least range are among them.
     """
     windows, first, width, side = strip  # in local variables, as the inner loops are faster with them
     kind, numbers, cuts, cut_start = shapes
     owner, centres, radii = pieces
-    jitter, largest_jitter, min_range, max_range = rays
+    jitter, largest_jitter, _, max_range = rays
     rows = jitter.shape[1]
     best = np.full((width + 2 * side, rows), np.inf)
     thin = np.full((width + 2 * side, rows), np.inf)
@@ -268,7 +268,6 @@ def cast(shapes, pieces, strip, grid, rays, beam, beside):  # type: ignore[no-un
                 t = hit(kind[i], numbers[i], cuts, cut_start[i], cut_start[i + 1], dx, dy, dz)
                 if t <= max_range and (t < best[j, row] or (t == best[j, row] and i < shape[j, row])):
                     best[j, row], shape[j, row] = t, i
-    hide(shape, best, min_range)
     return shape, best, thin
 
 
@@ -343,7 +342,7 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
     windows, first, width, side = strip  # in local variables, as the inner loops are faster with them
     kind, numbers, cuts, cut_start = shapes
     owner, centres, radii = pieces
-    jitter, largest_jitter, min_range, max_range = rays
+    jitter, largest_jitter, _, max_range = rays
     count, m = len(angle), len(offsets)
     best = np.full((count, m), np.inf)
     shape = np.full((count, m), MISS, np.int32)
@@ -386,7 +385,6 @@ def cast_around(shapes, pieces, strip, grid, rays, number, angle, offsets):  # t
                         changed = True
                 if changed:
                     farthest[ray] = best[ray].max()
-    hide(shape, best, min_range)
     return shape, best
 
 

@@ -1,7 +1,8 @@
 """Rays of a scanner's angular grid against exact surfaces, in float64.
 
 Every bounding sphere is drawn onto the grid; the rays it covers are intersected with its shape, and the nearest hit of
-each ray counts. Rays that meet nothing, as most rays of a scan of a roof, cost nothing.
+each ray counts. Rays that meet nothing, as most rays of a scan of a roof, cost nothing. Many triangles are in a tree of
+boxes instead (:mod:`designgen.scanning.triangle_tree`).
 
 A scanner's frame has its origin at the scanner and z along its axis. Column j has azimuth 2 pi j / columns, counter-
 clockwise from x, row i has elevation ``lowest + i step``. Results depend on neither the thread nor the strip.
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from designgen.designs.patch import Bools, Surface
-from designgen.scanning import angular_bounds, ray_kernels
+from designgen.scanning import angular_bounds, ray_kernels, tree_kernels
 from designgen.scanning.surfaces import CONE, DISC, SPHERE, TRIANGLE, Surfaces
 from processor.model import Floats, Labels, Shorts
 
@@ -46,13 +47,42 @@ class Grid(NamedTuple):
         return np.stack(formula.py_func(*cosines_and_sines, da, de), axis=-1)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class View:
     """The surfaces in a scanner's frame, and the strips of the grid with the windows that pieces cover."""
 
     shapes: ray_kernels.Shapes
     pieces: ray_kernels.Pieces
     strips: tuple[ray_kernels.Strip, ...]
+    tree: tree_kernels.TreeView | None
+    tree_windows: tuple[Labels, ...]  # of each strip, (b, 5)
+
+    def occupied(self) -> list[int]:
+        """Return the numbers of the strips in which rays may meet a shape."""
+        both = zip(self.strips, self.tree_windows, strict=True)
+        return [i for i, (strip, windows) in enumerate(both) if len(strip.windows) or len(windows)]
+
+    def cast(
+        self, number: int, grid: Grid, rays: ray_kernels.Rays, beam: ray_kernels.Beam, beside: Labels
+    ) -> tuple[Labels, Floats, Floats]:
+        """Return shape, range and range of thin shapes of the rays of a strip, see ray_kernels.cast; no near hits."""
+        strip = self.strips[number]
+        shape, best, thin = ray_kernels.cast(self.shapes, self.pieces, strip, grid, rays, beam, beside)
+        if self.tree is not None:
+            tree_kernels.cast(self.tree, self.tree_windows[number], strip, grid, rays, beside, shape, best)
+        ray_kernels.hide(shape, best, rays.min_range)
+        return shape, best, thin
+
+    def cast_around(
+        self, number: int, grid: Grid, rays: ray_kernels.Rays, ray: Labels, angle: Floats, offsets: Floats
+    ) -> tuple[Labels, Floats]:
+        """Return shape and range of sub-rays about the rays of a strip, see ray_kernels.cast_around; no near hits."""
+        strip = self.strips[number]
+        shape, best = ray_kernels.cast_around(self.shapes, self.pieces, strip, grid, rays, ray, angle, offsets)
+        if self.tree is not None:
+            tree_kernels.cast_around(self.tree, strip, grid, rays, ray, angle, offsets, shape, best)
+        ray_kernels.hide(shape, best, rays.min_range)
+        return shape, best
 
 
 def view(
@@ -72,19 +102,36 @@ def view(
                 numbers[rows, c : c + 3] = numbers[rows, c : c + 3] @ R.T + shift
     cuts = surfaces.cuts.copy()
     cuts[:, :3] = cuts[:, :3] @ R.T
-    centres = surfaces.piece_centre @ R.T + t
-    covered = angular_bounds.grid_windows(
-        centres, surfaces.piece_radius, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns,
-        side,
-    )  # fmt: skip
-    windows, start = angular_bounds.by_strip(covered, width, -(-grid.columns // width), side)
+
+    def windows_of(centres: Floats, radii: Floats) -> list[Labels]:
+        covered = angular_bounds.grid_windows(
+            centres, radii, reach, spread + grid.step, grid.step, grid.lowest, grid.rows, grid.columns, side
+        )
+        windows, start = angular_bounds.by_strip(covered, width, -(-grid.columns // width), side)
+        return [windows[start[i] : start[i + 1]] for i in range(len(start) - 1)]
+
+    tree, drawn = surfaces.tree, np.ones(len(surfaces.piece_shape), bool)
+    if tree is not None:
+        drawn = surfaces.kind[surfaces.piece_shape] != TRIANGLE
+    centres, radii = surfaces.piece_centre[drawn] @ R.T + t, surfaces.piece_radius[drawn]
+    strips = windows_of(centres, radii)
+    tree_view, tree_windows = None, [np.empty((0, 5), np.int32)] * len(strips)
+    if tree is not None:
+        rows = np.flatnonzero(surfaces.kind == TRIANGLE)[tree.order]
+        corners = np.ascontiguousarray(numbers[rows, :9])
+        tree_view = tree_kernels.TreeView(tree, corners, rows, np.ascontiguousarray(R.T), -R.T @ t)
+        box = tree.box[tree.top()]
+        middles, halves = 0.5 * (box[:, :3] + box[:, 3:]), 0.5 * np.linalg.norm(box[:, 3:] - box[:, :3], axis=1)
+        tree_windows = windows_of(middles @ R.T + t, halves)
     return View(
         shapes=ray_kernels.Shapes(surfaces.kind, numbers, cuts, surfaces.cut_start),
-        pieces=ray_kernels.Pieces(surfaces.piece_shape, centres, surfaces.piece_radius),
+        pieces=ray_kernels.Pieces(surfaces.piece_shape[drawn], centres, radii),
         strips=tuple(
-            ray_kernels.Strip(windows=windows[start[i] : start[i + 1]], first=i * width, width=width, side=side)
-            for i in range(len(start) - 1)
+            ray_kernels.Strip(windows=windows, first=i * width, width=width, side=side)
+            for i, windows in enumerate(strips)
         ),
+        tree=tree_view,
+        tree_windows=tuple(tree_windows),
     )
 
 
@@ -117,6 +164,7 @@ def _on_patches(
     edges = np.flatnonzero(np.diff(patch[order])) + 1
     for rows in np.split(order, edges):
         at, triangle = surfaces.patches[patch[rows[0]]].at, shape[rows]
+        assert at is not None, "a face of triangles has no other surface"
         d = ray[rows] @ R  # in the scene's frame
         corners, pq = surfaces.numbers[triangle, :9].reshape(-1, 3, 3), surfaces.corner_pq[triangle]
         edge, pq_edges = corners[:, 1:] - corners[:, :1], pq[:, 1:] - pq[:, :1]

@@ -137,7 +137,7 @@ def scan_station(
     )
     with ThreadPoolExecutor(_threads()) as pool:  # the kernels release the interpreter's lock
         # One strip at least: it gives the columns of an empty scan their types.
-        strips = [i for i, strip in enumerate(caster.view.strips) if len(strip.windows)] or [0]
+        strips = caster.view.occupied() or [0]
         returns = join(list(pool.map(caster.strip, strips)))
     measured = np.linalg.norm(returns.points, axis=1)
     factor = (measured * (1.0 + 1e-6 * scale) + offset) / measured
@@ -193,9 +193,7 @@ class _StationCaster:
         used, side = min(STRIP, self.grid.columns - strip.first), strip.side
         rays = self._rays(rng, used)
         beam_ = ray_kernels.Beam(0.5 * self.scanner.beam_exit_mm, 0.5e-3 * self.scanner.divergence_mrad)
-        shape, t, thin = ray_kernels.cast(
-            self.view.shapes, self.view.pieces, strip, self.grid, rays, beam_, self.margin.cast_columns
-        )
+        shape, t, thin = self.view.cast(number, self.grid, rays, beam_, self.margin.cast_columns)
         inside = shape >= 0
         inside[:side], inside[side + used :] = False, False
         edge, near = np.zeros(shape.shape, bool), t
@@ -207,7 +205,7 @@ class _StationCaster:
             inside &= ~edge
         column, row = (index.astype(np.int32) for index in np.nonzero(inside))
         on_surfaces = self._on_surfaces(strip, column, row, shape[column, row], t[column, row], rays)
-        at_edges = self._at_edges(strip, edge, near, rays) if edge.any() else []
+        at_edges = self._at_edges(number, edge, near, rays) if edge.any() else []
         echoes = join([on_surfaces, *at_edges])
         return self._returns(rng, rows_of(echoes, np.lexsort((echoes.row, echoes.column))))
 
@@ -246,16 +244,15 @@ class _StationCaster:
             source=np.full(len(t), SURFACE, np.uint8),
         )
 
-    def _at_edges(self, strip: Strip, edge: Bools, near: Floats, rays: ray_kernels.Rays) -> list[Echoes]:
+    def _at_edges(self, number: int, edge: Bools, near: Floats, rays: ray_kernels.Rays) -> list[Echoes]:
         """Return the echoes of the rays marked in ``edge``: of footprints on one surface after all, and mixed ones."""
+        strip = self.view.strips[number]
         column, row = (index.astype(np.int32) for index in np.nonzero(edge))
-        number = np.full(edge.shape, -1, np.int32)
-        number[column, row] = np.arange(len(column), dtype=np.int32)
+        numbered = np.full(edge.shape, -1, np.int32)
+        numbered[column, row] = np.arange(len(column), dtype=np.int32)
         offsets = beam(self.params.sub_rays)[0]
         angle = self.scanner.beam_angle(near[column, row])
-        subs, ranges = ray_kernels.cast_around(
-            self.view.shapes, self.view.pieces, strip, self.grid, rays, number, angle, offsets
-        )
+        subs, ranges = self.view.cast_around(number, self.grid, rays, numbered, angle, offsets)
         surface = np.where(subs >= 0, self.surfaces.surface[subs], -1)
         whole = (surface == surface[:, :1]).all(axis=1) & (subs[:, 0] >= 0)
         some = (subs >= 0).any(axis=1) & ~whole
@@ -315,7 +312,7 @@ class _StationCaster:
         low = self.scanner.min_range_mm
         measured = echoes.range + sigma * rng.standard_normal(n)
         measured = np.where(stray, low + where * (echoes.range - low), measured)
-        surface = self.surfaces.surface_label[self.surfaces.surface[echoes.shape]]
+        surface = self.surfaces.label[echoes.shape]
         returns = Returns(
             points=self.grid.directions(echoes.row, echoes.column) * measured[:, None],
             intensity=echoes.signal.astype(np.float32),

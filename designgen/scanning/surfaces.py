@@ -6,19 +6,23 @@ Curved faces whose intersection with a ray has no closed form are patches. Rays 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from designgen.designs.patch import Patch, within_triangle
+from designgen.designs.patch import Patch, Trimmed, within_triangle
+from designgen.scanning import triangle_tree
+from designgen.scanning.triangle_tree import Tree
 from designgen.sequences import in_square
 from processor.model import Floats, Ints, Labels
 
 SPHERE, CONE, DISC, TRIANGLE = range(4)
 NUMBERS = 14  # of a shape: see Builder
+MANY = 20_000  # triangles of a scene from which a tree is used; the results are the same
 FLAT_MM = 1e-7  # a face this close to a plane is plane, and its net is exact
 FLAT_SAMPLES = 1000  # least number of points of a face at which this is tested
 
@@ -33,7 +37,8 @@ class Surfaces:
 
     kind: npt.NDArray[np.int8]  # (m,)
     numbers: Floats  # (m, NUMBERS)
-    surface: Labels  # (m,) number of the smooth surface, a row of surface_label
+    surface: Labels  # (m,) number of the smooth surface
+    label: Labels  # (m,) row of surface_names
     part: Labels  # (m,) row of part_names, -1 = none
     patch: Labels  # (m,) row of patches, -1 = none or a plane one, whose net is exact
     corner_pq: Floats  # (m, 3, 2) parameters of the corners of a patch's triangles
@@ -42,9 +47,16 @@ class Surfaces:
     piece_shape: Labels  # (k,)
     piece_centre: Floats  # (k, 3)
     piece_radius: Floats  # (k,)
-    patches: tuple[Patch, ...]
+    patches: tuple[Patch | Trimmed, ...]
     surface_names: tuple[str, ...]
-    surface_label: Labels  # (surfaces,) row of surface_names
+
+    @cached_property
+    def tree(self) -> Tree | None:
+        """The tree of all triangles; None for few, of which the windows on the grid are faster."""
+        triangles = self.kind == TRIANGLE
+        if triangles.sum() < MANY:
+            return None
+        return triangle_tree.build(self.numbers[triangles, :9].reshape(-1, 3, 3))
 
 
 @dataclass
@@ -62,7 +74,7 @@ class Builder:
     _cuts: list[Floats] = field(default_factory=list)
     _pieces: list[tuple[int, Floats, float]] = field(default_factory=list)
     _labels: list[str] = field(default_factory=list)
-    _nets: list[tuple[Patch, int]] = field(default_factory=list)
+    _nets: list[tuple[Patch | Trimmed, int, Hashable]] = field(default_factory=list)
 
     def sphere(self, part: int, name: str, centre: Floats, radius: float, cuts: Sequence[tuple[Floats, float]]) -> None:
         """Add a sphere without the caps beyond planes, each given by unit normal and distance from the centre."""
@@ -108,9 +120,9 @@ class Builder:
             reach = float(np.linalg.norm(triangle - middle, axis=1).max())
             self._add(TRIANGLE, part, surface, triangle.ravel().tolist(), [(middle, reach)])
 
-    def patch(self, part: int, patch: Patch) -> None:
-        """Add a patch."""
-        self._nets.append((patch, part))
+    def patch(self, part: int, patch: Patch | Trimmed, smooth: Hashable = None) -> None:
+        """Add a patch. Patches of the same part and ``smooth`` are pieces of one smooth surface; None: of one name."""
+        self._nets.append((patch, part, patch.name if smooth is None else smooth))
 
     def _name(self, name: str) -> int:
         self._labels.append(name)
@@ -131,11 +143,15 @@ class Builder:
     def to_surfaces(self) -> Surfaces:
         """Return all shapes."""
         count = len(self._kind)
+        names: dict[str, int] = {}
+        for name in self._labels:
+            names.setdefault(name, len(names))
         blocks: list[dict[str, Any]] = [
             {
                 "kind": np.array(self._kind, np.int8),
                 "numbers": np.array(self._numbers).reshape(-1, NUMBERS),
                 "surface": np.array(self._surface, np.int32),
+                "label": np.array([names[self._labels[row]] for row in self._surface], np.int32),
                 "part": np.array(self._part, np.int32),
                 "patch": np.full(count, -1, np.int32),
                 "corner_pq": np.zeros((count, 3, 2)),
@@ -144,40 +160,41 @@ class Builder:
                 "piece_radius": np.array([radius for _, _, radius in self._pieces]),
             }
         ]
-        numbered: dict[tuple[int, str], int] = {}
-        for number, (patch, part) in enumerate(self._nets):
-            key = part, patch.name  # patches of the same part and name are pieces of one smooth surface
-            if key not in numbered:
-                numbered[key] = self._name(patch.name)
-            blocks.append(_net_shapes(patch, number, part, numbered[key], count))
+        numbered: dict[tuple[int, Hashable], int] = {}
+        for number, (patch, part, smooth) in enumerate(self._nets):
+            surface = numbered.setdefault((part, smooth), len(self._labels) + len(numbered))
+            label = names.setdefault(patch.name, len(names))
+            blocks.append(_net_shapes(patch, number, part, surface, label, count))
             count += len(blocks[-1]["kind"])
-        names = tuple(dict.fromkeys(self._labels))
-        rows_of = {name: i for i, name in enumerate(names)}
         ends = np.cumsum([0, *(len(c) for c in self._cuts), *[0] * (count - len(self._kind))])
         return Surfaces(
             **{key: np.concatenate([block[key] for block in blocks]) for key in blocks[0]},
             cuts=np.concatenate([np.empty((0, 4)), *self._cuts]),
             cut_start=ends.astype(np.int64),
-            patches=tuple(patch for patch, _ in self._nets),
-            surface_names=names,
-            surface_label=np.array([rows_of[label] for label in self._labels], np.int32),
+            patches=tuple(patch for patch, _, _ in self._nets),
+            surface_names=tuple(names),
         )
 
 
-def _net_shapes(patch: Patch, number: int, part: int, surface: int, first: int) -> dict[str, Any]:
+def _net_shapes(patch: Patch | Trimmed, number: int, part: int, surface: int, label: int, first: int) -> dict[str, Any]:
     """Return the triangles of a patch's net, from row ``first`` of all shapes, as columns of Surfaces."""
-    knots, faces = patch.net()
-    corners = patch.at(knots[:, 0], knots[:, 1])[faces]
-    count, centre = len(faces), corners.mean(axis=1)
+    if isinstance(patch, Trimmed):
+        corners, pq, flat = patch.corners, patch.pq, patch.at is None
+    else:
+        knots, faces = patch.net()
+        corners, pq = patch.at(knots[:, 0], knots[:, 1])[faces], knots[faces]
+        flat = _is_flat(patch, pq, corners)
+    count, centre = len(corners), corners.mean(axis=1)
     numbers = np.zeros((count, NUMBERS))
     numbers[:, :9] = corners.reshape(-1, 9)
     return {
         "kind": np.full(count, TRIANGLE, np.int8),
         "numbers": numbers,
         "surface": np.full(count, surface, np.int32),
+        "label": np.full(count, label, np.int32),
         "part": np.full(count, part, np.int32),
-        "patch": np.full(count, -1 if _is_flat(patch, knots[faces], corners) else number, np.int32),
-        "corner_pq": knots[faces],
+        "patch": np.full(count, -1 if flat else number, np.int32),
+        "corner_pq": pq,
         "piece_shape": np.arange(first, first + count, dtype=np.int32),
         "piece_centre": centre,
         "piece_radius": np.linalg.norm(corners - centre[:, None], axis=2).max(axis=1),

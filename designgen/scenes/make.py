@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 from threadpoolctl import threadpool_limits
 
-from designgen.scanning.scan_settings import scan_settings_of
-from designgen.scenes import arch_bridge, space_frame, structure
+from designgen.models.model import Model
+from designgen.scanning.scan_settings import Scanning, scan_settings_of
+from designgen.scenes import arch_bridge, model, space_frame, structure
 from processor.model import Scene, Truth, UsageError
 
-MAKERS = {
+Maker = Callable[[str, Mapping[str, Any], Scanning, int], tuple[Scene, Truth]]
+MAKERS: dict[str, tuple[str, Maker]] = {
     "arch-bridge": ("bridge", arch_bridge.make),
     "space-frame": ("frame", space_frame.make),
     "structure": ("structure", structure.make),
@@ -19,8 +22,10 @@ MAKERS = {
 EXTRA = {"structure": {"picks"}}  # sections of one kind only
 
 
-def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple[Scene, Truth]:
-    """Make the scene of a recipe and its truth; ``seed`` replaces that of the recipe.
+def make(
+    name: str, recipe: Mapping[str, Any], seed: int | None = None, of_model: Model | None = None
+) -> tuple[Scene, Truth]:
+    """Make the scene of a recipe and its truth; ``seed`` replaces that of the recipe, ``of_model`` its model's file.
 
     The result depends on the recipe and seed, not on time, host or number of threads. Raises UsageError that names the
     key for an unknown kind or key, a wrong type or an impossible size.
@@ -29,6 +34,8 @@ def make(name: str, recipe: Mapping[str, Any], seed: int | None = None) -> tuple
     if kind not in MAKERS:
         raise UsageError(f"recipe {name}: kind: expected one of {', '.join(MAKERS)}, got {kind!r}")
     section, maker = MAKERS[kind]
+    if kind == "structure" and "model" in recipe:
+        section, maker = "model", partial(model.make, model=of_model)
     keys = {"about", "kind", "seed", "scan", "scanner", "asbuilt", section} | EXTRA.get(kind, set())
     if unknown := sorted(set(recipe) - keys):
         raise UsageError(f"recipe {name}: unknown key {unknown[0]!r}; there are {', '.join(sorted(keys))}")

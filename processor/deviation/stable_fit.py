@@ -187,7 +187,9 @@ def _blocks(
 
 
 def _cells(points: Floats, side: float) -> Ints:
-    cells: Ints = np.floor((points - points.min(axis=0)) / side).astype(np.int64)
+    # Of a part too small for its blocks there may be no point.
+    low = points.min(axis=0) if len(points) else np.zeros(points.shape[1])
+    cells: Ints = np.floor((points - low) / side).astype(np.int64)
     return cells
 
 

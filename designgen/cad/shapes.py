@@ -1,0 +1,100 @@
+"""Shapes of the CAD kernel (Open CASCADE) as bodies: triangle meshes, and the forms of their faces."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+from OCP.Bnd import Bnd_Box
+from OCP.BRep import BRep_Builder
+from OCP.BRepBndLib import BRepBndLib
+from OCP.BRepBuilderAPI import BRepBuilderAPI_Transform
+from OCP.BRepGProp import BRepGProp
+from OCP.gp import gp_Pnt, gp_Trsf
+from OCP.GProp import GProp_GProps
+from OCP.TopAbs import TopAbs_FACE, TopAbs_SHELL, TopAbs_SOLID
+from OCP.TopExp import TopExp_Explorer
+from OCP.TopoDS import TopoDS_Compound
+
+from designgen.cad import brep_faces, tessellation
+from designgen.cad.bodies import Body, finest_mm, is_closed
+
+MOST_TRIANGLES = 700_000  # of a body: about ten seconds
+LARGE_MM = 1000.0  # larger bodies are meshed by the algorithm for many triangles
+
+
+def pieces(shape: Any) -> Iterator[tuple[Any, bool]]:
+    """Yield every solid (True), then every shell and the loose faces outside of solids (False)."""
+    for solid in parts(shape, TopAbs_SOLID):
+        yield solid, True
+    for shell in parts(shape, TopAbs_SHELL, TopAbs_SOLID):
+        yield shell, False
+    if faces := list(parts(shape, TopAbs_FACE, TopAbs_SHELL)):
+        builder, loose = BRep_Builder(), TopoDS_Compound()
+        builder.MakeCompound(loose)
+        for face in faces:
+            builder.Add(loose, face)
+        yield loose, False
+
+
+def parts(shape: Any, *kinds: Any) -> Iterator[Any]:
+    """Yield the parts of a shape of the first kind, outside of those of the second."""
+    explorer = TopExp_Explorer(shape, *kinds)
+    while explorer.More():
+        yield explorer.Current()
+        explorer.Next()
+
+
+def body_of(
+    path: str, name: str, shape: Any, scale: float, *, solid: bool, face_name: Callable[[Any], str] | None = None
+) -> Body | str:
+    """Return a shape, whose unit is ``scale`` mm, as a body, or the problem with it.
+
+    With ``face_name``, which names a face or returns "", the body has the forms of its faces, and edges are
+    meshed finer.
+    """
+    box = Bnd_Box()
+    BRepBndLib.Add_s(shape, box, False)
+    if box.IsVoid():
+        return f"{name!r} is empty and left out"
+    if not np.isfinite(box.SquareExtent()):
+        return f"{name!r} has a face without bounds and is left out"
+    size, exact = scale * float(np.sqrt(box.SquareExtent())), face_name is not None
+    if exact and scale != 1.0:  # the numbers of forms are in mm
+        scaling = gp_Trsf()
+        scaling.SetScale(gp_Pnt(0.0, 0.0, 0.0), scale)
+        shape, scale = BRepBuilderAPI_Transform(shape, scaling, True).Shape(), 1.0
+
+    def mesh(mm: float) -> int:
+        if exact:
+            return tessellation.mesh_edges_finer(shape, mm, brep_faces.is_meshed_finer, large=size > LARGE_MM)
+        return tessellation.mesh_faces(shape, mm / scale, large=size > LARGE_MM)
+
+    deviation = finest_mm(path, name, size, MOST_TRIANGLES, mesh)
+    volumes, areas = GProp_GProps(), GProp_GProps()
+    BRepGProp.VolumeProperties_s(shape, volumes)
+    BRepGProp.SurfaceProperties_s(shape, areas)
+    forms = None
+    try:
+        if face_name is None:
+            vertices, faces, measured = tessellation.facets(shape)
+        else:
+            vertices, faces, measured, forms = brep_faces.facets_and_forms(shape, face_name)
+    except ValueError:
+        return f"{name!r} has faces that cannot be meshed and is left out"
+    vertices = scale * vertices
+    numbers = np.array([volumes.Mass(), areas.Mass(), measured]) * [scale**3, scale**2, scale]
+    if not len(faces) or not np.isfinite(vertices).all() or not np.isfinite(numbers).all():
+        return f"{name!r} has no extent and is left out"
+    return Body(
+        name=name,
+        solid=solid,
+        closed=is_closed(faces),
+        vertices=vertices,
+        faces=faces,
+        volume_mm3=float(numbers[0]) if solid else float("nan"),
+        area_mm2=float(numbers[1]),
+        deviation_mm=max(deviation, float(numbers[2])),
+        forms=forms,
+    )

@@ -1,0 +1,1 @@
+"""Models to scan: CAD files, meshes and CadQuery objects. Read ``model``, then ``loading``, then ``placement``."""

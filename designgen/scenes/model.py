@@ -1,0 +1,110 @@
+"""Scenes of models: any CAD file, mesh or CadQuery object, scanned from stations around it."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from designgen.asbuilt import bodies
+from designgen.models import loading, placement
+from designgen.models.model import Model, ModelBody
+from designgen.reading import filled
+from designgen.recipe_files import Recipe, overridden
+from designgen.scanning import scanner as scanner_module
+from designgen.scanning import survey
+from designgen.scanning.scan_settings import ByRays, Scanning
+from designgen.scanning.surfaces import Builder, Surfaces
+from designgen.scenes import MADE_IN_MM
+from processor.model import Floats, Scene, StructureDesign, Truth, UsageError
+
+
+@dataclass(frozen=True)
+class Params:
+    """The model's file, the unit of its numbers ("": as the file states), and a file of stations ("": placed)."""
+
+    file: str = ""
+    units: str = ""
+    stations: str = ""
+
+
+def recipe_of(
+    file: str, stations: int | str, scanner: str, units: str, settings: Sequence[str] | Mapping[str, Any]
+) -> Recipe:
+    """Return the recipe of a scan of a model: ``stations`` is a number or a JSON file of places."""
+    recipe: Recipe = {
+        "kind": "structure",
+        "model": {"file": file, "units": units},
+        "scan": {"mode": scanner_module.MODE, "scanner": scanner},
+    }
+    if isinstance(stations, int) or stations.isdigit():
+        recipe["scan"]["stations"] = [int(stations)]
+    elif stations.lower().endswith(".json"):
+        recipe["model"]["stations"] = stations
+    else:
+        raise UsageError(f"--stations {stations}: expected a number from 1 or a .json file")
+    return overridden(recipe, settings)
+
+
+def make(
+    name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int, model: Model | None = None
+) -> tuple[Scene, Truth]:
+    """Make the scene of a model and its truth; without a model, that of the file which the recipe names."""
+    section = filled(Params, recipe, "model")
+    if not section.file:
+        raise UsageError('model.file: expected a file, got ""')
+    if not isinstance(scanning, ByRays):
+        raise UsageError('scan.mode: a model is scanned from stations; set scan.mode = "rays"')
+    if model is None:
+        model = loading.load(Path(section.file), section.units)
+    loading.say(model)
+    params, origin = scanning.params, np.array(scanning.params.origin_mm)
+    names = tuple(body.name for body in model.bodies)
+    built = bodies.build(model, bodies.params_of(recipe, names), seed)
+    poses = _poses(model, recipe, scanning, seed)
+    surveyed = survey.survey(_surfaces(built.bodies), names, poses, scanning.device, params, seed)
+    scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
+    if not params.registered:
+        scans = tuple(dataclasses.replace(scan, T_project_scan=np.empty(0)) for scan in scans)
+    vertices, faces = model.mesh()
+    scene = Scene(
+        name,
+        "structure",
+        scans,
+        stations=stations if params.registered else None,
+        units="mm",
+        units_reason=MADE_IN_MM,
+        structure=StructureDesign(model.name, vertices + origin, faces),
+    )
+    return scene, Truth(
+        labels,
+        structure=dataclasses.replace(built.movement, points=built.movement.points + origin),
+        defects=dataclasses.replace(built.defects, centres=built.defects.centres + origin),
+        stations=station_truth,
+        as_built=built.ledger,
+        spacing_mm=scanning.spacing_mm,
+        sigma_mm=scanning.sigma_mm,
+    )
+
+
+def _surfaces(built: Sequence[ModelBody | None]) -> Surfaces:
+    """Return the surfaces of bodies as built; None for one that is left out."""
+    builder = Builder()
+    for part, body in enumerate(built):
+        for patch, smooth in body.patches() if body is not None else ():
+            builder.patch(part, patch, smooth)
+    return builder.to_surfaces()
+
+
+def _poses(model: Model, recipe: Mapping[str, Any], scanning: ByRays, seed: int) -> dict[str, Floats]:
+    """Return the stations' poses, given or placed so that most of the surface is seen."""
+    given = filled(Params, recipe, "model").stations
+    if given:
+        return placement.given(Path(given), seed)
+    distance = scanning.params.distance_mm if "distance_mm" in recipe.get("scan", {}) else None
+    return placement.placed(model, math.prod(scanning.params.stations), distance, scanning.device, seed)
