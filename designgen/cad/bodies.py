@@ -17,10 +17,11 @@ ANGLE_RAD = 0.1  # largest angle between adjacent facets of a curved face
 COARSE_SHARE = 1e-3  # deviation of the first mesh as a fraction of the body's size
 COARSER = 10.0  # largest ratio of the deviations of a mesh and the next
 LARGEST_MM = 1e9
-NO_UNIT = "says no unit of length that is known; name it with --units"
+NO_UNIT = "states no known unit of length; name it with --units"
 UNITS_MM = {
     "millimetre": 1.0, "mm": 1.0, "centimetre": 10.0, "cm": 10.0, "decimetre": 100.0, "metre": 1000.0, "m": 1000.0,
     "kilometre": 1e6, "micrometre": 1e-3, "inch": 25.4, "in": 25.4, "foot": 304.8, "ft": 304.8, "yard": 914.4,
+    "dm": 100.0, "km": 1e6, "us-ft": 1_200_000.0 / 3937.0,
 }  # fmt: skip
 
 
@@ -53,13 +54,13 @@ class Body:
 class CadFile:
     """The bodies of a CAD file, and as ``problems`` what could not be read.
 
-    ``unit`` and its size ``unit_mm`` are those of the file's numbers; ``unit_said`` is the unit named in the file, ""
+    ``unit`` and its size ``unit_mm`` are those of the file's numbers; ``unit_stated`` is that in the file, ""
     for none. The two differ where another unit was requested.
     """
 
     unit: str
     unit_mm: float
-    unit_said: str
+    unit_stated: str
     bodies: tuple[Body, ...]
     problems: tuple[str, ...]
 
@@ -70,7 +71,7 @@ def unit_name(path: str, given: str, size_mm: float) -> tuple[str, list[str]]:
     Raises InputError for a size that is not positive and finite.
     """
     if not 0.0 < size_mm < float("inf"):
-        raise InputError(f"{path}: says a unit of length of {size_mm:.10g} mm; name it with --units")
+        raise InputError(f"{path}: states a unit of length of {size_mm:.10g} mm; name it with --units")
     given = given.strip().lower()
     fitting = [name for name, size in UNITS_MM.items() if abs(size / size_mm - 1.0) < 1e-6]
     if given in UNITS_MM and given not in fitting:

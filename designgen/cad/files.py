@@ -39,6 +39,7 @@ def unit_mm(name: str) -> float:
 def read(
     path: Path,
     units: str = "",
+    default_units: str = "",
     *,
     content: bytes | None = None,
     exact: bool = False,
@@ -47,16 +48,18 @@ def read(
 ) -> CadFile:
     """Read a STEP or IFC file, or its ``content``; ``units``, if given, replace the unit of length in the file.
 
+    ``default_units`` is the unit of a file that states none; "": such a file is refused.
+
     With ``exact`` bodies have the forms of their faces. A child process reads the file, within ``limit_s`` seconds and
     ``memory_bytes`` of memory. Raises InputError for a file that cannot be read so, is of another kind, cut off,
     damaged, or without geometry; UsageError for unknown units and where the library for IFC is missing.
     """
     content = _content(path) if content is None else content
-    if units:
-        unit_mm(units)
+    for unit in filter(None, (units, default_units)):
+        unit_mm(unit)
     suffix = ".ifc" if path.suffix.lower() in IFC_SUFFIXES else path.suffix.lower()
     job: dict[str, Any] = {"path": str(path), "suffix": suffix, "units": units.lower(), "exact": exact}
-    job |= {"limit_s": limit_s, "memory_bytes": memory_bytes}
+    job |= {"default_units": default_units.lower(), "limit_s": limit_s, "memory_bytes": memory_bytes}
     # A damaged file can end the child process, and the kernels print to its standard streams.
     with tempfile.TemporaryFile() as question, tempfile.TemporaryFile() as answer:
         question.write(json.dumps(job).encode("ascii") + b"\n" + content)
@@ -123,21 +126,21 @@ def _unzipped(path: Path) -> bytes:
         raise InputError(f"{path}: is no zip file, damaged or encrypted; copy or export it again") from None
 
 
-def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
+def import_file(path: Path, folder: Path, units: str = "", default_units: str = "") -> dict[str, Any]:
     """Write the meshes of a CAD file and import.json as a new folder; return the content of import.json.
 
     Raises UsageError where the folder exists and is not empty, InputError as :func:`read`.
     """
     check_new(folder)
     content = _content(path)
-    cad = read(path, units, content=content)
+    cad = read(path, units, default_units, content=content)
     report: dict[str, Any] = {
         "file": path.name,
         "sha256": sha256(content).hexdigest(),
         "unit": cad.unit,
         "unit_mm": cad.unit_mm,
-        "unit_from": "asked for by --units" if units else "said by the file",
-        "unit_said": cad.unit_said or None,
+        "unit_from": _unit_from(cad, units),
+        "unit_stated": cad.unit_stated or None,
         "bodies": [],
         "problems": list(cad.problems),
     }
@@ -164,9 +167,15 @@ def import_file(path: Path, folder: Path, units: str = "") -> dict[str, Any]:
     return report
 
 
+def _unit_from(cad: CadFile, units: str) -> str:
+    if units:
+        return "given by --units"
+    return "stated in the file" if cad.unit_stated else "given by --default-units"
+
+
 def summary(report: Mapping[str, Any]) -> list[str]:
     """Return the result of :func:`import_file` as lines of text: the unit, then a line for each body."""
-    in_file = f"; the file says {report['unit_said'] or 'none'}" if report["unit_said"] != report["unit"] else ""
+    in_file = f"; the file states {report['unit_stated'] or 'none'}" if report["unit_stated"] != report["unit"] else ""
     lines = [f"{report['file']}: unit {report['unit']} ({report['unit_mm']:.10g} mm, {report['unit_from']}{in_file})"]
     for body in report["bodies"]:
         x, y, z = body["size_mm"]

@@ -17,8 +17,8 @@ NO_BODIES = ("IfcFeatureElementSubtraction", "IfcSpace", "IfcVirtualElement", "I
 FLAT = ("Axis", "FootPrint", "Annotation", "Box", "CoG", "Reference")  # representations without a surface
 
 
-def parse(path: str, content: bytes, units: str, *, exact: bool = False) -> CadFile:
-    """Read the text of an IFC file; its numbers are in ``units`` if given. Raises as :func:`process.parse`.
+def parse(path: str, content: bytes, units: str, default_units: str, *, exact: bool = False) -> CadFile:
+    """Read the text of an IFC file; arguments and errors as of :func:`process.parse`.
 
     ``exact``: bodies have the forms of their faces, where the library gives their exact geometry.
     """
@@ -40,7 +40,7 @@ def parse(path: str, content: bytes, units: str, *, exact: bool = False) -> CadF
     if declared is not None:
         size = 1000.0 * float(ifcopenshell.util.unit.calculate_unit_scale(model))
         name, problems = unit_name(path, ifcopenshell.util.unit.get_full_unit_name(declared), size)
-    elif not units:
+    elif not (units := units or default_units):
         raise InputError(f"{path}: {NO_UNIT}")
     taken = UNITS_MM[units] if units else size
     bodies: list[Any] = []

@@ -26,9 +26,8 @@ from processor.model import InputError, UsageError
 def serve() -> None:
     """Read the file in the file descriptor of the command line; the answer goes to standard output.
 
-    The descriptor holds a line of JSON with ``path``, ``suffix``, ``units``, ``exact``, ``limit_s``,
-    ``memory_bytes``, and the
-    file's content.
+    The descriptor holds a line of JSON with ``path``, ``suffix``, ``units``, ``default_units``, ``exact``,
+    ``limit_s``, ``memory_bytes``, and the file's content.
     """
     end_with_parent()
     with os.fdopen(int(sys.argv[1]), "rb") as question:
@@ -40,7 +39,7 @@ def serve() -> None:
     _limit(job["limit_s"], job["memory_bytes"])
     path, cad = job["path"], None
     try:
-        cad = parse(path, job["suffix"], content, job["units"], exact=job["exact"])
+        cad = parse(path, job["suffix"], content, job["units"], job["default_units"], exact=job["exact"])
         header = _header(cad)
     except (InputError, UsageError) as error:
         header = {"error": type(error).__name__, "message": str(error)}
@@ -81,7 +80,7 @@ def _limit(limit_s: float, memory_bytes: int) -> None:
 
 def _header(cad: CadFile) -> dict[str, Any]:
     scalars = ("name", "solid", "closed", "volume_mm3", "area_mm2", "deviation_mm")
-    header = {key: getattr(cad, key) for key in ("unit", "unit_mm", "unit_said", "problems")}
+    header = {key: getattr(cad, key) for key in ("unit", "unit_mm", "unit_stated", "problems")}
     bodies: list[dict[str, Any]] = [{key: getattr(body, key) for key in scalars} for body in cad.bodies]
     for entry, body in zip(bodies, cad.bodies, strict=True):
         if body.forms is not None:
@@ -123,7 +122,7 @@ def received(answer: IO[bytes]) -> CadFile:
             raise ValueError("no number")
         bodies.append(body)
     problems = tuple(str(problem) for problem in header["problems"])
-    return CadFile(str(header["unit"]), float(header["unit_mm"]), str(header["unit_said"]), tuple(bodies), problems)
+    return CadFile(str(header["unit"]), float(header["unit_mm"]), str(header["unit_stated"]), tuple(bodies), problems)
 
 
 def _received_forms(answer: IO[bytes], entries: list[Any], triangles: int) -> Forms:
@@ -144,23 +143,25 @@ def _received_forms(answer: IO[bytes], entries: list[Any], triangles: int) -> Fo
     return Forms(forms, of_triangle, corner_uv)
 
 
-def parse(path: str, suffix: str, content: bytes, units: str, *, exact: bool = False) -> CadFile:
+def parse(
+    path: str, suffix: str, content: bytes, units: str, default_units: str = "", *, exact: bool = False
+) -> CadFile:
     """Read the text of a STEP file (``suffix`` .step, .stp) or an IFC file; its numbers are in ``units`` if given.
 
-    ``exact``: bodies have the forms of their faces.
-    Raises InputError for a text that cannot be read or has no unit, UsageError where the library for IFC is missing and
-    where ``units`` are given but the file has several units.
+    ``default_units`` is the unit of a file that states none. ``exact``: bodies have the forms of their faces.
+    Raises InputError for a text that cannot be read or is without any unit, UsageError where the library for IFC is
+    missing and where ``units`` are given but the file has several units.
     """
     # The kernels are loaded in the child process only: that takes seconds, and may fail.
     text = escaped(content)
     if suffix == ".ifc":
         from designgen.cad import ifc
 
-        cad = ifc.parse(path, text, units, exact=exact)
+        cad = ifc.parse(path, text, units, default_units, exact=exact)
     else:
         from designgen.cad import step
 
-        cad = step.parse(path, text, units, exact=exact)
+        cad = step.parse(path, text, units, default_units, exact=exact)
     lost = missing_lines(text)
     if not lost:
         return cad

@@ -28,8 +28,8 @@ from designgen.cad.shapes import body_of, parts, pieces
 from processor.model import InputError, UsageError
 
 
-def parse(path: str, content: bytes, units: str, *, exact: bool = False) -> CadFile:
-    """Read the text of a STEP file; its numbers are in ``units`` if given. Raises as :func:`process.parse`.
+def parse(path: str, content: bytes, units: str, default_units: str, *, exact: bool = False) -> CadFile:
+    """Read the text of a STEP file; arguments and errors as of :func:`process.parse`.
 
     ``exact``: bodies have the forms of their faces and meshes that are finer at edges.
     """
@@ -42,6 +42,8 @@ def parse(path: str, content: bytes, units: str, *, exact: bool = False) -> CadF
     unit_given, sizes = _units(reader, entities)
     damaged = _damaged(reader, entities)
     unit_readable = bool(sizes) and not any(re.match("StepBasic_.*(Length|Conversion)", kind) for kind in damaged)
+    if not unit_readable and len(sizes) < 2:
+        units = units or default_units
     if not unit_readable and not units and any("SHAPE" in type(entity).__name__.upper() for entity in entities):
         raise InputError(f"{path}: {NO_UNIT}")
     unit, problems = unit_name(path, unit_given, sizes[0]) if unit_readable else ("", [])

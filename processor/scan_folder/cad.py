@@ -27,14 +27,13 @@ from processor.version import __version__
 __all__ = ["SUFFIXES", "read"]
 
 LIMIT_S = 900.0  # designgen has a lower limit, with a better message
-NO_UNIT = "no unit of length"  # part of the message of designgen
 RECORD = "import.json"
 
 
 def read(path: Path, unit: str) -> tuple[Floats, Ints]:
     """Return vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file.
 
-    ``unit`` is that of a file without a unit. Raises InputError without designgen, and for a file that cannot be
+    ``unit`` is that of a file that states none. Raises InputError without designgen, and for a file that cannot be
     converted completely.
     """
     try:
@@ -106,9 +105,7 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
         # A copy of the hashed bytes, under a name that cannot be mistaken for an option.
         source = making / f"design{path.suffix.lower()}"
         source.write_bytes(content)
-        failure = _run(command, source, making / "meshes", "")
-        if failure and NO_UNIT in failure:
-            failure = _run(command, source, making / "meshes", unit)
+        failure = _run(command, source, making / "meshes", unit)
         if failure:
             raise InputError(f"{path}: {failure.replace(f'{source}: ', '')}")
         with suppress(OSError):  # another process has made them meanwhile
@@ -123,8 +120,8 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
 
 def _run(command: list[str], source: Path, out: Path, unit: str) -> str:
     """Run designgen import; returns its error message if it made no meshes, else ""."""
-    units = ["--units", unit] if unit else []
-    ended = process.run([*command, "import", str(source), "-o", str(out), *units], own_group=False, timeout_s=LIMIT_S)
+    arguments = ["import", str(source), "-o", str(out), "--default-units", unit]
+    ended = process.run([*command, *arguments], own_group=False, timeout_s=LIMIT_S)
     if ended.cause is process.Cause.TIME:
         return f"designgen import did not end within {LIMIT_S:g} s"
     if (out / RECORD).is_file():

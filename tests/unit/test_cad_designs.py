@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from designgen.cad.bodies import UNITS_MM
 from processor.model import InputError
 from processor.scan_folder import cad, folder
+from processor.scan_folder.units import MM_PER_UNIT
 
 REAL = Path(__file__).resolve().parents[3] / "shared/data/design/base_interface_AP203.STEP"
 PLY = (
@@ -19,14 +21,14 @@ PLY = (
     "element face 4\nproperty list uchar int vertex_indices\nend_header\n"
     "{0} 0 0\n{1} 0 0\n{0} 1000 0\n{0} 0 1000\n3 0 2 1\n3 0 1 3\n3 1 2 3\n3 0 3 2\n"
 )
-# Stands for `designgen import FILE -o OUT [--units U]`: the file says what is to happen.
+# Stands for `designgen import FILE -o OUT --default-units U`: the file says what is to happen.
 FAKE = f"""
 import json, os, pathlib, sys
 source, out = pathlib.Path(sys.argv[2]), pathlib.Path(sys.argv[4])
 says = json.loads(source.read_text())
 with open(says["log"], "a") as log:
     log.write(" ".join(sys.argv[5:]) + "\\n")
-if says.get("error") and not (says.get("unitless") and len(sys.argv) > 5):
+if says.get("error"):
     print("error: " + str(source) + ": " + says["error"], file=sys.stderr)
     sys.exit(3)
 out.mkdir()
@@ -59,7 +61,7 @@ def test_all_bodies_once(fake, tmp_path):
     path, calls = fake()
     for _ in range(2):
         vertices, faces = cad.read(path, "m")
-    assert calls() == [""], "the second time it is known"
+    assert calls() == ["--default-units m"], "the second time it is known"
     assert vertices.shape == (8, 3)
     assert np.ptp(vertices, axis=0).tolist() == [3000.0, 1000.0, 1000.0]
     assert faces.tolist()[4:] == (np.array(faces[:4]) + 4).tolist()
@@ -69,13 +71,14 @@ def test_all_bodies_once(fake, tmp_path):
     with pytest.raises(InputError, match="was damaged and has been removed"):
         cad.read(path, "m")
     cad.read(path, "m")
-    assert calls() == ["", ""]
+    assert calls() == ["--default-units m"] * 2
 
 
-def test_a_unit_that_the_file_does_not_say(fake):
-    path, calls = fake(error="says no unit of length that is known", unitless=True)
+def test_the_unit_of_a_file_that_states_none(fake):
+    path, calls = fake()
     cad.read(path, "inch")
-    assert calls() == ["", "--units inch"]
+    assert calls() == ["--default-units inch"], "in the one run, which takes it only where the file states none"
+    assert set(MM_PER_UNIT) <= set(UNITS_MM), "designgen takes every unit that a scan folder can have"
 
 
 @pytest.mark.parametrize(
@@ -98,7 +101,7 @@ def test_a_cache_that_cannot_be_written_is_done_without(fake, tmp_path):
     path, calls = fake()
     for _ in range(2):
         assert len(cad.read(path, "m")[0]) == 8
-    assert calls() == ["", ""]
+    assert calls() == ["--default-units m"] * 2
 
 
 def test_without_designgen_the_error_says_what_to_install(tmp_path, monkeypatch):

@@ -1,4 +1,4 @@
-"""CAD files in and out: units said by the file, sizes worked by hand, bad files refused with a reason."""
+"""CAD files in and out: units stated in the file, sizes worked by hand, bad files refused with a reason."""
 
 import json
 import random
@@ -144,7 +144,7 @@ def test_real_files_in_inches(name, tmp_path):
         pytest.skip("the real data are not here")
     command = [sys.executable, "-m", "designgen", "import", str(path), "-o", str(tmp_path / "out")]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=True)
-    assert done.stdout.splitlines()[0].endswith("unit inch (25.4 mm, said by the file)")
+    assert done.stdout.splitlines()[0].endswith("unit inch (25.4 mm, stated in the file)")
     assert len(done.stdout.splitlines()) == 2
     assert done.stderr == ""
     said = json.loads((tmp_path / "out/import.json").read_text("utf-8"))
@@ -193,19 +193,25 @@ def test_a_file_without_a_known_unit_needs_one(box, tmp_path):
     text = box.read_text()
     path = tmp_path / "unknown.step"
     # None at all; a prefix and a name that do not exist, which the kernel would take for metres.
-    for wrong in (
+    wrongs = (
         text.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT(.MILKI.,.METRE.)"),
         text.replace("SI_UNIT(.MILLI.,.METRE.)", "SI_UNIT(.MILLI.,.GRAM.)"),
         re.sub(r"(GLOBAL_UNIT_ASSIGNED_CONTEXT\s*\(\s*\()#\d+,", r"\1", text),
-    ):
+    )
+    for number, wrong in enumerate(wrongs):
         path.write_text(wrong)
-        with pytest.raises(InputError, match=r"no unit of length that is known; name it with --units"):
+        with pytest.raises(InputError, match=r"states no known unit of length; name it with --units"):
             cad_files.read(path)
         found = cad_files.read(path, "inch")
-        assert (found.unit, found.unit_mm, found.unit_said) == ("inch", 25.4, "")
+        assert (found.unit, found.unit_mm, found.unit_stated) == ("inch", 25.4, "")
         assert found.bodies[0].size_mm == pytest.approx([2540.0, 5080.0, 7620.0])
+        by_default = cad_files.import_file(path, tmp_path / f"default{number}", default_units="inch")
+        assert (by_default["unit"], by_default["unit_stated"]) == ("inch", None)
+        assert by_default["unit_from"] == "given by --default-units"
+    stated = cad_files.import_file(box, tmp_path / "stated", default_units="inch")
+    assert (stated["unit"], stated["unit_from"]) == ("millimetre", "stated in the file")
     said = cad_files.import_file(box, tmp_path / "out", "inch")
-    line = f"{box.name}: unit inch (25.4 mm, asked for by --units; the file says millimetre)"
+    line = f"{box.name}: unit inch (25.4 mm, given by --units; the file states millimetre)"
     assert cad_files.summary(said)[0] == line
     wall(tmp_path / "wall.ifc", "MILLI", (4000, 200, 2700))
     nowhere = re.sub(r"\n#\d+=\s?IFCUNITASSIGNMENT\([^;]*;", "", (tmp_path / "wall.ifc").read_text())
@@ -213,6 +219,7 @@ def test_a_file_without_a_known_unit_needs_one(box, tmp_path):
     (tmp_path / "none.ifc").write_text(nowhere)
     with pytest.raises(InputError, match="name it with --units"):
         cad_files.read(tmp_path / "none.ifc")
+    assert cad_files.read(tmp_path / "none.ifc", default_units="mm").unit == "mm"
     assert cad_files.read(tmp_path / "none.ifc", "cm").bodies[0].size_mm == pytest.approx([40000.0, 2000.0, 27000.0])
 
 
@@ -340,7 +347,7 @@ def test_damaged_files_end_in_a_result_or_an_input_error(tmp_path, capfd, each):
         ("import sys; print('noise'); print('noise', file=sys.stderr); sys.exit(3)", "exit code 3"),
         ("print('noise')", "nonsense"),
         ("print('[1, 2]')", "nonsense"),
-        ('print(\'{"unit": "mm", "unit_mm": 1, "unit_said": "", "problems": [], "bodies": [{}]}\')', "nonsense"),
+        ('print(\'{"unit": "mm", "unit_mm": 1, "unit_stated": "", "problems": [], "bodies": [{}]}\')', "nonsense"),
         ("import time; time.sleep(60)", "within 0.5 s"),
     ],
 )
