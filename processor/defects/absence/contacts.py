@@ -16,11 +16,12 @@ from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, cells_of
 from processor.defects.regions import EMPTY_SHARE, Region, chernoff
-from processor.defects.surface_charts import PER_SIDE, PLANE, DesignSurface
+from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import enclosure, mesh_distance
 from processor.geometry.mesh_distance import Bools
 from processor.model import Floats, Ints
 
+STEP_MM = 2.0  # between places by which contacts are measured
 WITHIN_MM = 4.0  # from the outline of a contact: beams at its border hit the face beside it
 DEPTH_MM = 1.0  # into the body, at which a place is tested
 ON_MM = 4.0  # distance from the face, up to which a point is on it
@@ -50,7 +51,7 @@ def of_bodies(
     if not present:
         return []
     rates = [contact.points / contact.area for contact in present]
-    # By error, on 1 mm2; of one body, those of the body that is gone are among them.
+    # By error, on 1 mm2; points on the contact of a body that is gone also count for the one that it stood on.
     rate = max(float(np.median(rates)), 1.0 / sum(contact.area for contact in present))
     least = EMPTY_SHARE * _density(field, surface)
     regions = []
@@ -70,8 +71,9 @@ def _contacts(
     charts = surface.charts
     size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
-    places, inward, sample_mm2 = *_hidden_places(surface, hidden), (charts.cell_mm / PER_SIDE) ** 2
-    found = _points_on_hidden(observed, surface, hidden)
+    touched = np.flatnonzero(hidden.any(axis=1) & (charts.kind == PLANE)[chart_of_cells(surface)])
+    places, inward, place_mm2 = _places_of(surface, touched)
+    found = _points_on(observed, surface, touched)
     low, high = enclosure.boxes(surface.vertices, surface.faces, body)
     typical = _density(field, surface) * charts.cell_mm**2
     for one in range(len(low)):
@@ -87,7 +89,7 @@ def _contacts(
         if samples and typical and len(judged) >= FEWEST_CELLS:
             counted = (field.count + field.stray)[judged].sum()
             empty = bool(counted <= GONE_SHARE * typical * surface.share[judged].sum())
-            yield _Contact(one, samples * sample_mm2, number(*found), empty)
+            yield _Contact(one, samples * place_mm2, number(*found), empty)
 
 
 def _density(field: Field, surface: DesignSurface) -> float:
@@ -117,26 +119,23 @@ def _well_inside(points: Floats, normals: Floats, grid: mesh_distance.FacetGrid,
     return inside
 
 
-def _hidden_places(surface: DesignSurface, hidden: Bools) -> tuple[Floats, Floats]:
-    """Return the middles (n, 3) of hidden samples of plane faces, and the faces' normals (n, 3)."""
+def _places_of(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats, float]:
+    """Return places (n, 3) spread over ``cells``, the faces' normals (n, 3), and the area of each place, mm2."""
     charts = surface.charts
-    plane = charts.kind[chart_of_cells(surface)] == PLANE
-    cell, sample = np.nonzero(hidden & plane[:, None])
-    axes = charts.axes[chart_of_cells(surface)[cell]]
-    offset = charts.cell_mm * ((np.stack(np.divmod(sample, PER_SIDE), axis=1) + 0.5) / PER_SIDE - 0.5)
-    return surface.centres[cell] + np.einsum("nk,nkj->nj", offset, axes[:, :2]), axes[:, 2]
+    side = int(np.ceil(charts.cell_mm / STEP_MM))
+    offset = charts.cell_mm * ((np.indices((side, side)).reshape(2, -1).T + 0.5) / side - 0.5)
+    axes = charts.axes[chart_of_cells(surface)[cells]]
+    places = surface.centres[cells][:, None] + np.einsum("ok,nkj->noj", offset, axes[:, :2])
+    return places.reshape(-1, 3), np.repeat(axes[:, 2], side * side, axis=0), (charts.cell_mm / side) ** 2
 
 
-def _points_on_hidden(observed: Observed, surface: DesignSurface, hidden: Bools) -> tuple[Floats, Floats]:
-    """Return the feet (n, 3) of points on hidden samples of plane faces, and the faces' normals (n, 3)."""
+def _points_on(observed: Observed, surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats]:
+    """Return the feet (n, 3) of points on ``cells`` of plane faces, and the faces' normals (n, 3)."""
     charts = surface.charts
-    near = np.flatnonzero((np.abs(observed.deviation) < ON_MM) & (charts.kind[observed.chart] == PLANE))
-    chart, uv = observed.chart[near], observed.uv[near]
-    cell = cells_of(observed, surface)[near]
-    share = (uv - charts.low[chart]) / charts.cell_mm
-    at = np.clip(np.floor((share - np.floor(share)) * PER_SIDE), 0, PER_SIDE - 1).astype(np.int64)
-    on = hidden[cell, at[:, 0] * PER_SIDE + at[:, 1]]
-    chart, uv = chart[on], uv[on]
+    wanted = np.zeros(len(surface.share), np.bool_)
+    wanted[cells] = True
+    on = wanted[cells_of(observed, surface)] & (np.abs(observed.deviation) < ON_MM)
+    chart, uv = observed.chart[on], observed.uv[on]
     axes = charts.axes[chart]
     return charts.origin[chart] + np.einsum("nk,nkj->nj", uv, axes[:, :2]), axes[:, 2]
 

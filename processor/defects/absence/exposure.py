@@ -16,7 +16,7 @@ from scipy import ndimage
 from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
 from processor.defects.observations import cells_at
-from processor.defects.regions import COUNTED_SHARE, EIGHT_NEIGHBOURS, EMPTY_SHARE, Region, chernoff
+from processor.defects.regions import EIGHT_NEIGHBOURS, EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import Bools, FacetGrid
@@ -27,7 +27,7 @@ OPPOSITE_COS = -0.95  # of the normals of the two sides of a plate
 BEFORE_MM = 1.0  # start of a line of sight above the face
 DIRECTIONS = 400  # about a face, 5 degrees apart
 LEAST_COS = 0.2  # of incidence, as of points that are used
-LOST_SHARE = 0.02  # of the directions of a seen place, that a place beside it may lack
+LOST_SHARE = 0.05  # of a seen place's directions, that one beside it may lack: 1 of 400 that both sides lie in shade
 RING_CELLS = 3  # about an empty region: its surroundings
 FEWEST_RING = 4  # cells of the surroundings
 MOST_RING, MOST_CORE = 24, 60  # cells whose lines of sight are compared
@@ -84,9 +84,7 @@ def _both_sides(
         if not rows or shared < EXPOSED_SHARE:
             continue
         sides = [hole, *(found[row] for row in rows)]
-        strength = sum(
-            chernoff(COUNTED_SHARE * side.expected, side.counted, more=False) / side.spread for side in sides
-        )
+        strength = sum(chernoff(side.expected, side.counted, more=False) / side.spread for side in sides)
         if strength > -np.log(alarms_per_mm2 * cell_mm2):
             chance = float(np.exp(-strength)) / cell_mm2
             regions.append(Region(hole.chart, hole.cells, 0, float(np.sqrt(2.0 * strength)), chance))
