@@ -54,7 +54,7 @@ def of_bodies(
     # By error, on 1 mm2; points on the contact of a body that is gone also count for the one that it stood on.
     rate = max(float(np.median(rates)), 1.0 / sum(contact.area for contact in present))
     least = EMPTY_SHARE * _density(field, surface)
-    regions = []
+    regions: list[Region] = []
     for contact in contacts:
         if not contact.is_empty or contact.points < least * contact.area:
             continue
