@@ -1,7 +1,8 @@
 """Errors stated by the class of terrestrial laser scanners, phase-shift and pulsed, where data cannot show them.
 
 One standard deviation each, in mm. ``VIEW_MM``: what the points of one view have in common, relative to other views;
-data sheets give a range error of 1 mm for up to 130 m, which is taken as the limit of 95 %.
+data sheets give a range error of 1 mm for up to 130 m, which is taken as the limit of 95 %. ``SCALE``: of the ranges of
+one view, without unit; the same sheets give 10 ppm beside 1 mm.
 ``SHIFT_MM``: of all views together, along each axis: targets are measured to about 1 mm, and a network rests on some
 25 sightings of them. ``OFFSET_MM``: the zero offset of a calibrated scanner, which all of its views have in common.
 """
@@ -14,6 +15,7 @@ from processor.geometry import rigid
 from processor.model import Floats
 
 VIEW_MM = 0.5
+SCALE = 5e-6
 SHIFT_MM = 0.2
 OFFSET_MM = 0.2
 

@@ -23,11 +23,13 @@ from processor.defects import (
     surface_charts,
     to_result,
 )
+from processor.defects.absence import contacts, exposure
 from processor.defects.alignment import Alignment
 from processor.defects.component_shapes import ComponentShape
 from processor.defects.deviation_field import Field
 from processor.defects.observations import Observed, Pairs
 from processor.defects.params import Params
+from processor.defects.regions import Region
 from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import merging, mesh_distance, rigid
@@ -128,6 +130,8 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     finding = scan_statistic.search(residuals, surface, levels)
     expected = missing_material.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
     missing = regions.missing(field, expected, surface, alarms_per_mm2)
+    if observed.stations.unnamed:
+        missing += _inferred(scene, registered, field, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
     near_mm = max(UNITE_CELLS * surface.charts.cell_mm, UNITE_MM)
     return to_result.Search(
@@ -143,6 +147,18 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
         shape_values=shape_values,
         points=measures.points_by_cell(observed, surface, aligned),
     )
+
+
+def _inferred(scene: Scene, registered: Registered, field: Field, alarms_per_mm2: float) -> list[Region]:
+    """Return what is missing from a cloud of which no ray is known: bodies that are gone, and holes in plates."""
+    surface, scan = registered.surface, scene.scans[0]
+    hidden = surface_charts.hidden(surface)
+    gone = contacts.of_bodies(registered.observed, field, surface, hidden, alarms_per_mm2)
+    T = registered.T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4))
+    points = rigid.apply(T, scan.points[:: max(1, len(scan.points) // SD_SAMPLES)] + scan.origin)
+    known = {cell for region in gone for cell in region.cells.tolist()}
+    holes = exposure.holes(field, surface, points, alarms_per_mm2)
+    return gone + [region for region in holes if known.isdisjoint(region.cells.tolist())]
 
 
 def _fitted_shapes(

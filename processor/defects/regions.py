@@ -72,12 +72,18 @@ def missing(field: Field, expected: Floats, surface: DesignSurface, alarms_per_m
             core = cells[inner[cells]]
             mean = COUNTED_SHARE * expected[core].sum()
             number = float(count[core].sum())
-            # Chernoff's bound of the probability that a Poisson number is so far below its mean.
-            strength = mean - number + (number * np.log(number / mean) if number else 0.0) if mean > number else 0.0
+            strength = chernoff(mean, number, more=False)
             if strength > threshold:
                 chance = float(np.exp(-strength)) / charts.cell_mm**2
                 regions.append(Region(chart, cells, 0, float(np.sqrt(2.0 * strength)), chance))
     return regions
+
+
+def chernoff(mean: float, number: float, *, more: bool) -> float:
+    """Return less the logarithm of Chernoff's bound of the probability of a Poisson ``number`` so far from its mean."""
+    if mean <= 0.0 or (number <= mean if more else number >= mean):
+        return 0.0
+    return float(mean - number + (number * np.log(number / mean) if number else 0.0))
 
 
 def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> list[list[Region]]:

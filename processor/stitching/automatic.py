@@ -69,7 +69,8 @@ def stitch(scans: Sequence[Scan], params: Params, reference: int, picked: Picked
     solution, blocks = _adjust(clouds, cells, coarse.T, reference)
     pairs = _measure_pairs(blocks, solution)
     solution, blocks = _without_gross_pairs(blocks, solution, pairs, reference)
-    solution = jackknife.with_raised_covariance(blocks, solution, reference)
+    factor = jackknife.factors(blocks, solution, reference)
+    solution, pairs = jackknife.with_raised_covariance(solution, pairs, factor)
     scores = _score_pairs(patches, solution.T)
     return RegisteredScans(
         clouds=clouds,
@@ -126,11 +127,11 @@ def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) ->
             rays=np.empty((0, 3, 7)), face=none,
         )  # fmt: skip
         return bundle_adjustment.solve(blocks, T, reference), blocks
-    ranges = np.zeros(len(T))
+    ranges = np.zeros((len(T), 2))
     for gate in GATES:
         blocks = correspondences.segment(cells, T, gate * cells.size_mm, ranges).shared()
         solution = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
-        T, ranges = solution.T, solution.ranges[: len(T)]
+        T, ranges = solution.T, solution.of_scans
     pieces = correspondences.segment(cells, T, 0.0, ranges)
     faces = bundle_adjustment.solve(pieces.shared(), T, reference)
     T = edge_constraints.resolve_loose_motions(clouds, pieces, faces, REACH * cells.size_mm)
@@ -138,7 +139,7 @@ def _adjust(clouds: list[Cloud], cells: CellTable, T: Floats, reference: int) ->
         pieces = correspondences.segment(cells, T, 0.0, ranges)
         blocks = edge_constraints.with_ends(clouds, pieces, T, gate * cells.size_mm).shared()
         solution = bundle_adjustment.solve(blocks, T, reference, slack_mm=gate * cells.size_mm)
-        before, T, ranges = T, solution.T, solution.ranges[: len(T)]
+        before, T, ranges = T, solution.T, solution.of_scans
         if gate == 0.0 and _largest_shift(T, before) < STILL_MM:
             break
     return solution, blocks

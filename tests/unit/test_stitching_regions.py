@@ -86,14 +86,14 @@ def test_the_variance_of_faces_is_that_of_an_analysis_of_variance():
     """Errors y of equal variances 1 / a about an unknown mean: sum (y - mean)^2 / (f - 1) - 1 / a, or 0."""
     a, y = 4.0, np.array([0.9, -1.6, 0.4, 2.1, -0.7])
     x, f = 0.3 * y - 0.2, len(y)  # the equations are at range errors x
-    N, g = np.zeros((7 + f, 7 + f)), np.zeros(7 + f)
-    faces = np.arange(7, 7 + f)
+    N, g = np.zeros((8 + f, 8 + f)), np.zeros(8 + f)
+    faces = np.arange(8, 8 + f)
     N[3, 3], N[3, faces], N[faces, 3], N[faces, faces] = a * f, a, a, a
     for shrunk, expected in ((1.0, np.sqrt(y.var(ddof=1) - 1.0 / a)), (0.2, 0.0)):
         g[faces], g[3] = a * (x - shrunk * y), a * (x - shrunk * y).sum()
         none = np.empty(0)
         equations = bundle_adjustment._Equations(N=N, spurious=N, g=g, z=none, offset=none, variance=none)
-        found = bundle_adjustment._estimate_face_sd(equations, np.array([3, 6, *faces]), 1, np.append(0.0, x))
+        found = bundle_adjustment._estimate_face_sd(equations, np.array([3, 6, 7, *faces]), 1, np.append([0.0, 0.0], x))
         np.testing.assert_allclose(found, expected, rtol=1e-6)
 
 

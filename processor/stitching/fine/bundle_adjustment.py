@@ -16,7 +16,7 @@ import numpy.typing as npt
 from numba import njit
 from scipy.optimize import brentq
 
-from processor.adjustment.scanner_class import VIEW_MM
+from processor.adjustment.scanner_class import SCALE, VIEW_MM
 from processor.geometry import rigid
 from processor.model import Floats, Ints
 from processor.stitching.fine.correspondences import Blocks
@@ -30,7 +30,7 @@ ASIDE, ROUNDS = 1e-3, 8  # a weight below which a block counts as an outlier; ro
 PRIOR_MM, PRIOR_RAD = 1e4, 1.0  # weak priors on the poses: undetermined components stay as they are
 MEDIAN = 0.6745  # of |z|, z normal
 KINDS = 2
-COLUMNS = 8  # unknowns of a block: the pose of its scan, and the range errors of its scan and of its face
+COLUMNS = 9  # unknowns of a block: the pose of its scan, the scan's range errors (offset, scale), and its face's
 LEAST_FACE_MM, MOST_FACE_MM = 1e-3, 10.0  # standard deviation of the range errors of faces: where none show, at most
 EVEN, WIDE_SIGMAS = 3, 0.3  # first iterations with almost equal weights of all pieces: tau by the noise of a point
 LEAST_REAL = 0.01  # least share of the information in a direction that is taken as real
@@ -44,7 +44,8 @@ class Solution:
 
     ``offset`` (b,) is the mean distance of a block from its plane, mm; ``weight`` (b,) its robust weight. ``tau`` of
     each kind: mm, for ends in standard deviations of a single one; the last is of the range errors of faces. ``ranges``
-    (k + f,) are the range errors of scans and of faces, mm, ``ranges_sd`` (k,) the standard deviations of the former.
+    (2k + f,) are the range errors: offsets of scans, mm, their scales, and offsets of faces, mm; ``ranges_sd`` (k,) are
+    the standard deviations of the first.
     """
 
     T: Floats
@@ -54,6 +55,12 @@ class Solution:
     weight: Floats
     ranges: Floats
     ranges_sd: Floats
+
+    @property
+    def of_scans(self) -> Floats:
+        """Range errors (k, 2) of scans: offset, mm, and scale."""
+        k = len(self.T)
+        return np.stack([self.ranges[:k], self.ranges[k : 2 * k]], axis=1)
 
 
 def solve(
@@ -73,7 +80,7 @@ def solve(
     """
     k = len(T)
     common = np.zeros(KINDS + 1) if tau is None else np.array(tau)
-    ranges = np.zeros(k + blocks.faces)
+    ranges = np.zeros(2 * k + blocks.faces)
     unknowns = _unknowns(blocks, len(ranges), k, reference)
     poses = unknowns[unknowns < 6 * k]
     if not len(poses):
@@ -115,21 +122,29 @@ def solve(
 def weights_at(blocks: Blocks, solution: Solution) -> Floats:
     """Return the robust weights (b,) of blocks at the poses and the scans' range errors of a solution."""
     weight, tau = np.ones(len(blocks.piece)), np.array(solution.tau)
-    ranges = np.zeros(len(solution.T) + blocks.faces)
-    ranges[: len(solution.T)] = solution.ranges[: len(solution.T)]
+    k = len(solution.T)
+    ranges = np.concatenate([solution.ranges[: 2 * k], np.zeros(blocks.faces)])
     for _ in range(ROUNDS):
         weight = _robust_weights(blocks, _linearize(blocks, solution.T, ranges, tau, weight).z)
     return weight
 
 
-def step_without(
+def without(
     blocks: Blocks, solution: Solution, reference: int, out: npt.NDArray[np.bool_], almost_none: float
-) -> Floats:
-    """Return the step (6k,) of the poses from a solution if blocks ``out`` (b,) had the weight ``almost_none``."""
+) -> tuple[Floats, Floats]:
+    """Return step (6k,) and covariance (6k, 6k) of the poses if blocks ``out`` (b,) had the weight ``almost_none``.
+
+    The step is one of Newton's from the solution; rows and columns of poses that are not adjusted are 0.
+    """
     weight = np.where(out, almost_none, solution.weight)
     ranges, k = solution.ranges, len(solution.T)
     equations = _linearize(blocks, solution.T, ranges, np.array(solution.tau), weight)
-    return _newton_step(equations, _unknowns(blocks, len(ranges), k, reference), ranges, solution.tau[KINDS])[: 6 * k]
+    unknowns = _unknowns(blocks, len(ranges), k, reference)
+    poses = unknowns[unknowns < 6 * k]
+    N = (equations.N + _prior(len(ranges), k, solution.tau[KINDS]))[np.ix_(unknowns, unknowns)]
+    covariance = np.zeros((6 * k, 6 * k))
+    covariance[np.ix_(poses, poses)] = np.linalg.solve(N, np.eye(len(N), len(poses)))[: len(poses)]
+    return _newton_step(equations, unknowns, ranges, solution.tau[KINDS])[: 6 * k], covariance
 
 
 # Normal equations.
@@ -178,9 +193,11 @@ def _linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: F
     """
     k, b = len(T), len(blocks.piece)
     size = 6 * k + len(ranges)
-    of_face = np.where(blocks.face < 0, size, 7 * k + blocks.face)
-    columns = np.column_stack([6 * blocks.scan[:, None] + np.arange(6), 6 * k + blocks.scan, of_face])
-    W = in_world(blocks, T, np.append(ranges, 0.0)[columns[:, 6:] - 6 * k].sum(axis=1))
+    of_face = np.where(blocks.face < 0, size, 8 * k + blocks.face)
+    of_scan = 6 * blocks.scan
+    columns = np.column_stack([of_scan[:, None] + np.arange(6), 6 * k + blocks.scan, 7 * k + blocks.scan, of_face])
+    errors = np.append(ranges, 0.0)[columns[:, 6:] - 6 * k]
+    W = in_world(blocks, T, errors[:, 0] + errors[:, 2], errors[:, 1])
     total = hashing.summed(extraction.triangle(W) * weight[:, None], blocks.piece, blocks.pieces)
     planes = extraction.planes_of(total)
     n, c = planes.normal[blocks.piece], planes.mean[blocks.piece]
@@ -223,20 +240,26 @@ def _linearize(blocks: Blocks, T: Floats, ranges: Floats, tau: Floats, weight: F
     )  # fmt: skip
 
 
-def in_world(blocks: Blocks, T: Floats, error: Floats) -> Floats:
-    """Return the moments (b, 7, 7) of [p; 1; u], at poses T and with ranges shorter by ``error`` (b,)."""
+def in_world(blocks: Blocks, T: Floats, error: Floats, scale: Floats) -> Floats:
+    """Return the moments (b, 7, 7) of [p; 1; u] at poses T, with ranges R shorter by ``error + scale R``, both (b,)."""
     W = np.empty((len(error), 7, 7))
     W[:, :4, :4], W[:, 4:] = extraction.square(blocks.sums), blocks.rays
     W[:, :4, 4:] = blocks.rays[:, :, :4].transpose(0, 2, 1)
     world = np.zeros_like(W)
     world[:, :4, :4], world[:, 4:, 4:] = T[blocks.scan], T[blocks.scan, :3, :3]
     world[:, :3, 4:] = -error[:, None, None] * world[:, 4:, 4:]
+    world[:, :3, :3] *= 1.0 - (scale * _rays_known(blocks))[:, None, None]
     moments: Floats = world @ W @ world.transpose(0, 2, 1)
     return moments
 
 
+def _rays_known(blocks: Blocks) -> npt.NDArray[np.bool_]:
+    """Return whether the rays of each block are known: a range error moves no point of a scanner of unknown place."""
+    return np.asarray(np.trace(blocks.rays[:, :, 4:], axis1=1, axis2=2) > 0.0)
+
+
 def _design_matrices(blocks: Blocks, T: Floats, planes: Planes) -> tuple[Floats, Floats]:
-    """Return the derivatives of a point's distance from its plane by its columns (b, 8, 7) and the plane (b, 3, 7).
+    """Return the derivatives of a point's distance from its plane by its columns (b, 9, 7) and the plane (b, 3, 7).
 
     They are linear in [p; 1; u], p relative to the mean of the plane, u the unit vector of the ray.
     """
@@ -253,7 +276,10 @@ def _design_matrices(blocks: Blocks, T: Floats, planes: Planes) -> tuple[Floats,
     Ls[:, :3, 3] = np.cross(arm, n)
     Ls[:, 3:6, 3] = n
     Ls[:, 6, 4:] = -n
-    Ls[:, 7, 4:] = -n * (blocks.face >= 0)[:, None]
+    # A scale moves a point along its ray by n . (p + arm) across the plane. Without noise n . p is 0; with it the least
+    # squares of the residuals would be sought in scans that are smaller as a whole.
+    Ls[:, 7, 3] = -np.einsum("bi,bi->b", n, arm) * _rays_known(blocks)
+    Ls[:, 8, 4:] = -n * (blocks.face >= 0)[:, None]
     return Ls, Lp
 
 
@@ -315,7 +341,7 @@ def _shifted(W: Floats, c: Floats) -> Floats:
 
 
 def _newton_step(equations: _Equations, unknowns: Ints, ranges: Floats, face_mm: float) -> Floats:
-    """Return the step of all unknowns; ``ranges`` (k + f,) are drawn to 0 by their priors."""
+    """Return the step of all unknowns; ``ranges`` (2k + f,) are drawn to 0 by their priors."""
     size = len(equations.g)
     prior = _prior(len(ranges), (size - len(ranges)) // 6, face_mm)
     g = equations.g.copy()
@@ -328,9 +354,9 @@ def _newton_step(equations: _Equations, unknowns: Ints, ranges: Floats, face_mm:
 def _prior(ranges: int, k: int, face_mm: float) -> Floats:
     """Return the information of the priors: weak ones of k poses; range errors of scans by their class, of faces."""
     of_poses = np.tile([PRIOR_RAD**-2] * 3 + [PRIOR_MM**-2] * 3, k)
-    return np.diag(
-        np.concatenate([of_poses, np.full(k, VIEW_MM**-2), np.full(ranges - k, max(face_mm, LEAST_FACE_MM) ** -2)])
-    )
+    of_scans = np.repeat([VIEW_MM**-2, SCALE**-2], k)
+    of_faces = np.full(ranges - 2 * k, max(face_mm, LEAST_FACE_MM) ** -2)
+    return np.diag(np.concatenate([of_poses, of_scans, of_faces]))
 
 
 def _unknowns(blocks: Blocks, ranges: int, k: int, reference: int) -> Ints:
@@ -346,13 +372,13 @@ def _estimate_face_sd(equations: _Equations, unknowns: Ints, k: int, ranges: Flo
     With the other unknowns eliminated, the faces' information S and S times their estimate are turned to the axes of S,
     where they are independent.
     """
-    if len(ranges) == k:
+    if len(ranges) == 2 * k:
         return 0.0
-    rest, faces = unknowns[unknowns < 7 * k], np.arange(7 * k, len(equations.g))
+    rest, faces = unknowns[unknowns < 8 * k], np.arange(8 * k, len(equations.g))
     N = equations.N + _prior(len(ranges), k, np.inf)
     half = np.linalg.solve(N[np.ix_(rest, rest)], np.column_stack([N[np.ix_(rest, faces)], equations.g[rest]]))
     S = N[np.ix_(faces, faces)] - N[np.ix_(faces, rest)] @ half[:, :-1]
-    pull = S @ ranges[k:] - equations.g[faces] + N[np.ix_(faces, rest)] @ half[:, -1]
+    pull = S @ ranges[2 * k :] - equations.g[faces] + N[np.ix_(faces, rest)] @ half[:, -1]
     information, axes = np.linalg.eigh(0.5 * (S + S.T))
     information = np.maximum(information, 0.0)
     square = (axes.T @ pull) ** 2
@@ -414,7 +440,8 @@ def _robust_weights(blocks: Blocks, z: Floats) -> Floats:
 def _with_slack(equations: _Equations, slack_mm: float) -> Floats:
     """Return misfits (b,) by their standard deviations combined with the error of poses not yet adjusted."""
     z, offset = equations.z, equations.offset
-    reduced: Floats = offset / np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm)
+    sd = np.hypot(offset / np.where(z == 0.0, 1.0, z), slack_mm)
+    reduced: Floats = offset / np.maximum(sd, 1e-300)
     return reduced
 
 

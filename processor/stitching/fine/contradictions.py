@@ -69,7 +69,7 @@ def _misfits(blocks: Blocks, solution: Solution) -> _Misfits:
     # Where all faces of a piece but one are outliers, any may be wrong: each is compared with all others.
     left = np.bincount(blocks.piece, weight > bundle_adjustment.ASIDE, blocks.pieces)
     weight = np.where(left[blocks.piece] < 2, 1.0, weight)
-    moments = bundle_adjustment.in_world(blocks, solution.T, solution.ranges[blocks.scan])
+    moments = bundle_adjustment.in_world(blocks, solution.T, *solution.of_scans[blocks.scan].T)
     world = extraction.triangle(moments)
     faces = extraction.planes_of(world)
     weighted = world * weight[:, None]

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from processor.geometry.neighbors import thinned
 from processor.model import Floats, Ints
 from processor.stitching.coarse import candidate_rotations
+from processor.stitching.fine import noise_model
 from processor.stitching.planes import extraction, hashing
 from processor.stitching.planes.extraction import Planes
 from processor.stitching.planes.samples import facing
@@ -22,9 +23,7 @@ LEVELS = 7
 SAME_COS = float(np.cos(np.radians(8.0)))
 MOST_NORMALS = 1500
 LEAST_POINTS = 6.0  # of a scan on a piece
-ACROSS_SHARES = (0.0, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # share of the noise that does not run along the ray
 FLAT_SIGMAS, SLACK_SIGMAS = 1.6, 0.5  # scatter of a merged piece: by the noise across it, and beside that
-LEAST_WEIGHT_SHARE = 0.05  # noise across a face seen at grazing incidence, of the range noise
 MOST_SCANS = 4096
 PRIOR_FREEDOMS = 20.0  # with which a piece's points are taken to scatter as the noise model states
 
@@ -88,9 +87,11 @@ class CellTable:
     slack_mm: float  # of planar pieces, beyond the noise
 
     def corrected(self, ranges: Floats) -> CellTable:
-        """Return the cells if all ranges of each scan were too long by ``ranges`` (k,), mm."""
+        """Return the cells if ranges of each scan were too long by ``ranges`` (k, 2): an offset, mm, and a scale."""
         A = np.tile(np.eye(4), (len(self.scan), 1, 1))
-        A[:, :3] -= (ranges[self.scan] * self.known)[:, None, None] * ray_maps(self.mean)
+        offset, scale = (ranges[self.scan] * self.known[:, None]).T
+        A[:, :3, :3] *= (1.0 - scale)[:, None, None]
+        A[:, :3] -= offset[:, None, None] * ray_maps(self.mean)
         sums = extraction.transformed(self.sums, A)
         return replace(self, sums=sums, mean=extraction.scatter(sums)[0])
 
@@ -105,18 +106,13 @@ def ray_maps(points: Floats) -> Floats:
 
 def gather(clouds: list[Cloud]) -> CellTable:
     """Put the cells of all clouds in one table."""
-    variance = []
-    for cloud in clouds:
-        across, along = noise(cloud)
-        c2 = incidence_cos(cloud.mean, cloud.normal, cloud.has_position) ** 2
-        variance.append(np.maximum(across + along * c2, (LEAST_WEIGHT_SHARE**2) * (across + along)))
     sigma = max(cloud.sigma_mm for cloud in clouds)
     return CellTable(
         scan=np.repeat(np.arange(len(clouds)), [len(cloud.sums) for cloud in clouds]),
         sums=np.vstack([cloud.sums for cloud in clouds]),
         mean=np.vstack([cloud.mean for cloud in clouds]),
         normal=np.vstack([cloud.normal for cloud in clouds]),
-        variance=np.concatenate(variance),
+        variance=np.concatenate([noise_model.variances(cloud) for cloud in clouds]),
         known=np.repeat([cloud.has_position for cloud in clouds], [len(cloud.sums) for cloud in clouds]),
         size_mm=max(cloud.cell_mm for cloud in clouds),
         limit_mm=LIMIT_SIGMAS * sigma,
@@ -124,39 +120,11 @@ def gather(clouds: list[Cloud]) -> CellTable:
     )
 
 
-def noise(cloud: Cloud) -> tuple[float, float]:
-    """Estimate variances (across the face, along the ray), mm^2, of the scatter a + b cos^2(incidence) of the pieces.
-
-    Medians are used, since pieces that are not quite planar scatter by more than the noise.
-    """
-    freedoms = cloud.planes.count - 3.0
-    keep = freedoms >= 10.0
-    v = cloud.planes.variance[keep, 0] * cloud.planes.count[keep] / freedoms[keep]
-    c2 = incidence_cos(cloud.planes.mean[keep], cloud.planes.normal[keep], cloud.has_position) ** 2
-    if len(v) < 10 or not cloud.has_position:
-        return 0.0, max(float(np.median(v)) if len(v) else cloud.sigma_mm**2, 1e-8)
-    best = (np.inf, 0.0, 1.0)
-    for share in ACROSS_SHARES:
-        model = share + (1.0 - share) * c2 + LEAST_WEIGHT_SHARE**2
-        size = float(np.median(v / model))
-        spread = float(np.median(np.abs(np.log(np.maximum(v, 1e-12) / max(size, 1e-12) / model))))
-        best = min(best, (spread, share, size))
-    return best[1] * best[2], max((1.0 - best[1]) * best[2], 1e-10)
-
-
-def incidence_cos(points: Floats, normals: Floats, known: bool) -> Floats:
-    """Return the cosine (n,) between rays from the origin and normals; 1 if the scanner's position is not known."""
-    if not known:
-        return np.ones(len(points))
-    R = np.maximum(np.linalg.norm(points, axis=1), 1e-9)
-    cosine: Floats = np.abs(np.einsum("ni,ni->n", points, normals)) / R
-    return cosine
-
-
 def segment(cells: CellTable, T: Floats, gate_mm: float, ranges: Floats | None = None) -> Blocks:
     """Segment the scans merged by poses T (k, 4, 4) into planar pieces; faces up to about ``gate_mm`` apart are one.
 
-    ``ranges`` (k,) are the range errors of scans that the segmentation is corrected by; those of the blocks stay.
+    ``ranges`` (k, 2) are the range errors of scans, offset and scale, that the segmentation is corrected by; those of
+    the blocks stay.
     """
     raw, cells = cells, cells if ranges is None else cells.corrected(ranges)
     rows = np.flatnonzero(np.isfinite(T[cells.scan]).all(axis=(1, 2)))

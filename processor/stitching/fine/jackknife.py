@@ -2,12 +2,13 @@
 
 An adjustment takes the errors of pieces as independent. A scanner with systematic range or angle errors, or a structure
 that moved in between, makes them alike over whole walls, and the covariance is then far too small. Each region is left
-out in turn (delete-a-group jackknife, one Newton step each). Where a pose reacts by more than its covariance explains,
-beyond chance, the covariance is raised.
+out in turn (delete-a-group jackknife, one Newton step each). Independent errors move a pose by as much as its
+covariance grows without the region. Where a pose reacts by more, beyond chance, its covariance is raised.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,6 +18,7 @@ from processor.model import Floats, Ints
 from processor.stitching.fine import bundle_adjustment
 from processor.stitching.fine.bundle_adjustment import Solution
 from processor.stitching.fine.correspondences import Blocks
+from processor.stitching.fine.pair_checks import Pair
 from processor.stitching.planes import extraction, hashing
 
 HALVINGS = 3
@@ -24,18 +26,23 @@ REGIONS = 2**HALVINGS
 LEAST_PIECES = 4  # of a region
 ALMOST_NONE = 1e-9  # weight of the pieces left out
 BY_CHANCE = 1e-3
+LEAST_GROWTH = 0.01  # of a pose's covariance: a region that holds less of it decides nothing
 
 
-def with_raised_covariance(blocks: Blocks, solution: Solution, reference: int) -> Solution:
-    """Return the solution with each scan's covariance raised to its scatter between regions, never lowered."""
-    by_row = np.repeat(factors(blocks, solution, reference), 6)
-    return replace(solution, covariance=solution.covariance * by_row[:, None] * by_row[None])
+def with_raised_covariance(solution: Solution, pairs: Sequence[Pair], factor: Floats) -> tuple[Solution, list[Pair]]:
+    """Return a solution and pairs with covariances raised by each scan's ``factor`` (k,), of a pair by the larger."""
+    by_row = np.repeat(factor, 6)
+    return (
+        replace(solution, covariance=solution.covariance * by_row[:, None] * by_row[None]),
+        [replace(pair, covariance=pair.covariance * max(factor[pair.a], factor[pair.b]) ** 2) for pair in pairs],
+    )
 
 
 def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
     """Return the ratio (k,) of the standard deviations by regions to those of the adjustment; 1 if it may be chance.
 
-    The mean square of the motions without a region each, by their covariance, is chi-square by its freedoms.
+    The mean square of the motions without a region each, by the growth of their covariance, is chi-square by its
+    freedoms. A region that a pose rests on may be large: by the covariance alone it would count as a contradiction.
     """
     k, freedoms = len(solution.T), REGIONS - 1
     factor = np.ones(k)
@@ -43,21 +50,28 @@ def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
         return factor
     world = extraction.transformed(blocks.sums, solution.T[blocks.scan])
     mean = extraction.scatter(hashing.summed(world, blocks.piece, blocks.pieces))[0]
-    region = regions(mean)
-    steps = np.stack(
-        [
-            bundle_adjustment.step_without(blocks, solution, reference, region[blocks.piece] == g, ALMOST_NONE)
-            for g in range(REGIONS)
-        ]
-    )
-    steps = (steps - steps.mean(axis=0)).reshape(REGIONS, k, 6)
+    region = regions(mean)[blocks.piece]
+    none = np.zeros(len(region), bool)
+    rest, whole = bundle_adjustment.without(blocks, solution, reference, none, ALMOST_NONE)
+    square = np.zeros(k)
+    for g in range(REGIONS):
+        step, covariance = bundle_adjustment.without(blocks, solution, reference, region == g, ALMOST_NONE)
+        square += _squares(step - rest, covariance - whole, whole)
     for s in range(k):
-        C = solution.covariance[6 * s : 6 * s + 6, 6 * s : 6 * s + 6]
-        if s == reference or not np.isfinite(C).all():
-            continue
-        ratio = np.einsum("gi,gi->", steps[:, s], np.linalg.solve(C, steps[:, s].T).T) * freedoms / REGIONS / 6.0
+        ratio = square[s] / (6.0 * REGIONS)
         factor[s] = np.sqrt(ratio) if ratio > chi2.isf(BY_CHANCE, freedoms) / freedoms else 1.0
     return factor
+
+
+def _squares(step: Floats, growth: Floats, whole: Floats) -> Floats:
+    """Return the square (k,) of each pose's step by the growth of its covariance; 0 for poses that are not adjusted."""
+    square = np.zeros(len(step) // 6)
+    for s in range(len(square)):
+        rows = slice(6 * s, 6 * s + 6)
+        if whole[rows, rows].any():
+            C = growth[rows, rows] + LEAST_GROWTH * whole[rows, rows]
+            square[s] = float(step[rows] @ np.linalg.solve(C, step[rows]))
+    return square
 
 
 def regions(places: Floats) -> Ints:

@@ -1,0 +1,1 @@
+"""Missing material in clouds whose stations are not named: no ray shows that a place was looked at."""

@@ -1,0 +1,158 @@
+"""Bodies that are gone, by the places that they should hide: points where they would touch another body.
+
+A body of which no point was measured may be gone, or no station may have seen it. If points lie on the face that it
+should stand on, well within its outline and nearly as dense as elsewhere, no body stands there. How many points lie
+there by error is taken from the contacts of the other bodies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.defects.alignment import chart_of_cells
+from processor.defects.deviation_field import Field
+from processor.defects.observations import Observed, cells_of
+from processor.defects.regions import EMPTY_SHARE, Region, chernoff
+from processor.defects.surface_charts import PLANE, DesignSurface
+from processor.geometry import enclosure, mesh_distance
+from processor.geometry.mesh_distance import Bools
+from processor.model import Floats, Ints
+
+STEP_MM = 2.0  # between places by which contacts are measured
+WITHIN_MM = 4.0  # from the outline of a contact: beams at its border hit the face beside it
+DEPTH_MM = 1.0  # into the body, at which a place is tested
+ON_MM = 4.0  # distance from the face, up to which a point is on it
+GONE_SHARE = 0.02  # of the points that faces seen elsewhere have, up to which none of a body was measured
+FEWEST_CELLS = 2.0  # by area, of a body that can be judged
+NEAR_MM = 2.0  # margin of the box about a body
+GRID_SHARE = 0.01  # voxel by the design's size
+
+
+@dataclass(frozen=True)
+class _Contact:
+    """A body: area of its contacts (mm2, well within), points on them, and whether points lie on its faces."""
+
+    body: int
+    area: float
+    points: int
+    is_empty: bool
+
+
+def of_bodies(
+    observed: Observed, field: Field, surface: DesignSurface, hidden: Bools, alarms_per_mm2: float
+) -> list[Region]:
+    """Return the faces of bodies that are gone. ``hidden`` (cells, samples) are places that other bodies hide."""
+    body = enclosure.closed_bodies(surface.faces)
+    contacts = list(_contacts(observed, field, surface, hidden, body))
+    present = [contact for contact in contacts if not contact.is_empty]
+    if not present:
+        return []
+    rates = [contact.points / contact.area for contact in present]
+    # By error, on 1 mm2; points on the contact of a body that is gone also count for the one that it stood on.
+    rate = max(float(np.median(rates)), 1.0 / sum(contact.area for contact in present))
+    least = EMPTY_SHARE * _density(field, surface)
+    regions: list[Region] = []
+    for contact in contacts:
+        if not contact.is_empty or contact.points < least * contact.area:
+            continue
+        strength = chernoff(rate * contact.area, float(contact.points), more=True)
+        if strength > -np.log(alarms_per_mm2 * contact.area):
+            regions += _faces(surface, hidden, body, contact.body, strength)
+    return regions
+
+
+def _contacts(
+    observed: Observed, field: Field, surface: DesignSurface, hidden: Bools, body: Ints
+) -> Iterator[_Contact]:
+    """Yield the contacts of each closed body that has any."""
+    charts = surface.charts
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
+    touched = np.flatnonzero(hidden.any(axis=1) & (charts.kind == PLANE)[chart_of_cells(surface)])
+    places, inward, place_mm2 = _places_of(surface, touched)
+    found = _points_on(observed, surface, touched)
+    low, high = enclosure.boxes(surface.vertices, surface.faces, body)
+    typical = _density(field, surface) * charts.cell_mm**2
+    for one in range(len(low)):
+        only = np.where(body == one, 0, -1)
+
+        def number(points: Floats, normals: Floats, only: Ints = only, one: int = one) -> int:
+            near = ((points > low[one] - NEAR_MM) & (points < high[one] + NEAR_MM)).all(axis=1)
+            return int(_well_inside(points[near], normals[near], grid, only).sum())
+
+        samples = number(places, inward)
+        cells = _cells_of_body(surface, body, one)
+        judged = cells[field.inner[cells] > 0.0]
+        if samples and typical and len(judged) >= FEWEST_CELLS:
+            counted = (field.count + field.stray)[judged].sum()
+            empty = bool(counted <= GONE_SHARE * typical * surface.share[judged].sum())
+            yield _Contact(one, samples * place_mm2, number(*found), empty)
+
+
+def _density(field: Field, surface: DesignSurface) -> float:
+    """Return the median number of points on 1 mm2 of the faces that were seen; 0 if none were."""
+    seen = field.seen > 0.0
+    return float(np.median(field.count[seen])) / surface.charts.cell_mm**2 if seen.any() else 0.0
+
+
+def _well_inside(points: Floats, normals: Floats, grid: mesh_distance.FacetGrid, only: Ints) -> Bools:
+    """Mark the places (n, 3) of which all within WITHIN_MM along the face lie inside the one body of ``only`` (f,).
+
+    A contact is on two faces, of this body and of the one that it touches: both ways of the normal are tried.
+    """
+    inside = np.zeros(len(points), np.bool_)
+    if not len(points):
+        return inside
+    helper = np.eye(3)[np.argmin(np.abs(normals), axis=1)]
+    along = np.cross(normals, helper)
+    along /= np.linalg.norm(along, axis=1)[:, None]
+    across = np.cross(normals, along)
+    for way in (1.0, -1.0):
+        all_within = np.ones(len(points), np.bool_)
+        for a, b in ((0.0, 0.0), (1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0)):
+            place = points + WITHIN_MM * (a * along + b * across) + (way * DEPTH_MM - enclosure.OUTSIDE_MM) * normals
+            all_within &= enclosure.enclosed(place, normals, grid, only)
+        inside |= all_within
+    return inside
+
+
+def _places_of(surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats, float]:
+    """Return places (n, 3) spread over ``cells``, the faces' normals (n, 3), and the area of each place, mm2."""
+    charts = surface.charts
+    side = int(np.ceil(charts.cell_mm / STEP_MM))
+    offset = charts.cell_mm * ((np.indices((side, side)).reshape(2, -1).T + 0.5) / side - 0.5)
+    axes = charts.axes[chart_of_cells(surface)[cells]]
+    places = surface.centres[cells][:, None] + np.einsum("ok,nkj->noj", offset, axes[:, :2])
+    return places.reshape(-1, 3), np.repeat(axes[:, 2], side * side, axis=0), (charts.cell_mm / side) ** 2
+
+
+def _points_on(observed: Observed, surface: DesignSurface, cells: Ints) -> tuple[Floats, Floats]:
+    """Return the feet (n, 3) of points on ``cells`` of plane faces, and the faces' normals (n, 3)."""
+    charts = surface.charts
+    wanted = np.zeros(len(surface.share), np.bool_)
+    wanted[cells] = True
+    on = wanted[cells_of(observed, surface)] & (np.abs(observed.deviation) < ON_MM)
+    chart, uv = observed.chart[on], observed.uv[on]
+    axes = charts.axes[chart]
+    return charts.origin[chart] + np.einsum("nk,nkj->nj", uv, axes[:, :2]), axes[:, 2]
+
+
+def _cells_of_body(surface: DesignSurface, body: Ints, one: int) -> Ints:
+    """Return the cells of the faces that are of one body alone."""
+    charts = np.unique(surface.chart_of[body == one])
+    charts = np.setdiff1d(charts, surface.chart_of[body != one])
+    return np.flatnonzero(np.isin(chart_of_cells(surface), charts))
+
+
+def _faces(surface: DesignSurface, hidden: Bools, body: Ints, one: int, strength: float) -> Iterator[Region]:
+    """Yield the cells of each face of a body that could be seen, as missing."""
+    cells = _cells_of_body(surface, body, one)
+    cells = cells[(surface.covered & ~hidden)[cells].mean(axis=1) > 0.5 * surface.share[cells]]
+    cells = cells[surface.share[cells] > 0.0]
+    chart = chart_of_cells(surface)[cells]
+    chance = float(np.exp(-strength)) / surface.charts.cell_mm**2
+    for number in np.unique(chart):
+        yield Region(int(number), cells[chart == number], 0, float(np.sqrt(2.0 * strength)), chance)

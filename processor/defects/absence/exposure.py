@@ -1,0 +1,210 @@
+"""Holes in plates, by the steel around them: places that must be seen wherever their surroundings are seen.
+
+An empty place on a face may be missing, or in the shadow of something from all stations. Steel of the design cannot
+shade it if the place can be seen along every direction along which its seen surroundings can. Something that is not of
+the design may: a place counts as missing only where both sides of the plate are empty, which a shadow of one station
+does not do. The number of points to be expected follows from the density around.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+
+from processor.defects.alignment import chart_of_cells
+from processor.defects.deviation_field import Field
+from processor.defects.observations import cells_at
+from processor.defects.regions import EIGHT_NEIGHBOURS, EMPTY_SHARE, Region, chernoff
+from processor.defects.surface_charts import PLANE, DesignSurface
+from processor.geometry import mesh_distance
+from processor.geometry.mesh_distance import Bools, FacetGrid
+from processor.model import Floats, Ints
+
+PLATE_MM = 80.0  # largest thickness of a plate, whose other side is compared
+OPPOSITE_COS = -0.95  # of the normals of the two sides of a plate
+BEFORE_MM = 1.0  # start of a line of sight above the face
+DIRECTIONS = 400  # about a face, 5 degrees apart
+LEAST_COS = 0.2  # of incidence, as of points that are used
+LOST_SHARE = 0.05  # of a seen place's directions, that one beside it may lack: 1 of 400 that both sides lie in shade
+RING_CELLS = 3  # about an empty region: its surroundings
+FEWEST_RING = 4  # cells of the surroundings
+MOST_RING, MOST_CORE = 24, 60  # cells whose lines of sight are compared
+EXPOSED_SHARE = 0.5  # of the surroundings, from which a place can be seen as well
+LOW_QUANTILE = 0.25  # of the densities around: what is counted on
+SLIM = 4.0  # length of a strip along a border by its width: edges that a filter removed
+FEWEST_BEYOND = 100  # points beyond a place: where the cloud ends, it may have been cropped
+GRID_SHARE = 0.01  # voxel by the design's size
+FEWEST_PAIRS = 30  # of cells side by side, to estimate the scatter of numbers of points from
+
+
+@dataclass(frozen=True)
+class _Hole:
+    """An empty place on one side of a plate: its cells, those away from borders, and the points expected on these."""
+
+    chart: int
+    cells: Ints
+    core: Ints
+    expected: float
+    counted: float
+    spread: float  # variance of a number of points by that of a Poisson distribution
+
+
+def holes(field: Field, surface: DesignSurface, points: Floats, alarms_per_mm2: float) -> list[Region]:
+    """Return the empty places of plates of which both sides must have been seen; ``points`` (n, 3) are of the cloud."""
+    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
+    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
+    count = (field.count + field.stray).astype(np.float64)
+    opposite: dict[int, int] = {}
+    found: list[_Hole] = []
+    for chart in np.flatnonzero(surface.charts.kind == PLANE):
+        for cells, ring in _empty_regions(field, surface, count, int(chart)):
+            hole = _hole(field, surface, count, int(chart), cells, ring)
+            if hole is None or not _is_beyond(surface, hole, ring, points):
+                continue
+            other = _other_sides(surface, grid, hole.core)
+            if (other < 0).all() or not _is_exposed(surface, grid, hole.core, ring, 2.0 * size):
+                continue
+            opposite |= dict(zip(hole.core.tolist(), other.tolist(), strict=True))
+            found.append(hole)
+    return _both_sides(found, opposite, surface, alarms_per_mm2)
+
+
+def _both_sides(
+    found: list[_Hole], opposite: dict[int, int], surface: DesignSurface, alarms_per_mm2: float
+) -> list[Region]:
+    """Return the holes that both sides of a plate show, where so few points are improbable on both together."""
+    empty = {cell: row for row, hole in enumerate(found) for cell in hole.cells.tolist()}
+    regions, cell_mm2 = [], surface.charts.cell_mm**2
+    for hole in found:
+        behind = np.array([opposite[cell] for cell in hole.core.tolist()])
+        rows = {empty[cell] for cell in behind.tolist() if cell in empty}
+        shared = np.mean([cell in empty for cell in behind.tolist()])
+        if not rows or shared < EXPOSED_SHARE:
+            continue
+        sides = [hole, *(found[row] for row in rows)]
+        strength = sum(chernoff(side.expected, side.counted, more=False) / side.spread for side in sides)
+        if strength > -np.log(alarms_per_mm2 * cell_mm2):
+            chance = float(np.exp(-strength)) / cell_mm2
+            regions.append(Region(hole.chart, hole.cells, 0, float(np.sqrt(2.0 * strength)), chance))
+    return regions
+
+
+def _empty_regions(field: Field, surface: DesignSurface, count: Floats, chart: int) -> list[tuple[Ints, Ints]]:
+    """Return connected empty cells of a face, each with the seen cells about them."""
+    charts, first = surface.charts, int(surface.charts.first[chart])
+    inner, seen, share = (charts.image(x, chart) for x in (field.inner, field.seen, surface.share))
+    number = charts.image(count, chart)
+    on = (inner > 0.0) & (seen > 0.0)
+    if on.sum() < FEWEST_RING:
+        return []
+    low = float(np.quantile(number[on] / share[on], LOW_QUANTILE))
+    empty = (share > 0.0) & (number <= EMPTY_SHARE * low * share)
+    label, regions = ndimage.label(empty, EIGHT_NEIGHBOURS)
+    found = []
+    for k, box in enumerate(ndimage.find_objects(label, regions), start=1):
+        if box is None:
+            continue
+        wide = tuple(slice(max(part.start - RING_CELLS, 0), part.stop + RING_CELLS) for part in box)
+        mask = label[wide] == k
+        if not (mask & (inner[wide] > 0.0)).any():
+            continue
+        about = ndimage.binary_dilation(mask, EIGHT_NEIGHBOURS, RING_CELLS) & on[wide] & ~mask
+        rows = [np.flatnonzero(_placed(part, wide, label.shape)) + first for part in (mask, about)]
+        if len(rows[1]) >= FEWEST_RING:
+            found.append((rows[0], rows[1]))
+    return found
+
+
+def _placed(mask: Bools, box: tuple[slice, ...], shape: tuple[int, ...]) -> Bools:
+    whole = np.zeros(shape, np.bool_)
+    whole[box] = mask
+    return whole
+
+
+def _hole(field: Field, surface: DesignSurface, count: Floats, chart: int, cells: Ints, ring: Ints) -> _Hole | None:
+    """Return an empty place with the points expected there; None for a strip along a border of its face."""
+    core = cells[field.inner[cells] > 0.0]
+    grid = np.stack(np.divmod(core - surface.charts.first[chart], surface.charts.shape[chart, 1]), axis=1)
+    sides = np.ptp(grid, axis=0) + 1
+    if sides.max() >= SLIM * len(core) / sides.max():
+        return None
+    density = float(np.quantile(count[ring] / surface.share[ring], LOW_QUANTILE))
+    expected = density * float(surface.share[core].sum())
+    return _Hole(chart, cells, core, expected, float(count[core].sum()), _spread(field, surface, count, chart))
+
+
+def _spread(field: Field, surface: DesignSurface, count: Floats, chart: int) -> float:
+    """Return the variance of numbers of points by their mean, from cells side by side; at least 1 (Poisson)."""
+    charts = surface.charts
+    number, seen = charts.image(count, chart), charts.image(field.seen, chart) > 0.0
+    square = [
+        (a[both] - b[both]) ** 2 / np.maximum(a[both] + b[both], 1.0)
+        for a, b, both in (
+            (number[1:], number[:-1], seen[1:] & seen[:-1]),
+            (number[:, 1:], number[:, :-1], seen[:, 1:] & seen[:, :-1]),
+        )
+    ]
+    pairs = np.concatenate(square)
+    return max(float(pairs.mean()), 1.0) if len(pairs) >= FEWEST_PAIRS else 1.0
+
+
+def _is_beyond(surface: DesignSurface, hole: _Hole, ring: Ints, points: Floats) -> bool:
+    """Return whether the cloud goes on beyond a place, as seen from its surroundings: else it may end there."""
+    middle = surface.centres[hole.core].mean(axis=0)
+    way = middle - surface.centres[ring].mean(axis=0)
+    length = float(np.linalg.norm(way))
+    if length < 0.5 * surface.charts.cell_mm:  # steel all around
+        return True
+    return int(((points - middle) @ way > 0.0).sum()) >= FEWEST_BEYOND
+
+
+def _other_sides(surface: DesignSurface, grid: FacetGrid, cells: Ints) -> Ints:
+    """Return the cell (n,) on the other side of the plate at each of ``cells`` (n,); -1 where there is no plate."""
+    starts = surface.centres[cells] - 1e-3 * surface.outward[cells]
+    ends = surface.centres[cells] - PLATE_MM * surface.outward[cells]
+    row, facet, part = mesh_distance.crossings(grid, starts, ends, False)
+    facing = np.einsum("ni,ni->n", surface.normals[facet], surface.outward[cells[row]]) < OPPOSITE_COS
+    row, facet, part = row[facing], facet[facing], part[facing]
+    order = np.lexsort([part, row])
+    row, facet, part = row[order], facet[order], part[order]
+    first = np.unique(row, return_index=True)[1]
+    row, facet, part = row[first], facet[first], part[first]
+    other = np.full(len(cells), -1, np.int64)
+    places = starts[row] + part[:, None] * (ends[row] - starts[row])
+    other[row] = cells_at(surface, surface.chart_of[facet], places)
+    return other
+
+
+def _is_exposed(surface: DesignSurface, grid: FacetGrid, core: Ints, ring: Ints, far_mm: float) -> bool:
+    """Return whether the middle of a place can be seen along the directions of most of its surroundings.
+
+    All of its cells are compared, or an even sample of many.
+    """
+    core, ring = (x[:: max(1, -(-len(x) // most))] for x, most in ((core, MOST_CORE), (ring, MOST_RING)))
+    directions = _directions(surface, int(core[0]))
+    of_core, of_ring = (_open(surface, grid, x, directions, far_mm) for x in (core, ring))
+    lost = of_ring[None].astype(float).sum(axis=2) - of_core.astype(float) @ of_ring.T.astype(float)
+    exposed = lost <= LOST_SHARE * of_ring.sum(axis=1)[None]
+    return bool((exposed.mean(axis=1) >= EXPOSED_SHARE).mean() >= EXPOSED_SHARE)
+
+
+def _directions(surface: DesignSurface, cell: int) -> Floats:
+    """Return directions (d, 3) about the normal of a cell's face, evenly spread (Fibonacci's spiral)."""
+    k = np.arange(DIRECTIONS) + 0.5
+    height = 1.0 - k / DIRECTIONS * (1.0 - LEAST_COS)
+    turn = np.pi * (1.0 + np.sqrt(5.0)) * k
+    axes = surface.charts.axes[chart_of_cells(surface)[cell]]
+    across = np.sqrt(1.0 - height**2)
+    spread: Floats = np.stack([across * np.cos(turn), across * np.sin(turn), height], axis=1) @ axes
+    return spread
+
+
+def _open(surface: DesignSurface, grid: FacetGrid, cells: Ints, directions: Floats, far_mm: float) -> Bools:
+    """Return for each of ``cells`` (n,) and directions (d,) whether the design leaves the line of sight open."""
+    starts = np.repeat(surface.centres[cells] + BEFORE_MM * surface.outward[cells], len(directions), axis=0)
+    ends = starts + far_mm * np.tile(directions, (len(cells), 1))
+    clear = np.ones(len(starts), np.bool_)
+    clear[mesh_distance.crossings(grid, starts, ends, True)[0]] = False
+    return clear.reshape(len(cells), len(directions))
