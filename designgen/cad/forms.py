@@ -13,13 +13,13 @@ from typing import NamedTuple
 import numpy as np
 from scipy.interpolate import BSpline
 
-from designgen.designs.patch import Surface
 from processor.model import Floats, Ints
 
 PLANE, CYLINDER, CONE, SPHERE, TORUS = "plane", "cylinder", "cone", "sphere", "torus"
 SPLINE, EXTRUSION, REVOLUTION, FACETS = "spline", "extrusion", "revolution", "facets"
 LINE, ELLIPSE, CURVE = 0.0, 1.0, 2.0  # basis curves of extrusions and revolutions
 
+Surface = Callable[[Floats, Floats], Floats]  # parameters u, v (n,) -> points (n, 3)
 Curve = Callable[[Floats], Floats]  # parameters (n,) -> points (n, 3)
 
 

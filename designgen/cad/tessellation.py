@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from OCP.BRep import BRep_Builder, BRep_Tool
 from OCP.BRepMesh import BRepMesh_IncrementalMesh
 from OCP.BRepTools import BRepTools
@@ -18,7 +19,6 @@ from OCP.TopoDS import TopoDS, TopoDS_Compound
 from OCP.TopTools import TopTools_IndexedMapOfShape
 
 from designgen.cad.bodies import ANGLE_RAD, EDGE_SHARE
-from designgen.designs.patch import Bools
 from processor.model import Floats, Ints
 
 
@@ -98,7 +98,7 @@ def meshes(shape: Any) -> list[tuple[Any, Any, Any]]:
     return result
 
 
-def merged(points: Floats, triangles: Ints) -> tuple[Floats, Ints, Bools]:
+def merged(points: Floats, triangles: Ints) -> tuple[Floats, Ints, npt.NDArray[np.bool_]]:
     """Return the distinct points (v, 3), the triangles of these (f, 3), and which of the given triangles are kept.
 
     Triangles of which two corners are one point are left out.

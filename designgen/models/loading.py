@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from collections import Counter
 from collections.abc import Sequence
 from os import PathLike
 from pathlib import Path
@@ -14,7 +13,7 @@ import numpy as np
 from designgen.cad import files
 from designgen.cad.bodies import Body
 from designgen.models import cadquery_objects, mesh_bodies, mesh_files
-from designgen.models.model import Model, ModelBody, of_cad, turned, unique, volume
+from designgen.models.model import Model, ModelBody, of_cad, repeated, turned, unique, volume
 from processor.model import Floats, InputError, Ints, UsageError
 
 PYTHON = ".py"
@@ -80,7 +79,7 @@ def _of_file(path: Path, units: str) -> tuple[Sequence[Body | ModelBody], list[s
     cad = files.read(path, units, exact=True)
     notes = list(cad.problems)
     if cad.unit_mm != 1.0:
-        why = "by --units" if units else "by the file"
+        why = "given by --units" if units else "stated in the file"
         notes.insert(0, f"its numbers are in {cad.unit} ({cad.unit_mm:.10g} mm, {why}); the scene is in mm")
     return cad.bodies, notes
 
@@ -93,13 +92,7 @@ def _named(
     if bodies and isinstance(bodies[0], ModelBody):
         return tuple(bodies), tuple(notes)  # type: ignore[arg-type]
     names = [body.name for body in bodies]
-    repeated = {name: count for name, count in Counter(names).items() if count > 1}
-    if repeated:
-        most = max(repeated, key=lambda name: repeated[name])
-        notes.append(
-            f"{sum(repeated.values())} bodies share {len(repeated)} name(s), as {most!r} {repeated[most]} times: they "
-            f"are numbered, {most!r}, '{most} (2)', ..."
-        )
+    notes += repeated(names)
     stem = Path(file).stem
     numbered = sum(name.startswith(f"{stem}-") and name[len(stem) + 1 :].isdigit() for name in names)
     if numbered:

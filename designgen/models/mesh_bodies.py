@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from designgen.models.mesh_files import Piece
-from designgen.models.model import ModelBody, components, of_mesh, shared_edges, unique, volume
+from designgen.models.model import ModelBody, components, of_mesh, repeated, shared_edges, unique, volume
 from processor.model import Floats, InputError, Ints
 
 JOIN_SHARE = 1e-9  # of the model's size: vertices nearer to each other are one
@@ -27,7 +27,7 @@ def bodies_of(path: str, pieces: Sequence[Piece], stem: str) -> tuple[list[Model
             continue
         parts = _oriented(points, faces, name or stem, notes)
         if name:
-            parts = [np.concatenate(parts)] if parts else []
+            parts = [np.concatenate(parts)]
         for part in parts:
             found.append((name, *_compact(points, part)))
     if not found:
@@ -36,7 +36,8 @@ def bodies_of(path: str, pieces: Sequence[Piece], stem: str) -> tuple[list[Model
     names = [name or (f"{stem}-{i + 1}" if len(found) > 1 else stem) for i, (name, _, _) in enumerate(found)]
     if unnamed > 1:
         notes.append(f"{unnamed} connected parts have no names and are numbered as bodies {names[0]} to {names[-1]}")
-    for name, (_, _, faces) in zip(names, found, strict=True):
+    notes += repeated(names)
+    for name, (_, _, faces) in zip(unique(names), found, strict=True):
         if holes := _open_edges(faces):
             notes.append(f"{name!r} is not closed ({holes} open edges): it is scanned as it is, from both sides")
     return [of_mesh(name, points, faces) for name, (_, points, faces) in zip(unique(names), found, strict=True)], notes

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -119,6 +120,18 @@ def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0
         flat=(True,) * count,
         smooth=tuple(range(count)),
     )
+
+
+def repeated(names: Sequence[str]) -> list[str]:
+    """Return a note on names that several bodies have, which :func:`unique` numbers; empty without such names."""
+    shared = {name: count for name, count in Counter(names).items() if count > 1}
+    if not shared:
+        return []
+    most = max(shared, key=lambda name: shared[name])
+    return [
+        f"{sum(shared.values())} bodies share {len(shared)} name(s), as {most!r} {shared[most]} times: they "
+        f"are numbered, {most!r}, '{most} (2)', ..."
+    ]
 
 
 def unique(names: Sequence[str]) -> list[str]:

@@ -44,17 +44,14 @@ def given(path: Path, seed: int) -> dict[str, Floats]:
     try:
         content = json.loads(path.read_text("utf-8"))
         entries = content.items() if isinstance(content, dict) else [(entry["id"], entry) for entry in content]
-        places = {str(name): (_position(entry), entry.get("heading_deg")) for name, entry in entries}
+        places = {str(name): (_position(entry), _heading(str(name), entry, seed)) for name, entry in entries}
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror or error})") from None
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise InputError(f"{path}: expected stations as {form}, found others ({error})") from None
     if not places:
         raise InputError(f"{path}: expected stations as {form}, found none")
-    return {
-        name: levelled_pose(position, _heading(name, seed) if heading is None else math.radians(float(heading)))
-        for name, (position, heading) in places.items()
-    }
+    return {name: levelled_pose(position, heading) for name, (position, heading) in places.items()}
 
 
 def _position(entry: Any) -> Floats:
@@ -64,7 +61,17 @@ def _position(entry: Any) -> Floats:
     return position
 
 
-def _heading(name: str, seed: int) -> float:
+def _heading(name: str, entry: Any, seed: int) -> float:
+    """Return the heading of a station, rad: given, or drawn."""
+    if "heading_deg" in entry:
+        heading = math.radians(float(entry["heading_deg"]))
+        if not math.isfinite(heading):
+            raise ValueError(f"heading_deg {entry['heading_deg']!r}")
+        return heading
+    return _drawn(name, seed)
+
+
+def _drawn(name: str, seed: int) -> float:
     return float(generator(seed, f"place {name}").uniform(0.0, 2.0 * np.pi))
 
 
@@ -91,7 +98,7 @@ def placed(model: Model, count: int, distance_mm: float | None, device: Scanner,
         best = int(np.argmax(gains))  # the first of equal ones
         chosen.append(best)
         worth = np.where(seen[best], AGAIN * worth, worth)
-    return {f"S{i + 1}": levelled_pose(places[k], _heading(f"S{i + 1}", seed)) for i, k in enumerate(chosen)}
+    return {f"S{i + 1}": levelled_pose(places[k], _drawn(f"S{i + 1}", seed)) for i, k in enumerate(chosen)}
 
 
 def _room(device: Scanner) -> float:

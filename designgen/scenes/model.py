@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from designgen.asbuilt import bodies
-from designgen.models import loading, placement
+from designgen.models import as_built, loading, placement
 from designgen.models.model import Model, ModelBody
 from designgen.reading import filled
 from designgen.recipe_files import Recipe, overridden
@@ -65,7 +64,7 @@ def make(
     loading.say(model)
     params, origin = scanning.params, np.array(scanning.params.origin_mm)
     names = tuple(body.name for body in model.bodies)
-    built = bodies.build(model, bodies.params_of(recipe, names), seed)
+    built = as_built.build(model, as_built.params_of(recipe, names), seed)
     poses = _poses(model, recipe, scanning, seed)
     surveyed = survey.survey(_surfaces(built.bodies), names, poses, scanning.device, params, seed)
     scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)

@@ -328,7 +328,7 @@ def test_the_software_of_a_scene_is_what_makes_it():
     assert set(batch.software()) == {"designgen", *batch.SOFTWARE}
 
 
-LAYERS = ("designs", "asbuilt", "scanning", "scenes", "export")  # each imports only those before it, and cad none
+LAYERS = ("designs", "asbuilt", "scanning", "models", "scenes", "export")  # each imports those before it, cad none
 
 
 def test_imports_go_one_way():

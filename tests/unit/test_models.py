@@ -13,8 +13,7 @@ from OCP.BRepExtrema import BRepExtrema_DistShapeShape
 from OCP.gp import gp_Pnt
 
 import designgen
-from designgen.asbuilt import bodies
-from designgen.models import loading, placement
+from designgen.models import as_built, loading, placement
 from designgen.models.model import of_mesh, unique
 from designgen.scanning import returns, scanner, surfaces, survey
 from designgen.scanning.surfaces import Builder
@@ -138,8 +137,8 @@ def test_bodies_as_built_are_where_the_truth_has_them(source):
     if source == "mesh":
         plate = loading.load((plate.bodies[0].vertices, plate.bodies[0].triangles))
     name = plate.bodies[0].name
-    params = bodies.Params(dent_mm=5.0, dent_radius_mm=90.0, dent_at_mm=(100.0, 20.0, 10.0), move_mm=(0.0, 0.0, 7.0))
-    built = bodies.build(plate, {name: params}, 0)
+    params = as_built.Params(dent_mm=5.0, dent_radius_mm=90.0, dent_at_mm=(100.0, 20.0, 10.0), move_mm=(0.0, 0.0, 7.0))
+    built = as_built.build(plate, {name: params}, 0)
     assert built.defects.classes == ("dent", "misalignment")
     np.testing.assert_allclose(built.defects.depth_max_mm, [5.0, 7.0])
     hits = hits_on(dataclasses.replace(plate, bodies=built.bodies), 4.0)
@@ -154,19 +153,19 @@ def test_bodies_as_built_are_where_the_truth_has_them(source):
 
 def test_bodies_that_bend_turn_and_are_left_out():
     beam = loading.load(cq.Workplane().box(2000, 100, 40))
-    built = bodies.build(beam, {"model-1": bodies.Params(bend_mm=6.0, bend_along=(0.0, 0.0, 1.0))}, 0)
+    built = as_built.build(beam, {"model-1": as_built.Params(bend_mm=6.0, bend_along=(0.0, 0.0, 1.0))}, 0)
     hits = hits_on(dataclasses.replace(beam, bodies=built.bodies))
     top = hits[(np.abs(hits[:, 1]) < 40.0) & (np.abs(hits[:, 0]) < 900.0) & (hits[:, 2] > 15.0)]
     assert len(top) > 100
     np.testing.assert_allclose(top[:, 2], 20.0 + 6.0 * np.cos(np.pi * top[:, 0] / 2000.0), atol=0.01)
-    turned = bodies.build(beam, {"model-1": bodies.Params(turn_deg=(0.0, 0.0, 90.0))}, 0).bodies[0]
+    turned = as_built.build(beam, {"model-1": as_built.Params(turn_deg=(0.0, 0.0, 90.0))}, 0).bodies[0]
     np.testing.assert_allclose(np.ptp(turned.vertices, axis=0), [100.0, 2000.0, 40.0], atol=1e-9)
-    gone = bodies.build(beam, {"model-1": bodies.Params(missing=True)}, 0)
+    gone = as_built.build(beam, {"model-1": as_built.Params(missing=True)}, 0)
     assert gone.bodies == (None,)
     assert gone.defects.classes == ("missing-part",)
     assert gone.defects.volume_mm3[0] == pytest.approx(2000.0 * 100.0 * 40.0)
     with pytest.raises(UsageError, match="no body of this name; there are 1, as model-1"):
-        bodies.params_of({"asbuilt": {"modell-1": {}}}, ["model-1"])
+        as_built.params_of({"asbuilt": {"modell-1": {}}}, ["model-1"])
 
 
 def test_files_come_back(tmp_path, caplog):

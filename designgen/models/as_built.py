@@ -113,7 +113,7 @@ def params_of(recipe: Mapping[str, Any], names: Sequence[str]) -> dict[str, Para
             raise UsageError(
                 f"asbuilt.{name}: the model has no body of this name; there are {len(names)}, as {', '.join(near)}"
             )
-    return {name: filled(Params, section, name) for name in section}
+    return {name: filled(Params, {f"asbuilt.{name}": table}, f"asbuilt.{name}") for name, table in section.items()}
 
 
 def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
