@@ -43,7 +43,7 @@ def design_of(parts):
     )
 
 
-def cloud(part, seed=0, spacing_mm=10.0, sigma_mm=1.0):
+def cloud(part, seed=0, spacing_mm=14.0, sigma_mm=1.0):
     """Points of a part in the bridge's frame."""
     params = sampler.Params(spacing_mm=spacing_mm, sigma_mm=sigma_mm)
     return sampler.scan_part(part, 0, params, np.random.default_rng(seed)).points
@@ -178,7 +178,7 @@ def without_the_marks_places(part, points):
 
 def test_a_part_of_which_no_mark_was_seen_says_which_other_it_may_be():
     parts, design = bridge()
-    scan, _ = scanned(without_the_marks_places(parts[1], cloud(parts[1], spacing_mm=14.0)))
+    scan, _ = scanned(without_the_marks_places(parts[1], cloud(parts[1])))
     found = measured(design, 1, scan)
     assert (found.status, found.reasons) == ("ok", (reason("preassemble.mark-not-seen", parts=("rib3",)),))
 
@@ -309,7 +309,7 @@ def test_two_scans_of_one_part_make_one():
     """One scan shows the left side, the other the right: each constrains the part, only both show whole ends."""
     parts, design = bridge()
     part = parts[RIB]
-    points = cloud(part, spacing_mm=12.0)
+    points = cloud(part, spacing_mm=16.0)
     one, T = scanned(points[points[:, 1] > -50.0], 1, "left")
     other, _ = scanned(points[points[:, 1] < 50.0], 2, "right")
     both = measured(design, RIB, one, other)

@@ -132,7 +132,14 @@ def _hole(field: Field, surface: DesignSurface, count: Floats, chart: int, cells
         return None
     density = float(np.quantile(count[ring] / surface.share[ring], LOW_QUANTILE))
     expected = density * float(surface.share[core].sum())
-    return _Hole(chart, cells, core, expected, float(count[core].sum()), _spread(field, surface, count, chart))
+    return _Hole(
+        chart=chart,
+        cells=cells,
+        core=core,
+        expected=expected,
+        counted=float(count[core].sum()),
+        spread=_spread(field, surface, count, chart),
+    )
 
 
 def _spread(field: Field, surface: DesignSurface, count: Floats, chart: int) -> float:
