@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.geometry import unit_ratio
+from processor import unit_ratio
 from processor.geometry.m3c2 import Scales
 from processor.model import Floats
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.geometry import unit_ratio
+from processor import unit_ratio
 from processor.model import Floats, InputError, UsageError
 
 MM_PER_UNIT = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from processor.geometry import unit_ratio
+from processor import unit_ratio
 from processor.model import Word
 
 LEAST_POINTS = 3

@@ -88,7 +88,7 @@ def circles():
 
 
 def crowded_folders():
-    counts = Counter(str(path.parent.relative_to(ROOT)) for path in SOURCES if path.name != "__init__.py")
+    counts = Counter(str(path.parent.relative_to(ROOT)) for path in SOURCES)
     return {folder: count for folder, count in counts.items() if count > MOST_FILES}
 
 
@@ -138,7 +138,7 @@ STEPS = ("defects", "deviation", "preassembly", "space_frame", "stitching")
 LAYERS = (
     ("version",),
     ("model",),
-    ("progress", "language", "jobs"),
+    ("progress", "language", "jobs", "unit_ratio"),
     ("geometry",),
     ("adjustment",),
     ("limits", "store"),
@@ -154,7 +154,7 @@ LAYERS = (
     ("cli",),
     ("__main__",),
 )
-FOR_STEPS = ("version", "model", "progress", "geometry", "adjustment", "limits")
+FOR_STEPS = ("version", "model", "progress", "unit_ratio", "geometry", "adjustment", "limits")
 
 
 def wrong_arrows():

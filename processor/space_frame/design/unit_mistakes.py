@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from processor.geometry import unit_ratio
+from processor import unit_ratio
 from processor.model import Floats, Reason, reason
 
 FACTORS = (1000.0, 304.8, 25.4)  # m, feet and inches read as mm, or the other way round
