@@ -415,3 +415,18 @@ def test_the_roof_that_moved_is_measured_within_its_level_of_detection(seed):
     assert all(one.passed for one in deviation_evaluation.check(scene, result, truth))
     assert np.isfinite(result.core.lod95).mean() > 0.95
     assert np.nanmedian(result.core.lod95) < 2.0
+
+
+@pytest.mark.parametrize("size_mm", [(200.0, 100.0, 20.0), (60.0, 40.0, 10.0)])
+def test_a_part_too_small_for_blocks_of_the_stable_fit_has_a_result(size_mm):
+    """From a shifted frame, so that the part is registered."""
+    mesh = trimesh.creation.box(size_mm)
+    rng = np.random.default_rng(3)
+    points = np.asarray(trimesh.sample.sample_surface(mesh, 4000, seed=3)[0])
+    turn = np.eye(4)
+    turn[:3, 3] = 300.0, -200.0, 50.0
+    scan = Scan("scan", rigid.apply(turn, points + rng.normal(0.0, 0.5, points.shape)))
+    design = StructureDesign("box", np.asarray(mesh.vertices), np.asarray(mesh.faces))
+    result = deviation_step.run(Scene("box", "structure", (scan,), structure=design), deviation_step.Params())
+    assert result.status in (Status.OK, Status.WEAK, Status.AMBIGUOUS)
+    assert result.core_points > 0

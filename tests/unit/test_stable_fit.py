@@ -100,3 +100,8 @@ def test_a_plane_determines_no_motion_along_itself_but_an_error_along_its_normal
     assert 0.0 < found.stable.error_mm < SD / np.sqrt(POINTS)
     few = Samples(core.points[:8], core.normals[:8], core.facet[:8])
     assert not stable_fit.fits(few, moved(few, np.zeros((8, 3)), 1), 2.0 * SPACING, SPACING, 0).determined
+
+
+def test_a_part_without_a_block_of_enough_points_has_no_cells():
+    """As of a small part, of which no block is left."""
+    assert stable_fit._cells(np.empty((0, 3)), 100.0).shape == (0, 3)
