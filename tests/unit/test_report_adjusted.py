@@ -180,7 +180,7 @@ def test_why_a_method_failed_is_said_and_it_is_not_drawn():
     nothing = Deviations(deviation=np.full(120, NAN))
     result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
-    caption, picture = all_figures.draw_figures(silent, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = drawn(silent)["preassemble"]["linear-error.png"]
     assert "without a result, so not drawn: line" in str(caption)
     assert picture != answered[1]
     data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
