@@ -158,7 +158,7 @@ def test_hits_lie_on_the_surface_of_the_solid(kind):
     hits = hits_on(loading.load(SOLIDS[kind]))
     assert len(hits) > 300
     shell = cq.Compound.makeCompound(SOLIDS[kind].val().Shells()).wrapped
-    picked = hits[np.random.default_rng(0).choice(len(hits), 120, replace=False)]
+    picked = hits[np.random.default_rng(0).choice(len(hits), 300, replace=False)]
     vertices = (BRepBuilderAPI_MakeVertex(gp_Pnt(*hit)).Vertex() for hit in picked.tolist())
     distances = [BRepExtrema_DistShapeShape(vertex, shell).Value() for vertex in vertices]
     assert max(distances) < 1e-5, "a hit is refined to 1e-5 mm; 0.01 mm is promised"
