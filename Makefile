@@ -10,12 +10,13 @@ JOBS ?= 2
 demo: $(VENV)/.demo
 	@BIN=$(BIN) OUT=$(OUT) sh .ci/demo
 
-# All tests but the slow ones; weekend runs these, too.
+# All tests but the slow ones; weekend runs these, too. The types are checked beside them: that takes one core.
 test: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
-	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
+	@$(BIN)/mypy >$(VENV)/mypy.log 2>&1 & types=$$!; \
+	OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"; tests=$$?; \
+	wait $$types; types=$$?; cat $(VENV)/mypy.log; exit $$((tests || types))
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check --fix .

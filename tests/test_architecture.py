@@ -80,3 +80,14 @@ def test_help_comes_at_once(module):
         after = os.times()  # of processors: other work on the machine does not count
         took.append(after.children_user + after.children_system - before.children_user - before.children_system)
     assert min(took) < 1.0
+
+
+def test_a_run_begins_without_what_few_runs_need():
+    """A batch starts a process for every input: half a second each of loading all distributions and PDF fonts."""
+    code = (
+        "import sys; from processor import pipeline; from processor.api import runs\n"
+        "pipeline.step_modules()\n"
+        "heavy = {'scipy.stats', 'fontTools.subset', 'matplotlib.pyplot', 'cadquery'} & set(sys.modules)\n"
+        "assert not heavy, heavy"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

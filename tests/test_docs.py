@@ -188,6 +188,8 @@ def place(tmp_path, monkeypatch):
     (tmp_path / "mine.toml").write_text("\n".join(blocks(ROOT / "docs/parameters.md", "toml")))
     cadquery.exporters.export(cadquery.Workplane().box(200.0, 100.0, 20.0), str(tmp_path / "design.step"))
     monkeypatch.chdir(tmp_path)
+    # Where nothing is compiled yet, the two jobs of the batch would compile the same kernels at the same time.
+    invoke("processor run projects/frame-1 -o compiled")
     invoke("designgen make arch-s1 -o s1.h5 --set scan.spacing_mm=100")
     invoke(f"designgen make {fixtures / 'frame-of-four.toml'} -o roof.h5 --set scan.step_mrad=10")
     plates = '--set scan.step_mrad=3 --set \'structure.components=["none", "none", "dent"]\''

@@ -37,6 +37,11 @@ def serve() -> None:
     for stream in (1, 2):
         os.dup2(nowhere, stream)
     _limit(job["limit_s"], job["memory_bytes"])
+    answer(job, content, answers)
+
+
+def answer(job: dict[str, Any], content: bytes, answers: IO[bytes]) -> None:
+    """Read the content of a file and write the bodies, or the error, to ``answers``; ``job`` as for :func:`serve`."""
     path, cad = job["path"], None
     try:
         cad = parse(path, job["suffix"], content, job["units"], job["default_units"], exact=job["exact"])
@@ -89,7 +94,7 @@ def _header(cad: CadFile) -> dict[str, Any]:
 
 
 def received(answer: IO[bytes]) -> CadFile:
-    """Return the content of an answer of :func:`serve`.
+    """Return the content of an :func:`answer`.
 
     Raises the InputError or UsageError in the answer; ValueError, KeyError, TypeError or EOFError for an invalid one.
     """

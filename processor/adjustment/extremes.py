@@ -10,7 +10,7 @@ value has it. Values that cannot be the greatest are left out; where one stands 
 from __future__ import annotations
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processor.model import NORMAL_95, Floats
 
@@ -28,7 +28,7 @@ def of_independent(values: Floats, sd: Floats, axes: int = 1) -> tuple[float, fl
     """
     top = int(np.argmax(values))
     near = values >= values[top] - CLEAR_SD * (sd + sd[top]) - EXACT_MM
-    reach = float(np.sqrt(chi2.ppf(0.95 ** (1.0 / near.sum()), axes))) * sd[near]
+    reach = float(np.sqrt(chdtri(axes, 1.0 - 0.95 ** (1.0 / near.sum())))) * sd[near]
     return float(values[top]), float((values[near] - reach).max()), float((values[near] + reach).max())
 
 

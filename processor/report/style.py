@@ -15,7 +15,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib import font_manager
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_pdf import PdfPages
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 from matplotlib.ft2font import FT2Font
@@ -56,6 +55,8 @@ def png(figure: Figure) -> bytes:
 
 def pdf(pages: Iterable[Figure]) -> bytes:
     """Write figures as a document of a page each, without a date."""
+    from matplotlib.backends.backend_pdf import PdfPages  # takes long to load, and few runs write documents
+
     out = io.BytesIO()
     with PdfPages(out, metadata={"CreationDate": None, "Creator": None, "Producer": None}) as document:
         for page in pages:

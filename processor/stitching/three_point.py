@@ -11,8 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import f
-from scipy.stats import t as student
+from scipy.special import fdtri, stdtrit
 
 from processor.adjustment import data_snooping
 from processor.geometry import rigid
@@ -124,7 +123,7 @@ def pooled(fits: list[PairFit]) -> list[PairFit]:
         rest = [max(freedoms - fit.freedoms, 1) for fit in used]
         others = [(freedoms * sd**2 - fit.freedoms * fit.sd_mm**2) / n for fit, n in zip(used, rest, strict=True)]
         beyond = [
-            fit.sd_mm**2 / max(variance, 1e-300) / f.isf(BY_CHANCE / len(fits), fit.freedoms, n)
+            fit.sd_mm**2 / max(variance, 1e-300) / fdtri(fit.freedoms, n, 1.0 - BY_CHANCE / len(fits))
             for fit, variance, n in zip(used, others, rest, strict=True)
         ]
         if len(used) < 3 or max(beyond) <= 1.0:
@@ -143,7 +142,7 @@ def pooled(fits: list[PairFit]) -> list[PairFit]:
 
 def _with_sd(fit: PairFit, sd: float, freedoms: int, scaled_sd: float, scaled_freedoms: int) -> PairFit:
     """Scale the covariances of a pair to standard deviations that are known by so many freedoms."""
-    factor = sd / fit.sd_mm * float(student.isf(0.025, freedoms)) / NORMAL_95
+    factor = sd / fit.sd_mm * float(stdtrit(freedoms, 0.975)) / NORMAL_95
     return replace(
         fit, sd_mm=sd, covariance=fit.covariance * factor**2, scale_sd=scaled_sd / fit.scaled_sd_mm * fit.scale_sd,
         scaled_sd_mm=scaled_sd, scaled_freedoms=scaled_freedoms,
@@ -156,7 +155,7 @@ def cause_of_scale(scale: float, sd: float, limit_ppm: float, freedoms: float = 
     slip = units_slip(scale)
     if slip:
         return reason("stitch.scale-of-units", scale=scale, units=slip)
-    if off <= float(student.isf(0.5 * SCALE_BY_CHANCE, freedoms)) * 1e6 * sd:
+    if off <= float(stdtrit(freedoms, 1.0 - 0.5 * SCALE_BY_CHANCE)) * 1e6 * sd:
         return None
     if off > limit_ppm:
         return reason("stitch.scale-by-blunder", scale=scale)
@@ -165,7 +164,7 @@ def cause_of_scale(scale: float, sd: float, limit_ppm: float, freedoms: float = 
 
 def widened(sd: float, freedoms: float) -> float:
     """Scale a standard deviation known by a few freedoms such that 1.96 of it contain 95 % (Student's t)."""
-    return float(student.isf(0.025, freedoms)) / NORMAL_95 * sd
+    return float(stdtrit(freedoms, 0.975)) / NORMAL_95 * sd
 
 
 def as_pair(a: int, b: int, fit: PairFit) -> Pair:

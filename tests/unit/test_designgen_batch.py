@@ -1,9 +1,11 @@
 """Folders of scenes: the same bytes whoever makes them, taken up after a kill, failures recorded, usage refused."""
 
+import contextlib
 import csv
 import fcntl
 import functools
 import hashlib
+import io
 import json
 import os
 import pty
@@ -17,12 +19,14 @@ import sys
 import termios
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 import h5py
 import numpy as np
 import pytest
 
-from designgen import batch, recipe_files
+from designgen import __main__, batch, recipe_files
 from processor.jobs import process as processes
 from processor.jobs import runner
 from processor.jobs.child import Loss, Lost
@@ -36,6 +40,22 @@ MARK = "STARTED_FOR"
 
 
 def run(*arguments, code=0, command=MAKE):
+    """Run the command line in this process, whatever processes it starts itself."""
+    out, err = io.StringIO(), io.StringIO()
+    with (
+        mock.patch.object(sys, "argv", ["designgen", *command[3:], *map(str, arguments)]),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+        pytest.raises(SystemExit) as end,
+    ):
+        __main__.main()
+    assert (end.value.code or 0) == code, err.getvalue()
+    assert "Traceback" not in err.getvalue()
+    return SimpleNamespace(stdout=out.getvalue(), stderr=err.getvalue())
+
+
+def run_by_itself(*arguments, code=0, command=MAKE):
+    """Run the command line in a process of its own."""
     done = subprocess.run([*command, *map(str, arguments)], capture_output=True, text=True, timeout=300)
     assert done.returncode == code, done.stderr
     assert "Traceback" not in done.stderr
@@ -64,7 +84,7 @@ def times(folder):
 def made(tmp_path_factory):
     """Three seeds made by one process; not to be changed."""
     folder = tmp_path_factory.mktemp("batch") / "set"
-    run("-o", folder, "--count", 3, "--seed", 7)
+    run_by_itself("-o", folder, "--count", 3, "--seed", 7)
     return folder
 
 

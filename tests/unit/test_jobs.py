@@ -98,9 +98,10 @@ def test_a_job_is_stopped_at_once():
 
 
 def test_an_error_of_a_job_here_stops_the_others():
-    stopped = []
+    stopped, all_began = [], threading.Barrier(3, timeout=60.0)
 
     def do(job, is_stopped):
+        all_began.wait()
         if job == 0:
             raise InputError("no room")
         while not is_stopped():

@@ -1,8 +1,10 @@
-"""Scans of any model: hits against the CAD kernel's own distances, labels, stations, bodies as built, bad input."""
+"""Scans of models: points and hits on the CAD kernel's surfaces, labels, stations, bodies as built, bad models."""
 
 import dataclasses
 import json
 import logging
+import sys
+from types import SimpleNamespace
 
 import cadquery as cq
 import numpy as np
@@ -13,14 +15,31 @@ from OCP.BRepExtrema import BRepExtrema_DistShapeShape
 from OCP.gp import gp_Pnt
 
 import designgen
+from designgen import __main__, recipe_files
 from designgen.models import as_built, loading, placement
 from designgen.models.model import of_mesh, unique
 from designgen.scanning import returns, scanner, surfaces, survey
 from designgen.scanning.surfaces import Builder
+from designgen.scenes import make
 from designgen.scenes.model import recipe_of
 from processor.model import InputError, UsageError
 
 QUIET = scanner.Scanner(**{**scanner.preset("phase"), "flying_share": 0.0, "threshold": 0.0})
+FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 2.5}
+FEW = {"scan.step_mrad": 4.0}
+TOLERANCE_MM = 0.01  # of points on a CAD model, stated in docs/simulation.md
+NAMES = ("box", "cylinder", "cone", "ball", "torus", "spline")
+CORNERS = np.array([[x, y, z] for z in (0.0, 900.0) for y in (0.0, 900.0) for x in (0.0, 900.0)])
+SIDES = np.array(
+    [
+        *([0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4]),
+        *([2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5]),
+    ]
+)
+EMPTY_STEP = (
+    "ISO-10303-21;\nHEADER;\nFILE_DESCRIPTION((''),'2;1');\nFILE_NAME('','',(''),(''),'','','');\n"
+    "FILE_SCHEMA(('AUTOMOTIVE_DESIGN'));\nENDSEC;\nDATA;\nENDSEC;\nEND-ISO-10303-21;\n"
+)
 SPLINE = [(100, 0), (60, 80), (-70, 60), (-90, -40), (20, -90)]
 SOLIDS = {
     "plane": cq.Workplane().box(300, 200, 100),
@@ -32,6 +51,57 @@ SOLIDS = {
     "loft": cq.Workplane().rect(200, 150).workplane(offset=120).circle(60).workplane(offset=100).rect(60, 90).loft(),
     "fillets and holes": cq.Workplane().box(300, 200, 60).edges("|Z").fillet(40).faces("<Z").workplane().hole(25),
 }
+
+
+def mesh_text(faces, vertices=CORNERS, name="plain"):
+    """A mesh as the text of an STL file."""
+    lines = [f"solid {name}"]
+    for face in faces:
+        corners = "\n".join("vertex {} {} {}".format(*vertices[k]) for k in face)
+        lines.append(f"facet normal 0 0 0\nouter loop\n{corners}\nendloop\nendfacet")
+    return "\n".join([*lines, f"endsolid {name}\n"])
+
+
+def shapes():
+    outline = [(0, 0), (100, 120), (300, 40), (400, 100)]
+    spline = cq.Workplane().moveTo(1200, 600).spline([(1200 + x, 600 + y) for x, y in outline[1:]], includeCurrent=True)
+    return {
+        "box": cq.Solid.makeBox(400, 300, 200),
+        "cylinder": cq.Solid.makeCylinder(80, 300, cq.Vector(700, 0, 0)),
+        "cone": cq.Solid.makeCone(120, 40, 250, cq.Vector(0, 700, 0)),
+        "ball": cq.Solid.makeSphere(150, cq.Vector(700, 700, 150), angleDegrees1=-90),
+        "torus": cq.Solid.makeTorus(150, 40, cq.Vector(1400, 0, 40)),
+        "spline": spline.lineTo(1600, 900).lineTo(1200, 900).close().extrude(150).val(),
+    }
+
+
+def assembly(of):
+    whole = cq.Assembly(name="whole")
+    for name, shape in of.items():
+        whole.add(shape, name=name)
+    return whole
+
+
+def joined(scene, truth):
+    """All points in the project's frame, with the names of their body and face."""
+    columns = []
+    for scan, label in zip(scene.scans, truth.labels, strict=True):
+        T = scan.T_project_scan
+        faces = [(*label.surface_names, "")[k] for k in label.surface]
+        columns.append((scan.points @ T[:3, :3].T + T[:3, 3], np.take(label.part_names, label.part), faces))
+    return tuple(np.concatenate(column) for column in zip(*columns, strict=True))
+
+
+def departures(points, shape):
+    """Distances of points from a shape, mm, by the CAD kernel (BRepExtrema)."""
+    return np.array([cq.Vertex.makeVertex(*point).distance(shape) for point in points])
+
+
+def run(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["designgen", *map(str, arguments)])
+    with pytest.raises(SystemExit) as ended:
+        __main__.main()
+    return ended.value.code or 0
 
 
 def surfaces_of(model):
@@ -51,6 +121,36 @@ def hits_on(model, step_mrad=6.0, stations=4):
         ).returns
         found.append(seen.hits[seen.source == 0] @ T[:3, :3].T + T[:3, 3])
     return np.concatenate(found)
+
+
+# --- points, hits and labels ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def seen():
+    made = shapes()
+    scene, truth = designgen.scan(assembly(made), stations=4, seed=1, settings=FINE)
+    points, bodies, faces = joined(scene, truth)
+    return SimpleNamespace(shapes=made, scene=scene, truth=truth, points=points, bodies=bodies, faces=faces)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_points_lie_on_the_face_that_their_label_names(seen, name):
+    faces = seen.shapes[name].Faces()
+    names = np.unique(seen.faces[seen.bodies == name])
+    assert len(names) >= len(faces) - 1, "the scanner sees every face but the bottom"
+    for face in names:
+        rows = np.flatnonzero((seen.bodies == name) & (seen.faces == face))
+        points = seen.points[rows[:: len(rows) // 40 + 1]]
+        assert departures(points, faces[int(face.removeprefix("face ")) - 1]).max() < TOLERANCE_MM, face
+
+
+def test_labels_name_bodies_and_what_is_as_designed_has_no_defect(seen):
+    assert seen.scene.kind == "structure"
+    assert all(label.part_names == NAMES for label in seen.truth.labels)
+    assert len(seen.truth.defects.ids) == 0
+    assert len(seen.truth.structure.displacement) > 1000
+    assert not seen.truth.structure.displacement.any()
 
 
 @pytest.mark.parametrize("kind", SOLIDS)
@@ -84,43 +184,81 @@ def test_a_tree_of_triangles_gives_the_same_returns(monkeypatch):
         np.testing.assert_array_equal(getattr(found[0], field.name), getattr(found[1], field.name))
 
 
-def assembly():
-    made = cq.Assembly(name="frame")
-    made.add(cq.Workplane().box(1000, 400, 20), name="plate")
-    made.add(cq.Workplane().circle(60).extrude(600).translate((0, 0, 10)), name="tube")
-    return made
+def test_a_step_file_by_the_command(tmp_path, monkeypatch, capsys, caplog):
+    whole = cq.Workplane().box(8, 4, 3).edges("|Z").fillet(1).faces(">Z").workplane().hole(2.0)
+    path, output = tmp_path / "part.step", tmp_path / "out.h5"
+    cq.exporters.export(whole, str(path))
+    settings = [part for key, value in FINE.items() for part in ("--set", f"{key}={value}")]
+    arguments = ["scan", path, "-o", output, "--stations", 2, "--units", "inch", "--seed", 3, *settings, "--json"]
+    assert run(monkeypatch, *arguments) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert (printed["scene"], printed["seed"], printed["scans"]) == (str(output), 3, 2)
+    assert caplog.messages == ["part: its numbers are in inch (25.4 mm, given by --units); the scene is in mm"]
+    scene, truth = designgen.scan(path, 2, seed=3, units="inch", settings=FINE)
+    points = joined(scene, truth)[0]
+    assert len(points) == printed["points"]
+    shape = whole.val().scale(25.4)
+    assert departures(points[:: len(points) // 200 + 1], shape.Shells()[0]).max() < TOLERANCE_MM
+    assert np.ptp(scene.structure.vertices, axis=0) == pytest.approx([203.2, 101.6, 76.2], abs=0.01)
 
 
-FEW = {"scan.step_mrad": 4.0}
+def test_same_seed_same_bytes_and_a_recipe_is_the_same_as_the_command(tmp_path, monkeypatch):
+    (tmp_path / "cube.stl").write_text(mesh_text(SIDES))
+    (tmp_path / "cube.toml").write_text(
+        'kind = "structure"\n[model]\nfile = "cube.stl"\n[scan]\nmode = "rays"\nstations = [2]\nstep_mrad = 5.0\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    for output, seed in (("a.h5", 1), ("b.h5", 1), ("c.h5", 2)):
+        wanted = ["--stations", 2, "--seed", seed, "--set", "scan.step_mrad=5.0"]
+        assert run(monkeypatch, "scan", "cube.stl", "-o", output, *wanted) == 0
+    one, same, other = ((tmp_path / name).read_bytes() for name in ("a.h5", "b.h5", "c.h5"))
+    assert one == same
+    assert one != other
+    monkeypatch.chdir("/")  # the model is beside its recipe
+    scene, _ = designgen.make(tmp_path / "cube.toml", seed=1)
+    direct, _ = designgen.scan(tmp_path / "cube.stl", 2, seed=1, settings={"scan.step_mrad": 5.0})
+    for a, b in zip(scene.scans, direct.scans, strict=True):
+        assert a.points.tobytes() == b.points.tobytes()
 
 
-def test_labels_name_bodies_and_the_same_seed_gives_the_same_scene():
-    scene, truth = designgen.scan(assembly(), stations=2, seed=5, settings=FEW)
-    again, _ = designgen.scan(assembly(), stations=2, seed=5, settings=FEW)
-    assert scene.kind == "structure"
-    assert truth.labels[0].part_names == ("plate", "tube")
-    assert len(truth.defects.ids) == 0
-    assert not truth.structure.displacement.any()
-    for scan, other, label in zip(scene.scans, again.scans, truth.labels, strict=True):
-        np.testing.assert_array_equal(scan.points, other.points)
-        points = scan.points @ scan.T_project_scan[:3, :3].T + scan.T_project_scan[:3, 3]
-        tube = (label.part == 1) & (label.source == 0)
-        radius = np.hypot(points[tube, 0], points[tube, 1])
-        assert np.median(np.abs(radius[points[tube, 2] < 600.0] - 60.0)) < 2.0
+def test_files_come_back(tmp_path, caplog):
+    step, python, stl = (tmp_path / name for name in ("part.step", "part.py", "part.stl"))
+    cq.exporters.export(SOLIDS["plane"], str(step))
+    python.write_text("import cadquery as cq\nresult = cq.Workplane().box(300, 200, 100)\n")
+    trimesh.creation.box((300.0, 200.0, 100.0)).export(stl)
+    for path in (step, python, stl):
+        vertices, triangles = loading.load(path).mesh()
+        np.testing.assert_allclose(np.ptp(vertices, axis=0), [300.0, 200.0, 100.0])
+        assert len(triangles) == 12
+    with caplog.at_level(logging.WARNING, "designgen"):
+        loading.say(loading.load(stl))
+    assert "names no unit: its numbers are taken as mm" in caplog.text
+    assert np.ptp(loading.load(stl, "inch").mesh()[0]) > 25.0 * 300.0 / 2.0
 
 
-def test_a_further_station_leaves_the_first_as_they_are_and_stations_are_given_by_a_file(tmp_path):
-    model = loading.load(assembly())
-    two, three = (placement.placed(model, n, None, QUIET, 3) for n in (2, 3))
-    assert list(three) == ["S1", "S2", "S3"]
-    for name, T in two.items():
-        np.testing.assert_array_equal(T, three[name])
-    file = tmp_path / "stations.json"
-    file.write_text(json.dumps([{"id": "A", "position": [0, -3000, 500], "heading_deg": 90.0}]))
-    np.testing.assert_allclose(placement.given(file, 0)["A"][:3, 3], [0, -3000, 500])
-    file.write_text('{"A": {"position": [0, 1]}}')
-    with pytest.raises(InputError, match="expected stations as"):
-        placement.given(file, 0)
+# --- stations ---------------------------------------------------------------------------------------------------------
+
+
+def test_stations_from_a_file_and_placed(tmp_path):
+    path = tmp_path / "places.json"
+    path.write_text('{"A": {"position": [3000, 450, 1500], "heading_deg": 90}, "B": {"position": [450, -2500, 900]}}')
+    scene, _ = designgen.scan((CORNERS, SIDES), stations=path, settings={**FINE, "scan.step_mrad": 5.0})
+    assert [scan.station for scan in scene.scans] == ["A", "B"]
+    assert [scan.T_project_scan[:3, 3].tolist() for scan in scene.scans] == [[3000, 450, 1500], [450, -2500, 900]]
+    np.testing.assert_allclose(scene.scans[0].T_project_scan[:3, 0], [0.0, 1.0, 0.0], atol=1e-12)
+    device = scanner.Scanner(**scanner.preset("phase"))
+    model = loading.load((CORNERS, SIDES))
+    few, more, many = (placement.placed(model, count, None, device, 1) for count in (2, 3, 4))
+    assert list(more) == ["S1", "S2", "S3"]
+    for name, T in few.items():
+        np.testing.assert_array_equal(T, more[name])
+        np.testing.assert_array_equal(T, many[name])
+    path.write_text(json.dumps([{"id": "A", "position": [0, -3000, 500], "heading_deg": 90.0}]))
+    np.testing.assert_allclose(placement.given(path, 0)["A"][:3, 3], [0, -3000, 500])
+    for wrong in ("{}", "[1]", '{"A": {"position": [1, 2]}}', '{"A": {"position": [1, 2, 3], "heading_deg": "x"}}'):
+        path.write_text(wrong)
+        with pytest.raises(InputError, match=r"places\.json: expected stations as"):
+            placement.given(path, 1)
 
 
 def test_stations_see_what_can_be_seen():
@@ -129,6 +267,66 @@ def test_stations_see_what_can_be_seen():
     _, truth = designgen.scan(SOLIDS["plane"], stations=6, settings=FEW)
     seen = set().union(*(set(label.surface.tolist()) for label in truth.labels)) - {-1}
     assert len(seen) == len(model.bodies[0].face_names) == 6
+
+
+# --- bodies as built --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def built():
+    made = {
+        "moved": cq.Solid.makeCylinder(80, 300, cq.Vector(700, 0, 0)),
+        "dented": cq.Solid.makeBox(400, 300, 200),
+        "gone": cq.Solid.makeBox(100, 100, 100, cq.Vector(0, 600, 0)),
+    }
+    deviations = {
+        "asbuilt.moved.move_mm": [10.0, 0.0, 0.0],
+        "asbuilt.dented.dent_mm": 8.0,
+        "asbuilt.dented.dent_radius_mm": 60.0,
+        "asbuilt.dented.dent_at_mm": [200.0, 150.0, 200.0],
+        "asbuilt.gone.missing": True,
+    }
+    scene, truth = designgen.scan(assembly(made), 4, seed=1, settings={**FINE, **deviations})
+    points, bodies, _ = joined(scene, truth)
+    return SimpleNamespace(shapes=made, points=points, bodies=bodies, truth=truth, scene=scene)
+
+
+def test_a_moved_body_and_its_truth(built):
+    rows = np.flatnonzero(built.bodies == "moved")
+    there = built.shapes["moved"].moved(cq.Location(cq.Vector(10, 0, 0)))
+    assert departures(built.points[rows[:: len(rows) // 100 + 1]], there.Shells()[0]).max() < TOLERANCE_MM
+    truth, defects = built.truth.structure, built.truth.defects
+    on_it = truth.points[:, 0] > 610.0
+    assert on_it.sum() > 1000
+    np.testing.assert_allclose(truth.displacement[on_it], np.tile([10.0, 0.0, 0.0], (on_it.sum(), 1)), atol=1e-9)
+    assert dict(zip(defects.components, defects.classes, strict=True)) == {
+        "moved": "misalignment",
+        "dented": "dent",
+        "gone": "missing-part",
+    }
+    assert defects.depth_max_mm[0] == pytest.approx(10.0, abs=0.05)
+    design = built.scene.structure.vertices
+    assert design[:, 0].max() == pytest.approx(780.0, abs=0.01), "the design is not moved"
+
+
+def test_a_dent_has_its_shape(built):
+    x, y, z = built.points[built.bodies == "dented"].T
+    top = (z > 150.0) & (np.hypot(x - 200.0, y - 150.0) < 140.0)
+    share = np.minimum(np.hypot(x - 200.0, y - 150.0)[top] / 60.0, 1.0) ** 2
+    assert (share < 0.5).sum() > 50
+    np.testing.assert_allclose(z[top], 200.0 - 8.0 * (1.0 - share) ** 2, atol=TOLERANCE_MM)
+    truth = built.truth.structure
+    middle = np.hypot(*(truth.points - [200.0, 150.0, 200.0]).T[:2]) < 5.0
+    middle &= truth.points[:, 2] > 199.0
+    assert middle.any()
+    np.testing.assert_allclose(truth.displacement[middle], np.tile([0.0, 0.0, -8.0], (middle.sum(), 1)), atol=0.15)
+    defects = built.truth.defects
+    assert defects.volume_mm3[1] == pytest.approx(np.pi * 60.0**2 * 8.0 / 3.0)  # 2 pi int r (1 - r2/R2)^2 dr
+
+
+def test_a_body_left_out_returns_no_points(built):
+    assert set(built.bodies) == {"moved", "dented"}
+    assert built.truth.defects.volume_mm3[2] == pytest.approx(1e6)
 
 
 @pytest.mark.parametrize("source", ["solid", "mesh"])
@@ -168,21 +366,6 @@ def test_bodies_that_bend_turn_and_are_left_out():
         as_built.params_of({"asbuilt": {"modell-1": {}}}, ["model-1"])
 
 
-def test_files_come_back(tmp_path, caplog):
-    step, python, stl = (tmp_path / name for name in ("part.step", "part.py", "part.stl"))
-    cq.exporters.export(SOLIDS["plane"], str(step))
-    python.write_text("import cadquery as cq\nresult = cq.Workplane().box(300, 200, 100)\n")
-    trimesh.creation.box((300.0, 200.0, 100.0)).export(stl)
-    for path in (step, python, stl):
-        vertices, triangles = loading.load(path).mesh()
-        np.testing.assert_allclose(np.ptp(vertices, axis=0), [300.0, 200.0, 100.0])
-        assert len(triangles) == 12
-    with caplog.at_level(logging.WARNING, "designgen"):
-        loading.say(loading.load(stl))
-    assert "names no unit: its numbers are taken as mm" in caplog.text
-    assert np.ptp(loading.load(stl, "inch").mesh()[0]) > 25.0 * 300.0 / 2.0
-
-
 def test_a_recipe_names_a_model_beside_it(tmp_path):
     cq.exporters.export(SOLIDS["plane"], str(tmp_path / "part.step"))
     (tmp_path / "part.toml").write_text(
@@ -197,50 +380,119 @@ def test_a_recipe_names_a_model_beside_it(tmp_path):
     np.testing.assert_allclose(truth.structure.displacement, np.tile([0.0, 0.0, 5.0], (len(truth.structure.points), 1)))
 
 
+# --- bad models -------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize(
-    ("name", "content", "said"),
+    ("faces", "note"),
     [
+        (SIDES[1:], "'cube' is not closed (3 open edges): it is scanned as it is, from both sides"),
+        (SIDES[:, ::-1], "'cube': 12 of 12 triangles were turned so that all normals point outward"),
+        (np.array([f[::-1] if k in (2, 7) else f for k, f in enumerate(SIDES)]), "'cube': 2 of 12 triangles were"),
+        (
+            np.array([f[::-1] if k % 2 == 0 else f for k, f in enumerate(SIDES)]),
+            "'cube': 6 of 12 triangles were turned",
+        ),
+    ],
+    ids=["hole", "inside out", "mixed", "half"],
+)
+def test_a_mesh_with_a_hole_or_turned_faces(faces, note, tmp_path):
+    (tmp_path / "cube.stl").write_text(mesh_text(faces, name=""))
+    model = loading.load(tmp_path / "cube.stl")
+    assert sum(note in found for found in model.notes) == 1
+    (body,) = model.bodies
+    corners = body.vertices[body.triangles]
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (np.einsum("ni,ni->n", outward, corners.mean(axis=1) - 450.0) > 0.0).all()
+    if len(faces) == len(SIDES):
+        assert trimesh.Trimesh(*model.mesh(), process=False).volume == pytest.approx(900.0**3)
+
+
+def test_a_mesh_in_pieces_makes_bodies_and_a_cavity_belongs_to_its_body():
+    two = loading.load((np.vstack([CORNERS, CORNERS + 1000.0]), np.vstack([SIDES, SIDES + len(CORNERS)])))
+    assert [body.name for body in two.bodies] == ["model-1", "model-2"]
+    # The normals of a cavity point into it.
+    middle = CORNERS.mean(axis=0)
+    inner = middle + 0.5 * (CORNERS - middle)
+    hollow = np.vstack([CORNERS, inner]), np.vstack([SIDES, SIDES[:, ::-1] + len(CORNERS)])
+    (body,) = loading.load(hollow).bodies
+    volume = trimesh.Trimesh(body.vertices, body.triangles, process=False).volume
+    assert volume == pytest.approx(900.0**3 * 7.0 / 8.0)
+
+
+def test_bodies_of_one_name_are_numbered(tmp_path, caplog):
+    text = mesh_text(SIDES, name="rib") + mesh_text(SIDES, CORNERS + 2000.0, name="rib")
+    (tmp_path / "two.stl").write_text(text)
+    model = loading.load(tmp_path / "two.stl", "mm")
+    assert [body.name for body in model.bodies] == ["rib", "rib (2)"]
+    with caplog.at_level(logging.WARNING, "designgen"):
+        loading.say(model)
+    assert caplog.messages == [
+        "two: 2 bodies share 1 name(s), as 'rib' 2 times: they are numbered, 'rib', 'rib (2)', ..."
+    ]
+    assert unique(["web", "web", "web (2)", "web"]) == ["web", "web (3)", "web (2)", "web (4)"]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("a.step", EMPTY_STEP, "holds no geometry"),
+        ("a.step", "", "expected a STEP or IFC text file"),
+        ("a.stl", "solid a\nendsolid a\n", "expected a mesh with faces, found none"),
+        ("a.stl", mesh_text([[0, 0, 1]]), "expected triangles with an area, found none"),
+        ("a.stl", mesh_text(SIDES)[:500], "is cut off"),
+        ("a.ply", "ply\nformat ascii 1.0\nelement vertex 3\n", "is damaged"),
+        ("a.txt", "", "expected a model"),
+        ("a.py", "x = 1\n\nx / 0\n", "ended with an error in line 3 (ZeroDivisionError"),
+        ("a.py", "x = 1\n", "in the variable result, which it does not set"),
+        ("a.py", "result = 3\n", "found int"),
         ("a.py", "import nothing_of_this_name", "ended with an error in line 1"),
-        ("a.py", "x = 1", "expected a CadQuery .* in the variable result"),
-        ("a.py", "result = 3", "found int"),
+        ("a.py", "x = 1", "expected a CadQuery "),
         ("a.stl", "solid x\nfacet", "is cut off"),
         ("a.obj", "v 0 0 0\n", "expected a mesh with faces"),
         ("a.obj", "v 0 0 0\nv 1 0 0\nv 2 0 0\nf 1 2 3\n", "expected triangles with an area"),
         ("a.obj", "v 0 0 0\nf 1 2 9\n", "finite vertices"),
         ("a.ply", "no ply", "is damaged"),
         ("a.ifczip", "no zip", "is no zip file"),
-        ("a.xyz", "", "expected a model"),
     ],
 )
-def test_bad_files_end_in_one_line(tmp_path, name, content, said):
+def test_a_bad_model_is_one_line_and_exit_code_3(name, content, message, tmp_path, monkeypatch, capsys):
     (tmp_path / name).write_text(content)
-    with pytest.raises(InputError, match=said) as error:
-        loading.load(tmp_path / name)
-    assert "\n" not in str(error.value)
+    assert run(monkeypatch, "scan", tmp_path / name, "-o", tmp_path / "out.h5") == 3
+    said = capsys.readouterr().err.splitlines()
+    assert [line for line in said if line.startswith("error: ")] == said[-1:], "one line, and no second one"
+    assert message in said[-1]
+    assert str(tmp_path / name) in said[-1]
+    assert not (tmp_path / "out.h5").exists()
 
 
-def test_bad_meshes_are_repaired_or_reported():
-    box = trimesh.creation.box((300.0, 200.0, 100.0))
-    vertices, faces = np.asarray(box.vertices), np.array(box.faces, np.int64)
-    mixed = faces.copy()
-    mixed[::2] = mixed[::2, ::-1]
-    for wrong, count in ((mixed, 6), (faces[:, ::-1], 12)):
-        model = loading.load((vertices, wrong))
-        points, triangles = model.mesh()
-        assert trimesh.Trimesh(points, triangles, process=False).volume == pytest.approx(6e6)
-        assert f"{count} of 12 triangles were turned" in " ".join(model.notes)
-    assert "is not closed (3 open edges)" in " ".join(loading.load((vertices, faces[1:])).notes)
-    two = loading.load((np.vstack([vertices, vertices + 1000.0]), np.vstack([faces, faces + len(vertices)])))
-    assert [body.name for body in two.bodies] == ["model-1", "model-2"]
-    # A cavity belongs to the body around it, and its normals point into it.
-    hollow = np.vstack([vertices, 0.5 * vertices]), np.vstack([faces, faces[:, ::-1] + len(vertices)])
-    (body,) = loading.load(hollow).bodies
-    assert trimesh.Trimesh(body.vertices, body.triangles, process=False).volume == pytest.approx(6e6 * 7.0 / 8.0)
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--set", "scan.nothing=1"], "scan.nothing"),
+        (["--set", "asbuilt.nobody.dent_mm=1"], "the model has no body of this name; there are 1, as cube"),
+        (["--set", "asbuilt.cube.dint_mm=1"], "asbuilt.cube.dint_mm"),
+        (["--set", "asbuilt.cube.move_mm=1"], "move_mm"),
+        (["--set", "modle.file=x"], "unknown key 'modle'"),
+        (["--scanner", "nobody"], "nobody"),
+        (["--units", "parsec"], "parsec"),
+        (["--stations", "0"], "stations"),
+        (["--stations", "many"], "--stations many: expected a number from 1 or a .json file"),
+    ],
+)
+def test_wrong_usage_is_exit_code_2(arguments, message, tmp_path, monkeypatch, capsys):
+    (tmp_path / "cube.stl").write_text(mesh_text(SIDES, name=""))
+    assert run(monkeypatch, "scan", tmp_path / "cube.stl", "-o", tmp_path / "out.h5", *arguments) == 2
+    errors = capsys.readouterr().err
+    assert message in errors
+    assert "Traceback" not in errors
 
 
-def test_names_are_unique_and_settings_are_checked():
-    assert unique(["web", "web", "web (2)", "web"]) == ["web", "web (3)", "web (2)", "web (4)"]
+def test_a_model_is_scanned_by_rays():
+    recipe = {"kind": "structure", "model": {"file": "x.stl"}}
+    with pytest.raises(UsageError, match=r"scan\.mode"):
+        make.make("x", recipe_files.overridden(recipe, []), 0)
+    with pytest.raises(UsageError, match=r"set scan\.mode"):
+        designgen.scan((CORNERS, SIDES), settings={"scan": {"mode": "surface"}})
     with pytest.raises(UsageError, match=r"expected a number from 1 or a \.json file"):
         recipe_of("a.step", "six", "phase", "", ())
-    with pytest.raises(UsageError, match=r"set scan\.mode"):
-        designgen.scan(assembly(), settings={"scan": {"mode": "surface"}})

@@ -33,7 +33,7 @@ from tests.support.ball_results import balls
 from tests.support.bridge_results import KEYS, NAN, PROVENANCE, arch_scene, assembled
 from tests.support.metrics import metric
 from tests.support.records import assert_equal
-from tests.support.report_pages import TablesOfPage
+from tests.support.report_pages import TablesOfPage, drawn
 
 
 def frame_scene(k=3):
@@ -59,7 +59,8 @@ def of_frame():
 
 
 def render(execution, report):
-    return page.html(execution, report, all_figures.draw_figures(execution, report))
+    figures = drawn(execution) if report == ErrorReport() else all_figures.draw_figures(execution, report)
+    return page.html(execution, report, figures)
 
 
 # --- results.json --------------------------------------------------------------------------------------------------

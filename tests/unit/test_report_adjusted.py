@@ -34,7 +34,7 @@ from tests.support.bridge_results import (
     verdicts,
     with_band,
 )
-from tests.support.report_pages import Page, rendered
+from tests.support.report_pages import Page, drawn, rendered
 
 NAN = float("nan")
 
@@ -158,7 +158,7 @@ def test_why_a_method_failed_is_said_and_it_is_not_drawn():
     execution = of_bridge()
     (row,) = of_file(execution, "components-compared")
     assert row == {"method": "line", "component": "foot2", "status": "failed", "remark": "J2: no joint edges found"}
-    answered = all_figures.draw_figures(execution, ErrorReport())["preassemble"]["linear-error.png"]
+    answered = drawn(execution)["preassemble"]["linear-error.png"]
     assert "without a band, for they state no uncertainty: line" in str(answered[0])
     line = execution.runs[1]
     linear = line.result.linear
@@ -180,7 +180,7 @@ def test_why_a_method_failed_is_said_and_it_is_not_drawn():
     nothing = Deviations(deviation=np.full(120, NAN))
     result = dataclasses.replace(line.result, linear=dataclasses.replace(linear, assembled=nothing, best_fit=nothing))
     silent = dataclasses.replace(execution, runs=(execution.runs[0], dataclasses.replace(line, result=result)))
-    caption, picture = all_figures.draw_figures(silent, ErrorReport())["preassemble"]["linear-error.png"]
+    caption, picture = drawn(silent)["preassemble"]["linear-error.png"]
     assert "without a result, so not drawn: line" in str(caption)
     assert picture != answered[1]
     data = json.loads(Page(rendered(silent)).scripts[0][1])["steps"]["preassemble"]
@@ -207,7 +207,7 @@ def test_methods_without_intervals_have_none_of_these():
     execution = Execution(arch_scene(), runs, PROVENANCE)
     files = {table.file for table in all_tables.tables_of_run(execution, ErrorReport())}
     assert not files & {"what-to-do", "limits", "measures", "span", "budget", "trade-off"}
-    assert not set(all_figures.draw_figures(execution, ErrorReport())["preassemble"]) & OWN
+    assert not set(drawn(execution)["preassemble"]) & OWN
     assert "What limits the accuracy" not in rendered(execution)
 
 
@@ -253,13 +253,13 @@ def unknown(result, joints, parts):
     )
 
 
-@pytest.mark.parametrize(("joints", "parts", "drawn"), [((1,), (2,), 2), ((0, 1), (0, 1, 2), 0)])
-def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
+@pytest.mark.parametrize(("joints", "parts", "pictures"), [((1,), (2,), 2), ((0, 1), (0, 1, 2), 0)])
+def test_what_is_not_known_is_said_and_not_drawn(joints, parts, pictures):
     execution = of_bridge()
     result = unknown(execution.runs[0].result, list(joints), parts)
     execution = dataclasses.replace(execution, runs=(dataclasses.replace(execution.runs[0], result=result),))
-    found = all_figures.draw_figures(execution, ErrorReport())["preassemble"]
-    assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == drawn
+    found = drawn(execution)["preassemble"]
+    assert len({"gap-vectors.png", "residuals.png", "trade-off.png"} & set(found)) == pictures
     parsed = Page(rendered(execution))
     last = parsed.tables["Joints: what to do, method adjustment"][-1]
     assert last[:2] == ["J2", "indeterminate"]
@@ -274,7 +274,7 @@ def test_what_is_not_known_is_said_and_not_drawn(joints, parts, drawn):
 
 
 def test_every_picture_shows_something():
-    found = all_figures.draw_figures(of_bridge(), ErrorReport())["preassemble"]
+    found = drawn(of_bridge())["preassemble"]
     assert set(found) == OWN | {"bridge.png", "linear-error.png", "gaps-by-axis.png"}
     for name, (caption, png) in found.items():
         pixels = matplotlib.image.imread(io.BytesIO(png))[:, :, :3]
@@ -286,7 +286,7 @@ def test_every_picture_shows_something():
 
 def test_pictures_follow_what_they_show():
     """Pictures of other gaps, residuals or weights are other pictures; the rest stay as they are."""
-    before = all_figures.draw_figures(of_bridge(), ErrorReport())["preassemble"]
+    before = drawn(of_bridge())["preassemble"]
     execution = of_bridge()
     run = execution.runs[0]
     before_of = run.result.adjustment
@@ -317,11 +317,11 @@ def test_parts_unroll_face_by_face():
 
 
 def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps_says_so(monkeypatch):
-    drawn = []
+    figures_made = []
 
     def kept(figure):
         FigureCanvasAgg(figure).draw()
-        drawn.append(figure)
+        figures_made.append(figure)
         return b""
 
     monkeypatch.setattr(joint_figures, "png", kept)
@@ -331,7 +331,7 @@ def test_numbers_of_large_gaps_stay_within_their_frames_and_a_joint_without_gaps
     judged = dataclasses.replace(result.adjustment.joints, measures=records)
     adjustment = dataclasses.replace(result.adjustment, joints=judged)
     joint_figures.gap_vectors(dataclasses.replace(result, adjustment=adjustment))
-    shown, silent = drawn[0].axes
+    shown, silent = figures_made[0].axes
     numbers = [one for one in shown.texts if one.get_text().startswith("P")]
     assert len(numbers) == 8
     frame = shown.get_window_extent()

@@ -102,6 +102,15 @@ def test_a_plane_determines_no_motion_along_itself_but_an_error_along_its_normal
     assert not stable_fit.fits(few, moved(few, np.zeros((8, 3)), 1), 2.0 * SPACING, SPACING, 0).determined
 
 
-def test_a_part_without_a_block_of_enough_points_has_no_cells():
-    """As of a small part, of which no block is left."""
-    assert stable_fit._cells(np.empty((0, 3)), 100.0).shape == (0, 3)
+@pytest.mark.parametrize("bend_mm", [200.0, 400.0])
+def test_where_no_block_agrees_there_is_no_stable_motion_but_a_best_one(bend_mm):
+    core = beams()
+    u = np.zeros_like(core.points)
+    u[:, 2] = bend_mm * ((core.points[:, :2] / 12_000.0) ** 2).sum(axis=1)
+    found = stable_fit.fits(core, moved(core, u, 0), 2.0 * SPACING, SPACING, 0)
+    assert found.stable.share < 0.05
+    assert np.isnan(found.stable.motion).all()
+    assert np.isnan(found.stable.error_mm)
+    assert not found.determined
+    mean = (found.best.motion[:3, :3] @ core.points.T).T + found.best.motion[:3, 3] - core.points
+    assert mean[:, 2].mean() == pytest.approx(u[:, 2].mean(), rel=0.05)

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 from processor.geometry import rigid, surface_registration
 from processor.geometry.mesh_distance import MeshSurface
@@ -105,7 +105,7 @@ def bound(vectors: Floats) -> Floats:
     mean = given.sum(axis=0) / count[:, None]
     square = (given**2).sum(axis=(0, 2)) - count * (mean**2).sum(axis=1)
     sd = np.sqrt(np.maximum(square, 0.0) / (count - 1) * (1.0 + 1.0 / count))
-    length: Floats = np.linalg.norm(mean, axis=1) + student.ppf(0.975, count - 1) * sd
+    length: Floats = np.linalg.norm(mean, axis=1) + stdtrit(count - 1, 0.975) * sd
     length[known.sum(axis=0) < LEAST] = np.nan
     return length
 

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processor.adjustment import clusters, global_test
 from processor.adjustment.scanner_class import VIEW_MM
@@ -125,7 +125,7 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
         along=_variance(float((value[:, 1] ** 2).sum()), float(noise[:, 1].sum()), len(plates)),
         across=_variance(float((value[:, 2] ** 2).sum()), float(noise[:, 2].sum()), len(plates)),
         known=freedom > 0,
-        evident=squares > float(chi2.ppf(1.0 - RISK, max(freedom, 1))) * float(noise[:, 0].mean()),
+        evident=squares > float(chdtri(max(freedom, 1), RISK)) * float(noise[:, 0].mean()),
     )
 
 

@@ -368,18 +368,19 @@ def only_in(surface: Surface, T: Floats, other: Surface, T_other: Floats) -> tup
     ``T`` and ``T_other`` are T_bridge_scan (4, 4) of the two designs, which may be the same.
     """
     samples = rigid.apply(T_other, rigid.apply(rigid.invert(T), surface.points))
-    _, distance, beyond = other.mesh.distances(samples, 5.0 * TELLING_MM)
+    found, distance, beyond = other.mesh.distances(samples, 5.0 * TELLING_MM)
     near = (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)  # False where nothing is in reach: NaN
-    far = np.flatnonzero(~near)
     # Near a corner the nearest sample may be on the other face, from which the search over facets does not get round.
-    around = other.mesh.tree.query(samples[far], k=CORNER_SAMPLES, workers=-1)
+    # Where nothing is in reach, no face is: the most of two poses' samples, and the costly ones to search for.
+    doubtful = np.flatnonzero(~near & (found >= 0))
+    around = other.mesh.tree.query(samples[doubtful], k=CORNER_SAMPLES, workers=-1)
     beside = around[0][:, 0] <= 1.4 * TELLING_MM
     for k in range(CORNER_SAMPLES):
         face = other.mesh.sample_face[around[1][:, k]]
-        _, distance, beyond = other.mesh.distances(samples[far], np.inf, face)
+        _, distance, beyond = other.mesh.distances(samples[doubtful], np.inf, face)
         beside |= (np.abs(distance) <= TELLING_MM) & (beyond <= TELLING_MM)
-    far = far[~beside]
-    return surface.points[far], surface.normals[far]
+    near[doubtful[beside]] = True
+    return surface.points[~near], surface.normals[~near]
 
 
 def shown(points: Floats, T: Floats, samples: Floats) -> int:

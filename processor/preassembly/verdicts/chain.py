@@ -10,7 +10,7 @@ import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from scipy.stats import norm
+from scipy.special import ndtr
 
 from processor.adjustment import extremes
 from processor.limits import standards as limits_of
@@ -100,6 +100,6 @@ def _compare(measured: tuple[Floats, Floats], limit: Limit, span_mm: float, doub
     probability = nan
     if len(values) == 1 and not doubtful:
         spread = max(float(sd[0]), extremes.EXACT_MM)
-        probability = float(norm.cdf((high - value) / spread) - norm.cdf((low - value) / spread))
+        probability = float(ndtr((high - value) / spread) - ndtr((low - value) / spread))
     verdict = Verdict.INDETERMINATE if doubtful else verdict
     return Comparison(value=value, ci95=half_width, low=low, high=high, verdict=verdict, probability=probability)

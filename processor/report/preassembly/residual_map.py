@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from scipy.stats import binned_statistic_2d
 
 from processor.language.messages import Message, text
 from processor.model import DesignPart, Floats, Scene
@@ -86,6 +85,8 @@ def cells(flat: Unrolled, values: Floats) -> tuple[Floats, Floats, Floats]:
             [np.linspace(a, b, max(rows // 4, 1) + 1) for a, b in zip(flat.edges, flat.edges[1:], strict=False)]
         )
     )
+    from scipy.stats import binned_statistic_2d  # takes long to load, and few reports draw this
+
     medians = binned_statistic_2d(flat.around, flat.along, values, "median", bins=(y, x)).statistic
     return medians, x, y
 

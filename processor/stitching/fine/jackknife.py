@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processor.model import Floats, Ints
 from processor.stitching.fine import bundle_adjustment
@@ -59,7 +59,7 @@ def factors(blocks: Blocks, solution: Solution, reference: int) -> Floats:
         square += _squares(step - rest, covariance - whole, whole)
     for s in range(k):
         ratio = square[s] / (6.0 * REGIONS)
-        factor[s] = np.sqrt(ratio) if ratio > chi2.isf(BY_CHANCE, freedoms) / freedoms else 1.0
+        factor[s] = np.sqrt(ratio) if ratio > chdtri(freedoms, BY_CHANCE) / freedoms else 1.0
     return factor
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from processor.geometry import rigid
 from processor.model import Floats
@@ -33,7 +33,7 @@ class Pair:
     @property
     def is_gross(self) -> bool:
         """Whether the pair's pose differs from the network's beyond chance."""
-        return bool(self.chi2 > chi2.isf(GROSS_PROBABILITY, 6))
+        return bool(self.chi2 > chdtri(6, GROSS_PROBABILITY))
 
 
 @dataclass(frozen=True)
