@@ -30,6 +30,7 @@ ALIKE_MM = 2.0  # plates that differ by less are of one nominal thickness: rolli
 PATCH_MM, FEWEST_OF_PATCH = 50.0, 4  # size of a patch, and points on either side of it
 FLOOR_MM = 0.004
 RISK = 1e-3  # that noise alone is taken for a difference between viewpoints
+OF_CLASS = 2  # observations that the variance by the scanner's class counts for, beside those of the plates
 OF_PAIR = 2  # opposite plates of an end are seen from the same two sides: their differences are the same
 
 
@@ -104,7 +105,7 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
     """Variances between viewpoints by the plates at all ends of a bridge; ``rings`` are the variances of their points.
 
     They are widened for the number of differences they come from, so that 1.96 standard deviations cover what Student's
-    t covers. 0 where no two plates are alike.
+    t covers; where levels differ evidently, they include the scanner's class. 0 where no two plates are alike.
     """
     if not plates:
         return NONE
@@ -116,7 +117,10 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
     by_noise = float(noise[:, 0].mean()) * (len(plates) - len(count))
     freedom = len(plates) - len(count)
     squares = float((level**2).sum())
+    evident = squares > float(chdtri(max(freedom, 1), RISK)) * float(noise[:, 0].mean())
     between = _variance(squares, by_noise, freedom)
+    if evident:
+        between = max(between, _with_class(between, squares, by_noise, freedom))
     of_points = np.maximum(np.mean([one.sides for one in plates], axis=0), FLOOR_MM**2)
     outer = of_points[0] / of_points.mean()
     return Variances(
@@ -125,7 +129,7 @@ def variances(plates: Sequence[Thickness], rings: Sequence[float] = ()) -> Varia
         along=_variance(float((value[:, 1] ** 2).sum()), float(noise[:, 1].sum()), len(plates)),
         across=_variance(float((value[:, 2] ** 2).sum()), float(noise[:, 2].sum()), len(plates)),
         known=freedom > 0,
-        evident=squares > float(chdtri(max(freedom, 1), RISK)) * float(noise[:, 0].mean()),
+        evident=evident,
     )
 
 
@@ -164,6 +168,18 @@ def _alike(level: Floats) -> Ints:
     group = np.zeros(len(level), np.int64)
     group[order] = np.cumsum(np.diff(level[order], prepend=level[order[:1]]) > ALIKE_MM)
     return group
+
+
+def _with_class(between: float, squares: float, by_noise: float, freedom: int) -> float:
+    """Variance on one side of a plate by the plates and by the scanner's class together.
+
+    A few stations may by chance agree better than they are right. The class counts for OF_CLASS observations, up to the
+    95 % confidence limit of what the plates show: a network may be better than its class.
+    """
+    pairs = freedom / OF_PAIR
+    both = (between * pairs + VIEW_MM**2 * OF_CLASS) / (pairs + OF_CLASS)
+    limit = max(squares - by_noise, 0.0) / (2.0 * freedom) * pairs / float(chdtri(pairs, 0.95))
+    return min(both, limit)
 
 
 def _variance(squares: float, by_noise: float, freedom: int) -> float:
