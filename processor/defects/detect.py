@@ -130,8 +130,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     finding = scan_statistic.search(residuals, surface, levels)
     expected = missing_material.expected(scene, registered.T_design_project, pairs, surface, observed.stations)
     missing = regions.missing(field, expected, surface, alarms_per_mm2)
-    if observed.stations.unnamed:
-        missing += _inferred(scene, registered, field, alarms_per_mm2)
+    missing += _inferred(scene, registered, field, missing, alarms_per_mm2)
     deviating = regions.of_finding(finding, surface)
     near_mm = max(UNITE_CELLS * surface.charts.cell_mm, UNITE_MM)
     return to_result.Search(
@@ -149,16 +148,36 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
     )
 
 
-def _inferred(scene: Scene, registered: Registered, field: Field, alarms_per_mm2: float) -> list[Region]:
-    """Return what is missing from a cloud of which no ray is known: bodies that are gone, and holes in plates."""
-    surface, scan = registered.surface, scene.scans[0]
-    hidden = surface_charts.hidden(surface)
-    gone = contacts.of_bodies(registered.observed, field, surface, hidden, alarms_per_mm2)
-    T = registered.T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4))
-    points = rigid.apply(T, scan.points[:: max(1, len(scan.points) // SD_SAMPLES)] + scan.origin)
-    known = {cell for region in gone for cell in region.cells.tolist()}
+def _inferred(
+    scene: Scene, registered: Registered, field: Field, missing: list[Region], alarms_per_mm2: float
+) -> list[Region]:
+    """Return what is missing where no ray shows it: holes in plates, and of clouds without any ray bodies that are gone.
+
+    Rays show nothing where stations are not named, or see a face obliquely alone. ``missing`` is what they show.
+    """
+    surface = registered.surface
+    gone: list[Region] = []
+    if registered.observed.stations.unnamed:
+        hidden = surface_charts.hidden(surface)
+        gone = contacts.of_bodies(registered.observed, field, surface, hidden, alarms_per_mm2)
+    points = _sample(scene, registered.T_design_project)
+    known = {cell for region in missing + gone for cell in region.cells.tolist()}
     holes = exposure.holes(field, surface, points, alarms_per_mm2)
     return gone + [region for region in holes if known.isdisjoint(region.cells.tolist())]
+
+
+def _sample(scene: Scene, T_design_project: Floats) -> Floats:
+    """Return points (n, 3) of all scans in the design's frame, at most about SD_SAMPLES of them."""
+    step = max(1, sum(len(scan.points) for scan in scene.scans) // SD_SAMPLES)
+    return np.concatenate(
+        [
+            rigid.apply(
+                T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4)),
+                scan.points[::step] + scan.origin,
+            )
+            for scan in scene.scans
+        ]
+    )
 
 
 def _fitted_shapes(

@@ -97,6 +97,18 @@ def test_a_rib_that_is_gone_and_a_corner_are_missing():
         assert np.linalg.norm(centre - place, axis=1).min() < 40.0
 
 
+def test_a_long_bite_out_of_an_edge_is_edge_loss():
+    """Four times as long as deep, and more without the cells at the border, but no strip that a filter removed along the border."""
+    kinds, centre = run(cloud_of(BOXES, 8, cut=((3495.0, 235.0, 300.0), (3520.0, 320.0, 640.0))))
+    assert kinds == ["edge-loss"]
+    assert np.linalg.norm(centre[0] - [3507.0, 273.0, 470.0]) < 40.0
+
+
+def test_edges_that_a_filter_removed_are_not_missing():
+    cut = ((1095.0, 296.0, 30.0), (1120.0, 320.0, 720.0))
+    assert run(cloud_of(BOXES, 9, cut=cut))[0] == []
+
+
 def test_a_corner_in_the_shadow_of_something_is_not_missing():
     """A board before one side of the corner: the other side is seen."""
     shade = ((1220.0, 230.0, 560.0), (1225.0, 400.0, 800.0))

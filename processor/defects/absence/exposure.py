@@ -34,6 +34,7 @@ MOST_RING, MOST_CORE = 24, 60  # cells whose lines of sight are compared
 EXPOSED_SHARE = 0.5  # of the surroundings, from which a place can be seen as well
 LOW_QUANTILE = 0.25  # of the densities around: what is counted on
 SLIM = 4.0  # length of a strip along a border by its width: edges that a filter removed
+DEEP_CELLS = 2.0  # width of a place, from which on it is no such strip: borders themselves are not examined
 FEWEST_BEYOND = 100  # points beyond a place: where the cloud ends, it may have been cropped
 GRID_SHARE = 0.01  # voxel by the design's size
 FEWEST_PAIRS = 30  # of cells side by side, to estimate the scatter of numbers of points from
@@ -128,7 +129,8 @@ def _hole(field: Field, surface: DesignSurface, count: Floats, chart: int, cells
     core = cells[field.inner[cells] > 0.0]
     grid = np.stack(np.divmod(core - surface.charts.first[chart], surface.charts.shape[chart, 1]), axis=1)
     sides = np.ptp(grid, axis=0) + 1
-    if sides.max() >= SLIM * len(core) / sides.max():
+    width = len(core) / sides.max()
+    if width < DEEP_CELLS and sides.max() >= SLIM * width:
         return None
     density = float(np.quantile(count[ring] / surface.share[ring], LOW_QUANTILE))
     expected = density * float(surface.share[core].sum())
