@@ -151,7 +151,7 @@ def _search(scene: Scene, registered: Registered, error_mm: float, params: Param
 def _inferred(
     scene: Scene, registered: Registered, field: Field, missing: list[Region], alarms_per_mm2: float
 ) -> list[Region]:
-    """Return what is missing where no ray shows it: holes in plates, and of clouds without any ray bodies that are gone.
+    """Return what is missing where no ray shows it: holes in plates, and of clouds without rays bodies that are gone.
 
     Rays show nothing where stations are not named, or see a face obliquely alone. ``missing`` is what they show.
     """

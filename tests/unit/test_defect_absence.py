@@ -98,7 +98,7 @@ def test_a_rib_that_is_gone_and_a_corner_are_missing():
 
 
 def test_a_long_bite_out_of_an_edge_is_edge_loss():
-    """Four times as long as deep, and more without the cells at the border, but no strip that a filter removed along the border."""
+    """Four times as long as deep, and more without the cells at the border; a strip that a filter removes is none."""
     kinds, centre = run(cloud_of(BOXES, 8, cut=((3495.0, 235.0, 300.0), (3520.0, 320.0, 640.0))))
     assert kinds == ["edge-loss"]
     assert np.linalg.norm(centre[0] - [3507.0, 273.0, 470.0]) < 40.0

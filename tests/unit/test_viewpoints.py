@@ -28,9 +28,9 @@ def test_waves_of_a_plate_do_not_change_its_thickness():
     assert found[:, 0].std() < 0.1
 
 
-# Of 21 differences, 10.5 pairs of opposite plates. By Student's t they are widened by 1.29 = (2.22 / 1.96)^2. The class
-# counts for 2 more: (10.5 * 1.29 * 0.3^2 + 2 * 0.5^2) / 12.5 = 1.53 * 0.3^2. Of 0.1 mm the 95 % limit is less than that:
-# 10.5 / 4.25 = 2.47, by the 5 % quantile of chi-square.
+# Of 21 differences, 10.5 pairs of opposite plates. By Student's t they are widened by 1.29 = (2.22 / 1.96)^2. The
+# class counts for 2 more: (10.5 * 1.29 * 0.3^2 + 2 * 0.5^2) / 12.5 = 1.53 * 0.3^2. Of 0.1 mm the 95 % limit is less
+# than that: 10.5 / 4.25 = 2.47, by the 5 % quantile of chi-square.
 @pytest.mark.parametrize(("apart", "wider"), [(0.1, 2.47), (0.3, 1.53)])
 def test_variance_between_viewpoints_by_plates_of_several_thicknesses(apart, wider):
     rng = np.random.default_rng(1)

@@ -80,16 +80,21 @@ def _both_sides(
     regions, cell_mm2 = [], surface.charts.cell_mm**2
     for hole in found:
         behind = np.array([opposite[cell] for cell in hole.core.tolist()])
-        rows = {empty[cell] for cell in behind.tolist() if cell in empty}
-        shared = np.mean([cell in empty for cell in behind.tolist()])
-        if not rows or shared < EXPOSED_SHARE:
+        rows = np.array([empty.get(cell, -1) for cell in behind.tolist()])
+        if np.mean(rows >= 0) < EXPOSED_SHARE:
             continue
-        sides = [hole, *(found[row] for row in rows)]
-        strength = sum(chernoff(side.expected, side.counted, more=False) / side.spread for side in sides)
+        strength = _strength(hole, 1.0)
+        for row, number in zip(*np.unique(rows[rows >= 0], return_counts=True), strict=True):
+            strength += _strength(found[row], min(1.0, number / len(found[row].core)))
         if strength > -np.log(alarms_per_mm2 * cell_mm2):
             chance = float(np.exp(-strength)) / cell_mm2
             regions.append(Region(hole.chart, hole.cells, 0, float(np.sqrt(2.0 * strength)), chance))
     return regions
+
+
+def _strength(hole: _Hole, part: float) -> float:
+    """Return less the logarithm of the probability of so few points on a part of an empty place."""
+    return chernoff(part * hole.expected, part * hole.counted, more=False) / hole.spread
 
 
 def _empty_regions(field: Field, surface: DesignSurface, count: Floats, chart: int) -> list[tuple[Ints, Ints]]:
@@ -110,6 +115,8 @@ def _empty_regions(field: Field, surface: DesignSurface, count: Floats, chart: i
         wide = tuple(slice(max(part.start - RING_CELLS, 0), part.stop + RING_CELLS) for part in box)
         mask = label[wide] == k
         if not (mask & (inner[wide] > 0.0)).any():
+            continue
+        if mask.sum() > on.sum():  # less of the face was seen than is empty here
             continue
         about = ndimage.binary_dilation(mask, EIGHT_NEIGHBOURS, RING_CELLS) & on[wide] & ~mask
         rows = [np.flatnonzero(_placed(part, wide, label.shape)) + first for part in (mask, about)]
