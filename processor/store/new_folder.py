@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from processor.model import UsageError
+from processor.model import InputError, UsageError
 from processor.store.atomic_file import sync
 
 
@@ -21,10 +21,14 @@ def check_new(folder: Path) -> None:
 
 @contextmanager
 def new_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder that is renamed to ``folder`` at the end, and removed after an error."""
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    """Yield a temporary folder that is renamed to ``folder`` at the end, and removed after an error.
+
+    Raises InputError where it cannot be written, as on a full disk.
+    """
+    making: Path | None = None
     try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        making = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
         yield making
         for written in (*making.rglob("*"), making):
             sync(written)
@@ -33,6 +37,12 @@ def new_folder(folder: Path) -> Iterator[Path]:
         os.chmod(making, 0o755)
         os.replace(making, folder)
         sync(folder.parent)
-    except BaseException:
-        shutil.rmtree(making, ignore_errors=True)
+    except BaseException as error:
+        if making is not None:
+            shutil.rmtree(making, ignore_errors=True)
+        if isinstance(error, OSError):
+            reason = error.strerror or error
+            raise InputError(
+                f"{folder}: cannot be written ({reason}); nothing was kept: free the disk or name another folder"
+            ) from error
         raise
