@@ -18,6 +18,7 @@ from processor.writers.cloud import BLOCK, COLUMN, GRID, INTENSITY, ROW, STATION
 
 FULL = 65535  # intensities up to here that are whole numbers are written as they are
 SINGLE = np.dtype(np.float32)
+SAME_MM = 1e-3
 FOUND_MM = 200.0  # core points lie on the design's surface: its samples are nearer
 
 
@@ -130,7 +131,7 @@ def _has_stations(run: Run, placed: Placed) -> bool:
 
 
 def numbering(run: Run, scans: Sequence[Placed]) -> Numbering:
-    """Return the numbers of the stations of scans: first those of merged clouds, then each scan that is of one station."""
+    """Return the numbers of the stations of scans: those of merged clouds, then each other scan."""
     stations = run.scene.stations
     ids: list[str] = []
     of_station = np.zeros(_stations(run) + 1, np.int64)  # the last is that of -1: unknown
@@ -155,20 +156,28 @@ def stations_of(run: Run, scans: Sequence[Placed]) -> Stations | None:
     for placed, number in zip(scans, numbers.of_scan, strict=True):
         if number and placed.scan.position.size:
             positions[number] = rigid.apply(placed.T, placed.scale * placed.scan.position)
-    stations = run.scene.stations
-    if stations is not None and numbers.of_station.any():
-        moved = {}
-        for placed in scans:
-            if _has_stations(run, placed):
-                given = placed.scan.T_project_scan if placed.scan.T_project_scan.size else np.eye(4)
-                moved[placed.number] = rigid.apply(placed.T @ rigid.invert(given), stations.positions)
-        if len(moved) > 1 and placed.known and "stitch" in run.steps:
-            return None  # a station may be seen in several clouds that were moved apart
-        for row, number in enumerate(numbers.of_station[:-1].tolist()):
-            positions[number] = next(iter(moved.values()))[row]
+    if numbers.of_station.any():
+        moved = stations_moved(run, scans)
+        if moved is None:
+            return None
+        positions |= dict(enumerate(moved.positions, 1))
     if len(positions) != len(numbers.ids):
         return None
     return Stations(numbers.ids, np.array([positions[i + 1] for i in range(len(numbers.ids))]))
+
+
+def stations_moved(run: Run, scans: Sequence[Placed]) -> Stations | None:
+    """Return the scene's stations as the clouds that name them were moved; None where these moved differently."""
+    stations = run.scene.stations
+    places = []
+    for placed in scans:
+        if stations is not None and _has_stations(run, placed):
+            given = placed.scan.T_project_scan if placed.scan.T_project_scan.size else np.eye(4)
+            T = placed.T @ rigid.invert(given) if placed.known else np.eye(4)
+            places.append(rigid.apply(T, placed.scale * stations.positions))
+    if stations is None or not places or any(np.abs(one - places[0]).max() > SAME_MM for one in places):
+        return None
+    return Stations(stations.ids, places[0])
 
 
 def core_cloud(run: Run) -> Cloud:

@@ -5,16 +5,18 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 
-from processor.clouds import contents, poses
+from processor.clouds import cleaning, contents, poses, scan_folder
 from processor.clouds import run as runs
+from processor.clouds.cleaning import Removed
 from processor.clouds.poses import Placed, Poses
 from processor.clouds.run import Run
-from processor.model import Reason, UsageError
+from processor.clouds.thinning import thinned
+from processor.model import Reason, UsageError, reason
 from processor.pipeline import Execution
 from processor.progress import tracked
 from processor.store.new_folder import check_new, new_folder
@@ -46,12 +48,16 @@ class Exported:
 
 @dataclass(frozen=True)
 class _Content:
-    """Clouds with their names of files, the scans they are of, and remarks; ``whole``: scans in one frame."""
+    """Clouds by the stems of their files, the scans they are of, and remarks; ``frame`` is that of the coordinates.
+
+    ``removed`` counts what is left out of each cloud.
+    """
 
     clouds: dict[str, Cloud]
     scans: tuple[Placed, ...] = ()
     remarks: tuple[Reason, ...] = ()
     frame: str = ""
+    removed: dict[str, Removed] = field(default_factory=dict)
 
 
 def export(
@@ -81,7 +87,13 @@ def export(
         _opened(source, Path(aside), input_, units) as run,
     ):
         content = CONTENTS[what](run, Path(aside))
-        return _write(run, content, folder, making, (what, format_), spacing_mm)
+        clouds = {}
+        for stem, cloud in content.clouds.items():
+            identity = f"{run.digest} {what} {spacing_mm} {stem}".encode()
+            clouds[stem] = replace(cloud, identity=identity)
+            if spacing_mm:
+                clouds[stem] = thinned(clouds[stem], spacing_mm, Path(aside))
+        return _write(run, replace(content, clouds=clouds), (folder, making), (what, format_))
 
 
 def _opened(
@@ -92,21 +104,24 @@ def _opened(
     return runs.opened(source, input_, units, aside)
 
 
-def _write(
-    run: Run, content: _Content, folder: Path, making: Path, names: tuple[str, str], spacing_mm: float
-) -> Exported:
-    what, format_ = names
+def _write(run: Run, content: _Content, target: tuple[Path, Path], names: tuple[str, str]) -> Exported:
+    """Write the files of a content into a folder that is still being made."""
+    (folder, making), (what, format_) = target, names
     bright = contents.brightest(run, [placed.number for placed in content.scans]) if format_ in ("las", "laz") else 0.0
     files = {}
     for stem, cloud in tracked(list(content.clouds.items())):
         name = f"{stem}.{format_}"
         (making / name).parent.mkdir(exist_ok=True)
-        identity = f"{run.digest} {what} {spacing_mm} {stem}".encode()
         comments = (f"coordinates in mm, {content.frame}",)
-        files[name] = WRITERS[format_](
-            making / name, replace(cloud, brightest=bright, identity=identity, comments=comments)
-        )
-    return Exported(folder, what, format_, files, content.remarks)
+        files[name] = WRITERS[format_](making / name, replace(cloud, brightest=bright, comments=comments))
+    if content.scans:
+        scan_folder.write(making, run, content.scans, list(files), what, format_)
+    remarks = list(content.remarks)
+    for stem, removed in content.removed.items():
+        if not removed.compared:
+            remarks.append(reason("export.not-compared", file=stem))
+        remarks.append(reason("export.removed", file=stem, outliers=removed.outliers, clutter=removed.clutter))
+    return Exported(folder, what, format_, files, tuple(remarks))
 
 
 def _registered(run: Run, aside: Path) -> _Content:
@@ -117,6 +132,16 @@ def _scans(run: Run, placed: Poses) -> _Content:
     stems = project.stems([one.scan for one in placed.scans])
     clouds = {f"{SCANS}/{stem}": contents.scan_cloud(run, one) for stem, one in zip(stems, placed.scans, strict=True)}
     return _Content(clouds, placed.scans, placed.remarks, "frame of the scan")
+
+
+def _clean(run: Run, aside: Path) -> _Content:
+    placed = poses.own_frames(run)
+    content = _scans(run, placed)
+    marks = cleaning.filters(run, placed.scans)
+    clouds, removed = {}, {}
+    for (stem, cloud), one, of_design in zip(content.clouds.items(), placed.scans, marks, strict=True):
+        clouds[stem], removed[stem] = cleaning.cleaned(cloud, of_design, cleaning.scanner_of(run, one), aside)
+    return replace(content, clouds=clouds, removed=removed)
 
 
 def _merged(run: Run, aside: Path) -> _Content:
@@ -140,5 +165,6 @@ CONTENTS: dict[str, Callable[[Run, Path], _Content]] = {
     "registered": _registered,
     "merged": _merged,
     "assembled": _assembled,
+    "clean": _clean,
     "deviation": _deviation,
 }

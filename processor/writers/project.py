@@ -72,7 +72,7 @@ def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
     components: dict[str, dict[str, Any]] = {}
     for part in design.parts:
         component = components[part.name] = {}
-        if folder is not None:
+        if folder is not None and part.source == "mesh":
             component["mesh"] = f"design/{part.name}.ply"
             (folder / "design").mkdir(exist_ok=True)
             write_mesh(folder / component["mesh"], part.vertices, part.faces)
