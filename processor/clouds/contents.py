@@ -14,7 +14,7 @@ from processor.clouds.run import Run
 from processor.defects import surface_charts
 from processor.geometry import merging, rigid
 from processor.model import Floats, Ints, Stations
-from processor.writers.cloud import BLOCK, COLUMN, GRID, INTENSITY, ROW, STATION, Block, Cloud
+from processor.writers.cloud import BLOCK, COLOURS, COLUMN, GRID, INTENSITY, ROW, STATION, Block, Cloud
 
 FULL = 65535  # intensities up to here that are whole numbers are written as they are
 SINGLE = np.dtype(np.float32)
@@ -37,6 +37,8 @@ def fields_of(run: Run, numbers: Sequence[int], *, grid: bool) -> dict[str, np.d
     fields: dict[str, np.dtype[Any]] = {}
     if "intensity" in present:
         fields[INTENSITY] = SINGLE
+    if "colour" in present:
+        fields |= dict.fromkeys(COLOURS, TYPES["colour"])
     if "point_station" in present:
         fields[STATION] = TYPES["point_station"]
     elif grid and "grid_row" in present:
@@ -53,6 +55,8 @@ def _columns(found: Mapping[str, Any], fields: Mapping[str, np.dtype[Any]], of_s
     for name, (field,) in given.items():
         if field in columns and name in found:
             columns[field] = found[name].astype(fields[field])
+    if "colour" in found:
+        columns |= dict(zip(COLOURS, found["colour"].T, strict=True))
     if STATION in columns and "point_station" in found:
         columns[STATION] = of_station[found["point_station"]].astype(fields[STATION])
     return columns

@@ -19,7 +19,7 @@ from processor.clouds.thinning import thinned
 from processor.model import Reason, UsageError, reason
 from processor.pipeline import Execution
 from processor.progress import tracked
-from processor.store.new_folder import check_new, new_folder
+from processor.store.new_folder import check_new, new_folder, unwritable
 from processor.writers import e57, las, ply, project, text
 from processor.writers.cloud import Cloud
 
@@ -93,7 +93,13 @@ def export(
             clouds[stem] = replace(cloud, identity=identity)
             if spacing_mm:
                 clouds[stem] = thinned(clouds[stem], spacing_mm, Path(aside))
-        return _write(run, replace(content, clouds=clouds), (folder, making), (what, format_))
+        try:
+            return _write(run, replace(content, clouds=clouds), (folder, making), (what, format_))
+        except OSError as error:
+            if error.errno is None:  # of HDF5: the input is damaged
+                raise
+            # Here, as an error that passes an open scene file is taken for damage of that file.
+            raise unwritable(folder, error) from error
 
 
 def _opened(

@@ -354,6 +354,7 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         position=position * scale,
         T_project_scan=pose,
         sigma_mm=entry.sigma_mm,
+        colour=raw.colour,
     )
 
 

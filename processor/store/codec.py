@@ -269,9 +269,9 @@ def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
     return _dataset(group, name, stored, ndim)[()]
 
 
-def column(group: Any, name: str, dtype: type) -> Any:
+def column(group: Any, name: str, dtype: type, ndim: int = 1) -> Any:
     """Return the dataset of a column, to be read in slices; an absent optional column is empty."""
-    return _dataset(group, name, np.dtype(dtype).str[1:], 1)
+    return _dataset(group, name, np.dtype(dtype).str[1:], ndim)
 
 
 def read_text(group: Any, name: str) -> str:

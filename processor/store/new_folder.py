@@ -41,8 +41,11 @@ def new_folder(folder: Path) -> Iterator[Path]:
         if making is not None:
             shutil.rmtree(making, ignore_errors=True)
         if isinstance(error, OSError):
-            reason = error.strerror or error
-            raise InputError(
-                f"{folder}: cannot be written ({reason}); nothing was kept: free the disk or name another folder"
-            ) from error
+            raise unwritable(folder, error) from error
         raise
+
+
+def unwritable(folder: Path, error: OSError) -> InputError:
+    """Return the error of a folder that cannot be written."""
+    reason = error.strerror or error
+    return InputError(f"{folder}: cannot be written ({reason}); nothing was kept: free the disk or name another folder")

@@ -16,6 +16,12 @@ from processor.store.codec import DecodeError
 
 AXES = ("x", "y", "z")
 NO_STATIONS = np.empty(0, np.int32)
+# Columns that came to the schema later, and are stored where they are not empty: shape of a row and type.
+NEWER = {
+    field.name: (field.metadata["shape"][1:], field.metadata["dtype"])
+    for field in dataclasses.fields(Scan)
+    if field.metadata.get("newer")
+}
 
 
 def write_scan(group: Any, scan: Scan) -> Ints:
@@ -26,7 +32,8 @@ def write_scan(group: Any, scan: Scan) -> Ints:
         for name in per_point_fields(Scan)
         if name != "points" and getattr(scan, name).size
     }
-    codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points"})
+    absent = {name for name in NEWER if not getattr(scan, name).size}
+    codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points", *absent})
     points = group.create_group("points")
     for axis, column in zip(AXES, tiled.columns, strict=True):
         codec.write_array(points, axis, column)
@@ -49,7 +56,8 @@ def read_scan(group: Any) -> Scan:
     wrong = tiles.misplaced(grid, stored.cell, stored.counts, (data[0], data[1], data[2]))
     if wrong:
         raise DecodeError([f"{group.name}/points: {wrong} points lie outside their tile of the index"])
-    scan = codec.read_record(group, Scan, given={"points": grid.millimetres((data[0], data[1], data[2]))})
+    given = {"points": grid.millimetres((data[0], data[1], data[2])), **_absent(group)}
+    scan = codec.read_record(group, Scan, given=given)
     if not np.isfinite(scan.origin).all():
         raise DecodeError([f"{group.name}/origin: is not finite"])
     return scan
@@ -73,11 +81,20 @@ def shape(group: Any, name: str) -> tuple[int, ...]:
     """Return the shape of a per-point column of a scan's group."""
     if name == "points":
         return (count(group), 3)
-    return (len(_column(group, name)),)
+    return tuple(_column(group, name).shape)
 
 
 def _column(group: Any, name: str) -> Any:
-    return codec.column(group, name, next(f.metadata["dtype"] for f in dataclasses.fields(Scan) if f.name == name))
+    absent = _absent(group)
+    if name in absent:
+        return absent[name]
+    field = next(f for f in dataclasses.fields(Scan) if f.name == name)
+    return codec.column(group, name, field.metadata["dtype"], len(field.metadata["shape"]))
+
+
+def _absent(group: Any) -> dict[str, Any]:
+    """Return the newer columns that a group has not, empty."""
+    return {name: np.empty((0, *shape), dtype) for name, (shape, dtype) in NEWER.items() if name not in group}
 
 
 @dataclasses.dataclass(frozen=True)

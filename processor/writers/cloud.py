@@ -58,6 +58,8 @@ def columns_of(scan: Scan, rows: slice = slice(None)) -> dict[str, Any]:
     fields: dict[str, Any] = {}
     if len(scan.intensity):
         fields[INTENSITY] = scan.intensity[rows].astype(np.float32)
+    if len(scan.colour):
+        fields |= dict(zip(COLOURS, scan.colour[rows].T, strict=True))
     if len(scan.point_station):
         fields[STATION] = scan.point_station[rows] + np.int32(1)
     # A merged cloud has no grid: the rows and columns of its scans repeat.

@@ -1,7 +1,7 @@
 """E57 files (ASTM E2807) in double precision: several scans, each with its pose, Cartesian or spherical.
 
 The library's own function rounds coordinates to 32 bits, which at map coordinates loses decimetres. Scalar fields are
-written under an extension's prefix, as the standard requires.
+written under an extension's prefix, as the standard requires; numbers of stations are not, as each scan is of one.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from processor.model import Floats
-from processor.writers.cloud import BLOCK, COLOURS, COLUMN, INTENSITY, METRES, ROW, Cloud
+from processor.writers.cloud import BLOCK, COLOURS, COLUMN, INTENSITY, METRES, ROW, STATION, Cloud
 
 STANDARD = {INTENSITY: "intensity", ROW: "rowIndex", COLUMN: "columnIndex"}
 STANDARD |= {name: f"color{name.title()}" for name in COLOURS}
@@ -46,7 +46,7 @@ def _write(path: Path, clouds: Sequence[Cloud], *, spherical: bool) -> list[int]
     whole = False
     try:
         image.extensionsAdd("", libe57.E57_V1_0_URI)
-        if any(name not in STANDARD for cloud in clouds for name in cloud.fields):
+        if any(name not in STANDARD for cloud in clouds for name in _kept(cloud)):
             image.extensionsAdd(PREFIX, EXTENSION)
         root, vector = image.root(), libe57.VectorNode(image, True)
         guids = [_guid(f"{number} {cloud.name}".encode(), cloud.identity) for number, cloud in enumerate(clouds)]
@@ -110,6 +110,11 @@ def _structure(image: Any, values: Mapping[str, Any]) -> Any:
     return node
 
 
+def _kept(cloud: Cloud) -> list[str]:
+    """Return the columns that are written."""
+    return [name for name in cloud.fields if name != STATION]
+
+
 def _type(image: Any, cloud: Cloud, name: str) -> Any:
     """Return the node of the type of a column."""
     from pye57 import libe57
@@ -138,11 +143,11 @@ def _write_scan(image: Any, scans: Any, cloud: Cloud, guid: str, *, spherical: b
     if COLOURS[0] in cloud.fields:
         colours = {f"color{name.title()}{end}": value for name in COLOURS for end, value in COLOUR_ENDS}
         node.set("colorLimits", _structure(image, colours))
-    stored = {name: STANDARD.get(name, f"{PREFIX}:{name}") for name in cloud.fields}
+    stored = {name: STANDARD.get(name, f"{PREFIX}:{name}") for name in _kept(cloud)}
     prototype = libe57.StructureNode(image)
     for name in SPHERICAL if spherical else CARTESIAN:
         prototype.set(name, libe57.FloatNode(image, 0.0, libe57.E57_DOUBLE))
-    for name in cloud.fields:
+    for name in stored:
         prototype.set(stored[name], _type(image, cloud, name))
     vector = libe57.CompressedVectorNode(image, prototype, libe57.VectorNode(image, True))
     node.set("points", vector)
@@ -162,7 +167,8 @@ def _write_points(
 
     axes = SPHERICAL if spherical else CARTESIAN
     arrays: dict[str, Any] = {name: np.empty(BLOCK) for name in axes}
-    for name, dtype in cloud.fields.items():
+    for name in stored:
+        dtype = cloud.fields[name]
         # The library takes the type "long" for 32 bits.
         arrays[stored[name]] = np.empty(BLOCK, dtype if np.dtype(dtype).kind == "f" else np.longlong)
     buffers = libe57.VectorSourceDestBuffer()
@@ -175,7 +181,7 @@ def _write_points(
             rows = slice(first, first + BLOCK)
             points = (block.points[rows] + cloud.origin) * METRES
             columns = dict(zip(axes, (_spherical(points) if spherical else points).T, strict=True))
-            columns |= {stored[name]: block.fields[name][rows] for name in cloud.fields}
+            columns |= {field: block.fields[name][rows] for name, field in stored.items()}
             for name, column in columns.items():
                 arrays[name][: len(points)] = column
             writer.write(len(points))

@@ -21,10 +21,18 @@ def write(path: Path, cloud: Cloud) -> int:
     """Write a cloud in metres; return the number of points. The suffix decides on LAZ.
 
     Intensities are scaled to 16 bits unless they fit, the station is the point source. Raises InputError for points too
-    far from the cloud's origin for 32 bits of 0.1 mm, about 200 km.
+    far from the cloud's origin for 32 bits of 0.1 mm, about 200 km, OSError where the file cannot be written.
     """
     import laspy
+    import lazrs
 
+    try:
+        return _write(laspy, path, cloud)
+    except lazrs.LazrsError as error:
+        raise OSError(0, f"LAZ: {error}") from error
+
+
+def _write(laspy: Any, path: Path, cloud: Cloud) -> int:
     header = laspy.LasHeader(point_format=COLOURED if COLOURS[0] in cloud.fields else PLAIN, version="1.4")
     header.scales = np.full(3, STEP_M)
     header.offsets = np.floor(cloud.origin * METRES)
