@@ -176,20 +176,23 @@ def _write_points(
         buffers.append(libe57.SourceDestBuffer(image, name, array, BLOCK, True, True))
     writer = vector.writer(buffers)
     count, low, high = 0, np.inf, -np.inf
-    for block in cloud.blocks():
-        for first in range(0, len(block.points), BLOCK):
-            rows = slice(first, first + BLOCK)
-            points = (block.points[rows] + cloud.origin) * METRES
-            columns = dict(zip(axes, (_spherical(points) if spherical else points).T, strict=True))
-            columns |= {field: block.fields[name][rows] for name, field in stored.items()}
-            for name, column in columns.items():
-                arrays[name][: len(points)] = column
-            writer.write(len(points))
-            count += len(points)
-        if INTENSITY in cloud.fields and len(block.points):
-            bright = block.fields[INTENSITY]
-            low, high = min(low, float(bright.min())), max(high, float(bright.max()))
-    writer.close()
+    try:
+        for block in cloud.blocks():
+            for first in range(0, len(block.points), BLOCK):
+                rows = slice(first, first + BLOCK)
+                points = (block.points[rows] + cloud.origin) * METRES
+                columns = dict(zip(axes, (_spherical(points) if spherical else points).T, strict=True))
+                columns |= {field: block.fields[name][rows] for name, field in stored.items()}
+                for name, column in columns.items():
+                    arrays[name][: len(points)] = column
+                writer.write(len(points))
+                count += len(points)
+            if INTENSITY in cloud.fields and len(block.points):
+                bright = block.fields[INTENSITY]
+                low, high = min(low, float(bright.min())), max(high, float(bright.max()))
+        writer.close()
+    finally:
+        del writer  # before the file is closed after an error: the library crashes where a writer outlives its file
     return count, (low, high)
 
 
