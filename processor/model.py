@@ -441,6 +441,7 @@ class PointLabels(Checked):
     surface: Labels = column("n", dtype=np.int32)  # -1 = none
     range_error_mm: Shorts = column("n", dtype=np.float32)
     incidence_cos: Shorts = column("n", dtype=np.float32)
+    defect: Labels = column("n", dtype=np.int32, newer=True)  # id of the defect that displaced the surface, -1 = none
 
 
 SOURCES = ("surface", "mixed", "outlier")  # the footprint on one surface; on several, or past an edge; a stray return

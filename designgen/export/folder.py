@@ -25,6 +25,7 @@ from processor.store.new_folder import check_new, new_folder
 from processor.writers import project
 from processor.writers.cloud import METRES
 
+LABELS = "labels.json"  # names of the parts and surfaces by the numbers in the scans' files
 PICKS, PICK_COLUMNS = "picks.csv", ("scan_a", "scan_b", "point", "xa", "ya", "za", "xb", "yb", "zb")
 FEWEST_POINTS = 4  # of a scan that a reader accepts
 
@@ -51,7 +52,8 @@ def export(
 
     The folder is made under a temporary name and renamed. ``spherical`` is for E57; ``step`` adds the design's solids
     as STEP; without ``with_meshes`` the design of an arch bridge has bottom edges and joints only. Scans of less than
-    FEWEST_POINTS points are left out. The truth's labels have the names and order of the scans as read from the folder.
+    FEWEST_POINTS points are left out. With the truth, files of the formats LABELLED have the
+    points' labels as columns. The truth's labels have the names and order of the scans as read from the folder.
 
     Raises UsageError where the folder exists and is not empty, for a format that cannot hold the scene, where no scan
     is left, and for a scene other than an arch bridge without meshes.
@@ -65,11 +67,15 @@ def export(
         raise UsageError(f"{source}: only an arch bridge has a design without meshes")
     scene = dataclasses.replace(whole, scans=scans)
     with new_folder(folder) as making:
-        written = _write(scene, making, format_, spherical=spherical, with_meshes=with_meshes)
+
+        def write(labels: Sequence[PointLabels]) -> tuple[PointLabels, ...]:
+            written = _write(scene, making, format_, labels, spherical=spherical, with_meshes=with_meshes)
+            return _labels_as_read(labels, written)
+
+        if not (with_truth and store.copy_truth(source, making / "truth.h5", write)):
+            write(())
         if step:
             solids.write_design(store.read_provenance(source).get("parameters") or {}, making / "design")
-        if with_truth:
-            store.copy_truth(source, making / "truth.h5", lambda labels: _labels_as_read(labels, written))
     return Exported(len(scans), tuple(scan.name for scan in whole.scans if len(scan.points) < FEWEST_POINTS))
 
 
@@ -88,7 +94,15 @@ def _labels_as_read(labels: Sequence[PointLabels], written: Sequence[Written]) -
     return tuple(result)
 
 
-def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_meshes: bool) -> list[Written]:
+def _write(
+    scene: Scene,
+    folder: Path,
+    format_: str,
+    labels: Sequence[PointLabels],
+    *,
+    spherical: bool,
+    with_meshes: bool,
+) -> list[Written]:
     (folder / "scans").mkdir()
     lines = [f"name = {project.quoted(scene.name)}", f"kind = {project.quoted(scene.kind)}"]
     lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
@@ -99,7 +113,10 @@ def _write(scene: Scene, folder: Path, format_: str, *, spherical: bool, with_me
     if np.isfinite(scene.temperature_C):
         lines.append(f"temperature_C = {scene.temperature_C!r}")
     named = list(zip(project.stems(scene.scans), scene.scans, strict=True))
-    written = formats.write_all(folder / "scans", format_, named, scene.stations, spherical=spherical)
+    written = formats.write_all(folder / "scans", format_, named, scene.stations, labels, spherical=spherical)
+    if labels and format_ in formats.LABELLED:
+        first = labels[0]
+        project.write_json(folder / LABELS, {"part": list(first.part_names), "surface": list(first.surface_names)})
     for file in written:
         lines += ["", "[[scan]]", f"file = {project.quoted(f'scans/{file.name}')}"]
         if len(file.scans) > 1:

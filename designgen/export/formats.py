@@ -6,20 +6,22 @@ point's station (from 1, 0 = unknown).
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from processor.model import Floats, Ints, Scan, Stations, UsageError
+from processor.model import SOURCES, Floats, Ints, PointLabels, Scan, Stations, UsageError
 from processor.writers import e57, las, ply, text
-from processor.writers.cloud import GRID, METRES, Cloud, columns_of, of_scan, of_scans
+from processor.writers.cloud import GRID, METRES, Block, Cloud, columns_of, of_scan
 
 WRITERS: dict[str, Callable[[Path, Cloud], int]] = {
     "ply": ply.write, "las": las.write, "laz": las.write, "xyz": text.write,
 }  # fmt: skip
+LABELLED = ("ply", "las", "laz", "e57")  # formats whose files have the labels of the points
 
 
 def write_pcd(path: Path, scan: Scan) -> None:
@@ -96,17 +98,49 @@ class Written:
     read_as: tuple[tuple[str, Scan, Ints], ...]
 
 
+def labelled(scan: Scan, labels: Sequence[PointLabels]) -> Cloud:
+    """Return the cloud of a scan with its labels, if there are any, as columns.
+
+    ``part``, ``surface`` and ``defect`` are numbers of the truth's names and defects, -1 = none; ``mixed`` marks points
+    whose footprint lies on several surfaces.
+    """
+    cloud = of_scan(scan)
+    label = next((label for label in labels if label.scan == scan.name), None)
+    if label is None:
+        return cloud
+    columns = {"part": label.part, "surface": label.surface, "defect": label.defect}
+    columns["mixed"] = (label.source == SOURCES.index("mixed")).astype(np.uint8)
+    columns = {name: column for name, column in columns.items() if len(column)}
+
+    def blocks() -> Iterator[Block]:
+        start = 0
+        for block in cloud.blocks():
+            rows = slice(start, start + len(block.points))
+            start = rows.stop
+            yield Block(block.points, {**block.fields, **{name: column[rows] for name, column in columns.items()}})
+
+    types = {name: column.dtype for name, column in columns.items()}
+    return dataclasses.replace(cloud, fields={**cloud.fields, **types}, blocks=blocks)
+
+
 def write_all(
-    folder: Path, format_: str, scans: Sequence[tuple[str, Scan]], stations: Stations | None, *, spherical: bool
+    folder: Path,
+    format_: str,
+    scans: Sequence[tuple[str, Scan]],
+    stations: Stations | None,
+    labels: Sequence[PointLabels] = (),
+    *,
+    spherical: bool,
 ) -> list[Written]:
     """Write scans under ``folder`` by their file stems: a file each, but several stations together in one E57 file.
 
-    Scans of components have a file each in E57, too, because project.toml names the component of a file.
+    Scans of components have a file each in E57, too, because project.toml names the component of a file. Formats of
+    LABELLED have the ``labels`` of the points as columns.
     """
     if format_ == "e57":
         separate = len(scans) == 1 or any(scan.component for _, scan in scans)
         groups = [(stem, [scan]) for stem, scan in scans] if separate else [("scans", [scan for _, scan in scans])]
-        return [_write_e57(folder, stem, group, spherical=spherical) for stem, group in groups]
+        return [_write_e57(folder, stem, group, labels, spherical=spherical) for stem, group in groups]
     if format_ == "ptx":
         return [_write_ptx(folder, stem, scan, stations) for stem, scan in scans]
     written = []
@@ -115,7 +149,8 @@ def write_all(
         if format_ == "pcd":
             write_pcd(folder / name, scan)
         else:
-            WRITERS[format_](folder / name, of_scan(scan))
+            cloud = labelled(scan, labels) if format_ in LABELLED else of_scan(scan)
+            WRITERS[format_](folder / name, cloud)
         written.append(Written(name, (scan,), ((stem, scan, _all_rows(scan)),)))
     return written
 
@@ -124,8 +159,10 @@ def _all_rows(scan: Scan) -> Ints:
     return np.arange(len(scan.points))
 
 
-def _write_e57(folder: Path, stem: str, scans: Sequence[Scan], *, spherical: bool) -> Written:
-    e57.write(folder / f"{stem}.e57", of_scans(scans), spherical=spherical)
+def _write_e57(
+    folder: Path, stem: str, scans: Sequence[Scan], labels: Sequence[PointLabels], *, spherical: bool
+) -> Written:
+    e57.write(folder / f"{stem}.e57", [labelled(scan, labels) for scan in scans], spherical=spherical)
     names = [stem] if len(scans) == 1 else e57.names_read(stem, [scan.name for scan in scans])
     read_as = tuple((name, scan, _all_rows(scan)) for name, scan in zip(names, scans, strict=True))
     return Written(f"{stem}.e57", tuple(scans), read_as)

@@ -32,8 +32,7 @@ def write_scan(group: Any, scan: Scan) -> Ints:
         for name in per_point_fields(Scan)
         if name != "points" and getattr(scan, name).size
     }
-    absent = {name for name in NEWER if not getattr(scan, name).size}
-    codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points", *absent})
+    codec.write_record(group, dataclasses.replace(scan, **sorted_columns), skip={"points"})
     points = group.create_group("points")
     for axis, column in zip(AXES, tiled.columns, strict=True):
         codec.write_array(points, axis, column)
@@ -56,8 +55,7 @@ def read_scan(group: Any) -> Scan:
     wrong = tiles.misplaced(grid, stored.cell, stored.counts, (data[0], data[1], data[2]))
     if wrong:
         raise DecodeError([f"{group.name}/points: {wrong} points lie outside their tile of the index"])
-    given = {"points": grid.millimetres((data[0], data[1], data[2])), **_absent(group)}
-    scan = codec.read_record(group, Scan, given=given)
+    scan = codec.read_record(group, Scan, given={"points": grid.millimetres((data[0], data[1], data[2]))})
     if not np.isfinite(scan.origin).all():
         raise DecodeError([f"{group.name}/origin: is not finite"])
     return scan

@@ -26,6 +26,7 @@ from processor.scan_folder import folder
 from processor.store import store
 from processor.writers.cloud import Block, Cloud
 from tests.support import exported_runs, stitch_clouds
+from tests.support.e57_fields import e57_field
 from tests.support.exported_runs import MAP, pose, swept
 from tests.support.meshes import bracket
 
@@ -462,20 +463,6 @@ def test_core_points_carry_deviation_lod_and_component(measured, tmp_path):
     assert (component[~is_other] < component.max()).all()
     other = vertex["deviation_mm"][is_other]
     assert np.nanmedian(other) == pytest.approx(4.0, abs=0.3)
-
-
-def e57_field(path, name):
-    """A column of the first scan, by the library's own buffers."""
-    from pye57 import libe57
-
-    image = libe57.ImageFile(str(path), "r")
-    points = image.root()["data3D"][0]["points"]
-    values = np.empty(points.childCount())
-    buffers = libe57.VectorSourceDestBuffer()
-    buffers.append(libe57.SourceDestBuffer(image, name, values, len(values), True, True))
-    points.reader(buffers).read()
-    image.close()
-    return values
 
 
 def test_a_clean_scan_has_no_clutter(measured, tmp_path):
