@@ -130,7 +130,8 @@ def _stations(run: Run) -> int:
     return 0 if run.scene.stations is None else len(run.scene.stations.ids)
 
 
-def _has_stations(run: Run, placed: Placed) -> bool:
+def has_stations(run: Run, placed: Placed) -> bool:
+    """Whether a scan is a merged cloud whose points name their stations."""
     return len(run.points.column(placed.number, "point_station")) > 0
 
 
@@ -139,12 +140,12 @@ def numbering(run: Run, scans: Sequence[Placed]) -> Numbering:
     stations = run.scene.stations
     ids: list[str] = []
     of_station = np.zeros(_stations(run) + 1, np.int64)  # the last is that of -1: unknown
-    if stations is not None and any(_has_stations(run, placed) for placed in scans):
+    if stations is not None and any(has_stations(run, placed) for placed in scans):
         ids = list(stations.ids)
         of_station[:-1] = np.arange(1, len(ids) + 1)
     of_scan = []
     for placed in scans:
-        if _has_stations(run, placed):
+        if has_stations(run, placed):
             of_scan.append(0)
             continue
         name = placed.scan.station or placed.scan.name
@@ -175,7 +176,7 @@ def stations_moved(run: Run, scans: Sequence[Placed]) -> Stations | None:
     stations = run.scene.stations
     places = []
     for placed in scans:
-        if stations is not None and _has_stations(run, placed):
+        if stations is not None and has_stations(run, placed):
             given = placed.scan.T_project_scan if placed.scan.T_project_scan.size else np.eye(4)
             T = placed.T @ rigid.invert(given) if placed.known else np.eye(4)
             places.append(rigid.apply(T, placed.scale * stations.positions))

@@ -123,6 +123,9 @@ def _write(run: Run, content: _Content, target: tuple[Path, Path], names: tuple[
     if content.scans:
         scan_folder.write(making, run, content.scans, list(files), what, format_)
     remarks = list(content.remarks)
+    if format_ == "e57":
+        lost = tuple(one.scan.name for one in content.scans if contents.has_stations(run, one))
+        remarks += [reason("export.stations-lost", scans=lost)] if lost else []
     for stem, removed in content.removed.items():
         if not removed.compared:
             remarks.append(reason("export.not-compared", file=stem))

@@ -72,7 +72,7 @@ def in_project(run: Run, what: str) -> Poses:
     if unposed and run.scene.kind == "arch-bridge":
         raise UsageError(
             f"{what} needs scans in one frame, but those of {run.name} are parts without poses ({unposed[0]}): "
-            "export them assembled or clean"
+            "use --what assembled or clean"
         )
     if unposed and run.scene.kind == "structure":
         run.step("stitch", what)

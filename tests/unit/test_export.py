@@ -21,7 +21,7 @@ from processor.cli.main import commands
 from processor.clouds import cleaning, slabs, thinning
 from processor.clouds import export as clouds_export
 from processor.clouds.points import InMemory, Spool
-from processor.model import InputError, Scene, Status, UsageError
+from processor.model import InputError, Scene, Stations, Status, UsageError
 from processor.scan_folder import folder
 from processor.store import store
 from processor.writers.cloud import Block, Cloud
@@ -182,6 +182,22 @@ def test_parts_are_assembled_at_the_reference_temperature(tmp_path):
     assert np.isnan(processor.read(target).temperature_C)
 
 
+def test_stations_of_a_merged_cloud(tmp_path):
+    scan = dataclasses.replace(swept("all", 1), grid_row=(), grid_column=())
+    station = np.arange(len(scan.points)) % 4 - 1  # -1: unknown
+    scan = dataclasses.replace(scan, point_station=station)
+    stations = Stations(("A", "B", "C"), RNG.uniform(-1e4, 1e4, (3, 3)))
+    results = exported_runs.not_run(Scene("hall", "structure", (scan,), stations=stations))
+    for what, name in (("registered", "scans/all"), ("merged", "merged")):
+        processor.export(results, tmp_path / what, what=what, format="laz")
+        np.testing.assert_array_equal(laspy.read(tmp_path / what / f"{name}.laz").point_source_id, station + 1)
+        back = processor.read(tmp_path / what)
+        np.testing.assert_array_equal(back.scans[0].point_station, station)
+        np.testing.assert_allclose(back.stations.positions, stations.positions, atol=1e-6)
+    done = processor.export(results, tmp_path / "e57")
+    assert [remark.code for remark in done.remarks] == ["export.stations-lost"]
+
+
 def test_of_several_scans_of_a_part_the_one_with_the_pose_is_assembled(tmp_path):
     names = ("foot1", "foot1, again")
     scans = [swept(name, i, component="foot1") for i, name in enumerate(names)]
@@ -300,7 +316,7 @@ def test_scans_without_poses_need_stitching(tmp_path):
     with pytest.raises(UsageError, match="registered needs the step stitch"):
         processor.export(results, tmp_path / "x")
     parts = exported_runs.assembled([swept("a", 1, component="a"), swept("b", 2, component="b")], [pose(1), pose(2)])
-    with pytest.raises(UsageError, match="export them assembled or clean"):
+    with pytest.raises(UsageError, match="use --what assembled or clean"):
         processor.export(parts, tmp_path / "x", what="merged")
 
 
