@@ -79,15 +79,17 @@ class Spool:
     def keep(self, scan: Scan) -> Scan:
         """Put the points of the next scan aside, and return the scan without them."""
         number = len(self.columns)
-        columns = {}
+        columns: dict[str, FileColumn] = {}
+        none: dict[str, Any] = {}
         for name in NAMES:
             values = getattr(scan, name)
             path = self.folder / f"{number}-{name}"
             if values.size:
                 values.tofile(path)
             columns[name] = FileColumn(path, values.dtype, values.shape)
+            none[name] = np.empty((0, *values.shape[1:]), values.dtype)  # no view, which would keep the memory
         self.columns.append(columns)
-        return dataclasses.replace(scan, **{name: values[:0] for name, values in _columns(scan).items()})
+        return dataclasses.replace(scan, **none)
 
     def column(self, scan: int, name: str) -> Column:
         """Return a column; an absent one is empty."""
@@ -97,10 +99,6 @@ class Spool:
         """Return the shape of a column and an iterator over it; see :func:`processor.store.store.scene_hash`."""
         column = self.columns[scan][name]
         return column.shape, (column[start : start + BLOCK] for start in range(0, len(column), BLOCK))
-
-
-def _columns(scan: Scan) -> dict[str, Any]:
-    return {name: getattr(scan, name) for name in NAMES}
 
 
 def blocks(points: Points, scan: int) -> Iterator[dict[str, Any]]:
