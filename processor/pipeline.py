@@ -344,7 +344,10 @@ def read_runs(results: Path) -> tuple[tuple[StepRun, ...], dict[str, Any]]:
 def check_same_input(results: Path, provenance: Mapping[str, Any], path: Path, digest: str) -> None:
     """Raise InputError where the hash of the scene of ``path`` is not that of the input of ``results``."""
     if digest != provenance["input_sha256"]:
-        raise InputError(f"{results}: was made from {provenance['input']!r} as it was then, not from {path} as it is")
+        raise InputError(
+            f"{results}: was made from {provenance['input']!r} as it was then, not from {path} as it is "
+            "(or with another --units); run processor run again"
+        )
 
 
 def read_execution(results: Path, path: Path, units: str | None) -> Execution:
