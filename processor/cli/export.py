@@ -38,7 +38,7 @@ def export(
     units: str | None,
     as_json: bool,
 ) -> None:
-    r"""Write point clouds of the run in OUT as a new folder.
+    """Write point clouds of the run in OUT as a new folder.
 
     \b
     registered  each scan with its pose, and a project.toml that processor run takes
@@ -48,7 +48,7 @@ def export(
     deviation   core points with deviation_mm, lod95_mm and component
 
     Without INPUT the file of its name beside OUT is taken, or in the current folder, if its content is the same.
-    """
+    """  # noqa: D301
     from processor.clouds.export import export as write
     from processor.language.messages import messages
     from processor.progress import stage
