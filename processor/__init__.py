@@ -13,7 +13,7 @@ from processor.version import __version__
 
 if TYPE_CHECKING:
     from processor.api.arrays import CorePoints, Pose, SphereFit, fit_sphere, m3c2, register
-    from processor.api.runs import Results, check, read, run
+    from processor.api.runs import Results, check, export, read, run
 
 __all__ = [
     "CorePoints",
@@ -22,13 +22,14 @@ __all__ = [
     "SphereFit",
     "__version__",
     "check",
+    "export",
     "fit_sphere",
     "m3c2",
     "read",
     "register",
     "run",
 ]
-_RUNS = ("Results", "check", "read", "run")
+_RUNS = ("Results", "check", "export", "read", "run")
 _ARRAYS = ("CorePoints", "Pose", "SphereFit", "fit_sphere", "m3c2", "register")
 _HOMES = dict.fromkeys(_RUNS, "processor.api.runs") | dict.fromkeys(_ARRAYS, "processor.api.arrays")
 

@@ -127,7 +127,10 @@ def per_point_fields(record: type) -> tuple[str, ...]:
 
 
 def newer() -> Any:
-    """Declare a record that came to the schema later: absent, it changes no scene's hash."""
+    """Declare a record that came to the schema later: absent, it changes no scene's hash.
+
+    A column with ``newer`` in its metadata is of this kind too: where it is empty it is not stored.
+    """
     return dataclasses.field(default=None, metadata={"newer": True})
 
 
@@ -274,6 +277,7 @@ class Scan(Checked):
         4, 4
     )  # absent: the scan is in the project's frame already, or its pose is unknown
     sigma_mm: float = float("nan")  # range noise, one standard deviation; NaN = unknown
+    colour: Codes = column("n", 3, dtype=np.uint8, newer=True)  # red, green, blue
 
 
 @dataclass(frozen=True)
@@ -437,6 +441,7 @@ class PointLabels(Checked):
     surface: Labels = column("n", dtype=np.int32)  # -1 = none
     range_error_mm: Shorts = column("n", dtype=np.float32)
     incidence_cos: Shorts = column("n", dtype=np.float32)
+    defect: Labels = column("n", dtype=np.int32, newer=True)  # id of the defect that displaced the surface, -1 = none
 
 
 SOURCES = ("surface", "mixed", "outlier")  # the footprint on one surface; on several, or past an edge; a stray return

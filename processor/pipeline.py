@@ -19,7 +19,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from processor.model import InputError, Scene, Status, StepRun, UsageError, reason
+from processor.model import InputError, Scan, Scene, Status, StepRun, UsageError, reason
 from processor.progress import stage
 from processor.store.json_values import json_ready
 from processor.version import __version__
@@ -84,10 +84,13 @@ def result_classes() -> dict[str, type]:
     return {name: module.Result for name, module in step_modules().items()}
 
 
-def read(path: Path, units: str | None, piecewise: bool = False) -> Scene:
+def read(
+    path: Path, units: str | None, piecewise: bool = False, keep: Callable[[Scan], Scan] = lambda scan: scan
+) -> Scene:
     """Read a scan folder, a scene file or one scan file; InputError where it cannot be used.
 
-    ``piecewise`` leaves the points of a scene file where they are, for steps that take them piece by piece.
+    ``piecewise`` leaves the points of a scene file where they are, for steps that take them piece by piece. Scans of
+    other files go through ``keep``, see :func:`processor.scan_folder.folder.read_input`.
     """
     from processor.scan_folder import folder
     from processor.store import store
@@ -97,7 +100,7 @@ def read(path: Path, units: str | None, piecewise: bool = False) -> Scene:
             raise UsageError(f"--units {units}: {path.name} is a scene file, which knows its units; leave --units out")
         scene = store.read_scene(path, not piecewise)
     else:
-        scene = folder.read_input(path, units)
+        scene = folder.read_input(path, units, keep)
     for name in (path.name, scene.name, *(scan.name for scan in scene.scans)):
         try:
             name.encode("utf-8")
@@ -325,10 +328,9 @@ def _parameters(runs: Sequence[StepRun]) -> list[dict[str, Any]]:
     return [{"step": run.step, **json.loads(run.params)} for run in runs]
 
 
-def read_execution(results: Path, path: Path, units: str | None) -> Execution:
-    """Read what was run on ``path`` earlier. Raises InputError where the results are those of another input."""
+def read_runs(results: Path) -> tuple[tuple[StepRun, ...], dict[str, Any]]:
+    """Read the steps that were run earlier, and how. Raises InputError where the file does not say what it should."""
     from processor.store import store
-    from processor.store.streaming import points_of
 
     runs = store.read_results(results, result_classes())
     provenance = store.read_provenance(results)
@@ -336,12 +338,29 @@ def read_execution(results: Path, path: Path, units: str | None) -> Execution:
     if missing:
         raise InputError(f"{results}: does not say its {', '.join(sorted(missing))}; run processor run again")
     provenance["parameters"] = _parameters(runs)  # the store sorts names, a run's parameters keep their order
+    return runs, provenance
+
+
+def check_same_input(results: Path, provenance: Mapping[str, Any], path: Path, digest: str) -> None:
+    """Raise InputError where the hash of the scene of ``path`` is not that of the input of ``results``."""
+    if digest != provenance["input_sha256"]:
+        raise InputError(
+            f"{results}: was made from {provenance['input']!r} as it was then, not from {path} as it is "
+            "(or with another --units); run processor run again"
+        )
+
+
+def read_execution(results: Path, path: Path, units: str | None) -> Execution:
+    """Read what was run on ``path`` earlier. Raises InputError where the results are those of another input."""
+    from processor.store import store
+    from processor.store.streaming import points_of
+
+    runs, provenance = read_runs(results)
     piecewise = is_large(path)
     scene = read(path, units, piecewise)
     with points_of(path) if piecewise else nullcontext() as points:
         digest = store.scene_hash(scene, None if points is None else points.pieces)
-    if digest != provenance["input_sha256"]:
-        raise InputError(f"{results}: was made from {provenance['input']!r} as it was then, not from {path} as it is")
+    check_same_input(results, provenance, path, digest)
     return Execution(scene, runs, provenance, path if piecewise else None)
 
 

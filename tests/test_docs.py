@@ -38,6 +38,9 @@ RUN = (
     "processor run my-frame -o results --method ray,ransac",
     "processor check results",
     "processor report results",
+    "processor export results -o registered --what registered --format e57",
+    "processor export results -o merged --what merged --format laz --spacing-mm 5",
+    "processor export results -o clean --what clean --format ply",
     "processor run target.e57 -o results --steps spheres",
     "processor batch projects -o all-results --jobs 2",
     "processor batch projects -o all-results --jobs 4",
@@ -50,6 +53,7 @@ RUN = (
     "designgen import design.step -o meshes",
     "designgen scan design.step -o part.h5",
     "processor run my-roof -o results --steps deviation",
+    "processor export results -o deviation --what deviation --format ply",
     "processor run my-plates -o results --steps deviation,defects",
 )
 # Commands that take minutes or need other machines, and what runs them, or the same with less to do.
@@ -58,6 +62,7 @@ ELSEWHERE = {
     "processor run my-bridge -o results --method adjustment,design-aided": "make demo",
     "processor run my-truss -o results --steps stitch": "tests/unit/test_stitching.py",
     "processor run my-truss -o results --steps stitch --method three-point": "tests/unit/test_stitching_picks.py",
+    "processor export results -o assembled --what assembled --format e57": "tests/unit/test_export.py",
     "processor batch /scans -o /results --cluster tcp://10.0.0.1:8786": "tests/unit/test_batch.py",
     "processor validate mine.toml -o nights --jobs 2": "tests/unit/test_validation_running.py",
     "processor validate mine.toml -o nights --cluster tcp://10.0.0.1:8786": "tests/unit/test_validation_running.py",
@@ -207,6 +212,9 @@ def test_cheap_commands_run(place):
             assert [ball["radius"] for ball in balls] == pytest.approx([75.0], abs=0.5)
     assert json.loads((place / "results/results.json").read_text("utf-8"))["steps"]["defects"]["status"] == "ok"
     assert (place / "change/compare.csv").exists()
+    assert len(read_input(place / "registered").scans) == len(read_input(place / "clean").scans) == 1
+    assert (place / "merged/merged.laz").exists()
+    assert (place / "deviation/deviation.ply").exists()
     assert read_input(place / "example").arch is not None
 
 
@@ -262,7 +270,7 @@ def test_parameters_in_the_pages_exist():
 def test_the_functions_of_the_python_page_exist():
     code = "\n".join(blocks(ROOT / "docs/python.md", "python"))
     names = re.findall(r"\b(processor|designgen)\.(\w+)\(", code)
-    assert len(names) == 8
+    assert len(names) == 9
     missing = [f"{module}.{name}" for module, name in names if not hasattr(MODULES[module], name)]
     if missing:
         pytest.skip(f"not in this version yet: {', '.join(missing)}")

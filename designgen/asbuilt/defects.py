@@ -21,6 +21,7 @@ from processor.model import Floats, UsageError
 CLASSES = (
     "dent", "bulge", "bend", "twist", "waviness", "edge-loss", "missing-part", "pit", "crack", "step", "misalignment",
 )  # fmt: skip
+LEAST_MM = 0.01  # displacement of a surface that belongs to a defect
 MOST_SHARE = 0.95  # largest fraction of a component's length or height that a defect may cover
 SIZED = (
     "dent_depth_mm", "bend_mm", "twist_mrad", "wave_mm", "loss_mm", "pit_depth_mm", "step_mm", "shift_mm", "tilt_mrad",
@@ -75,6 +76,11 @@ class Defect:
     fine: tuple[float, float]  # half width and step of the finer part of the net about the place
     missing: Floats = dataclasses.field(default_factory=lambda: np.empty((0, 4)))
     front_only: bool = False
+
+    def displaces(self, points: Floats) -> Bools:
+        """Mark the points (n, 3), in the component's axes, where the surface is displaced by LEAST_MM or more."""
+        displaced: Bools = np.linalg.norm(self.displacement(points), axis=1) >= LEAST_MM
+        return displaced
 
 
 def extent(form: plate_row.Params) -> tuple[float, float]:

@@ -16,10 +16,10 @@ from typing import Any
 
 from designgen.cad.bodies import UNITS_MM, CadFile
 from designgen.cad.process import received
-from designgen.new_folder import check_new, new_folder
-from designgen.ply import write_mesh
 from processor.jobs.process import Cause, isolated, run
 from processor.model import InputError, UsageError
+from processor.store.new_folder import check_new, new_folder
+from processor.writers.ply import write_mesh
 
 STEP_SUFFIXES, ZIPPED, IFC_SUFFIXES = (".step", ".stp"), ".ifczip", (".ifc", ".ifczip")
 MAGIC, END = b"ISO-10303-21", b"END-ISO-10303-21"

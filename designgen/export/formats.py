@@ -6,69 +6,29 @@ point's station (from 1, 0 = unknown).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import dataclasses
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from designgen.export import METRES, e57
-from designgen.ply import records, write_columns
-from processor.model import Floats, Ints, Scan, Stations, UsageError
+from processor.model import SOURCES, Floats, Ints, PointLabels, Scan, Stations, UsageError
+from processor.writers import e57, las, ply, text
+from processor.writers.cloud import GRID, METRES, Block, Cloud, columns_of, of_scan
 
-LAS_STEP_M = 0.0001
-
-
-def station_numbers(scan: Scan) -> Ints:
-    """Return the stations' numbers (n,) of a merged cloud, (0,) of any other."""
-    return scan.point_station.astype(np.int64) + 1
-
-
-def _columns(scan: Scan, scale: float = 1.0) -> dict[str, Any]:
-    """Return coordinates times ``scale``, and the intensities and stations that there are, by name."""
-    columns: dict[str, Any] = {axis: (scan.points[:, i] + scan.origin[i]) * scale for i, axis in enumerate("xyz")}
-    if len(scan.intensity):
-        columns["intensity"] = scan.intensity.astype(np.float32)
-    if len(scan.point_station):
-        columns["station"] = station_numbers(scan).astype(np.int32)
-    return columns
-
-
-def write_ply(path: Path, scan: Scan) -> None:
-    """Write binary PLY with coordinates as doubles, mm."""
-    write_columns(path, _columns(scan))
-
-
-def write_las(path: Path, scan: Scan) -> None:
-    """Write LAS or LAZ 1.4 in metres, to 0.0001 m; the intensity scaled to 16 bits, the station as point source."""
-    import laspy
-
-    header = laspy.LasHeader(point_format=6, version="1.4")
-    header.scales = np.full(3, LAS_STEP_M)
-    low = scan.points.min(axis=0) if len(scan.points) else np.zeros(3)
-    header.offsets = np.floor((scan.origin + low) * METRES)
-    # With a date, the bytes would change from day to day.
-    header.creation_date = None
-    las = laspy.LasData(header)
-    # Steps from the offset, without large coordinates in between.
-    shift = scan.origin - header.offsets / METRES
-    steps = np.rint((scan.points + shift) * (METRES / LAS_STEP_M)).astype(np.int32)
-    record = laspy.ScaleAwarePointRecord.zeros(len(scan.points), header=header)
-    record.X, record.Y, record.Z = steps.T
-    if len(scan.intensity):
-        brightest = max(float(scan.intensity.max(initial=0.0)), 1e-12)
-        record.intensity = np.rint(np.clip(scan.intensity / brightest, 0.0, 1.0) * 65535.0).astype(np.uint16)
-    if len(scan.point_station):
-        record.point_source_id = station_numbers(scan).astype(np.uint16)
-    las.points = record
-    las.write(str(path))
+WRITERS: dict[str, Callable[[Path, Cloud], int]] = {
+    "ply": ply.write, "las": las.write, "laz": las.write, "xyz": text.write,
+}  # fmt: skip
+LABELLED = ("ply", "las", "laz", "e57")  # formats whose files have the labels of the points
 
 
 def write_pcd(path: Path, scan: Scan) -> None:
     """Write binary PCD in metres, coordinates as doubles."""
-    columns = _columns(scan, METRES)
-    rows = records(columns)
+    columns: dict[str, Any] = {axis: (scan.points[:, i] + scan.origin[i]) * METRES for i, axis in enumerate("xyz")}
+    columns |= {name: column for name, column in columns_of(scan).items() if name not in GRID}
+    rows = ply.records(columns)
     types = [column.dtype for column in columns.values()]
     header = (
         f"VERSION 0.7\nFIELDS {' '.join(columns)}\nSIZE {' '.join(str(t.itemsize) for t in types)}\n"
@@ -76,14 +36,6 @@ def write_pcd(path: Path, scan: Scan) -> None:
         f"HEIGHT 1\nVIEWPOINT 0.0 0.0 0.0 1.0 0.0 0.0 0.0\nPOINTS {len(rows)}\nDATA binary\n"
     )
     path.write_bytes(header.encode() + rows.tobytes())
-
-
-def write_xyz(path: Path, scan: Scan) -> None:
-    """Write text in metres to 0.1 micrometre; with a header if there are columns besides the coordinates."""
-    columns = _columns(scan, METRES) | ({"intensity": scan.intensity} if len(scan.intensity) else {})
-    forms = ["%.7f"] * 3 + [{"intensity": "%.5g", "station": "%d"}[name] for name in list(columns)[3:]]
-    header = " ".join(columns) if len(columns) > 3 else ""
-    np.savetxt(path, np.stack(list(columns.values()), axis=1), fmt=forms, header=header, comments="")
 
 
 def write_ptx(path: Path, scan: Scan, stations: Stations | None) -> None:
@@ -146,24 +98,59 @@ class Written:
     read_as: tuple[tuple[str, Scan, Ints], ...]
 
 
+def labelled(scan: Scan, labels: Sequence[PointLabels]) -> Cloud:
+    """Return the cloud of a scan with its labels, if there are any, as columns.
+
+    ``part``, ``surface`` and ``defect`` are numbers of the truth's names and defects, -1 = none; ``mixed`` marks points
+    whose footprint lies on several surfaces.
+    """
+    cloud = of_scan(scan)
+    label = next((label for label in labels if label.scan == scan.name), None)
+    if label is None:
+        return cloud
+    columns = {"part": label.part, "surface": label.surface, "defect": label.defect}
+    columns["mixed"] = (label.source == SOURCES.index("mixed")).astype(np.uint8)
+    columns = {name: column for name, column in columns.items() if len(column)}
+
+    def blocks() -> Iterator[Block]:
+        start = 0
+        for block in cloud.blocks():
+            rows = slice(start, start + len(block.points))
+            start = rows.stop
+            yield Block(block.points, {**block.fields, **{name: column[rows] for name, column in columns.items()}})
+
+    types = {name: column.dtype for name, column in columns.items()}
+    return dataclasses.replace(cloud, fields={**cloud.fields, **types}, blocks=blocks)
+
+
 def write_all(
-    folder: Path, format_: str, scans: Sequence[tuple[str, Scan]], stations: Stations | None, *, spherical: bool
+    folder: Path,
+    format_: str,
+    scans: Sequence[tuple[str, Scan]],
+    stations: Stations | None,
+    labels: Sequence[PointLabels] = (),
+    *,
+    spherical: bool,
 ) -> list[Written]:
     """Write scans under ``folder`` by their file stems: a file each, but several stations together in one E57 file.
 
-    Scans of components have a file each in E57, too, because project.toml names the component of a file.
+    Scans of components have a file each in E57, too, because project.toml names the component of a file. Formats of
+    LABELLED have the ``labels`` of the points as columns.
     """
     if format_ == "e57":
         separate = len(scans) == 1 or any(scan.component for _, scan in scans)
         groups = [(stem, [scan]) for stem, scan in scans] if separate else [("scans", [scan for _, scan in scans])]
-        return [_write_e57(folder, stem, group, spherical=spherical) for stem, group in groups]
+        return [_write_e57(folder, stem, group, labels, spherical=spherical) for stem, group in groups]
     if format_ == "ptx":
         return [_write_ptx(folder, stem, scan, stations) for stem, scan in scans]
-    writers = {"ply": write_ply, "las": write_las, "laz": write_las, "pcd": write_pcd, "xyz": write_xyz}
     written = []
     for stem, scan in scans:
         name = f"{stem}.{format_}"
-        writers[format_](folder / name, scan)
+        if format_ == "pcd":
+            write_pcd(folder / name, scan)
+        else:
+            cloud = labelled(scan, labels) if format_ in LABELLED else of_scan(scan)
+            WRITERS[format_](folder / name, cloud)
         written.append(Written(name, (scan,), ((stem, scan, _all_rows(scan)),)))
     return written
 
@@ -172,9 +159,11 @@ def _all_rows(scan: Scan) -> Ints:
     return np.arange(len(scan.points))
 
 
-def _write_e57(folder: Path, stem: str, scans: Sequence[Scan], *, spherical: bool) -> Written:
-    e57.write(folder / f"{stem}.e57", scans, spherical=spherical)
-    names = [stem] if len(scans) == 1 else e57.names_read(stem, scans)
+def _write_e57(
+    folder: Path, stem: str, scans: Sequence[Scan], labels: Sequence[PointLabels], *, spherical: bool
+) -> Written:
+    e57.write(folder / f"{stem}.e57", [labelled(scan, labels) for scan in scans], spherical=spherical)
+    names = [stem] if len(scans) == 1 else e57.names_read(stem, [scan.name for scan in scans])
     read_as = tuple((name, scan, _all_rows(scan)) for name, scan in zip(names, scans, strict=True))
     return Written(f"{stem}.e57", tuple(scans), read_as)
 

@@ -144,7 +144,7 @@ def merged(
         **join(surveyed.scans, ("intensity", "grid_row", "grid_column")),
     )
     first = surveyed.labels[0]
-    columns = join(surveyed.labels, LABELS)
+    columns = join(surveyed.labels, (*LABELS, "defect") if len(first.defect) else LABELS)
     return scan, PointLabels(name, first.part_names, surface_names=first.surface_names, **columns)
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from processor.model import (
     AsBuilt,
     DefectTruth,
     Floats,
+    Labels,
     Picks,
     PointLabels,
     Scan,
@@ -37,14 +39,26 @@ from processor.model import (
 TRUTH_STEP_MM = 250.0
 Components = tuple[box_and_tube.Component, ...]
 PartPatches = list[tuple[int, Patch]]  # the row of the component of each face
-Built = tuple[PartPatches, Displacement | None, DefectTruth | None]
+OfDefects = Callable[[Floats, PointLabels], Labels]  # points in the design's frame -> defect of each
+
+
+PlacedDefect = tuple[plate_row.Place, asbuilt_defects.Defect]
+
+
+class Built(NamedTuple):
+    """Faces as built, the displacement of a whole structure, and the truth of plates' defects."""
+
+    patches: PartPatches
+    displacement: Displacement | None = None
+    defects: DefectTruth | None = None
+    of_defects: OfDefects | None = None
 
 
 def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) -> tuple[Scene, Truth]:
     """Make the scene of a structure of type ``structure.type``: stadium-roof, truss-bridge or plate-row."""
     components = structure_registry.design(recipe)
     kind = recipe["structure"]["type"]
-    patches, displacement, defects = built_faces(kind, components, recipe, seed)
+    patches, displacement, defects, of_defects = built_faces(kind, components, recipe, seed)
     names = tuple(component.name for component in components)
     stations, station_truth, picks = None, None, None
     origin = np.zeros(3)
@@ -57,6 +71,8 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         poses = _places(kind, patches, params, seed)
         _add_poles(builder, poses, patches, params.clutter, seed)
         surveyed = survey.survey(builder.to_surfaces(), names, poses, scanning.device, params, seed)
+        if of_defects is not None:
+            surveyed = _labelled(surveyed, of_defects)
         scans, labels, stations, station_truth = survey.in_project(surveyed, origin, params.merged)
         picks = _picks(recipe, scans, station_truth, seed)
         if not params.registered:
@@ -70,7 +86,10 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
         hidden = None if kind == "plate-row" else _hidden(components)
         cloud = sampler.scan_patches(patches, scanning, generator(seed, "scan"), hidden)
         scans = (Scan("scan", cloud.points, sigma_mm=scanning.sigma_mm),)
-        labels = (PointLabels("scan", names, cloud.part, cloud.source),)
+        label = PointLabels("scan", names, cloud.part, cloud.source)
+        if of_defects is not None:
+            label = dataclasses.replace(label, defect=of_defects(cloud.points, label))
+        labels = (label,)
     vertices, faces = box_and_tube.mesh_of(components)
     scene = Scene(
         name,
@@ -93,6 +112,15 @@ def make(name: str, recipe: Mapping[str, Any], scanning: Scanning, seed: int) ->
     )
 
 
+def _labelled(surveyed: survey.Survey, of_defects: OfDefects) -> survey.Survey:
+    """Label the points of a survey with the defects that displaced them."""
+    labels = [
+        dataclasses.replace(label, defect=of_defects(scan.points @ T[:3, :3].T + T[:3, 3], label))
+        for scan, label, T in zip(surveyed.scans, surveyed.labels, surveyed.truth.T_project_station, strict=True)
+    ]
+    return dataclasses.replace(surveyed, labels=tuple(labels))
+
+
 def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth, seed: int) -> Picks | None:
     if "picks" not in recipe:
         return None
@@ -104,16 +132,16 @@ def _picks(recipe: Mapping[str, Any], scans: Sequence[Scan], truth: StationTruth
 
 
 def built_faces(kind: str, components: Components, recipe: Mapping[str, Any], seed: int) -> Built:
-    """Return the faces as built, the displacement of a whole structure, and the truth of plates' defects."""
+    """Return a structure as built."""
     if kind == "plate-row":
         return _plates(components, recipe, seed)
     designed = _as_designed(components)
     if "asbuilt" not in recipe:
-        return designed, None, None
+        return Built(designed)
     if kind == "truss-bridge":
         raise UsageError("asbuilt: a truss-bridge is built as designed; leave the section asbuilt out")
     displacement = asbuilt_defects.movement(filled(asbuilt_defects.MovementParams, recipe, "asbuilt"), components)
-    return [(part, patch.displaced(displacement)) for part, patch in designed], displacement, None
+    return Built([(part, patch.displaced(displacement)) for part, patch in designed], displacement)
 
 
 def _ledger(kind: str, recipe: Mapping[str, Any]) -> AsBuilt:
@@ -132,7 +160,7 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
     form = structure_registry.params(recipe)
     sizes = filled(asbuilt_defects.Params, recipe, "asbuilt")
     patches: PartPatches = []
-    placed: list[tuple[plate_row.Place, asbuilt_defects.Defect]] = []
+    placed: list[PlacedDefect] = []
     for part, place in enumerate(plate_row.places(form)):
         if place.defect == "none":
             patches += [(part, patch) for patch in components[part].patches]
@@ -150,7 +178,19 @@ def _plates(components: Components, recipe: Mapping[str, Any], seed: int) -> Bui
         depth_max_mm=np.array([defect.depth_max_mm for _, defect in placed]),
         volume_mm3=np.array([defect.volume_mm3 for _, defect in placed]),
     )
-    return patches, None, truth
+    return Built(patches, defects=truth, of_defects=partial(_defects_of, placed))
+
+
+def _defects_of(placed: Sequence[PlacedDefect], at: Floats, label: PointLabels) -> Labels:
+    """Return the row in ``placed`` of the defect that displaced the surface at each of the points ``at``, -1 = none."""
+    rows = np.full(len(at), -1, np.int32)
+    for number, (place, defect) in enumerate(placed):
+        of_component = np.flatnonzero(label.part == label.part_names.index(place.name))
+        if defect.front_only and len(label.surface):
+            fronts = [row for row, name in enumerate(label.surface_names) if name == "0 +n"]
+            of_component = of_component[np.isin(label.surface[of_component], fronts)]
+        rows[of_component[defect.displaces(place.local(at[of_component]))]] = number
+    return rows
 
 
 def _as_designed(components: Components) -> PartPatches:

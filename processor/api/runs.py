@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from processor import pipeline
+from processor.clouds import export as clouds_export
+from processor.clouds.export import Exported
 from processor.evaluation import evaluate
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import InputError, Metric, Scene, Truth, Verdict, worst
@@ -173,6 +175,38 @@ def check(results: Results, truth: Truth) -> tuple[Metric, ...]:
     InputError : the truth is that of another scene.
     """
     return evaluate.against(truth, results.execution, results.scene.name).metrics
+
+
+def export(
+    results: Results | str | Path,
+    folder: str | Path,
+    what: str = "registered",
+    format: str = "e57",
+    spacing_mm: float | None = None,
+) -> Exported:
+    """Write point clouds of a run as a new folder, as ``processor export`` does.
+
+    Parameters
+    ----------
+    results : of :func:`run`, or a folder of results, whose input is beside it or in the current folder.
+    folder : a new or an empty one. It is made whole or not at all.
+    what : "registered", each scan with its pose; "merged", all as one cloud in the project's frame; "assembled", the
+        parts of a bridge in the bridge's frame; "clean", each scan without outliers and points away from the design;
+        "deviation", core points with deviation_mm, lod95_mm and component in the design's frame.
+    format : "e57", "las", "laz", "ply" or "xyz". PLY is in mm, the others in metres.
+    spacing_mm : least distance of two points; others are left out. None = all points.
+
+    Returns
+    -------
+    The files by name with their numbers of points, and remarks on what was left out.
+
+    Raises
+    ------
+    InputError : the input has changed since the run, or the folder cannot be written.
+    UsageError : a name is unknown, the folder exists, or a step that is needed was not run.
+    """
+    source = results.execution if isinstance(results, Results) else Path(results)
+    return clouds_export.export(source, Path(folder), what, format, spacing_mm or 0.0)
 
 
 def _names(value: Names) -> tuple[str, ...]:

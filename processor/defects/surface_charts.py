@@ -15,7 +15,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processor.geometry import enclosure, mesh_distance
-from processor.geometry.mesh_distance import Bools
+from processor.geometry.mesh_distance import Bools, MeshSurface
 from processor.model import Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
@@ -167,6 +167,12 @@ def _welded(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
     key = np.round(vertices / WELD_MM).astype(np.int64)
     _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
     return vertices[first], inverse.reshape(-1)[faces]
+
+
+def with_components(vertices: Floats, faces: Ints) -> tuple[MeshSurface, Ints]:
+    """Prepare a mesh for searches; also the component (f,) of each of its facets, numbered as in the defects' names."""
+    surface = mesh_distance.of_design(*_welded(vertices, faces))
+    return surface, _components(surface.vertices, surface.faces)
 
 
 def _components(vertices: Floats, faces: Ints) -> Ints:

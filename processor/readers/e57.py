@@ -6,6 +6,7 @@ the scanner's grid, if the scan has both.
 
 from __future__ import annotations
 
+import dataclasses
 import re
 import struct
 from collections.abc import Sequence
@@ -15,8 +16,9 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from processor.model import Floats, InputError, Labels
+from processor.model import Codes, Floats, InputError, Labels
 from processor.readers.allocation import allocate
+from processor.readers.colours import scaled
 from processor.readers.file_checks import errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
@@ -29,6 +31,7 @@ PIECE = 1 << 18
 CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 LONGEST_NAME = 100
 GRID = ("rowIndex", "columnIndex")
+COLOURS = ("colorRed", "colorGreen", "colorBlue")
 MOST_LINES = 2**31 - 1  # rows or columns of a grid: they are stored as int32
 SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
 
@@ -131,11 +134,11 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
             f"{path}: expected Cartesian or spherical points in scan {name!r}, found {', '.join(sorted(fields))}"
         )
     axes = CARTESIAN if cartesian else SPHERICAL
-    points, intensity, cells = _read_points(path, name, file, header, axes)
+    points, intensity, cells, colour = _read_points(path, name, file, header, axes)
     pose = _pose(path, name, header) if header.has_pose() else np.empty(0)
     # Writers give single and merged clouds an identity pose too, so it is no evidence of a scanner's position.
     posed = pose.size > 0 and (len(scan_names) > 1 or bool((pose != np.eye(4)).any()))
-    return build_scan(
+    scan = build_scan(
         path,
         name,
         points,
@@ -146,18 +149,22 @@ def _read_scan(path: Path, file: Any, index: int, scan_names: Sequence[str]) -> 
         grid=(cells[0], cells[1]) if cells else None,
         single=_is_single(header, axes[0]),
     )
+    return dataclasses.replace(scan, colour=colour) if len(colour) else scan
 
 
 def _read_points(
     path: Path, name: str, file: Any, header: Any, axes: Sequence[str]
-) -> tuple[Floats, Floats, list[Labels]]:
-    """Return points (n, 3), intensities and, if the scan has a grid, rows and columns (n,) of the valid points."""
+) -> tuple[Floats, Floats, list[Labels], Codes]:
+    """Return points (n, 3), intensities, if the scan has a grid rows and columns (n,), and colours of valid points."""
     declared, fields = int(header.point_count), set(header.point_fields)
     state = "cartesianInvalidState" if axes is CARTESIAN else "sphericalInvalidState"
     points = allocate(declared, 3)
     intensity = allocate(declared if "intensity" in fields else 0)
     data, buffers = file.make_buffers([*axes, *({state, "intensity"} & fields)], min(declared, PIECE) or 1)
-    grid = _grid_buffers(file, header, data, buffers, min(declared, PIECE) or 1)
+    grid = _number_buffers(file, header, data, buffers, GRID)
+    colours = _number_buffers(file, header, data, buffers, COLOURS)
+    low, high = _colour_limits(header) if colours else (0.0, 255.0)
+    colour = allocate(declared if colours else 0, 3, dtype=np.uint8)
     cells = [allocate(declared, dtype=np.int32) for _ in grid]
     reader = header.points.reader(buffers)
     read = count = 0
@@ -175,6 +182,8 @@ def _read_points(
             points[part] = cartesian_from_spherical(*columns)
         if len(intensity):
             intensity[part] = data["intensity"][:rows][valid]
+        if colours:
+            colour[part] = scaled([data[name][:rows][valid] for name in colours], low, high)
         for field, lines in zip(grid, cells, strict=True):
             numbers = data[field][:rows][valid]
             # The comparisons are false for NaN.
@@ -189,24 +198,43 @@ def _read_points(
         )
     if declared and not count:
         raise InputError(f"{path}: scan {name!r} holds no returns: all of its {declared} points are marked invalid")
-    return points[:count], intensity[:count], [lines[:count] for lines in cells]
+    return points[:count], intensity[:count], [lines[:count] for lines in cells], colour[:count]
 
 
-def _grid_buffers(file: Any, header: Any, data: dict[str, Any], buffers: Any, capacity: int) -> tuple[str, ...]:
-    """Add buffers for the grid's fields and return their names: none if a field is missing or not a number.
+def _number_buffers(
+    file: Any, header: Any, data: dict[str, Any], buffers: Any, names: tuple[str, ...]
+) -> tuple[str, ...]:
+    """Add buffers for fields and return their ``names``: none if a field is missing or not a number.
 
     The library's default buffers of 16 bits fail on larger numbers; float64 holds all of them.
     """
     from pye57 import libe57
 
+    capacity = min(int(header.point_count), PIECE) or 1
     prototype = libe57.StructureNode(header.points.prototype())
     numbers = (libe57.IntegerNode, libe57.ScaledIntegerNode, libe57.FloatNode)
-    if not all(prototype.isDefined(name) and isinstance(prototype[name], numbers) for name in GRID):
+    if not all(prototype.isDefined(name) and isinstance(prototype[name], numbers) for name in names):
         return ()
-    for name in GRID:
+    for name in names:
         data[name] = np.empty(capacity)
         buffers.append(libe57.SourceDestBuffer(file.image_file, name, data[name], capacity, True, True))
-    return GRID
+    return names
+
+
+def _colour_limits(header: Any) -> tuple[float, float]:
+    """Return the numbers of black and of full colour: as stated, else by the type of the numbers, else 0 to 255."""
+    from pye57 import libe57
+
+    node, limits = header.node, {}
+    if node.isDefined("colorLimits"):
+        for end in ("Minimum", "Maximum"):
+            if node["colorLimits"].isDefined(f"colorRed{end}"):
+                limits[end] = float(node["colorLimits"][f"colorRed{end}"].value())
+    red = libe57.StructureNode(header.points.prototype())[COLOURS[0]]
+    if len(limits) < 2 and isinstance(red, libe57.IntegerNode):
+        limits = {"Minimum": float(red.minimum()), "Maximum": float(red.maximum())}
+    low, high = limits.get("Minimum", 0.0), limits.get("Maximum", 255.0)
+    return (low, high) if np.isfinite([low, high]).all() and low < high else (0.0, 255.0)
 
 
 def _is_single(header: Any, field: str) -> bool:

@@ -11,6 +11,7 @@ import numpy as np
 
 from processor.model import InputError
 from processor.readers.allocation import allocate
+from processor.readers.colours import coloured
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
 
@@ -21,6 +22,7 @@ LEAST_HEADER, HEADER_1_4 = 227, 375
 VERSION_MINOR_AT, COUNTS_AT, POINT_FORMAT_AT, EXTENDED_AT = 25, 96, 104, 235
 VLR_HEADER, EVLR_HEADER = 54, 60
 PIECE = 1_000_000
+COLOURS = ("red", "green", "blue")
 PACKED = 0xC0  # bits of the point format
 LAZ_LIMIT = 2_000  # compression ratio that no real file exceeds
 LINEAR_UNIT_KEYS = (3076, 4052)  # ProjLinearUnitsGeoKey, GeogLinearUnitsGeoKey of GeoTIFF
@@ -53,23 +55,26 @@ def read(path: Path) -> list[RawScan]:
             )
         points, intensity = allocate(declared, 3), allocate(declared)
         station = np.empty(declared, np.uint16)
+        colours = COLOURS if set(COLOURS) <= set(header.point_format.dimension_names) else ()
+        colour = [allocate(declared, dtype=np.uint16) for _ in colours]
         for piece in file.chunk_iterator(PIECE):
             rows = slice(count, count + len(piece))
             for i, axis in enumerate("XYZ"):
-                column = points[rows, i]
-                np.multiply(piece[axis], header.scales[i], out=column)
-                column += header.offsets[i]
+                coordinate = points[rows, i]
+                np.multiply(piece[axis], header.scales[i], out=coordinate)
+                coordinate += header.offsets[i]
             intensity[rows] = piece["intensity"]
             station[rows] = piece["point_source_id"]
+            for name, column in zip(colours, colour, strict=True):
+                column[rows] = piece[name]
             count += len(piece)
     if count != declared:
         raise InputError(f"{path}: expected {declared} points as declared, found {count}; copy it again")
     # 0 in all points: the stations are unknown.
-    return [
-        build_scan(
-            path, scan_name(path), points, unit=unit, intensity=intensity, station=station if station.any() else ()
-        )
-    ]
+    scan = build_scan(
+        path, scan_name(path), points, unit=unit, intensity=intensity, station=station if station.any() else ()
+    )
+    return [coloured(scan, colour)]
 
 
 def _check_header(path: Path) -> None:

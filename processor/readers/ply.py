@@ -14,6 +14,8 @@ import numpy as np
 from processor.model import InputError
 from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
+from processor.readers.colours import coloured
+from processor.readers.colours import named as colours_named
 from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, columns_of_records, fill_columns, first_named
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
 from processor.readers.raw_scan import RawScan, build_scan, scan_name
@@ -64,30 +66,32 @@ def read(path: Path) -> list[RawScan]:
     intensity, station = first_named(vertex.types, INTENSITY_NAMES), first_named(vertex.types, STATION_NAMES)
     wanted = [*"xyz", *(name for name in (intensity, station) if name)]
     columns = [allocate(vertex.count, 3), *(allocate(vertex.count) for _ in wanted[3:])]
+    colours = [name for name in colours_named(vertex.types) if name not in wanted]
+    colour = [allocate(vertex.count, dtype=np.float32) for _ in colours]
+    every, read = [*columns, *colour], [*wanted, *colours]
     with errors_name_the_file(path, "PLY"), path.open("rb") as file:
         file.seek(header.start)
         if header.order:
             dtype = np.dtype([(name, header.order + code) for name, code in vertex.types.items()])
             skipped = sum(e.count * sum(int(code[1]) for code in e.types.values()) for e in before)
             file.seek(header.start + skipped)
-            fill_columns(columns, columns_of_records(file, dtype, wanted, vertex.count))
+            fill_columns(every, columns_of_records(file, dtype, read, vertex.count))
         else:
             rows = Rows(file)
             for _ in range(sum(element.count for element in before)):
                 rows.skip_line()
             names = list(vertex.types)
-            fill_columns(columns, rows.pieces([names.index(name) for name in wanted], vertex.count))
-    return [
-        build_scan(
-            path,
-            scan_name(path),
-            columns[0],
-            unit=UNIT,
-            intensity=columns[1] if intensity else (),
-            station=columns[-1] if station else (),
-            single=bool(header.order) and vertex.types["x"] == "f4",
-        )
-    ]
+            fill_columns(every, rows.pieces([names.index(name) for name in read], vertex.count))
+    scan = build_scan(
+        path,
+        scan_name(path),
+        columns[0],
+        unit=UNIT,
+        intensity=columns[1] if intensity else (),
+        station=columns[-1] if station else (),
+        single=bool(header.order) and vertex.types["x"] == "f4",
+    )
+    return [coloured(scan, colour)]
 
 
 def read_header(path: Path) -> Header:

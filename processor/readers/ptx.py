@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from processor.model import Floats, InputError, Labels
+from processor.model import Codes, Floats, InputError, Labels
 from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
@@ -65,21 +65,23 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
     check_declared_points(path, "PTX", cells, SHORTEST_ROW, size)
     T_project_scan = _rigid(path, number, np.array(numbers[6:]).T)
     with errors_name_the_file(path, "PTX"):
-        wide = rows.width() in (4, 7)
+        width = rows.width()
+        wide = width in (4, 7)
         points, intensity = allocate(cells, 3), allocate(cells if wide else 0)
         # A cloud without a grid is often written as one row or column.
         gridded = cells if min(columns, lines) > 1 and max(columns, lines) <= MOST_LINES else 0
         row, column = (allocate(gridded, dtype=np.int32) for _ in range(2))
+        colour = allocate(cells if width == 7 else 0, 3, dtype=np.uint8)
         read = count = 0
-        for piece in rows.pieces((0, 1, 2, 3) if wide else (0, 1, 2), cells):
-            count = copy_returns(piece, read, lines, count, points, intensity, row, column)
+        for piece in rows.pieces(tuple(range(width if wide else 3)), cells):
+            count = copy_returns(piece, read, lines, count, points, (intensity, colour), (row, column))
             read += len(piece)
     if read != cells:
         raise InputError(f"{path}: expected {cells} cells in scan {number}, found {read}; copy or export it again")
     if not count:
         raise InputError(f"{path}: scan {number} holds no returns, only cells of 0 0 0")
     position = T_project_scan[:3, :3].T @ (np.array(numbers[2]) - T_project_scan[:3, 3])
-    return build_scan(
+    scan = build_scan(
         path,
         scan_name(path),
         points[:count],
@@ -89,6 +91,7 @@ def _read_grid(path: Path, rows: Rows, first: str, number: int, size: int) -> Ra
         T_project_scan=T_project_scan,
         grid=(row[:count], column[:count]) if gridded else None,
     )
+    return dataclasses.replace(scan, colour=colour[:count]) if len(colour) else scan
 
 
 def _rigid(path: Path, number: int, T: Floats) -> Floats:
@@ -113,15 +116,17 @@ def copy_returns(
     lines: int,
     count: int,
     points: Floats,
-    intensity: Floats,
-    row: Labels,
-    column: Labels,
+    values: tuple[Floats, Codes],
+    grid: tuple[Labels, Labels],
 ) -> int:
-    """Copy the cells (n, 3 or 4) that are not ``0 0 0`` behind the ``count`` returns copied before.
+    """Copy the cells (n, 3, 4 or 7) that are not ``0 0 0`` behind the ``count`` returns copied before.
 
     Cells are in order of columns of ``lines`` cells; the first one has the number ``first``. Fills ``points`` (m, 3)
-    and those of ``intensity``, ``row`` and ``column`` (m,) that are not empty. Returns the number of all returns.
+    and those that are not empty of intensity (m,) and colour (m, 3) in ``values``, and of row and column (m,) in
+    ``grid``. Returns the number of all returns.
     """
+    intensity, colour = values
+    row, column = grid
     c, r = divmod(first, lines)
     for i in range(len(cells)):
         x, y, z = cells[i, 0], cells[i, 1], cells[i, 2]
@@ -129,6 +134,9 @@ def copy_returns(
             points[count, 0], points[count, 1], points[count, 2] = x, y, z
             if len(intensity):
                 intensity[count] = cells[i, 3]
+            if len(colour):
+                for k in range(3):
+                    colour[count, k] = np.uint8(min(max(cells[i, 4 + k], 0.0), 255.0))
             if len(row):
                 row[count], column[count] = r, c
             count += 1

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from processor.model import Checked, Floats, InputError, Ints, Labels, column, optional
+from processor.model import Checked, Codes, Floats, InputError, Ints, Labels, column, optional
 from processor.readers.encoding import file_name_as_text
 
 FAR = 10_000.0  # units; an origin is subtracted from coordinates beyond this
@@ -32,6 +32,7 @@ class RawScan(Checked):
     station: Ints = column("n", dtype=np.int64)  # station that saw the point, from 1; 0 = unknown
     grid_row: Labels = column("n", dtype=np.int32)  # as stored; see scan_folder.scanner_grid
     grid_column: Labels = column("n", dtype=np.int32)
+    colour: Codes = column("n", 3, dtype=np.uint8)  # red, green, blue
     step: float = 0.0  # resolution of the coordinates in the file's number type; 0 = unlimited
 
 

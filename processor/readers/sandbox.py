@@ -39,7 +39,7 @@ SLACK_BYTES = 1 << 30
 LEAST_S, BYTES_PER_S = 8.0, 1_000_000  # the libraries are much faster than this
 PATIENCE = 4.0  # ratio of elapsed to processor time: the machine may be busy
 START_S = 120.0
-ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column")
+ARRAYS = ("points", "origin", "intensity", "position", "T_project_scan", "station", "grid_row", "grid_column", "colour")
 SMALL = 1 << 16
 START = "from processor.readers import sandbox; sandbox.serve()"
 

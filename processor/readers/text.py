@@ -1,7 +1,7 @@
 """Tables of numbers: XYZ, TXT, ASC, CSV, PTS. Any separator, header or none, decimal point or comma.
 
-Without a header the first three columns are x, y, z; the fourth is the intensity of tables with four or seven columns.
-A first line of one whole number is the number of points.
+Without a header the first three columns are x, y, z; the fourth is the intensity of tables with four or seven columns,
+the last three of seven are the colour. A first line of one whole number is the number of points.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ import numpy as np
 from processor.model import Floats, InputError
 from processor.readers.allocation import allocate
 from processor.readers.ascii_rows import Rows
+from processor.readers.colours import coloured
+from processor.readers.colours import named as colours_named
 from processor.readers.columns import INTENSITY_NAMES, STATION_NAMES, first_named
 from processor.readers.encoding import decoded
 from processor.readers.file_checks import check_declared_points, errors_name_the_file
@@ -59,6 +61,9 @@ def read(path: Path) -> list[RawScan]:
     layout = sniff(path)
     columns = _columns(path, layout)
     wanted = [*columns.axes, *(index for index in (columns.intensity, columns.station) if index is not None)]
+    colours = [len(wanted) - 3 + i for i in range(len(columns.colour))]
+    station = len(wanted) - 4
+    wanted += columns.colour
     size = path.stat().st_size
     tables, declared = [], layout.declared
     with errors_name_the_file(path, "text"), _opened(path, layout) as file:
@@ -74,13 +79,16 @@ def read(path: Path) -> list[RawScan]:
             declared = int(following)
     names = [scan_name(path)] if len(tables) == 1 else [f"{scan_name(path)}-{i}" for i in range(1, len(tables) + 1)]
     return [
-        build_scan(
-            path,
-            name,
-            points,
-            unit=columns.unit,
-            intensity=others[:, 0] if columns.intensity is not None else (),
-            station=others[:, -1] if columns.station is not None else (),
+        coloured(
+            build_scan(
+                path,
+                name,
+                points,
+                unit=columns.unit,
+                intensity=others[:, 0] if columns.intensity is not None else (),
+                station=others[:, station] if columns.station is not None else (),
+            ),
+            [others[:, i] for i in colours],
         )
         for name, (points, others) in zip(names, tables, strict=True)
     ]
@@ -232,6 +240,7 @@ class _Columns:
     intensity: int | None = None
     station: int | None = None
     unit: str = UNIT
+    colour: Sequence[int] = ()
 
 
 def _columns(path: Path, layout: Layout) -> _Columns:
@@ -247,13 +256,15 @@ def _columns(path: Path, layout: Layout) -> _Columns:
             )
         others = [first_named(names, pattern) for pattern in (INTENSITY_NAMES, STATION_NAMES)]
         intensity, station = (names.index(name) if name else None for name in others)
-        return _Columns([names.index(name) for name in axes if name is not None], intensity, station, units.pop())
+        wanted = [names.index(name) for name in axes if name is not None]
+        colour = [names.index(name) for name in colours_named(names)]
+        return _Columns(wanted, intensity, station, units.pop(), colour)
     if sum(map(bool, axes)) > 1 and len(names) != layout.columns:
         raise InputError(
             f"{path}: the header names {len(names)} columns ({' '.join(names)[:80]}), but rows have {layout.columns}"
         )
     _check_plain(path, layout)
-    return _Columns([0, 1, 2], 3 if layout.columns in (4, 7) else None)
+    return _Columns([0, 1, 2], 3 if layout.columns in (4, 7) else None, colour=(4, 5, 6) if layout.columns == 7 else ())
 
 
 def _check_plain(path: Path, layout: Layout) -> None:

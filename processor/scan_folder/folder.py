@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,6 +51,7 @@ POSE_TOLERANCE = 1e-3  # of R^T R - I
 NAN = float("nan")
 
 Design = ArchDesign | FrameDesign | StructureDesign
+Keep = Callable[[Scan], Scan]
 
 
 @dataclass(frozen=True)
@@ -87,11 +88,18 @@ def truth_file(path: Path) -> Path | None:
     return path if path.suffix.lower() == ".h5" else None
 
 
-def read_input(path: Path, units: str | None = None) -> Scene:
+def as_read(scan: Scan) -> Scan:
+    """Keep a scan as it is."""
+    return scan
+
+
+def read_input(path: Path, units: str | None = None, keep: Keep = as_read) -> Scene:
     """Read a scan folder, a single scan file or a scene file.
 
     ``units`` is the unit of the scans' coordinates and overrides that of their format. Without it the unit of the
-    format applies, then that of the project file, then metres; ``Scene.units_reason`` gives the source.
+    format applies, then that of the project file, then metres; ``Scene.units_reason`` gives the source. ``keep``
+    receives each scan once it is read, before the next, and returns it as the scene is to hold it: without its points
+    where they are too many for the memory.
 
     Raises InputError for input that cannot be used, UsageError for an unknown unit.
     """
@@ -99,13 +107,13 @@ def read_input(path: Path, units: str | None = None) -> Scene:
     if not path.exists():
         raise InputError(f"{path}: no such file or folder")
     if path.is_dir() and not readers.is_closed(path):
-        return _read_folder(path, option)
+        return _read_folder(path, option, keep)
     if path.suffix.lower() == ".h5":
         return store.read_scene(path)
-    return _scene(_Project(scan_name(path), (_Entry(path),)), None, option)
+    return _scene(_Project(scan_name(path), (_Entry(path),)), None, option, keep=keep)
 
 
-def _read_folder(folder: Path, option: str) -> Scene:
+def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     project = _read_project(folder)
     design: Design | None = None
     if project.design is not None:
@@ -114,7 +122,7 @@ def _read_folder(folder: Path, option: str) -> Scene:
             design = StructureDesign(scan_name(project.design), *read_surface(project.design, unit))
         else:
             design = read_design(folder, project.design, unit)
-    scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"))
+    scene = _scene(project, design, option, _read_stations(folder, project.units or option or "m"), keep)
     if scene.structure is not None and project.design is not None and project.design.suffix.lower() in MESH_SUFFIXES:
         named = project.design_units or project.units
         source = f"given in {PROJECT}" if named else "given by --units" if option else "not given, so metres"
@@ -243,7 +251,9 @@ def _open_scans(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
     return scans
 
 
-def _scene(project: _Project, design: Design | None, option: str, stations: Stations | None = None) -> Scene:
+def _scene(
+    project: _Project, design: Design | None, option: str, stations: Stations | None = None, keep: Keep = as_read
+) -> Scene:
     arch = design if isinstance(design, ArchDesign) else None
     frame = design if isinstance(design, FrameDesign) else None
     kind = "arch-bridge" if arch else "space-frame" if frame else project.kind or "structure"
@@ -265,7 +275,7 @@ def _scene(project: _Project, design: Design | None, option: str, stations: Stat
             if any(scan.name == other.name for other in scans):
                 raise InputError(f"{entry.path}: a second scan named {scan.name!r}; rename one of the files")
             _check_unit(entry.path, scan, unit, reason, design)
-            scans.append(scan)
+            scans.append(keep(scan))
             scan_units.append(unit)
     where = stations or _stations(scans)
     return Scene(
@@ -344,6 +354,7 @@ def _scan(raw: RawScan, entry: _Entry, unit: str, parts: set[str], stations: Sta
         position=position * scale,
         T_project_scan=pose,
         sigma_mm=entry.sigma_mm,
+        colour=raw.colour,
     )
 
 

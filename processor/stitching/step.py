@@ -30,8 +30,12 @@ LEAST_POINTS = 100
 
 
 def applies(scene: Scene) -> bool:
-    """Whether a scene of a structure has two or more scans, and not every one but the first comes with its pose."""
-    return scene.kind == KIND and len(scene.scans) > 1 and any(not scan.T_project_scan.size for scan in scene.scans[1:])
+    """Whether a structure has two or more scans, some but the first without a pose, or no design to compare them with.
+
+    Scans that all have poses and no design are stitched to check their poses.
+    """
+    unposed = any(not scan.T_project_scan.size for scan in scene.scans[1:])
+    return scene.kind == KIND and len(scene.scans) > 1 and (unposed or scene.structure is None)
 
 
 def run(scene: Scene, params: Params) -> Result:

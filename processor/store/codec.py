@@ -118,8 +118,10 @@ def write_record(
     ``hooks`` maps a type of record to another writer. Raises TypeError for a field of a type that cannot be stored.
     """
     for field in dataclasses.fields(record):
-        if field.name not in skip:
-            _write(group, field.name, getattr(record, field.name), field.metadata, hooks)
+        value = getattr(record, field.name)
+        newer_and_empty = field.metadata.get("newer") and isinstance(value, np.ndarray) and not value.size
+        if field.name not in skip and not newer_and_empty:
+            _write(group, field.name, value, field.metadata, hooks)
 
 
 def _write(group: Any, name: str, value: Any, metadata: Any, hooks: Mapping[type, Hook]) -> None:
@@ -199,6 +201,8 @@ def _read(group: Any, name: str, hint: Any, metadata: Any, hooks: Mapping[type, 
     if name not in group:
         if union:
             return None
+        if "shape" in metadata and metadata.get("newer"):
+            return np.empty(0, metadata["dtype"])
         raise DecodeError([f"{where}: missing"])
     kind = allowed[0] if union else hint
     if "shape" in metadata:
@@ -269,9 +273,9 @@ def read_array(group: Any, name: str, dtype: type, ndim: int) -> Any:
     return _dataset(group, name, stored, ndim)[()]
 
 
-def column(group: Any, name: str, dtype: type) -> Any:
+def column(group: Any, name: str, dtype: type, ndim: int = 1) -> Any:
     """Return the dataset of a column, to be read in slices; an absent optional column is empty."""
-    return _dataset(group, name, np.dtype(dtype).str[1:], 1)
+    return _dataset(group, name, np.dtype(dtype).str[1:], ndim)
 
 
 def read_text(group: Any, name: str) -> str:

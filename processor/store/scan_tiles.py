@@ -16,6 +16,12 @@ from processor.store.codec import DecodeError
 
 AXES = ("x", "y", "z")
 NO_STATIONS = np.empty(0, np.int32)
+# Columns that came to the schema later, and are stored where they are not empty: shape of a row and type.
+NEWER = {
+    field.name: (field.metadata["shape"][1:], field.metadata["dtype"])
+    for field in dataclasses.fields(Scan)
+    if field.metadata.get("newer")
+}
 
 
 def write_scan(group: Any, scan: Scan) -> Ints:
@@ -73,28 +79,52 @@ def shape(group: Any, name: str) -> tuple[int, ...]:
     """Return the shape of a per-point column of a scan's group."""
     if name == "points":
         return (count(group), 3)
-    return (len(_column(group, name)),)
+    return tuple(_column(group, name).shape)
 
 
 def _column(group: Any, name: str) -> Any:
-    return codec.column(group, name, next(f.metadata["dtype"] for f in dataclasses.fields(Scan) if f.name == name))
+    absent = _absent(group)
+    if name in absent:
+        return absent[name]
+    field = next(f for f in dataclasses.fields(Scan) if f.name == name)
+    return codec.column(group, name, field.metadata["dtype"], len(field.metadata["shape"]))
+
+
+def _absent(group: Any) -> dict[str, Any]:
+    """Return the newer columns that a group has not, empty."""
+    return {name: np.empty((0, *shape), dtype) for name, (shape, dtype) in NEWER.items() if name not in group}
+
+
+@dataclasses.dataclass(frozen=True)
+class PointColumn:
+    """The points (n, 3) of a scan's group, mm, to be read in slices. DecodeError for points that are not finite."""
+
+    where: str
+    stored: StoredTiles
+
+    def __len__(self) -> int:
+        """Return the number of points."""
+        return len(self.stored.columns[0])
+
+    def __getitem__(self, rows: slice) -> Floats:
+        """Read points."""
+        x, y, z = (column[rows] for column in self.stored.columns)
+        points = self.stored.grid.millimetres((x, y, z))
+        if not np.isfinite(points).all():
+            raise DecodeError([f"{self.where}/points: holds coordinates that are not finite"])
+        return points
+
+
+def column(group: Any, name: str) -> Any:
+    """Return a per-point column of a scan's group, to be read in slices; one that is absent is empty."""
+    return PointColumn(group.name, _read_tiles(group)) if name == "points" else _column(group, name)
 
 
 def pieces(group: Any, name: str, size: int) -> Iterator[Any]:
     """Yield a per-point column of a scan's group, ``size`` rows at a time. DecodeError for points not finite."""
-    if name == "points":
-        stored = _read_tiles(group)
-        grid, columns = stored.grid, stored.columns
-        for start in range(0, len(columns[0]), size):
-            x, y, z = (column[start : start + size] for column in columns)
-            points = grid.millimetres((x, y, z))
-            if not np.isfinite(points).all():
-                raise DecodeError([f"{group.name}/points: holds coordinates that are not finite"])
-            yield points
-        return
-    column = _column(group, name)
-    for start in range(0, len(column), size):
-        yield column[start : start + size]
+    stored = column(group, name)
+    for start in range(0, len(stored), size):
+        yield stored[start : start + size]
 
 
 class StoredTiles(NamedTuple):

@@ -323,15 +323,18 @@ def _feed(digest: Any, name: str, value: Any, pieces: Pieces | None, scan: int =
     elif dataclasses.is_dataclass(value):
         digest.update(f"{name}:{type(value).__name__}(".encode())
         for field in dataclasses.fields(value):
+            newer = field.metadata.get("newer", False)
             if pieces is not None and isinstance(value, Scan) and field.name in per_point_fields(Scan):
                 shape, parts = pieces(scan, field.name)
+                if newer and not shape[0]:
+                    continue
                 kind = np.dtype(field.metadata["dtype"]).newbyteorder("<")
                 digest.update(f"{field.name}:{kind.str}{shape};".encode())
                 for part in parts:
                     digest.update(np.ascontiguousarray(part, kind).data)
                 continue
             item = getattr(value, field.name)
-            if item is not None or not field.metadata.get("newer"):
+            if not newer or (item is not None and not (isinstance(item, np.ndarray) and item.size == 0)):
                 _feed(digest, field.name, item, pieces)
         digest.update(b")")
     elif isinstance(value, tuple):

@@ -31,6 +31,10 @@ class StoredPoints:
         for points in scan_tiles.pieces(self.scans[scan], "points", size):
             yield points, next(stations, scan_tiles.NO_STATIONS)
 
+    def column(self, scan: int, name: str) -> Any:
+        """Return a per-point column of a scan, to be read in slices; one that is absent is empty."""
+        return scan_tiles.column(self.scans[scan], name)
+
     def within(self, boxes: Sequence[tuple[Floats, Floats]]) -> Boxed:
         """Restrict each scan to a box: lower and upper corner (3,), mm, relative to the scan's origin."""
         return Boxed(self.scans, tuple(boxes))

@@ -45,10 +45,11 @@ def cloud(count):
 
 
 def write_e57(path, points, intensity):
-    from designgen.export import e57
     from processor.model import Scan
+    from processor.writers import e57
+    from processor.writers.cloud import of_scans
 
-    e57.write(path, [Scan("S1", points * 1_000.0, intensity=intensity.astype(float))], spherical=False)
+    e57.write(path, of_scans([Scan("S1", points * 1_000.0, intensity=intensity.astype(float))]), spherical=False)
 
 
 def write_las(path, points, intensity):

@@ -7,10 +7,11 @@ import struct
 import numpy as np
 import pytest
 
-from designgen.export import e57
 from processor import readers
 from processor.model import InputError, Scan
 from processor.readers.e57 import cartesian_from_spherical
+from processor.writers import e57
+from processor.writers.cloud import of_scans
 from tests.support.scan_bytes import DATA, TURNED, las_bytes, needs_data, pcd_header, ply_header, put
 
 POINTS = np.array([[1.5, -2.25, 3.0], [0.1, 0.2, 0.3], [-7.0, 8.0, 1e-3]])
@@ -187,7 +188,7 @@ def test_las_by_the_specification(tmp_path):
 )
 def test_e57_scans_keep_their_names_where_these_are_plain(own, expected, tmp_path):
     scans = [Scan(name, POINTS + i) for i, name in enumerate(own)]
-    e57.write(tmp_path / "a.e57", scans, spherical=False)
+    e57.write(tmp_path / "a.e57", of_scans(scans), spherical=False)
     assert [scan.name for scan in readers.read(tmp_path / "a.e57")] == expected
 
 
@@ -284,3 +285,37 @@ def test_real_sphere_lies_where_it_was_published():
     points = one(DATA / "spheres/SPH101.xyz").points
     distance = np.linalg.norm(points - [-5.895833, 3.628939, -1.561255], axis=1)
     assert 0.4 < np.mean(np.abs(distance - 0.05) < 0.001) < 0.8
+
+
+@needs_data
+def test_colours_are_those_that_other_programs_read():
+    import laspy
+    import pye57
+
+    (scan,) = readers.read(DATA / "e57/pumpAVisualReferenceImage.e57")
+    raw = pye57.E57(str(DATA / "e57/pumpAVisualReferenceImage.e57")).read_scan_raw(0)
+    valid = raw["cartesianInvalidState"] == 0
+    for i, name in enumerate(("Red", "Green", "Blue")):
+        np.testing.assert_array_equal(scan.colour[:, i], raw[f"color{name}"][valid])
+    (scan,) = readers.read(DATA / "las/simple1_4.las")  # 256 steps of 16 bits a step
+    las = laspy.read(DATA / "las/simple1_4.las")
+    np.testing.assert_array_equal(scan.colour, np.stack([las.red, las.green, las.blue], axis=1) // 256)
+    (scan,) = readers.read(DATA / "las/indoor.laz")  # all black: no colours
+    assert scan.colour.shape == (0, 3)
+    (scan,) = readers.read(DATA / "ptx_pts/1.2-with-color.ptx")
+    cells = np.loadtxt(DATA / "ptx_pts/1.2-with-color.ptx", skiprows=10)
+    np.testing.assert_array_equal(scan.colour, cells[(cells[:, :3] != 0).any(axis=1), 4:])
+    (scan,) = readers.read(DATA / "ptx_pts/test.pts")
+    np.testing.assert_array_equal(scan.colour, np.loadtxt(DATA / "ptx_pts/test.pts", skiprows=1)[:, 4:])
+
+
+def test_columns_that_are_no_colours_are_left(tmp_path):
+    rows = np.column_stack([POINTS, np.full(len(POINTS), 0.5), [[0.1, 0.2, 0.3]] * len(POINTS)])
+    np.savetxt(tmp_path / "normals.xyz", rows)
+    (scan,) = readers.read(tmp_path / "normals.xyz")
+    assert scan.colour.shape == (0, 3)
+    np.savetxt(
+        tmp_path / "named.csv", rows * [1, 1, 1, 1, 10, 10, 10], header="x,y,z,i,B,G,R", delimiter=",", comments=""
+    )
+    (scan,) = readers.read(tmp_path / "named.csv")
+    assert scan.colour.tolist() == [[3, 2, 1]] * len(POINTS)

@@ -13,7 +13,7 @@ from click.testing import CliRunner
 
 from designgen import cli as designgen_cli
 from designgen import recipe_files
-from designgen.export import FORMATS, e57, formats
+from designgen.export import FORMATS, formats
 from designgen.export import folder as export_folder
 from designgen.scenes.make import make as make_scene
 from processor.model import (
@@ -27,6 +27,8 @@ from processor.model import (
 )
 from processor.scan_folder import folder
 from processor.store import store
+from processor.writers import e57, las, text
+from processor.writers.cloud import of_scan, of_scans
 from tests.support.exported_scenes import exported, merged, on_grid, stations_apart
 
 LIMITS_MM = {"las": 0.0501, "laz": 0.0501, "ptx": 1.1e-4, "xyz": 1.1e-4}  # the rest are doubles
@@ -135,12 +137,12 @@ def test_other_programs_read_the_files(tmp_path):
     formats.write_pcd(tmp_path / "a.pcd", scan)
     cloud = open3d.t.io.read_point_cloud(str(tmp_path / "a.pcd"))
     np.testing.assert_allclose(cloud.point.positions.numpy(), scan.points / 1000.0, atol=1e-15)
-    formats.write_las(tmp_path / "a.laz", scan)
-    las = laspy.read(tmp_path / "a.laz")
-    np.testing.assert_allclose(las.xyz, scan.points / 1000.0, atol=0.501e-4)
-    np.testing.assert_array_equal(las.point_source_id, scan.point_station + 1)
-    assert (las.header.version.minor, las.header.point_format.id) == (4, 6)
-    formats.write_xyz(tmp_path / "a.xyz", scan)
+    las.write(tmp_path / "a.laz", of_scan(scan))
+    laz = laspy.read(tmp_path / "a.laz")
+    np.testing.assert_allclose(laz.xyz, scan.points / 1000.0, atol=0.501e-4)
+    np.testing.assert_array_equal(laz.point_source_id, scan.point_station + 1)
+    assert (laz.header.version.minor, laz.header.point_format.id) == (4, 6)
+    text.write(tmp_path / "a.xyz", of_scan(scan))
     table = np.loadtxt(tmp_path / "a.xyz", skiprows=1)
     np.testing.assert_allclose(table[:, :3], scan.points / 1000.0, atol=0.51e-7)
 
@@ -233,14 +235,15 @@ def test_odd_names_in_e57_are_numbers_in_the_truth_too(tmp_path):
     """The generator's notion of an odd name is the reader's."""
     points = on_grid(50)[0]
     taken = [Scan(name, points) for name in ("t-2", "a/b", "ok")]
-    e57.write(tmp_path / "t.e57", taken, spherical=False)
+    e57.write(tmp_path / "t.e57", of_scans(taken), spherical=False)
     back = folder.read_input(tmp_path / "t.e57")
-    assert [scan.name for scan in back.scans] == e57.names_read("t", taken) == ["t-1", "t-2", "t-3"]
+    assert [scan.name for scan in back.scans] == ["t-1", "t-2", "t-3"]
+    assert e57.names_read("t", [scan.name for scan in taken]) == ["t-1", "t-2", "t-3"]
     odd = ["ok", "a/b", " a", ".a", "x" * 101, "a\\b", "a\tb", "S 1"]
     scans = [Scan(name, points + i) for i, name in enumerate(odd)]
-    e57.write(tmp_path / "f.e57", scans, spherical=False)
+    e57.write(tmp_path / "f.e57", of_scans(scans), spherical=False)
     back = folder.read_input(tmp_path / "f.e57")
-    assert [scan.name for scan in back.scans] == e57.names_read("f", scans)
+    assert [scan.name for scan in back.scans] == e57.names_read("f", [scan.name for scan in scans])
     assert [scan.name for scan in back.scans] == ["ok", *(f"f-{i}" for i in range(2, 8)), "S 1"]
 
 
@@ -289,7 +292,7 @@ def test_an_arch_bridge_comes_back_from_e57_with_its_components(spherical, tmp_p
 def test_two_e57_files_may_hold_scans_of_one_name(tmp_path):
     scans = stations_apart(np.zeros(3)).scans
     for stem in ("day1", "day2"):
-        e57.write(tmp_path / f"{stem}.e57", scans[:2], spherical=False)
+        e57.write(tmp_path / f"{stem}.e57", of_scans(scans[:2]), spherical=False)
     back = folder.read_input(tmp_path)
     assert [scan.name for scan in back.scans] == ["S1", "二号站", "day2-1", "day2-2"]
 

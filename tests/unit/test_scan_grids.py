@@ -8,8 +8,8 @@ import pytest
 from pye57 import libe57
 
 from designgen import recipe_files
-from designgen.export import e57, formats
 from designgen.export import folder as export_folder
+from designgen.export import formats
 from designgen.scenes.make import make
 from processor import readers
 from processor.evaluation import stitching as stitching_evaluation
@@ -17,6 +17,8 @@ from processor.scan_folder import folder, scanner_grid
 from processor.stitching import step as stitching_step
 from processor.stitching.planes import scan_planes
 from processor.store import store
+from processor.writers import e57
+from processor.writers.cloud import of_scans
 from tests.support import stitch_clouds
 from tests.support.exported_scenes import exported, merged
 from tests.support.scan_bytes import DATA, needs_data
@@ -234,7 +236,7 @@ def room():
 
 def test_e57_brings_the_grid_back(room, tmp_path):
     for spherical in (False, True):
-        e57.write(tmp_path / "a.e57", room, spherical=spherical)
+        e57.write(tmp_path / "a.e57", of_scans(room), spherical=spherical)
         for ours, theirs in zip(room, folder.read_input(tmp_path / "a.e57").scans, strict=True):
             np.testing.assert_array_equal(theirs.grid_row, ours.grid_row)
             np.testing.assert_array_equal(theirs.grid_column, ours.grid_column)
@@ -260,7 +262,7 @@ def test_a_merged_cloud_has_no_grid_in_e57(tmp_path):
 def test_stitching_finds_the_same_ends_in_files_as_in_the_scene(room, tmp_path):
     ours = room[0]
     formats.write_ptx(tmp_path / "a.ptx", ours, None)
-    e57.write(tmp_path / "b.e57", [ours], spherical=False)
+    e57.write(tmp_path / "b.e57", of_scans([ours]), spherical=False)
     expected = scan_planes.extract(ours, 200.0)
     assert len(expected.ends.points) > 100
     for path in (tmp_path / "a.ptx", tmp_path / "b.e57"):

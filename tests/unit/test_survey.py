@@ -36,7 +36,7 @@ def test_a_station_more_leaves_the_others_where_they_are(count):
         for name in ("stadium-roof", "truss-bridge", "plates-defects"):
             recipe = recipe_files.load(name)[1]
             components = structure_registry.design(recipe)
-            patches, _, _ = structure.built_faces(recipe["structure"]["type"], components, recipe, 1)
+            patches = structure.built_faces(recipe["structure"]["type"], components, recipe, 1).patches
             found.append(structure._places(recipe["structure"]["type"], patches, params, 3))
         return found
 

@@ -1,0 +1,1 @@
+"""Clouds out of a run's results and its input."""

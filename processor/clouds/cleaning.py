@@ -1,0 +1,193 @@
+"""Clouds without outliers, and without clutter: points that are not of the design.
+
+A point that step ``deviation`` suspects (1 standard deviation) still counts there in part; what is left out here is
+gone, so the limit is wider.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from processor.clouds import poses, slabs
+from processor.clouds.poses import Placed
+from processor.clouds.run import Run
+from processor.deviation.measure import REACH_MM
+from processor.geometry import merging, mesh_distance, neighbors, rigid
+from processor.geometry.mesh_distance import MeshSurface
+from processor.model import Flags, Floats
+from processor.writers.cloud import Block, Cloud
+
+NEIGHBOURS, RATIO = 20, 3.0
+LEAST_RANGE_MM = 1.0
+HALO = 20.0  # spacings of a cloud, within which the neighbours of a point are searched beyond its slab
+OfDesign = Callable[[Floats], Flags]  # marks points (n, 3), less the origin of a cloud, that are of the design
+
+
+@dataclass
+class Removed:
+    """Points left out of a cloud, counted while it is written; ``compared``: with a design."""
+
+    outliers: int = 0
+    clutter: int = 0
+    compared: bool = False
+
+
+def cleaned(cloud: Cloud, of_design: OfDesign | None, scanner: Floats | None, aside: Path) -> tuple[Cloud, Removed]:
+    """Return a cloud without clutter and outliers, and the count of what is left out.
+
+    Outliers are points whose mean distance to NEIGHBOURS neighbours exceeds the mean of all by more than RATIO standard
+    deviations (statistical outlier removal), among the points of the design. The distances are relative to the range
+    from the ``scanner`` (3,), less the cloud's origin, where it is known: a scan is sparser the farther away it is.
+    """
+    removed = Removed(compared=of_design is not None)
+
+    def kept() -> Iterator[Block]:
+        for block in cloud.blocks():
+            if of_design is None:
+                yield block
+                continue
+            marks = of_design(block.points)
+            yield Block(block.points[marks], {name: column[marks] for name, column in block.fields.items()})
+
+    on_design = replace(cloud, blocks=kept, count=None)
+
+    def blocks() -> Iterator[Block]:
+        count = 0
+        for block in _without_outliers(on_design, scanner, removed, aside):
+            count += len(block.points)
+            yield block
+        removed.clutter = (cloud.count or 0) - count - removed.outliers
+
+    return replace(cloud, blocks=blocks, count=None), removed
+
+
+def _without_outliers(cloud: Cloud, scanner: Floats | None, removed: Removed, aside: Path) -> Iterator[Block]:
+    """Yield the blocks of a cloud without statistical outliers."""
+    parts = slabs.cut(cloud, aside)
+    with tempfile.TemporaryDirectory(dir=aside) as folder:
+        paths = [Path(folder) / str(number) for number in range(len(parts))]
+        count, total, squares = 0, 0.0, 0.0
+        for number, path in enumerate(paths):
+            distance = _distances(parts, number, scanner)
+            distance.tofile(path)
+            count, total = count + len(distance), total + float(distance.sum())
+        mean = total / max(count, 1)
+        for path in paths:
+            squares += float(((np.fromfile(path) - mean) ** 2).sum())
+        limit = mean + RATIO * np.sqrt(squares / max(count, 1))
+        for number, path in enumerate(paths):
+            inlier = np.fromfile(path) <= limit
+            removed.outliers += int(np.count_nonzero(~inlier))
+            yield from slabs.in_blocks(parts.read(number)[inlier])
+
+
+def _distances(parts: slabs.Slabs, number: int, scanner: Floats | None) -> Floats:
+    """Return the mean distance (n,) of each point of a slab to its neighbours, also those in the slabs beside it."""
+    points = slabs.points_of(parts.read(number))
+    if not len(points):
+        return np.empty(0)
+    if len(parts) > 1:
+        reach = HALO * neighbors.spacing(neighbors.of_spacing(points))
+        low, high = parts.edges[number] - reach, parts.edges[number + 1] + reach
+        beside = [slabs.points_of(parts.read(other)) for other in (number - 1, number + 1)]
+        beside = [one[(one[:, parts.axis] >= low) & (one[:, parts.axis] <= high)] for one in beside]
+        every = np.concatenate([points, *beside])
+    else:
+        every = points
+    grid = neighbors.of_spacing(every)
+    mean = np.empty(len(every))
+    mean[grid.order] = neighbors.mean_distances(grid, NEIGHBOURS)
+    mean = mean[: len(points)]
+    if scanner is not None:
+        mean /= np.maximum(np.linalg.norm(points - scanner, axis=1), LEAST_RANGE_MM)
+    return mean
+
+
+def scanner_of(run: Run, placed: Placed) -> Floats | None:
+    """Return the scanner's position (3,) in the frame of a scan's points as written, less their origin.
+
+    None where it is not known. A scan with a grid has it at the origin of its frame, which its rows were checked with.
+    """
+    scan = placed.scan
+    if scan.position.size:
+        return placed.scale * (scan.position - scan.origin)
+    single = not len(run.points.column(placed.number, "point_station"))
+    return -placed.scale * scan.origin if single and len(run.points.column(placed.number, "grid_row")) else None
+
+
+@dataclass(frozen=True)
+class DesignSurfaces:
+    """Surfaces of a design, and how far from them points are of it, mm."""
+
+    surface: MeshSurface
+    depth: float
+
+    def marks(self, T: Floats) -> OfDesign:
+        """Return the function that marks points placed by T (4, 4)."""
+
+        def of_design(points: Floats) -> Flags:
+            reach = self.depth + mesh_distance.DESIGN_SPACING_MM[1]  # to a sample of the surface
+            facet, distance, beyond = self.surface.distances(rigid.apply(T, points), reach)
+            with np.errstate(invalid="ignore"):
+                near: Flags = (facet >= 0) & (np.abs(distance) <= self.depth) & (beyond <= self.depth)
+            return near
+
+        return of_design
+
+
+def of_structure(run: Run) -> DesignSurfaces | None:
+    """Return the design's surfaces, less their local origin, and the depth to which step deviation compared with them.
+
+    None where it was not run, or has no pose.
+    """
+    result = run.steps.get("deviation")
+    if run.scene.structure is None or result is None or not result.T_design_scan.size:
+        return None
+    vertices, _ = merging.local_design(run.scene.structure)
+    depth = result.max_depth if np.isfinite(result.max_depth) else REACH_MM
+    return DesignSurfaces(mesh_distance.of_design(vertices, run.scene.structure.faces), depth)
+
+
+def of_part(run: Run, component: str) -> DesignSurfaces | None:
+    """Return the surfaces of a part in the bridge's frame; None without."""
+    parts = () if run.scene.arch is None else run.scene.arch.parts
+    part = next((part for part in parts if part.name == component), None)
+    if part is None or not len(part.faces):
+        return None
+    return DesignSurfaces(mesh_distance.of_mesh(part.vertices, part.faces), REACH_MM)
+
+
+def filters(run: Run, scans: Sequence[Placed]) -> list[OfDesign | None]:
+    """Return for each scan what marks its points, in its own frame less its origin, that are of the design.
+
+    None where the run does not tell: without a design with surfaces, or without a pose in it.
+    """
+    structure = of_structure(run)
+    if structure is not None and run.scene.structure is not None:
+        origin = merging.local_design(run.scene.structure)[1]
+        T = run.steps["deviation"].T_design_scan
+        return [structure.marks(_to_local(one, T, origin)) for one in scans]
+    if "preassemble" not in run.steps:
+        return [None] * len(scans)
+    in_bridge = {one.number: one for one in poses.in_bridge(run).scans}
+    marks: list[OfDesign | None] = []
+    for one in scans:
+        part = in_bridge.get(one.number)
+        surfaces = None if part is None else of_part(run, part.component)
+        marks.append(
+            None if part is None or surfaces is None else surfaces.marks(_to_local(part, np.eye(4), np.zeros(3)))
+        )
+    return marks
+
+
+def _to_local(placed: Placed, T: Floats, origin: Floats) -> Floats:
+    """Return the map (4, 4) of a scan's points as written, less their origin, by its pose and T, less ``origin``."""
+    whole = T @ placed.T
+    # Large offsets are subtracted from each other first.
+    shift = whole[:3, :3] @ (placed.scale * placed.scan.origin) + (whole[:3, 3] - origin)
+    return rigid.transform(whole[:3, :3], shift)

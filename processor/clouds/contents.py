@@ -1,0 +1,221 @@
+"""What is exported: clouds of a run by the name of their content."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from processor.clouds.points import NAMES, TYPES, blocks
+from processor.clouds.poses import Placed
+from processor.clouds.run import Run
+from processor.defects import surface_charts
+from processor.geometry import merging, rigid
+from processor.model import Floats, Ints, Stations
+from processor.writers.cloud import BLOCK, COLOURS, COLUMN, GRID, INTENSITY, ROW, STATION, Block, Cloud
+
+FULL = 65535  # intensities up to here that are whole numbers are written as they are
+SINGLE = np.dtype(np.float32)
+SAME_MM = 1e-3
+FOUND_MM = 200.0  # core points lie on the design's surface: its samples are nearer
+
+
+@dataclass(frozen=True)
+class Numbering:
+    """Names of the scanner's stations from 1, and the number of each: of scans by row, of stations by row."""
+
+    ids: tuple[str, ...]
+    of_scan: tuple[int, ...]
+    of_station: Ints
+
+
+def fields_of(run: Run, numbers: Sequence[int], *, grid: bool) -> dict[str, np.dtype[Any]]:
+    """Return the types of the columns that any of the scans of these numbers has."""
+    present = {name for name in NAMES for number in numbers if len(run.points.column(number, name))}
+    fields: dict[str, np.dtype[Any]] = {}
+    if "intensity" in present:
+        fields[INTENSITY] = SINGLE
+    if "colour" in present:
+        fields |= dict.fromkeys(COLOURS, TYPES["colour"])
+    if "point_station" in present:
+        fields[STATION] = TYPES["point_station"]
+    elif grid and "grid_row" in present:
+        # A merged cloud has no grid: the rows and columns of its scans repeat.
+        fields |= dict.fromkeys(GRID, TYPES["grid_row"])
+    return fields
+
+
+def _columns(found: Mapping[str, Any], fields: Mapping[str, np.dtype[Any]], of_station: Ints) -> dict[str, Any]:
+    """Return the columns of a block by their names in files; zeros where a scan has none."""
+    count = len(found["points"])
+    columns: dict[str, Any] = {name: np.zeros(count, dtype) for name, dtype in fields.items()}
+    given = {"intensity": (INTENSITY,), "grid_row": (ROW,), "grid_column": (COLUMN,)}
+    for name, (field,) in given.items():
+        if field in columns and name in found:
+            columns[field] = found[name].astype(fields[field])
+    if "colour" in found:
+        columns |= dict(zip(COLOURS, found["colour"].T, strict=True))
+    if STATION in columns and "point_station" in found:
+        columns[STATION] = of_station[found["point_station"]].astype(fields[STATION])
+    return columns
+
+
+def scan_cloud(run: Run, placed: Placed, *, grid: bool = True) -> Cloud:
+    """Return the cloud of a scan in its own frame, with its pose and, by ``grid``, rows and columns of its grid."""
+    fields = fields_of(run, [placed.number], grid=grid)
+    stations = np.append(np.arange(1, _stations(run) + 1), 0)  # the last is that of -1
+    in_place = Placed(placed.number, placed.scan, np.eye(4), placed.scale)
+    origin = in_place.origin()
+
+    def read() -> Iterator[Block]:
+        for found in blocks(run.points, placed.number):
+            yield Block(in_place.moved(found["points"], origin), _columns(found, fields, stations))
+
+    return Cloud(
+        placed.scan.name,
+        fields,
+        read,
+        origin,
+        len(run.points.column(placed.number, "points")),
+        T_project_scan=placed.T if placed.known else np.empty(0),
+        largest=_largest_cells(run, placed.number) if ROW in fields else {},
+    )
+
+
+def _largest_cells(run: Run, number: int) -> dict[str, int]:
+    largest = {}
+    for name, field in (("grid_row", ROW), ("grid_column", COLUMN)):
+        column = run.points.column(number, name)
+        largest[field] = max(int(column[i : i + BLOCK].max()) for i in range(0, len(column), BLOCK))
+    return largest
+
+
+def part_cloud(run: Run, placed: Placed) -> Cloud:
+    """Return the cloud of a part in the frame that its pose leads to."""
+    fields = fields_of(run, [placed.number], grid=False)
+    stations = np.append(np.arange(1, _stations(run) + 1), 0)
+    origin = np.zeros(3)
+
+    def read() -> Iterator[Block]:
+        for found in blocks(run.points, placed.number):
+            yield Block(placed.moved(found["points"], origin), _columns(found, fields, stations))
+
+    count = len(run.points.column(placed.number, "points"))
+    return Cloud(placed.component, fields, read, origin, count)
+
+
+def merged_cloud(run: Run, scans: Sequence[Placed]) -> Cloud:
+    """Return all scans as one cloud in the project's frame, with the number of the station of each point."""
+    numbers = numbering(run, scans)
+    fields = fields_of(run, [placed.number for placed in scans], grid=False)
+    if len(numbers.ids) > 1:
+        fields[STATION] = TYPES["point_station"]
+    origin = np.floor(scans[0].origin() / merging.ORIGIN_STEP_MM) * merging.ORIGIN_STEP_MM
+
+    def read() -> Iterator[Block]:
+        for placed, number in zip(scans, numbers.of_scan, strict=True):
+            for found in blocks(run.points, placed.number):
+                columns = _columns(found, fields, numbers.of_station)
+                if STATION in columns and "point_station" not in found:
+                    columns[STATION][:] = number
+                yield Block(placed.moved(found["points"], origin), columns)
+
+    count = sum(len(run.points.column(placed.number, "points")) for placed in scans)
+    return Cloud("merged", fields, read, origin, count)
+
+
+def _stations(run: Run) -> int:
+    return 0 if run.scene.stations is None else len(run.scene.stations.ids)
+
+
+def has_stations(run: Run, placed: Placed) -> bool:
+    """Whether a scan is a merged cloud whose points name their stations."""
+    return len(run.points.column(placed.number, "point_station")) > 0
+
+
+def numbering(run: Run, scans: Sequence[Placed]) -> Numbering:
+    """Return the numbers of the stations of scans: those of merged clouds, then each other scan."""
+    stations = run.scene.stations
+    ids: list[str] = []
+    of_station = np.zeros(_stations(run) + 1, np.int64)  # the last is that of -1: unknown
+    if stations is not None and any(has_stations(run, placed) for placed in scans):
+        ids = list(stations.ids)
+        of_station[:-1] = np.arange(1, len(ids) + 1)
+    of_scan = []
+    for placed in scans:
+        if has_stations(run, placed):
+            of_scan.append(0)
+            continue
+        name = placed.scan.station or placed.scan.name
+        ids.append(name if name not in ids else placed.scan.name)
+        of_scan.append(len(ids))
+    return Numbering(tuple(ids), tuple(of_scan), of_station)
+
+
+def stations_of(run: Run, scans: Sequence[Placed]) -> Stations | None:
+    """Return the positions of the stations as numbered, in the project's frame; None where one is not known."""
+    numbers = numbering(run, scans)
+    positions: dict[int, Floats] = {}
+    for placed, number in zip(scans, numbers.of_scan, strict=True):
+        if number and placed.scan.position.size:
+            positions[number] = rigid.apply(placed.T, placed.scale * placed.scan.position)
+    if numbers.of_station.any():
+        moved = stations_moved(run, scans)
+        if moved is None:
+            return None
+        positions |= dict(enumerate(moved.positions, 1))
+    if len(positions) != len(numbers.ids):
+        return None
+    return Stations(numbers.ids, np.array([positions[i + 1] for i in range(len(numbers.ids))]))
+
+
+def stations_moved(run: Run, scans: Sequence[Placed]) -> Stations | None:
+    """Return the scene's stations as the clouds that name them were moved; None where these moved differently."""
+    stations = run.scene.stations
+    places = []
+    for placed in scans:
+        if stations is not None and has_stations(run, placed):
+            given = placed.scan.T_project_scan if placed.scan.T_project_scan.size else np.eye(4)
+            T = placed.T @ rigid.invert(given) if placed.known else np.eye(4)
+            places.append(rigid.apply(T, placed.scale * stations.positions))
+    if stations is None or not places or any(np.abs(one - places[0]).max() > SAME_MM for one in places):
+        return None
+    return Stations(stations.ids, places[0])
+
+
+def core_cloud(run: Run) -> Cloud:
+    """Return the core points of step deviation in the design's frame, with their deviation, LOD95 and component.
+
+    The components are numbered from 1, as in the names of the defects.
+    """
+    result = run.step("deviation", "deviation")
+    core = result.core
+    component = np.zeros(len(core.points), np.int32)
+    if run.scene.structure is not None and len(core.points):
+        vertices, origin = merging.local_design(run.scene.structure)
+        surface, of_facet = surface_charts.with_components(vertices, run.scene.structure.faces)
+        facet, _, _ = surface.distances(core.points + (result.origin - origin), FOUND_MM)
+        component = np.where(facet >= 0, of_facet[np.maximum(facet, 0)] + 1, 0).astype(np.int32)
+    fields = {"deviation_mm": core.distance, "lod95_mm": core.lod95, "component": component}
+
+    def read() -> Iterator[Block]:
+        for start in range(0, len(core.points), BLOCK):
+            rows = slice(start, start + BLOCK)
+            yield Block(core.points[rows], {name: column[rows] for name, column in fields.items()})
+
+    types = {name: column.dtype for name, column in fields.items()}
+    return Cloud("deviation", types, read, result.origin, len(core.points))
+
+
+def brightest(run: Run, numbers: Sequence[int]) -> float:
+    """Return the greatest intensity of scans; 0 where all are whole numbers of 16 bits, which need no scaling."""
+    whole, most = True, 0.0
+    for number in numbers:
+        column = run.points.column(number, "intensity")
+        for start in range(0, len(column), BLOCK):
+            values = column[start : start + BLOCK]
+            most = max(most, float(values.max()))
+            whole = whole and bool((values >= 0.0).all() and (values == np.rint(values)).all())
+    return 0.0 if whole and 1.0 < most <= FULL else most

@@ -1,0 +1,128 @@
+"""The files beside exported scans that make their folder a scan folder: project.toml, design, stations, points."""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from processor.clouds import contents
+from processor.clouds.poses import Placed
+from processor.clouds.run import Run
+from processor.model import Control, Floats, Picks, Scan, Stations, Tolerance
+from processor.scan_folder import picks as picks_table
+from processor.scan_folder.control_points import COLUMNS
+from processor.scan_folder.files import CONTROL, PICKS, PROJECT, STATIONS
+from processor.writers import project
+from processor.writers.cloud import METRES
+
+NO_POSE = np.empty(0)
+EACH_SCAN = ("registered", "clean")  # contents with a file a scan, in the scan's own frame
+
+
+def write(folder: Path, run: Run, scans: Sequence[Placed], files: Sequence[str], what: str, format_: str) -> None:
+    """Write what `processor run` needs beside the ``files`` of ``scans`` in a folder."""
+    scene, scale = run.scene, 1.0 if format_ == "ply" else METRES
+    lines = [f"name = {project.quoted(scene.name)}", f"kind = {project.quoted(scene.kind)}"]
+    lines.append(f'units = "{"mm" if format_ == "ply" else "m"}"')
+    design = project.write_design(scene, folder, scale, with_meshes=True)
+    if design:
+        lines.append(f"design = {project.quoted(design)}")
+    if np.isfinite(scene.temperature_C) and what != "assembled":  # the assembled parts have their reference lengths
+        lines.append(f"temperature_C = {scene.temperature_C!r}")
+    lines += _tolerance(scene.tolerance)
+    if what == "merged":
+        stations = contents.stations_of(run, scans)
+        lines += ["", "[[scan]]", f"file = {project.quoted(files[0])}", *_common_noise(scans)]
+    else:
+        stations = contents.stations_moved(run, scans)
+        for one, file in zip(scans, files, strict=True):
+            written = _as_written(one, what)
+            lines += ["", "[[scan]]", f"file = {project.quoted(file)}"]
+            in_file = format_ == "e57" and written.T_project_scan.size > 0
+            lines += project.scan_lines(
+                dataclasses.replace(written, T_project_scan=NO_POSE) if in_file else written, scale, with_pose=False
+            )
+    (folder / PROJECT).write_text("\n".join(lines) + "\n", encoding="utf-8")
+    _write_stations(folder / STATIONS, stations, scale)
+    if what in EACH_SCAN:
+        names = {one.number: Path(file).stem for one, file in zip(scans, files, strict=True)}
+        _write_picks(folder / PICKS, run, scans, names, scale)
+        _write_control(folder / CONTROL, scene.control, run, names, scale)
+
+
+def _as_written(one: Placed, what: str) -> Scan:
+    """Return a scan without points, with the pose and the position that belong to its points as written."""
+    position = one.scale * one.scan.position
+    if what in EACH_SCAN:
+        return dataclasses.replace(one.scan, T_project_scan=one.T if one.known else NO_POSE, position=position)
+    at = one.T[:3, :3] @ position + one.T[:3, 3] if position.size else position
+    return dataclasses.replace(one.scan, T_project_scan=NO_POSE, position=at, component=one.component)
+
+
+def _common_noise(scans: Sequence[Placed]) -> list[str]:
+    """Return the line about the noise of a merged cloud, where it is the same in all scans."""
+    sigmas = {one.scan.sigma_mm for one in scans}
+    return [f"sigma_mm = {min(sigmas)!r}"] if len(sigmas) == 1 and np.isfinite(min(sigmas)) else []
+
+
+def _tolerance(tolerance: Tolerance | None) -> list[str]:
+    """Return the lines of the limits that the project names."""
+    if tolerance is None:
+        return []
+    lines = ["", "[tolerance]"]
+    if tolerance.standard:
+        lines.append(f"standard = {project.quoted(tolerance.standard)}")
+    if tolerance.root_gap_mm:
+        lines.append(f"root_gap_mm = {tolerance.root_gap_mm!r}")
+    for limit in tolerance.limits:
+        if limit.source == PROJECT:
+            both = [limit.low, limit.high] if np.isfinite(limit.low) else limit.high
+            lines.append(f"{limit.key} = {both!r}")
+    return lines
+
+
+def _write_stations(path: Path, stations: Stations | None, scale: float) -> None:
+    if stations is not None:
+        places = zip(stations.ids, stations.positions, strict=True)
+        project.write_json(path, {name: {"position": (position * scale).tolist()} for name, position in places})
+
+
+def _write_picks(path: Path, run: Run, scans: Sequence[Placed], names: dict[int, str], scale: float) -> None:
+    picks: Picks | None = run.scene.picks
+    if picks is None:
+        return
+    read_as = {one.scan.name: (names[one.number], one.scale * scale) for one in scans}
+    with path.open("w", encoding="utf-8", newline="") as file:
+        rows = csv.writer(file, lineterminator="\n")
+        rows.writerow(picks_table.COLUMNS)
+        for a, b, point, at_a, at_b in zip(
+            picks.scan_a, picks.scan_b, picks.points, picks.in_a, picks.in_b, strict=True
+        ):
+            if a in read_as and b in read_as:
+                places: Floats = np.concatenate([at_a * read_as[a][1], at_b * read_as[b][1]])
+                rows.writerow([read_as[a][0], read_as[b][0], point, *places.tolist()])
+
+
+def _write_control(path: Path, control: Control | None, run: Run, names: dict[int, str], scale: float) -> None:
+    """Write the control points, and where the exported scans have them."""
+    if control is None:
+        return
+    stations = run.scene.stations
+    rows: list[list[object]] = [
+        [name, "", *(position * scale).tolist(), float(sd)]
+        for name, position, sd in zip(control.ids, control.positions, control.sd, strict=True)
+    ]
+    for point, scan, station, seen, sd in zip(
+        control.point, control.scan, control.station, control.seen, control.seen_sd, strict=True
+    ):
+        if int(scan) in names:
+            name = stations.ids[station] if stations is not None and station >= 0 else names[int(scan)]
+            rows.append([control.ids[point], name, *(seen * scale).tolist(), float(sd)])
+    if len(rows) > len(control.ids):
+        with path.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.writer(file, lineterminator="\n")
+            writer.writerows([COLUMNS, *rows])

@@ -1,0 +1,58 @@
+"""Colours of points: found by the names of columns, and brought to 8 bits."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from processor.model import Codes
+from processor.readers.columns import first_named
+from processor.readers.raw_scan import RawScan
+
+NAMES = (r"(diffuse_)?r(ed)?", r"(diffuse_)?g(reen)?", r"(diffuse_)?b(lue)?")
+MOST = 255
+STEP = 256  # of 16 bits a step of 8 bits
+
+
+def named(columns: Any) -> list[str]:
+    """Return the names of the columns red, green and blue; none unless there are all three."""
+    found = [first_named(columns, pattern) for pattern in NAMES]
+    return [name for name in found if name is not None] if all(found) else []
+
+
+def of_columns(columns: Sequence[Any]) -> Codes:
+    """Return colours (n, 3) of columns (n,) red, green and blue: to 255, or to 65535 where one is beyond 255.
+
+    Empty without columns, where all are 0, and for numbers that are not colours: not whole, or beyond 65535.
+    """
+    none = np.empty((0, 3), np.uint8)
+    if not columns or not len(columns[0]):
+        return none
+    most = max(float(column.max()) for column in columns)
+    least = min(float(column.min()) for column in columns)
+    if not (least >= 0.0 and 0.0 < most < (MOST + 1) * STEP):
+        return none
+    if any(np.asarray(column).dtype.kind == "f" and (column != np.rint(column)).any() for column in columns):
+        return none
+    if most > MOST:
+        # Of c in 8 bits some programs write 256 c, others 257 c.
+        columns = [np.asarray(column, np.float32) // STEP for column in columns]
+    return scaled(columns, 0.0, float(MOST))
+
+
+def coloured(scan: RawScan, columns: Sequence[Any]) -> RawScan:
+    """Return a scan with the colours of columns (n,) red, green and blue, see :func:`of_columns`."""
+    colour = of_columns(columns)
+    return dataclasses.replace(scan, colour=colour) if len(colour) else scan
+
+
+def scaled(columns: Sequence[Any], low: float, high: float) -> Codes:
+    """Return colours (n, 3) of columns (n,) from ``low`` to ``high``."""
+    colour = np.empty((len(columns[0]), 3), np.uint8)
+    for i, column in enumerate(columns):
+        share = (np.asarray(column, np.float32) - low) * (MOST / max(high - low, 1e-12))
+        colour[:, i] = np.clip(np.rint(share), 0, MOST)
+    return colour

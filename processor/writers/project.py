@@ -1,0 +1,100 @@
+"""The files of a scan folder beside the clouds: lines of project.toml, the design with its meshes, JSON files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processor.model import KEY_POINTS, ArchDesign, FrameDesign, Scan, Scene
+from processor.writers.ply import write_mesh
+
+
+def scan_lines(scan: Scan, scale: float, *, with_pose: bool) -> list[str]:
+    """Return the lines of project.toml about one scan; ``with_pose``: the file contains the scanner's pose."""
+    lines = [f"component = {quoted(scan.component)}"] if scan.component else []
+    if scan.station:
+        lines.append(f"station = {quoted(scan.station)}")
+    if np.isfinite(scan.sigma_mm):
+        lines.append(f"sigma_mm = {scan.sigma_mm!r}")
+    if scan.T_project_scan.size and not with_pose:
+        pose = scan.T_project_scan.copy()
+        pose[:3, 3] *= scale
+        lines.append(f"pose = {json.dumps(pose.tolist())}")
+    if scan.position.size and not with_pose:
+        lines.append(f"position = {json.dumps((scan.position * scale).tolist())}")
+    return lines
+
+
+def quoted(text: str) -> str:
+    """Return a text as a TOML string."""
+    return json.dumps(text, ensure_ascii=False)
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Write a JSON file."""
+    path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def stems(scans: Sequence[Scan]) -> list[str]:
+    """Return unique file stems: each scan's name if it is a plain file name, else a number."""
+    plain = {scan.name for scan in scans if scan.name.replace("-", "").replace("_", "").isalnum()}
+    stems = []
+    for number, scan in enumerate(scans):
+        stem = scan.name if scan.name in plain else f"scan{number}"
+        while scan.name not in plain and stem in plain:
+            stem += "-"
+        stems.append(stem)
+    return stems
+
+
+def write_design(scene: Scene, folder: Path, scale: float, *, with_meshes: bool) -> str:
+    """Write the design, a structure's mesh times ``scale``; return its file name, empty without a design."""
+    if scene.arch is not None:
+        write_json(folder / "design.json", _arch_design(scene.arch, folder if with_meshes else None))
+    elif scene.frame is not None:
+        write_json(folder / "design.json", _frame_design(scene.frame))
+    elif scene.structure is not None:
+        (folder / "design").mkdir(exist_ok=True)
+        vertices = scene.structure.vertices * scale
+        write_mesh(folder / "design/structure.ply", vertices, scene.structure.faces)
+        return "design/structure.ply"
+    else:
+        return ""
+    return "design.json"
+
+
+def _arch_design(design: ArchDesign, folder: Path | None) -> dict[str, Any]:
+    """Return the design as JSON, and write its meshes to ``folder`` unless it is None."""
+    components: dict[str, dict[str, Any]] = {}
+    for part in design.parts:
+        component = components[part.name] = {}
+        if folder is not None and part.source == "mesh":
+            component["mesh"] = f"design/{part.name}.ply"
+            (folder / "design").mkdir(exist_ok=True)
+            write_mesh(folder / component["mesh"], part.vertices, part.faces)
+        component["bottom_edge_left"] = part.bottom_edge_left.tolist()
+        component["bottom_edge_right"] = part.bottom_edge_right.tolist()
+    joints = [
+        {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, points.tolist(), strict=True))}
+        for name, left, right, points in zip(
+            design.joint_names, design.joint_left, design.joint_right, design.joint_points, strict=True
+        )
+    ]
+    order = [part.name for part in design.parts]
+    return {"units": "mm", "kind": "arch-bridge", "order": order, "components": components, "joints": joints}
+
+
+def _frame_design(design: FrameDesign) -> dict[str, Any]:
+    nodes = [
+        {"id": int(i), "centre": centre.tolist(), "radius": float(radius)}
+        for i, centre, radius in zip(design.ids, design.centres, design.radii, strict=True)
+    ]
+    members = [
+        {"a": int(a), "b": int(b), "tube_diameter": float(d)}
+        for a, b, d in zip(design.member_a, design.member_b, design.tube_diameters, strict=True)
+    ]
+    return {"units": "mm", "kind": "space-frame", "nodes": nodes, "members": members}
