@@ -42,11 +42,12 @@ ERROR = "batch.error"  # code of an error of the command line, whose text is Eng
 
 @dataclass(frozen=True)
 class Summary:
-    """The number of inputs of each status, the page that lists them, and those that failed."""
+    """The number of inputs of each status, the page that lists them, those that failed, and all verdicts."""
 
     counts: Mapping[str, int]
     page: Path
     failed: tuple[tuple[str, str], ...]  # name and reason
+    verdicts: frozenset[Verdict]
 
 
 def remove(out: Path) -> None:
@@ -81,7 +82,8 @@ def write(out: Path, done: Sequence[tuple[Job, Record]], left_out: Mapping[str, 
         remove(out)
         raise
     failed = tuple((row["input"], row["reason"]) for row in rows if row["status"] == JobStatus.FAILED)
-    return Summary(counts, out / PAGE, failed)
+    verdicts = frozenset(Verdict(row["verdict"] or "none") for row in rows)
+    return Summary(counts, out / PAGE, failed, verdicts)
 
 
 def _written(why: Reason | None, lang: str) -> str:

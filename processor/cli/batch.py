@@ -14,10 +14,11 @@ from processor.cli.common import (
     UNITS,
     check_jobs,
     debug_option,
+    fail_on_option,
     print_error_line,
     split_names,
 )
-from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED
+from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED, VERDICT, is_refused
 
 if TYPE_CHECKING:
     from processor.batch.batch import Settings
@@ -40,6 +41,7 @@ class BatchOptions:
     units: str | None
     seed: int | None
     lang: str
+    fail_on: str | None
     as_json: bool
 
 
@@ -57,6 +59,7 @@ class BatchOptions:
 @click.option("--units", type=click.Choice(UNITS), help="of scans; scene files state theirs")
 @click.option("--seed", type=click.IntRange(min=0))
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of all pages")
+@fail_on_option
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object a line for each input, then one for all")
 @debug_option
 @click.pass_context
@@ -65,7 +68,7 @@ def batch(context: click.Context, /, root: Path, **options: Any) -> None:
 
     Run again, it goes on where it was: what is done is kept while input, parameters and software are the same. Writes
     a folder of results for each input, index.html, summary.csv and summary.json. Exit codes: 1 where an input failed
-    (it is listed), 4 where none did and an accuracy limit was missed.
+    (it is listed), 4 where none did and an accuracy limit was missed, 5 where a verdict is as --fail-on names.
     """
     from processor.batch import batch as batch_run
     from processor.jobs.runner import StoppedError
@@ -84,7 +87,10 @@ def batch(context: click.Context, /, root: Path, **options: Any) -> None:
         click.echo(f"{summary.page}: {', '.join(f'{count} {name}' for name, count in counts.items())}")
     if summary.failed:
         context.exit(IN_PART)
-    context.exit(LIMIT_MISSED if "limit-missed" in counts else IN_PART if "in-part" in counts else DONE)
+    if "limit-missed" in counts:
+        context.exit(LIMIT_MISSED)
+    refused = is_refused(summary.verdicts, chosen.fail_on)
+    context.exit(VERDICT if refused else IN_PART if "in-part" in counts else DONE)
 
 
 def _settings(root: Path, options: BatchOptions) -> Settings:

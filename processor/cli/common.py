@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from processor.jobs.exit_codes import DONE, IN_PART, LIMIT_MISSED
+from processor.jobs.exit_codes import DONE, FAIL_ON, IN_PART, LIMIT_MISSED, VERDICT, is_refused
 from processor.language.messages import printable
 from processor.model import Status, UsageError
 
@@ -18,6 +18,9 @@ LANGUAGES = ("en", "zh")
 UNITS = ("m", "mm", "cm", "inch", "ft")
 
 
+fail_on_option = click.option(
+    "--fail-on", type=click.Choice(tuple(FAIL_ON)), help="exit code 5 where a verdict is so, or worse"
+)
 debug_option = click.option("--debug", is_flag=True, expose_value=False, help="show where an error arose")
 
 
@@ -37,18 +40,23 @@ def split_names(_: click.Context, __: click.Parameter, value: str | None) -> tup
     return tuple(name.strip() for name in value.split(",") if name.strip()) if value else ()
 
 
-def show_results(context: click.Context, output: Path, results: Results, as_json: bool) -> None:
-    """Print what was found and set the exit code."""
-    from processor.report import all_tables
+def show_results(
+    context: click.Context, output: Path, results: Results, as_json: bool, fail_on: str | None = None
+) -> None:
+    """Print what was found, the headline first, and set the exit code."""
+    from processor.report import all_tables, headline
     from processor.report import table as report_table
     from processor.results.names import REPORT_PAGE, RESULTS_JSON
 
     if as_json:
         click.echo((output / RESULTS_JSON).read_text("utf-8"), nl=False)
     else:
+        click.echo(printable(headline.of_run(results.execution)) + "\n")
         for table in all_tables.tables_of_run(results.execution, results.report):
             if table.on_terminal:
                 click.echo(report_table.plain_text(table) + "\n")
         click.echo(f"report: {output / REPORT_PAGE}")
     complete = all(result.status == Status.OK for result in results.steps.values())
-    context.exit(LIMIT_MISSED if not results.report.passed else DONE if complete else IN_PART)
+    if not results.report.passed:
+        context.exit(LIMIT_MISSED)
+    context.exit(VERDICT if is_refused([results.verdict], fail_on) else DONE if complete else IN_PART)

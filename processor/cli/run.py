@@ -6,7 +6,15 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import LANGUAGES, UNITS, debug_option, print_error_line, show_results, split_names
+from processor.cli.common import (
+    LANGUAGES,
+    UNITS,
+    debug_option,
+    fail_on_option,
+    print_error_line,
+    show_results,
+    split_names,
+)
 
 
 @click.command()
@@ -20,6 +28,7 @@ from processor.cli.common import LANGUAGES, UNITS, debug_option, print_error_lin
 @click.option("--units", type=click.Choice(UNITS), help="of the scans' coordinates, whatever the format says")
 @click.option("--seed", type=click.IntRange(min=0), help="of all randomness  [default: 0, or the parameters']")
 @click.option("--lang", type=click.Choice(LANGUAGES), default="en", show_default=True, help="of the page")
+@fail_on_option
 @click.option("--json", "as_json", is_flag=True, help="print results.json instead of tables")
 @debug_option
 @click.pass_context
@@ -33,10 +42,11 @@ def run(
     units: str | None,
     seed: int | None,
     lang: str,
+    fail_on: str | None,
     as_json: bool,
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
     from processor.api import runs
 
     results = runs.run(input_, output, steps, methods, params, units, seed, lang=lang, log=print_error_line)
-    show_results(context, output, results, as_json)
+    show_results(context, output, results, as_json, fail_on)

@@ -14,7 +14,7 @@ from processor.evaluation.evaluate import ErrorReport
 from processor.language.messages import Text, label, messages, text
 from processor.model import Scene, StepRun, Verdict, Word
 from processor.pipeline import Execution
-from processor.report import all_tables, page_script, templates
+from processor.report import all_tables, headline, page_script, templates
 from processor.report.step_report import step_report
 from processor.report.style import CaptionedPngs
 from processor.report.table import Table, headings, numeric, shown
@@ -93,12 +93,11 @@ def _verdicts(execution: Execution, report: ErrorReport) -> list[dict[str, Any]]
     verdicts: list[dict[str, Any]] = []
     for run, _ in execution.by_step():
         report_of = step_report(run.step)
-        head, body = report_of.summary(run.result)
-        title = text("{step}: {head}", step=report_of.title, head=head)
+        _, body = report_of.summary(run.result)
         method = text("Method {method}.", method=run.method)
         if body:
             method = text("Method {method}. {text}", method=run.method, text=body)
-        verdicts.append({"tone": _tone(run), "head": title, "text": method})
+        verdicts.append({"tone": _tone(run), "head": headline.of_step(run), "text": method})
         verdicts += [{"tone": "", "head": head, "text": body} for head, body in report_of.further_verdicts(run.result)]
     return [*verdicts, _truth(report)]
 

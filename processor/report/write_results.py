@@ -9,7 +9,7 @@ from pathlib import Path
 from processor.evaluation.evaluate import ErrorReport
 from processor.model import UsageError
 from processor.pipeline import Execution
-from processor.report import all_figures, all_tables, page
+from processor.report import all_figures, all_tables, headline, page
 from processor.report import table as report_table
 from processor.report.step_report import step_report
 from processor.results.names import FIGURES, JOB_RECORD, REPORT_PAGE, RESULTS_H5, RESULTS_JSON
@@ -47,7 +47,7 @@ def write_results(out: Path, execution: Execution, report: ErrorReport, lang: st
     """
     with replacing_folder(out) as making:
         store.write_results(making / RESULTS_H5, execution.runs, execution.provenance)
-        content = results_json(execution, report)
+        content = results_json(execution, report, headline.of_run(execution))
         write_text(making / RESULTS_JSON, json.dumps(content, indent=1, allow_nan=False, ensure_ascii=False) + "\n")
         for table in all_tables.tables_of_run(execution, report):
             if table.file:

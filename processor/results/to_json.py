@@ -5,20 +5,22 @@ from __future__ import annotations
 from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import StepRun
+from processor.model import StepRun, Verdict, worst
 from processor.pipeline import Execution
 from processor.results.fields_to_json import as_object
 from processor.results.names import FORMAT, FORMAT_VERSION
 from processor.store.json_values import json_ready
 
 
-def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
+def results_json(execution: Execution, report: ErrorReport, headline: str = "") -> dict[str, Any]:
     """Build the object of results.json; further methods of a step are under ``comparison``."""
     by_step = execution.by_step()
     made = execution.provenance
     content: dict[str, Any] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
+        "verdict": worst(_verdict(run) for run, _ in by_step),
+        "headline": headline,
         "input": made["input"],
         "input_sha256": made["input_sha256"],
         "units": {"read_as": execution.scene.units, "reason": execution.scene.units_reason, "written_as": "mm"},
@@ -48,5 +50,9 @@ def results_json(execution: Execution, report: ErrorReport) -> dict[str, Any]:
 
 
 def step_json(run: StepRun) -> dict[str, Any]:
-    """Write the result of one step."""
-    return as_object(run.result)
+    """Write the result of one step, with its verdict: the worst of those in it."""
+    return as_object(run.result) | {"verdict": _verdict(run)}
+
+
+def _verdict(run: StepRun) -> Verdict:
+    return getattr(run.result, "overall", Verdict.NONE)
