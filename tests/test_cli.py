@@ -14,8 +14,9 @@ import pytest
 
 from processor import __main__, pipeline
 from processor.evaluation.evaluate import evaluate
-from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError
+from processor.model import FrameDesign, FrameTruth, InputError, Scan, Scene, Truth, UsageError, Verdict
 from processor.report import write_results
+from processor.space_frame.result import Result as FrameResult
 from processor.store import store
 from tests.support import arch_clouds
 
@@ -238,6 +239,24 @@ def test_a_missed_limit_exits_with_4(called, frame, tmp_path):
     assert again.returncode == 4
     assert json.loads(again.stdout)["passed"] is False
     assert "MISSED" in called("check", tmp_path / "out").stdout
+
+
+@pytest.mark.parametrize(
+    ("verdict", "fail_on", "code"),
+    [("fail", "fail", 5), ("indeterminate", "fail", 0), ("indeterminate", "indeterminate", 5), ("pass", "fail", 0),
+     ("fail", None, 0)],
+)  # fmt: skip
+def test_a_verdict_sets_the_exit_code_where_asked(called, frame, tmp_path, monkeypatch, verdict, fail_on, code):
+    monkeypatch.setattr(FrameResult, "overall", Verdict(verdict))
+    store.write_scene(tmp_path / "s.h5", frame[0], None, {})
+    option = ["--fail-on", fail_on] if fail_on else []
+    done = called("run", tmp_path / "s.h5", "-o", tmp_path / "out", *option)
+    assert done.returncode == code
+    found = json.loads((tmp_path / "out" / "results.json").read_text("utf-8"))
+    assert found["verdict"] == found["steps"]["spheres"]["verdict"] == verdict
+    assert found["headline"]
+    assert done.stdout.splitlines()[0] == found["headline"]
+    assert found["headline"] in (tmp_path / "out" / "report.html").read_text("utf-8")
 
 
 def test_names_from_outside_are_shown_as_text(frame, tmp_path):

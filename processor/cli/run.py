@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -33,20 +34,20 @@ from processor.cli.common import (
 @debug_option
 @click.pass_context
 def run(
-    context: click.Context,
-    input_: Path,
-    output: Path,
-    steps: tuple[str, ...],
-    methods: tuple[str, ...],
-    params: Path | None,
-    units: str | None,
-    seed: int | None,
-    lang: str,
-    fail_on: str | None,
-    as_json: bool,
+    context: click.Context, /, input_: Path, output: Path, fail_on: str | None, as_json: bool, **options: Any
 ) -> None:
     """Process INPUT: a scan folder, a scene file (.h5) or one scan file."""
     from processor.api import runs
 
-    results = runs.run(input_, output, steps, methods, params, units, seed, lang=lang, log=print_error_line)
+    results = runs.run(
+        input_,
+        output,
+        options["steps"],
+        options["methods"],
+        options["params"],
+        options["units"],
+        options["seed"],
+        lang=options["lang"],
+        log=print_error_line,
+    )
     show_results(context, output, results, as_json, fail_on)
