@@ -30,10 +30,16 @@ class Classification:
     otherwise: DefectClass
 
 
-def of_deviation(sign: int, diameter: float, length: float, width: float, thickness: float, z: float) -> Classification:
-    """Classify a place that deviates inward (``sign`` -1) or outward, sizes in mm; ``z``: deviation by its sd."""
+def of_deviation(
+    sign: int, diameter: float, length: float, width: float, thickness: float, z: float, stayed: float = np.nan
+) -> Classification:
+    """Classify a place that deviates inward (``sign`` -1) or outward, sizes in mm; ``z``: deviation by its sd.
+
+    ``stayed`` is the probability that the other side of the plate did not move, which distinguishes a pit from a dent.
+    Where that side was not seen (NaN), the size does.
+    """
     slim = _slim(length, width, thickness)
-    small = _above(PIT_THICKNESSES * thickness, diameter)
+    small = _above(PIT_THICKNESSES * thickness, diameter) if np.isnan(stayed) else stayed
     significance = 1.0 - np.exp(-0.5 * max(z, 0.0))
     if sign > 0:
         ranks = {DefectClass.BULGE: 1.0 - slim, DefectClass.UNKNOWN: slim}

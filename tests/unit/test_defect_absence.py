@@ -59,8 +59,22 @@ def seen(points, normals, boxes, station):
     return visible
 
 
-def cloud_of(boxes, seed, cut=None, shades=(), stations=STATIONS):
-    """A scene with one cloud of all stations, less what lies within ``cut``; ``shades`` are boxes not of the design."""
+def pressed(points, radius, sides):
+    """Points with a rib's far side pressed in by 4 mm within ``radius``, or both of its ``sides``."""
+    (near, y, z), (far, *_) = RIBS[9]
+    share = np.exp(-((np.hypot(points[:, 1] - y - 85.0, points[:, 2] - z - 320.0) / radius) ** 8))
+    on = points[:, 0] == far
+    if sides == 2:
+        on |= points[:, 0] == near
+    points[:, 0] -= 4.0 * share * on
+    return points
+
+
+def cloud_of(boxes, seed, cut=None, shades=(), stations=STATIONS, press=None):
+    """A scene with one cloud of all stations, less what lies within ``cut``; ``shades`` are boxes not of the design.
+
+    ``press`` are radius and sides for :func:`pressed`.
+    """
     rng = np.random.default_rng(seed)
     parts = []
     for station in stations:
@@ -68,7 +82,7 @@ def cloud_of(boxes, seed, cut=None, shades=(), stations=STATIONS):
         keep = seen(points, normals, [*boxes, *shades], station)
         if cut is not None:
             keep &= ~((points > cut[0]) & (points < cut[1])).all(axis=1)
-        points = points[keep]
+        points = points[keep] if press is None else pressed(points[keep], *press)
         ray = (points - station) / np.linalg.norm(points - station, axis=1)[:, None]
         parts.append(points + rng.normal(0.0, 0.5, len(points))[:, None] * ray)
     design = StructureDesign(
@@ -107,6 +121,13 @@ def test_a_long_bite_out_of_an_edge_is_edge_loss():
 def test_edges_that_a_filter_removed_are_not_missing():
     cut = ((1095.0, 296.0, 30.0), (1120.0, 320.0, 720.0))
     assert run(cloud_of(BOXES, 9, cut=cut))[0] == []
+
+
+@pytest.mark.parametrize(("sides", "kinds"), [(1, ["pit"]), (2, ["bulge", "dent"])])
+@pytest.mark.parametrize("radius", [28.0, 55.0])
+def test_a_pit_is_on_one_side_of_a_plate_and_a_dent_on_both_whatever_their_size(sides, kinds, radius):
+    """By their size alone, 56 and 110 mm on 14 mm of steel, the small one is a pit and the large one a dent."""
+    assert run(cloud_of(BOXES, 10, press=(radius, sides)))[0] == kinds
 
 
 def test_a_corner_in_the_shadow_of_something_is_not_missing():

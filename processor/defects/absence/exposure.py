@@ -15,15 +15,13 @@ from scipy import ndimage
 
 from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
-from processor.defects.observations import cells_at
+from processor.defects.places import other_side
 from processor.defects.regions import EIGHT_NEIGHBOURS, EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import Bools, FacetGrid
 from processor.model import Floats, Ints
 
-PLATE_MM = 80.0  # largest thickness of a plate, whose other side is compared
-OPPOSITE_COS = -0.95  # of the normals of the two sides of a plate
 BEFORE_MM = 1.0  # start of a line of sight above the face
 DIRECTIONS = 400  # about a face, 5 degrees apart
 LEAST_COS = 0.2  # of incidence, as of points that are used
@@ -36,7 +34,6 @@ LOW_QUANTILE = 0.25  # of the densities around: what is counted on
 SLIM = 4.0  # length of a strip along a border by its width: edges that a filter removed
 DEEP_CELLS = 2.0  # width of a place, from which on it is no such strip: borders themselves are not examined
 FEWEST_BEYOND = 100  # points beyond a place: where the cloud ends, it may have been cropped
-GRID_SHARE = 0.01  # voxel by the design's size
 FEWEST_PAIRS = 30  # of cells side by side, to estimate the scatter of numbers of points from
 
 
@@ -55,7 +52,7 @@ class _Hole:
 def holes(field: Field, surface: DesignSurface, points: Floats, alarms_per_mm2: float) -> list[Region]:
     """Return the empty places of plates of which both sides must have been seen; ``points`` (n, 3) are of the cloud."""
     size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
+    grid = other_side.grid_of(surface)
     count = (field.count + field.stray).astype(np.float64)
     opposite: dict[int, int] = {}
     found: list[_Hole] = []
@@ -64,7 +61,7 @@ def holes(field: Field, surface: DesignSurface, points: Floats, alarms_per_mm2: 
             hole = _hole(field, surface, count, int(chart), cells, ring)
             if hole is None or not _is_beyond(surface, hole, ring, points):
                 continue
-            other = _other_sides(surface, grid, hole.core)
+            other = other_side.cells_opposite(surface, grid, hole.core)
             if (other < 0).all() or not _is_exposed(surface, grid, hole.core, ring, 2.0 * size):
                 continue
             opposite |= dict(zip(hole.core.tolist(), other.tolist(), strict=True))
@@ -174,23 +171,6 @@ def _is_beyond(surface: DesignSurface, hole: _Hole, ring: Ints, points: Floats) 
     if length < 0.5 * surface.charts.cell_mm:  # steel all around
         return True
     return int(((points - middle) @ way > 0.0).sum()) >= FEWEST_BEYOND
-
-
-def _other_sides(surface: DesignSurface, grid: FacetGrid, cells: Ints) -> Ints:
-    """Return the cell (n,) on the other side of the plate at each of ``cells`` (n,); -1 where there is no plate."""
-    starts = surface.centres[cells] - 1e-3 * surface.outward[cells]
-    ends = surface.centres[cells] - PLATE_MM * surface.outward[cells]
-    row, facet, part = mesh_distance.crossings(grid, starts, ends, False)
-    facing = np.einsum("ni,ni->n", surface.normals[facet], surface.outward[cells[row]]) < OPPOSITE_COS
-    row, facet, part = row[facing], facet[facing], part[facing]
-    order = np.lexsort([part, row])
-    row, facet, part = row[order], facet[order], part[order]
-    first = np.unique(row, return_index=True)[1]
-    row, facet, part = row[first], facet[first], part[first]
-    other = np.full(len(cells), -1, np.int64)
-    places = starts[row] + part[:, None] * (ends[row] - starts[row])
-    other[row] = cells_at(surface, surface.chart_of[facet], places)
-    return other
 
 
 def _is_exposed(surface: DesignSurface, grid: FacetGrid, core: Ints, ring: Ints, far_mm: float) -> bool:
