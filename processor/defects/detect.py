@@ -33,7 +33,7 @@ from processor.defects.regions import Region
 from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import merging, mesh_distance, rigid
-from processor.model import Floats, InputError, Ints, Reason, Scene, Status, reason
+from processor.model import DesignBodies, Floats, InputError, Ints, Reason, Scene, Status, StructureDesign, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
 CELL_BOUNDS_MM = (5.0, 60.0)
@@ -67,7 +67,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     if pose.T_design_project is None:
         return Result(status=Status.FAILED, method=params.method, reasons=pose.reasons)
     T = rigid.transform(np.eye(3), -origin) @ pose.T_design_project
-    registered = _registered(scene, vertices, design.faces, T, pose.error_mm, params)
+    registered = _registered(scene, vertices, design, T, pose.error_mm, params)
     if registered is None:
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.no-point"),))
     search = _search(scene, registered, pose.error_mm, params)
@@ -77,11 +77,19 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
         result,
         covariance=rigid.about_origin(search.alignment.pose_covariance(), search.alignment.centre + origin),
         status=pose.status if result.status is Status.OK else result.status,
-        reasons=(*pose.reasons, *_of_views(search), *result.reasons),
+        reasons=(*pose.reasons, *_of_names(design.bodies), *_of_views(search), *result.reasons),
         T_design_project=rigid.transform(np.eye(3), origin) @ T,
         points=registered.observed.points,
         points_used=len(registered.observed.chart),
     )
+
+
+def _of_names(bodies: DesignBodies | None) -> Iterator[Reason]:
+    """Yield how components are named where the design does not give each body a name of its own."""
+    if bodies is not None and bodies.shared:
+        yield reason("defects.names-shared", bodies=bodies.shared)
+    if bodies is not None and bodies.unnamed:
+        yield reason("defects.names-missing", bodies=bodies.unnamed)
 
 
 def _of_views(search: to_result.Search) -> Iterator[Reason]:
@@ -93,10 +101,10 @@ def _of_views(search: to_result.Search) -> Iterator[Reason]:
 
 
 def _registered(
-    scene: Scene, vertices: Floats, faces: Ints, T: Floats, error_mm: float, params: Params
+    scene: Scene, vertices: Floats, design: StructureDesign, T: Floats, error_mm: float, params: Params
 ) -> Registered | None:
     """Assign points to cells and align them, again after a large movement; None without points near the design."""
-    base = surface_charts.of_mesh(vertices, faces, _coarse_cell(vertices, faces))
+    base = surface_charts.of_mesh(vertices, design.faces, _coarse_cell(vertices, design.faces), design.bodies)
     for left in reversed(range(ROUNDS)):
         observed = observations.observe(scene, T, base, params.reach_mm)
         if not len(observed.chart):

@@ -123,13 +123,13 @@ def table(rows: Sequence[dict[str, Any]], origin: Floats, doubt: Reason | None =
     return Defects(id=np.arange(len(rows)), **columns)
 
 
-def _row(classification: Classification, component: int, **values: Any) -> dict[str, Any]:
+def _row(classification: Classification, component: str, **values: Any) -> dict[str, Any]:
     """Return the values of a row of the table of defects."""
     row = {
         "defect_class": classification.defect_class,
         "confidence": classification.confidence,
         "otherwise": classification.otherwise,
-        "component": f"component-{component + 1}",
+        "component": component,
         "reasons": (),
         "deflection": Curve(),
     }
@@ -186,7 +186,7 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
     volume = float((np.abs(value) if both_ways else -value) @ area)
     values = _row(
         classes.of_shape(kind, judged.margin),
-        component,
+        surface.names[component],
         centre=surface.centres[rows[part]].mean(axis=0),
         axes=frame.axes,
         extent=extent,
@@ -328,11 +328,11 @@ def _place_values(
             classification, measured, reasons = _by_profile(
                 search, region, measured, classification, assumed, inflation, claimed
             )
-    return _row_of(measured, classification, component, region, reasons)
+    return _row_of(measured, classification, surface.names[component], region, reasons)
 
 
 def _row_of(
-    measured: Measures, classification: Classification, component: int, region: Region, reasons: tuple[Reason, ...]
+    measured: Measures, classification: Classification, component: str, region: Region, reasons: tuple[Reason, ...]
 ) -> dict[str, Any]:
     """Return the values of the row of a place."""
     return _row(

@@ -60,3 +60,6 @@ def test_bodies_in_contact_as_designed_have_no_defects(gap):
     assert result.examined_mm2 > 1.0e6
     # One false alarm on 100 m2 is asked for: the limit has a chance of 0.1 %.
     assert len(result.defects) <= poisson.ppf(0.999, result.examined_mm2 / 1e8)
+
+
+BUILT = (("asbuilt.beam.move_mm", [0.0, 0.0, 10.0]), ("asbuilt.column.dent_mm", 5.0))
