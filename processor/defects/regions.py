@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from processor.defects.classes import CRACK_RATIO
 from processor.defects.deviation_field import Field
 from processor.defects.scan_statistic import Finding
-from processor.defects.surface_charts import CYLINDER, Charts, DesignSurface
+from processor.defects.surface_charts import CYLINDER, PLANE, Charts, DesignSurface
 from processor.model import Floats, Ints
 
 EIGHT_NEIGHBOURS = np.ones((3, 3))
@@ -21,6 +21,8 @@ LEAST_EXPECTED = (
     6.0  # points on the cells that are judged together: with fewer, cells are empty by chance, side by side
 )
 COUNTED_SHARE = 0.5  # of the points expected: scanners return fewer where a surface reflects badly
+PLATE_MM = 80.0  # largest thickness of a plate, whose two sides move together
+OPPOSITE_COS = -0.95  # of the normals of the two sides of a plate
 LINE_CELLS = 1.6  # distance of a crack's piece from its line
 LINE_REACH = 3.0  # half lengths of a crack, within which further pieces lie
 
@@ -104,8 +106,10 @@ def chernoff(mean: float, number: float, *, more: bool) -> float:
 def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> list[list[Region]]:
     """Group the parts of one defect: of one component, near each other, and missing or to the same side.
 
-    Deviations right beside a missing region belong to it: beams that hit its edge.
+    Deviations right beside a missing region belong to it: beams that hit its edge. What is pushed in on one side of a
+    plate comes out on the other: both are one defect, of the side that shows more of it.
     """
+    charts = surface.charts
     groups: list[list[Region]] = []
     trees: list[cKDTree] = []
     for region in sorted(regions, key=lambda region: (region.sign != 0, -len(region.cells), int(region.cells[0]))):
@@ -114,13 +118,29 @@ def united(regions: list[Region], surface: DesignSurface, near_mm: float) -> lis
         for group, tree in zip(groups, trees, strict=True):
             first = group[0]
             same = first.sign in (0, region.sign) and surface.charts.component[first.chart] == component
-            if same and float(tree.query(places)[0].min()) < near_mm:
+            cosine = float(charts.axes[first.chart, 2] @ charts.axes[region.chart, 2])
+            if _is_other_side(first, region, charts, cosine):
+                reach = float(np.hypot(near_mm, PLATE_MM))
+            elif same:
+                reach = near_mm
+            else:
+                continue
+            if float(tree.query(places)[0].min()) < reach:
                 group.append(region)
                 break
         else:
             groups.append([region])
             trees.append(cKDTree(places))
     return _lines_united([_joined(group) for group in groups], surface)
+
+
+def _is_other_side(first: Region, region: Region, charts: Charts, cosine: float) -> bool:
+    """Return whether a region is on the other side of a plate, and deviates the same way in space."""
+    if not (charts.component[first.chart] == charts.component[region.chart] and first.sign * region.sign == -1):
+        return False
+    plane = (charts.kind[[first.chart, region.chart]] == PLANE).all()
+    apart = float((charts.origin[first.chart] - charts.origin[region.chart]) @ charts.axes[first.chart, 2])
+    return bool(plane and cosine < OPPOSITE_COS and 0.0 < apart < PLATE_MM)
 
 
 def unrolled(surface: DesignSurface, region: Region) -> Floats:

@@ -59,7 +59,7 @@ def read(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies]:
 
 def _named(names: list[str], facets: list[int]) -> DesignBodies:
     """Return bodies of so many facets under unique names: "web", "web (2)", and "body 3" where the file has no name."""
-    unnamed = [re.fullmatch(UNNAMED, name) is not None for name in names]
+    unnamed = [not name or re.fullmatch(UNNAMED, name) is not None for name in names]
     said = [f"body {k + 1}" if none else name for k, (name, none) in enumerate(zip(names, unnamed, strict=True))]
     count = Counter(said)
     taken, result = set(said), list[str]()
@@ -84,7 +84,7 @@ def _bodies(meshes: Path, path: Path) -> list[tuple[str, str]]:
     """Return name and mesh of each body of an import."""
     try:
         record = json.loads((meshes / RECORD).read_text("utf-8"))
-        names = [(str(body["name"]), str(body["mesh"])) for body in record["bodies"]]
+        names = [(str(body.get("name", "")), str(body["mesh"])) for body in record["bodies"]]
         problems = [str(problem) for problem in record["problems"]]
     except (OSError, ValueError, KeyError, TypeError):
         shutil.rmtree(meshes, ignore_errors=True)

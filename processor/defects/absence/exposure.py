@@ -16,14 +16,12 @@ from scipy import ndimage
 from processor.defects.alignment import chart_of_cells
 from processor.defects.deviation_field import Field
 from processor.defects.observations import cells_at
-from processor.defects.regions import EIGHT_NEIGHBOURS, EMPTY_SHARE, Region, chernoff
+from processor.defects.regions import EIGHT_NEIGHBOURS, EMPTY_SHARE, OPPOSITE_COS, PLATE_MM, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_distance
 from processor.geometry.mesh_distance import Bools, FacetGrid
 from processor.model import Floats, Ints
 
-PLATE_MM = 80.0  # largest thickness of a plate, whose other side is compared
-OPPOSITE_COS = -0.95  # of the normals of the two sides of a plate
 BEFORE_MM = 1.0  # start of a line of sight above the face
 DIRECTIONS = 400  # about a face, 5 degrees apart
 LEAST_COS = 0.2  # of incidence, as of points that are used
