@@ -177,9 +177,7 @@ def _welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, I
     return vertices[corners[first]], inverse.reshape(faces.shape)
 
 
-def with_components(
-    vertices: Floats, faces: Ints, bodies: DesignBodies | None = None
-) -> tuple[MeshSurface, Ints]:
+def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None = None) -> tuple[MeshSurface, Ints]:
     """Prepare a mesh for searches; also the component (f,) of each of its facets, numbered as in the defects' names.
 
     Components are the ``bodies``, in their order, where these have names.
