@@ -329,12 +329,27 @@ class FrameDesign(Checked):
 
 
 @dataclass(frozen=True)
+class DesignBodies(Checked):
+    """The bodies of a structure's mesh by their names in the CAD file: the row (f,) of ``names`` of each facet.
+
+    No two names are equal. ``shared`` of the bodies had a name that others have, ``unnamed`` had none: the design's
+    reader numbered them.
+    """
+
+    names: tuple[str, ...] = names("b")
+    of_facet: Ints = column("f", dtype=np.int64)
+    shared: int = 0
+    unnamed: int = 0
+
+
+@dataclass(frozen=True)
 class StructureDesign(Checked):
-    """One mesh of a whole structure, in the design's frame (mm)."""
+    """One mesh of a whole structure, in the design's frame (mm); ``bodies`` are None where the mesh has no names."""
 
     name: str
     vertices: Floats = column("v", 3)
     faces: Ints = column("f", 3, dtype=np.int64)
+    bodies: DesignBodies | None = newer()
 
 
 @dataclass(frozen=True)

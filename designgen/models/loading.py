@@ -13,7 +13,7 @@ import numpy as np
 from designgen.cad import files
 from designgen.cad.bodies import Body
 from designgen.models import cadquery_objects, mesh_bodies, mesh_files
-from designgen.models.model import Model, ModelBody, of_cad, repeated, turned, unique, volume
+from designgen.models.model import Model, ModelBody, of_cad, repeated, shared_count, turned, unique, volume
 from processor.model import Floats, InputError, Ints, UsageError
 
 PYTHON = ".py"
@@ -31,7 +31,7 @@ def load(model: Any, units: str = "", name: str = "model") -> Model:
     if isinstance(model, str | PathLike):
         path = Path(model)
         found = _of_file(path, units)
-        return Model(path.stem, *_named(path.name, found))
+        return _named(path.stem, path.name, found)
     if units:
         raise UsageError("units: expected none for an object, whose lengths are in mm")
     if isinstance(model, tuple | list) and len(model) == 2:
@@ -39,7 +39,7 @@ def load(model: Any, units: str = "", name: str = "model") -> Model:
         bodies, notes = mesh_bodies.bodies_of(name, [("", vertices, faces)], name)
         return Model(name, tuple(bodies), tuple(notes))
     cad, notes = cadquery_objects.bodies_of(name, model, name)
-    return Model(name, *_named(name, (cad, notes)))
+    return _named(name, name, (cad, notes))
 
 
 def _arrays(model: Any) -> tuple[Floats, Ints]:
@@ -84,13 +84,11 @@ def _of_file(path: Path, units: str) -> tuple[Sequence[Body | ModelBody], list[s
     return cad.bodies, notes
 
 
-def _named(
-    file: str, found: tuple[Sequence[Body | ModelBody], list[str]]
-) -> tuple[tuple[ModelBody, ...], tuple[str, ...]]:
-    """Return bodies under unique names, and the notes with those on names and open shells."""
+def _named(model: str, file: str, found: tuple[Sequence[Body | ModelBody], list[str]]) -> Model:
+    """Return the model of bodies under unique names, with the notes on names and open shells."""
     bodies, notes = found
     if bodies and isinstance(bodies[0], ModelBody):
-        return tuple(bodies), tuple(notes)  # type: ignore[arg-type]
+        return Model(model, tuple(bodies), tuple(notes))  # type: ignore[arg-type]
     names = [body.name for body in bodies]
     notes += repeated(names)
     stem = Path(file).stem
@@ -108,7 +106,7 @@ def _named(
         notes.append(f"{_listed(open_)} not closed: scanned as it is, from both sides; check it in the CAD program")
     if inverted:
         notes.append(f"{_listed(inverted)} inside out: the normals were turned outward")
-    return tuple(result), tuple(notes)
+    return Model(model, tuple(result), tuple(notes), shared_count(names), numbered)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -12,7 +12,7 @@ import numpy as np
 from designgen.cad.bodies import Body
 from designgen.cad.forms import PLANE, surface_of
 from designgen.designs.patch import Surface, Trimmed
-from processor.model import Floats, Ints
+from processor.model import DesignBodies, Floats, Ints
 
 SMOOTH_COS = np.cos(1e-2)  # of the angle between two faces at a common edge, up to which they are one smooth surface
 
@@ -56,11 +56,25 @@ class ModelBody:
 
 @dataclass(frozen=True)
 class Model:
-    """Named bodies, and the notes: what was found and done when they were read."""
+    """Named bodies, and the notes: what was found and done when they were read.
+
+    ``shared`` of the bodies had a name in the file that others have, ``unnamed`` had none.
+    """
 
     name: str
     bodies: tuple[ModelBody, ...]
     notes: tuple[str, ...] = ()
+    shared: int = 0
+    unnamed: int = 0
+
+    def design_bodies(self) -> DesignBodies:
+        """Return the bodies of the facets of :meth:`mesh`."""
+        return DesignBodies(
+            names=tuple(body.name for body in self.bodies),
+            of_facet=np.repeat(np.arange(len(self.bodies)), [len(body.triangles) for body in self.bodies]),
+            shared=self.shared,
+            unnamed=self.unnamed,
+        )
 
     def mesh(self) -> tuple[Floats, Ints]:
         """Return vertices (v, 3), mm, and triangles (f, 3) of all bodies."""
@@ -124,14 +138,23 @@ def of_mesh(name: str, vertices: Floats, triangles: Ints, most_deg: float = 20.0
 
 def repeated(names: Sequence[str]) -> list[str]:
     """Return a note on names that several bodies have, which :func:`unique` numbers; empty without such names."""
-    shared = {name: count for name, count in Counter(names).items() if count > 1}
+    shared = _shared(names)
     if not shared:
         return []
     most = max(shared, key=lambda name: shared[name])
     return [
-        f"{sum(shared.values())} bodies share {len(shared)} name(s), as {most!r} {shared[most]} times: they "
+        f"{shared_count(names)} bodies share {len(shared)} name(s), as {most!r} {shared[most]} times: they "
         f"are numbered, {most!r}, '{most} (2)', ..."
     ]
+
+
+def shared_count(names: Sequence[str]) -> int:
+    """Return the number of bodies with a name that others have."""
+    return sum(_shared(names).values())
+
+
+def _shared(names: Sequence[str]) -> dict[str, int]:
+    return {name: count for name, count in Counter(names).items() if count > 1}
 
 
 def unique(names: Sequence[str]) -> list[str]:

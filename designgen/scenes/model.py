@@ -78,7 +78,7 @@ def make(
         stations=stations if params.registered else None,
         units="mm",
         units_reason=MADE_IN_MM,
-        structure=StructureDesign(model.name, vertices + origin, faces),
+        structure=StructureDesign(model.name, vertices + origin, faces, model.design_bodies()),
     )
     return scene, Truth(
         labels,

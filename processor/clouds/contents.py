@@ -188,14 +188,16 @@ def stations_moved(run: Run, scans: Sequence[Placed]) -> Stations | None:
 def core_cloud(run: Run) -> Cloud:
     """Return the core points of step deviation in the design's frame, with their deviation, LOD95 and component.
 
-    The components are numbered from 1, as in the names of the defects.
+    The components are numbered from 1, in the order of the design's bodies, or as in the names of the defects without
+    named bodies.
     """
     result = run.step("deviation", "deviation")
     core = result.core
     component = np.zeros(len(core.points), np.int32)
     if run.scene.structure is not None and len(core.points):
         vertices, origin = merging.local_design(run.scene.structure)
-        surface, of_facet = surface_charts.with_components(vertices, run.scene.structure.faces)
+        design = run.scene.structure
+        surface, of_facet = surface_charts.with_components(vertices, design.faces, design.bodies)
         facet, _, _ = surface.distances(core.points + (result.origin - origin), FOUND_MM)
         component = np.where(facet >= 0, of_facet[np.maximum(facet, 0)] + 1, 0).astype(np.int32)
     fields = {"deviation_mm": core.distance, "lod95_mm": core.lod95, "component": component}

@@ -16,11 +16,13 @@ from numba import njit
 
 from processor.adjustment import scanner_class
 from processor.defects.observations import Pairs, Stations
-from processor.defects.surface_charts import DesignSurface
+from processor.defects.surface_charts import CYLINDER, DesignSurface
 from processor.geometry import rigid
+from processor.geometry.mesh_distance import Bools
 from processor.model import Floats, Ints
 
 BLOCK_MM = 80.0
+BLOCK_RAD = 0.25  # of a block around a tube: within it, a movement of the tube is nearly one deviation
 # Largest and least standard deviations of a station's error: rotation (rad), translation (mm), range offset (mm).
 PRIOR = np.array([2e-4] * 3 + [3.0] * 3 + [2.0])
 LEAST_PRIOR = np.array([1e-6] * 3 + [0.02] * 3 + [0.02])
@@ -73,7 +75,8 @@ class Alignment:
 class StationBlocks:
     """Observations of stations summed up by blocks of cells; ``variance`` is of the mean.
 
-    ``cell`` is the cell nearest to the middle of the points: a place on the face, as the mean of places need not be.
+    ``cell`` is the cell nearest to the middle of the points of all stations: a place on the face, as the mean of places
+    need not be. It is one for all, so that a movement which all stations have in common makes no difference.
     """
 
     block: Ints  # (n,)
@@ -104,8 +107,8 @@ def align(
 ) -> Alignment:
     """Fit stations to each other, and the whole to the design if there are enough components.
 
-    ``excluded`` are components that moved or are deformed: the whole is fitted by the others. What views that are not
-    named have in common is added to the covariance by the class of scanners.
+    ``excluded`` are components that moved or are deformed: stations and whole are fitted by the others. What views that
+    are not named have in common is added to the covariance by the class of scanners.
     """
     start = none(surface, len(stations.names), error_mm)
     blocks = _blocks(pairs, surface)
@@ -113,12 +116,15 @@ def align(
         return start
     points, outward = surface.centres[blocks.cell], surface.outward[blocks.cell]
     J = _derivative(points - start.centre, outward, rays_to(points, stations.positions[blocks.station]))
-    movements, station_covariance = station_movements(blocks, J, len(stations.names))
-    start = replace(start, movements=movements, station_covariance=station_covariance)
-    residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
     component = surface.charts.component[chart_of_cells(surface)[blocks.cell]]
     used = ~np.isin(component, sorted(excluded))
-    if len(np.unique(component[used])) < FEWEST_COMPONENTS:
+    # Of what moved by much, stations do not see the same place in one cell: they are compared on the rest.
+    enough = len(np.unique(component[used])) >= FEWEST_COMPONENTS
+    compared = used if enough else np.ones_like(used)
+    movements, station_covariance = station_movements(_of_rows(blocks, compared), J[compared], len(stations.names))
+    start = replace(start, movements=movements, station_covariance=station_covariance)
+    residual = blocks.mean - np.einsum("nk,nk->n", J, movements[blocks.station])
+    if not enough:
         return start
     whole, covariance, gain = _whole(residual[used], J[used, :6], component[used])
     if stations.unnamed:
@@ -201,16 +207,23 @@ def _derivative(arm: Floats, outward: Floats, rays: Floats) -> Floats:
     return np.hstack([np.cross(arm, outward), outward, np.einsum("ni,ni->n", rays, outward)[:, None]])
 
 
+def _of_rows(blocks: StationBlocks, rows: Bools) -> StationBlocks:
+    """Return some of the observations."""
+    return StationBlocks(*(column[rows] for column in vars(blocks).values()))
+
+
 def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
     """Sum up pairs of cell and station by blocks of cells."""
     charts = surface.charts
     chart = chart_of_cells(surface)[pairs.cell]
     used = pairs.count > 0
     u, v = np.divmod(pairs.cell - charts.first[chart], charts.shape[chart, 1])
-    side = max(1, round(BLOCK_MM / charts.cell_mm))
+    wide = np.where(charts.kind == CYLINDER, np.minimum(BLOCK_MM, BLOCK_RAD * charts.radius), BLOCK_MM)
+    side = np.maximum(1, np.round(np.stack([np.full_like(wide, BLOCK_MM), wide], axis=1) / charts.cell_mm))
+    side = side.astype(np.int64)
     across = -(-charts.shape // side)
     first = np.concatenate([[0], np.cumsum(across.prod(axis=1))])[:-1]
-    block = first[chart] + u // side * across[chart, 1] + v // side
+    block = first[chart] + u // side[chart, 0] * across[chart, 1] + v // side[chart, 1]
     stations = int(pairs.station.max(initial=0)) + 1
     key, index = np.unique((block * stations + pairs.station)[used], return_inverse=True)
     index = index.reshape(-1)
@@ -219,9 +232,14 @@ def _blocks(pairs: Pairs, surface: DesignSurface) -> StationBlocks:
     mean = np.bincount(index, weight * pairs.mean[used]) / count
     freedom = np.maximum(np.bincount(index, np.maximum(weight - 1.0, 0.0)), 1.0)
     square = np.bincount(index, pairs.square[used]) / freedom
-    middle_u, middle_v = (np.round(np.bincount(index, weight * x[used]) / count).astype(np.int64) for x in (u, v))
-    last = np.empty(len(key), np.int64)
-    last[index] = np.flatnonzero(used)
+    _, of_block = np.unique(block[used], return_inverse=True)
+    of_block = of_block.reshape(-1)
+    total = np.bincount(of_block, weight)
+    last, group = np.empty(len(key), np.int64), np.empty(len(key), np.int64)
+    last[index], group[index] = np.flatnonzero(used), of_block
+    middle_u, middle_v = (
+        np.round(np.bincount(of_block, weight * x[used]) / total).astype(np.int64)[group] for x in (u, v)
+    )
     c = chart[last]
     cell = charts.first[c] + middle_u * charts.shape[c, 1] + middle_v
     return StationBlocks(
@@ -291,10 +309,19 @@ def _normal_equations(
     return A, right
 
 
+def _component_weights(residual: Floats, component: Ints) -> Floats:
+    """Return the weight (n,) of each residual's component, by the root mean square of a component's residuals."""
+    rms = np.sqrt(np.bincount(component, residual**2) / np.bincount(component))
+    scale = max(float(np.median(rms)), FLOOR_MM)
+    weight: Floats = 1.0 / (1.0 + (rms / (CAUCHY * scale)) ** 2) ** 2
+    return weight[component]
+
+
 def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Floats, Floats]:
     """Return the movement (6,) of the whole, with redescending weights, its covariance, and its gain (6, n).
 
-    The movement is the gain times the deviations.
+    The movement is the gain times the deviations. A component has a weight as well as each of its blocks: of one that
+    moved, faces along the movement do not deviate, and its other faces may be the largest of their direction.
 
     The covariance follows from the scatter between components (sandwich estimator), plus that of the fit itself.
     """
@@ -302,9 +329,11 @@ def _whole(deviation: Floats, J: Floats, component: Ints) -> tuple[Floats, Float
     prior = np.diag(1.0 / WHOLE_PRIOR**2)
     scale = max(1.4826 * float(np.median(np.abs(deviation))), FLOOR_MM)
     weight = np.ones(len(deviation))
+    _, of_component = np.unique(component, return_inverse=True)
+    of_component = of_component.reshape(-1)
     for _ in range(4 * ROUNDS):
         residual = deviation - J @ x
-        weight = 1.0 / (1.0 + (residual / (CAUCHY * scale)) ** 2) ** 2
+        weight = _component_weights(residual, of_component) / (1.0 + (residual / (CAUCHY * scale)) ** 2) ** 2
         A = J.T @ (weight[:, None] * J) / scale**2 + prior
         step = np.linalg.solve(A, J.T @ (weight * deviation) / scale**2) - x
         x = x + step

@@ -26,7 +26,7 @@ from processor.defects.surface_charts import of_mesh
 from processor.defects.to_result import table
 from processor.geometry import icp, merging, mesh_distance, pfh, rigid
 from processor.geometry.neighbors import surface_spacing, voxel_means
-from processor.model import NORMAL_95, Floats, Ints, Scene, Status, reason
+from processor.model import NORMAL_95, Floats, Ints, Scene, Status, StructureDesign, reason
 
 VOXEL_SPACINGS = 1.5
 RADIUS_VOXELS = 2.5  # radius of the neighbourhood that density is counted in
@@ -52,6 +52,7 @@ class Deviations:
     distance: Floats
     normal: Floats
     component: Ints
+    names: tuple[str, ...]  # of the components
     label: Ints  # NOISE: of no defect
     sigma: float  # robust standard deviation of the distances, mm
     threshold: float  # mm
@@ -80,7 +81,7 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
             T, rms, paired_share = fit.T_target_source, fit.rms, fit.paired_share
     if not np.isfinite(rms):
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.paper-not-placed"),))
-    deviations = _deviations(rigid.apply(T, points), vertices, scene.structure.faces, radius, params)
+    deviations = _deviations(rigid.apply(T, points), vertices, scene.structure, radius, params)
     rows = sorted(_rows(deviations, size, paper), key=lambda row: -abs(row["volume_mm3"]))
     order = np.array([row.pop("label") for row in rows], np.int64)
     row_of = np.append(np.argsort(order), NOISE).astype(np.int32)  # by label; the last: of no defect
@@ -109,9 +110,9 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     )
 
 
-def _deviations(points: Floats, vertices: Floats, faces: Ints, radius: float, params: Params) -> Deviations:
+def _deviations(points: Floats, vertices: Floats, design: StructureDesign, radius: float, params: Params) -> Deviations:
     """Measure distances of points (n, 3), and cluster those beyond the threshold."""
-    surface = of_mesh(vertices, faces, 1000.0)
+    surface = of_mesh(vertices, design.faces, 1000.0, design.bodies)
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, params.reach_mm)
     facet, distance = mesh_distance.nearest_visible(grid, points, np.zeros((1, 3)), np.full(len(points), -1, np.int64))
     near = facet >= 0
@@ -126,6 +127,7 @@ def _deviations(points: Floats, vertices: Floats, faces: Ints, radius: float, pa
         distance=distance,
         normal=surface.normals[facet],
         component=surface.component_of[facet],
+        names=surface.names,
         label=label,
         sigma=sigma,
         threshold=threshold,
@@ -151,7 +153,7 @@ def _rows(deviations: Deviations, size: float, paper: Paper) -> Iterator[dict[st
             "defect_class": DefectClass.UNKNOWN,
             "confidence": 0.0,
             "otherwise": DefectClass.DENT if distance.mean() < 0.0 else DefectClass.BULGE,
-            "component": f"component-{int(np.bincount(deviations.component[inside]).argmax()) + 1}",
+            "component": deviations.names[int(np.bincount(deviations.component[inside]).argmax())],
             "centre": middle,
             "axes": np.stack([axes[:, 2], np.cross(outward, axes[:, 2]), outward]),
             "extent": [np.ptp(along) + size, np.ptp(across) + size],

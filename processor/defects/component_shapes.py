@@ -24,6 +24,8 @@ FLOOR_MM = 0.02
 DEFORMED_GAIN = 100.0  # of chi-square, above which a component is deformed
 JUMP_CELLS = 1.5
 LEAST_Z = 4.5  # of a shape: what stations have in common is known from few of them
+FEWEST_SEEN = 6  # cells of a face, whose mean movement is compared with that of others
+FACE_GAIN = 1.1  # from which on another face than the front shows a movement
 FLUSH_COS, FLUSH_MM = 0.9998, 1.0  # faces in one plane
 LARGE_SHARE = 0.9  # of the largest face's area, from which a face may be the front
 
@@ -122,16 +124,17 @@ def significant(
         candidates = [(k, s) for k, s in enumerate(fit.fitted.shapes) if s.kind != "bump"]
         if not candidates:
             continue
-        rows = front_of(surface, fit.component, field)
-        rows = rows[surface.share[rows] > 0.5]
-        area = float(surface.share[rows].sum()) * surface.charts.cell_mm**2
+        front = front_of(surface, fit.component, field)
+        front = front[surface.share[front] > 0.5]
+        area = float(surface.share[front].sum()) * surface.charts.cell_mm**2
         threshold = max(LEAST_Z, float(-ndtri(min(0.25, 0.5 * alarms_per_mm2 * area / len(shape_models.BASES)))))
         # Noise of blocks; the common error of larger places is added below.
         size = int(np.searchsorted(levels.sides, fit.blocks.side_mm / surface.charts.cell_mm))
         inflation = float(levels.inflation[min(size, len(levels.sides) - 1)])
-        points, outward = with_corners(surface, rows)
-        registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
         for k, shape in candidates:
+            rows = cells_of_shape(surface, field, fit, shape)
+            points, outward = with_corners(surface, rows)
+            registration = np.hypot(alignment.sd(points, outward), field.stations_sd(rows))
             value = shape.values(fit.frame, points, outward)
             top = int(np.argmax(np.abs(value)))
             formal = abs(value[top]) / max(np.sqrt(max(fit.fitted.gain[k], 1e-9)), 1e-9) * inflation
@@ -148,6 +151,30 @@ def significant(
                 )
                 chosen.setdefault(fit.component, []).append(judged)
     return chosen
+
+
+def cells_of_shape(
+    surface: DesignSurface, field: Field, fit: ComponentShape, shape: shape_models.Shape | None = None
+) -> Ints:
+    """Return the cells on which a shape is measured: the front, or the seen face on which a movement is largest.
+
+    A component that moved along its front shows it on other faces alone.
+    """
+    front = front_of(surface, fit.component, field)
+    front = front[surface.share[front] > 0.5]
+    if shape is None or shape.kind != shape_models.RIGID:
+        return front
+    seen = np.flatnonzero((component_of_cells(surface) == fit.component) & (field.seen > 0.0))
+    charts, index, count = np.unique(chart_of_cells(surface)[seen], return_inverse=True, return_counts=True)
+    value = np.abs(shape.values(fit.frame, surface.centres[seen], surface.outward[seen]))
+    mean = np.where(count >= FEWEST_SEEN, np.bincount(index.reshape(-1), value) / np.maximum(count, 1), 0.0)
+    on_front = np.isin(charts, chart_of_cells(surface)[front])
+    if not len(charts) or mean.max() <= max(FACE_GAIN * mean[on_front].max(initial=0.0), 1e-9):
+        return front
+    of_face = surface.charts.cells(int(charts[int(np.argmax(mean))]))
+    cells = np.arange(of_face.start, of_face.stop)
+    shown: Ints = cells[surface.share[cells] > 0.5]
+    return shown if len(shown) else front
 
 
 def front_of(surface: DesignSurface, component: int, field: Field) -> Ints:

@@ -27,13 +27,14 @@ from processor.defects.absence import contacts, exposure
 from processor.defects.alignment import Alignment
 from processor.defects.component_shapes import ComponentShape
 from processor.defects.deviation_field import Field
+from processor.defects.movement import moved_bodies
 from processor.defects.observations import Observed, Pairs
 from processor.defects.params import Params
 from processor.defects.regions import Region
 from processor.defects.result import Result
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import merging, mesh_distance, rigid
-from processor.model import Floats, InputError, Ints, Reason, Scene, Status, reason
+from processor.model import DesignBodies, Floats, InputError, Ints, Reason, Scene, Status, StructureDesign, reason
 
 CELL_POINTS = 12.0  # in a cell, on the median
 CELL_BOUNDS_MM = (5.0, 60.0)
@@ -67,21 +68,46 @@ def defects(scene: Scene, params: Params, earlier: dict[str, Any]) -> Result:
     if pose.T_design_project is None:
         return Result(status=Status.FAILED, method=params.method, reasons=pose.reasons)
     T = rigid.transform(np.eye(3), -origin) @ pose.T_design_project
-    registered = _registered(scene, vertices, design.faces, T, pose.error_mm, params)
+    registered = _registered(scene, vertices, design, T, pose.error_mm, params)
     if registered is None:
         return Result(status=Status.FAILED, method=params.method, reasons=(reason("defects.no-point"),))
     search = _search(scene, registered, pose.error_mm, params)
+    movements = moved_bodies.moved(search.shapes, search.significant)
+    if movements:
+        # Of what moved, stations do not see one place in one cell: its movement is that by stations fitted elsewhere.
+        others = frozenset(movements)
+        aligned = alignment.align(
+            registered.pairs, registered.surface, registered.observed.stations, pose.error_mm, others
+        )
+        if aligned.fitted:
+            again_fitted = _shapes_of(registered, aligned, params)[1]
+            movements = moved_bodies.refitted(movements, again_fitted)
+        changed = moved_bodies.design(design.name, registered.surface, movements)
+        T = registered.T_design_project
+        again = _registered(scene, changed.vertices, changed, T, pose.error_mm, params, others)
+        if again is not None:
+            registered, search = again, _search(scene, again, pose.error_mm, params)
+            shapes, significant = moved_bodies.together(movements, search.shapes, search.significant)
+            search = dataclasses.replace(search, shapes=shapes, significant=significant)
     result = to_result.result_of(search, params, origin, pose.doubt)
     T = alignment.corrected_pose(registered.T_design_project, search.alignment)
     return dataclasses.replace(
         result,
         covariance=rigid.about_origin(search.alignment.pose_covariance(), search.alignment.centre + origin),
         status=pose.status if result.status is Status.OK else result.status,
-        reasons=(*pose.reasons, *_of_views(search), *result.reasons),
+        reasons=(*pose.reasons, *_of_names(design.bodies), *_of_views(search), *result.reasons),
         T_design_project=rigid.transform(np.eye(3), origin) @ T,
         points=registered.observed.points,
         points_used=len(registered.observed.chart),
     )
+
+
+def _of_names(bodies: DesignBodies | None) -> Iterator[Reason]:
+    """Yield how components are named where the design does not give each body a name of its own."""
+    if bodies is not None and bodies.shared:
+        yield reason("defects.names-shared", bodies=bodies.shared)
+    if bodies is not None and bodies.unnamed:
+        yield reason("defects.names-missing", bodies=bodies.unnamed)
 
 
 def _of_views(search: to_result.Search) -> Iterator[Reason]:
@@ -93,10 +119,19 @@ def _of_views(search: to_result.Search) -> Iterator[Reason]:
 
 
 def _registered(
-    scene: Scene, vertices: Floats, faces: Ints, T: Floats, error_mm: float, params: Params
+    scene: Scene,
+    vertices: Floats,
+    design: StructureDesign,
+    T: Floats,
+    error_mm: float,
+    params: Params,
+    excluded: frozenset[int] = frozenset(),
 ) -> Registered | None:
-    """Assign points to cells and align them, again after a large movement; None without points near the design."""
-    base = surface_charts.of_mesh(vertices, faces, _coarse_cell(vertices, faces))
+    """Assign points to cells and align them, again after a large movement; None without points near the design.
+
+    ``excluded`` are components that stations and whole are not fitted by.
+    """
+    base = surface_charts.of_mesh(vertices, design.faces, _coarse_cell(vertices, design.faces), design.bodies)
     for left in reversed(range(ROUNDS)):
         observed = observations.observe(scene, T, base, params.reach_mm)
         if not len(observed.chart):
@@ -108,7 +143,7 @@ def _registered(
         if not params.align:
             aligned = alignment.none(surface, len(observed.stations.names), error_mm)
             break
-        aligned = alignment.align(pairs, surface, observed.stations, error_mm)
+        aligned = alignment.align(pairs, surface, observed.stations, error_mm, excluded)
         if not left or _largest_movement(aligned, surface) < AGAIN_MM:
             break
         T = alignment.corrected_pose(T, aligned)
@@ -185,11 +220,9 @@ def _fitted_shapes(
 ) -> tuple[Alignment, Field, list[ComponentShape]]:
     """Fit shapes of components; align the whole again without the components that have one, if that is more precise."""
     surface, pairs, stations = registered.surface, registered.pairs, registered.observed.stations
-    inner = deviation_field.inner_cells(surface, params.edge_mm)
 
     def fitted(aligned: Alignment) -> tuple[Alignment, Field, list[ComponentShape]]:
-        field = deviation_field.of_pairs(pairs, surface, stations, aligned, inner)
-        return aligned, field, component_shapes.fit_all(field, surface)
+        return (aligned, *_shapes_of(registered, aligned, params))
 
     first = fitted(registered.alignment)
     deformed = component_shapes.deformed(first[2])
@@ -199,6 +232,14 @@ def _fitted_shapes(
     # The components left may be few, or all on one side: then the whole is known better by all.
     better = again.fitted and _median_sd(again, surface) < _median_sd(first[0], surface)
     return fitted(again) if better else first
+
+
+def _shapes_of(registered: Registered, aligned: Alignment, params: Params) -> tuple[Field, list[ComponentShape]]:
+    """Return the field of an alignment, and the shapes of components in it."""
+    surface = registered.surface
+    inner = deviation_field.inner_cells(surface, params.edge_mm)
+    field = deviation_field.of_pairs(registered.pairs, surface, registered.observed.stations, aligned, inner)
+    return field, component_shapes.fit_all(field, surface)
 
 
 def _coarse_cell(vertices: Floats, faces: Ints) -> float:

@@ -26,10 +26,11 @@ PIECE_CELLS = 6.0  # side of a piece of a face, whose mean is compared with that
 class Field:
     """Deviation (mm, outward positive) of each cell (cells,), its variance from noise, and numbers of points.
 
-    ``stray`` counts points that do not agree with the others of the cell. ``inner`` are cells away from their face's
-    border, ``seen`` those of them with enough points, and about them as well. ``stations`` is the variance by errors of
-    the stations' movements, which neighbouring cells have in common; 0 in cells without points. ``views`` is the
-    standard deviation of what the points of one view have in common, where views are not named, mm.
+    ``stray`` counts points that do not agree with the others of the cell, or whose beams may have hit something else.
+    ``inner`` are cells away from their face's border, ``seen`` those of them with enough points, and about them as
+    well. ``stations`` is the variance by errors of the stations' movements, which neighbouring cells have in common; 0
+    in cells without points. ``views`` is the standard deviation of what the points of one view have in common, where
+    views are not named, mm.
     """
 
     deviation: Floats
@@ -78,8 +79,8 @@ def of_pairs(pairs: Pairs, surface: DesignSurface, stations: Stations, alignment
         known = pooled_freedom * POOLED_CELLS**2 > FEWEST_FREE
         noise[rows] = np.where(known, pooled_square / np.maximum(pooled_freedom, 1e-9), overall).ravel()
     noise = np.sqrt(np.maximum(noise, 1e-6))
-    stray = np.bincount(pairs.cell, pairs.stray, cells)
-    variance, seen = noise**2 / divisor, inner * (count + stray >= FEWEST_POINTS)
+    stray, mixed = (np.bincount(pairs.cell, x, cells) for x in (pairs.stray, pairs.mixed))
+    variance, seen = noise**2 / divisor, inner * ((count + stray - mixed >= FEWEST_POINTS) & (count > 0))
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
         seen[rows] *= _amid(charts.image(seen, chart), charts.image(inner, chart), charts, chart).ravel()

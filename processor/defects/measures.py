@@ -98,7 +98,8 @@ class CellPoints:
 def points_by_cell(observed: Observed, surface: DesignSurface, alignment: Alignment) -> CellPoints:
     """Sort the points of a scene by their cells."""
     cell = cells_of(observed, surface)
-    order = np.argsort(cell, kind="stable")
+    pure = np.flatnonzero(~observed.mixed)
+    order = pure[np.argsort(cell[pure], kind="stable")]
     return CellPoints(observed, surface, alignment, order, cell[order])
 
 

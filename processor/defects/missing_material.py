@@ -31,7 +31,6 @@ LEAST_BIN_RAD = 0.003
 BIN_STEPS = 5.0  # angular steps of a scanner in a bin of directions
 FACE_SHARE = 0.2  # of a face's cells seen by a station, from which on the rest is expected
 FEWEST_CELLS = 10  # with points, to estimate the density of points from
-FIELD_MARGIN_RAD = 0.02
 GAP_RAD = 0.5  # of azimuth without returns, that is still within the field of view
 
 
@@ -130,7 +129,8 @@ def _nearest_ranges(
 ) -> tuple[Floats, npt.NDArray[np.bool_]]:
     """Return the shortest range about directions arm (n, 3), and whether they are within the station's field of view.
 
-    Bins of azimuth without any return are outside it, except for gaps as wide as structures have.
+    Bins of azimuth without any return are outside it, except for gaps as wide as structures have. What is lower or
+    higher than all returns may be outside it, as the scanner's tripod hides what is below.
     """
     wide, high = int(np.ceil(2.0 * np.pi / bin_rad)), int(np.ceil(np.pi / bin_rad))
     nearest = np.full(wide * high, np.inf)
@@ -153,7 +153,7 @@ def _nearest_ranges(
     closing = np.ones(max(1, int(GAP_RAD / bin_rad)))
     columns |= ndimage.binary_closing(np.tile(columns, 3), closing)[wide : 2 * wide]
     i, j, elevation = bins(arm)
-    inside = columns[i] & (elevation > lowest - FIELD_MARGIN_RAD) & (elevation < highest + FIELD_MARGIN_RAD)
+    inside = columns[i] & (elevation > lowest) & (elevation < highest)
     return nearest[i, j], inside
 
 

@@ -7,11 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from processor.defects.surface_charts import DesignSurface, layout
+from processor.adjustment import foreground
+from processor.defects.surface_charts import CYLINDER, DesignSurface, layout
 from processor.geometry import mesh_distance, rigid
-from processor.model import Floats, InputError, Ints, Scene
+from processor.geometry.mesh_distance import Bools, FacetGrid
+from processor.model import Floats, InputError, Ints, Scan, Scene
 
 CHUNK = 500_000
+BEHIND_MM = 4.0  # a face, from which on a beam must have passed through it as designed
+HALF_BEAM_MM = 4.0  # at the outline of a round face: beams there miss it in part
 LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beams that hit two surfaces
 GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond which a point is stray
 LEAST_GATE_MM = 1.0
@@ -33,12 +37,17 @@ class Stations:
 
 @dataclass(frozen=True)
 class Observed:
-    """Points on the design's faces: the chart, place on it, station and deviation (mm, outward positive) of each."""
+    """Points on the design's faces: the chart, place on it, station and deviation (mm, outward positive) of each.
+
+    ``mixed`` marks points whose beams may have hit something before the face as well: they show that something is
+    there, but not where.
+    """
 
     chart: Ints
     uv: Floats  # (n, 2)
     station: Ints
     deviation: Floats
+    mixed: Bools
     stations: Stations
     points: int  # of the scene
 
@@ -47,7 +56,8 @@ class Observed:
 class Pairs:
     """Deviations by cell and station: mean over ``count`` points, and their sum of squares about it.
 
-    Points that do not agree with the others of their cell are left out and counted by ``stray``.
+    Points that do not agree with the others of their cell, and mixed ones, are left out and counted by ``stray``;
+    ``mixed`` counts the latter.
     """
 
     cell: Ints
@@ -56,6 +66,7 @@ class Pairs:
     stray: Ints
     mean: Floats
     square: Floats
+    mixed: Ints
 
 
 def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reach_mm: float) -> Observed:
@@ -68,7 +79,7 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach_mm)
     names: list[str] = []
     positions: list[Floats] = []
-    parts: list[tuple[Ints, Floats, Ints, Floats]] = []
+    parts: list[tuple[Ints, Floats, Ints, Floats, Bools]] = []
     for scan in scene.scans:
         T = T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4))
         T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
@@ -84,28 +95,85 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
         else:
             names.append(scan.name)
             positions.append(np.full(3, np.nan))
-        known = np.isfinite(np.array(positions).sum(axis=1))
-        scanners = np.nan_to_num(np.array(positions))
-        for start in range(0, len(station_of), CHUNK):
-            rows = slice(start, start + CHUNK)
-            points, of_point = rigid.apply(T, scan.points[rows]), station_of[rows]
-            station = np.where(known[of_point], of_point, -1)
-            facet, deviation = mesh_distance.nearest_visible(grid, points, scanners, station)
-            near = np.flatnonzero(facet >= 0)
-            arm = scanners[of_point[near]] - points[near]
-            cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[near]]) / np.linalg.norm(arm, axis=1)
-            on = near[(station[near] < 0) | (cosine > LEAST_COS)]
-            chart = surface.chart_of[facet[on]]
-            parts.append((chart, layout(surface.charts, chart, points[on]), of_point[on], deviation[on]))
-    chart, uv, station, deviation = (np.concatenate(column) for column in zip(*parts, strict=True))
+        parts.append(_of_scan(scan, T, station_of, np.array(positions), surface, grid))
+    chart, uv, station, deviation, mixed = (np.concatenate(column) for column in zip(*parts, strict=True))
     return Observed(
         chart=chart,
         uv=uv,
         station=station,
         deviation=deviation,
+        mixed=mixed,
         stations=Stations(tuple(names), np.array(positions)),
         points=sum(len(scan.points) for scan in scene.scans),
     )
+
+
+def _of_scan(
+    scan: Scan, T: Floats, station_of: Ints, positions: Floats, surface: DesignSurface, grid: FacetGrid
+) -> tuple[Ints, Floats, Ints, Floats, Bools]:
+    """Return chart, place, station, deviation and mixed of the points on faces; ``T`` (4, 4) maps them to the design.
+
+    ``station_of`` (n,) are rows of ``positions`` (k, 3).
+    """
+    known, scanners = np.isfinite(positions.sum(axis=1)), np.nan_to_num(positions)
+    facet, deviation = np.full(len(scan.points), -1, np.int64), np.full(len(scan.points), np.nan)
+    points = np.empty((len(scan.points), 3))
+    for start in range(0, len(station_of), CHUNK):
+        rows = slice(start, start + CHUNK)
+        points[rows], of_point = rigid.apply(T, scan.points[rows]), station_of[rows]
+        station = np.where(known[of_point], of_point, -1)
+        facet[rows], deviation[rows] = mesh_distance.nearest_visible(grid, points[rows], scanners, station)
+    near = np.flatnonzero(facet >= 0)
+    arm = scanners[station_of[near]] - points[near]
+    cosine = np.einsum("ni,ni->n", arm, surface.normals[facet[near]]) / np.linalg.norm(arm, axis=1)
+    on = near[~known[station_of[near]] | (cosine > LEAST_COS)]
+    mixed = _at_outline(surface, facet[on], points[on], scanners[station_of[on]])
+    mixed |= _passed_by(surface, grid, facet[on], points[on], deviation[on], scanners[station_of[on]])
+    mixed &= known[station_of[on]]
+    for k in np.unique(station_of[on]):
+        if known[k]:
+            rows = station_of[on] == k
+            of_face = surface.normals[facet[on[rows]]], deviation[on[rows]]
+            mixed[rows] |= foreground.beside(points[on[rows]], positions[k], *of_face, points[station_of == k])
+    chart = surface.chart_of[facet[on]]
+    return chart, layout(surface.charts, chart, points[on]), station_of[on], deviation[on], mixed
+
+
+def _at_outline(surface: DesignSurface, facet: Ints, points: Floats, scanners: Floats) -> Bools:
+    """Mark points (n, 3) on round faces of which half a beam from the scanners (n, 3) passes by the face.
+
+    What counts is how far the line of sight passes the axis, which does not depend on the range that was measured.
+    """
+    charts, chart = surface.charts, surface.chart_of[facet]
+    marked = np.zeros(len(facet), np.bool_)
+    rows = np.flatnonzero(charts.kind[chart] == CYLINDER)
+    chart = chart[rows]
+    axis, arm = charts.axes[chart, 0], points[rows] - charts.origin[chart]
+    across = np.cross(scanners[rows] - points[rows], axis)
+    across /= np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
+    off = np.abs(np.einsum("ni,ni->n", arm, across))
+    is_convex = np.einsum("ni,ni->n", arm, surface.normals[facet[rows]]) > 0.0
+    marked[rows] = is_convex & (off > charts.radius[chart] - HALF_BEAM_MM)
+    return marked
+
+
+def _passed_by(
+    surface: DesignSurface, grid: FacetGrid, facet: Ints, points: Floats, deviation: Floats, scanners: Floats
+) -> Bools:
+    """Mark points (n, 3) behind their face whose line of sight does not cross it: the beam passed its outline.
+
+    Such a beam met an edge in part and something far behind it. Where the steel lies deeper than designed, the beam
+    crosses the face.
+    """
+    marked = deviation < -BEHIND_MM
+    rows = np.flatnonzero(marked)
+    arm = scanners[rows] - points[rows]
+    depth, rise = -deviation[rows], np.einsum("ni,ni->n", arm, surface.normals[facet[rows]])
+    ends = points[rows] + arm * np.minimum(1.0, (depth + BEHIND_MM) / np.maximum(rise, 1e-9))[:, None]
+    row, crossed, _ = mesh_distance.crossings(grid, points[rows], ends, False)
+    through = surface.chart_of[crossed] == surface.chart_of[facet[rows[row]]]
+    marked[rows[row[through]]] = False
+    return marked
 
 
 def fitting_cell(observed: Observed, surface: DesignSurface, points: float, bounds: tuple[float, float]) -> float:
@@ -139,11 +207,13 @@ def paired(observed: Observed, surface: DesignSurface) -> Pairs:
     """Sum up the points by cell and station."""
     cell = cells_of(observed, surface)
     order = np.argsort(cell * len(observed.stations.names) + observed.station, kind="stable")
-    return Pairs(*pairs(cell[order], observed.station[order], observed.deviation[order]))
+    return Pairs(*pairs(cell[order], observed.station[order], observed.deviation[order], observed.mixed[order]))
 
 
 @njit(cache=True, nogil=True)
-def pairs(cell: Ints, station: Ints, deviation: Floats) -> tuple[Ints, Ints, Ints, Ints, Floats, Floats]:
+def pairs(
+    cell: Ints, station: Ints, deviation: Floats, mixed: Bools
+) -> tuple[Ints, Ints, Ints, Ints, Floats, Floats, Ints]:
     """Return the columns of :class:`Pairs` of points sorted by cell and station (Welford's algorithm)."""
     n = len(cell)
     total = 0
@@ -151,7 +221,7 @@ def pairs(cell: Ints, station: Ints, deviation: Floats) -> tuple[Ints, Ints, Int
         if i == 0 or cell[i] != cell[i - 1] or station[i] != station[i - 1]:
             total += 1
     cells, stations = np.empty(total, np.int64), np.empty(total, np.int64)
-    count, stray = np.zeros(total, np.int64), np.zeros(total, np.int64)
+    count, stray, beside = np.zeros(total, np.int64), np.zeros(total, np.int64), np.zeros(total, np.int64)
     mean, square = np.zeros(total), np.zeros(total)
     at, start = -1, 0
     while start < n:
@@ -159,20 +229,22 @@ def pairs(cell: Ints, station: Ints, deviation: Floats) -> tuple[Ints, Ints, Int
         while end < n and cell[end] == cell[start]:
             end += 1
         middle, gate = 0.0, np.inf
-        if end - start >= FEWEST_POINTS:
-            middle = np.median(deviation[start:end])
-            gate = max(LEAST_GATE_MM, GATE_SDS * 1.4826 * np.median(np.abs(deviation[start:end] - middle)))
+        pure = deviation[start:end][~mixed[start:end]]
+        if len(pure) >= FEWEST_POINTS:
+            middle = np.median(pure)
+            gate = max(LEAST_GATE_MM, GATE_SDS * 1.4826 * np.median(np.abs(pure - middle)))
         for i in range(start, end):
             if i == start or station[i] != station[i - 1]:
                 at += 1
                 cells[at], stations[at] = cell[i], station[i]
             value = deviation[i]
-            if abs(value - middle) > gate:
+            if mixed[i] or abs(value - middle) > gate:
                 stray[at] += 1
+                beside[at] += mixed[i]
                 continue
             count[at] += 1
             step = value - mean[at]
             mean[at] += step / count[at]
             square[at] += step * (value - mean[at])
         start = end
-    return cells, stations, count, stray, mean, square
+    return cells, stations, count, stray, mean, square, beside

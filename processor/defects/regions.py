@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
@@ -16,6 +17,9 @@ from processor.model import Floats, Ints
 
 EIGHT_NEIGHBOURS = np.ones((3, 3))
 EMPTY_SHARE = 0.15  # of the points expected, up to which a cell is empty
+LEAST_EXPECTED = (
+    6.0  # points on the cells that are judged together: with fewer, cells are empty by chance, side by side
+)
 COUNTED_SHARE = 0.5  # of the points expected: scanners return fewer where a surface reflects badly
 LINE_CELLS = 1.6  # distance of a crack's piece from its line
 LINE_REACH = 3.0  # half lengths of a crack, within which further pieces lie
@@ -61,14 +65,14 @@ def missing(field: Field, expected: Floats, surface: DesignSurface, alarms_per_m
     charts = surface.charts
     count = field.count + field.stray
     inner = field.inner > 0.0  # cells that could be examined: beams there hit the face alone
-    empty = (expected > 0.0) & (count <= EMPTY_SHARE * expected)
     threshold = -np.log(alarms_per_mm2 * charts.cell_mm**2)
     regions = []
     for chart in range(len(charts.kind)):
         rows = charts.cells(chart)
-        if not (empty[rows] & inner[rows]).any():
+        empty = _empty(charts.image(count.astype(float), chart), charts.image(expected, chart))
+        if not (empty.ravel() & inner[rows]).any():
             continue
-        for cells in _connected(charts.image(empty.astype(float), chart) > 0.0, charts, chart):
+        for cells in _connected(empty, charts, chart):
             core = cells[inner[cells]]
             mean = COUNTED_SHARE * expected[core].sum()
             number = float(count[core].sum())
@@ -77,6 +81,17 @@ def missing(field: Field, expected: Floats, surface: DesignSurface, alarms_per_m
                 chance = float(np.exp(-strength)) / charts.cell_mm**2
                 regions.append(Region(chart, cells, 0, float(np.sqrt(2.0 * strength)), chance))
     return regions
+
+
+def _empty(count: Floats, expected: Floats) -> npt.NDArray[np.bool_]:
+    """Return which cells of a face are empty, with those about them where few points are expected on one cell."""
+    possible = expected > 0.0
+    if not possible.any():
+        return possible
+    side = int(np.ceil(np.sqrt(LEAST_EXPECTED / float(np.median(expected[possible])))))
+    about = [ndimage.uniform_filter(np.where(possible, x, 0.0), side, mode="constant") for x in (count, expected)]
+    empty: npt.NDArray[np.bool_] = possible & (about[0] <= EMPTY_SHARE * about[1])
+    return empty
 
 
 def chernoff(mean: float, number: float, *, more: bool) -> float:

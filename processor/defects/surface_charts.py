@@ -1,7 +1,8 @@
 """The design's surface on grids: components, their faces, and cells on the faces.
 
 A plane or cylindrical face is mapped to a plane by one chart; any other face is cut into pieces that are nearly flat. A
-component is a set of bodies that touch, or a single body where more than MOST_BODIES touch.
+component is a body that the design names. In a mesh without names it is a set of bodies that touch, or a single body
+where more than MOST_BODIES touch.
 """
 
 from __future__ import annotations
@@ -16,12 +17,13 @@ from scipy.sparse.csgraph import connected_components
 
 from processor.geometry import enclosure, mesh_distance
 from processor.geometry.mesh_distance import Bools, MeshSurface
-from processor.model import Floats, Ints
+from processor.model import DesignBodies, Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
 PIECE_COS = np.cos(np.radians(15.0))
 ROUND_SHARE = 0.02  # of the radius, the largest distance of a vertex from its cylinder
 WELD_MM = 0.01
+LEAST_AREA_MM2 = 1e-9  # of twice a facet; smaller ones have no normal
 TOUCH_MM = 0.5
 MOST_BODIES = 12  # of a component
 MOST_SIDES = 60  # edges tried for the direction of a face
@@ -76,7 +78,7 @@ class DesignSurface:
     share: Floats  # (cells,)
     centres: Floats  # (cells, 3)
     outward: Floats  # (cells, 3)
-    components: int
+    names: tuple[str, ...]  # of the components
 
     @property
     def area_mm2(self) -> float:
@@ -84,11 +86,14 @@ class DesignSurface:
         return float(self.share.sum()) * self.charts.cell_mm**2
 
 
-def of_mesh(vertices: Floats, faces: Ints, cell_mm: float) -> DesignSurface:
-    """Map a mesh to charts with cells of ``cell_mm``."""
-    mesh = mesh_distance.of_mesh(*_welded(vertices, faces), spacing_mm=1e9)
+def of_mesh(vertices: Floats, faces: Ints, cell_mm: float, bodies: DesignBodies | None = None) -> DesignSurface:
+    """Map a mesh to charts with cells of ``cell_mm``; its components are its ``bodies``, where these have names."""
+    vertices, faces = _welded(vertices, faces, None if bodies is None else bodies.of_facet)
+    has_area = mesh_distance.double_areas(vertices, faces)[1] > LEAST_AREA_MM2
+    mesh = mesh_distance.of_mesh(vertices, faces[has_area], spacing_mm=1e9)
     vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
-    component = _components(vertices, faces)
+    component = _components(vertices, faces) if bodies is None else bodies.of_facet[has_area]
+    count = int(component.max(initial=-1)) + 1
     chart_of = _pieces(vertices, faces, normals, mesh.part_of)
     surface = DesignSurface(
         vertices=vertices,
@@ -101,7 +106,7 @@ def of_mesh(vertices: Floats, faces: Ints, cell_mm: float) -> DesignSurface:
         share=np.empty(0),
         centres=np.empty((0, 3)),
         outward=np.empty((0, 3)),
-        components=int(component.max(initial=-1)) + 1,
+        names=tuple(f"component-{k + 1}" for k in range(count)) if bodies is None else bodies.names,
     )
     return gridded(surface, cell_mm)
 
@@ -162,17 +167,26 @@ def layout(charts: Charts, chart: Ints, points: Floats) -> Floats:
     return np.stack([local[:, 0], np.where(charts.kind[chart] == CYLINDER, around, local[:, 1])], axis=1)
 
 
-def _welded(vertices: Floats, faces: Ints) -> tuple[Floats, Ints]:
-    """Merge vertices at the same place."""
-    key = np.round(vertices / WELD_MM).astype(np.int64)
+def _welded(vertices: Floats, faces: Ints, body: Ints | None) -> tuple[Floats, Ints]:
+    """Merge vertices at the same place, but not those of different bodies (f,)."""
+    corners = faces.ravel()
+    key = np.round(vertices[corners] / WELD_MM).astype(np.int64)
+    if body is not None:
+        key = np.hstack([key, np.repeat(body, 3)[:, None]])
     _, first, inverse = np.unique(key, axis=0, return_index=True, return_inverse=True)
-    return vertices[first], inverse.reshape(-1)[faces]
+    return vertices[corners[first]], inverse.reshape(faces.shape)
 
 
-def with_components(vertices: Floats, faces: Ints) -> tuple[MeshSurface, Ints]:
-    """Prepare a mesh for searches; also the component (f,) of each of its facets, numbered as in the defects' names."""
-    surface = mesh_distance.of_design(*_welded(vertices, faces))
-    return surface, _components(surface.vertices, surface.faces)
+def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None = None) -> tuple[MeshSurface, Ints]:
+    """Prepare a mesh for searches; also the component (f,) of each of its facets, numbered as in the defects' names.
+
+    Components are the ``bodies``, in their order, where these have names.
+    """
+    vertices, faces = _welded(vertices, faces, None if bodies is None else bodies.of_facet)
+    has_area = mesh_distance.double_areas(vertices, faces)[1] > LEAST_AREA_MM2
+    surface = mesh_distance.of_design(vertices, faces[has_area])
+    of_facet = _components(surface.vertices, surface.faces) if bodies is None else bodies.of_facet[has_area]
+    return surface, of_facet
 
 
 def _components(vertices: Floats, faces: Ints) -> Ints:

@@ -13,7 +13,7 @@ from processor.adjustment.finite_median import finite_median
 from processor.defects import classes, measures, pictures
 from processor.defects.alignment import Alignment
 from processor.defects.classes import Classification
-from processor.defects.component_shapes import ComponentShape, SignificantShape, front_of, with_corners
+from processor.defects.component_shapes import ComponentShape, SignificantShape, cells_of_shape, with_corners
 from processor.defects.deviation_field import Field
 from processor.defects.measures import CellPoints, Measures
 from processor.defects.params import Params
@@ -23,7 +23,7 @@ from processor.defects.places.waves import Lobe
 from processor.defects.regions import Region, unrolled
 from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Result, Windows
 from processor.defects.scan_statistic import Levels
-from processor.defects.shape_models import Frame
+from processor.defects.shape_models import RIGID, Frame
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry.mesh_distance import Bools, FacetGrid
 from processor.model import NORMAL_95, Floats, Ints, Reason, Status, reason
@@ -123,13 +123,13 @@ def table(rows: Sequence[dict[str, Any]], origin: Floats, doubt: Reason | None =
     return Defects(id=np.arange(len(rows)), **columns)
 
 
-def _row(classification: Classification, component: int, **values: Any) -> dict[str, Any]:
+def _row(classification: Classification, component: str, **values: Any) -> dict[str, Any]:
     """Return the values of a row of the table of defects."""
     row = {
         "defect_class": classification.defect_class,
         "confidence": classification.confidence,
         "otherwise": classification.otherwise,
-        "component": f"component-{component + 1}",
+        "component": component,
         "reasons": (),
         "deflection": Curve(),
     }
@@ -142,12 +142,21 @@ def _row(classification: Classification, component: int, **values: Any) -> dict[
 def _shape_defects(search: Search) -> Iterator[Defect]:
     """Yield a defect for each significant shape of a component."""
     surface = search.surface
-    frames = {fit.component: fit.frame for fit in search.shapes}
+    fits = {fit.component: fit for fit in search.shapes}
     for component, shapes in sorted(search.significant.items()):
-        rows = front_of(surface, component, search.field)
-        rows = rows[surface.share[rows] > 0.5]
-        for shape in _of_held_plate(search, rows, shapes, frames[component]) if len(rows) else ():
-            yield _shape_defect(search, component, rows, shape, frames[component])
+        fit = fits[component]
+        front = cells_of_shape(surface, search.field, fit)
+        for shape in _of_held_plate(search, front, shapes, fit.frame) if len(front) else ():
+            rows = cells_of_shape(surface, search.field, fit, shape.shape)
+            yield _shape_defect(search, component, rows, _on_cells(shape, fit, surface, rows), fit.frame)
+
+
+def _on_cells(judged: SignificantShape, fit: ComponentShape, surface: DesignSurface, rows: Ints) -> SignificantShape:
+    """Return a movement with its largest value on the cells of a face and at its corners."""
+    if judged.shape.kind != RIGID:
+        return judged
+    value = judged.shape.values(fit.frame, *with_corners(surface, rows))
+    return dataclasses.replace(judged, peak=float(value[int(np.argmax(np.abs(value)))]))
 
 
 def _of_held_plate(search: Search, rows: Ints, shapes: list[SignificantShape], frame: Frame) -> list[SignificantShape]:
@@ -186,7 +195,7 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
     volume = float((np.abs(value) if both_ways else -value) @ area)
     values = _row(
         classes.of_shape(kind, judged.margin),
-        component,
+        surface.names[component],
         centre=surface.centres[rows[part]].mean(axis=0),
         axes=frame.axes,
         extent=extent,
@@ -330,11 +339,11 @@ def _place_values(
             classification, measured, reasons = _by_profile(
                 search, region, measured, classification, assumed, inflation, claimed
             )
-    return _row_of(measured, classification, component, region, reasons)
+    return _row_of(measured, classification, surface.names[component], region, reasons)
 
 
 def _row_of(
-    measured: Measures, classification: Classification, component: int, region: Region, reasons: tuple[Reason, ...]
+    measured: Measures, classification: Classification, component: str, region: Region, reasons: tuple[Reason, ...]
 ) -> dict[str, Any]:
     """Return the values of the row of a place."""
     return _row(

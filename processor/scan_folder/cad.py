@@ -9,9 +9,11 @@ import hashlib
 import importlib.util
 import json
 import os
+import re
 import shutil
 import sys
 import tempfile
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from processor.jobs import process
-from processor.model import Floats, InputError, Ints
+from processor.model import DesignBodies, Floats, InputError, Ints
 from processor.scan_folder.meshes import CAD_SUFFIXES as SUFFIXES
 from processor.scan_folder.meshes import read_mesh
 from processor.version import __version__
@@ -28,10 +30,12 @@ __all__ = ["SUFFIXES", "read"]
 
 LIMIT_S = 900.0  # designgen has a lower limit, with a better message
 RECORD = "import.json"
+SOURCE = "design"  # stem of the copy that is imported, by which bodies without names are numbered
+UNNAMED = rf"{SOURCE}-\d+"
 
 
-def read(path: Path, unit: str) -> tuple[Floats, Ints]:
-    """Return vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file.
+def read(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies]:
+    """Return vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file, and the bodies.
 
     ``unit`` is that of a file that states none. Raises InputError without designgen, and for a file that cannot be
     converted completely.
@@ -45,16 +49,42 @@ def read(path: Path, unit: str) -> tuple[Floats, Ints]:
         meshes = cache / key.hexdigest()
         if not (meshes / RECORD).is_file():
             _import(path, content, unit, cache, meshes)
-        bodies = [read_mesh(meshes / name) for name in _names(meshes, path)]
+        record = _bodies(meshes, path)
+        bodies = [read_mesh(meshes / mesh) for _, mesh in record]
     counts = np.cumsum([0, *(len(vertices) for vertices, _ in bodies)])
     faces = [faces + first for (_, faces), first in zip(bodies, counts.tolist(), strict=False)]
-    return np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces)
+    named = _named([name for name, _ in record], [len(triangles) for _, triangles in bodies])
+    return np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces), named
 
 
-def _names(meshes: Path, path: Path) -> list[str]:
+def _named(names: list[str], facets: list[int]) -> DesignBodies:
+    """Return bodies of so many facets under unique names: "web", "web (2)", and "body 3" where the file has no name."""
+    unnamed = [not name or re.fullmatch(UNNAMED, name) is not None for name in names]
+    said = [f"body {k + 1}" if none else name for k, (name, none) in enumerate(zip(names, unnamed, strict=True))]
+    count = Counter(said)
+    taken, result = set(said), list[str]()
+    before = Counter[str]()
+    for name in said:
+        before[name] += 1
+        free = name
+        while free in taken and before[name] > 1:
+            free = f"{name} ({before[name]})"
+            before[name] += free in taken
+        taken.add(free)
+        result.append(free)
+    return DesignBodies(
+        names=tuple(result),
+        of_facet=np.repeat(np.arange(len(names)), facets),
+        shared=sum(number for number in count.values() if number > 1),
+        unnamed=sum(unnamed),
+    )
+
+
+def _bodies(meshes: Path, path: Path) -> list[tuple[str, str]]:
+    """Return name and mesh of each body of an import."""
     try:
         record = json.loads((meshes / RECORD).read_text("utf-8"))
-        names = [str(body["mesh"]) for body in record["bodies"]]
+        names = [(str(body.get("name", "")), str(body["mesh"])) for body in record["bodies"]]
         problems = [str(problem) for problem in record["problems"]]
     except (OSError, ValueError, KeyError, TypeError):
         shutil.rmtree(meshes, ignore_errors=True)
@@ -62,7 +92,7 @@ def _names(meshes: Path, path: Path) -> list[str]:
     if problems:
         more = f", and {len(problems) - 1} more" if len(problems) > 1 else ""
         raise InputError(f"{path}: cannot be converted to meshes completely ({problems[0]}{more}); export it again")
-    if not names or any(Path(name).name != name for name in names):
+    if not names or any(Path(mesh).name != mesh for _, mesh in names):
         raise InputError(f"{path}: expected solids or surfaces, found none; export it with them")
     return names
 
@@ -103,7 +133,7 @@ def _import(path: Path, content: bytes, unit: str, cache: Path, meshes: Path) ->
         raise InputError(f"{cache}: cannot be written ({error.strerror or error})") from error
     try:
         # A copy of the hashed bytes, under a name that cannot be mistaken for an option.
-        source = making / f"design{path.suffix.lower()}"
+        source = making / f"{SOURCE}{path.suffix.lower()}"
         source.write_bytes(content)
         failure = _run(command, source, making / "meshes", unit)
         if failure:

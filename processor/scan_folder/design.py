@@ -11,7 +11,17 @@ from pathlib import Path
 import numpy as np
 
 from processor.geometry import box_girder
-from processor.model import KEY_POINTS, ArchDesign, DesignPart, Floats, FrameDesign, InputError, Ints, UsageError
+from processor.model import (
+    KEY_POINTS,
+    ArchDesign,
+    DesignBodies,
+    DesignPart,
+    Floats,
+    FrameDesign,
+    InputError,
+    Ints,
+    UsageError,
+)
 from processor.scan_folder import cad
 from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.meshes import MESH_SUFFIXES, read_mesh
@@ -123,7 +133,7 @@ def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floa
             raise InputError(f"{part.where}: expected two points or more in bottom_edge_{side}, none repeated in a row")
     plate_mm = part.number("plate_mm", box_girder.PLATE_MM, positive=True)
     if "mesh" in part.values:
-        vertices, faces = read_surface(existing_file_in(folder, part.text("mesh"), part.where), unit)
+        vertices, faces, _ = read_surface(existing_file_in(folder, part.text("mesh"), part.where), unit)
         return DesignPart(name, vertices, faces, edges[0], edges[1])
     try:
         vertices, faces = box_girder.mesh(edges[0], edges[1], joints[0], joints[1], plate_mm)
@@ -213,12 +223,12 @@ def is_surface(path: Path) -> bool:
     return path.suffix.lower() in (*MESH_SUFFIXES, *cad.SUFFIXES)
 
 
-def read_surface(path: Path, unit: str) -> tuple[Floats, Ints]:
-    """Return vertices (v, 3) in mm and triangles (f, 3) of a mesh, or of a CAD file.
+def read_surface(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies | None]:
+    """Return vertices (v, 3) in mm and triangles (f, 3) of a mesh, or of a CAD file with its bodies.
 
     ``unit`` is that of a mesh, and of a CAD file that has none.
     """
     if path.suffix.lower() in cad.SUFFIXES:
         return cad.read(path, unit)
     vertices, faces = read_mesh(path)
-    return vertices * MM_PER_UNIT[unit], faces
+    return vertices * MM_PER_UNIT[unit], faces, None

@@ -147,7 +147,7 @@ def _read_design(folder: Path, path: Path | None, project: Guess) -> ArchDesign 
         existing_file_in(folder, str(path.relative_to(folder)), str(folder))
         if is_surface(path):
             project.kind, project.kind_reason = "structure", f"{project.design} is one surface of the whole"
-            return read_surface(path, "mm")
+            return read_surface(path, "mm")[:2]
         design = read_design(folder, path, "m")
     except InputError as error:
         project.unsure.append(f"design: {error}")

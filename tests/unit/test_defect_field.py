@@ -24,7 +24,8 @@ def pairs_of(surface, seed, mean=None):
     rng, cells = np.random.default_rng(seed), np.flatnonzero(surface.share > 0.5)
     value = rng.normal(0.0, SIGMA / np.sqrt(POINTS), len(surface.share)) if mean is None else mean
     n, count = len(cells), np.full(len(cells), POINTS)
-    return Pairs(cells, np.zeros(n, np.int64), count, np.zeros(n, np.int64), value[cells], SIGMA**2 * (count - 1.0))
+    none = np.zeros(n, np.int64)
+    return Pairs(cells, none, count, none, value[cells], SIGMA**2 * (count - 1.0), none)
 
 
 def field_of(surface, pairs, stations=NAMED):

@@ -1,0 +1,138 @@
+"""Points beside something nearer to the scanner: their beams may have hit both, and state a range between the two.
+
+A beam has a width of some millimetres. At the outline of a body it meets the body and what is behind, and a phase
+scanner states a mean of the two ranges (mixed pixel, Hebert and Krotkov 1992). Such points lie in the air or, where the
+body behind is near, a little before its surface. They are recognised by their neighbours in direction: one of them lies
+before the face that the point is assigned to, higher than any slope of steel would bring it.
+"""
+# Numba infers the types of the kernels' arguments: they stay without annotations.
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit
+from scipy.spatial import cKDTree
+
+from processor.geometry.parallel import over_ranges
+from processor.model import Floats, Ints
+
+Bools = npt.NDArray[np.bool_]
+
+WINDOW_STEPS = 1.6  # of the scanner, within which a point is a neighbour: those of a square grid and its diagonals
+HALF_BEAM_MM = 4.0  # of scanners up to 20 m away, by which the window is wider
+NEAREST_SHARE = 0.05  # of the points, which are so near that their window is not taken in full
+STEP_NEIGHBOUR, STEP_SAMPLE = 4, 2_000  # of a point of a square grid, the first four lie one step away
+HIGHER_MM = 3.0  # before the face, from which a neighbour is something else
+SLOPE = 0.25  # height by the distance along the face, up to which a neighbour may be of the same steel: dents have less
+LEAST_RANGE = 5_000  # points per task of a thread
+
+
+class _Others(NamedTuple):
+    """All points (m, 3) of a scanner, sorted by the bins (m,) of their directions; first bins of rows; step in rad."""
+
+    points: Floats
+    key: Ints
+    columns: Ints
+    step: float
+
+
+def beside(points: Floats, scanner: Floats, normals: Floats, height: Floats, every: Floats) -> Bools:
+    """Mark the points (n, 3) seen from a scanner (3,) that have something before their face beside them.
+
+    ``normals`` (n, 3) are of the points' faces, ``height`` (n,) is how far the points lie above these, mm. ``every``
+    (m, 3) are all points of the scanner, of which these are some. A point without a face has NaN for a height.
+    """
+    marked = np.zeros(len(points), np.bool_)
+    step = _step(_directions(every, scanner))
+    if not (len(points) and step > 0.0):
+        return marked
+    nearest = float(np.quantile(np.linalg.norm(points - scanner, axis=1), NEAREST_SHARE))
+    key, columns = _keys(_directions(every, scanner), WINDOW_STEPS * step + HALF_BEAM_MM / nearest)
+    order = np.argsort(key, kind="stable")
+    others = _Others(np.ascontiguousarray(every[order]), key[order], columns, step)
+    points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
+
+    def kernel(first: int, last: int) -> None:
+        _mark(points, normals, height, scanner, others, marked, first, last)
+
+    over_ranges(kernel, len(points), least=LEAST_RANGE)
+    return marked
+
+
+def _directions(points: Floats, scanner: Floats) -> Floats:
+    """Return unit vectors (n, 3) from a scanner (3,) to points (n, 3)."""
+    arm = points - scanner
+    directions: Floats = arm / np.maximum(np.linalg.norm(arm, axis=1), 1e-9)[:, None]
+    return directions
+
+
+def _step(directions: Floats) -> float:
+    """Return the angle in rad between neighbouring rays, of which only those that returned are known."""
+    if len(directions) <= STEP_NEIGHBOUR:
+        return 0.0
+    sample = directions[:: max(1, len(directions) // STEP_SAMPLE)]
+    distance = cKDTree(directions, balanced_tree=False).query(sample, k=STEP_NEIGHBOUR + 1)[0]
+    return float(np.median(distance[:, -1]))
+
+
+def _keys(directions: Floats, window: float) -> tuple[Ints, Ints]:
+    """Return the bin (n,) of directions, and the first bins (rows + 1,) of rows of one elevation.
+
+    A bin is as high as the window and at least as wide, so that all neighbours are in the bins about one.
+    """
+    rows = int(np.ceil(np.pi / window))
+    elevation = np.pi * np.abs(np.arange(rows + 1) / rows - 0.5)
+    widest = np.cos(np.maximum(elevation[:-1], elevation[1:]))
+    columns = np.concatenate([[0], np.cumsum(np.maximum(1, np.floor(2.0 * np.pi * widest / window)))]).astype(np.int64)
+    polar, turn = np.arccos(np.clip(directions[:, 2], -1.0, 1.0)), np.arctan2(directions[:, 1], directions[:, 0])
+    row = np.minimum((polar / np.pi * rows).astype(np.int64), rows - 1)
+    wide = columns[row + 1] - columns[row]
+    return columns[row] + np.minimum(((turn / (2.0 * np.pi) + 0.5) * wide).astype(np.int64), wide - 1), columns
+
+
+@njit(cache=True, nogil=True)
+def _mark(points, normals, height, scanner, others, marked, first, last):  # type: ignore[no-untyped-def]
+    """Mark points first to last - 1 of which a neighbour within the window stands before the face."""
+    key, columns = others.key, others.columns
+    rows = len(columns) - 1
+    for i in range(first, last):
+        if np.isnan(height[i]):
+            continue
+        x, y, z = points[i, 0] - scanner[0], points[i, 1] - scanner[1], points[i, 2] - scanner[2]
+        far = np.sqrt(x * x + y * y + z * z)
+        x, y, z = x / far, y / far, z / far
+        window = WINDOW_STEPS * others.step + HALF_BEAM_MM / far
+        row = min(int(np.arccos(z) / np.pi * rows), rows - 1)
+        turn = np.arctan2(y, x) / (2.0 * np.pi) + 0.5
+        for r in range(max(row - 1, 0), min(row + 2, rows)):
+            wide = columns[r + 1] - columns[r]
+            middle = min(int(turn * wide), wide - 1)
+            for c in range(middle - 1, middle + 2):
+                if marked[i] or (wide < 3 and not 0 <= c < wide):
+                    continue
+                wanted = columns[r] + c % wide
+                k = np.searchsorted(key, wanted)
+                while k < len(key) and key[k] == wanted:
+                    if _stands_before(points[i], normals[i], height[i], scanner, others.points[k], x, y, z, window):
+                        marked[i] = True
+                        break
+                    k += 1
+
+
+@njit(cache=True, nogil=True, inline="always")
+def _stands_before(point, normal, height, scanner, other, x, y, z, window):  # type: ignore[no-untyped-def]
+    """Return whether another point is a neighbour of a direction (x, y, z), and too high above the point's face."""
+    a, b, c = other[0] - scanner[0], other[1] - scanner[1], other[2] - scanner[2]
+    far = np.sqrt(a * a + b * b + c * c)
+    cosine = (a * x + b * y + c * z) / far
+    if 1.0 - cosine > 0.5 * window * window:
+        return False
+    dx, dy, dz = other[0] - point[0], other[1] - point[1], other[2] - point[2]
+    rise = dx * normal[0] + dy * normal[1] + dz * normal[2]
+    if rise < HIGHER_MM or rise + height < HIGHER_MM:
+        return False
+    across = np.sqrt(max(dx * dx + dy * dy + dz * dz - rise * rise, 0.0))
+    return rise > HIGHER_MM + SLOPE * across

@@ -1,0 +1,1 @@
+"""Components that moved as a whole."""

@@ -1,0 +1,91 @@
+"""Components that moved as a whole: the design with them where they are, for the search of everything else.
+
+Against the design as it was meant, a component that moved by some millimetres has faces where beams should have met
+others: strips beside it appear bulged, dented or missing, and round faces deviate by more than a linear movement gives.
+The search is therefore repeated on the design with the component moved, and what is left of its movement is added.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+
+from processor.defects.component_shapes import ComponentShape, SignificantShape
+from processor.defects.shape_models import RIGID, Shape
+from processor.defects.surface_charts import DesignSurface
+from processor.geometry import rigid
+from processor.model import DesignBodies, Floats, StructureDesign
+
+LEAST_MM = 1.0  # movement from which on the design is changed: less is within a cell's own scatter of faces
+OTHERS_SHARE = 0.25  # of the movement, up to which other shapes of a component may be of its fit
+
+Significant = dict[int, list[SignificantShape]]
+
+
+def moved(shapes: list[ComponentShape], significant: Significant) -> dict[int, tuple[ComponentShape, SignificantShape]]:
+    """Return the components that moved as a whole by LEAST_MM or more, other shapes of which are small beside it.
+
+    Such shapes are what the linear fit of a movement leaves; the search on the changed design shows which are real.
+    """
+    fits, found = {fit.component: fit for fit in shapes}, {}
+    for number, of_one in significant.items():
+        movements = [one for one in of_one if one.shape.kind == RIGID]
+        others = max((abs(one.peak) for one in of_one if one.shape.kind != RIGID), default=0.0)
+        if movements and abs(movements[0].peak) >= max(LEAST_MM, others / OTHERS_SHARE):
+            found[number] = (fits[number], movements[0])
+    return found
+
+
+def refitted(
+    movements: dict[int, tuple[ComponentShape, SignificantShape]], shapes: list[ComponentShape]
+) -> dict[int, tuple[ComponentShape, SignificantShape]]:
+    """Return movements with the factors of another fit, where that has them."""
+    found = dict(movements)
+    for fit in shapes:
+        own = [shape for shape in fit.fitted.shapes if shape.kind == RIGID]
+        if fit.component in found and own:
+            judged = found[fit.component][1]
+            found[fit.component] = (fit, dataclasses.replace(judged, shape=own[0]))
+    return found
+
+
+def design(
+    name: str, surface: DesignSurface, movements: dict[int, tuple[ComponentShape, SignificantShape]]
+) -> StructureDesign:
+    """Return the design with components moved; each component is a body of its own."""
+    vertices = surface.vertices.copy()
+    for number, (fit, judged) in movements.items():
+        rows = np.unique(surface.faces[surface.component_of == number])
+        vertices[rows] = _at(judged.shape, fit, surface.vertices[rows])
+    return StructureDesign(name, vertices, surface.faces, DesignBodies(surface.names, surface.component_of))
+
+
+def _at(shape: Shape, fit: ComponentShape, points: Floats) -> Floats:
+    """Return points (n, 3) of a component after its movement, which has the factors of a shape in its frame."""
+    frame = fit.frame
+    span = float(frame.half.max())
+    R = rigid.rotation_from_vector(shape.factors[3:] / span @ frame.axes)
+    middle: Floats = frame.origin + shape.factors[:3] @ frame.axes
+    after: Floats = (points - frame.origin) @ R.T + middle
+    return after
+
+
+def together(
+    before: dict[int, tuple[ComponentShape, SignificantShape]], shapes: list[ComponentShape], significant: Significant
+) -> tuple[list[ComponentShape], Significant]:
+    """Return shapes and significant shapes of the search on the changed design, with the movements ``before`` added.
+
+    The uncertainty of a movement is that of the first fit, by its share of the whole.
+    """
+    fits = {fit.component: fit for fit in shapes}
+    total = {number: list(of_one) for number, of_one in significant.items()}
+    for number, (fit, judged) in before.items():
+        fits.setdefault(number, fit)
+        rest = [one for one in total.get(number, []) if one.shape.kind == RIGID]
+        others = [one for one in total.get(number, []) if one.shape.kind != RIGID]
+        factors = judged.shape.factors + sum((one.shape.factors for one in rest), np.zeros(6))
+        ci95 = rest[0].ci95 if rest else judged.ci95
+        whole = dataclasses.replace(judged, shape=dataclasses.replace(judged.shape, factors=factors), ci95=ci95)
+        total[number] = [whole, *others]
+    return [fits[number] for number in sorted(fits)], total

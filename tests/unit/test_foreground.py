@@ -1,0 +1,82 @@
+"""Points beside something nearer to the scanner: a wall behind a post, by formula."""
+
+import numpy as np
+import pytest
+
+from processor.adjustment import foreground
+from processor.defects import observations, surface_charts
+
+SCANNER, STEP, WALL, POST = np.array([0.0, -5000.0, 0.0]), 1.7e-3, 0.0, -300.0
+HALF = 50.0  # of the post, mm
+
+
+def scan(noise=0.0, seed=0):
+    """Points of rays on a wall at y = 0 and a post before it, and which of them lie on the wall."""
+    turn, rise = (x.ravel() for x in np.meshgrid(np.arange(-60, 61) * STEP, np.arange(-40, 41) * STEP))
+    ray = np.stack([np.sin(turn) * np.cos(rise), np.cos(turn) * np.cos(rise), np.sin(rise)], axis=1)
+    at = SCANNER + ray * ((POST - SCANNER[1]) / ray[:, 1])[:, None]
+    on_post = np.abs(at[:, 0]) < HALF
+    depth = np.where(on_post, POST, WALL) - SCANNER[1]
+    points = SCANNER + ray * (depth / ray[:, 1])[:, None]
+    points += np.random.default_rng(seed).normal(0.0, noise, len(points))[:, None] * ray
+    return points, ~on_post
+
+
+def marked(points, wall, every):
+    normals = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1))
+    return foreground.beside(points[wall], SCANNER, normals, -points[wall, 1], every)
+
+
+def test_points_beside_a_post_are_marked_and_no_others():
+    points, wall = scan()
+    found = marked(points, wall, points)
+    shadow = HALF * 5000.0 / 4700.0  # half of the post's shadow on the wall
+    off = np.abs(points[wall, 0]) - shadow
+    step_mm = 5000.0 * STEP
+    assert found[off < step_mm].all()
+    assert not found[off > foreground.WINDOW_STEPS * step_mm + foreground.HALF_BEAM_MM + step_mm].any()
+
+
+def test_without_the_post_nothing_is_marked_whatever_the_noise_of_a_point_itself():
+    points, wall = scan(noise=0.5)
+    assert not marked(points, wall, points[wall]).any()
+    pulled = points.copy()  # the error of a point's own range does not decide about it
+    pulled[wall] += 0.5 * (points[wall] - SCANNER) / np.linalg.norm(points[wall] - SCANNER, axis=1)[:, None]
+    assert np.array_equal(marked(pulled, wall, points), marked(points, wall, points))
+
+
+@pytest.mark.parametrize("depth", [4.0, 8.0])
+def test_a_dent_is_not_marked(depth):
+    points, wall = scan()
+    at = points[wall]
+    away = np.abs(at[:, 0]) > 200.0
+    at = at[away] + np.outer(
+        depth * np.exp(-((at[away, 0] - 400.0) ** 2 + at[away, 2] ** 2) / 60.0**2), [0.0, 1.0, 0.0]
+    )
+    assert not marked(at, np.ones(len(at), bool), at).any()
+
+
+def test_a_few_points_are_no_scan():
+    points, wall = scan()
+    assert not marked(points[:3], wall[:3], points[:3]).any()
+
+
+def square(low, high):
+    """A closed box as vertices and faces."""
+    x = np.array([[(low, high)[i >> k & 1][k] for k in range(3)] for i in range(8)], float)
+    faces = [[0, 2, 1], [1, 2, 3], [4, 5, 6], [5, 7, 6], [0, 1, 4], [1, 5, 4],
+             [2, 6, 3], [3, 6, 7], [0, 4, 2], [2, 4, 6], [1, 3, 5], [3, 7, 5]]  # fmt: skip
+    return x, np.array(faces, np.int64)
+
+
+def test_a_beam_past_the_edge_of_a_plate_is_no_dent_of_its_far_side():
+    vertices, faces = square((0.0, 0.0, 0.0), (200.0, 12.0, 400.0))
+    surface = surface_charts.of_mesh(vertices, faces, 20.0)
+    grid = observations.mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, 60.0)
+    scanner = np.array([[2000.0, -600.0, 200.0]])
+    front = int(np.flatnonzero(surface.normals[:, 1] < -0.9)[0])
+    through = np.array([[100.0, 10.0, 200.0], [197.0, 10.0, 200.0]])  # the second line of sight enters by the edge
+    passed = observations._passed_by(
+        surface, grid, np.full(2, front), through, np.full(2, -10.0), np.repeat(scanner, 2, axis=0)
+    )
+    assert passed.tolist() == [False, True]
