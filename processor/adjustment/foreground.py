@@ -3,7 +3,7 @@
 A beam has a width of some millimetres. At the outline of a body it meets the body and what is behind, and a phase
 scanner states a mean of the two ranges (mixed pixel, Hebert and Krotkov 1992). Such points lie in the air or, where the
 body behind is near, a little before its surface. They are recognised by their neighbours in direction: one of them lies
-before the face that the point is assigned to, higher than any slope of steel would bring it.
+before the face that the point is assigned to, and before the point by more than any slope of steel would bring it.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -124,7 +124,7 @@ def _mark(points, normals, height, scanner, others, marked, first, last):  # typ
 
 @njit(cache=True, nogil=True, inline="always")
 def _stands_before(point, normal, height, scanner, other, x, y, z, window):  # type: ignore[no-untyped-def]
-    """Return whether another point is a neighbour of a direction (x, y, z), and too high above the point's face."""
+    """Return whether another point is a neighbour of a direction (x, y, z), too high above the point and its face."""
     a, b, c = other[0] - scanner[0], other[1] - scanner[1], other[2] - scanner[2]
     far = np.sqrt(a * a + b * b + c * c)
     cosine = (a * x + b * y + c * z) / far

@@ -45,8 +45,9 @@ def test_without_the_post_nothing_is_marked_whatever_the_noise_of_a_point_itself
     assert np.array_equal(marked(pulled, wall, points), marked(points, wall, points))
 
 
-@pytest.mark.parametrize("depth", [4.0, 8.0])
-def test_a_dent_is_not_marked(depth):
+@pytest.mark.parametrize("depth", [4.0, 8.0, -4.0, -8.0])
+def test_a_dent_or_a_bulge_is_not_marked(depth):
+    """Points on top of a bulge have neighbours before the face, but none before themselves."""
     points, wall = scan()
     at = points[wall]
     away = np.abs(at[:, 0]) > 200.0
