@@ -2,8 +2,9 @@
 
 A beam has a width of some millimetres. At the outline of a body it meets the body and what is behind, and a phase
 scanner states a mean of the two ranges (mixed pixel, Hebert and Krotkov 1992). Such points lie in the air or, where the
-body behind is near, a little before its surface. They are recognised by their neighbours in direction: one of them lies
-before the face that the point is assigned to, and before the point by more than any slope of steel would bring it.
+body behind is near, a little before its surface. They are recognised by their neighbours in direction: one of them is
+of another face, and lies before that of the point by more than any slope of steel would bring it; or it is of the same
+face, and lies so far before the point itself: on top of a bulge all neighbours lie before the face, but none does that.
 """
 # Numba infers the types of the kernels' arguments: they stay without annotations.
 
@@ -31,32 +32,40 @@ LEAST_RANGE = 5_000  # points per task of a thread
 
 
 class _Others(NamedTuple):
-    """All points (m, 3) of a scanner, sorted by the bins (m,) of their directions; first bins of rows; step in rad."""
+    """All points (m, 3) of a scanner and their faces (m,), sorted by the bins (m,) of their directions.
+
+    ``columns`` are the first bins of rows of one elevation, ``step`` is in rad.
+    """
 
     points: Floats
+    face: Ints
     key: Ints
     columns: Ints
     step: float
 
 
-def beside(points: Floats, scanner: Floats, normals: Floats, height: Floats, every: Floats) -> Bools:
+def beside(
+    points: Floats, scanner: Floats, normals: Floats, height: Floats, face: Ints, every: tuple[Floats, Ints]
+) -> Bools:
     """Mark the points (n, 3) seen from a scanner (3,) that have something before their face beside them.
 
-    ``normals`` (n, 3) are of the points' faces, ``height`` (n,) is how far the points lie above these, mm. ``every``
-    (m, 3) are all points of the scanner, of which these are some. A point without a face has NaN for a height.
+    ``normals`` (n, 3) are of the points' faces, ``height`` (n,) is how far the points lie above these, mm,
+    and ``face`` (n,) numbers the faces. ``every`` are all points (m, 3) of the scanner, of which these are some, and
+    their faces (m,), -1 = none. A point without a face has NaN for a height.
     """
+    everything, faces = every
     marked = np.zeros(len(points), np.bool_)
-    step = _step(_directions(every, scanner))
+    step = _step(_directions(everything, scanner))
     if not (len(points) and step > 0.0):
         return marked
     nearest = float(np.quantile(np.linalg.norm(points - scanner, axis=1), NEAREST_SHARE))
-    key, columns = _keys(_directions(every, scanner), WINDOW_STEPS * step + HALF_BEAM_MM / nearest)
+    key, columns = _keys(_directions(everything, scanner), WINDOW_STEPS * step + HALF_BEAM_MM / nearest)
     order = np.argsort(key, kind="stable")
-    others = _Others(np.ascontiguousarray(every[order]), key[order], columns, step)
+    others = _Others(np.ascontiguousarray(everything[order]), faces[order], key[order], columns, step)
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
 
     def kernel(first: int, last: int) -> None:
-        _mark(points, normals, height, scanner, others, marked, first, last)
+        _mark(points, normals, height, face, scanner, others, marked, first, last)
 
     over_ranges(kernel, len(points), least=LEAST_RANGE)
     return marked
@@ -94,7 +103,7 @@ def _keys(directions: Floats, window: float) -> tuple[Ints, Ints]:
 
 
 @njit(cache=True, nogil=True)
-def _mark(points, normals, height, scanner, others, marked, first, last):  # type: ignore[no-untyped-def]
+def _mark(points, normals, height, face, scanner, others, marked, first, last):  # type: ignore[no-untyped-def]
     """Mark points first to last - 1 of which a neighbour within the window stands before the face."""
     key, columns = others.key, others.columns
     rows = len(columns) - 1
@@ -116,7 +125,8 @@ def _mark(points, normals, height, scanner, others, marked, first, last):  # typ
                 wanted = columns[r] + c % wide
                 k = np.searchsorted(key, wanted)
                 while k < len(key) and key[k] == wanted:
-                    if _stands_before(points[i], normals[i], height[i], scanner, others.points[k], x, y, z, window):
+                    level = 0.0 if others.face[k] == face[i] else height[i]
+                    if _stands_before(points[i], normals[i], level, scanner, others.points[k], x, y, z, window):
                         marked[i] = True
                         break
                     k += 1
@@ -124,7 +134,7 @@ def _mark(points, normals, height, scanner, others, marked, first, last):  # typ
 
 @njit(cache=True, nogil=True, inline="always")
 def _stands_before(point, normal, height, scanner, other, x, y, z, window):  # type: ignore[no-untyped-def]
-    """Return whether another point is a neighbour of a direction (x, y, z), too high above the point and its face."""
+    """Return whether another point is a neighbour of a direction (x, y, z), too high above one ``height`` below it."""
     a, b, c = other[0] - scanner[0], other[1] - scanner[1], other[2] - scanner[2]
     far = np.sqrt(a * a + b * b + c * c)
     cosine = (a * x + b * y + c * z) / far
@@ -132,7 +142,7 @@ def _stands_before(point, normal, height, scanner, other, x, y, z, window):  # t
         return False
     dx, dy, dz = other[0] - point[0], other[1] - point[1], other[2] - point[2]
     rise = dx * normal[0] + dy * normal[1] + dz * normal[2]
-    if rise < HIGHER_MM or rise + height < HIGHER_MM:
+    if rise + height < HIGHER_MM:
         return False
     across = np.sqrt(max(dx * dx + dy * dy + dz * dz - rise * rise, 0.0))
-    return rise > HIGHER_MM + SLOPE * across
+    return rise + height > HIGHER_MM + SLOPE * across

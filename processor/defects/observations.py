@@ -130,12 +130,14 @@ def _of_scan(
     mixed = _at_outline(surface, facet[on], points[on], scanners[station_of[on]])
     mixed |= _passed_by(surface, grid, facet[on], points[on], deviation[on], scanners[station_of[on]])
     mixed &= known[station_of[on]]
+    every_chart = np.where(facet >= 0, surface.chart_of[facet], -1)
+    chart = every_chart[on]
     for k in np.unique(station_of[on]):
         if known[k]:
             rows = station_of[on] == k
-            of_face = surface.normals[facet[on[rows]]], deviation[on[rows]]
-            mixed[rows] |= foreground.beside(points[on[rows]], positions[k], *of_face, points[station_of == k])
-    chart = surface.chart_of[facet[on]]
+            of_face = surface.normals[facet[on[rows]]], deviation[on[rows]], chart[rows]
+            every = points[station_of == k], every_chart[station_of == k]
+            mixed[rows] |= foreground.beside(points[on[rows]], positions[k], *of_face, every)
     return chart, layout(surface.charts, chart, points[on]), station_of[on], deviation[on], mixed
 
 

@@ -22,9 +22,11 @@ def scan(noise=0.0, seed=0):
     return points, ~on_post
 
 
-def marked(points, wall, every):
-    normals = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1))
-    return foreground.beside(points[wall], SCANNER, normals, -points[wall, 1], every)
+def marked(points, wall, every, is_wall=None):
+    """The wall is face 0, the post another."""
+    normals, is_wall = np.tile([0.0, -1.0, 0.0], (wall.sum(), 1)), wall if is_wall is None else is_wall
+    face = np.zeros(wall.sum(), np.int64)
+    return foreground.beside(points[wall], SCANNER, normals, -points[wall, 1], face, (every, np.where(is_wall, 0, 1)))
 
 
 def test_points_beside_a_post_are_marked_and_no_others():
@@ -39,7 +41,7 @@ def test_points_beside_a_post_are_marked_and_no_others():
 
 def test_without_the_post_nothing_is_marked_whatever_the_noise_of_a_point_itself():
     points, wall = scan(noise=0.5)
-    assert not marked(points, wall, points[wall]).any()
+    assert not marked(points, wall, points[wall], wall[wall]).any()
     pulled = points.copy()  # the error of a point's own range does not decide about it
     pulled[wall] += 0.5 * (points[wall] - SCANNER) / np.linalg.norm(points[wall] - SCANNER, axis=1)[:, None]
     assert np.array_equal(marked(pulled, wall, points), marked(points, wall, points))

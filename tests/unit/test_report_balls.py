@@ -143,7 +143,7 @@ def test_results_json_holds_only_what_there_is():
     paper = balls()
     execution = Execution(scene(whole()), (StepRun("spheres", "ransac", "{}", paper),), PROVENANCE)
     step = to_json.results_json(execution, ErrorReport())["steps"]["spheres"]
-    assert set(step) == {"status", "method", "reasons", "balls"}
+    assert set(step) == {"status", "method", "reasons", "balls", "verdict"}
     assert "size" not in step["balls"][0]
     blind = written(without_design(whole()))
     assert not {"gauge", "matching", "movement_limit"} & set(blind)
