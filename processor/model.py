@@ -279,6 +279,11 @@ class Scan(Checked):
     sigma_mm: float = float("nan")  # range noise, one standard deviation; NaN = unknown
     colour: Codes = column("n", 3, dtype=np.uint8, newer=True)  # red, green, blue
 
+    @property
+    def pose(self) -> Floats:
+        """T_project_scan (4, 4); the identity for a scan without a pose."""
+        return self.T_project_scan if self.T_project_scan.size else np.eye(4)
+
 
 @dataclass(frozen=True)
 class Stations(Checked):
@@ -646,3 +651,9 @@ class StepRun:
     method: str
     params: str
     result: Any
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst verdict in the result; none where the step compares nothing with limits."""
+        verdict: Verdict = getattr(self.result, "overall", Verdict.NONE)
+        return verdict

@@ -51,15 +51,16 @@ def beside(
 
     ``normals`` (n, 3) are of the points' faces, ``height`` (n,) is how far the points lie above these, mm,
     and ``face`` (n,) numbers the faces. ``every`` are all points (m, 3) of the scanner, of which these are some, and
-    their faces (m,), -1 = none. A point without a face has NaN for a height.
+    their faces (m,), -1 = none.
     """
     everything, faces = every
     marked = np.zeros(len(points), np.bool_)
-    step = _step(_directions(everything, scanner))
+    directions = _directions(everything, scanner)
+    step = _step(directions)
     if not (len(points) and step > 0.0):
         return marked
     nearest = float(np.quantile(np.linalg.norm(points - scanner, axis=1), NEAREST_SHARE))
-    key, columns = _keys(_directions(everything, scanner), WINDOW_STEPS * step + HALF_BEAM_MM / nearest)
+    key, columns = _keys(directions, WINDOW_STEPS * step + HALF_BEAM_MM / nearest)
     order = np.argsort(key, kind="stable")
     others = _Others(np.ascontiguousarray(everything[order]), faces[order], key[order], columns, step)
     points, normals = np.ascontiguousarray(points), np.ascontiguousarray(normals)
@@ -108,8 +109,6 @@ def _mark(points, normals, height, face, scanner, others, marked, first, last): 
     key, columns = others.key, others.columns
     rows = len(columns) - 1
     for i in range(first, last):
-        if np.isnan(height[i]):
-            continue
         x, y, z = points[i, 0] - scanner[0], points[i, 1] - scanner[1], points[i, 2] - scanner[2]
         far = np.sqrt(x * x + y * y + z * z)
         x, y, z = x / far, y / far, z / far

@@ -60,7 +60,7 @@ class Results:
     @property
     def verdict(self) -> Verdict:
         """The worst verdict of the steps."""
-        return worst(getattr(result, "overall", Verdict.NONE) for result in self.steps.values())
+        return worst(run.verdict for run, _ in self.execution.by_step())
 
 
 def read(path: str | Path, units: str | None = None) -> Scene:

@@ -8,17 +8,14 @@ from pathlib import Path
 import click
 
 from processor.cli.common import UNITS, debug_option, print_error_line
-
-# As in processor.clouds.export, which takes long to import.
-WHATS = ("registered", "merged", "assembled", "clean", "deviation")
-FORMATS = ("e57", "las", "laz", "ply", "xyz")
+from processor.clouds import CONTENTS, FORMATS
 
 
 @click.command()
 @click.argument("output", metavar="OUT", type=click.Path(path_type=Path))
 @click.argument("input_", metavar="[INPUT]", required=False, type=click.Path(path_type=Path))
 @click.option("-o", "--output", "folder", required=True, type=click.Path(path_type=Path), help="new folder")
-@click.option("--what", required=True, type=click.Choice(WHATS), help="content of the clouds")
+@click.option("--what", required=True, type=click.Choice(CONTENTS), help="content of the clouds")
 @click.option("--format", "format_", required=True, type=click.Choice(FORMATS), help="format of the clouds")
 @click.option(
     "--spacing-mm",

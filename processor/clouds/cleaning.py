@@ -171,7 +171,7 @@ def filters(run: Run, scans: Sequence[Placed]) -> list[OfDesign | None]:
     if structure is not None and run.scene.structure is not None:
         origin = merging.local_design(run.scene.structure)[1]
         T = run.steps["deviation"].T_design_scan
-        return [structure.marks(_to_local(one, T, origin)) for one in scans]
+        return [structure.marks(one.to_local(T @ one.T, origin)) for one in scans]
     if "preassemble" not in run.steps:
         return [None] * len(scans)
     in_bridge = {one.number: one for one in poses.in_bridge(run).scans}
@@ -179,15 +179,5 @@ def filters(run: Run, scans: Sequence[Placed]) -> list[OfDesign | None]:
     for one in scans:
         part = in_bridge.get(one.number)
         surfaces = None if part is None else of_part(run, part.component)
-        marks.append(
-            None if part is None or surfaces is None else surfaces.marks(_to_local(part, np.eye(4), np.zeros(3)))
-        )
+        marks.append(None if part is None or surfaces is None else surfaces.marks(part.to_local(part.T, np.zeros(3))))
     return marks
-
-
-def _to_local(placed: Placed, T: Floats, origin: Floats) -> Floats:
-    """Return the map (4, 4) of a scan's points as written, less their origin, by its pose and T, less ``origin``."""
-    whole = T @ placed.T
-    # Large offsets are subtracted from each other first.
-    shift = whole[:3, :3] @ (placed.scale * placed.scan.origin) + (whole[:3, 3] - origin)
-    return rigid.transform(whole[:3, :3], shift)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -51,8 +51,7 @@ def _columns(found: Mapping[str, Any], fields: Mapping[str, np.dtype[Any]], of_s
     """Return the columns of a block by their names in files; zeros where a scan has none."""
     count = len(found["points"])
     columns: dict[str, Any] = {name: np.zeros(count, dtype) for name, dtype in fields.items()}
-    given = {"intensity": (INTENSITY,), "grid_row": (ROW,), "grid_column": (COLUMN,)}
-    for name, (field,) in given.items():
+    for name, field in (("intensity", INTENSITY), ("grid_row", ROW), ("grid_column", COLUMN)):
         if field in columns and name in found:
             columns[field] = found[name].astype(fields[field])
     if "colour" in found:
@@ -62,25 +61,14 @@ def _columns(found: Mapping[str, Any], fields: Mapping[str, np.dtype[Any]], of_s
     return columns
 
 
-def scan_cloud(run: Run, placed: Placed, *, grid: bool = True) -> Cloud:
-    """Return the cloud of a scan in its own frame, with its pose and, by ``grid``, rows and columns of its grid."""
-    fields = fields_of(run, [placed.number], grid=grid)
-    stations = np.append(np.arange(1, _stations(run) + 1), 0)  # the last is that of -1
-    in_place = Placed(placed.number, placed.scan, np.eye(4), placed.scale)
-    origin = in_place.origin()
-
-    def read() -> Iterator[Block]:
-        for found in blocks(run.points, placed.number):
-            yield Block(in_place.moved(found["points"], origin), _columns(found, fields, stations))
-
-    return Cloud(
-        placed.scan.name,
-        fields,
-        read,
-        origin,
-        len(run.points.column(placed.number, "points")),
+def scan_cloud(run: Run, placed: Placed) -> Cloud:
+    """Return the cloud of a scan in its own frame, with its pose, and rows and columns of the scanner's grid."""
+    in_place = replace(placed, T=np.eye(4))
+    cloud = _cloud(run, in_place, placed.scan.name, in_place.origin(), grid=True)
+    return replace(
+        cloud,
         T_project_scan=placed.T if placed.known else np.empty(0),
-        largest=_largest_cells(run, placed.number) if ROW in fields else {},
+        largest=_largest_cells(run, placed.number) if ROW in cloud.fields else {},
     )
 
 
@@ -94,16 +82,19 @@ def _largest_cells(run: Run, number: int) -> dict[str, int]:
 
 def part_cloud(run: Run, placed: Placed) -> Cloud:
     """Return the cloud of a part in the frame that its pose leads to."""
-    fields = fields_of(run, [placed.number], grid=False)
-    stations = np.append(np.arange(1, _stations(run) + 1), 0)
-    origin = np.zeros(3)
+    return _cloud(run, placed, placed.component, np.zeros(3), grid=False)
+
+
+def _cloud(run: Run, placed: Placed, name: str, origin: Floats, *, grid: bool) -> Cloud:
+    """Return the cloud of a scan in the frame that its pose leads to, with the numbers of the scene's stations."""
+    fields = fields_of(run, [placed.number], grid=grid)
+    stations = np.append(np.arange(1, _stations(run) + 1), 0)  # the last is that of -1
 
     def read() -> Iterator[Block]:
         for found in blocks(run.points, placed.number):
             yield Block(placed.moved(found["points"], origin), _columns(found, fields, stations))
 
-    count = len(run.points.column(placed.number, "points"))
-    return Cloud(placed.component, fields, read, origin, count)
+    return Cloud(name, fields, read, origin, len(run.points.column(placed.number, "points")))
 
 
 def merged_cloud(run: Run, scans: Sequence[Placed]) -> Cloud:
@@ -177,7 +168,7 @@ def stations_moved(run: Run, scans: Sequence[Placed]) -> Stations | None:
     places = []
     for placed in scans:
         if stations is not None and has_stations(run, placed):
-            given = placed.scan.T_project_scan if placed.scan.T_project_scan.size else np.eye(4)
+            given = placed.scan.pose
             T = placed.T @ rigid.invert(given) if placed.known else np.eye(4)
             places.append(rigid.apply(T, placed.scale * stations.positions))
     if stations is None or not places or any(np.abs(one - places[0]).max() > SAME_MM for one in places):

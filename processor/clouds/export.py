@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from processor.clouds import cleaning, contents, poses, scan_folder
+from processor.clouds import CONTENTS, FORMATS, cleaning, contents, poses, scan_folder
 from processor.clouds import run as runs
 from processor.clouds.cleaning import Removed
 from processor.clouds.poses import Placed, Poses
@@ -23,8 +23,6 @@ from processor.store.new_folder import check_new, new_folder, unwritable
 from processor.writers import e57, las, ply, project, text
 from processor.writers.cloud import Cloud
 
-WHATS = ("registered", "merged", "assembled", "clean", "deviation")
-FORMATS = ("e57", "las", "laz", "ply", "xyz")
 SCANS = "scans"
 WRITERS: dict[str, Callable[[Path, Cloud], int]] = {
     "e57": lambda path, cloud: e57.write(path, [cloud])[0],
@@ -74,8 +72,8 @@ def export(
     Raises UsageError for names that are not known, a folder that exists, and where a step is missing; InputError for an
     input that has changed, and where the folder cannot be written.
     """
-    if what not in WHATS:
-        raise UsageError(f"what: expected one of {', '.join(WHATS)}, found {what!r}")
+    if what not in CONTENTS:
+        raise UsageError(f"what: expected one of {', '.join(CONTENTS)}, found {what!r}")
     if format_ not in FORMATS:
         raise UsageError(f"format: expected one of {', '.join(FORMATS)}, found {format_!r}")
     if not 0.0 <= spacing_mm < np.inf:
@@ -86,7 +84,7 @@ def export(
         tempfile.TemporaryDirectory(prefix=".aside-", dir=making) as aside,
         _opened(source, Path(aside), input_, units) as run,
     ):
-        content = CONTENTS[what](run, Path(aside))
+        content = CONTENT_OF[what](run, Path(aside))
         clouds = {}
         for stem, cloud in content.clouds.items():
             identity = f"{run.digest} {what} {spacing_mm} {stem}".encode()
@@ -170,7 +168,7 @@ def _deviation(run: Run, aside: Path) -> _Content:
     return _Content({"deviation": contents.core_cloud(run)}, frame="frame of the design")
 
 
-CONTENTS: dict[str, Callable[[Run, Path], _Content]] = {
+CONTENT_OF: dict[str, Callable[[Run, Path], _Content]] = {
     "registered": _registered,
     "merged": _merged,
     "assembled": _assembled,

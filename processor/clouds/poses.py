@@ -34,11 +34,12 @@ class Placed:
 
     def moved(self, points: Floats, origin: Floats) -> Floats:
         """Map points (n, 3) less the scan's origin to points less ``origin`` (3,)."""
-        R = self.T[:3, :3]
+        return rigid.apply(self.to_local(self.T, origin), self.scale * points)
+
+    def to_local(self, T: Floats, origin: Floats) -> Floats:
+        """Return the map (4, 4) by T (4, 4) of scaled points less the scan's origin to points less ``origin`` (3,)."""
         # Large offsets are subtracted from each other first: added to the points, either would cost them digits.
-        shift = R @ (self.scale * self.scan.origin) + (self.T[:3, 3] - origin)
-        moved: Floats = (self.scale * points) @ R.T + shift
-        return moved
+        return rigid.transform(T[:3, :3], T[:3, :3] @ (self.scale * self.scan.origin) + (T[:3, 3] - origin))
 
 
 @dataclass(frozen=True)

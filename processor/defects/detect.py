@@ -207,7 +207,7 @@ def _sample(scene: Scene, T_design_project: Floats) -> Floats:
     return np.concatenate(
         [
             rigid.apply(
-                T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4)),
+                T_design_project @ scan.pose,
                 scan.points[::step] + scan.origin,
             )
             for scan in scene.scans

@@ -16,7 +16,7 @@ from scipy import ndimage
 
 from processor.defects.alignment import chart_of_cells
 from processor.defects.observations import CHUNK, Pairs, Stations, cells_at
-from processor.defects.surface_charts import DesignSurface
+from processor.defects.surface_charts import GRID_SHARE, DesignSurface
 from processor.geometry import mesh_distance, rigid
 from processor.model import Floats, Ints, Scene
 
@@ -26,7 +26,6 @@ BEYOND_MM = 20.0  # least distance of a point behind a face that it was measured
 BEFORE_MM = 1.0  # distance of a face of the design that hides a cell
 SEEN_SHARE = 0.5  # of the points expected, up to which a cell may be hidden
 LEAST_POINTS = 1e-6  # expected; less is the rounding of sums
-GRID_SHARE = 0.01  # voxel by the design's size, for lines of sight
 LEAST_BIN_RAD = 0.003
 BIN_STEPS = 5.0  # angular steps of a scanner in a bin of directions
 FACE_SHARE = 0.2  # of a face's cells seen by a station, from which on the rest is expected
@@ -49,13 +48,11 @@ def expected(
     for _, cell, number in parts:
         points[cell] += number
     empty = counted < SEEN_SHARE * points
-    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
     for k, cell, number in parts:
         rows = np.flatnonzero(empty[cell])
         starts = surface.centres[cell[rows]] + BEFORE_MM * surface.outward[cell[rows]]
         ends = np.repeat(stations.positions[k : k + 1], len(rows), axis=0)
-        rows = rows[np.unique(mesh_distance.crossings(grid, starts, ends, True)[0])]
+        rows = rows[np.unique(mesh_distance.crossings(surface.sight_grid, starts, ends, True)[0])]
         points[cell[rows]] -= number[rows]
     points = np.where(points > LEAST_POINTS, points, 0.0)
     return np.maximum(points, _through(scene, T_design_project, counted, surface, stations))
@@ -166,7 +163,7 @@ def _points_of(scene: Scene, T_design_project: Floats, station: int) -> Iterator
     """Yield the points of a station in chunks, in the design's frame."""
     first = 0
     for scan in scene.scans:
-        T = T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4))
+        T = T_design_project @ scan.pose
         T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
         count = 1
         if not scan.position.size and scene.stations is not None and len(scan.point_station):

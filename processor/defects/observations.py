@@ -15,7 +15,6 @@ from processor.model import Floats, InputError, Ints, Scan, Scene
 
 CHUNK = 500_000
 BEHIND_MM = 4.0  # a face, from which on a beam must have passed through it as designed
-HALF_BEAM_MM = 4.0  # at the outline of a round face: beams there miss it in part
 LEAST_COS = 0.2  # of incidence: points at a more oblique one are mostly of beams that hit two surfaces
 GATE_SDS = 4.0  # robust standard deviations from the median of a cell, beyond which a point is stray
 LEAST_GATE_MM = 1.0
@@ -81,7 +80,7 @@ def observe(scene: Scene, T_design_project: Floats, surface: DesignSurface, reac
     positions: list[Floats] = []
     parts: list[tuple[Ints, Floats, Ints, Floats, Bools]] = []
     for scan in scene.scans:
-        T = T_design_project @ (scan.T_project_scan if scan.T_project_scan.size else np.eye(4))
+        T = T_design_project @ scan.pose
         T = rigid.transform(T[:3, :3], T[:3, :3] @ scan.origin + T[:3, 3])
         station_of = np.full(len(scan.points), len(names), np.int64)
         if scan.position.size:
@@ -155,7 +154,7 @@ def _at_outline(surface: DesignSurface, facet: Ints, points: Floats, scanners: F
     across /= np.maximum(np.linalg.norm(across, axis=1), 1e-9)[:, None]
     off = np.abs(np.einsum("ni,ni->n", arm, across))
     is_convex = np.einsum("ni,ni->n", arm, surface.normals[facet[rows]]) > 0.0
-    marked[rows] = is_convex & (off > charts.radius[chart] - HALF_BEAM_MM)
+    marked[rows] = is_convex & (off > charts.radius[chart] - foreground.HALF_BEAM_MM)
     return marked
 
 

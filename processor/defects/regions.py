@@ -17,9 +17,7 @@ from processor.model import Floats, Ints
 
 EIGHT_NEIGHBOURS = np.ones((3, 3))
 EMPTY_SHARE = 0.15  # of the points expected, up to which a cell is empty
-LEAST_EXPECTED = (
-    6.0  # points on the cells that are judged together: with fewer, cells are empty by chance, side by side
-)
+LEAST_EXPECTED = 6.0  # points on cells that are judged together: with fewer, cells side by side are empty by chance
 COUNTED_SHARE = 0.5  # of the points expected: scanners return fewer where a surface reflects badly
 LINE_CELLS = 1.6  # distance of a crack's piece from its line
 LINE_REACH = 3.0  # half lengths of a crack, within which further pieces lie

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numba import njit
@@ -16,7 +17,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from processor.geometry import enclosure, mesh_distance
-from processor.geometry.mesh_distance import Bools, MeshSurface
+from processor.geometry.mesh_distance import Bools, FacetGrid, MeshSurface
 from processor.model import DesignBodies, Floats, Ints
 
 FLAT_COS = np.cos(np.radians(1.0))
@@ -28,7 +29,7 @@ TOUCH_MM = 0.5
 MOST_BODIES = 12  # of a component
 MOST_SIDES = 60  # edges tried for the direction of a face
 PLANE, CYLINDER = 0, 1
-GRID_SHARE = 0.01  # voxel by the design's size, to find bodies
+GRID_SHARE = 0.01  # voxel by the design's size
 PER_SIDE = 4  # samples of a cell along each axis, for the share that its face covers
 
 
@@ -80,6 +81,16 @@ class DesignSurface:
     outward: Floats  # (cells, 3)
     names: tuple[str, ...]  # of the components
 
+    @cached_property
+    def size_mm(self) -> float:
+        """Diagonal of the box about the design, mm."""
+        return float(np.linalg.norm(np.ptp(self.vertices, axis=0)))
+
+    @cached_property
+    def sight_grid(self) -> FacetGrid:
+        """The facets in a grid, by which lines of sight are followed."""
+        return mesh_distance.facet_grid(self.vertices, self.faces, self.normals, GRID_SHARE * self.size_mm)
+
     @property
     def area_mm2(self) -> float:
         """Area of all cells, mm2."""
@@ -88,11 +99,9 @@ class DesignSurface:
 
 def of_mesh(vertices: Floats, faces: Ints, cell_mm: float, bodies: DesignBodies | None = None) -> DesignSurface:
     """Map a mesh to charts with cells of ``cell_mm``; its components are its ``bodies``, where these have names."""
-    vertices, faces = _welded(vertices, faces, None if bodies is None else bodies.of_facet)
-    has_area = mesh_distance.double_areas(vertices, faces)[1] > LEAST_AREA_MM2
-    mesh = mesh_distance.of_mesh(vertices, faces[has_area], spacing_mm=1e9)
+    vertices, faces, component = _joined(vertices, faces, bodies)
+    mesh = mesh_distance.of_mesh(vertices, faces, spacing_mm=1e9)
     vertices, faces, normals = mesh.vertices, mesh.faces, mesh.normals
-    component = _components(vertices, faces) if bodies is None else bodies.of_facet[has_area]
     count = int(component.max(initial=-1)) + 1
     chart_of = _pieces(vertices, faces, normals, mesh.part_of)
     surface = DesignSurface(
@@ -136,7 +145,7 @@ def hidden(surface: DesignSurface) -> Bools:
     body = enclosure.closed_bodies(surface.faces)
     near = np.flatnonzero(_near_bodies(surface, body, 0.5 * charts.cell_mm * (np.abs(along) + np.abs(across))))
     centres, outward, along, across = (x[near] for x in (surface.centres, surface.outward, along, across))
-    reach = max(float(np.linalg.norm(np.ptp(surface.vertices, axis=0))) * GRID_SHARE, charts.cell_mm)
+    reach = max(surface.size_mm * GRID_SHARE, charts.cell_mm)
     grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, reach)
     for sample in range(PER_SIDE**2):
         a, b = (charts.cell_mm * ((k + 0.5) / PER_SIDE - 0.5) for k in divmod(sample, PER_SIDE))
@@ -182,11 +191,16 @@ def with_components(vertices: Floats, faces: Ints, bodies: DesignBodies | None =
 
     Components are the ``bodies``, in their order, where these have names.
     """
+    vertices, faces, component = _joined(vertices, faces, bodies)
+    return mesh_distance.of_design(vertices, faces), component
+
+
+def _joined(vertices: Floats, faces: Ints, bodies: DesignBodies | None) -> tuple[Floats, Ints, Ints]:
+    """Return a mesh with one vertex at a place, without facets of no area, and the component (f,) of each facet."""
     vertices, faces = _welded(vertices, faces, None if bodies is None else bodies.of_facet)
     has_area = mesh_distance.double_areas(vertices, faces)[1] > LEAST_AREA_MM2
-    surface = mesh_distance.of_design(vertices, faces[has_area])
-    of_facet = _components(surface.vertices, surface.faces) if bodies is None else bodies.of_facet[has_area]
-    return surface, of_facet
+    faces = faces[has_area]
+    return vertices, faces, _components(vertices, faces) if bodies is None else bodies.of_facet[has_area]
 
 
 def _components(vertices: Floats, faces: Ints) -> Ints:

@@ -25,7 +25,7 @@ from processor.defects.result import DOUBTFUL, Curve, DefectClass, Defects, Resu
 from processor.defects.scan_statistic import Levels
 from processor.defects.shape_models import RIGID, Frame
 from processor.defects.surface_charts import PLANE, DesignSurface
-from processor.geometry.mesh_distance import Bools, FacetGrid
+from processor.geometry.mesh_distance import Bools
 from processor.model import NORMAL_95, Floats, Ints, Reason, Status, reason
 
 CHANCE_MM2 = 1e8  # the area that false alarms are counted on
@@ -239,11 +239,10 @@ def _place_defects(search: Search) -> Iterator[Defect]:
     claimed = np.zeros(len(search.surface.share), bool)
     for group in search.places:
         claimed[group[0].cells] = True
-    grid = other_side.grid_of(search.surface)
     found: list[tuple[Region, Defect]] = []
     for group in search.places:
         component = int(search.surface.charts.component[group[0].chart])
-        values = _place_values(search, group[0], component, amplitudes.get(component, 0.0), claimed, grid)
+        values = _place_values(search, group[0], component, amplitudes.get(component, 0.0), claimed)
         if values is not None:
             cells = np.unique(np.concatenate([region.cells for region in group]))
             found.append((group[0], Defect(values=values, component=component, cells=cells, field=search.residuals)))
@@ -304,11 +303,11 @@ def _wave(lobes: list[Defect]) -> Defect:
 
 
 def _place_values(
-    search: Search, region: Region, component: int, amplitude: float, claimed: Bools, grid: FacetGrid
+    search: Search, region: Region, component: int, amplitude: float, claimed: Bools
 ) -> dict[str, Any] | None:
     """Measure and classify a place on a component whose shape has an ``amplitude`` in mm; None if it is no defect.
 
-    ``claimed`` (cells,) marks the cells of all places; ``grid`` finds the other side of plates.
+    ``claimed`` (cells,) marks the cells of all places.
     """
     surface, cell = search.surface, search.surface.charts.cell_mm
     middle = int(region.cells[len(region.cells) // 2])
@@ -326,7 +325,7 @@ def _place_values(
     else:
         if abs(measured.depth) < SHALLOW_SHARE * amplitude:
             return None
-        stayed = other_side.stayed(search.residuals, surface, grid, region.cells) if region.sign < 0 else np.nan
+        stayed = other_side.stayed(search.residuals, surface, region.cells) if region.sign < 0 else np.nan
         classification = classes.of_deviation(region.sign, measured.diameter, length, width, assumed, region.z, stayed)
         crack = classification.defect_class is DefectClass.CRACK
         if measured.diameter < SMALL_CELLS * cell and not crack:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from processor.geometry import mesh_distance, rigid
-from processor.model import Floats, InputError, Scan, Scene, Status, StructureDesign
+from processor.model import Floats, InputError, Scene, Status, StructureDesign
 
 ORIGIN_STEP_MM = 1000.0
 UNPLACED = (Status.FAILED, Status.AMBIGUOUS)  # of a scan: its pose may be wrong
@@ -30,11 +30,11 @@ class MergedCloud:
 
 def merged(scene: Scene, with_scanner: bool) -> MergedCloud:
     """Merge the scans of a scene; a scan without a pose is taken to be in the project's frame already."""
-    origin = rigid.apply(_pose(scene.scans[0]), scene.scans[0].origin) if scene.scans else np.zeros(3)
+    origin = rigid.apply(scene.scans[0].pose, scene.scans[0].origin) if scene.scans else np.zeros(3)
     points, scanners = [np.empty((0, 3))], [np.empty((0, 3))]
     known = with_scanner
     for scan in scene.scans:
-        T = _pose(scan)
+        T = scan.pose
         # Large offsets are subtracted from each other first: added to the points, either would cost them digits.
         shift = T[:3, :3] @ scan.origin + (T[:3, 3] - origin)
         points.append((scan.points @ T[:3, :3].T if scan.T_project_scan.size else scan.points) + shift)
@@ -48,10 +48,6 @@ def merged(scene: Scene, with_scanner: bool) -> MergedCloud:
         else:
             known = False
     return MergedCloud(np.concatenate(points), origin, np.concatenate(scanners) if known else None)
-
-
-def _pose(scan: Scan) -> Floats:
-    return scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
 
 
 def stitched(scene: Scene, result: Any) -> Scene:

@@ -125,10 +125,9 @@ def _truth(report: ErrorReport) -> dict[str, Any]:
 
 def _tone(run: StepRun) -> str:
     """Return the colour class of a step's box: a pass against limits that are not verified is neutral."""
-    overall = getattr(run.result, "overall", Verdict.NONE)
-    if run.result.status != GOOD or overall is Verdict.FAIL:
+    if run.result.status != GOOD or run.verdict is Verdict.FAIL:
         return "bad"
-    provisional = overall is Verdict.INDETERMINATE or not getattr(run.result, "verified", True)
+    provisional = run.verdict is Verdict.INDETERMINATE or not getattr(run.result, "verified", True)
     return "" if provisional else "good"
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from processor.evaluation.evaluate import ErrorReport
-from processor.model import StepRun, Verdict, worst
+from processor.model import StepRun, worst
 from processor.pipeline import Execution
 from processor.results.fields_to_json import as_object
 from processor.results.names import FORMAT, FORMAT_VERSION
@@ -19,7 +19,7 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
     content: dict[str, Any] = {
         "format": FORMAT,
         "format_version": FORMAT_VERSION,
-        "verdict": worst(_verdict(run) for run, _ in by_step),
+        "verdict": worst(run.verdict for run, _ in by_step),
         "headline": headline,
         "input": made["input"],
         "input_sha256": made["input_sha256"],
@@ -51,8 +51,4 @@ def results_json(execution: Execution, report: ErrorReport, headline: str = "") 
 
 def step_json(run: StepRun) -> dict[str, Any]:
     """Write the result of one step, with its verdict: the worst of those in it."""
-    return as_object(run.result) | {"verdict": _verdict(run)}
-
-
-def _verdict(run: StepRun) -> Verdict:
-    return getattr(run.result, "overall", Verdict.NONE)
+    return as_object(run.result) | {"verdict": run.verdict}

@@ -363,7 +363,7 @@ def _stations(scans: list[Scan]) -> Stations | None:
     positions: dict[str, Floats] = {}
     for scan in scans:
         if scan.position.size:
-            T = scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
+            T = scan.pose
             positions.setdefault(scan.station or scan.name, T[:3, :3] @ scan.position + T[:3, 3])
     return Stations(tuple(positions), np.array(list(positions.values()))) if positions else None
 

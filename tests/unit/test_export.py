@@ -280,7 +280,7 @@ def test_the_command_writes_and_says_what(room, tmp_path, monkeypatch):
     )
     assert json.loads(done.output)["files"] == {"merged.e57": count}
     help_ = CliRunner().invoke(commands, ["export", "--help"]).output
-    assert {line.split()[0] for line in help_.splitlines() if line.strip()} >= set(clouds_export.WHATS)
+    assert {line.split()[0] for line in help_.splitlines() if line.strip()} >= set(clouds_export.CONTENTS)
 
 
 # --- what cannot be exported

@@ -214,7 +214,7 @@ def test_methods_without_intervals_have_none_of_these():
 @pytest.mark.parametrize(("verified", "tone"), [(True, "good"), (False, "")])
 def test_a_pass_is_marked_as_good_only_by_limits_that_are_verified(verified, tone):
     result = SimpleNamespace(status=Status.OK, overall=Verdict.PASS, verified=verified)
-    assert page._tone(SimpleNamespace(result=result)) == tone
+    assert page._tone(StepRun("preassemble", "adjustment", "{}", result)) == tone
 
 
 def test_the_verdict_stands_before_all_else_and_what_to_do_before_the_pictures():

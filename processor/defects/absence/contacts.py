@@ -28,7 +28,6 @@ ON_MM = 4.0  # distance from the face, up to which a point is on it
 GONE_SHARE = 0.02  # of the points that faces seen elsewhere have, up to which none of a body was measured
 FEWEST_CELLS = 2.0  # by area, of a body that can be judged
 NEAR_MM = 2.0  # margin of the box about a body
-GRID_SHARE = 0.01  # voxel by the design's size
 
 
 @dataclass(frozen=True)
@@ -69,8 +68,6 @@ def _contacts(
 ) -> Iterator[_Contact]:
     """Yield the contacts of each closed body that has any."""
     charts = surface.charts
-    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    grid = mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
     touched = np.flatnonzero(hidden.any(axis=1) & (charts.kind == PLANE)[chart_of_cells(surface)])
     places, inward, place_mm2 = _places_of(surface, touched)
     found = _points_on(observed, surface, touched)
@@ -81,7 +78,7 @@ def _contacts(
 
         def number(points: Floats, normals: Floats, only: Ints = only, one: int = one) -> int:
             near = ((points > low[one] - NEAR_MM) & (points < high[one] + NEAR_MM)).all(axis=1)
-            return int(_well_inside(points[near], normals[near], grid, only).sum())
+            return int(_well_inside(points[near], normals[near], surface.sight_grid, only).sum())
 
         samples = number(places, inward)
         cells = _cells_of_body(surface, body, one)

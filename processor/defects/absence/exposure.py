@@ -19,7 +19,7 @@ from processor.defects.places import other_side
 from processor.defects.regions import EIGHT_NEIGHBOURS, EMPTY_SHARE, Region, chernoff
 from processor.defects.surface_charts import PLANE, DesignSurface
 from processor.geometry import mesh_distance
-from processor.geometry.mesh_distance import Bools, FacetGrid
+from processor.geometry.mesh_distance import Bools
 from processor.model import Floats, Ints
 
 BEFORE_MM = 1.0  # start of a line of sight above the face
@@ -51,8 +51,6 @@ class _Hole:
 
 def holes(field: Field, surface: DesignSurface, points: Floats, alarms_per_mm2: float) -> list[Region]:
     """Return the empty places of plates of which both sides must have been seen; ``points`` (n, 3) are of the cloud."""
-    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    grid = other_side.grid_of(surface)
     count = (field.count + field.stray).astype(np.float64)
     opposite: dict[int, int] = {}
     found: list[_Hole] = []
@@ -61,8 +59,8 @@ def holes(field: Field, surface: DesignSurface, points: Floats, alarms_per_mm2: 
             hole = _hole(field, surface, count, int(chart), cells, ring)
             if hole is None or not _is_beyond(surface, hole, ring, points):
                 continue
-            other = other_side.cells_opposite(surface, grid, hole.core)
-            if (other < 0).all() or not _is_exposed(surface, grid, hole.core, ring, 2.0 * size):
+            other = other_side.cells_opposite(surface, hole.core)
+            if (other < 0).all() or not _is_exposed(surface, hole.core, ring):
                 continue
             opposite |= dict(zip(hole.core.tolist(), other.tolist(), strict=True))
             found.append(hole)
@@ -173,14 +171,14 @@ def _is_beyond(surface: DesignSurface, hole: _Hole, ring: Ints, points: Floats) 
     return int(((points - middle) @ way > 0.0).sum()) >= FEWEST_BEYOND
 
 
-def _is_exposed(surface: DesignSurface, grid: FacetGrid, core: Ints, ring: Ints, far_mm: float) -> bool:
+def _is_exposed(surface: DesignSurface, core: Ints, ring: Ints) -> bool:
     """Return whether the middle of a place can be seen along the directions of most of its surroundings.
 
     All of its cells are compared, or an even sample of many.
     """
     core, ring = (x[:: max(1, -(-len(x) // most))] for x, most in ((core, MOST_CORE), (ring, MOST_RING)))
     directions = _directions(surface, int(core[0]))
-    of_core, of_ring = (_open(surface, grid, x, directions, far_mm) for x in (core, ring))
+    of_core, of_ring = (_open(surface, x, directions) for x in (core, ring))
     lost = of_ring[None].astype(float).sum(axis=2) - of_core.astype(float) @ of_ring.T.astype(float)
     exposed = lost <= LOST_SHARE * of_ring.sum(axis=1)[None]
     return bool((exposed.mean(axis=1) >= EXPOSED_SHARE).mean() >= EXPOSED_SHARE)
@@ -197,10 +195,10 @@ def _directions(surface: DesignSurface, cell: int) -> Floats:
     return spread
 
 
-def _open(surface: DesignSurface, grid: FacetGrid, cells: Ints, directions: Floats, far_mm: float) -> Bools:
+def _open(surface: DesignSurface, cells: Ints, directions: Floats) -> Bools:
     """Return for each of ``cells`` (n,) and directions (d,) whether the design leaves the line of sight open."""
     starts = np.repeat(surface.centres[cells] + BEFORE_MM * surface.outward[cells], len(directions), axis=0)
-    ends = starts + far_mm * np.tile(directions, (len(cells), 1))
+    ends = starts + 2.0 * surface.size_mm * np.tile(directions, (len(cells), 1))
     clear = np.ones(len(starts), np.bool_)
-    clear[mesh_distance.crossings(grid, starts, ends, True)[0]] = False
+    clear[mesh_distance.crossings(surface.sight_grid, starts, ends, True)[0]] = False
     return clear.reshape(len(cells), len(directions))

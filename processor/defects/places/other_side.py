@@ -8,30 +8,22 @@ from processor.defects.deviation_field import Field
 from processor.defects.observations import cells_at
 from processor.defects.surface_charts import DesignSurface
 from processor.geometry import mesh_distance
-from processor.geometry.mesh_distance import FacetGrid
 from processor.model import Floats, Ints
 
 PLATE_MM = 80.0  # largest thickness of a plate, whose other side is compared
 OPPOSITE_COS = -0.95  # of the normals of the two sides of a plate
-GRID_SHARE = 0.01  # voxel by the design's size
 LEAST_SHARE = 0.5  # of a place's cells, whose other side was seen
 FORM_SHARE = 0.25  # of the depth, by which the two sides of a dent may differ in form (one standard deviation)
 MOST_EVIDENCE = 20.0  # of the logarithm of a ratio of likelihoods
 
 
-def grid_of(surface: DesignSurface) -> FacetGrid:
-    """Return the grid by which :func:`cells_opposite` searches."""
-    size = float(np.linalg.norm(np.ptp(surface.vertices, axis=0)))
-    return mesh_distance.facet_grid(surface.vertices, surface.faces, surface.normals, GRID_SHARE * size)
-
-
-def stayed(field: Field, surface: DesignSurface, grid: FacetGrid, cells: Ints) -> float:
+def stayed(field: Field, surface: DesignSurface, cells: Ints) -> float:
     """Return the probability that the other side of a plate did not move with ``cells`` (n,); NaN if it was not seen.
 
     Either it stayed, or it moved by as much; both are as likely beforehand.
     """
     cells = cells[field.seen[cells] > 0.0]
-    other = cells_opposite(surface, grid, cells)
+    other = cells_opposite(surface, cells)
     known = (other >= 0) & (field.seen[other] > 0.0)
     if not len(cells) or known.mean() < LEAST_SHARE:
         return float("nan")
@@ -44,11 +36,11 @@ def stayed(field: Field, surface: DesignSurface, grid: FacetGrid, cells: Ints) -
     return float(1.0 / (1.0 + np.exp(-evidence)))
 
 
-def cells_opposite(surface: DesignSurface, grid: FacetGrid, cells: Ints) -> Ints:
+def cells_opposite(surface: DesignSurface, cells: Ints) -> Ints:
     """Return the cell (n,) on the other side of the plate at each of ``cells`` (n,); -1 where there is no plate."""
     starts: Floats = surface.centres[cells] - 1e-3 * surface.outward[cells]
     ends = surface.centres[cells] - PLATE_MM * surface.outward[cells]
-    row, facet, part = mesh_distance.crossings(grid, starts, ends, False)
+    row, facet, part = mesh_distance.crossings(surface.sight_grid, starts, ends, False)
     facing = np.einsum("ni,ni->n", surface.normals[facet], surface.outward[cells[row]]) < OPPOSITE_COS
     row, facet, part = row[facing], facet[facing], part[facing]
     order = np.lexsort([part, row])

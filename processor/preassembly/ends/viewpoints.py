@@ -178,12 +178,14 @@ def _with_class(between: float, squares: float, by_noise: float, freedom: int) -
     """
     pairs = freedom / OF_PAIR
     both = (between * pairs + VIEW_MM**2 * OF_CLASS) / (pairs + OF_CLASS)
-    limit = max(squares - by_noise, 0.0) / (2.0 * freedom) * pairs / float(chdtri(pairs, 0.95))
-    return min(both, limit)
+    return min(both, _estimate(squares, by_noise, freedom) * pairs / float(chdtri(pairs, 0.95)))
 
 
 def _variance(squares: float, by_noise: float, freedom: int) -> float:
+    """Variance on one side of a plate, widened for the number of differences it comes from."""
+    return float(clusters.widening(freedom / OF_PAIR)) * _estimate(squares, by_noise, freedom) if freedom >= 1 else 0.0
+
+
+def _estimate(squares: float, by_noise: float, freedom: int) -> float:
     """Variance on one side of a plate by the sum of squares of differences of its two sides."""
-    if freedom < 1:
-        return 0.0
-    return float(clusters.widening(freedom / OF_PAIR)) * max(squares - by_noise, 0.0) / (2.0 * freedom)
+    return max(squares - by_noise, 0.0) / (2.0 * freedom)

@@ -109,7 +109,7 @@ def _boxes(scene: Scene, centre: Floats, far: float) -> list[tuple[Floats, Float
     """Box a scan, less its origin, that holds all that is within ``far`` of a place (3,) in the project's frame."""
     boxes = []
     for scan in scene.scans:
-        T = scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
+        T = scan.pose
         middle = T[:3, :3].T @ (centre - T[:3, 3]) - scan.origin
         boxes.append((middle - far - SLACK_MM, middle + far + SLACK_MM))
     return boxes

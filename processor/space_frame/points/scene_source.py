@@ -66,7 +66,7 @@ class SceneSource:
     def chunks(self) -> Iterator[Chunk]:
         """Pass over all points."""
         for number, (scan, scanner) in enumerate(zip(self.scans, self.scanner_of, strict=True)):
-            T = pose_of(scan)
+            T = scan.pose
             R = T[:3, :3]
             # offset less offset first: adding either to the points would lose digits
             shift = R @ scan.origin + (T[:3, 3] - self.origin)
@@ -80,7 +80,7 @@ class SceneSource:
 def of_scene(scene: Scene, points: PointReader | None = None) -> SceneSource:
     """Return the source of a scene's points, or of those that ``points`` reads."""
     first = scene.scans[0] if scene.scans else None
-    origin = np.zeros(3) if first is None else rigid.apply(pose_of(first), first.origin[None])[0]
+    origin = np.zeros(3) if first is None else rigid.apply(first.pose, first.origin[None])[0]
     names: list[str] = []
     places: list[Floats] = []
     # A scan of one station has a position of its own; the points of a merged one name their stations.
@@ -91,7 +91,7 @@ def of_scene(scene: Scene, points: PointReader | None = None) -> SceneSource:
         if not scan.position.size:
             scanner_of.append(UNKNOWN_STATION)
             continue
-        T = pose_of(scan)
+        T = scan.pose
         scanner_of.append(len(names))
         names.append(scan.station or scan.name)
         places.append(T[:3, :3] @ scan.position + (T[:3, 3] - origin))
@@ -104,11 +104,6 @@ def of_scene(scene: Scene, points: PointReader | None = None) -> SceneSource:
         scanner_of=tuple(scanner_of),
         points=points or InScans(scene.scans),
     )
-
-
-def pose_of(scan: Scan) -> Floats:
-    """Return T_project_scan (4, 4), the identity for a scan without a pose."""
-    return scan.T_project_scan if scan.T_project_scan.size else np.eye(4)
 
 
 def _moved(points: Floats, R: Floats, shift: Floats) -> Floats:

@@ -6,7 +6,7 @@ import numpy as np
 
 from processor.model import Floats, InputError, Ints, Scene
 from processor.space_frame.design import unit_mistakes
-from processor.space_frame.points.scene_source import SceneSource, pose_of
+from processor.space_frame.points.scene_source import SceneSource
 from processor.space_frame.stations.control_points import ControlPoints
 
 FARTHEST_MM = 1000.0  # control points farther from their sightings are in another frame
@@ -28,7 +28,7 @@ def control_of(scene: Scene, source: SceneSource) -> ControlPoints | None:
         return None
     measured = np.empty((len(rows), 3))
     for i, row in enumerate(rows.tolist()):
-        T = pose_of(scene.scans[control.scan[row]])
+        T = scene.scans[control.scan[row]].pose
         measured[i] = T[:3, :3] @ control.seen[row] + (T[:3, 3] - source.origin)
     point, target = control.point[rows], control.positions[control.point[rows]] - source.origin
     off = float(np.median(np.linalg.norm(target - measured, axis=1)))
