@@ -32,7 +32,8 @@ LEAST_SHARE = 1e-4  # a hypothesis of less weight is left out of the average
 class Means(NamedTuple):
     """Means (c,) of departures over patches at ``place`` (c, 2), mm, their variances by noise, and the trend (c, k).
 
-    ``freedom`` is that of the noise's estimate.
+    ``freedom`` is that of the noise's estimate. Coefficients of the trend are expected within ``trend_sd`` of
+    ``trend_mean`` (k,): patches may not determine all of them.
     """
 
     place: Floats
@@ -40,6 +41,8 @@ class Means(NamedTuple):
     variance: Floats
     trend: Floats
     freedom: float = np.inf
+    trend_mean: Floats | float = 0.0
+    trend_sd: float = np.inf
 
 
 class Kriged(NamedTuple):
@@ -109,11 +112,14 @@ def _by_one(means: Means, apart: Floats, to_wanted: Floats, among: Floats) -> tu
     system = np.hstack([apart + np.diag(means.variance), means.trend, means.value[:, None], to_wanted.T])
     products = _eliminated(np.ascontiguousarray(system), count)
     trend, value, wanted = slice(0, columns), columns, slice(columns + 1, None)
-    inverse = np.linalg.inv(products[trend, trend])
-    coefficients = inverse @ products[trend, value]
+    expected = np.broadcast_to(means.trend_mean, columns) / means.trend_sd**2
+    precision = products[trend, trend] + np.eye(columns) / means.trend_sd**2
+    of_values = products[trend, value] + expected
+    inverse = np.linalg.inv(precision)
+    coefficients = inverse @ of_values
     by_trend = products[wanted, trend]
-    rest = products[value, value] - coefficients @ products[trend, value]
-    log = -float(np.log(np.diag(system)).sum()) - 0.5 * float(np.linalg.slogdet(products[trend, trend])[1] + rest)
+    rest = products[value, value] + expected @ np.broadcast_to(means.trend_mean, columns) - coefficients @ of_values
+    log = -float(np.log(np.diag(system)).sum()) - 0.5 * float(np.linalg.slogdet(precision)[1] + rest)
     of_process = among - products[wanted, wanted] + by_trend @ inverse @ by_trend.T
     both = -inverse @ by_trend.T
     covariance = np.block([[inverse, both], [both.T, of_process]])

@@ -138,6 +138,19 @@ def test_a_face_a_plate_further_in_is_not_taken_for_its_inner_side(side):
     assert np.abs(end.departure[list(on_side)] - corners[list(on_side)]).max() < 1.0
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_face_seen_as_one_strip_is_within_its_interval_where_it_was_not_seen(seed):
+    rng = np.random.default_rng(seed)
+    points = cloud(rng, 12.0, inner=0.3)
+    on_top = np.abs(points[:, 2] - H) < 0.1
+    seen = ~on_top | (np.abs(points[:, 1] - 300.0) < 20.0)
+    shift = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 0.0, 9.0], [0.0, 0.0, -7.0]])
+    end = fitted(built(points[seen], shift), rng)
+    sd = np.sqrt(np.diag(end.covariance)).reshape(8, 3)[[2, 3], 2]
+    assert (np.abs(end.departure[[2, 3], 2] - shift[2:, 2]) < 2.5 * sd).all()
+    assert (sd > 1.0).all()
+
+
 def without_the_outside(side):
     """Points of a box as designed, none on the outside of one wall (bottom, right, top, left)."""
     rng = np.random.default_rng(5 + side)

@@ -54,3 +54,20 @@ def test_without_waves_it_is_least_squares():
     np.testing.assert_allclose(kriged.mean, [*expected, 0.0, 0.0, 0.0], atol=1e-9)
     by_noise = 0.01 * np.linalg.inv(means.trend.T @ means.trend)
     np.testing.assert_allclose(kriged.covariance[:3, :3], by_noise, rtol=1e-9, atol=1e-15)
+
+
+def test_a_trend_that_patches_in_a_line_do_not_determine_is_as_expected_before():
+    rng = np.random.default_rng(2)
+    x = np.arange(25.0, 500.0, 50.0)
+    trend = np.stack([np.ones_like(x), x / 500.0, np.full(len(x), 0.3), 0.3 * x / 500.0], axis=1)
+    value, expected, sd, noise = trend @ [1.0, 2.0, 3.0, 4.0] + 0.1 * rng.standard_normal(len(x)), 0.5, 20.0, 0.1
+    place = np.stack([x, np.full(len(x), 240.0)], axis=1)
+    means = kriging.Means(place, value, np.full(len(x), noise**2), trend, np.inf, np.full(4, expected), sd)
+    only = np.eye(len(kriging.HYPOTHESES))[0]  # no waves
+    kriged = kriging.average(kriging.by_hypotheses(means, np.zeros((1, 2))), only)
+    # Conditional distribution of a Gaussian, in the space of the values.
+    gain = sd**2 * trend.T @ np.linalg.inv(sd**2 * trend @ trend.T + noise**2 * np.eye(len(x)))
+    np.testing.assert_allclose(kriged.mean[:4], expected + gain @ (value - trend @ np.full(4, expected)), atol=1e-6)
+    covariance = sd**2 * (np.eye(4) - gain @ trend)
+    np.testing.assert_allclose(kriged.covariance[:4, :4], covariance, atol=1e-6 * sd**2)
+    assert np.sqrt(kriged.covariance[0, 0]) > 0.2 * sd  # level and tilt across are not told apart

@@ -167,7 +167,7 @@ def _with_waves(coefficients: Floats, used: UsedPoints, at: Floats, half: float)
     trend = basis(found.centre[:, 0], found.centre[:, 1] / half)
     noise = max(found.noise, FLOOR_MM**2)
     freedom = len(used.residual) - len(found.mean)
-    means = kriging.Means(found.centre, found.mean, noise / found.number, trend, freedom)
+    means = kriging.Means(found.centre, found.mean, noise / found.number, trend, freedom, -coefficients, REACH_MM)
     nodes = np.stack([np.zeros(len(NODES)), half * np.array(NODES)], axis=1)
     hypotheses = kriging.by_hypotheses(means, nodes)
     hypotheses.means[:, :FACE] += coefficients
@@ -226,13 +226,18 @@ def _noise(residual: Floats) -> float:
 
 
 def least_squares(basis: Floats, value: Floats) -> tuple[Floats, Floats, Bools]:
-    """Coefficients (k,), residuals of the inliers, and a mark of these; empty for too few points."""
+    """Coefficients (k,), residuals of the inliers, and a mark of these; empty for too few points.
+
+    Coefficients that the points do not determine, as of a face seen as one strip, are 0 within REACH_MM.
+    """
     used = np.ones(len(value), bool)
+    expected = np.eye(basis.shape[1]) / REACH_MM
     coefficients: Floats = np.empty(0, np.float64)
     for _ in range(6):
         if used.sum() < LEAST_POINTS:
             return np.empty(0), np.empty(0), used
-        coefficients = np.asarray(np.linalg.lstsq(basis[used], value[used], rcond=None)[0], np.float64)
+        rows = np.vstack([basis[used], expected]), np.append(value[used], np.zeros(len(expected)))
+        coefficients = np.asarray(np.linalg.lstsq(*rows, rcond=None)[0], np.float64)
         residual = value - basis @ coefficients
         now = np.abs(residual) < 4.5 * max(_noise(residual[used]), FLOOR_MM)
         if (now == used).all():
