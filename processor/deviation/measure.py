@@ -32,6 +32,7 @@ REACH_MM = 200.0  # points farther from the design's surface are not of the stru
 DEPTH_SHARE, DEPTH_TIMES, LEAST_DEPTH_MM = 0.98, 2.5, 20.0
 DEPTH_POINTS = 100_000
 FIT_POINTS, FIT_ROUNDS = 300_000, 2
+UNCERTAIN = 0.5  # of a point's standard deviation: a registration no better than the mean of four points
 HALF = 0.5  # of the steel: the least that a stable fit is to rest on
 
 
@@ -73,8 +74,13 @@ def measure(scene: Scene, scan: ScanCloud, vertices: Floats, origin: Floats, par
 
 
 def _doubted(result: Result, placement: Placement) -> Result:
-    """Put first why a result is not sure: the scans that were left out, or that the scan does not lie at the design."""
-    status = result.status
+    """Put first why a result is not sure.
+
+    Either the scan does not lie at the design, or scans were left out, or the registration is less certain than what
+    scanners and single points are wrong by.
+    """
+    status, error = result.status, result.registration_error
+    given = result.registration is Registration.AS_GIVEN
     if not placement.lies and placement.placed.registration is Registration.COARSE:
         first, status = reason("deviation.not-at-design"), Status.FAILED
     elif placement.left_out:
@@ -82,6 +88,8 @@ def _doubted(result: Result, placement: Placement) -> Result:
         points = sum(one.points for one in placement.left_out)
         first = reason("deviation.scans-elsewhere", scans=names, points=points, read=result.points_read)
         status = Status.WEAK if status is Status.OK else status
+    elif status is Status.OK and error > max(UNCERTAIN * result.sigma, scanner_class.SHIFT_MM) and not given:
+        first, status = reason("deviation.registration-uncertain", sd=error, sigma=result.sigma), Status.WEAK
     else:
         return result
     return replace(result, status=status, reasons=(first, *result.reasons))

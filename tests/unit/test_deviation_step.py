@@ -34,6 +34,7 @@ from processor.pipeline import Execution
 from processor.report import write_results
 from processor.report.deviation import figures, section
 from processor.results import fields_to_json, to_json
+from tests.support import plate_clouds
 from tests.support.meshes import bracket
 
 FAR = np.array([5.0e8, 3.2e9, 1.0e5])  # mm
@@ -112,6 +113,17 @@ def test_a_structure_that_is_bent_all_over_is_laid_on_all_its_points():
     assert result.status == "weak"
     assert codes(result)[:2] == ["deviation.no-stable-half", "deviation.best-fit"]
     assert np.isfinite(result.registration_error)
+
+
+@pytest.mark.parametrize("sigma", [0.8, 1.0])
+def test_a_thin_plate_seen_from_one_side_is_not_surely_registered(sigma, monkeypatch):
+    monkeypatch.setattr(plate_clouds, "SIGMA", sigma)
+    scene = plate_clouds.plate(3.0, 1, plate_clouds.STATIONS[:1], positions=False)
+    result = deviation_step.run(scene, deviation_step.Params(register="fine"))
+    assert result.status == "weak"
+    assert codes(result)[0] == "deviation.registration-uncertain"
+    thick = plate_clouds.plate(8.0, 1, plate_clouds.STATIONS[:1], positions=False)
+    assert deviation_step.run(thick, deviation_step.Params(register="fine")).status == "ok"
 
 
 def test_a_scan_in_another_frame_is_registered_whatever_its_order():
