@@ -300,7 +300,7 @@ def test_killed_at_random_and_run_again(whole, tmp_path):
         process = started(folder, "--jobs", 2)
         until_scenes(folder, left, process)
         time.sleep(dice.uniform(0.0, 0.1))
-        assert len(members(folder)) == 3
+        assert len(members(folder)) >= 3  # the command and its workers, of which one may just be replaced
         process.kill()
         process.communicate()
         assert process.returncode == -signal.SIGKILL, "killed too late"
