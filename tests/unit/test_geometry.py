@@ -150,6 +150,13 @@ def test_the_order_by_cells_does_not_depend_on_that_of_the_file():
     np.testing.assert_array_equal(sorted_points, shuffled[neighbors.by_cell(shuffled, 40.0)])
 
 
+@pytest.mark.parametrize("grid_mm", [1e-6, 7.0])
+def test_the_order_by_cells_is_that_of_sorting_by_cell_and_coordinates(grid_mm):
+    points = np.round(np.random.default_rng(5).uniform(0.0, 300.0, (3000, 3)) / grid_mm) * grid_mm
+    x, y, z = (points - points.min(axis=0)).T // 40.0
+    np.testing.assert_array_equal(neighbors.by_cell(points, 40.0), np.lexsort((*points.T[::-1], z, y, x)))
+
+
 def test_the_nearest_rotation_is_the_polar_factor_and_never_a_reflection():
     R = rigid.rotation_from_vector(np.array([0.4, -1.1, 0.7]))
     stretch = np.array([[3.0, 0.5, 0.1], [0.5, 2.0, 0.3], [0.1, 0.3, 1.0]])

@@ -387,9 +387,9 @@ def shown(points: Floats, T: Floats, samples: Floats) -> int:
     """Count the samples that have a point within TELLING_MM, the points placed by T (4, 4)."""
     if len(samples) == 0:
         return 0
-    placed = rigid.apply(T, points)
-    near = ((placed > samples.min(axis=0) - TELLING_MM) & (placed < samples.max(axis=0) + TELLING_MM)).all(axis=1)
+    placed = rigid.apply(rigid.invert(T), samples)  # few, where the points are many
+    near = ((points > placed.min(axis=0) - TELLING_MM) & (points < placed.max(axis=0) + TELLING_MM)).all(axis=1)
     if not near.any():
         return 0
-    distance = cKDTree(placed[near], balanced_tree=False).query(samples, distance_upper_bound=TELLING_MM, workers=-1)[0]
+    distance = cKDTree(points[near], balanced_tree=False).query(placed, distance_upper_bound=TELLING_MM, workers=-1)[0]
     return int(np.isfinite(distance).sum())
