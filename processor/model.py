@@ -517,12 +517,45 @@ class AsBuilt(Checked):
 
 
 @dataclass(frozen=True)
+class BodyTruth(Checked):
+    """The bodies of a structure by name, how each moved as a whole, and the row (m,) of the body of each true point.
+
+    ``shift`` is that of the middle of a body's box in the design, ``turn`` the rotation vector about it; NaN for a
+    body that is missing. Bends and dents are none of either.
+    """
+
+    names: tuple[str, ...] = names("b")
+    of_point: Labels = column("m", dtype=np.int32)
+    shift: Floats = column("b", 3)  # mm
+    turn: Floats = column("b", 3)  # rad
+
+    @property
+    def moved(self) -> Flags:
+        """Whether each body (b,) moved as a whole."""
+        known = np.isfinite(self.shift).all(axis=1)
+        changed: Flags = known & ((self.shift != 0.0).any(axis=1) | (self.turn != 0.0).any(axis=1))
+        return changed
+
+
+@dataclass(frozen=True)
 class StructureTruth(Checked):
-    """Points of the design's surface with their outward normals, and where the structure really has them (mm)."""
+    """Points of the design's surface with their outward normals, and where the structure really has them (mm).
+
+    ``bodies`` are None where the structure is no model of named bodies.
+    """
 
     points: Floats = column("m", 3)
     normals: Floats = column("m", 3)
     displacement: Floats = column("m", 3)
+    bodies: BodyTruth | None = newer()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.bodies is not None and len(self.bodies.of_point) != len(self.points):
+            raise RecordError(
+                f"StructureTruth.bodies: expected a row for each of {len(self.points)} points, "
+                f"found {len(self.bodies.of_point)}"
+            )
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from designgen.models.subdivision import Spacing, subdivided
 from designgen.randomness import generator
 from designgen.reading import filled
 from designgen.scanning import triangle_tree
-from processor.model import AsBuilt, DefectTruth, Floats, StructureTruth, UsageError
+from processor.model import AsBuilt, BodyTruth, DefectTruth, Floats, StructureTruth, UsageError
 
 TRUTH_POINTS, LEAST_TRUTH_POINTS = 20_000, 60  # of the whole model, by area; of a body, at least
 DENT_TRUTH_POINTS = 400  # in addition, in and about a dent
@@ -120,16 +120,16 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
     """Return a model as built, and its truth."""
     ledger, defects = Ledger(), list[_Defect]()
     built: list[ModelBody | None] = []
-    truths = []
+    truths = list[_Sampled]()
     areas = np.array([_areas(body).sum() for body in model.bodies])
     view = _View.of(model) if params else None
-    for body, share in zip(model.bodies, areas / areas.sum(), strict=True):
+    for row, (body, share) in enumerate(zip(model.bodies, areas / areas.sum(), strict=True)):
         count = max(LEAST_TRUTH_POINTS, int(TRUTH_POINTS * share))
         points, normals = spread(body.vertices[body.triangles], count)
         deviations = params.get(body.name)
         if deviations is None:
             built.append(body)
-            truths.append((points, normals, np.zeros_like(points)))
+            truths.append(_Sampled(row, points, normals, np.zeros_like(points)))
             continue
         if deviations.missing:
             built.append(None)
@@ -141,12 +141,40 @@ def build(model: Model, params: Mapping[str, Params], seed: int) -> Built:
         built.append(_displaced(body, parts))
         near = _about(parts, body)
         points, normals = np.concatenate([points, near[0]]), np.concatenate([normals, near[1]])
-        truths.append((points, normals, parts.displacement(points)))
+        truths.append(_Sampled(row, points, normals, parts.displacement(points)))
         defects += parts.defects
         for what, value, unit in parts.notes:
             ledger.note(what, body.name, value, unit)
-    columns = [np.concatenate(column) for column in zip(*truths, strict=True)] if truths else [np.empty((0, 3))] * 3
-    return Built(tuple(built), StructureTruth(*columns), _truth(defects), ledger.record() if params else None)
+    movement = _sampled_movement(model, params, truths)
+    return Built(tuple(built), movement, _truth(defects), ledger.record() if params else None)
+
+
+class _Sampled(NamedTuple):
+    """Points (n, 3) of the design of the body in a row of the model, normals, and displacements."""
+
+    row: int
+    points: Floats
+    normals: Floats
+    displacement: Floats
+
+
+def _sampled_movement(model: Model, params: Mapping[str, Params], of_bodies: Sequence[_Sampled]) -> StructureTruth:
+    """Return the movement of all bodies, and of each as a whole."""
+    gone = np.full(3, np.nan)
+    as_wholes = [params.get(body.name, Params()) for body in model.bodies]
+    bodies = BodyTruth(
+        names=tuple(body.name for body in model.bodies),
+        of_point=np.repeat([one.row for one in of_bodies], [len(one.points) for one in of_bodies]).astype(np.int32),
+        shift=np.array([gone if one.missing else one.move_mm for one in as_wholes]),
+        turn=np.array([gone if one.missing else np.radians(one.turn_deg) for one in as_wholes]),
+    )
+    empty = [np.empty((0, 3))]
+    return StructureTruth(
+        points=np.concatenate([one.points for one in of_bodies] or empty),
+        normals=np.concatenate([one.normals for one in of_bodies] or empty),
+        displacement=np.concatenate([one.displacement for one in of_bodies] or empty),
+        bodies=bodies,
+    )
 
 
 def _truth(defects: Sequence[_Defect]) -> DefectTruth:

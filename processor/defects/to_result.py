@@ -193,6 +193,9 @@ def _shape_defect(search: Search, component: int, rows: Ints, judged: Significan
     area = surface.share[rows] * surface.charts.cell_mm**2
     both_ways = kind in ("twist", "waviness")
     volume = float((np.abs(value) if both_ways else -value) @ area)
+    if kind == RIGID:  # what is swept: a round face goes outward on one side and inward on the other
+        inward, outward = (float(np.maximum(way * value, 0.0) @ area) for way in (-1.0, 1.0))
+        volume = inward if inward >= outward else -outward
     values = _row(
         classes.of_shape(kind, judged.margin),
         surface.names[component],

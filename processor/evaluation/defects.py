@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
+
 import numpy as np
 import numpy.typing as npt
 
 from processor.defects.result import DefectClass, Defects, Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls, signed
-from processor.model import Better, DefectTruth, Floats, Ints, Metric, Scene, Statistic, Truth
+from processor.model import Better, BodyTruth, DefectTruth, Floats, Ints, Metric, Scene, Statistic, Truth
 
 DEPTH_SHARE = 0.10
 DEPTH_LODS = 2.0
@@ -15,14 +17,15 @@ CLASS_SHARE = 0.9
 NAN = float("nan")
 WRONG_DEPTHS = "depths off by more than a tenth and 2 LOD95"
 NEAR_MM = 30.0
+OPPOSITE = -0.9  # cosine between the normals of two sides of a plate
 ALARM_SDS = 3.0  # standard deviations of the number of false alarms that the limit allows
 
 
-def matched(defects: Defects, truth: DefectTruth) -> Ints:
+def matched(defects: Defects, truth: DefectTruth, named: bool = False) -> Ints:
     """Return the row (t,) of each true defect among those found, -1 = missed.
 
     It is the one whose centre is nearest, within the radius of a disc of the true area and ``NEAR_MM``; of those
-    within, one of the same class goes first.
+    within, one of the same class goes first, and before it, where components are ``named`` bodies, one of the same.
     """
     rows = np.full(len(truth.ids), -1, np.int64)
     taken: set[int] = set()
@@ -35,7 +38,11 @@ def matched(defects: Defects, truth: DefectTruth) -> Ints:
             reach = max(reach, 0.5 * float(defects.extent[int(np.argmin(distance)), 0]) + NEAR_MM)
         order = sorted(
             (row for row in np.flatnonzero(distance < reach).tolist() if row not in taken),
-            key=lambda row: (defects.defect_class[row] != truth.classes[k], distance[row]),
+            key=lambda row: (
+                named and defects.component[row] != truth.components[k],
+                defects.defect_class[row] != truth.classes[k],
+                distance[row],
+            ),
         )
         if order:
             rows[k] = order[0]
@@ -58,15 +65,22 @@ def check(scene: Scene, result: Result, truth: Truth) -> list[Metric]:
     if truth.defects is None:
         return []
     limited = result.method != "paper"  # figures of the baseline have no limits
-    rows = matched(result.defects, truth.defects)
+    bodies = truth.structure.bodies if truth.structure is not None else None
+    if scene.structure is None or scene.structure.bodies is None:
+        bodies = None  # components that are not named by the design have no true name
+    rows = matched(result.defects, truth.defects, named=bodies is not None)
     metrics = _missed(truth.defects, rows, limited)
-    false = len(result.defects) - int((rows >= 0).sum())
+    behind = _other_sides(result.defects, truth.defects, rows) if bodies is not None else 0
+    false = len(result.defects) - int((rows >= 0).sum()) - behind
     expected = result.examined_mm2 / 1e8
     most = np.floor(expected + ALARM_SDS * np.sqrt(expected) + 1.0) if np.isfinite(expected) and limited else NAN
     metrics += [
         Metric("defects", "false alarms", float(false), Statistic.COUNT, limit=float(most)),
         Metric("defects", "surface examined", result.examined_mm2 / 1e6, unit="m2", better=Better.HIGH),
     ]
+    if bodies is not None:
+        metrics += _bodies(result.defects, truth.defects, rows, bodies, limited)
+        metrics.append(Metric("defects", "other sides of dents and bulges", float(behind), Statistic.COUNT))
     if truth.pose is not None and result.T_design_project.size and result.covariance.size:
         pulls = pose_pulls(result.T_design_project, truth.pose.T_design_project, result.covariance)
         metrics += covered_pulls("defects", "poses", pulls)
@@ -82,6 +96,43 @@ def _missed(truth: DefectTruth, rows: Ints, limited: bool) -> list[Metric]:
     return [
         Metric("defects", f"missed: {kind}", float((rows[classes == kind] < 0).sum()), Statistic.COUNT, limit=limit)
         for kind in dict.fromkeys(truth.classes)
+    ]
+
+
+def _other_sides(defects: Defects, truth: DefectTruth, rows: Ints) -> int:
+    """Return the number of unmatched defects that are the other side of a plate with a dent or bulge that was found.
+
+    They lie on the same body within the true radius, face the other way and have a depth of the other sign.
+    """
+    free = np.setdiff1d(np.arange(len(defects)), rows)
+    behind = np.zeros(len(free), bool)
+    for k, row in enumerate(rows.tolist()):
+        if row < 0 or truth.classes[k] not in (DefectClass.DENT, DefectClass.BULGE):
+            continue
+        near = np.linalg.norm(defects.centre[free] - truth.centres[k], axis=1) < np.sqrt(truth.area_mm2[k] / np.pi)
+        against = defects.axes[free, 2] @ defects.axes[row, 2] < OPPOSITE
+        against &= defects.depth_max[free] * defects.depth_max[row] < 0.0
+        behind |= near & against & np.array([defects.component[i] == truth.components[k] for i in free], bool)
+    return int(behind.sum())
+
+
+def _bodies(defects: Defects, truth: DefectTruth, rows: Ints, bodies: BodyTruth, limited: bool) -> list[Metric]:
+    """Return how far defects are of the right bodies: each that moved is one misalignment, and no other is one."""
+    found = Counter(
+        name
+        for name, kind in zip(defects.component, defects.defect_class, strict=True)
+        if kind is DefectClass.MISALIGNMENT
+    )
+    moved = {name for name, has_moved in zip(bodies.names, bodies.moved, strict=True) if has_moved}
+    wrong = sum(
+        row >= 0 and defects.component[row] != name for row, name in zip(rows.tolist(), truth.components, strict=True)
+    )
+    not_one, others = sum(found[name] != 1 for name in moved), len(set(found) - moved)
+    limit = 0.0 if limited else NAN
+    return [
+        Metric("defects", "defects of another body than the true one", float(wrong), Statistic.COUNT, limit=limit),
+        Metric("defects", "moved bodies that are not one misalignment", float(not_one), Statistic.COUNT, limit=limit),
+        Metric("defects", "bodies called misaligned that did not move", float(others), Statistic.COUNT, limit=limit),
     ]
 
 

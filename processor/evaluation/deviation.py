@@ -9,7 +9,7 @@ from processor.deviation.result import Result
 from processor.evaluation.error_statistics import covered, covered_pulls, pose_pulls
 from processor.geometry import principal, rigid
 from processor.geometry.surface_registration import Registration
-from processor.model import Floats, Metric, Scene, Statistic, Status, StructureTruth, Truth
+from processor.model import Flags, Floats, Ints, Metric, Scene, Statistic, Status, StructureTruth, Truth
 
 NEIGHBOURS = 24
 REACH_MM = 500.0  # of a core point: a movement is smooth
@@ -21,6 +21,7 @@ LODS = 2.0  # levels of detection beyond which a movement has to be found
 LEAST_SHARE = 0.2  # of a structure's surface that did not move
 MOST_FALSE, MOST_MISSED = 6.0, 10.0  # %
 STABLE_POSE_MM, STABLE_POSE_MRAD, AS_DESIGNED_MM = 0.5, 0.05, 0.05
+ALIKE = 0.9  # cosine between normals of one face at places near each other
 BEYOND_LIMIT = 5.0  # % of core points farther from the truth than their level of detection
 
 
@@ -105,8 +106,7 @@ def _moved_and_not(result: Result, truth: StructureTruth) -> list[Metric]:
     A core point moved where the movement along its normal is over twice its LOD95. Limits are for structures of which
     one part moved, and for the mean of those exactly as designed.
     """
-    nearest = cKDTree(truth.points).query(result.core.points + result.origin)[1]
-    displacement = truth.displacement[nearest]
+    displacement = truth.displacement[_nearest(result, truth)]
     still = np.linalg.norm(displacement, axis=1) < STABLE_MM
     along = np.abs(np.einsum("ki,ki->k", displacement, result.core.normals))
     lod95, found = result.core.lod95, np.abs(result.core.distance)
@@ -152,6 +152,25 @@ def _held_by_steel_at_rest(result: Result, truth: StructureTruth) -> bool:
     return at_rest > LEAST_SHARE and np.allclose(result.T_design_scan, result.T_stable_fit, rtol=0.0, atol=1e-6)
 
 
+def _nearest(result: Result, truth: StructureTruth) -> Ints:
+    """Return the nearest row (k,) of the truth to each core point; with named bodies one on a face as its own."""
+    count = 1 if truth.bodies is None else min(NEIGHBOURS, len(truth.points))
+    index = cKDTree(truth.points).query(result.core.points + result.origin, k=count)[1].reshape(len(result.core), -1)
+    first = _first_alike(result, truth, index, np.ones(index.shape, bool))
+    rows: Ints = np.take_along_axis(index, first[:, None], axis=1)[:, 0]
+    return rows
+
+
+def _first_alike(result: Result, truth: StructureTruth, at: Ints, near: Flags) -> Ints:
+    """Return which (k,) of the neighbours ``at`` (k, n) of each core point is the first on a face as its own, or 0.
+
+    Bodies that touch move apart: what is true of one is not of the other.
+    """
+    alike = near & (np.einsum("knc,kc->kn", truth.normals[at], result.core.normals) > ALIKE)
+    first: Ints = np.argmax(alike, axis=1)
+    return first
+
+
 def true_deviation(result: Result, truth: StructureTruth, true_pose: Floats) -> Floats:
     """Movement (k,) along the normal of each core point by the nearest points of the truth, NaN where none is near."""
     places = truth.points - result.origin
@@ -161,6 +180,9 @@ def true_deviation(result: Result, truth: StructureTruth, true_pose: Floats) -> 
     distance, index = distance.reshape(len(result.core), -1), index.reshape(len(result.core), -1)
     near = np.isfinite(distance)
     at = np.minimum(index, len(places) - 1)
+    if truth.bodies is not None:
+        body, first = truth.bodies.of_point[at], _first_alike(result, truth, at, near)
+        near &= body == np.take_along_axis(body, first[:, None], axis=1)
     off = (places[at] - result.core.points[:, None]) / REACH_MM
     weight = np.where(near, 1.0 / (distance**2 + LEAST_MM**2), 0.0)
     basis = np.concatenate([np.ones((*off.shape[:2], 1)), off], axis=2)  # a plane: the movement at the core point

@@ -16,6 +16,7 @@ import numpy as np
 from processor.model import (
     ArchTruth,
     AsBuilt,
+    BodyTruth,
     DefectTruth,
     FrameTruth,
     InputError,
@@ -64,4 +65,9 @@ def read(folder: Path) -> Truth | None:
 def _record(kind: type[Any], table: dict[str, Any]) -> Any:
     """Return a record made of lists; an unknown key raises TypeError."""
     arrays = {field.name: field.metadata["dtype"] for field in dataclasses.fields(kind) if "dtype" in field.metadata}
-    return kind(**{key: np.array(value, arrays[key]) if key in arrays else value for key, value in table.items()})
+    values: dict[str, Any] = {
+        key: np.array(value, arrays[key]) if key in arrays else value for key, value in table.items()
+    }
+    if values.get("bodies") is not None:
+        values["bodies"] = _record(BodyTruth, values["bodies"])
+    return kind(**values)

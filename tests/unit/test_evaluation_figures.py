@@ -10,13 +10,17 @@ from processor.deviation.result import Result as DeviationResult
 from processor.evaluation import defects, deviation, error_statistics, space_frame, stitching
 from processor.geometry import rigid
 from processor.model import (
+    BodyTruth,
     DefectTruth,
+    DesignBodies,
     FrameTruth,
     PoseTruth,
+    RecordError,
     Scan,
     Scene,
     StationTruth,
     Statistic,
+    StructureDesign,
     StructureTruth,
     Truth,
 )
@@ -76,6 +80,30 @@ def test_a_structure_in_a_frame_of_its_own_is_held_against_the_truth_there():
     assert beyond["unmoved steel beyond LOD95"].value == 100.0
 
 
+def test_bodies_that_touch_have_each_its_own_truth():
+    """Two plates side by side, one 3 mm up: with bodies named, the truth beside the joint is that of each plate."""
+    x, y = (c.ravel() for c in np.meshgrid(np.arange(0.0, 2000.0, 50.0) + 5.0, np.arange(0.0, 1000.0, 50.0)))
+    at, of_point = np.stack([x, y, np.zeros(len(x))], axis=1), (x > 1000.0).astype(np.int32)
+    # The edge of the second plate, seen from the first, faces it: its points are of no face that core points are on.
+    edge = np.stack([np.full(20, 1000.0), np.arange(20) * 50.0, np.full(20, -2.0)], axis=1)
+    at, of_point = np.vstack([at, edge]), np.append(of_point, np.ones(20, np.int32))
+    up = np.vstack([np.tile([0.0, 0.0, 1.0], (len(x), 1)), np.tile([-1.0, 0.0, 0.0], (20, 1))])
+    moved = 3.0 * of_point[:, None] * [0.0, 0.0, 1.0]
+    bodies = BodyTruth(("a", "b"), of_point, [[0.0] * 3, [0.0, 0.0, 3.0]], np.zeros((2, 3)))
+    core = CorePoints(
+        points=at[: len(x)], normals=up[: len(x)], distance=moved[: len(x), 2], lod95=np.full(len(x), 0.1),
+        n1=np.full(len(x), 9), n2=np.full(len(x), 9), std1=np.zeros(len(x)), std2=np.zeros(len(x)),
+    )  # fmt: skip
+    result = DeviationResult(status="ok", method="default", T_design_scan=np.eye(4), core=core)
+    name, scene = "deviations within their 95 % intervals", Scene("plates", "structure", (Scan("s", at),))
+    of_bodies = figures(deviation.check(scene, result, Truth(structure=StructureTruth(at, up, moved, bodies))))
+    assert of_bodies[name].value == 100.0
+    assert of_bodies["unmoved steel beyond LOD95"].value == of_bodies["moved steel within LOD95"].value == 0.0
+    assert figures(deviation.check(scene, result, Truth(structure=StructureTruth(at, up, moved))))[name].value < 90.0
+    with pytest.raises(RecordError, match="a row for each of 5 points, found 820"):
+        StructureTruth(at[:5], up[:5], moved[:5], bodies)
+
+
 def test_a_pose_that_is_turned_is_told_by_its_error_and_by_the_steel_that_did_not_move():
     found = slab(0.0, turn=1.0)
     assert found["pose, turn"].value == pytest.approx(1.0, rel=1e-6)
@@ -122,6 +150,57 @@ def test_depths_and_volumes_have_their_coverage_and_parts_that_are_gone_have_non
     assert told["volumes within their 95 % intervals"].value == 100.0
     assert (told["depths, number"].value, told["areas, bias"].value) == (2.0, pytest.approx(-5.0))
     assert told["depth error, max"].value == pytest.approx(1.0)
+
+
+def of_bodies(*rows):
+    """Return the figures of defects by class, component, place along x, depth and side; b moved, a has a dent at 0."""
+    count = len(rows)
+    classes, components, x, depth, side = zip(*rows, strict=True)
+    found = Defects(
+        id=np.arange(count), defect_class=classes, confidence=np.ones(count), otherwise=("pit",) * count,
+        component=components, centre=np.outer(x, [1.0, 0.0, 0.0]), area_mm2=np.full(count, 1e4), depth_max=depth,
+        depth_ci95=np.ones(count), depth_mean=np.zeros(count), volume_mm3=np.zeros(count), volume_ci95=np.ones(count),
+        axes=np.tile(np.eye(3), (count, 1, 1)) * np.array(side)[:, None, None], extent=np.ones((count, 2)),
+        edge_distance=np.zeros(count), curvature_per_m=np.zeros(count), lod95=np.full(count, 0.1), z=np.ones(count),
+        chance=np.zeros(count), doubtful=np.zeros(count, bool), reasons=((),) * count,
+    )  # fmt: skip
+    true = DefectTruth(
+        ids=[0, 1], classes=("dent", "misalignment"), components=("a", "b"), centres=[[0.0] * 3, [1e3, 0.0, 0.0]],
+        area_mm2=[1e4, 1e4], depth_max_mm=[5.0, 5.0], volume_mm3=[0.0, 0.0],
+    )  # fmt: skip
+    moved = BodyTruth(("a", "b"), np.zeros(1, np.int32), [[0.0] * 3, [5.0, 0.0, 0.0]], np.zeros((2, 3)))
+    structure = StructureTruth(np.zeros((1, 3)), np.zeros((1, 3)), np.zeros((1, 3)), moved)
+    design = StructureDesign("s", np.zeros((3, 3)), [[0, 1, 2]], DesignBodies(("a", "b"), [0]))
+    result = DefectsResult(status="ok", method="default", defects=found, examined_mm2=1e6)
+    scene, truth = Scene("s", "structure", structure=design), Truth(structure=structure, defects=true)
+    told = figures(defects.check(scene, result, truth))
+    names = (
+        "defects of another body than the true one",
+        "moved bodies that are not one misalignment",
+        "bodies called misaligned that did not move",
+        "other sides of dents and bulges",
+    )
+    return [*(told[name].value for name in names), told["false alarms"].value]
+
+
+DENT, MOVED = ("dent", "a", 0.0, 5.0, 1.0), ("misalignment", "b", 1000.0, 5.0, 1.0)
+
+
+def test_defects_are_held_against_the_names_of_bodies():
+    assert of_bodies(DENT, MOVED) == [0, 0, 0, 0, 0]
+    assert of_bodies(("dent", "b", 0.0, 5.0, 1.0), MOVED) == [1, 0, 0, 0, 0]
+    assert of_bodies(("misalignment", "a", 0.0, 5.0, 1.0), MOVED) == [0, 0, 1, 0, 0]
+    assert of_bodies(DENT, MOVED, ("misalignment", "b", 1010.0, 5.0, 1.0)) == [0, 1, 0, 0, 1]
+    assert of_bodies(DENT, ("misalignment", "a", 1000.0, 5.0, 1.0), MOVED) == [0, 0, 1, 0, 1], "by its name"
+    assert of_bodies(DENT) == [0, 1, 0, 0, 0]
+
+
+def test_the_other_side_of_a_dented_plate_is_no_false_alarm():
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 30.0, -4.0, -1.0)) == [0, 0, 0, 1, 0]
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 30.0, -4.0, 1.0)) == [0, 0, 0, 0, 1], "the same side"
+    assert of_bodies(DENT, MOVED, ("unknown", "b", 30.0, -4.0, -1.0)) == [0, 0, 0, 0, 1], "another body"
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 30.0, 4.0, -1.0)) == [0, 0, 0, 0, 1], "inward, too"
+    assert of_bodies(DENT, MOVED, ("unknown", "a", 90.0, -4.0, -1.0)) == [0, 0, 0, 0, 1], "beside it"
 
 
 # --- stitching --------------------------------------------------------------------------------------------------------

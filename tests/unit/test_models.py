@@ -23,6 +23,7 @@ from designgen.scanning.surfaces import Builder
 from designgen.scenes import make
 from designgen.scenes.model import recipe_of
 from processor.model import InputError, UsageError
+from processor.store import store
 
 QUIET = scanner.Scanner(**{**scanner.preset("phase"), "flying_share": 0.0, "threshold": 0.0})
 FINE = {"scan.scanner": "plain-2mm", "scanner.noise_mm": 0.0, "scan.step_mrad": 2.5}
@@ -307,6 +308,19 @@ def test_a_moved_body_and_its_truth(built):
     assert defects.depth_max_mm[0] == pytest.approx(10.0, abs=0.05)
     design = built.scene.structure.vertices
     assert design[:, 0].max() == pytest.approx(780.0, abs=0.01), "the design is not moved"
+
+
+def test_the_truth_names_bodies_and_their_movements(built, tmp_path):
+    bodies, points = built.truth.structure.bodies, built.truth.structure.points
+    assert bodies.names == ("moved", "dented", "gone")
+    assert bodies.moved.tolist() == [True, False, False]
+    np.testing.assert_array_equal(bodies.shift, [[10.0, 0.0, 0.0], [0.0] * 3, [np.nan] * 3])
+    np.testing.assert_array_equal(bodies.of_point == 0, points[:, 0] > 610.0)
+    assert set(bodies.of_point.tolist()) == {0, 1}
+    store.write_scene(tmp_path / "s.h5", built.scene, built.truth, {})
+    again = store.read_truth(tmp_path / "s.h5", labels=False).structure.bodies
+    np.testing.assert_array_equal(again.of_point, bodies.of_point)
+    assert again.names == bodies.names
 
 
 def test_a_dent_has_its_shape(built):
