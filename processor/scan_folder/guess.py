@@ -18,7 +18,7 @@ from processor.readers import RawScan
 from processor.scan_folder import component_names
 from processor.scan_folder.checked_toml import existing_file_in
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
-from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files
+from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files, scan_files_below
 from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.shapes import files as surface_files
 from processor.scan_folder.shapes import guess_design
@@ -87,7 +87,7 @@ def guess(folder: Path, design_units: str = "") -> Guess:
     path = _written_design(folder, project)
     groups = [] if path else surface_files.candidates(folder)
     surfaces = [one for group in groups for one in group]
-    project.scans = [_read_scan(folder, file, project) for file in scan_files(folder, [path, *surfaces])]
+    project.scans = [_read_scan(folder, file, project) for file in scan_files_below(folder, [path, *surfaces])]
     design = _read_design(folder, path, project) if path else _shown_design(folder, groups, design_units, project)
     if not design and len(surfaces) > 1:  # they may be scans with faces
         project.scans += [_read_scan(folder, file, project) for file in scan_files(folder, [path]) if file in surfaces]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -13,6 +14,7 @@ from processor.model import Floats, Ints
 
 WELD_MM = 1e-4  # vertices nearer to each other are one: far below any edge and far above rounding
 SHARP_RAD = np.radians(20.0)  # between the facets on both sides of an edge; curved plates turn less from facet to facet
+ROUNDED_MM, FEWEST_ROUNDED = (10.0, 1.0, 0.1), 100  # a few vertices may have such coordinates by their design
 
 Mask = npt.NDArray[np.bool_]
 
@@ -71,12 +73,34 @@ class Body:
         return int((self.edges[1][:, 0] < 0).sum())
 
     @cached_property
+    def step_mm(self) -> float:
+        """Step of the coordinates where they are rounded to 0.1 mm or more, else 0."""
+        for step in ROUNDED_MM if len(self.vertices) >= FEWEST_ROUNDED else ():
+            if np.abs(self.vertices / step - np.round(self.vertices / step)).max() < 1e-3:
+                return step
+        return 0.0
+
+    @cached_property
     def sharp(self) -> Ints:
         """Vertices (s, 2) of the edges where the surface turns, and of those at which it ends."""
-        ends, sides = self.edges
-        cosine = np.abs(np.einsum("ei,ei->e", self.normals[sides[:, 0]], self.normals[sides[:, 1]]))
-        sharp: Ints = ends[(sides[:, 0] < 0) | (cosine < np.cos(SHARP_RAD))]
+        sharp: Ints = self.edges[0][self.turning]
         return sharp
+
+    @cached_property
+    def turning(self) -> Mask:
+        """Whether an edge (e,) is sharp, or has not exactly two facets."""
+        sides = self.edges[1]
+        cosine = np.abs(np.einsum("ei,ei->e", self.normals[sides[:, 0]], self.normals[sides[:, 1]]))
+        return np.asarray((sides[:, 0] < 0) | (cosine < np.cos(SHARP_RAD)))
+
+    @cached_property
+    def faces_between(self) -> Ints:
+        """Number (f,) of the face that each facet belongs to: faces end at sharp edges."""
+        sides = self.edges[1][~self.turning]
+        count = len(self.faces)
+        graph = sparse.coo_matrix((np.ones(len(sides), np.int8), (sides[:, 0], sides[:, 1])), (count, count))
+        label: Ints = sparse.csgraph.connected_components(graph, directed=False)[1]
+        return label
 
 
 def welded(name: str, vertices: Floats, faces: Ints) -> Body | None:
@@ -114,3 +138,10 @@ def pieces(body: Body) -> list[Body]:
         used, renumbered = np.unique(faces, return_inverse=True)
         result.append(Body(body.name, body.vertices[used], renumbered.reshape(-1, 3).astype(np.int64)))
     return result
+
+
+def stacked(name: str, bodies: Sequence[Body]) -> Body:
+    """Return one mesh of several bodies, which share no vertices."""
+    counts = np.cumsum([0, *(len(body.vertices) for body in bodies)]).tolist()
+    faces = [body.faces + first for body, first in zip(bodies, counts, strict=False)]
+    return Body(name, np.concatenate([body.vertices for body in bodies]), np.concatenate(faces))

@@ -11,6 +11,7 @@ from processor.model import Floats
 from processor.scan_folder.shapes.body import Body
 
 AT_CORNER_MM = 0.2  # distance of the first vertex from the corner
+BEVEL_MM, BEVEL_SLOPE = 60.0, 0.02  # how far behind the corner the edge may begin, and how far aside by that
 TURN_COS = np.cos(np.radians(35.0))  # an edge that turns more at a vertex has ended
 STEP_MM = 100.0  # between points of a curved edge
 STRAIGHT_MM = 1e-3
@@ -19,11 +20,17 @@ STRAIGHT_MM = 1e-3
 def follow(body: Body, corner: Floats, inward: Floats) -> Floats:
     """Return the vertices (n, 3) of the sharp edge from a corner (3,) into a body, until it ends; n = 0 for none.
 
-    ``inward`` (3,) leads from the corner into the body. At a fork the edge goes on straight.
+    ``inward`` (3,) leads from the corner along the edge. Where no vertex is at the corner, as with a bevel, the edge
+    begins with the next one on it. At a fork the edge goes on straight.
     """
-    first = int(np.linalg.norm(body.vertices - corner, axis=1).argmin())
-    if np.linalg.norm(body.vertices[first] - corner) > AT_CORNER_MM:
+    off = body.vertices[np.unique(body.sharp)] - corner
+    inward = inward / np.linalg.norm(inward)
+    along = off @ inward
+    aside = np.linalg.norm(off - along[:, None] * inward, axis=1)
+    beginning = (along > -AT_CORNER_MM) & (along < BEVEL_MM) & (aside < AT_CORNER_MM + BEVEL_SLOPE * np.abs(along))
+    if not beginning.any():
         return np.empty((0, 3))
+    first = int(np.unique(body.sharp)[beginning][np.linalg.norm(off[beginning], axis=1).argmin()])
     beside = defaultdict(list)
     for a, b in body.sharp.tolist():
         beside[a].append(b)
@@ -36,8 +43,7 @@ def follow(body: Body, corner: Floats, inward: Floats) -> Floats:
         ways = body.vertices[others] - body.vertices[path[-1]]
         ways /= np.linalg.norm(ways, axis=1, keepdims=True)
         best = int((ways @ way).argmax())
-        # The first edge may be skew to the end's normal.
-        if ways[best] @ way < (TURN_COS if len(path) > 1 else 0.5):
+        if ways[best] @ way < TURN_COS:
             break
         path.append(others[best])
         seen.add(others[best])

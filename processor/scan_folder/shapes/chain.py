@@ -58,12 +58,15 @@ def find(bodies: Sequence[Body]) -> Chain | str:
         return f"{bodies[i].name} meets {_names(bodies, beside[i])}: the order of the parts is not clear"
     chains = _paths(beside)
     if not chains:
-        return f"no two of {_names(bodies, range(len(bodies)))} meet end to end, or lie {GAP_MM:g} mm apart at most"
-    chains.sort(key=lambda chain: -len(chain))
-    if len(chains) > 1 and len(chains[1]) == len(chains[0]):
         return (
-            f"there are several chains of parts ({_names(bodies, chains[0])}; {_names(bodies, chains[1])}); make a "
-            "folder for each"
+            f"no two of {_names(bodies, range(len(bodies)))} meet end to end, or lie {GAP_MM:g} mm apart at most"
+            f"{_open(bodies)}"
+        )
+    chains.sort(key=lambda chain: -len(chain))
+    if len(chains) > 1:
+        return (
+            f"there are several chains of parts ({_names(bodies, chains[0])}; {_names(bodies, chains[1])}), which do "
+            f"not meet{_open(bodies)}; make a folder for each bridge, or correct the parts between them"
         )
     order = chains[0]
     if _joint_x(contacts, order[0], order[1]) > _joint_x(contacts, order[-2], order[-1]) or (
@@ -77,12 +80,20 @@ def _chain(bodies: Sequence[Body], order: Sequence[int], contacts: Mapping[tuple
     doubts = []
     left_out = [body.name for i, body in enumerate(bodies) if i not in order]
     if left_out:
-        doubts.append(f"{', '.join(left_out)}: meets no part of the bridge end to end, so it is left out")
+        doubts.append(
+            f"{', '.join(left_out)}: meets no part of the bridge end to end{_open(bodies)}, so it is left out"
+        )
     joints = []
     for i, k in pairwise(order):
         one = contacts[min(i, k), max(i, k)]
         joints.append(one if i < k else Contact(one.b, one.a, one.gap_mm, one.rival))
     return Chain(tuple(bodies[i] for i in order), tuple(joints), tuple(doubts))
+
+
+def _open(bodies: Sequence[Body]) -> str:
+    """Return which bodies are not closed: they may lack the faces of their ends."""
+    names = [body.name for body in bodies if body.open_edges]
+    return f" (not closed: {', '.join(names[:6])}{', ...' if len(names) > 6 else ''})" if names else ""
 
 
 def _joint_x(contacts: Mapping[tuple[int, int], Contact], i: int, k: int) -> float:

@@ -15,6 +15,7 @@ SMALL_SHARE = 0.02  # of the largest plane's area: smaller ones are not ends
 PARALLEL_COS = np.cos(np.radians(3.0))
 OVERLAP_SHARE = 0.5  # of the smaller face's extents, in both directions of the plane
 LARGER_MM = 200.0  # one section may project so far beyond the other
+OVERLAP_MM = 10.0  # bodies that overlap more do not meet
 RIVAL_SHARE = 0.5  # of the best pair's area: another pair of faces may as well be the joint
 
 
@@ -36,8 +37,8 @@ class PlaneFace:
 class Contact:
     """Opposite faces of two bodies.
 
-    ``gap_mm`` is the distance between their planes; ``rival`` is true where a second pair of faces, in another plane,
-    is nearly as large.
+    ``gap_mm`` is the distance between their planes, negative where the bodies overlap; ``rival`` is true where a second
+    pair of faces, in another plane, is nearly as large.
     """
 
     a: PlaneFace
@@ -76,25 +77,30 @@ def _facets_near(body: Body, other: Body, limit_mm: float) -> Ints:
 
 def _planes(body: Body, facets: Ints) -> list[PlaneFace]:
     """Return the plane faces that facets (n,) of a body make up, the largest first."""
-    left = facets[np.argsort(-body.areas[facets], kind="stable")]
+    tolerance = max(PLANE_MM, 2.0 * body.step_mm)
+    label = body.faces_between[facets]
+    area = np.bincount(label, weights=body.areas[facets])
+    left = np.ones(len(facets), bool)
     faces: list[PlaneFace] = []
-    for _ in range(MOST_PLANES):
-        if not len(left):
-            break
-        normal, at = body.normals[left[0]], body.vertices[body.faces[left[0], 0]]
-        inside = (np.abs((body.vertices - at) @ normal) < PLANE_MM)[body.faces[left]].all(axis=1)
-        chosen, left = left[inside], left[~inside]
-        points = body.vertices[np.unique(body.faces[chosen])]
-        faces.append(PlaneFace(_normal(points, normal), points, float(body.areas[chosen].sum())))
+    for face in np.argsort(-area, kind="stable")[:MOST_PLANES].tolist():
+        seed = left & (label == face)
+        if not area[face] > SMALL_SHARE * area.max() or not seed.any():
+            continue
+        points = body.vertices[np.unique(body.faces[facets[seed]])]
+        normal, origin = _normal(points), points.mean(axis=0)
+        if np.abs((points - origin) @ normal).max() > tolerance:
+            continue  # curved
+        inside = left & (np.abs((body.vertices - origin) @ normal) <= tolerance)[body.faces[facets]].all(axis=1)
+        left &= ~inside
+        points = body.vertices[np.unique(body.faces[facets[inside]])]
+        faces.append(PlaneFace(_normal(points), points, float(body.areas[facets[inside]].sum())))
     faces.sort(key=lambda face: -face.area)
-    return [face for face in faces if face.area > SMALL_SHARE * faces[0].area]
+    return faces
 
 
-def _normal(points: Floats, near: Floats) -> Floats:
-    """Return the normal of the plane through points (n, 3) by least squares, on the side of ``near``."""
-    _, _, Vt = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    normal: Floats = Vt[2] if Vt[2] @ near > 0 else -Vt[2]
-    return normal
+def _normal(points: Floats) -> Floats:
+    """Return the normal of the plane through points (n, 3) by least squares."""
+    return np.asarray(np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2])
 
 
 def _gap(a: PlaneFace, b: PlaneFace, body_a: Body, body_b: Body) -> float | None:
@@ -105,7 +111,7 @@ def _gap(a: PlaneFace, b: PlaneFace, body_a: Body, body_b: Body) -> float | None
     if out @ (body_b.centre - b.origin) <= 0 or out @ (body_a.centre - a.origin) >= 0:
         return None
     gap = float(out @ (b.origin - a.origin))
-    return max(gap, 0.0) if gap > -PLANE_MM else None
+    return gap if gap > -OVERLAP_MM else None
 
 
 def _overlap(a: PlaneFace, b: PlaneFace) -> bool:

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints
 from processor.scan_folder import component_names
-from processor.scan_folder.shapes import arch, files, unit
-from processor.scan_folder.shapes.body import Body, welded
+from processor.scan_folder.shapes import arch, files, frame, unit
+from processor.scan_folder.shapes.body import Body, stacked, welded
 from processor.scan_folder.units import MM_PER_UNIT
 
 PARTS = ("foot", "rib", "crown")  # words in the names of an arch bridge's parts
@@ -56,25 +58,42 @@ def guess(
             )
         if not units.unit:
             return GuessedDesign(doubts=tuple(doubts), files=_names(folder, chosen))
+    names, json_units = _names(folder, chosen), units.unit if without else "mm"
     bodies, mesh_of, meshes, named = _bodies(folder, surfaces, units.unit)
+    if not bodies:
+        return GuessedDesign(doubts=(*doubts, "no surface has an area"), files=names)
+    balls = frame.find(stacked("all", bodies))
+    if balls.design is not None:
+        return GuessedDesign(
+            design=balls.design,
+            doubts=(*doubts, *balls.doubts),
+            units=json_units,
+            reason=f"balls and the tubes between them, in {_some(names)}",
+            files=names,
+        )
     found = arch.find(bodies)
     whole = len(surfaces) == 1
     if found.design is None or (whole and not found.arched and not _named_as_parts(bodies)):
-        why = [] if whole and not _named_as_parts(bodies) else [f"as an arch bridge: {text}" for text in found.doubts]
-        return GuessedDesign(doubts=(*doubts, *why), files=_names(folder, chosen))
-    kept = {part.name for part in found.design.parts}
+        told = not whole or _named_as_parts(bodies)
+        return GuessedDesign(
+            doubts=(*doubts, *(f"as an arch bridge: {text}" for text in found.doubts if told)), files=names
+        )
+    kept = {mesh_of[part.name] for part in found.design.parts}
     return GuessedDesign(
         design=found.design,
         doubts=(*doubts, *named, *found.doubts),
-        units="mm" if meshes or not without else units.unit,
-        reason=f"{len(kept)} parts that meet end to end, in {', '.join(_names(folder, chosen)[:3])}"
-        + (" and more" if len(chosen) > 3 else ""),
+        units="mm" if meshes else json_units,
+        reason=f"{len(kept)} parts that meet end to end, in {_some(names)}",
         kind_doubt="" if found.arched else "the parts follow each other in a straight line, which is no arch",
         root_gap_mm=found.root_gap_mm,
-        files=_names(folder, chosen),
-        mesh_of={name: mesh for name, mesh in mesh_of.items() if name in kept},
-        meshes=tuple(mesh for mesh in meshes if mesh[0] in {mesh_of[name] for name in kept}),
+        files=names,
+        mesh_of={part.name: mesh_of[part.name] for part in found.design.parts},
+        meshes=tuple(mesh for mesh in meshes if mesh[0] in kept),
     )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
 
 
 def _names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
@@ -130,28 +149,49 @@ def _stem(name: str, taken: dict[str, str]) -> str:
 
 def content(guessed: GuessedDesign, questions: Sequence[str]) -> dict[str, Any]:
     """Return the object of design.json; ``questions`` say what is not sure in it."""
-    assert isinstance(guessed.design, ArchDesign)
-    design, scale = guessed.design, 1.0 / MM_PER_UNIT[guessed.units]
+    head: dict[str, Any] = {"units": guessed.units}
+    if questions:
+        head["unsure"] = [f"? {text}" for text in questions]
+    scale = 1.0 / MM_PER_UNIT[guessed.units]
+    if isinstance(guessed.design, ArchDesign):
+        return {**head, "kind": "arch-bridge", **_arch(guessed.design, guessed.mesh_of, scale)}
+    assert guessed.design is not None
+    return {**head, "kind": "space-frame", **_frame(guessed.design, scale)}
+
+
+def _arch(design: ArchDesign, mesh_of: Mapping[str, str], scale: float) -> dict[str, Any]:
     components = {
         part.name: {
-            "mesh": guessed.mesh_of[part.name],
-            "bottom_edge_left": _rounded(part.bottom_edge_left * scale),
-            "bottom_edge_right": _rounded(part.bottom_edge_right * scale),
+            "mesh": mesh_of[part.name],
+            "bottom_edge_left": _rounded(part.bottom_edge_left, scale),
+            "bottom_edge_right": _rounded(part.bottom_edge_right, scale),
         }
         for part in design.parts
     }
     joints = [
-        {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, _rounded(p * scale), strict=True))}
+        {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, _rounded(p, scale), strict=True))}
         for name, left, right, p in zip(
             design.joint_names, design.joint_left, design.joint_right, design.joint_points, strict=True
         )
     ]
-    head: dict[str, Any] = {"units": guessed.units, "kind": "arch-bridge"}
-    if questions:
-        head["unsure"] = [f"? {text}" for text in questions]
-    return {**head, "order": [part.name for part in design.parts], "components": components, "joints": joints}
+    return {"order": [part.name for part in design.parts], "components": components, "joints": joints}
 
 
-def _rounded(points: Floats) -> list[list[float]]:
-    """Return points (n, 3) with 12 digits: far more than any coordinate has."""
-    return [[float(f"{x:.12g}") for x in point] for point in points]
+def _frame(design: FrameDesign, scale: float) -> dict[str, Any]:
+    centres, radii, diameters = (
+        _rounded(x, scale) for x in (design.centres, design.radii[:, None], design.tube_diameters[:, None])
+    )
+    nodes = [
+        {"id": int(i), "centre": centre, "radius": radius}
+        for i, centre, (radius,) in zip(design.ids, centres, radii, strict=True)
+    ]
+    members = [
+        {"a": int(a), "b": int(b), "tube_diameter": diameter}
+        for a, b, (diameter,) in zip(design.member_a, design.member_b, diameters, strict=True)
+    ]
+    return {"nodes": nodes, "members": members}
+
+
+def _rounded(values_mm: Floats, scale: float) -> list[list[float]]:
+    """Return values (n, k) to a millionth of a millimetre, times ``scale``."""
+    return [[float(f"{x:.12g}") for x in row] for row in np.round(values_mm, 6) * scale + 0.0]

@@ -11,6 +11,7 @@ from processor.model import Floats
 from processor.scan_folder.shapes.body import Body
 
 STRAIGHT_MM = 0.1  # a corner of the hull that is nearer to the line of its neighbours is none
+CHORDS_MM = 1.0  # the same of a section behind the end, which cuts facets of curved faces
 SQUARE_RAD = np.radians(35.0)  # largest departure of a corner from a right angle
 LEVEL_RAD = np.radians(20.0)  # largest slope of the lower and upper edges across the bridge
 DEPTHS_MM = np.array([60.0, 120.0, 180.0])  # of the sections that the skin is followed from to the end
@@ -58,15 +59,18 @@ class Corners:
     doubt: str = ""
 
 
-def corners(places: Floats) -> Corners | None:
-    """Return the corners of the hull of points (n, 2) in a section's plane; None where they enclose no area."""
+def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
+    """Return the corners of the hull of points (n, 2) in a section's plane; None where they enclose no area.
+
+    A side whose points are within ``straight_mm`` of a line is straight.
+    """
     if len(places) < 3:
         return None
     try:
         hull = places[ConvexHull(places).vertices]
     except QhullError:
         return None
-    hull = _without_straight(hull)
+    hull = _without_straight(hull, straight_mm)
     if len(hull) < 4:
         return None
     size = np.ptp(hull, axis=0)
@@ -78,7 +82,7 @@ def corners(places: Floats) -> Corners | None:
     return Corners(hull[chosen], _doubt(hull[chosen], len(hull)))
 
 
-def _without_straight(hull: Floats) -> Floats:
+def _without_straight(hull: Floats, straight_mm: float) -> Floats:
     """Return a convex polygon (n, 2) without vertices on the line of their neighbours."""
     while len(hull) > 3:
         before, after = np.roll(hull, 1, axis=0), np.roll(hull, -1, axis=0)
@@ -86,7 +90,7 @@ def _without_straight(hull: Floats) -> Floats:
         off = hull - before
         distance = np.abs(chord[:, 0] * off[:, 1] - chord[:, 1] * off[:, 0]) / np.linalg.norm(chord, axis=1)
         least = int(distance.argmin())
-        if distance[least] > STRAIGHT_MM:
+        if distance[least] > straight_mm:
             break
         hull = np.delete(hull, least, axis=0)
     return hull
@@ -123,14 +127,15 @@ def cut(body: Body, plane: SectionPlane) -> Floats:
     return plane.flat(first + share[:, None] * (last - first))
 
 
-def skin_at_end(body: Body, plane: SectionPlane, inward: float) -> Floats | None:
-    """Return P1..P4 (4, 2) at a plane, extrapolated from sections inside the body; None where they have no corners.
+def skin_at_end(body: Body, plane: SectionPlane, inward: float) -> tuple[Floats, Floats] | None:
+    """Return P1..P4 (4, 2) at a plane, extrapolated from sections inside, and their change (4, 2) a mm outward.
 
-    ``inward`` is 1 where the body lies on the side of the plane's normal, else -1. A bevel, or a flange around the
-    end, has other corners than the skin.
+    None where the sections have no corners. ``inward`` is 1 where the body lies on the side of the plane's normal, else
+    -1. A bevel, or a flange around the end, has other corners than the skin.
     """
-    inside = [corners(cut(body, plane.moved(inward * depth))) for depth in DEPTHS_MM]
+    inside = [corners(cut(body, plane.moved(inward * depth)), CHORDS_MM) for depth in DEPTHS_MM]
     if any(one is None or one.doubt for one in inside):
         return None
     places = np.array([one.places for one in inside if one is not None])
-    return np.asarray(3.0 * places[0] - 3.0 * places[1] + places[2])
+    at_end = 3.0 * places[0] - 3.0 * places[1] + places[2]
+    return at_end, (at_end - places[0]) / DEPTHS_MM[0]

@@ -12,7 +12,7 @@ from processor.scan_folder.units import MM_PER_UNIT, radius
 
 UNITS = ("mm", "m", "inch", "cm", "ft")
 TOLERANCE = 0.25  # relative difference of a scan's size from its design's
-SIZES_M = (3.0, 1500.0)  # of structures
+SIZES_M = (3.0, 300.0)  # of most structures
 USUAL = ("mm", "m")  # what CAD writes
 
 
