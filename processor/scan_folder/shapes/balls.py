@@ -24,6 +24,8 @@ SURE_RESIDUAL = 1e-3  # of the radius, rms
 SURE_COVER = 0.15  # of the sphere's area: a fillet or a domed cap covers less
 LEAST_COVER = 0.05
 THIN = 0.03  # of the radius: least thickness of what is there of a ball
+TURNING, FEWEST_FACETS = 0.02, 24  # least variance of a ball's normals in any direction; a sphere has 0.33
+RADIAL, LOOSE = 0.95, 0.01  # cosine of its normals from the radius; rms by the radius
 FLATTEST = 1e-5  # volume of four corners by the cube of their size
 
 
@@ -45,6 +47,7 @@ class Balls:
 def find(body: Body) -> Balls:
     """Find the balls of a mesh, each once: of concentric spheres the outer one."""
     ends, edges, centres, radii = _spheres_of_edges(body)
+    used = list[Ints]()
     label = _alike(edges, centres, radii)
     found = []
     order = np.argsort(label, kind="stable")
@@ -56,7 +59,9 @@ def find(body: Body) -> Balls:
             )
             if ball is not None:
                 found.append(ball)
-    return _each_once(np.array(found).reshape(-1, 6))
+                used.append(edges[rows].reshape(-1))
+    found += _of_rounded(body, np.concatenate([np.empty(0, np.int64), *used]))
+    return _each_once(np.array(found).reshape(-1, 7))
 
 
 def _spheres_of_edges(body: Body) -> tuple[Ints, Ints, Floats, Floats]:
@@ -103,8 +108,44 @@ def _alike(edges: Ints, centres: Floats, radii: Floats) -> Ints:
     return label
 
 
+def _of_rounded(body: Body, used: Ints) -> list[list[float]]:
+    """Return the spheres among the faces without a facet in ``used`` (n,), whose normals turn in all directions.
+
+    Where coordinates are rounded by more than a facet bulges, its edges say nothing, but the whole face does.
+    """
+    label = body.faces_between
+    count = int(label.max()) + 1
+    weights = np.bincount(label, weights=body.areas, minlength=count)
+    mean = np.stack([np.bincount(label, weights=body.areas * n, minlength=count) for n in body.normals.T], axis=1)
+    off = body.normals - (mean / weights[:, None])[label]
+    spread = np.zeros((count, 3, 3))
+    for i in range(3):
+        for k in range(3):
+            sums = np.bincount(label, weights=body.areas * off[:, i] * off[:, k], minlength=count)
+            spread[:, i, k] = sums / weights
+    round_ = np.linalg.eigvalsh(spread)[:, 0] > TURNING
+    round_ &= np.bincount(label, minlength=count) >= FEWEST_FACETS
+    round_[label[used]] = False
+    found = []
+    for face in np.flatnonzero(round_).tolist():
+        facets = np.flatnonzero(label == face)
+        points = body.vertices[np.unique(body.faces[facets])]
+        centre = 0.5 * (points.min(axis=0) + points.max(axis=0))
+        ball = _fitted(body, facets, centre, float(np.median(np.linalg.norm(points - centre, axis=1))))
+        if ball is not None and _radial(body, facets, np.array(ball[:3])) > RADIAL and ball[5] < LOOSE * ball[3]:
+            found.append(ball)
+    return found
+
+
+def _radial(body: Body, facets: Ints, centre: Floats) -> float:
+    """Return the median cosine between the normals of facets (n,) and their directions from a centre (3,)."""
+    ways = body.vertices[body.faces[facets]].mean(axis=1) - centre
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    return float(np.median(np.abs(np.einsum("ni,ni->n", ways, body.normals[facets]))))
+
+
 def _fitted(body: Body, facets: Ints, centre: Floats, radius: float) -> list[float] | None:
-    """Return centre, radius, cover and rms of the sphere of facets (n,), by least squares; None for too few of them."""
+    """Return centre, radius, cover, rms and first facet of the sphere of facets (n,), by least squares; else None."""
     for _ in range(3):
         corners = body.vertices[body.faces[facets]]
         off = np.abs(np.linalg.norm(corners - centre, axis=2) - radius).max(axis=1)
@@ -124,7 +165,7 @@ def _fitted(body: Body, facets: Ints, centre: Floats, radius: float) -> list[flo
     cover = float(body.areas[facets].sum() / (4.0 * np.pi * radius**2))
     if cover < LEAST_COVER:
         return None
-    return [*centre.tolist(), radius, cover, float(np.sqrt((residual**2).mean()))]
+    return [*centre.tolist(), radius, cover, float(np.sqrt((residual**2).mean())), float(facets.min())]
 
 
 def _thickness(points: Floats) -> float:
@@ -134,7 +175,7 @@ def _thickness(points: Floats) -> float:
 
 
 def _each_once(found: Floats) -> Balls:
-    """Return found spheres (n, 6) in the order they came; those within another's radius of it count as its part."""
+    """Return found spheres (n, 7) in the order of their first facets; one within another's radius is part of it."""
     order = np.argsort(-found[:, 3] * np.sqrt(found[:, 4]), kind="stable")
     left = np.ones(len(found), bool)
     kept = []
@@ -147,5 +188,5 @@ def _each_once(found: Floats) -> Balls:
         found[row, 4] = min(1.0, found[same, 4].sum())
         left[near] = False
         kept.append(row)
-    balls = found[sorted(kept)]
+    balls = found[sorted(kept, key=lambda row: float(found[row, 6]))]
     return Balls(balls[:, :3], balls[:, 3], balls[:, 4], rms=balls[:, 5])

@@ -40,6 +40,8 @@ def find(body: Body) -> GuessedFrame:
     if len(a) < FEWEST_MEMBERS:
         return GuessedFrame(None, (f"{len(nodes.radii)} balls found, but {len(a)} tube(s) between two of them",))
     doubts = _doubts(nodes, a, b, off)
+    if body.step_mm:
+        doubts.append("members: coordinates are rounded to 0.1 mm or more, so some may not be found")
     lengths = np.linalg.norm(pipes.ends[:, 1] - pipes.ends[:, 0], axis=1)
     used = np.isin(np.arange(len(lengths)), which)
     inside = _coaxial(pipes, which)

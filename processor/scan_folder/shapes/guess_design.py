@@ -37,6 +37,16 @@ class GuessedDesign:
     meshes: tuple[tuple[str, Floats, Ints], ...] = ()
 
 
+@dataclass(frozen=True)
+class _Parts:
+    """Bodies in mm, the file of each one's mesh, the meshes that are to be written, and doubts about names."""
+
+    bodies: list[Body]
+    mesh_of: dict[str, str]
+    meshes: tuple[tuple[str, Floats, Ints], ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
 def guess(
     folder: Path, group: Sequence[Path], scans: Sequence[tuple[float, str]], given_unit: str = ""
 ) -> GuessedDesign:
@@ -47,48 +57,68 @@ def guess(
     """
     chosen, doubts = files.one_a_stem(group)
     surfaces = [files.read(folder, path, given_unit or "mm") for path in chosen]
-    without = [surface for surface in surfaces if not surface.unit]
-    units = unit.DesignUnit(given_unit or "mm", "given" if given_unit else "the CAD files state their units", True)
-    if without and not given_unit:
-        units = unit.guess([surface.vertices for surface in surfaces], scans, len(surfaces) == 1)
-        if not units.sure:
-            doubts.append(
-                f"units of the design: {'taken as ' + units.unit if units.unit else 'not clear'}: {units.reason}; "
-                "state it by --design-units"
-            )
-        if not units.unit:
-            return GuessedDesign(doubts=tuple(doubts), files=_names(folder, chosen))
-    names, json_units = _names(folder, chosen), units.unit if without else "mm"
-    bodies, mesh_of, meshes, named = _bodies(folder, surfaces, units.unit)
+    names = _names(folder, chosen)
+    # Scans are of a whole frame, but of single parts of a bridge.
+    units = _unit(surfaces, scans, given_unit, as_whole=True)
+    bodies = _bodies(folder, surfaces, units.unit or "mm").bodies
     if not bodies:
         return GuessedDesign(doubts=(*doubts, "no surface has an area"), files=names)
     balls = frame.find(stacked("all", bodies))
     if balls.design is not None:
         return GuessedDesign(
-            design=balls.design,
-            doubts=(*doubts, *balls.doubts),
-            units=json_units,
+            design=balls.design if units.unit else None,
+            doubts=(*doubts, *_unit_doubts(units), *balls.doubts),
+            units=_json_unit(surfaces, units),
             reason=f"balls and the tubes between them, in {_some(names)}",
             files=names,
         )
-    found = arch.find(bodies)
-    whole = len(surfaces) == 1
-    if found.design is None or (whole and not found.arched and not _named_as_parts(bodies)):
-        told = not whole or _named_as_parts(bodies)
-        return GuessedDesign(
-            doubts=(*doubts, *(f"as an arch bridge: {text}" for text in found.doubts if told)), files=names
-        )
-    kept = {mesh_of[part.name] for part in found.design.parts}
+    units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
+    doubts += _unit_doubts(units)
+    if not units.unit:
+        return GuessedDesign(doubts=tuple(doubts), files=names)
+    return _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
+
+
+def _unit(
+    surfaces: Sequence[files.Surface], scans: Sequence[tuple[float, str]], given: str, as_whole: bool
+) -> unit.DesignUnit:
+    if given:
+        return unit.DesignUnit(given, "given", True)
+    if all(surface.unit for surface in surfaces):
+        return unit.DesignUnit("mm", "the CAD files state their units", True)
+    return unit.guess([surface.vertices for surface in surfaces], scans, as_whole)
+
+
+def _unit_doubts(units: unit.DesignUnit) -> list[str]:
+    if units.sure:
+        return []
+    taken = f"taken as {units.unit}" if units.unit else "not clear"
+    return [f"units of the design: {taken}: {units.reason}; state it by --design-units"]
+
+
+def _json_unit(surfaces: Sequence[files.Surface], units: unit.DesignUnit) -> str:
+    """Return the unit of design.json, which is also that of the meshes it names."""
+    return "mm" if all(surface.unit for surface in surfaces) else units.unit or "mm"
+
+
+def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_unit: str) -> GuessedDesign:
+    whole = len(names) == 1
+    found = arch.find(parts.bodies)
+    named = _named_as_parts(parts.bodies)
+    if found.design is None or (whole and not found.arched and not named):
+        told = [f"as an arch bridge: {text}" for text in found.doubts if named or not whole]
+        return GuessedDesign(doubts=(*doubts, *told), files=tuple(names))
+    mesh_of = {part.name: parts.mesh_of[part.name] for part in found.design.parts}
     return GuessedDesign(
         design=found.design,
-        doubts=(*doubts, *named, *found.doubts),
-        units="mm" if meshes else json_units,
-        reason=f"{len(kept)} parts that meet end to end, in {_some(names)}",
+        doubts=(*doubts, *parts.doubts, *found.doubts),
+        units="mm" if parts.meshes else json_unit,
+        reason=f"{len(mesh_of)} parts that meet end to end, in {_some(names)}",
         kind_doubt="" if found.arched else "the parts follow each other in a straight line, which is no arch",
         root_gap_mm=found.root_gap_mm,
-        files=names,
-        mesh_of={part.name: mesh_of[part.name] for part in found.design.parts},
-        meshes=tuple(mesh for mesh in meshes if mesh[0] in kept),
+        files=tuple(names),
+        mesh_of=mesh_of,
+        meshes=tuple(mesh for mesh in parts.meshes if mesh[0] in mesh_of.values()),
     )
 
 
@@ -104,27 +134,23 @@ def _named_as_parts(bodies: Sequence[Body]) -> bool:
     return any(word in component_names.plain(body.name).split() for body in bodies for word in PARTS)
 
 
-def _bodies(
-    folder: Path, surfaces: Sequence[files.Surface], units: str
-) -> tuple[list[Body], dict[str, str], list[tuple[str, Floats, Ints]], list[str]]:
-    """Return the parts in mm, the file of each part's mesh, the meshes to be written, and doubts about names."""
-    found, doubts = list[Body](), list[str]()
-    mesh_of: dict[str, str] = {}
-    meshes = list[tuple[str, Floats, Ints]]()
+def _bodies(folder: Path, surfaces: Sequence[files.Surface], units: str) -> _Parts:
+    """Return the parts in mm: a part a file, or of one file a part a body."""
+    bodies, mesh_of = list[Body](), dict[str, str]()
+    scales = [1.0 if surface.bodies is not None else MM_PER_UNIT[units] for surface in surfaces]
     if len(surfaces) > 1:
-        for surface in surfaces:
-            scale = 1.0 if surface.unit or surface.bodies is not None else MM_PER_UNIT[units]
+        for surface, scale in zip(surfaces, scales, strict=True):
             body = welded(surface.path.stem, surface.vertices * scale, surface.faces)
             if body is not None:
-                found.append(body)
+                bodies.append(body)
                 mesh_of[body.name] = str(surface.path.relative_to(folder))
-        return found, mesh_of, meshes, doubts
-    (surface,) = surfaces
-    scale = 1.0 if surface.unit or surface.bodies is not None else MM_PER_UNIT[units]
+        return _Parts(bodies, mesh_of)
+    (surface,), (scale,) = surfaces, scales
+    meshes, doubts = list[tuple[str, Floats, Ints]](), list[str]()
     for name, vertices, faces in files.bodies(surface):
         body = welded(name, vertices * scale, faces)
         if body is not None:
-            found.append(body)
+            bodies.append(body)
             mesh_of[name] = f"{files.MADE}/{_stem(name, mesh_of)}.ply"
             meshes.append((mesh_of[name], body.vertices, body.faces))
     if surface.bodies is None:
@@ -134,7 +160,7 @@ def _bodies(
             f"names: of the bodies of {surface.path.name} {surface.bodies.unnamed} have none and "
             f"{surface.bodies.shared} share theirs; they were numbered"
         )
-    return found, mesh_of, meshes, doubts
+    return _Parts(bodies, mesh_of, tuple(meshes), tuple(doubts))
 
 
 def _stem(name: str, taken: dict[str, str]) -> str:

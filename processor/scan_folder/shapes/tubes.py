@@ -14,6 +14,8 @@ FLAT_COS = np.cos(np.radians(0.5))  # facets that turn less at an edge are one p
 TURN_COS = np.cos(np.radians(50.0))  # a tube has 8 sides or more, a hexagonal sleeve 6
 PARALLEL = 2e-3  # rad: a cone's edges differ by more
 FEWEST_EDGES = 6
+FEWEST_FACETS = 12
+ACROSS, ABOUT, AXIAL_COS = 1e-3, 0.3, 0.98  # mean squares of the normals along the axis and across; of an edge along it
 ROUND = 5e-3  # of the radius: rms of the edges' distances from the axis
 LEAST_TURN = np.pi  # of the directions of the edges about the axis
 
@@ -40,9 +42,42 @@ def find(body: Body) -> Tubes:
     label = _parallel(pieces[sides[turning]], ways)
     order = np.argsort(label, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(order) else []
-    found = [_fitted(body.vertices[ends[turning[rows]]], ways[rows]) for rows in groups if len(rows) >= FEWEST_EDGES]
-    axes = [one for one in found if one is not None]
+    axes, used = [], [np.empty(0, np.int64)]
+    for rows in groups:
+        one = _fitted(body.vertices[ends[turning[rows]]], ways[rows]) if len(rows) >= FEWEST_EDGES else None
+        if one is not None:
+            axes.append(one)
+            used.append(sides[turning[rows]].reshape(-1))
+    axes += _of_rounded(body, np.concatenate(used))
     return Tubes(np.array([axis for axis, _ in axes]).reshape(-1, 2, 3), np.array([radius for _, radius in axes]))
+
+
+def _of_rounded(body: Body, used: Ints) -> list[tuple[Floats, float]]:
+    """Return the cylinders among the faces without a facet in ``used`` (n,), whose normals turn about an axis.
+
+    Where coordinates are rounded by more than a facet bulges, its edges say nothing, but the whole face does.
+    """
+    label = body.faces_between
+    count = int(label.max()) + 1
+    moments = np.zeros((count, 3, 3))
+    for i in range(3):
+        for k in range(3):
+            weights = body.areas * body.normals[:, i] * body.normals[:, k]
+            moments[:, i, k] = np.bincount(label, weights=weights, minlength=count)
+    values, vectors = np.linalg.eigh(moments / np.bincount(label, weights=body.areas, minlength=count)[:, None, None])
+    turns = (values[:, 0] < ACROSS) & (values[:, 1] > ABOUT) & (np.bincount(label, minlength=count) >= FEWEST_FACETS)
+    turns[label[used]] = False
+    found = []
+    for face in np.flatnonzero(turns).tolist():
+        facets = body.faces[label == face]
+        edges = body.vertices[facets[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
+        ways = edges[:, 1] - edges[:, 0]
+        lengths = np.linalg.norm(ways, axis=1)
+        along = np.abs(ways @ vectors[face, :, 0]) > AXIAL_COS * lengths
+        if along.sum() >= FEWEST_EDGES:
+            one = _fitted(edges[along], ways[along] / lengths[along, None])
+            found += [one] if one is not None else []
+    return found
 
 
 def _joined(count: int, pairs: Ints) -> Ints:
