@@ -1,4 +1,4 @@
-"""Command ``processor init``: a first project.toml for a folder of scans."""
+"""Command ``processor init``: a first project.toml for a folder of scans, and its design.json."""
 
 from __future__ import annotations
 
@@ -7,17 +7,21 @@ from pathlib import Path
 
 import click
 
-from processor.cli.common import debug_option
+from processor.cli.common import UNITS, debug_option
 from processor.model import UsageError
 
 
 @click.command()
 @click.argument("folder", metavar="FOLDER", type=click.Path(path_type=Path))
 @click.option("--force", is_flag=True, help="replace the project.toml that is there")
+@click.option("--design-units", type=click.Choice(UNITS), help="of a design that states none  [default: guessed]")
 @click.option("--json", "as_json", is_flag=True, help="print one JSON object")
 @debug_option
-def init(folder: Path, force: bool, as_json: bool) -> None:
+def init(folder: Path, force: bool, design_units: str | None, as_json: bool) -> None:
     """Write FOLDER/project.toml as its files suggest: kind, units, design, and which scan is which component.
+
+    Without a design.json it is written, too, where meshes or CAD files show one: the parts of an arch bridge in order
+    with their joints and bottom edges, or the nodes and members of a space frame. One that is there is never changed.
 
     Components are recognised by their names and by their shapes against the design. What is uncertain is printed and
     marked in the file: check it before the first run.
@@ -28,13 +32,16 @@ def init(folder: Path, force: bool, as_json: bool) -> None:
     path = folder / files.PROJECT
     if path.exists() and not force:
         raise UsageError(f"{path}: is there already; --force replaces it")
-    project = guess.guess(folder)
+    project = guess.guess(folder, design_units or "")
     text = guess.to_toml(project)
+    guess.write_design(folder, project)
     with replacing(path) as temporary:
         temporary.write_text(text, "utf-8")
     if as_json:
         click.echo(json.dumps(guess.as_json(project), ensure_ascii=False))
         return
+    if project.made:
+        click.echo(f"{folder / project.design}: {guess.summary(project)}")
     click.echo(f"{path}: kind {project.kind}, {len(project.scans)} file(s) of scans")
     for question in project.unsure:
         click.echo(f"? {question}")

@@ -74,7 +74,7 @@ def _about(scene: Scene) -> Text:
         "scans": len(scene.scans),
         "points": points,
         "units": scene.units,
-        "reason": label(scene.units_reason),
+        "reason": [label(one) for one in scene.units_reason.split("; ")],
     }
     if points:
         return text(

@@ -16,6 +16,7 @@ import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -34,12 +35,28 @@ SOURCE = "design"  # stem of the copy that is imported, by which bodies without 
 UNNAMED = rf"{SOURCE}-\d+"
 
 
+@dataclass(frozen=True)
+class CadDesign:
+    """Vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file; the unit that it states, "" for none."""
+
+    vertices: Floats
+    faces: Ints
+    bodies: DesignBodies
+    unit_stated: str
+
+
 def read(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies]:
     """Return vertices (v, 3) in mm and triangles (f, 3) of all bodies of a CAD file, and the bodies.
 
     ``unit`` is that of a file that states none. Raises InputError without designgen, and for a file that cannot be
     converted completely.
     """
+    design = read_design(path, unit)
+    return design.vertices, design.faces, design.bodies
+
+
+def read_design(path: Path, unit: str) -> CadDesign:
+    """Return a CAD file's bodies and whether it states a unit; see :func:`read`."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -49,12 +66,12 @@ def read(path: Path, unit: str) -> tuple[Floats, Ints, DesignBodies]:
         meshes = cache / key.hexdigest()
         if not (meshes / RECORD).is_file():
             _import(path, content, unit, cache, meshes)
-        record = _bodies(meshes, path)
+        record, stated = _record(meshes, path)
         bodies = [read_mesh(meshes / mesh) for _, mesh in record]
     counts = np.cumsum([0, *(len(vertices) for vertices, _ in bodies)])
     faces = [faces + first for (_, faces), first in zip(bodies, counts.tolist(), strict=False)]
     named = _named([name for name, _ in record], [len(triangles) for _, triangles in bodies])
-    return np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces), named
+    return CadDesign(np.concatenate([vertices for vertices, _ in bodies]), np.concatenate(faces), named, stated)
 
 
 def _named(names: list[str], facets: list[int]) -> DesignBodies:
@@ -80,12 +97,13 @@ def _named(names: list[str], facets: list[int]) -> DesignBodies:
     )
 
 
-def _bodies(meshes: Path, path: Path) -> list[tuple[str, str]]:
-    """Return name and mesh of each body of an import."""
+def _record(meshes: Path, path: Path) -> tuple[list[tuple[str, str]], str]:
+    """Return name and mesh of each body of an import, and the unit that the file states."""
     try:
         record = json.loads((meshes / RECORD).read_text("utf-8"))
         names = [(str(body.get("name", "")), str(body["mesh"])) for body in record["bodies"]]
         problems = [str(problem) for problem in record["problems"]]
+        stated = str(record.get("unit_stated") or "")
     except (OSError, ValueError, KeyError, TypeError):
         shutil.rmtree(meshes, ignore_errors=True)
         raise InputError(f"{meshes}: was damaged and has been removed; run again") from None
@@ -94,7 +112,7 @@ def _bodies(meshes: Path, path: Path) -> list[tuple[str, str]]:
         raise InputError(f"{path}: cannot be converted to meshes completely ({problems[0]}{more}); export it again")
     if not names or any(Path(mesh).name != mesh for _, mesh in names):
         raise InputError(f"{path}: expected solids or surfaces, found none; export it with them")
-    return names
+    return names, stated
 
 
 @contextmanager

@@ -73,7 +73,7 @@ def _text(path: Path) -> str:
 
 
 def _arch(folder: Path, design: Table) -> ArchDesign:
-    design.only(("units", "kind", "name", "order", "components", "joints"))
+    design.only(("units", "kind", "name", "unsure", "order", "components", "joints"))
     scale = MM_PER_UNIT[design.unit("units")]
     order = design.values.get("order")
     components = design.table("components")
@@ -143,7 +143,7 @@ def _part(folder: Path, name: str, part: Table, unit: str, joints: Sequence[Floa
 
 
 def _frame(design: Table) -> FrameDesign:
-    design.only(("units", "kind", "name", "nodes", "members"))
+    design.only(("units", "kind", "name", "unsure", "nodes", "members"))
     scale = MM_PER_UNIT[design.unit("units")]
     ids, centres, radii = [], [], []
     for node in design.tables("nodes"):

@@ -19,7 +19,17 @@ NOT_SCANS = ("design.csv", PICKS, "deviation.csv", CONTROL, "index.csv")
 
 def scan_files(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
     """Return the files in ``folder`` and ``folder/scans`` in a format of scans, open or closed, except ``excluded``."""
-    paths = [path for place in (folder, folder / SCANS) if place.is_dir() for path in sorted(place.iterdir())]
+    return _scans_in([place for place in (folder, folder / SCANS) if place.is_dir()], excluded)
+
+
+def scan_files_below(folder: Path, excluded: Collection[Path | None]) -> list[Path]:
+    """Return the same; without any there, those in the other folders below."""
+    found = scan_files(folder, excluded)
+    return found or _scans_in([place for place in sorted(folder.glob("[!.]*")) if place.is_dir()], excluded)
+
+
+def _scans_in(places: Collection[Path], excluded: Collection[Path | None]) -> list[Path]:
+    paths = [path for place in places for path in sorted(place.iterdir())]
     return [path for path in paths if not path.name.startswith(".") and _may_be_scan(path, excluded)]
 
 

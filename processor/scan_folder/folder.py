@@ -28,13 +28,15 @@ from processor.progress import tracked
 from processor.readers import RawScan
 from processor.readers.encoding import file_name_as_text
 from processor.readers.raw_scan import scaled_in_place, scan_name
-from processor.scan_folder import scanner_grid, units
+from processor.scan_folder import guess, scanner_grid, units
 from processor.scan_folder.checked_toml import Table, existing_file_in
 from processor.scan_folder.control_points import Measured, control_points, read_control
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
 from processor.scan_folder.files import DESIGNS, PICKS, PROJECT, SCANS, STATIONS, TRUTH, scan_files
+from processor.scan_folder.guess import Guess
 from processor.scan_folder.meshes import MESH_SUFFIXES
 from processor.scan_folder.picks import read_picks
+from processor.scan_folder.shapes import files as surface_files
 from processor.scan_folder.text_files import read_text
 from processor.scan_folder.units import MM_PER_UNIT, known_unit
 
@@ -49,6 +51,9 @@ FEWEST_POINTS = 4
 FLOAT_STEP_MM = 1.0
 POSE_TOLERANCE = 1e-3  # of R^T R - I
 NAN = float("nan")
+GUESSED = "guessed from the scans' size"
+GUESSED_DESIGN = "design and components as processor init guesses them, as there is no project.toml"
+UNSURE_DESIGN = "design and components as processor init guesses them, some not sure, as there is no project.toml"
 
 Design = ArchDesign | FrameDesign | StructureDesign
 Keep = Callable[[Scan], Scan]
@@ -79,6 +84,7 @@ class _Project:
     temperature_C: float = NAN
     tolerance: Tolerance | None = None
     control: tuple[Measured, ...] = ()
+    guessed: Guess | None = None  # instead of a project.toml
 
 
 def truth_file(path: Path) -> Path | None:
@@ -115,7 +121,8 @@ def read_input(path: Path, units: str | None = None, keep: Keep = as_read) -> Sc
 
 def _read_folder(folder: Path, option: str, keep: Keep) -> Scene:
     project = _read_project(folder)
-    design: Design | None = None
+    made = project.guessed.made if project.guessed else None
+    design: Design | None = made.design if made else None
     if project.design is not None:
         unit = project.design_units or project.units or option or "m"
         if is_surface(project.design) and project.kind in ("", "structure"):
@@ -161,6 +168,7 @@ def _read_project(folder: Path) -> _Project:
             table = Table.of(str(path), tomllib.loads(read_text(path)))
         except (tomllib.TOMLDecodeError, RecursionError) as error:
             raise InputError(f"{path}: not readable TOML: {error}") from None
+    guessed = None if path.exists() else _guess(folder)
     table.only(KEYS)
     kind = table.text("kind", "")
     if kind and kind not in KINDS:
@@ -168,18 +176,29 @@ def _read_project(folder: Path) -> _Project:
     named = table.text("design", "") or next((name for name in DESIGNS if (folder / name).exists()), "")
     design = existing_file_in(folder, named, str(path)) if named else None
     entries = [_entry(folder, scan) for scan in table.tables("scan")]
+    if guessed:
+        entries = [_Entry(folder / scan.file, component=scan.component) for scan in guessed.scans]
     control, control_file = read_control(folder, table)
     return _Project(
         name=table.text("name", file_name_as_text(folder.resolve().name)),
         kind=kind,
-        units=table.unit("units", ""),
+        units=guessed.units if guessed else table.unit("units", ""),
         design=design,
         design_units=table.unit("design_units", ""),
         temperature_C=table.number("temperature_C", NAN),
         entries=tuple(entries or [_Entry(scan) for scan in _open_scans(folder, (design, control_file))]),
         tolerance=_tolerance(table),
         control=control,
+        guessed=guessed,
     )
+
+
+def _guess(folder: Path) -> Guess | None:
+    """Return what `processor init` guesses of a folder whose surfaces show a bridge or a frame; else None."""
+    if any((folder / name).exists() for name in DESIGNS) or not surface_files.candidates(folder):
+        return None
+    guessed = guess.guess(folder)
+    return guessed if guessed.made else None
 
 
 def _tolerance(project: Table) -> Tolerance | None:
@@ -287,11 +306,17 @@ def _scene(
         stations=where,
         temperature_C=project.temperature_C,
         units=", ".join(reasons),
-        units_reason="; ".join(dict.fromkeys(reasons.values())),
+        units_reason="; ".join([*dict.fromkeys(reasons.values()), *_said(project)]),
         structure=design if isinstance(design, StructureDesign) else None,
         tolerance=project.tolerance,
         control=control_points(project.control, scans, scan_units, where, project.units or option or "m"),
     )
+
+
+def _said(project: _Project) -> list[str]:
+    if project.guessed is None:
+        return []
+    return [UNSURE_DESIGN if project.guessed.unsure else GUESSED_DESIGN]
 
 
 def _read_raws(entry: _Entry, scans: Sequence[Scan]) -> Iterator[RawScan]:
@@ -313,7 +338,7 @@ def _unit(raw: RawScan, path: Path, project: _Project, option: str) -> tuple[str
     if raw.unit:
         return known_unit(raw.unit), f"given by the {path.suffix.lower()[1:]} file or its format"
     if project.units:
-        return project.units, f"given in {PROJECT}"
+        return project.units, GUESSED if project.guessed else f"given in {PROJECT}"
     return "m", "taken as metres, as scanners write: neither the format nor the project gives a unit"
 
 

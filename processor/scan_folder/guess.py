@@ -1,4 +1,4 @@
-"""The content of a scan folder's project.toml guessed from its files, with a list of what is not sure."""
+"""The content of a scan folder's project.toml and design.json guessed from its files, with what is not sure."""
 
 from __future__ import annotations
 
@@ -18,11 +18,16 @@ from processor.readers import RawScan
 from processor.scan_folder import component_names
 from processor.scan_folder.checked_toml import existing_file_in
 from processor.scan_folder.design import is_surface, read_design, read_json, read_surface
-from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files
+from processor.scan_folder.files import DESIGNS, PROJECT, SCANS, STATIONS, scan_files, scan_files_below
 from processor.scan_folder.meshes import MESH_SUFFIXES
+from processor.scan_folder.shapes import files as surface_files
+from processor.scan_folder.shapes import guess_design
+from processor.scan_folder.shapes.guess_design import GuessedDesign
 from processor.scan_folder.units import MM_PER_UNIT, known_unit, radius
+from processor.store.atomic_file import replacing
+from processor.writers.ply import write_mesh
+from processor.writers.project import write_json
 
-DESIGN = "design"
 UNITS = ("m", "mm", "cm", "inch", "ft")  # candidates, the likeliest first
 UNIT_TOLERANCE = 0.25  # relative difference of a scan's size from its design's
 LARGEST_M = 2000.0  # a scan larger than this is not in metres
@@ -62,6 +67,7 @@ class Guess:
     design: str = ""
     design_reason: str = ""
     design_units: str = ""
+    made: GuessedDesign | None = None  # the design that design.json is to hold
     units: str = ""
     units_reason: str = ""
     stations: str = ""
@@ -69,19 +75,26 @@ class Guess:
     unsure: list[str] = field(default_factory=list)
 
 
-def guess(folder: Path) -> Guess:
-    """Guess project.toml from the files of a folder. Raises InputError without scans, and without such a folder."""
+def guess(folder: Path, design_units: str = "") -> Guess:
+    """Guess project.toml, and design.json where there is none, from the files of a folder.
+
+    ``design_units`` is the unit of a design that states none; "" = it is guessed. Raises InputError without scans, and
+    without such a folder.
+    """
     if not folder.is_dir():
         raise InputError(f"{folder}: expected a scan folder, found {'a file' if folder.exists() else 'nothing'}")
     project = Guess(str(folder), folder.resolve().name)
-    path = _find_design(folder, project)
-    design = _read_design(folder, path, project)
-    files = scan_files(folder, (path,))
-    if not files:
+    path = _written_design(folder, project)
+    groups = [] if path else surface_files.candidates(folder)
+    surfaces = [one for group in groups for one in group]
+    project.scans = [_read_scan(folder, file, project) for file in scan_files_below(folder, [path, *surfaces])]
+    design = _read_design(folder, path, project) if path else _shown_design(folder, groups, design_units, project)
+    if not design and len(surfaces) > 1:  # they may be scans with faces
+        project.scans += [_read_scan(folder, file, project) for file in scan_files(folder, [path]) if file in surfaces]
+    if not project.scans:
         raise InputError(
             f"{folder}: expected scans ({', '.join(readers.SUFFIXES)}) in the folder or in {SCANS}/, found none"
         )
-    project.scans = [_read_scan(folder, file, project) for file in files]
     _guess_units(project, _sizes(design))
     if isinstance(design, ArchDesign):
         _guess_components(project, design)
@@ -95,41 +108,65 @@ def guess(folder: Path) -> Guess:
 # --- design -----------------------------------------------------------------------------------------------------------
 
 
-def _find_design(folder: Path, project: Guess) -> Path | None:
+def _written_design(folder: Path, project: Guess) -> Path | None:
+    """Return a design.json, design.csv or another JSON file that states a kind; None without one."""
     for name in DESIGNS:
         if (folder / name).is_file():
             project.design, project.design_reason = name, "found by its name"
             return folder / name
-    surfaces = [
-        path
-        for place in (folder, folder / DESIGN)
-        for path in (sorted(place.iterdir()) if place.is_dir() else [])
-        if is_surface(path) and path.is_file() and _has_faces(path)
-    ]
     tables = [path for path in sorted(folder.glob("*.json")) if path.name != STATIONS and _has_kind(path)]
-    candidates = tables or surfaces
-    if len(candidates) > 1:
-        named = ", ".join(str(path.relative_to(folder)) for path in candidates[:5])
-        project.unsure.append(
-            f"design: several files may be it ({named}); name one as 'design', with kind = \"structure\", or write a "
-            "design.json"
-        )
-        return None
-    if candidates:
-        project.design = str(candidates[0].relative_to(folder))
-        project.design_reason = "the only candidate"
-        return candidates[0]
-    project.unsure.append("design: none found, so scans are not compared with one")
+    if len(tables) == 1:
+        project.design, project.design_reason = tables[0].name, "the only candidate"
+        return tables[0]
+    if tables:
+        named = ", ".join(path.name for path in tables[:5])
+        project.unsure.append(f"design: several files may be it ({named}); name one as 'design'")
     return None
 
 
-def _has_faces(path: Path) -> bool:
-    """Whether a mesh file has faces: a PLY file may be a scan."""
-    if path.suffix.lower() != ".ply":
-        return True
-    with path.open("rb") as file:
-        head = file.read(1 << 14).split(b"end_header")[0]
-    return any(line.startswith(b"element face") and not line.endswith(b" 0") for line in head.splitlines())
+def _shown_design(
+    folder: Path, groups: Sequence[Sequence[Path]], design_units: str, project: Guess
+) -> ArchDesign | FrameDesign | Surface | None:
+    """Return the design that meshes or CAD files show: of an arch bridge or a frame, else one surface of a whole."""
+    scans = [(scan.radius, scan.units) for scan in project.scans if not scan.error]
+    found = list[GuessedDesign]()
+    doubts = list[str]()
+    for group in groups:
+        try:
+            guessed = guess_design.guess(folder, group, scans, design_units)
+        except InputError as error:
+            project.unsure.append(f"design: {str(error).replace(f'{folder}/', '')}")
+            continue
+        found += [guessed] if guessed.design is not None else []
+        doubts += guessed.doubts if guessed.design is None else ()
+    if len(found) == 1:
+        _take_design(project, found[0])
+        return found[0].design
+    paths = [path for group in groups for path in group]
+    if len(paths) == 1 and not found:
+        project.design, project.design_reason = str(paths[0].relative_to(folder)), "the only candidate"
+        project.unsure += [text for text in doubts if not text.startswith("units of the design")]
+        return _read_design(folder, paths[0], project)
+    if not paths:
+        project.unsure.append("design: none found, so scans are not compared with one")
+        return None
+    candidates = [one.files[0] for one in found] or [str(path.relative_to(folder)) for path in paths]
+    named = ", ".join(candidates[:5])
+    project.unsure.append(
+        f"design: several files may be it ({named}); name one as 'design', with kind = \"structure\", or write a "
+        "design.json"
+    )
+    project.unsure += [f"design: {text}" for text in doubts]
+    return None
+
+
+def _take_design(project: Guess, guessed: GuessedDesign) -> None:
+    project.made, project.design = guessed, DESIGNS[0]
+    project.kind = "arch-bridge" if isinstance(guessed.design, ArchDesign) else "space-frame"
+    project.kind_reason = project.design_reason = guessed.reason
+    if guessed.kind_doubt:
+        project.unsure.append(f"kind: taken as {project.kind}: {guessed.kind_doubt}")
+    project.unsure += guessed.doubts
 
 
 def _has_kind(path: Path) -> bool:
@@ -139,10 +176,8 @@ def _has_kind(path: Path) -> bool:
         return False
 
 
-def _read_design(folder: Path, path: Path | None, project: Guess) -> ArchDesign | FrameDesign | Surface | None:
+def _read_design(folder: Path, path: Path, project: Guess) -> ArchDesign | FrameDesign | Surface | None:
     """Read the design; if it cannot be read, a message is added and the guess continues without."""
-    if path is None:
-        return None
     try:
         existing_file_in(folder, str(path.relative_to(folder)), str(folder))
         if is_surface(path):
@@ -338,7 +373,16 @@ def to_toml(project: Guess) -> str:
         lines.append(f"# {_one_line(project.stations)}")
     for scan in project.scans:
         lines += ["", *_scan_lines(scan)]
-    lines += ["", "# [tolerance]", '# standard = "GB 50205-2020"', ""]
+    gap = project.made.root_gap_mm if project.made else 0.0
+    lines += [
+        "",
+        *(
+            ["[tolerance]", f"root_gap_mm = {gap!r}  # between the ends as modelled"]
+            if gap > 0.0
+            else ["# [tolerance]"]
+        ),
+    ]
+    lines += ['# standard = "GB 50205-2020"', ""]
     return "\n".join(lines)
 
 
@@ -377,4 +421,33 @@ def as_json(project: Guess) -> dict[str, Any]:
     return {"file": f"{project.folder}/{PROJECT}", "name": project.name} | {
         **{key: getattr(project, key) for key in keys},
         "scans": scans,
+        "made": [f"{project.folder}/{name}" for name in (project.design, *_meshes(project))] if project.made else [],
     }
+
+
+def summary(project: Guess) -> str:
+    """Return what the guessed design holds, in a line."""
+    design = project.made.design if project.made else None
+    if isinstance(design, ArchDesign):
+        order = ", ".join(part.name for part in design.parts)
+        return f"{len(design.parts)} parts ({order}), {len(design.joint_names)} joint(s)"
+    if isinstance(design, FrameDesign):
+        return f"{len(design.ids)} node(s), {len(design.member_a)} member(s)"
+    return "no design"
+
+
+def _meshes(project: Guess) -> list[str]:
+    return [name for name, _, _ in project.made.meshes] if project.made else []
+
+
+def write_design(folder: Path, project: Guess) -> None:
+    """Write the guessed design.json, and the meshes that it names, to a folder."""
+    if project.made is None:
+        return
+    for name, vertices, faces in project.made.meshes:
+        (folder / name).parent.mkdir(exist_ok=True)
+        with replacing(folder / name) as temporary:
+            write_mesh(temporary, vertices, faces)
+    questions = [*([project.made.kind_doubt] if project.made.kind_doubt else []), *project.made.doubts]
+    with replacing(folder / project.design) as temporary:
+        write_json(temporary, guess_design.content(project.made, questions))

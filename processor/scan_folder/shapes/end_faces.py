@@ -1,0 +1,126 @@
+"""Plane faces of two bodies that lie opposite each other: where one part of a bridge meets the next."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from processor.model import Floats, Ints
+from processor.scan_folder.shapes.body import Body
+
+PLANE_MM = 0.1  # a facet is in a plane if its corners are nearer
+MOST_PLANES = 400
+SMALL_SHARE = 0.02  # of the largest plane's area: smaller ones are not ends
+PARALLEL_COS = np.cos(np.radians(3.0))
+OVERLAP_SHARE = 0.5  # of the smaller face's extents, in both directions of the plane
+LARGER_MM = 200.0  # one section may project so far beyond the other
+OVERLAP_MM = 10.0  # bodies that overlap more do not meet
+RIVAL_SHARE = 0.5  # of the best pair's area: another pair of faces may as well be the joint
+
+
+@dataclass(frozen=True)
+class PlaneFace:
+    """Facets of a body in one plane: its unit normal (3,), their corners (n, 3), mm, and their area, mm2."""
+
+    normal: Floats
+    points: Floats
+    area: float
+
+    @property
+    def origin(self) -> Floats:
+        """Mean (3,) of the corners, mm."""
+        return np.asarray(self.points.mean(axis=0))
+
+
+@dataclass(frozen=True)
+class Contact:
+    """Opposite faces of two bodies.
+
+    ``gap_mm`` is the distance between their planes, negative where the bodies overlap; ``rival`` is true where a second
+    pair of faces, in another plane, is nearly as large.
+    """
+
+    a: PlaneFace
+    b: PlaneFace
+    gap_mm: float
+    rival: bool
+
+
+def contact(a: Body, b: Body, limit_mm: float) -> Contact | None:
+    """Return the largest pair of faces of two bodies that meet or lie ``limit_mm`` apart at most; None without any."""
+    near_a, near_b = _facets_near(a, b, limit_mm), _facets_near(b, a, limit_mm)
+    if not len(near_a) or not len(near_b):
+        return None
+    found = []
+    faces_b = _planes(b, near_b)
+    for face_a in _planes(a, near_a):
+        for face_b in faces_b:
+            gap = _gap(face_a, face_b, a, b)
+            if gap is not None and gap <= limit_mm and _overlap(face_a, face_b):
+                found.append((min(face_a.area, face_b.area), gap, face_a, face_b))
+    if not found:
+        return None
+    found.sort(key=lambda pair: -pair[0])
+    area, gap, face_a, face_b = found[0]
+    rival = any(other[0] > RIVAL_SHARE * area and not _same_plane(other[2], face_a) for other in found[1:])
+    return Contact(face_a, face_b, gap, rival)
+
+
+def _facets_near(body: Body, other: Body, limit_mm: float) -> Ints:
+    """Return the facets of a body that lie in the other's bounding box, grown by the limit."""
+    reach = limit_mm + LARGER_MM
+    low, high = other.bounds[0] - reach, other.bounds[1] + reach
+    inside = ((body.vertices >= low) & (body.vertices <= high)).all(axis=1)
+    return np.flatnonzero(inside[body.faces].all(axis=1))
+
+
+def _planes(body: Body, facets: Ints) -> list[PlaneFace]:
+    """Return the plane faces that facets (n,) of a body make up, the largest first."""
+    tolerance = max(PLANE_MM, 2.0 * body.step_mm)
+    label = body.faces_between[facets]
+    area = np.bincount(label, weights=body.areas[facets])
+    left = np.ones(len(facets), bool)
+    faces: list[PlaneFace] = []
+    for face in np.argsort(-area, kind="stable")[:MOST_PLANES].tolist():
+        seed = left & (label == face)
+        if not area[face] > SMALL_SHARE * area.max() or not seed.any():
+            continue
+        points = body.vertices[np.unique(body.faces[facets[seed]])]
+        normal, origin = _normal(points), points.mean(axis=0)
+        if np.abs((points - origin) @ normal).max() > tolerance:
+            continue  # curved
+        inside = left & (np.abs((body.vertices - origin) @ normal) <= tolerance)[body.faces[facets]].all(axis=1)
+        left &= ~inside
+        points = body.vertices[np.unique(body.faces[facets[inside]])]
+        faces.append(PlaneFace(_normal(points), points, float(body.areas[facets[inside]].sum())))
+    faces.sort(key=lambda face: -face.area)
+    return faces
+
+
+def _normal(points: Floats) -> Floats:
+    """Return the normal of the plane through points (n, 3) by least squares."""
+    return np.asarray(np.linalg.svd(points - points.mean(axis=0), full_matrices=False)[2][2])
+
+
+def _gap(a: PlaneFace, b: PlaneFace, body_a: Body, body_b: Body) -> float | None:
+    """Return the distance between two faces; None if they are not parallel, or the bodies not on either side."""
+    if abs(a.normal @ b.normal) < PARALLEL_COS:
+        return None
+    out = a.normal if a.normal @ (a.origin - body_a.centre) > 0 else -a.normal
+    if out @ (body_b.centre - b.origin) <= 0 or out @ (body_a.centre - a.origin) >= 0:
+        return None
+    gap = float(out @ (b.origin - a.origin))
+    return gap if gap > -OVERLAP_MM else None
+
+
+def _overlap(a: PlaneFace, b: PlaneFace) -> bool:
+    _, _, Vt = np.linalg.svd(a.points - a.origin, full_matrices=False)
+    x, y = a.points @ Vt[:2].T, b.points @ Vt[:2].T
+    low, high = np.maximum(x.min(axis=0), y.min(axis=0)), np.minimum(x.max(axis=0), y.max(axis=0))
+    smaller = np.minimum(np.ptp(x, axis=0), np.ptp(y, axis=0))
+    return bool((high - low > OVERLAP_SHARE * smaller).all())
+
+
+def _same_plane(a: PlaneFace, b: PlaneFace) -> bool:
+    return bool(np.abs((a.points - b.origin) @ b.normal).max() < 10.0 * PLANE_MM)

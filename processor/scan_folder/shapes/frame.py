@@ -1,0 +1,134 @@
+"""The design of a space frame from its surfaces: balls as nodes, tubes between two of them as members."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from processor.model import Floats, FrameDesign, Ints
+from processor.scan_folder.shapes import balls, tubes
+from processor.scan_folder.shapes.balls import Balls
+from processor.scan_folder.shapes.body import Body
+from processor.scan_folder.shapes.tubes import Tubes
+
+FEWEST_BALLS, FEWEST_MEMBERS = 3, 2
+OFF_AXIS = 0.3  # of a ball's radius: its centre may lie so far from the axis of a tube that ends there
+TRUE_AXIS = 0.05  # of the radius: with more the design is eccentric, or the ball another's
+SHORT = 0.3  # of the clear distance between two balls: a shorter cylinder is a sleeve, a bolt or a bore
+LONG = 10.0  # a tube that leads to no two balls, this many radii long, is told
+PLAUSIBLE_MM = (20.0, 600.0)  # radii of balls
+
+
+@dataclass(frozen=True)
+class GuessedFrame:
+    """A design, or None, with what is not sure about it and the reason."""
+
+    design: FrameDesign | None
+    doubts: tuple[str, ...] = ()
+
+
+def find(body: Body) -> GuessedFrame:
+    """Return the design of a space frame whose surfaces are one mesh in mm; without one the reason."""
+    nodes = balls.find(body)
+    if len(nodes.radii) < FEWEST_BALLS:
+        return GuessedFrame(None, (f"{len(nodes.radii)} ball(s) found",))
+    pipes = tubes.find(body)
+    a, b, which, off = _members(nodes, pipes)
+    if len(a) < FEWEST_MEMBERS:
+        return GuessedFrame(None, (f"{len(nodes.radii)} balls found, but {len(a)} tube(s) between two of them",))
+    doubts = _doubts(nodes, a, b, off)
+    if body.step_mm:
+        doubts.append("members: coordinates are rounded to 0.1 mm or more, so some may not be found")
+    lengths = np.linalg.norm(pipes.ends[:, 1] - pipes.ends[:, 0], axis=1)
+    used = np.isin(np.arange(len(lengths)), which)
+    inside = _coaxial(pipes, which)
+    others = int((~used & ~inside & (lengths > LONG * pipes.radii)).sum())
+    if others:
+        doubts.append(f"members: {others} tube(s) lead to no two balls, so they are left out")
+    ids = np.arange(len(nodes.radii))
+    return GuessedFrame(
+        FrameDesign(
+            ids, nodes.centres, nodes.radii, member_a=ids[a], member_b=ids[b], tube_diameters=2.0 * pipes.radii[which]
+        ),
+        tuple(doubts),
+    )
+
+
+def _members(nodes: Balls, pipes: Tubes) -> tuple[Ints, Ints, Ints, Floats]:
+    """Return for each member (m,) its two balls, its tube, and how far the balls are off its axis by their radii."""
+    tree = cKDTree(nodes.centres)
+    longest: dict[tuple[int, int], tuple[float, float, int, float]] = {}
+    lengths = np.linalg.norm(pipes.ends[:, 1] - pipes.ends[:, 0], axis=1)
+    for tube in np.flatnonzero(lengths > 0.0).tolist():
+        way = (pipes.ends[tube, 1] - pipes.ends[tube, 0]) / lengths[tube]
+        found = [_ball_at(nodes, tree, pipes.ends[tube, k], sign * way) for k, sign in ((0, -1.0), (1, 1.0))]
+        if found[0] is None or found[1] is None or found[0][0] == found[1][0]:
+            continue
+        (i, off_i), (k, off_k) = found
+        clear = np.linalg.norm(nodes.centres[i] - nodes.centres[k]) - nodes.radii[i] - nodes.radii[k]
+        if lengths[tube] < SHORT * clear:
+            continue
+        pair = (min(i, k), max(i, k))
+        entry = (float(lengths[tube]), float(pipes.radii[tube]), tube, max(off_i, off_k))
+        # Of an outer and an inner wall the outer counts: about as long, and thicker.
+        best = longest.get(pair)
+        if best is None or entry[0] > 1.1 * best[0] or (entry[0] > best[0] / 1.1 and entry[1] > best[1]):
+            longest[pair] = entry
+    pairs = sorted(longest)
+    a, b = (np.array([pair[k] for pair in pairs], np.int64) for k in (0, 1))
+    which = np.array([longest[pair][2] for pair in pairs], np.int64)
+    return a, b, which, np.array([longest[pair][3] for pair in pairs])
+
+
+def _ball_at(nodes: Balls, tree: cKDTree, end: Floats, out: Floats) -> tuple[int, float] | None:
+    """Return the ball that an axis leads to from a tube's end (3,), and its distance from the axis by its radius."""
+    for ball in tree.query(end, k=min(6, len(nodes.radii)))[1].tolist():
+        away = nodes.centres[ball] - end
+        along = float(away @ out)
+        off = float(np.linalg.norm(away - along * out)) / nodes.radii[ball]
+        if off < OFF_AXIS and along > -nodes.radii[ball]:
+            return ball, off
+    return None
+
+
+def _coaxial(pipes: Tubes, which: Ints) -> np.ndarray:
+    """Whether each tube lies on the axis of one of the tubes ``which``: its inner wall, or a sleeve."""
+    used = pipes.ends[which].mean(axis=1)
+    way = pipes.ends[which, 1] - pipes.ends[which, 0]
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    middle = pipes.ends.mean(axis=1)
+    near = cKDTree(used).query(middle, k=min(12, len(used)))[1].reshape(len(middle), -1)
+    off = middle[:, None] - used[near]
+    off = off - np.einsum("nki,nki->nk", off, way[near])[..., None] * way[near]
+    result: np.ndarray = (np.linalg.norm(off, axis=2) < pipes.radii[which][near]).any(axis=1)
+    return result
+
+
+def _doubts(nodes: Balls, a: Ints, b: Ints, off: Floats) -> list[str]:
+    doubts = []
+    unsure = np.flatnonzero(~nodes.sure)
+    if len(unsure):
+        share = 100.0 * nodes.cover[unsure[0]]
+        doubts.append(
+            f"nodes: {_listed(unsure)} may be no ball: {share:.0f} % of its surface is there, "
+            f"{nodes.rms[unsure[0]]:.2g} mm rms off a sphere"
+        )
+    odd = np.flatnonzero((nodes.radii < PLAUSIBLE_MM[0]) | (nodes.radii > PLAUSIBLE_MM[1]))
+    if len(odd):
+        doubts.append(f"nodes: {_listed(odd)} of unusual radius ({nodes.radii[odd[0]]:.4g} mm); is the unit right?")
+    alone = np.setdiff1d(np.arange(len(nodes.radii)), np.concatenate([a, b]))
+    if len(alone):
+        doubts.append(f"nodes: {_listed(alone)}: no tube leads to it")
+    eccentric = np.flatnonzero(off > TRUE_AXIS)
+    if len(eccentric):
+        pairs = ", ".join(f"{a[m]}-{b[m]}" for m in eccentric[:6])
+        doubts.append(f"members: {len(eccentric)} do not lead through the centres of their balls ({pairs})")
+    return doubts
+
+
+def _listed(which: Sequence[int] | Ints) -> str:
+    listed = ", ".join(str(k) for k in which[:6])
+    return f"{len(which)} ({listed}{', ...' if len(which) > 6 else ''})"

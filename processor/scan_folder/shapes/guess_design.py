@@ -1,0 +1,223 @@
+"""A design.json from the surfaces in a folder: of an arch bridge in parts, or of a space frame."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from processor.model import KEY_POINTS, ArchDesign, Floats, FrameDesign, Ints
+from processor.scan_folder import component_names
+from processor.scan_folder.shapes import arch, files, frame, unit
+from processor.scan_folder.shapes.body import Body, stacked, welded
+from processor.scan_folder.units import MM_PER_UNIT
+
+PARTS = ("foot", "rib", "crown")  # words in the names of an arch bridge's parts
+
+
+@dataclass(frozen=True)
+class GuessedDesign:
+    """A design as guessed from surfaces.
+
+    ``design`` is None where there is none, and ``doubts`` say why. ``units`` are those of design.json, ``meshes`` the
+    files (path below the folder, vertices (v, 3) in mm, triangles) to be written beside it, by part.
+    """
+
+    design: ArchDesign | FrameDesign | None = None
+    doubts: tuple[str, ...] = ()
+    units: str = "mm"
+    reason: str = ""
+    kind_doubt: str = ""
+    root_gap_mm: float = 0.0
+    files: tuple[str, ...] = ()
+    mesh_of: dict[str, str] = field(default_factory=dict)
+    meshes: tuple[tuple[str, Floats, Ints], ...] = ()
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """Bodies in mm, the file of each one's mesh, the meshes that are to be written, and doubts about names."""
+
+    bodies: list[Body]
+    mesh_of: dict[str, str]
+    meshes: tuple[tuple[str, Floats, Ints], ...] = ()
+    doubts: tuple[str, ...] = ()
+
+
+def guess(
+    folder: Path, group: Sequence[Path], scans: Sequence[tuple[float, str]], given_unit: str = ""
+) -> GuessedDesign:
+    """Guess the design that the files of one folder hold.
+
+    ``scans`` are the radius of each scan and the unit that its format states. Raises InputError for a file that cannot
+    be read.
+    """
+    chosen, doubts = files.one_a_stem(group)
+    surfaces = [files.read(folder, path, given_unit or "mm") for path in chosen]
+    names = _names(folder, chosen)
+    # Scans are of a whole frame, but of single parts of a bridge.
+    units = _unit(surfaces, scans, given_unit, as_whole=True)
+    bodies = _bodies(folder, surfaces, units.unit or "mm").bodies
+    if not bodies:
+        return GuessedDesign(doubts=(*doubts, "no surface has an area"), files=names)
+    balls = frame.find(stacked("all", bodies))
+    if balls.design is not None:
+        return GuessedDesign(
+            design=balls.design if units.unit else None,
+            doubts=(*doubts, *_unit_doubts(units), *balls.doubts),
+            units=_json_unit(surfaces, units),
+            reason=f"balls and the tubes between them, in {_some(names)}",
+            files=names,
+        )
+    units = _unit(surfaces, scans, given_unit, as_whole=len(surfaces) == 1)
+    doubts += _unit_doubts(units)
+    if not units.unit:
+        return GuessedDesign(doubts=tuple(doubts), files=names)
+    return _bridge(_bodies(folder, surfaces, units.unit), names, tuple(doubts), _json_unit(surfaces, units))
+
+
+def _unit(
+    surfaces: Sequence[files.Surface], scans: Sequence[tuple[float, str]], given: str, as_whole: bool
+) -> unit.DesignUnit:
+    if given:
+        return unit.DesignUnit(given, "given", True)
+    if all(surface.unit for surface in surfaces):
+        return unit.DesignUnit("mm", "the CAD files state their units", True)
+    return unit.guess([surface.vertices for surface in surfaces], scans, as_whole)
+
+
+def _unit_doubts(units: unit.DesignUnit) -> list[str]:
+    if units.sure:
+        return []
+    taken = f"taken as {units.unit}" if units.unit else "not clear"
+    return [f"units of the design: {taken}: {units.reason}; state it by --design-units"]
+
+
+def _json_unit(surfaces: Sequence[files.Surface], units: unit.DesignUnit) -> str:
+    """Return the unit of design.json, which is also that of the meshes it names."""
+    return "mm" if all(surface.unit for surface in surfaces) else units.unit or "mm"
+
+
+def _bridge(parts: _Parts, names: Sequence[str], doubts: tuple[str, ...], json_unit: str) -> GuessedDesign:
+    whole = len(names) == 1
+    found = arch.find(parts.bodies)
+    named = _named_as_parts(parts.bodies)
+    if found.design is None or (whole and not found.arched and not named):
+        told = [f"as an arch bridge: {text}" for text in found.doubts if named or not whole]
+        return GuessedDesign(doubts=(*doubts, *told), files=tuple(names))
+    mesh_of = {part.name: parts.mesh_of[part.name] for part in found.design.parts}
+    return GuessedDesign(
+        design=found.design,
+        doubts=(*doubts, *parts.doubts, *found.doubts),
+        units="mm" if parts.meshes else json_unit,
+        reason=f"{len(mesh_of)} parts that meet end to end, in {_some(names)}",
+        kind_doubt="" if found.arched else "the parts follow each other in a straight line, which is no arch",
+        root_gap_mm=found.root_gap_mm,
+        files=tuple(names),
+        mesh_of=mesh_of,
+        meshes=tuple(mesh for mesh in parts.meshes if mesh[0] in mesh_of.values()),
+    )
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:3]) + (" and more" if len(names) > 3 else "")
+
+
+def _names(folder: Path, paths: Sequence[Path]) -> tuple[str, ...]:
+    return tuple(str(path.relative_to(folder)) for path in paths)
+
+
+def _named_as_parts(bodies: Sequence[Body]) -> bool:
+    return any(word in component_names.plain(body.name).split() for body in bodies for word in PARTS)
+
+
+def _bodies(folder: Path, surfaces: Sequence[files.Surface], units: str) -> _Parts:
+    """Return the parts in mm: a part a file, or of one file a part a body."""
+    bodies, mesh_of = list[Body](), dict[str, str]()
+    scales = [1.0 if surface.bodies is not None else MM_PER_UNIT[units] for surface in surfaces]
+    if len(surfaces) > 1:
+        for surface, scale in zip(surfaces, scales, strict=True):
+            body = welded(surface.path.stem, surface.vertices * scale, surface.faces)
+            if body is not None:
+                bodies.append(body)
+                mesh_of[body.name] = str(surface.path.relative_to(folder))
+        return _Parts(bodies, mesh_of)
+    (surface,), (scale,) = surfaces, scales
+    meshes, doubts = list[tuple[str, Floats, Ints]](), list[str]()
+    for name, vertices, faces in files.bodies(surface):
+        body = welded(name, vertices * scale, faces)
+        if body is not None:
+            bodies.append(body)
+            mesh_of[name] = f"{files.MADE}/{_stem(name, mesh_of)}.ply"
+            meshes.append((mesh_of[name], body.vertices, body.faces))
+    if surface.bodies is None:
+        doubts.append(f"names: the parts are pieces of {surface.path.name}, numbered in its order")
+    elif surface.bodies.unnamed or surface.bodies.shared:
+        doubts.append(
+            f"names: of the bodies of {surface.path.name} {surface.bodies.unnamed} have none and "
+            f"{surface.bodies.shared} share theirs; they were numbered"
+        )
+    return _Parts(bodies, mesh_of, tuple(meshes), tuple(doubts))
+
+
+def _stem(name: str, taken: dict[str, str]) -> str:
+    """Return a part's name as that of a new file."""
+    plain = "".join(c if c.isalnum() or c in "-_" else "_" for c in name) or "part"
+    stems = {Path(path).stem.casefold() for path in taken.values()}
+    stem, number = plain, 2
+    while stem.casefold() in stems:
+        stem, number = f"{plain}-{number}", number + 1
+    return stem
+
+
+def content(guessed: GuessedDesign, questions: Sequence[str]) -> dict[str, Any]:
+    """Return the object of design.json; ``questions`` say what is not sure in it."""
+    head: dict[str, Any] = {"units": guessed.units}
+    if questions:
+        head["unsure"] = [f"? {text}" for text in questions]
+    scale = 1.0 / MM_PER_UNIT[guessed.units]
+    if isinstance(guessed.design, ArchDesign):
+        return {**head, "kind": "arch-bridge", **_arch(guessed.design, guessed.mesh_of, scale)}
+    assert guessed.design is not None
+    return {**head, "kind": "space-frame", **_frame(guessed.design, scale)}
+
+
+def _arch(design: ArchDesign, mesh_of: Mapping[str, str], scale: float) -> dict[str, Any]:
+    components = {
+        part.name: {
+            "mesh": mesh_of[part.name],
+            "bottom_edge_left": _rounded(part.bottom_edge_left, scale),
+            "bottom_edge_right": _rounded(part.bottom_edge_right, scale),
+        }
+        for part in design.parts
+    }
+    joints = [
+        {"name": name, "left": left, "right": right, "points": dict(zip(KEY_POINTS, _rounded(p, scale), strict=True))}
+        for name, left, right, p in zip(
+            design.joint_names, design.joint_left, design.joint_right, design.joint_points, strict=True
+        )
+    ]
+    return {"order": [part.name for part in design.parts], "components": components, "joints": joints}
+
+
+def _frame(design: FrameDesign, scale: float) -> dict[str, Any]:
+    centres, radii, diameters = (
+        _rounded(x, scale) for x in (design.centres, design.radii[:, None], design.tube_diameters[:, None])
+    )
+    nodes = [
+        {"id": int(i), "centre": centre, "radius": radius}
+        for i, centre, (radius,) in zip(design.ids, centres, radii, strict=True)
+    ]
+    members = [
+        {"a": int(a), "b": int(b), "tube_diameter": diameter}
+        for a, b, (diameter,) in zip(design.member_a, design.member_b, diameters, strict=True)
+    ]
+    return {"nodes": nodes, "members": members}
+
+
+def _rounded(values_mm: Floats, scale: float) -> list[list[float]]:
+    """Return values (n, k) to a millionth of a millimetre, times ``scale``."""
+    return [[float(f"{x:.12g}") for x in row] for row in np.round(values_mm, 6) * scale + 0.0]

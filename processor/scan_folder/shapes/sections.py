@@ -1,0 +1,141 @@
+"""The corners P1 to P4 of a section, and the key points made of them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import ConvexHull, QhullError
+
+from processor.model import Floats
+from processor.scan_folder.shapes.body import Body
+
+STRAIGHT_MM = 0.1  # a corner of the hull that is nearer to the line of its neighbours is none
+CHORDS_MM = 1.0  # the same of a section behind the end, which cuts facets of curved faces
+SQUARE_RAD = np.radians(35.0)  # largest departure of a corner from a right angle
+LEVEL_RAD = np.radians(20.0)  # largest slope of the lower and upper edges across the bridge
+DEPTHS_MM = np.array([60.0, 120.0, 180.0])  # of the sections that the skin is followed from to the end
+LEFT_COS = 0.5  # least cosine between +Y and the plane of a section
+
+
+@dataclass(frozen=True)
+class SectionPlane:
+    """Plane of a section: a point (3,), the unit normal along the chain, left (+Y) and up in the plane."""
+
+    origin: Floats
+    normal: Floats
+    left: Floats
+    up: Floats
+
+    @staticmethod
+    def across(origin: Floats, normal: Floats) -> SectionPlane | None:
+        """Return the plane; None where +Y is too far from it to say which side is left."""
+        left = np.array([0.0, 1.0, 0.0]) - normal[1] * normal
+        size = float(np.linalg.norm(left))
+        if size < LEFT_COS:
+            return None
+        left /= size
+        return SectionPlane(origin, normal, left, np.cross(normal, left))
+
+    def moved(self, depth_mm: float) -> SectionPlane:
+        """Return the parallel plane at a distance along the normal."""
+        return SectionPlane(self.origin + depth_mm * self.normal, self.normal, self.left, self.up)
+
+    def flat(self, points: Floats) -> Floats:
+        """Return left and up (n, 2) of points (n, 3)."""
+        off = points - self.origin
+        return np.stack([off @ self.left, off @ self.up], axis=1)
+
+    def space(self, places: Floats) -> Floats:
+        """Return the points (n, 3) in the plane at left and up (n, 2)."""
+        return self.origin + places[:, :1] * self.left + places[:, 1:] * self.up
+
+
+@dataclass(frozen=True)
+class Corners:
+    """Corners P1..P4 (4, 2) of a section in its plane, left and up; ``doubt``: why they are not clear, else ""."""
+
+    places: Floats
+    doubt: str = ""
+
+
+def corners(places: Floats, straight_mm: float = STRAIGHT_MM) -> Corners | None:
+    """Return the corners of the hull of points (n, 2) in a section's plane; None where they enclose no area.
+
+    A side whose points are within ``straight_mm`` of a line is straight.
+    """
+    if len(places) < 3:
+        return None
+    try:
+        hull = places[ConvexHull(places).vertices]
+    except QhullError:
+        return None
+    hull = _without_straight(hull, straight_mm)
+    if len(hull) < 4:
+        return None
+    size = np.ptp(hull, axis=0)
+    unit = (hull - hull.min(axis=0)) / size
+    ways = np.array([[1.0, -1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+    chosen = (unit @ ways.T).argmax(axis=0)
+    if len(set(chosen.tolist())) < 4:
+        return Corners(hull[chosen], f"its outline has no four corners of a box (it has {len(hull)} in all)")
+    return Corners(hull[chosen], _doubt(hull[chosen], len(hull)))
+
+
+def _without_straight(hull: Floats, straight_mm: float) -> Floats:
+    """Return a convex polygon (n, 2) without vertices on the line of their neighbours."""
+    while len(hull) > 3:
+        before, after = np.roll(hull, 1, axis=0), np.roll(hull, -1, axis=0)
+        chord = after - before
+        off = hull - before
+        distance = np.abs(chord[:, 0] * off[:, 1] - chord[:, 1] * off[:, 0]) / np.linalg.norm(chord, axis=1)
+        least = int(distance.argmin())
+        if distance[least] > straight_mm:
+            break
+        hull = np.delete(hull, least, axis=0)
+    return hull
+
+
+def _doubt(four: Floats, count: int) -> str:
+    if count > 4:
+        return f"its outline has {count} corners instead of four"
+    sides = np.roll(four, -1, axis=0) - four
+    sides /= np.linalg.norm(sides, axis=1, keepdims=True)
+    turn = np.abs(np.einsum("ki,ki->k", sides, np.roll(sides, 1, axis=0)))
+    if turn.max() > np.sin(SQUARE_RAD):
+        return f"a corner is {np.degrees(np.arcsin(turn.max())):.0f} degrees from a right angle"
+    level = np.arcsin(np.abs(sides[[0, 2], 1]).max())
+    if level > LEVEL_RAD:
+        return f"its lower or upper edge slopes by {np.degrees(level):.0f} degrees across the bridge"
+    return ""
+
+
+def key_points(plane: SectionPlane, four: Floats) -> Floats:
+    """Return P1..P8 (8, 3) of the corners P1..P4 (4, 2) in a section's plane."""
+    middles = 0.5 * (four + np.roll(four, -1, axis=0))
+    return plane.space(np.vstack([four, middles]))
+
+
+def cut(body: Body, plane: SectionPlane) -> Floats:
+    """Return left and up (n, 2) of the points in which a plane cuts the edges of a body."""
+    side = (body.vertices - plane.origin) @ plane.normal
+    ends, _ = body.edges
+    a, b = side[ends[:, 0]], side[ends[:, 1]]
+    crossed = (a < 0) != (b < 0)
+    share = a[crossed] / (a[crossed] - b[crossed])
+    first, last = body.vertices[ends[crossed, 0]], body.vertices[ends[crossed, 1]]
+    return plane.flat(first + share[:, None] * (last - first))
+
+
+def skin_at_end(body: Body, plane: SectionPlane, inward: float) -> tuple[Floats, Floats] | None:
+    """Return P1..P4 (4, 2) at a plane, extrapolated from sections inside, and their change (4, 2) a mm outward.
+
+    None where the sections have no corners. ``inward`` is 1 where the body lies on the side of the plane's normal, else
+    -1. A bevel, or a flange around the end, has other corners than the skin.
+    """
+    inside = [corners(cut(body, plane.moved(inward * depth)), CHORDS_MM) for depth in DEPTHS_MM]
+    if any(one is None or one.doubt for one in inside):
+        return None
+    places = np.array([one.places for one in inside if one is not None])
+    at_end = 3.0 * places[0] - 3.0 * places[1] + places[2]
+    return at_end, (at_end - places[0]) / DEPTHS_MM[0]
